@@ -1,4 +1,7 @@
-"""The parts of a loop, each in one file with its source, its equations and its units; values are checked where made."""
+"""Models of the parts of a haptic loop: device, actuator, modes, operator, timing, velocity estimate, wall and others.
+
+Each module contains one part, with its equations, units and sources. The constructor of a part checks its values.
+"""
 
 import lazy_loader
 

@@ -1,6 +1,8 @@
-"""Functions of z on the unit circle, with their derivatives, by the roots they have: offsets ``1 - root``.
+"""Rational functions on the unit circle, with their derivatives, evaluated from their roots.
 
-Next to z = 1, where slow loops live, a root itself has lost its digits.
+A function is given by the *offsets* ``1 - root`` of its zeros and poles, because slow loops have roots near z = 1, and
+there float64 represents the offset far more accurately than the root. On the circle, z = e^(jw). Derivatives are taken
+with respect to the angle w.
 """
 
 from __future__ import annotations
@@ -12,40 +14,43 @@ import numpy as np
 from zwidth.words.types import Array
 from zwidth.words.xp import frozen, namespace
 
-# Nearer to the circle than this share of its offset, or of so much, a root of the loop is on it: an undamped mode, or a
-# zero of an undamped device. Of a slow one much less tells how soon it comes to rest.
-_ON_CIRCLE, _AT_ONE = 1e-12, 1e-3
-# And nearer than this share of its offset it is there but for rounding.
+# A root is on the unit circle, as that of an undamped mode, if its distance from the circle is at most
+# _ON_CIRCLE (_AT_ONE + |offset|). The limit decreases with the offset, because the distance of a root near z = 1
+# determines its decay time even if the distance is very small.
+_ON_CIRCLE = 1e-12  # relative tolerance
+_AT_ONE = 1e-3  # value added to the offset, so that the tolerance at z = 1 is not 0
+# Offsets whose root is closer to the circle, relative to the offset, differ from an exact root on the circle by
+# rounding errors only.
 _UNDAMPED = 8.0 * np.finfo(float).eps
 
 
 class Jet(NamedTuple):
-    """A complex function of w and its derivative."""
+    """The value of a complex function of w, and its derivative."""
 
     value: Array
-    slope: Array
+    slope: Array  # derivative with respect to w
 
     def times(self, other: Jet) -> Jet:
-        """The product."""
+        """Return the product with another function, by the product rule."""
         return Jet(self.value * other.value, self.slope * other.value + self.value * other.slope)
 
     def over(self, other: Jet) -> Jet:
-        """The quotient."""
+        """Return the quotient by another function, by the quotient rule."""
         value = self.value / other.value
         return Jet(value, (self.slope - value * other.slope) / other.value)
 
 
 class CirclePoints(NamedTuple):
-    """Points ``z = e^(jw)``, and z - 1 with all its digits."""
+    """Points ``z = e^(jw)`` of the unit circle; z - 1 and z + 1 are computed without cancellation."""
 
     w: Array
     z: Array
-    before: Array
+    before: Array  # z - 1
     after: Array  # z + 1
 
 
 def circle(w: Array) -> CirclePoints:
-    """The points of the unit circle at the angles ``w``, exactly -1 at pi."""
+    """Return the points of the unit circle at the angles ``w``; the point at pi is exactly -1."""
     xp = namespace(w)
     half = 0.5 * w
     s, c = xp.sin(half), _exactly_at_pi(w, 0.0, xp.cos(half), xp)
@@ -54,44 +59,46 @@ def circle(w: Array) -> CirclePoints:
 
 
 def depths(offsets: np.ndarray) -> np.ndarray:
-    """``1 - |root|`` of roots given by their offsets from 1, with the digits that they have next to 1."""
+    """Return ``1 - |root|`` for roots given by their offsets, without cancellation for roots near 1."""
     return (2.0 * np.real(offsets) - np.abs(offsets) ** 2) / (1.0 + np.abs(1.0 - offsets))
 
 
 def are_on_circle(offsets: np.ndarray) -> np.ndarray:
-    """Whether roots are on the unit circle but for rounding."""
+    """Return whether roots, given by their offsets, are on the unit circle except for rounding errors."""
     return np.abs(depths(offsets)) <= _ON_CIRCLE * (_AT_ONE + np.abs(offsets))
 
 
 def _exactly_at_pi(w: Array, exact: complex, value: Array, xp: Any) -> Array:
-    """``value`` without its rounding error at pi, which derivatives must not mistake for a constant."""
+    """Return ``value`` with its entries at w = pi replaced by their exact value."""
     if xp is np:
         return np.where(w >= np.pi, exact, value)
+    # Subtract the rounding error as a constant, so that the derivative at pi remains that of ``value``.
     return value - frozen(xp.where(w >= np.pi, value - exact, 0.0), xp)
 
 
-def lag_jet(at: CirclePoints, turns: float) -> Jet:
-    """``z^turns``."""
-    # At pi a whole number of half turns is a sign.
-    even = 1.0 - 2.0 * (turns % 2)
-    xp = namespace(at.w)
-    value = _exactly_at_pi(at.w, even + 0j, xp.exp(1j * turns * at.w), xp)
-    return Jet(value, 1j * turns * value)
+def lag_jet(points: CirclePoints, power: float) -> Jet:
+    """Return ``z^power`` and its derivative, for an integer power."""
+    # z^power is 1 at w = pi for even powers and -1 for odd ones.
+    at_pi = 1.0 - 2.0 * (power % 2)
+    xp = namespace(points.w)
+    value = _exactly_at_pi(points.w, at_pi + 0j, xp.exp(1j * power * points.w), xp)
+    return Jet(value, 1j * power * value)
 
 
-def product_jet(at: CirclePoints, offsets: Any, factor: Any) -> Jet:
-    """``factor prod(z - root)`` of roots given by their offsets from 1."""
-    value = 0.0 * at.z + factor
-    slope = 0.0 * at.z
-    turn = 1j * at.z
+def product_jet(points: CirclePoints, offsets: Any, factor: Any) -> Jet:
+    """Return ``factor prod(z - root)`` and its derivative, for roots given by their offsets."""
+    value = 0.0 * points.z + factor
+    slope = 0.0 * points.z
+    dz_dw = 1j * points.z
     for offset in offsets:
-        number = isinstance(offset, np.number)
-        if number and offset.imag and abs(2.0 * offset.real - abs(offset) ** 2) < _UNDAMPED * abs(offset):
-            # Next to a root on the circle a sum has lost its phase, too.
-            angle, xp = np.angle(1.0 - offset), namespace(at.w)
-            one = 2j * xp.sin(0.5 * (at.w - angle)) * xp.exp(0.5j * (at.w + angle))
+        is_number = isinstance(offset, np.number)
+        if is_number and offset.imag and abs(2.0 * offset.real - abs(offset) ** 2) < _UNDAMPED * abs(offset):
+            # Near a root on the circle, the sum z - 1 + offset would cancel and lose its phase as well.
+            angle, xp = np.angle(1.0 - offset), namespace(points.w)
+            difference = 2j * xp.sin(0.5 * (points.w - angle)) * xp.exp(0.5j * (points.w + angle))
         else:
-            # Next to z = -1 that around z = 1 has.
-            one = at.after + (offset - 2.0) if number and offset.real > 1.0 else at.before + offset
-        value, slope = value * one, slope * one + value * turn
+            # Expand about z = -1 for roots in the left half-plane, otherwise about z = 1: the difference is accurate
+            # near the root.
+            difference = points.after + (offset - 2.0) if is_number and offset.real > 1.0 else points.before + offset
+        value, slope = value * difference, slope * difference + value * dz_dw
     return Jet(value, slope)

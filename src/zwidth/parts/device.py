@@ -1,4 +1,8 @@
-"""The haptic device: a mass with viscous damping, and optionally a coupling, an actuator and modes."""
+"""Model of the haptic device: a mass with viscous damping, and optionally a compliant coupling, an actuator and modes.
+
+The *motor side* is the body that the actuator drives. With a coupling, the *tip* is the second body, which the operator
+holds; the position sensor is on one of the two bodies.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +18,16 @@ from zwidth.words.formatting import with_unit
 
 @dataclass(frozen=True, repr=False)
 class Coupling(Part):
-    """A second mass, coupled by a spring and a damper: the elasticity of a tendon, belt, gear or link.
+    """Compliant coupling: a second mass, connected by a spring and a damper, as with a tendon, belt, gear or link.
 
-    ``m x1'' = F - b x1' + k (x2 - x1) + c (x2' - x1')``, ``m2 x2'' = -k (x2 - x1) - c (x2' - x1')``; the wall's
-    force F acts on the motor side.
+    ``m x1'' = F - b x1' + k (x2 - x1) + c (x2' - x1')``, ``m2 x2'' = -k (x2 - x1) - c (x2' - x1')``, with the positions
+    x1 of the motor side and x2 of the tip. The force F of the wall acts on the motor side.
 
     Args:
-        mass: m2, the mass on the tip side, in kg, > 0.
-        stiffness: k of the spring, in N/m, > 0.
-        damping: c of the damper, in N s/m, >= 0.
-        sensor: side on which the position is measured, "motor" or "tip".
+        mass: mass m2 of the tip in kg, > 0.
+        stiffness: stiffness k of the spring in N/m, > 0.
+        damping: damping c of the damper in N s/m, >= 0.
+        sensor: location of the position sensor, "motor" or "tip".
 
     Example:
         >>> import zwidth
@@ -32,7 +36,7 @@ class Coupling(Part):
     """
 
     _owner = "coupling"
-    # Forms that the explorer offers.
+    # Presets of the explorer.
     usual: ClassVar[dict[str, dict[str, Any]]] = {
         "motor": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0},
         "tip": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0, "sensor": "tip"},
@@ -49,17 +53,18 @@ class Device(Part):
     """The haptic device: a mass with viscous damping, or an inertia if the device is rotary.
 
     The equations of a rotary device are the same in other units: kg m^2 instead of kg, N m s/rad instead of N s/m,
-    N m/rad instead of N/m, rad instead of m, and N m instead of N. All parts, walls and results of its scene have these
-    units.
+    N m/rad instead of N/m, rad instead of m, and N m instead of N. These are then the units of all parts, walls and
+    results of the scene.
 
     Args:
-        mass: m in kg, > 0; with a coupling, that of the motor side. For a rotary device, the inertia J in kg m^2.
-        damping: b in N s/m, >= 0; in N m s/rad for a rotary device.
-        coupling: a second mass, coupled by a spring and a damper; None for a rigid device.
-        actuator: dynamics of amplifier and motor; None if commands act immediately.
-        modes: resonances that commands excite and the sensor measures, in any number.
-        rotary: True for a rotary device. If left out, the units of the other arguments decide; plain numbers are those
-            of a linear device.
+        mass: mass m in kg, > 0; with a coupling, the mass of the motor side. For a rotary device, the inertia J in
+            kg m^2.
+        damping: viscous damping b in N s/m, >= 0; in N m s/rad for a rotary device.
+        coupling: compliant coupling to a second mass; None for a rigid device.
+        actuator: dynamics of amplifier and motor; None if the commanded force acts without lag.
+        modes: list of structural modes, possibly empty.
+        rotary: True for a rotary device, False for a linear one. Default: rotary if other arguments have rotary units;
+            numbers without unit are in units of a linear device.
 
     Example:
         >>> import zwidth
@@ -71,30 +76,30 @@ class Device(Part):
     damping: Any = 0.0
     coupling: Coupling | None = None
     actuator: Actuator | None = None
-    # A list is also accepted.
+    # Any, because `__post_init__` converts a list or a single mode to a tuple.
     modes: Any = ()
     rotary: bool | None = None
 
     def __post_init__(self) -> None:
         modes = (self.modes,) if isinstance(self.modes, Mode) else self.modes
         if not isinstance(modes, list | tuple) or not all(isinstance(mode, Mode) for mode in modes):
-            raise InputError(f"modes: got {self.modes!r}; a list of zwidth.Mode is needed")
+            raise InputError(f"modes: got {self.modes!r}; it must be a list of zwidth.Mode")
         if self.rotary is not None and not isinstance(self.rotary, bool):
-            raise InputError(f"rotary: got {self.rotary!r}; True or False is needed")
-        own = {name: getattr(self, name) for name in ("mass", "damping", "coupling")}
-        own |= {f"modes.{k}": mode for k, mode in enumerate(modes)}
-        told = find_kind(own)
-        rotary = told or False if self.rotary is None else self.rotary
+            raise InputError(f"rotary: got {self.rotary!r}; it must be True or False")
+        quantities = {name: getattr(self, name) for name in ("mass", "damping", "coupling")}
+        quantities |= {f"modes.{k}": mode for k, mode in enumerate(modes)}
+        unit_kind = find_kind(quantities)
+        rotary = unit_kind or False if self.rotary is None else self.rotary
         object.__setattr__(self, "modes", tuple(modes))
         for name, kind in {"coupling": Coupling, "actuator": Actuator}.items():
             part = getattr(self, name)
             if part is not None and not isinstance(part, kind):
-                raise InputError(f"{name}: got {part!r}; a zwidth.{kind.__name__} is needed, or None")
-        check_kind(rotary, own)
+                raise InputError(f"{name}: got {part!r}; it must be a zwidth.{kind.__name__} or None")
+        check_kind(rotary, quantities)
         object.__setattr__(self, "rotary", rotary)
         super().__post_init__()
 
     def spell(self) -> str:
-        """Return mass and damping with symbols and units."""
+        """Return mass and damping as text with symbols and units: ``m = 100.0 g, b = 1.000 N s/m``."""
         mass, damping = with_unit(self.mass, self.unit_system["kg"]), with_unit(self.damping, self.unit_system["N s/m"])
         return f"{'J' if self.rotary else 'm'} = {mass}, b = {damping}"

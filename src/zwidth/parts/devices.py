@@ -1,7 +1,7 @@
-"""Devices with published parameters, each parameter with its source.
+"""Catalog of devices and of a hand with published parameters, each parameter with its source.
 
-The equations of a rotary device are those of a linear one in other units: its ``mass`` is the inertia J in kg m^2, its
-``damping`` is in N m s/rad, and the walls of its loop are in N m/rad and N m s/rad.
+The data are in ``published.json``. For a rotary device, ``mass`` is the inertia J in kg m^2, ``damping`` is in
+N m s/rad, and walls are in N m/rad and N m s/rad.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ __all__ = ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_dev
 
 
 def __dir__() -> list[str]:
-    """Its own names, and not those that it imports."""
+    """Return the names of ``__all__``, without imported names."""
     return sorted(__all__)
 
 
 class Published(NamedTuple):
-    """One parameter with its unit, its source, and a note on its use."""
+    """A published parameter with its unit, its source, and a note on its use."""
 
     value: float
     unit: str
@@ -37,7 +37,7 @@ class Published(NamedTuple):
     note: str = ""
 
     def spell(self) -> str:
-        """Return the value with its unit."""
+        """Return the value with its unit as text, to three significant digits."""
         if self.unit in ("counts", "periods"):
             return f"{self.value:g} {self.unit.removesuffix('s') if self.value == 1 else self.unit}"
         return with_unit(self.value, self.unit, 3)
@@ -48,19 +48,19 @@ class KnownDevice:
     """Published parameters of one device; unpublished ones are None.
 
     Attributes:
-        name: the name in `find_device` and on the command line.
-        title: the name in texts.
+        name: short name, for `find_device` and the command line.
+        title: full name, for texts.
         motion: "linear" or "rotary"; determines the units of all other fields.
-        mass: in kg, or the inertia in kg m^2.
-        damping: viscous, in N s/m or N m s/rad.
+        mass: mass in kg, or inertia in kg m^2.
+        damping: viscous damping in N s/m or N m s/rad.
         friction: Coulomb friction in N or N m.
-        resolution: one step of the position sensor, in m or rad.
-        counts: counts of the encoder on the motor shaft; the transmission is not published with them.
+        resolution: resolution of the position sensor in m or rad.
+        counts: counts of the encoder on the motor shaft, published without the transmission ratio.
         period: sampling period in s of the loop in which the device was measured or used.
         delay: delay of that loop from a sample to its force, in s or in periods.
-        force: largest force, in N.
-        stiffness_limit: largest stiffness in use, in N/m, from a library or notes; not a measured boundary.
-        damping_limit: largest virtual damping in use, in N s/m, likewise.
+        force: largest force in N.
+        stiffness_limit: largest stiffness in use in N/m, from a software library or notes; not a stability limit.
+        damping_limit: largest virtual damping in use in N s/m, from a software library or notes.
     """
 
     name: str
@@ -79,8 +79,8 @@ class KnownDevice:
 
     def __repr__(self) -> str:
         """Return the name and the parameters, without sources."""
-        numbers = [f"{name}={number.spell()}" for name, number in self.numbers.items()]
-        return f"KnownDevice({', '.join([self.name, *numbers])})"
+        parameters = [f"{name}={parameter.spell()}" for name, parameter in self.numbers.items()]
+        return f"KnownDevice({', '.join([self.name, *parameters])})"
 
     @property
     def rotary(self) -> bool:
@@ -91,39 +91,39 @@ class KnownDevice:
     def numbers(self) -> dict[str, Published]:
         """The published parameters by name."""
         return {
-            field.name: found for field in fields(self) if isinstance(found := getattr(self, field.name), Published)
+            field.name: value for field in fields(self) if isinstance(value := getattr(self, field.name), Published)
         }
 
     def to_device(self, *, mass: Any = None, damping: Any = None) -> Device:
         """Return a `zwidth.Device` with the published mass and damping.
 
-        For a rotary device ``Device.mass`` holds the inertia in kg m^2 and ``Device.damping`` N m s/rad, and every
-        stiffness and virtual damping of such a scene is in N m/rad and N m s/rad.
+        For a rotary device, ``Device.mass`` is the inertia in kg m^2 and ``Device.damping`` is in N m s/rad. Stiffness
+        and virtual damping of its scene are in N m/rad and N m s/rad.
 
         Args:
             mass: mass that replaces the published one; required if none is published.
-            damping: damping, likewise; 0 is the cautious value, because no stable wall was found that more physical
-                damping makes unstable.
+            damping: damping that replaces the published one; required if none is published. If the damping is unknown,
+                0 is the cautious choice, because no stable wall was found that more physical damping makes unstable.
 
         Raises:
-            InputError: mass or damping is neither published nor given.
+            InputError: mass or damping is neither published nor passed.
 
         Example:
             >>> import zwidth
             >>> zwidth.devices.find_device("haptic_wheel").to_device()
             Device(mass=0.00045, damping=0.0013, rotary=True)
         """
-        numbers = {"mass": self._chosen("mass", mass), "damping": self._chosen("damping", damping)}
-        return Device(**numbers, rotary=self.rotary)
+        values = {"mass": self._choose("mass", mass), "damping": self._choose("damping", damping)}
+        return Device(**values, rotary=self.rotary)
 
     def to_timing(self, *, period: Any = None, rate: Any = None, delay: Any = None) -> Timing:
         """Return a `zwidth.Timing` with the published period and delay; the delay is 0 if none is published.
 
         Args:
-            period: sampling period that replaces the published one; required if neither ``rate`` nor a published
-                period is available.
-            rate: sampling rate, in place of ``period``.
-            delay: delay that replaces the published one. A delay published in periods stays in periods.
+            period: sampling period in s that replaces the published one; required if none is published and no ``rate``
+                is passed.
+            rate: sampling rate in Hz, instead of ``period``.
+            delay: delay in s, or a text such as "1.5 periods", that replaces the published one.
 
         Raises:
             InputError: no period is published, and neither ``period`` nor ``rate`` is passed.
@@ -136,33 +136,32 @@ class KnownDevice:
         if delay is None and self.delay is not None:
             delay = f"{self.delay.value!r} periods" if self.delay.unit == "periods" else self.delay.value
         if period is None and rate is None:
-            period = self._chosen("period", None)
+            period = self._choose("period", None)
         return Timing(period=period, rate=rate, delay=0.0 if delay is None else delay)
 
     def list_missing(self, given: Collection[str]) -> list[str]:
-        """Return the parameters, out of mass and damping, that are neither published nor in ``given``."""
+        """Return those of "mass" and "damping" that are neither published nor in ``given``."""
         return [name for name in ("mass", "damping") if name not in given and getattr(self, name) is None]
 
-    def _chosen(self, name: str, given: Any) -> Any:
+    def _choose(self, name: str, given: Any) -> Any:
+        """Return the given value, otherwise the published one; raise `InputError` if there is neither."""
         if given is not None:
             return given
-        found = getattr(self, name)
-        if found is None:
-            known = ", ".join(self.numbers)
-            raise InputError(
-                f"{name}: none is published for {self.name!r} (published are {known}); give one of your own"
-            )
-        return found.value
+        published = getattr(self, name)
+        if published is None:
+            names = ", ".join(self.numbers)
+            raise InputError(f"{name}: no value is published for {self.name!r}, only {names}; pass a value")
+        return published.value
 
     def as_dict(self) -> dict[str, Any]:
-        """Return JSON values; null for unpublished parameters."""
+        """Return the fields as JSON values, None (null) for unpublished parameters."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value._asdict() if isinstance(value, Published) else value for name, value in values.items()}
 
 
 @dataclass(frozen=True)
 class KnownHand:
-    """Measured mass (kg), damping (N s/m) and stiffness (N/m) to ground of one hand."""
+    """Published parameters of a hand: mass in kg, damping in N s/m and stiffness in N/m, both to ground."""
 
     name: str
     title: str
@@ -171,7 +170,9 @@ class KnownHand:
     stiffness: Published
 
     def to_operator(self) -> Operator:
-        """Return a `zwidth.Operator` with a rigid grasp; add a spring by `dataclasses.replace`.
+        """Return a `zwidth.Operator` with a rigid grasp.
+
+        Pass ``coupling_stiffness`` to `dataclasses.replace` for a grasp with a spring.
 
         Example:
             >>> import zwidth
@@ -182,27 +183,27 @@ class KnownHand:
 
 
 def _read_published() -> tuple[tuple[KnownDevice, ...], KnownHand]:
-    """Return the devices and the hand in ``published.json``."""
-    known = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
+    """Return the devices and the hand of ``published.json``."""
+    catalog = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
 
-    def spell_out(entry: dict[str, Any]) -> dict[str, Any]:
-        """Return an entry with its parameters as `Published`, with the sources in place of their keys."""
+    def convert(entry: dict[str, Any]) -> dict[str, Any]:
+        """Return an entry with each parameter as `Published`, with the text of its source in place of the key."""
         return {
-            name: Published(value[0], value[1], known["sources"][value[2]], *value[3:])
+            name: Published(value[0], value[1], catalog["sources"][value[2]], *value[3:])
             if isinstance(value, list)
             else value
             for name, value in entry.items()
         }
 
-    return tuple(KnownDevice(**spell_out(entry)) for entry in known["devices"]), KnownHand(**spell_out(known["hand"]))
+    return tuple(KnownDevice(**convert(entry)) for entry in catalog["devices"]), KnownHand(**convert(catalog["hand"]))
 
 
 DEVICES, HAND = _read_published()
-"""All devices, those with measured parameters first; and a hand for `zwidth.Scene(..., operator=...)`."""
+"""The devices of the catalog, those with measured parameters first; and the hand, for `zwidth.Scene`."""
 
 
 def find_device(name: str) -> KnownDevice:
-    """Return the published device with a name.
+    """Return a device of the catalog.
 
     Args:
         name: name of a device in `zwidth.devices.DEVICES`, as listed by ``zwidth devices``.
@@ -211,7 +212,7 @@ def find_device(name: str) -> KnownDevice:
         InputError: no device has this name.
 
     References:
-        Each parameter contains its source.
+        The field ``source`` of each parameter.
 
     Example:
         >>> import zwidth
@@ -226,11 +227,14 @@ def find_device(name: str) -> KnownDevice:
 
 
 def read_device(text: str) -> KnownDevice | LinearDevice | MeasuredDevice:
-    """A device as the command line names it: published, by its transfer function, or by a table of its response.
+    """Return the device that an option ``--device`` selects.
 
     Args:
-        text: a name that `find_device` knows, ``"NUMERATOR / DENOMINATOR"`` with coefficients in s, highest power
-            first, or the name of a file as `zwidth.MeasuredDevice.read` takes it.
+        text: the name of a device for `find_device`; a transfer function ``"NUMERATOR / DENOMINATOR"`` with the
+            coefficients in s, highest power first; or the name of a file for `zwidth.MeasuredDevice.read`.
+
+    Raises:
+        InputError: the text is none of these.
     """
     if text.endswith(SUFFIXES):
         return MeasuredDevice.read(text)

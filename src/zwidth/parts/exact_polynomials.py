@@ -1,6 +1,6 @@
-"""Compute with polynomials that have exact rational coefficients, and compute their roots to full float64 accuracy.
+"""Polynomials with exact rational coefficients, and their roots to full float64 accuracy.
 
-Every float is an integer over a power of 2, and therefore an exact fraction. Products, greatest common divisors and
+Every float is an integer times a power of 2, and therefore an exact fraction. Products, greatest common divisors and
 characteristic polynomials are exact. Roots are computed by Aberth's iteration in decimal arithmetic, whose precision is
 doubled until the error bounds of all roots are small enough.
 
@@ -23,21 +23,23 @@ from zwidth.words.errors import InputError
 Polynomial: TypeAlias = tuple[Fraction, ...]
 """Exact coefficients, highest power first, without leading zeros; empty for the zero polynomial."""
 
-DIGITS = tuple(50 << k for k in range(6))  # working precisions in decimal digits, tried in this order
+DIGITS = tuple(
+    50 << k for k in range(6)
+)  # working precisions in decimal digits, tried in this order: 50, 100, .., 1600
 STEPS = 400  # largest number of Aberth steps; about 10 suffice from the eigenvalues of the companion matrix
 ACCURATE = Decimal("1e-22")  # required relative error bound of a root, well below the float64 resolution of 1e-16
-EXPONENT = 10**9  # largest magnitude of decimal exponents, so that no intermediate result overflows
+EXPONENT = 10**9  # largest magnitude of decimal exponents, so large that no intermediate result overflows
 
 
 class Complex(NamedTuple):
-    """A complex number with decimal parts."""
+    """A complex number in decimal arithmetic."""
 
     real: Decimal
     imag: Decimal
 
 
 def trim(coefficients: Any) -> Polynomial:
-    """Return exact coefficients without leading zeros."""
+    """Convert coefficients to exact fractions and remove leading zeros."""
     exact = [Fraction(value) if isinstance(value, Fraction | int) else Fraction(float(value)) for value in coefficients]
     first = next((k for k, value in enumerate(exact) if value), len(exact))
     return tuple(exact[first:])
@@ -66,7 +68,8 @@ def differentiate(polynomial: Polynomial) -> Polynomial:
 
 
 def shift(polynomial: Polynomial) -> Polynomial:
-    """Return the polynomial p(1 - x)."""
+    """Return the polynomial p(1 - x) for a polynomial p(x)."""
+    # Horner's scheme (synthetic division) yields p(1 + x); reverse the sign of odd powers afterwards.
     values = list(polynomial)
     for k in range(1, len(values)):
         for j in range(1, len(values) - k + 1):
@@ -76,7 +79,7 @@ def shift(polynomial: Polynomial) -> Polynomial:
 
 
 def divide(top: Polynomial, bottom: Polynomial) -> tuple[Polynomial, Polynomial]:
-    """Return the quotient and the remainder of a polynomial division."""
+    """Return the quotient and the remainder of the division of two polynomials."""
     rest, quotient = list(top), []
     while len(rest) >= len(bottom):
         factor = rest[0] / bottom[0]
@@ -89,7 +92,8 @@ def find_common_factor(one: Polynomial, other: Polynomial) -> Polynomial:
     """Return the monic greatest common divisor of two polynomials, by Euclid's algorithm."""
     a, b = _to_integers(one), _to_integers(other)
     while b:
-        # Compute pseudo-remainders, which have integer coefficients. Division by their common factor keeps them small.
+        # Compute pseudo-remainders, which avoid fractions. Division by the common factor of the coefficients keeps the
+        # integers small.
         while len(a) >= len(b):
             a = [x * b[0] - a[0] * y for x, y in zip(a, b + [0] * (len(a) - len(b)), strict=True)][1:]
         first = next((k for k, value in enumerate(a) if value), len(a))
@@ -104,13 +108,13 @@ def _to_integers(polynomial: Polynomial) -> list[int]:
 
 
 def _without_content(values: list[int]) -> list[int]:
-    """Return integers divided by their greatest common divisor."""
+    """Divide integers by their greatest common divisor."""
     common = gcd(*values)
     return [value // common for value in values] if common > 1 else values
 
 
 def characteristic_polynomial(matrix: np.ndarray) -> Polynomial:
-    """Return det(s I - A) for a square matrix A of fractions, by the Faddeev-LeVerrier algorithm."""
+    """Return det(s I - A) for a square matrix A of fractions, by the Faddeev-LeVerrier algorithm in integers."""
     size = len(matrix)
     scale = lcm(1, *(value.denominator for value in matrix.ravel()))
     exact = np.array([[int(value * scale) for value in row] for row in matrix], object)
@@ -128,7 +132,7 @@ def find_roots(polynomial: Polynomial, offsets: bool = False) -> np.ndarray:
 
     Args:
         polynomial: the polynomial.
-        offsets: return 1 - root for each root, which stays accurate for roots near 1.
+        offsets: return 1 - root in place of each root, because this difference is inaccurate in float64 near 1.
     """
     rest = shift(polynomial) if offsets else polynomial
     roots: list[complex] = []
@@ -140,17 +144,21 @@ def find_roots(polynomial: Polynomial, offsets: bool = False) -> np.ndarray:
 
 
 def _split_by_multiplicity(polynomial: Polynomial) -> list[Polynomial]:
-    """Return the square-free factorization: polynomials with the roots of multiplicity 1, 2, and so on (Yun 1976)."""
-    parts = []
-    slope = differentiate(polynomial)
-    common = find_common_factor(polynomial, slope) if slope else polynomial
-    left, over = divide(polynomial, common)[0], divide(slope, common)[0]
-    while len(left) > 1:
-        over = subtract(over, differentiate(left))
-        part = find_common_factor(left, over) if over else left
-        parts.append(part)
-        left, over = divide(left, part)[0], divide(over, part)[0] if over else over
-    return parts
+    """Return the square-free factorization (Yun 1976).
+
+    The k-th factor has the roots of multiplicity k of the polynomial, counted from 1, as simple roots.
+    """
+    factors = []
+    derivative = differentiate(polynomial)
+    common = find_common_factor(polynomial, derivative) if derivative else polynomial
+    # The names b and d are those of Yun's algorithm.
+    b, d = divide(polynomial, common)[0], divide(derivative, common)[0]
+    while len(b) > 1:
+        d = subtract(d, differentiate(b))
+        factor = find_common_factor(b, d) if d else b
+        factors.append(factor)
+        b, d = divide(b, factor)[0], divide(d, factor)[0] if d else d
+    return factors
 
 
 def _simple_roots(polynomial: Polynomial) -> list[complex]:
@@ -161,18 +169,18 @@ def _simple_roots(polynomial: Polynomial) -> list[complex]:
         with localcontext(Context(prec=digits, Emax=EXPONENT, Emin=-EXPONENT)):
             exact = [Decimal(value.numerator) / Decimal(value.denominator) for value in polynomial]
             roots, errors = iterate_roots(exact)
-            # Increase the precision while errors are large, because a close pair of roots may then be real or complex.
+            # Require small errors, because otherwise a close pair of roots may be either real or complex.
             if all(error <= ACCURATE * size(root) for root, error in zip(roots, errors, strict=True)):
                 return _pair_up(roots, errors)
-    raise InputError("device: some poles or zeros are too close together; remove modes that hardly move the output")
+    raise InputError("device: some poles or zeros are too close together; remove modes that hardly affect the output")
 
 
 def _pair_up(roots: list[Complex], errors: list[Decimal]) -> list[complex]:
-    """Return the roots of a real polynomial as floats, exactly real or in exact conjugate pairs.
+    """Convert the roots of a real polynomial to floats that are exactly real or in exact conjugate pairs.
 
     Args:
         roots: approximate roots.
-        errors: bounds on the errors of the roots. An imaginary part below the bound is 0.
+        errors: bounds on the errors of the roots. Real and imaginary parts below the bound become 0.
     """
     pairs = []
     for root, error in zip(roots, errors, strict=True):
@@ -201,38 +209,39 @@ def _inverse(a: Complex) -> Complex:
 def iterate_roots(coefficients: list[Decimal]) -> tuple[list[Complex], list[Decimal]]:
     """Return the roots of a real polynomial in the precision of the decimal context, and bounds on their errors.
 
-    For a polynomial p of degree n, the disk of radius ``n |p/p'|`` around an approximate root contains a root. The
-    bound includes the rounding error of p.
+    For a polynomial p of degree n, the disk of radius ``n |p(x)/p'(x)|`` around any x contains a root. The error bound
+    of an approximate root x is this radius, including the rounding error of p(x).
     """
     order = len(coefficients) - 1
-    # Start from the eigenvalues of the companion matrix. Scale by the geometric mean of the roots, which keeps the
-    # coefficients within the range of floats.
+    # Start from the eigenvalues of the companion matrix in float64. Divide the roots by their geometric mean first, so
+    # that the coefficients do not overflow.
     unit = ((abs(coefficients[-1] / coefficients[0])).ln() / order).exp() if coefficients[-1] else Decimal(1)
     scaled = [value / coefficients[0] / unit**k for k, value in enumerate(coefficients)]
     with np.errstate(all="ignore"):
         start = np.roots([float(value) for value in scaled]).astype(complex)
     if start.size != order or not np.isfinite(start).all():
         start = np.exp(1j * (0.7 + 2.0 * np.pi * np.arange(order) / order))
-    # Perturb the starting values: real values may have to become a conjugate pair, and equal values cause a division
-    # by 0.
+    # Perturb the starting values, because real values can only converge to real roots, and equal values would cause a
+    # division by 0.
     start = start * (1.0 + 1e-9 * np.exp(2.4j * np.arange(order)))
     roots = [Complex(Decimal(value.real), Decimal(value.imag)) for value in start.tolist()]
-    unit_error = Decimal(10) ** (6 - getcontext().prec)
+    tolerance = Decimal(10) ** (6 - getcontext().prec)
     moving = [True] * order
     for _ in range(STEPS):
         for k in range(order):
             if not moving[k]:
                 continue
             ratio, _ = _newton(scaled, roots[k])
-            apart = Complex(Decimal(0), Decimal(0))
+            # Aberth's step is ratio/(1 - ratio sum_j 1/(x_k - x_j)), with the Newton step ratio = p/p'.
+            total = Complex(Decimal(0), Decimal(0))
             for j in range(order):
                 if j != k and roots[j] != roots[k]:
-                    one = _inverse(Complex(roots[k].real - roots[j].real, roots[k].imag - roots[j].imag))
-                    apart = Complex(apart.real + one.real, apart.imag + one.imag)
-            product = _times(ratio, apart)
+                    term = _inverse(Complex(roots[k].real - roots[j].real, roots[k].imag - roots[j].imag))
+                    total = Complex(total.real + term.real, total.imag + term.imag)
+            product = _times(ratio, total)
             step = _times(ratio, _inverse(Complex(1 - product.real, -product.imag)))
             roots[k] = Complex(roots[k].real - step.real, roots[k].imag - step.imag)
-            moving[k] = size(step) > unit_error * size(roots[k])
+            moving[k] = size(step) > tolerance * size(roots[k])
         if not any(moving):
             break
     errors = [_newton(scaled, root)[1] * order * unit for root in roots]
@@ -241,14 +250,15 @@ def iterate_roots(coefficients: list[Decimal]) -> tuple[list[Complex], list[Deci
 
 def _newton(coefficients: list[Decimal], x: Complex) -> tuple[Complex, Decimal]:
     """Return the Newton step p/p' at x, and a bound on its magnitude that includes the rounding error of p."""
-    value, slope, largest = Complex(Decimal(0), Decimal(0)), Complex(Decimal(0), Decimal(0)), Decimal(0)
-    far = size(x)
+    # Horner's scheme for p and p'. ``total`` is the sum of the magnitudes of all terms; it bounds the rounding error.
+    value, derivative, total = Complex(Decimal(0), Decimal(0)), Complex(Decimal(0), Decimal(0)), Decimal(0)
+    radius = size(x)
     for coefficient in coefficients:
-        moved, turned = _times(slope, x), _times(value, x)
-        slope = Complex(moved.real + value.real, moved.imag + value.imag)
-        value = Complex(turned.real + coefficient, turned.imag)
-        largest = largest * far + abs(coefficient)
-    if not (slope.real or slope.imag):
+        derivative_x, value_x = _times(derivative, x), _times(value, x)
+        derivative = Complex(derivative_x.real + value.real, derivative_x.imag + value.imag)
+        value = Complex(value_x.real + coefficient, value_x.imag)
+        total = total * radius + abs(coefficient)
+    if not (derivative.real or derivative.imag):
         return Complex(Decimal(0), Decimal(0)), Decimal("Infinity")
-    noise = largest * 4 * len(coefficients) * Decimal(10) ** (1 - getcontext().prec)
-    return _times(value, _inverse(slope)), (size(value) + noise) / size(slope)
+    rounding_error = total * 4 * len(coefficients) * Decimal(10) ** (1 - getcontext().prec)
+    return _times(value, _inverse(derivative)), (size(value) + rounding_error) / size(derivative)

@@ -1,4 +1,8 @@
-"""Sections of a velocity filter: reading their coefficients, and computing their roots."""
+"""Coefficients and roots of the sections of a velocity filter.
+
+A filter is a product of *sections*, polynomials in z with the highest power first. Roots are returned as *offsets*
+``1 - root``, which are accurate for roots near z = 1.
+"""
 
 from __future__ import annotations
 
@@ -9,29 +13,32 @@ from numpy.polynomial import Polynomial
 
 from zwidth.words.errors import InputError
 
-NEXT_TO_ONE = 1e-2  # largest distance from z = 1 of poles that rounding errors of the coefficients can move there
+NEXT_TO_ONE = 1e-2  # radius around z = 1 within which rounding errors of the coefficients can move poles
 
 
 def ball_offsets(coefficients: tuple[Any, ...]) -> np.ndarray:
-    """Return 1 - root for the roots of a polynomial with exact coefficients, as balls."""
+    """Return the offsets of a polynomial with exact coefficients, as balls that enclose them."""
     import flint
 
     exact = flint.fmpq_poly([flint.arb(value).fmpq() for value in reversed(coefficients)])
-    found: Any = exact(flint.fmpq_poly([1, -1])).numer().complex_roots()
-    return np.array([flint.acb(root) for root, times in found for _ in range(times)], object)
+    roots: Any = exact(flint.fmpq_poly([1, -1])).numer().complex_roots()
+    return np.array([flint.acb(root) for root, times in roots for _ in range(times)], object)
 
 
 def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
-    """Return the coefficients of the sections without leading zeros; raise `InputError` for other values.
+    """Return the coefficients of each section, without leading zeros.
 
     Args:
         name: "numerator" or "denominator", for messages.
         given: coefficients of one polynomial, or a list of sections with their coefficients.
+
+    Raises:
+        InputError: a coefficient is not a finite real number, or all coefficients of a section are 0.
     """
     try:
         rows = list(given) if np.ndim(given) or any(map(np.ndim, given)) else [given]
     except ValueError:
-        # NumPy raises this error for sections of different lengths.
+        # `numpy.ndim` raises this error for sections of different lengths.
         rows = list(given)
     except TypeError:
         rows = [given]
@@ -46,20 +53,20 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
         if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
             raise InputError(
                 f"velocity.{name}: got {given!r}; it must be a list of finite coefficients, highest power first, not "
-                "all 0"
+                "all of them 0"
             )
         sections.append(tuple(values.tolist()))
     return tuple(sections)
 
 
 def is_rounding(coefficients: tuple[float, ...]) -> bool:
-    """Return whether rounding errors of the coefficients alone can explain the roots on or outside the unit circle."""
+    """Return whether rounding errors of the coefficients can explain all roots on or outside the unit circle."""
     roots = 1.0 - offsets(np.trim_zeros(np.array(coefficients), "b"))
-    on = np.exp(1j * np.angle(roots[np.abs(roots) >= 1.0]))
-    # If the polynomial is this small at a point of the circle, another one whose coefficients differ only by rounding
-    # errors has a root exactly there.
-    noise = 4.0 * len(coefficients) * np.finfo(float).eps * np.abs(coefficients).sum()
-    return bool(on.size and len(coefficients) > 2 and np.all(np.abs(np.polyval(coefficients, on)) <= noise))
+    points = np.exp(1j * np.angle(roots[np.abs(roots) >= 1.0]))
+    # If the value at a point of the unit circle is within this bound, a polynomial whose coefficients differ only by
+    # rounding errors has a root at this point.
+    bound = 4.0 * len(coefficients) * np.finfo(float).eps * np.abs(coefficients).sum()
+    return bool(points.size and len(coefficients) > 2 and np.all(np.abs(np.polyval(coefficients, points)) <= bound))
 
 
 def count_trailing_zeros(polynomial: np.ndarray) -> int:
@@ -68,10 +75,11 @@ def count_trailing_zeros(polynomial: np.ndarray) -> int:
 
 
 def offsets(polynomial: np.ndarray) -> np.ndarray:
-    """Return 1 - root for all roots, computed in powers of z - 1, because roots near 1 then keep their digits."""
+    """Return the offsets of all roots in float64, computed from the coefficients in powers of z - 1."""
     if polynomial.size < 2:
         return np.zeros(0, complex)
     shifted = Polynomial(polynomial[::-1])(Polynomial([1.0, 1.0])).coef
     scale = np.abs(polynomial).sum()
+    # Set coefficients of the size of rounding errors to 0, so that roots at z = 1 are exact.
     shifted = np.where(np.abs(shifted) <= 4 * polynomial.size * np.finfo(float).eps * scale, 0.0, shifted)
     return -np.polynomial.polynomial.polyroots(shifted) + 0j

@@ -9,11 +9,11 @@ from zwidth.parts.checks import check_number
 from zwidth.parts.operator import Operator
 from zwidth.words.quantities import POSITIVE
 
-HAND = Operator(**Operator.usual["rigid"])
-SPRINGS = {"soft": 1e3, "firm": 10e3}  # N/m; coupling stiffness between hand and device
-DAMPERS = {"light": 1.0, "medium": 5.0, "strong": 20.0}  # N s/m; coupling damping between hand and device
-# Distances in m of the hand from the axis of a rotary device. They are closely spaced because a grasp with light
-# damping may make a wall unstable only in a narrow range of distances.
+HAND = Operator(**Operator.usual["rigid"])  # measured hand with a rigid grasp
+SPRINGS = {"soft": 1e3, "firm": 10e3}  # coupling stiffness between hand and device, in N/m
+DAMPERS = {"light": 1.0, "medium": 5.0, "strong": 20.0}  # coupling damping between hand and device, in N s/m
+# Distances of the hand from the axis of a rotary device, in m. They are closely spaced, because a grasp with light
+# damping may destabilize a wall in a narrow range of distances only.
 RADII = (0.01, 0.0125, 0.016, 0.02, 0.025, 0.032, 0.04, 0.05, 0.063, 0.08, 0.1)
 
 
@@ -26,8 +26,8 @@ def reference_grasps(radius: float | str | None = None) -> dict[str, Operator]:
     ``operator``.
 
     Args:
-        radius: distance of the hand from the axis of a rotary device, in m, > 0. All masses, dampers and springs of the
-            grasp are multiplied by the squared radius. None for a linear device.
+        radius: distance of the hand from the axis of a rotary device, in m, > 0; None for a linear device. Mass,
+            damping and stiffness of the grasp are multiplied by the squared radius.
 
     Returns:
         A dictionary of six `zwidth.Operator`; the keys are names such as "soft, light damping".
@@ -52,6 +52,6 @@ def reference_grasps(radius: float | str | None = None) -> dict[str, Operator]:
 
 
 def list_grasps(rotary: bool) -> list[tuple[str, Operator]]:
-    """Return pairs of name and grasp: six for a linear device, six per radius in ``RADII`` for a rotary device."""
+    """Return pairs of name and grasp: six for a linear device; for a rotary device, six per radius in ``RADII``."""
     radii = RADII if rotary else (None,)
-    return [each for radius in radii for each in reference_grasps(radius).items()]
+    return [pair for radius in radii for pair in reference_grasps(radius).items()]

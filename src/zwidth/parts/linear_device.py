@@ -1,4 +1,8 @@
-"""A device defined by a linear system from commanded force to sensed position."""
+"""Device defined by a linear system from commanded force to measured position.
+
+The system may be given by matrices, coefficients or roots, or as a model of scipy.signal or python-control. It is
+stored as a rational function with exact coefficients, from which poles and zeros are computed to full accuracy.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import short
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
+# Accepted forms of a system, for messages.
 _FORMS = (
     "(A, B, C), (numerator, denominator), (zeros, poles, gain), or a model of scipy.signal or python-control with one "
     "input and one output"
@@ -34,42 +39,42 @@ class RationalResponse(NamedTuple):
 
     numerator: Polynomial
     denominator: Polynomial
-    dt: float | None  # s
+    dt: float | None  # sampling period in s; None for a continuous-time system
 
 
 class WholeDevice:
-    """Base of devices without bodies: defines the attributes of a `Device` that they do not have."""
+    """Base class of devices that are defined by their response only, without masses, coupling, actuator and modes."""
 
     coupling: ClassVar[None] = None
     actuator: ClassVar[None] = None
     modes: ClassVar[tuple[()]] = ()
     rotary: bool = False
-    # The response contains the damping.
+    # The physical damping is part of the response.
     damping: ClassVar[float] = 0.0
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The units of the device."""
+        """The units of the device, linear or rotary."""
         return SYSTEMS[self.rotary]
 
 
 @dataclass(frozen=True, repr=False)
 class LinearDevice(WholeDevice):
-    """A device defined by any strictly proper linear system from commanded force (N) to sensed position (m).
+    """A device defined by any strictly proper linear system from commanded force (N) to measured position (m).
 
-    All functions for walls accept it; its coefficients are taken as exact. Its bodies are unknown, so an operator,
-    friction, initial values and energies need a `Device`. The stiffest wall and recommendations are restricted to
-    B >= 0, because B < 0 would cancel modeled damping that the real device may not have. Walls with B < 0 are included
-    in `Scene.max_stiffness` with ``negative_damping=True``.
+    The coefficients are taken as exact. All functions for walls accept such a device. An operator, friction, initial
+    values and energies require a `Device`, because the masses of a linear system are unknown. Stiffest walls and
+    recommendations are restricted to B >= 0, because B < 0 would cancel modeled damping that the real device may not
+    have; `Scene.max_stiffness` includes B < 0 with ``negative_damping=True``.
 
     Args:
-        system: matrices ``(A, B, C)``, coefficients ``(numerator, denominator)`` with the highest power first, as text
-            too, "1 / 0.1 10 0", or ``(zeros, poles, gain)``; or a model of scipy.signal (lti, dlti) or python-control
-            (TransferFunction, StateSpace). A sampled system, with ``dt`` equal to the period of the loop, includes hold
-            and delay.
+        system: matrices ``(A, B, C)``; coefficients ``(numerator, denominator)`` with the highest power first, or as
+            text, "1 / 0.1 10 0"; roots ``(zeros, poles, gain)``; or a model of scipy.signal (lti, dlti) or
+            python-control (TransferFunction, StateSpace). A discrete-time system must include hold and delay, and its
+            ``dt`` must equal the period of the loop.
 
     Raises:
-        InputError: the system is none of these, or it is not strictly proper.
+        InputError: the system has none of these forms, or it is not strictly proper.
 
     Example:
         >>> import zwidth
@@ -86,19 +91,19 @@ class LinearDevice(WholeDevice):
             object.__setattr__(self, "system", _read(self.system))
 
     def __repr__(self) -> str:
-        """Return an expression that creates the device."""
+        """Return the expression that creates the device."""
         return f"LinearDevice({self.spell_form()!r})"
 
     def spell_form(self) -> str | dict[str, Any]:
-        """Return the entry ``device`` of a configuration, with the coefficients in float64."""
-        top, bottom = ([float(c) for c in part] for part in self.system[:2])
+        """Return the value of the key ``device`` in a configuration, with the coefficients rounded to float64."""
+        numerator, denominator = ([float(c) for c in part] for part in self.system[:2])
         if self.dt:
-            return {"numerator": top, "denominator": bottom, "sampled": self.dt}
-        return " / ".join(" ".join(map(short, part)) for part in (top, bottom))
+            return {"numerator": numerator, "denominator": denominator, "sampled": self.dt}
+        return " / ".join(" ".join(map(short, part)) for part in (numerator, denominator))
 
     @property
     def dt(self) -> float | None:
-        """The period of a sampled system, in s."""
+        """The sampling period of a discrete-time system in s; None for a continuous-time system."""
         return self.system.dt
 
     def spell(self) -> str:
@@ -108,82 +113,89 @@ class LinearDevice(WholeDevice):
 
     @cached_property
     def zeros(self) -> np.ndarray:
-        """The finite zeros, in rad/s or in z."""
+        """The finite zeros, in s (rad/s) or in z."""
         return find_roots(self.system.numerator)
 
     @cached_property
     def poles(self) -> np.ndarray:
-        """The poles, in rad/s or in z."""
+        """The poles, in s (rad/s) or in z."""
         return find_roots(self.system.denominator)
 
     @cached_property
     def offsets(self) -> tuple[np.ndarray, np.ndarray]:
-        """``1 - z`` of the zeros and poles of a sampled system, with all digits of slow ones."""
+        """``1 - z`` for the zeros and for the poles of a discrete-time system, accurate for roots near z = 1."""
         return find_roots(self.system.numerator, True), find_roots(self.system.denominator, True)
 
     @cached_property
     def gain(self) -> float:
-        """Ratio of the leading coefficients of numerator and denominator."""
+        """The ratio of the leading coefficients of numerator and denominator."""
         return float(self.system.numerator[0] / self.system.denominator[0])
 
     @cached_property
     def mass(self) -> float:
-        """A mass in kg with a response of similar magnitude, the unit of normalized parameters."""
-        behind = self.poles.size - self.zeros.size
-        if self.dt is None and behind == 2 and self.gain > 0:
+        """A mass in kg whose response has a similar magnitude; the unit of mass of normalized parameters."""
+        relative_degree = self.poles.size - self.zeros.size
+        if self.dt is None and relative_degree == 2 and self.gain > 0:
             return 1.0 / self.gain
-        moving = np.abs(self.poles)[np.abs(self.poles) > 0]
-        w = float(np.exp(np.mean(np.log(moving)))) if moving.size else 1.0
-        # Evaluate off the axis or circle on which undamped devices have poles.
-        at, unit = (w * (0.3 + 1j), w) if self.dt is None else (0.3 + 1j, 1.0 / self.dt)
-        size = abs(self.gain) * np.prod(np.abs(at - self.zeros)) / np.prod(np.abs(at - self.poles))
+        magnitudes = np.abs(self.poles)[np.abs(self.poles) > 0]
+        w = float(np.exp(np.mean(np.log(magnitudes)))) if magnitudes.size else 1.0
+        # Evaluate the response at a point off the imaginary axis or the unit circle, because undamped devices have
+        # poles there.
+        point, unit = (w * (0.3 + 1j), w) if self.dt is None else (0.3 + 1j, 1.0 / self.dt)
+        size = abs(self.gain) * np.prod(np.abs(point - self.zeros)) / np.prod(np.abs(point - self.poles))
         return float(1.0 / (size * unit * unit))
 
 
 def split_fraction(text: str) -> tuple[list[float], list[float]]:
-    """Return the coefficients of ``NUMERATOR / DENOMINATOR``, separated by blanks or commas, highest power first."""
+    """Parse a text "NUMERATOR / DENOMINATOR" whose coefficients, highest power first, have blanks or commas between."""
     try:
-        top, bottom = ([float(c) for c in side.replace(",", " ").split()] for side in text.split("/"))
+        numerator, denominator = ([float(c) for c in side.replace(",", " ").split()] for side in text.split("/"))
     except ValueError:
         raise InputError(
-            f"device: got {text!r}; needed are coefficients in s, highest power first; write '1 / 0.1 10 0'"
+            f"device: got {text!r}; it must be 'NUMERATOR / DENOMINATOR', coefficients in s, highest power first; "
+            "write '1 / 0.1 10 0'"
         ) from None
-    return top, bottom
+    return numerator, denominator
 
 
 def _read(given: Any) -> RationalResponse:
-    """The exact response of a system in any form."""
+    """Return the exact response of a system in any accepted form; raise `InputError` for other values."""
     given = split_fraction(given) if isinstance(given, str) else given
     dt = getattr(given, "dt", None)
     if dt is True:
-        raise InputError("device: got a sampled system without its period; give it dt, that of the loop, in s")
+        raise InputError("device: got a sampled system without its period; set dt to the period of the loop in s")
     try:
-        top, bottom = _read_form(given)
+        numerator, denominator = _read_form(given)
     except (TypeError, ValueError, OverflowError, LookupError) as error:
-        raise InputError(f"device: got {str(given)[:60]!r}; needed are finite numbers as {_FORMS}") from error
-    if not top or len(bottom) < 2:
-        raise InputError("device: got a system that a force does not move; check input and output")
-    if len(top) >= len(bottom):
+        raise InputError(f"device: got {str(given)[:60]!r}; it must be finite numbers as {_FORMS}") from error
+    if not numerator or len(denominator) < 2:
+        raise InputError("device: got a system whose position does not depend on the force; check input and output")
+    if len(numerator) >= len(denominator):
         raise InputError(
-            f"device: got a numerator of degree {len(top) - 1} over a denominator of degree {len(bottom) - 1}; a force "
-            "must not move the position at once, so the denominator's must be higher: add the lag that is missing"
+            f"device: got a numerator of degree {len(numerator) - 1} over one of degree {len(denominator) - 1}; "
+            "the denominator must have the higher degree; add the missing dynamics"
         )
-    _refuse_stuck(find_roots(find_common_factor(top, bottom)), "z" if dt else "s")
-    return RationalResponse(top, bottom, float(dt) if dt else None)
+    _reject_unstable_hidden_modes(find_roots(find_common_factor(numerator, denominator)), "z" if dt else "s")
+    return RationalResponse(numerator, denominator, float(dt) if dt else None)
 
 
-def _refuse_stuck(roots: np.ndarray, letter: str) -> None:
-    """Refuse matrices with a mode that no wall moves and that does not come to rest."""
-    stuck = roots[(np.abs(roots) >= 1.0) if letter == "z" else (np.real(roots) >= 0.0)]
-    for root in stuck.tolist():
+def _reject_unstable_hidden_modes(roots: np.ndarray, letter: str) -> None:
+    """Raise `InputError` if a canceled mode is not asymptotically stable, because no wall can stabilize it.
+
+    Args:
+        roots: common roots of numerator and denominator, which are uncontrollable or unobservable modes.
+        letter: "s" or "z", the variable of the roots.
+    """
+    unstable = roots[(np.abs(roots) >= 1.0) if letter == "z" else (np.real(roots) >= 0.0)]
+    for root in unstable.tolist():
         raise InputError(
-            f"device: a mode of {letter} = {root if root.imag else root.real:.4g} is not moved by the force, or not "
-            "seen in the position, so that with every wall it does not come to rest; leave it out of the matrices"
+            f"device: the mode {letter} = {root if root.imag else root.real:.4g} does not decay and is uncontrollable "
+            "or unobservable, so no wall is stable; remove it from the matrices"
         )
 
 
 def _read_form(given: Any) -> tuple[Polynomial, Polynomial]:
-    """Return the numerator and denominator of a system given by matrices, coefficients or roots."""
+    """Return the exact numerator and denominator of a system given by matrices, coefficients or roots."""
     if hasattr(given, "A") and hasattr(given, "C"):
         given = (given.A, given.B, given.C, given.D)
     elif hasattr(given, "num") and hasattr(given, "den"):
@@ -200,14 +212,14 @@ def _read_form(given: Any) -> tuple[Polynomial, Polynomial]:
     if np.shape(A) != (size, size) or np.size(B) != size or np.size(C) != size or np.any(D):
         raise ValueError("matrices of one input and one output without feedthrough")
     dynamics, inputs, outputs = (_as_fractions(part) for part in (A, np.ravel(B), np.ravel(C)))
-    bottom = characteristic_polynomial(dynamics)
+    denominator = characteristic_polynomial(dynamics)
     # The numerator C adj(s I - A) B is det(s I - A + B C) - det(s I - A), by the matrix determinant lemma.
-    top = subtract(characteristic_polynomial(dynamics - np.outer(inputs, outputs)), bottom)
-    return top, bottom
+    numerator = subtract(characteristic_polynomial(dynamics - np.outer(inputs, outputs)), denominator)
+    return numerator, denominator
 
 
 def _as_fractions(values: Any) -> np.ndarray:
-    """Return an array of floats as exact fractions."""
+    """Convert an array of floats to exact fractions."""
     floats = np.asarray(values, float)
     return np.array([Fraction(value) for value in floats.ravel().tolist()], object).reshape(floats.shape)
 
@@ -227,19 +239,19 @@ def _expand(roots: Any) -> Polynomial:
     return product
 
 
-def _reduce(top: Polynomial, bottom: Polynomial) -> tuple[Polynomial, Polynomial]:
-    """Return numerator and denominator without their common factors, because canceled modes do not affect the response.
+def _reduce(numerator: Polynomial, denominator: Polynomial) -> tuple[Polynomial, Polynomial]:
+    """Divide numerator and denominator by their common factor.
 
-    Sums of responses, for example, have common factors.
+    A sum of two responses, for example, has a common factor if both have the same integrator.
     """
-    if not top or len(top) >= len(bottom):
-        return top, bottom
-    common = find_common_factor(top, bottom)
-    return divide(top, common)[0], divide(bottom, common)[0]
+    if not numerator or len(numerator) >= len(denominator):
+        return numerator, denominator
+    common = find_common_factor(numerator, denominator)
+    return divide(numerator, common)[0], divide(denominator, common)[0]
 
 
 def _take_channel(part: Any) -> Any:
-    """Coefficients of the only input and output, which python-control nests."""
+    """Return the coefficients of the only input and output from the nested lists of python-control."""
     while len(part) == 1 and np.ndim(part[0]) > 0:
         part = part[0]
     if np.ndim(part) != 1:

@@ -1,8 +1,9 @@
-"""A device by its measured frequency response: what a controller reads of what it commands, and no model.
+"""Device defined by its measured frequency response, from commanded force to sampled position, without a model.
 
-Its tables are texts, or arrays of NumPy and MATLAB, as `zwidth.words.tables` reads them. A column is the frequency, in
-Hz or rad/s; the response stands as real and imaginary part, as magnitude and phase, or as complex numbers in one; a
-column of its deviation may follow.
+Each measured frequency is called a *line*. Responses are read from text tables and from files of NumPy and MATLAB
+(`zwidth.words.tables`). The columns are the frequency in Hz or rad/s; the response as real and imaginary part, as
+magnitude and phase, or as complex numbers; and optionally the deviation, a radius around the response at each frequency
+that contains the true response.
 """
 
 from __future__ import annotations
@@ -22,11 +23,9 @@ from zwidth.words.formatting import suggestion
 from zwidth.words.tables import read_columns
 from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, Dimension, split_head
 
-# Fewer lines show no curve.
-_FEWEST = 8
-# How the names of files end that hold one.
-SUFFIXES = (".csv", ".txt", ".dat", ".npz", ".mat")
-# What each column may be called.
+_MIN_LINES = 8  # fewer frequencies do not define a curve
+SUFFIXES = (".csv", ".txt", ".dat", ".npz", ".mat")  # suffixes of files that contain a measured response
+# Accepted names of each column, in lower case.
 _NAMES = {
     "frequency": ("frequency", "freq", "f", "omega", "w", "angular frequency"),
     "real": ("real", "re", "real part"),
@@ -36,30 +35,32 @@ _NAMES = {
     "response": ("response", "complex", "frf", "g", "h"),
     "deviation": ("deviation", "radius", "uncertainty"),
 }
-_TURN = 2.0 * math.pi
+_TURN = 2.0 * math.pi  # rad per revolution
+# Units of the columns.
 _FREQUENCY = Dimension(RATE.names, RATE.example, {"rad/s": 1.0 / _TURN, "1/s": 1.0 / _TURN, "krad/s": 1e3 / _TURN})
 _COMPLIANCE = Dimension(", ".join(f"{length}/{force}" for length in LENGTH.units for force in FORCE.units), "1 mm/N")
 _ANGULAR_COMPLIANCE = Dimension("rad/(N m), rad/(mN m), mrad/(N m), mrad/(mN m), deg/(N m), deg/(mN m)", "1 rad/(N m)")
+# Decibels with an optional reference unit, as in "dB", "dB re 1 m/N" or "dB (mm/N)".
 _DECIBELS = re.compile(r"dB(?:\s*(?:\(?re\.?\s*)?(?:1\s*)?(m\s*/\s*N|mm\s*/\s*N|um\s*/\s*N|µm\s*/\s*N)\)?)?")
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredDevice(WholeDevice):
-    """A frequency response from commanded force to sampled position, at the controller's own rate.
+    """A device defined by its frequency response from commanded force to sampled position.
 
-    Hold, amplifier, mechanics, encoder and every delay are in it: the ratio of the position that the program reads to
-    the force that it commands, ``G*(e^(j 2 pi f T)) = X/U`` with ``z^k = e^(+j 2 pi f k T)``, so that a lag has a
-    negative phase.
+    The response is the ratio X/U of the position that the control program reads to the force that it commands, at the
+    sampling rate of the controller. It includes hold, amplifier, mechanics, encoder and all delays. The convention is
+    ``z = e^(+j 2 pi f T)``, so that a lag has a negative phase.
 
     Args:
-        frequency: of the lines in Hz, growing, > 0 and below half the controller's rate; 8 or more.
-        response: complex, in m/N, one for each line.
-        deviation: the radius in m/N, of each line or of all, in which the true response lies; None where it is taken as
-            it stands. With one, answers hold for every response in the band.
-        rotary: True if the response is from a torque to an angle. Response and deviation are then in rad/(N m).
+        frequency: at least 8 frequencies in Hz, increasing, > 0 and below the Nyquist frequency of the controller.
+        response: complex response in m/N, one value per frequency.
+        deviation: radius in m/N around the response that contains the true response, one value or one per frequency.
+            Results then hold for all responses within the radius. None if the response is exact.
+        rotary: True if the response is from torque to angle. Response and deviation are then in rad/(N m).
 
     Raises:
-        InputError: lines do not grow, there are too few, a number is not finite, shapes differ.
+        InputError: the frequencies are not increasing or too few, a value is not finite, or shapes differ.
 
     References:
         Pintelon, Schoukens 2012, System Identification: A Frequency Domain Approach, chapter 2.
@@ -86,26 +87,31 @@ class MeasuredDevice(WholeDevice):
             r = _as_line("deviation", np.broadcast_to(r, f.shape) if np.ndim(r) == 0 else r, float)
         for name, values in {"response": g, "deviation": r}.items():
             if values is not None and values.shape != f.shape:
-                raise InputError(f"{name}: got {values.size} numbers for {f.size} frequencies; give one a frequency")
-        if f.size < _FEWEST:
-            raise InputError(f"frequency: got {f.size} lines; at least {_FEWEST} are needed to show a curve")
+                raise InputError(
+                    f"{name}: got {values.size} values for {f.size} frequencies; pass one value per frequency"
+                )
+        if f.size < _MIN_LINES:
+            raise InputError(f"frequency: got {f.size} frequencies; at least {_MIN_LINES} are needed; measure more")
         if f[0] <= 0:
-            raise InputError(f"frequency: got {f[0]:g} Hz; lines must be > 0: leave out the mean position")
-        falls = np.flatnonzero(np.diff(f) <= 0)
-        if falls.size:
-            k = int(falls[0])
-            raise InputError(f"frequency: {f[k + 1]:g} Hz follows on {f[k]:g} Hz; sort the lines, drop double ones")
+            raise InputError(f"frequency: got {f[0]:g} Hz; frequencies must be > 0; omit the mean value (0 Hz)")
+        decreasing = np.flatnonzero(np.diff(f) <= 0)
+        if decreasing.size:
+            k = int(decreasing[0])
+            raise InputError(
+                f"frequency: got {f[k + 1]:g} Hz after {f[k]:g} Hz; frequencies must increase; sort them and remove "
+                "duplicates"
+            )
         if not np.any(g):
-            raise InputError("response: it is 0 at every frequency; check the column of the position")
+            raise InputError("response: got 0 at every frequency; check the column of the position")
         if r is not None and r.min() < 0:
-            raise InputError(f"deviation: got {r.min():g} m/N; a radius is at least 0")
+            raise InputError(f"deviation: got {r.min():g} m/N; it must be >= 0")
         for name, values in {"frequency": f, "response": g, "deviation": r}.items():
             if values is not None:
                 values.flags.writeable = False
             object.__setattr__(self, name, values)
 
     def __eq__(self, other: object) -> bool:
-        """Whether all numbers are the same."""
+        """Return whether all values are equal."""
         return isinstance(other, MeasuredDevice) and self._key == other._key
 
     def __hash__(self) -> int:
@@ -115,36 +121,41 @@ class MeasuredDevice(WholeDevice):
         return f"MeasuredDevice({self.spell().partition(', ')[2]})"
 
     def spell(self) -> str:
-        """What it is, in words."""
+        """Return a one-line description of the response."""
         f, band = self.frequency, "" if self.deviation is None else ", with deviation"
         band += " of a rotary device" if self.rotary else ""
         return f"measured response, {f.size} lines from {f[0]:g} to {f[-1]:g} Hz{band}"
 
     @property
     def _key(self) -> tuple[bytes, ...]:
+        """All values as bytes, for comparisons and hashes."""
         parts = (self.frequency, self.response, self.deviation)
         return (*(b"" if part is None else part.tobytes() for part in parts), bytes([self.rotary]))
 
     @property
     def mass(self) -> float:
-        """The mass in kg that moves as far in the middle of the band: the unit of normalized walls, no estimate."""
+        """The unit of mass of normalized walls in kg: the median of the apparent mass ``1/(|G| w^2)`` over frequency.
+
+        It is not an estimate of the mass of the device.
+        """
         return 1.0 / float(np.median(np.abs(self.response) * (2.0 * np.pi * self.frequency) ** 2))
 
     @classmethod
     def read(cls, file: str | Path) -> MeasuredDevice:
-        """Read a table of frequency and response with units in the names of its columns.
+        """Read a table of frequencies and responses, with units in the column names.
+
+        The columns are ``frequency [Hz]`` or ``[rad/s]``; then ``real [m/N]`` and ``imag [m/N]``, or ``magnitude`` in
+        m/N, mm/N, um/N or dB and ``phase`` in deg or rad, or ``response`` with complex numbers; and optionally
+        ``deviation [m/N]``. Units rad/(N m) or deg/(N m) instead of m/N define a rotary device.
 
         Args:
-            file: a text with commas, semicolons, tabs or blanks, a preamble or a line of units, packed or not; ``.npz``
-                or ``.mat``. With a column ``frequency [Hz]`` or ``[rad/s]``; and ``real [m/N]`` and ``imag [m/N]``, or
-                ``magnitude`` in m/N, mm/N, um/N or dB and ``phase`` in deg or rad, or complex numbers under
-                ``response``; and, where it is known, ``deviation [m/N]``. Units of rad/(N m) or deg/(N m) in place of
-                m/N define a rotary device.
+            file: text file with commas, semicolons, tabs or blanks between columns, possibly with a preamble or a line
+                of units, and possibly compressed by gzip; or a file ``.npz`` or ``.mat``.
         """
         return cls(*_read_table(file))
 
     def save(self, file: str | Path, *remarks: str) -> None:
-        """Write the table that `read` reads, with every digit; remarks become its first lines, behind a #."""
+        """Write a table for `read`, in full precision; remarks become its first lines, after a #."""
         unit = "rad/(N m)" if self.rotary else "m/N"
         heads = ["frequency [Hz]", f"real [{unit}]", f"imag [{unit}]"]
         columns = [self.frequency, np.real(self.response), np.imag(self.response)]
@@ -156,29 +167,29 @@ class MeasuredDevice(WholeDevice):
 
 
 def _as_line(name: str, values: Any, kind: type) -> np.ndarray:
-    """A copy as one line of finite numbers."""
+    """Return a copy of the values as a one-dimensional array of finite numbers; raise `InputError` for other values."""
     try:
         with np.errstate(all="ignore"):
-            line = np.array(values)
-            line = line.astype(kind, casting="safe" if line.dtype.kind in "iufcb" else "unsafe")
+            array = np.array(values)
+            array = array.astype(kind, casting="safe" if array.dtype.kind in "iufcb" else "unsafe")
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name}: got {type(values).__name__} that holds no {kind.__name__} numbers") from None
-    if line.ndim != 1:
-        raise InputError(f"{name}: got shape {line.shape}; a list of numbers, one a frequency, is needed")
-    bad = np.flatnonzero(~np.isfinite(line))
+        raise InputError(f"{name}: got {type(values).__name__}; it must be a list of {kind.__name__} numbers") from None
+    if array.ndim != 1:
+        raise InputError(f"{name}: got shape {array.shape}; it must be a list of numbers, one per frequency")
+    bad = np.flatnonzero(~np.isfinite(array))
     if bad.size:
         raise InputError(
-            f"{name}: {bad.size} numbers are not finite, the first is number {bad[0]}; leave the lines out"
+            f"{name}: got {bad.size} values that are not finite, first at index {bad[0]}; omit these lines"
         )
-    return line
+    return array
 
 
 def _read_table(file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, bool]:
     """Read a table of a frequency response.
 
     Returns:
-        The frequencies in Hz; the response and its deviation in m/N, or in rad/(N m) for a rotary device, with None for
-        the deviation if the table has none; and whether the device is rotary.
+        The frequencies in Hz; the response and its deviation in m/N, or in rad/(N m) for a rotary device; and whether
+        the device is rotary. The deviation is None if the table has no such column.
 
     Raises:
         InputError: a column is missing, or a unit is unknown.
@@ -186,49 +197,53 @@ def _read_table(file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
     file = Path(file)
     table = read_columns(file)
     heads = [split_head(head) for head in table.heads]
-    found: dict[str, int] = {}
-    for name, known in _NAMES.items():
-        places = [k for k, (head, _) in enumerate(heads) if head.lower() in known]
-        if len(places) > 1:
-            raise InputError(f"{file}: {name} may be any of {', '.join(table.heads[k] for k in places)}; rename one")
-        found |= {name: places[0]} if places else {}
-    parts = next((p for p in (("real", "imag"), ("magnitude", "phase"), ("response",)) if set(p) <= found.keys()), None)
-    if "frequency" not in found or parts is None:
+    indices: dict[str, int] = {}
+    for name, names in _NAMES.items():
+        matches = [k for k, (head, _) in enumerate(heads) if head.lower() in names]
+        if len(matches) > 1:
+            raise InputError(
+                f"{file}: got several columns for {name}: {', '.join(table.heads[k] for k in matches)}; rename one"
+            )
+        indices |= {name: matches[0]} if matches else {}
+    parts = next(
+        (p for p in (("real", "imag"), ("magnitude", "phase"), ("response",)) if set(p) <= indices.keys()), None
+    )
+    if "frequency" not in indices or parts is None:
         got = table.nameless or f"{file}: got the columns {', '.join(map(repr, table.heads))}"
         raise InputError(
-            f"{got}; needed are 'frequency [Hz]' and 'real [m/N]' with 'imag [m/N]', or 'magnitude [m/N]' with 'phase "
-            "[deg]', or 'response [m/N]'"
+            f"{got}; required are 'frequency [Hz]' and 'real [m/N]' with 'imag [m/N]', or 'magnitude [m/N]' with "
+            "'phase [deg]', or 'response [m/N]'"
         )
-    names = [name for name in ("frequency", *parts, "deviation") if name in found and name != "response"]
-    columns = dict(zip(names, table.numbers([found[name] for name in names]), strict=True))
-    units = {name: heads[at][1] for name, at in found.items()}
+    names = [name for name in ("frequency", *parts, "deviation") if name in indices and name != "response"]
+    columns = dict(zip(names, table.numbers([indices[name] for name in names]), strict=True))
+    units = {name: heads[k][1] for name, k in indices.items()}
     hertz = columns["frequency"] * _size(file, "frequency", units["frequency"], _FREQUENCY, _FREQUENCY.units)
     scale, rotary = _compliance(file, parts[0], units[parts[0]])
     if parts[0] == "magnitude":
         size = columns["magnitude"]
         size = 10.0 ** (size / 20.0) if units["magnitude"].lower().startswith("db") else size
-        answer = size * np.exp(1j * columns["phase"] * _size(file, "phase", units["phase"], ANGLE, ("deg", "rad")))
+        response = size * np.exp(1j * columns["phase"] * _size(file, "phase", units["phase"], ANGLE, ("deg", "rad")))
     elif parts[0] == "response":
-        (answer,) = table.numbers([found["response"]], complex)
+        (response,) = table.numbers([indices["response"]], complex)
     else:
-        answer = columns["real"] + 1j * columns["imag"]
+        response = columns["real"] + 1j * columns["imag"]
     if parts[0] == "real" and _compliance(file, "imag", units["imag"]) != (scale, rotary):
-        raise InputError(f"{file}: real and imag have different units; write both in one")
+        raise InputError(f"{file}: real and imag have different units; write both in the same unit")
     band = None
     if "deviation" in columns:
-        size, turns = _compliance(file, "deviation", units["deviation"])
-        if turns != rotary:
+        size, deviation_rotary = _compliance(file, "deviation", units["deviation"])
+        if deviation_rotary != rotary:
             raise InputError(f"{file}: response and deviation mix linear and rotary units; use one unit for both")
         band = columns["deviation"] * size
-    return hertz, answer * scale, band, rotary
+    return hertz, response * scale, band, rotary
 
 
-def _size(file: Path, name: str, unit: str, dimension: Dimension, known: tuple[str, ...]) -> float:
-    """What one of a unit is in the SI unit."""
+def _size(file: Path, name: str, unit: str, dimension: Dimension, allowed: tuple[str, ...]) -> float:
+    """Return the factor that converts a unit of a column to SI; raise `InputError` for an unknown or missing unit."""
     size = dimension.in_base("1", 0, unit) if unit else None
     if size is None:
-        remedy = suggestion(unit, known, f"write one of {', '.join(known)} in brackets behind the name")
-        raise InputError(f"{file}: {name} in {unit or 'no unit'}; {remedy}")
+        remedy = suggestion(unit, allowed, f"write one of {', '.join(allowed)} in brackets after the name")
+        raise InputError(f"{file}: got {unit or 'no unit'} for column {name}; {remedy}")
     return size
 
 
@@ -242,5 +257,5 @@ def _compliance(file: Path, name: str, unit: str) -> tuple[float, bool]:
     angular = _ANGULAR_COMPLIANCE.in_base("1", 0, unit)
     if angular is not None:
         return angular, True
-    known = ("m/N", "mm/N", "um/N", "rad/(N m)", "deg/(N m)", *(("dB",) if name == "magnitude" else ()))
-    return _size(file, name, unit, _COMPLIANCE, known), False
+    allowed = ("m/N", "mm/N", "um/N", "rad/(N m)", "deg/(N m)", *(("dB",) if name == "magnitude" else ()))
+    return _size(file, name, unit, _COMPLIANCE, allowed), False

@@ -1,25 +1,34 @@
-"""A resonance of the device's structure, seen by its sensor."""
+"""Structural mode of a device: a resonance that contributes to the measured position.
+
+The position is the sum of the displacement of the bodies and of one term per mode. The displacement q of a mode is
+
+    q'' + 2 zeta w q' + w^2 q = F/mass
+
+with the actuator force F, the natural frequency w, the damping ratio zeta and the modal mass.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-from zwidth.parts.actuator import angular
+from zwidth.parts.actuator import to_angular
 from zwidth.parts.checks import Part
 from zwidth.words.errors import InputError
 
 
 @dataclass(frozen=True, repr=False)
 class Mode(Part):
-    """What one resonance adds to the position that the sensor sees: ``(1/mass)/(s^2 + 2 zeta w s + w^2)`` of the force.
+    """A structural mode: adds ``(1/mass)/(s^2 + 2 zeta w s + w^2)`` to the response from force to measured position.
 
-    A command excites it behind the actuator; a hand and friction act on the device's body without it.
+    The actuator force excites the mode. The forces of the operator and of friction act on the body of the device and do
+    not excite it.
 
     Args:
-        frequency: w/(2 pi) in Hz, > 0, of the undamped resonance.
+        frequency: natural frequency w/(2 pi) of the undamped mode in Hz, > 0.
         damping_ratio: zeta, > 0 and at most 10.
-        mass: modal mass in kg, as driving force and sensor meet it; negative where the sensor lies beyond a node.
+        mass: modal mass in kg, divided by the product of the mode shape at actuator and sensor; negative if actuator
+            and sensor move in opposite directions.
 
     References:
         Ewins 2000, Modal Testing, section 2.4 (receptance as a sum of modes).
@@ -40,9 +49,11 @@ class Mode(Part):
     def __post_init__(self) -> None:
         super().__post_init__()
         if isinstance(self.mass, float) and self.mass == 0.0:
-            raise InputError("mode.mass: got 0.0; a mass is needed, negative where the sensor lies beyond a node")
+            raise InputError(
+                "mode.mass: got 0.0; it must not be 0; use < 0 if actuator and sensor move in opposite directions"
+            )
 
     @property
     def rate(self) -> Any:
-        """w in rad/s."""
-        return angular(self.frequency)
+        """The natural frequency w in rad/s."""
+        return to_angular(self.frequency)

@@ -1,4 +1,8 @@
-"""Compute the noise of a velocity estimate that is caused by the quantization of the position."""
+"""Noise of velocity estimates: the standard deviation of the velocity caused by quantization of the position.
+
+The quantization error is modeled as white noise with variance Q^2/12, where Q is the resolution (Widrow, Kollar 2008,
+chapter 5). A velocity filter with the impulse response f_k multiplies the variance by the sum of f_k^2.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +20,22 @@ DOUBLINGS = 60  # doublings of the number of summed terms; 2^60 terms cover time
 def find_velocity_noise(velocity: Velocity, period: Any, resolution: float) -> float:
     """Return the standard deviation in m/s of a velocity that is estimated from quantized positions.
 
-    The quantization error is approximately white with variance ``Q^2/12``, where Q is the resolution (Widrow, Kollar
-    2008, chapter 5). A velocity filter with the impulse response f_k multiplies the variance by ``sum f_k^2``.
+    Args:
+        velocity: velocity estimate.
+        period: sampling period in s.
+        resolution: quantization step of the position in m.
     """
     estimate = velocity.estimate(period)
     return resolution / period * math.sqrt(_sum_squared_response(estimate) / 12.0)
 
 
 def _sum_squared_response(estimate: Estimate) -> float:
-    """Return the sum of the squared impulse response of a velocity estimate for T = 1."""
+    """Return the sum of the squared impulse response of a velocity estimate that is normalized to T = 1."""
     if estimate.window and not estimate.zeros.size and not estimate.poles.size:
         return 2.0 * (float(estimate.gain) / estimate.window) ** 2
     A, B, C, D, _ = estimate_matrices(estimate)
-    # Compute the controllability Gramian, sum A^k B B' A'^k, by Smith's method (1968): each step doubles the number of
-    # summed terms.
+    # The sum is C G C' + D^2 with the controllability Gramian G, the sum of A^k B B' A'^k. Smith's method (1968)
+    # doubles the number of summed terms in each step.
     gramian, power = B @ B.T, A
     for _ in range(DOUBLINGS):
         added = power @ gramian @ power.T

@@ -1,7 +1,7 @@
-"""The operator's hand: attached to the device rigidly, or by a spring and a damper.
+"""Model of the operator's hand: a mass with a damper and a spring to ground, attached to the device.
 
-A rigid grasp adds mass, damping and a spring to ground to the body that is held (the tip, if the device has a
-coupling). A hand attached by a spring and a damper is a separate mass, with its own damper and spring to ground.
+A rigid grasp adds mass, damping and stiffness to the body of the device that the operator holds: the tip if the device
+has a coupling. A grasp with a spring and a damper connects this body with the hand as a separate mass.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from zwidth.words.errors import InputError
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.xp import is_jax
 
-# Values of the reference below.
+# Measured hand, from the reference of `Operator`; kg, N s/m and N/m.
 _HAND = {"mass": 0.554, "damping": 6.45, "stiffness": 135.0}
 
 
 @dataclass(frozen=True, repr=False)
 class Operator(Part):
-    """The operator's hand.
+    """The operator's hand on the device: a mass with a damper and a spring to ground.
 
     Args:
-        mass: in kg, >= 0; > 0 unless the grasp is rigid.
-        damping: to ground, in N s/m, >= 0.
-        stiffness: to ground, in N/m, >= 0.
-        coupling_stiffness: of the spring between hand and device, in N/m, > 0; None for a rigid grasp.
-        coupling_damping: of the damper parallel to this spring, in N s/m, >= 0.
+        mass: mass of the hand in kg, >= 0; > 0 if ``coupling_stiffness`` is given.
+        damping: damping of the hand to ground in N s/m, >= 0.
+        stiffness: stiffness of the hand to ground in N/m, >= 0.
+        coupling_stiffness: stiffness of the spring between hand and device in N/m, > 0; None for a rigid grasp.
+        coupling_damping: damping parallel to this spring in N s/m, >= 0.
 
     References:
         A hand of 0.554 kg, 6.45 N s/m and 135 N/m: Sci. Rep. 5:18004 (2015), Fig. 3 (one trial).
@@ -39,7 +39,7 @@ class Operator(Part):
     """
 
     _owner = "operator"
-    # Forms that the explorer offers.
+    # Presets of the explorer.
     usual: ClassVar[dict[str, dict[str, float]]] = {
         "rigid": _HAND,
         "grasp": {**_HAND, "coupling_stiffness": 1e3, "coupling_damping": 5.0},
@@ -54,16 +54,16 @@ class Operator(Part):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.rigid:
-            # Check the mass after its conversion to SI.
+            # Check the mass only now, because `Part` has converted it to SI.
             check_number("operator.mass", self.mass, self.unit_system["kg"], POSITIVE)
         # Count any JAX value as nonzero, because a traced value cannot be compared.
         if self.rigid and (is_jax(self.coupling_damping) or self.coupling_damping):
             raise InputError(
-                f"operator.coupling_damping: got {self.coupling_damping!r} without a spring beside it; give "
-                "operator.coupling_stiffness as well, or add the damping to the device"
+                f"operator.coupling_damping: got {self.coupling_damping!r} without a coupling spring; pass "
+                "operator.coupling_stiffness too, or add the damping to the device"
             )
 
     @property
     def rigid(self) -> bool:
-        """True if the grasp is rigid."""
+        """True if the grasp is rigid, without a spring between hand and device."""
         return self.coupling_stiffness is None

@@ -1,7 +1,8 @@
-"""A scene as configurations spell it, its parameters by dotted path: ``mass``, ``period``, ``velocity.cutoff``, ...
+"""Parameters of a scene by dotted path, and the conversion of a scene to the mapping of a configuration file.
 
-Device, timing and wall go by bare names, for each name is one thing there; velocity estimate, hand and coupling go by
-their own: ``velocity.``, ``operator.``, ``coupling.``, ``actuator.``, ``modes.0.``.
+The path of a parameter of device, timing or wall is its name: ``mass``, ``period``, ``stiffness``. The path of a
+parameter of another part begins with the name of the part: ``velocity.cutoff``, ``operator.mass``,
+``coupling.stiffness``, ``actuator.order``, ``modes.0.frequency``.
 """
 
 from __future__ import annotations
@@ -24,10 +25,9 @@ from zwidth.words.xp import is_jax
 
 
 class Parts(Protocol):
-    """A scene as those see it who are below it: its parts, and nothing that is asked of them."""
+    """Protocol of a scene, restricted to its parts, for modules that `zwidth.Scene` itself imports."""
 
-    # Of dataclasses.
-    __dataclass_fields__: ClassVar[dict[str, Any]]
+    __dataclass_fields__: ClassVar[dict[str, Any]]  # allows calls of `dataclasses.replace`
 
     @property
     def device(self) -> Device | LinearDevice | MeasuredDevice: ...
@@ -43,41 +43,49 @@ class Parts(Protocol):
 
 AnyScene = TypeVar("AnyScene", bound=Parts)
 
-_BARE = ("device", "timing", "wall")
-# Parts that are replaced only as a whole, because they have no paths to single parameters.
-_WHOLE = ("safe_limit",)
-# The parts that a scene need not have, in the order in which it is described; those of the device are fields of it.
+_BARE = ("device", "timing", "wall")  # parts whose parameters have paths without prefix
+_WHOLE = ("safe_limit",)  # parts that can only be replaced as a whole; their parameters have no paths
 PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator}
-_OF_DEVICE = ("coupling", "actuator")
+"""The optional parts of a scene, in the order of descriptions."""
+_OF_DEVICE = ("coupling", "actuator")  # optional parts that are fields of the device
+# Fields of the scene whose parameters have the name of the part as prefix.
 _NAMED = ("velocity", *(name for name in PARTS if name not in _OF_DEVICE))
 
 
 def find_parts(scene: Parts) -> dict[str, Any]:
-    """The velocity estimate and the parts that a scene has, by name."""
-    found = {name: getattr(scene, name) for name in _NAMED} | {name: getattr(scene.device, name) for name in _OF_DEVICE}
-    found |= {f"modes.{k}": mode for k, mode in enumerate(scene.device.modes)}
-    return {name: part for name, part in found.items() if part is not None}
+    """Return the velocity estimate, the optional parts and the modes of a scene, by name."""
+    parts = {name: getattr(scene, name) for name in _NAMED} | {name: getattr(scene.device, name) for name in _OF_DEVICE}
+    parts |= {f"modes.{k}": mode for k, mode in enumerate(scene.device.modes)}
+    return {name: part for name, part in parts.items() if part is not None}
 
 
 def _parts(scene: Parts) -> list[tuple[str, str, Any]]:
-    """Every part there is, the wall last: what its paths begin with, its field of the scene, and itself."""
+    """Return prefix of the paths, name and value of each part of a scene, the wall last."""
     *bare, wall = (("", name, getattr(scene, name)) for name in _BARE)
     return [*bare, *((f"{name}.", name, part) for name, part in find_parts(scene).items()), wall]
 
 
 def list_parameters(scene: Parts) -> dict[str, Any]:
-    """Every number of a scene by its dotted path, those of the wall last."""
-    found = {prefix + item.name: getattr(part, item.name) for prefix, _, part in _parts(scene) for item in fields(part)}
+    """Return every numeric parameter of a scene by its dotted path, the parameters of the wall last."""
+    values = {
+        prefix + item.name: getattr(part, item.name) for prefix, _, part in _parts(scene) for item in fields(part)
+    }
     return {
         path: value
-        for path, value in found.items()
+        for path, value in values.items()
         if is_jax(value) or (isinstance(value, int | float | np.number) and not isinstance(value, bool))
     }
 
 
 def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
-    """A new scene with some parameters, or whole parts, changed; everything else stays as it is in SI units."""
-    # Numbers are those of the new parts.
+    """Return a scene with the given changes; all other parameters keep their values in SI units.
+
+    Args:
+        scene: the scene.
+        changes: new values by dotted path, or new parts by name.
+    """
+    # Replace whole parts of the scene first, then whole parts of the device, then single parameters, because the
+    # parameters refer to the new parts.
     levels = {
         path: 0 if path in (*_BARE, *_NAMED, *_WHOLE) else 1 if path in (*_OF_DEVICE, "modes") else 2
         for path in changes
@@ -88,6 +96,7 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 
 
 def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
+    """Return a scene with changes by path, all of which refer to the present parts of the scene."""
     parts = {name: part for _, name, part in _parts(scene)}
     owners = {prefix + item.name: (name, item.name) for prefix, name, part in _parts(scene) for item in fields(part)}
     owners |= {name: ("", name) for name in (*_BARE, *_NAMED, *_WHOLE)}
@@ -98,50 +107,55 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
         part, name = owners[path]
         changed.setdefault(part, {})[name] = value
     if "rate" in changed.get("timing", {}):
-        # Period and rate are one thing; what was given last counts.
+        # Discard the period, because the rate determines it.
         changed["timing"].setdefault("period", None)
     if "timing" in changed:
-        # Pass a delay in its original unit, so that a delay in periods stays in periods if the period changes.
+        # Pass the delay in its original unit, so that a delay in periods keeps its number of periods.
         changed["timing"].setdefault("delay", scene.timing.span)
     if isinstance(scene.wall, NoWall):
         parts["wall"] = VirtualWall(0.0)
-    whole, own = changed.pop("", {}), changed.pop("device", {})
-    made = {name: replace(parts[name], **new) for name, new in changed.items()}
-    own |= {name: made.pop(name) for name in _OF_DEVICE if name in made}
-    if any(name.startswith("modes.") for name in made):
-        own["modes"] = tuple(made.pop(f"modes.{k}", mode) for k, mode in enumerate(scene.device.modes))
-    if own:
-        made["device"] = replace(scene.device, **own)
-    return replace(scene, **whole, **made)
+    whole_parts, device_fields = changed.pop("", {}), changed.pop("device", {})
+    new_parts = {name: replace(parts[name], **values) for name, values in changed.items()}
+    device_fields |= {name: new_parts.pop(name) for name in _OF_DEVICE if name in new_parts}
+    if any(name.startswith("modes.") for name in new_parts):
+        device_fields["modes"] = tuple(new_parts.pop(f"modes.{k}", mode) for k, mode in enumerate(scene.device.modes))
+    if device_fields:
+        new_parts["device"] = replace(scene.device, **device_fields)
+    return replace(scene, **whole_parts, **new_parts)
 
 
 def spell_scene(scene: Any) -> dict[str, Any]:
-    """The section ``scene`` of a configuration, with the keys that differ from their defaults."""
+    """Return the section ``scene`` of a configuration, with the keys whose values differ from the defaults."""
     parts: dict[str, Any] = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
     if scene.safe_limit is not None:
         parts["safe_limit"] = spell_part(scene.safe_limit)
     if scene.device.modes:
         parts["modes"] = [spell_part(mode) for mode in scene.device.modes]
     if isinstance(scene.device, LinearDevice):
-        own: dict[str, Any] = {"device": scene.device.spell_form()}
+        device: dict[str, Any] = {"device": scene.device.spell_form()}
     else:
-        own = {name: value for name, value in spell_part(scene.device).items() if name not in (*PARTS, "modes")}
-        own |= {"damping": scene.device.damping}
-    return own | spell_part(scene.timing) | spell_part(scene.wall) | spell_estimate(scene.velocity) | parts
+        device = {name: value for name, value in spell_part(scene.device).items() if name not in (*PARTS, "modes")}
+        device |= {"damping": scene.device.damping}
+    return device | spell_part(scene.timing) | spell_part(scene.wall) | spell_estimate(scene.velocity) | parts
 
 
 def spell_estimate(velocity: Velocity, *, every: bool = False) -> dict[str, Any]:
-    """The key ``velocity``, nothing for the difference of two samples; ``every`` writes defaults as well."""
+    """Return the key ``velocity`` of a configuration; empty for the default, the backward difference.
+
+    Args:
+        velocity: the velocity estimate.
+        every: include parameters that have their default values.
+    """
     given = {"kind": name_estimate(velocity), **spell_part(velocity, every=every)}
     return {} if velocity == BackwardDifference() else {"velocity": given}
 
 
 def spell_part(part: Any, *, every: bool = False) -> dict[str, Any]:
-    """The fields of a part that differ from their defaults, or every one that is not None."""
+    """Return the fields of a part that differ from their defaults; with ``every``, all fields that are not None."""
     values = {field.name: (getattr(part, field.name), field.default) for field in fields(part)}
     return {
         name: value
         for name, (value, default) in values.items()
-        # A device is linear where nothing is said.
+        # Omit ``rotary=False``, because a device is linear by default.
         if (value is not None if every else default is MISSING or value != default) and value is not False
     }

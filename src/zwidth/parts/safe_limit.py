@@ -1,4 +1,4 @@
-"""Represent the safe limit: the stiffest wall that measurements of a device support, with reason and warnings."""
+"""Safe limit of a device: the stiffest wall whose stability the measurements support, with its reason and warnings."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import name_wall
 from zwidth.words.unit_system import UnitSystem
 
-ROUNDING = 5e-4  # relative tolerance, so that the limit allows a wall that is rounded to four digits
+ROUNDING = 5e-4  # relative tolerance of `allows`, so that the limit allows a wall that is rounded to four digits
 
 
 @dataclass(frozen=True, repr=False)
 class SafeLimit(Part):
-    """The stiffest wall that measurements of a device support.
+    """The stiffest wall (K, B) whose stability the measurements of a device support.
 
-    The limit is a wall (K, B). It allows a wall (K', B') if K' <= K and B' is between B K'/K and B. The two extremes
-    are the limit with reduced stiffness only, and the limit with stiffness and damping reduced by the same factor.
+    The limit allows a wall (K', B') if K' <= K and B' is between B K'/K and B. In the first extreme, stiffness and
+    damping are reduced by the same factor; in the second, only the stiffness is reduced.
 
     Args:
-        stiffness: K in N/m, >= 0; 0 if no wall is supported.
+        stiffness: K in N/m, >= 0; 0 if the measurements support no wall.
         virtual_damping: B in N s/m.
-        reason: the reason of the limit, and the measurement that can raise it.
-        warnings: faults of the measurement, one sentence each.
-        damping_reserve: physical damping of the device in N s/m that passivity does not count, because its estimate is
-            uncertain: the estimate minus the lower end of its 95 % interval, for a fit.
+        reason: the effect that limits the stiffness, and the measurement that could raise the limit.
+        warnings: faults of the measurements, one sentence each.
+        damping_reserve: physical damping of the device in N s/m that does not count for passivity, because its estimate
+            is uncertain; for a fit, the estimate minus the lower end of its 95 % interval.
 
     Example:
         >>> import zwidth
@@ -45,7 +45,7 @@ class SafeLimit(Part):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.stiffness >= 0:
-            raise InputError(f"safe_limit.stiffness: got {self.stiffness!r}; it must be >= 0 (0: no wall is allowed)")
+            raise InputError(f"safe_limit.stiffness: got {self.stiffness!r}; it must be >= 0; 0 allows no wall")
         if not isinstance(self.reason, str):
             raise InputError(f"safe_limit.reason: got {self.reason!r}; it must be a string")
         texts = (self.warnings,) if isinstance(self.warnings, str) else self.warnings
@@ -61,28 +61,28 @@ class SafeLimit(Part):
         return self.stiffness == 0
 
     def dampings(self, stiffness: float) -> tuple[float, float] | None:
-        """Return the smallest and the largest allowed damping at a stiffness; None if no damping is allowed."""
+        """Return the smallest and the largest allowed damping at a stiffness; None if the stiffness is not allowed."""
         if self.forbids_all or not 0 <= stiffness <= (1.0 + ROUNDING) * self.stiffness:
             return None
         scaled = min(stiffness / self.stiffness, 1.0) * self.virtual_damping
         return min(scaled, self.virtual_damping), max(scaled, self.virtual_damping)
 
     def allows(self, stiffness: float, virtual_damping: float) -> bool:
-        """Return True if the limit allows a wall."""
+        """Return whether the limit allows a wall, within a relative tolerance of ``ROUNDING``."""
         ends = self.dampings(stiffness)
         slack = ROUNDING * abs(self.virtual_damping)
         return ends is not None and ends[0] - slack <= virtual_damping <= ends[1] + slack
 
     def warn(self, text: str) -> SafeLimit:
-        """Return the limit with an additional warning."""
+        """Return a copy with an additional warning; the limit itself if it contains this warning already."""
         return self if text in self.warnings else replace(self, warnings=(*self.warnings, text))
 
     def describe(self, system: UnitSystem) -> str:
-        """Return a one-line description of the limit and its reason."""
+        """Return a one-line description of the limit and its reason, in the given units."""
         wall = "no wall is supported" if self.forbids_all else name_wall(self.stiffness, self.virtual_damping, system)
         return f"{wall}: {self.reason}" if self.reason else wall
 
 
 def reserve_damping(scene: Any) -> float:
-    """Return the physical damping that passivity does not count, from the safe limit of a scene."""
+    """Return the physical damping of a device that does not count for passivity, from the safe limit of its scene."""
     return 0.0 if scene.safe_limit is None else scene.safe_limit.damping_reserve

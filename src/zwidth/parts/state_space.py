@@ -1,7 +1,8 @@
-"""State-space matrices, and the velocity estimate as such.
+"""Discrete-time state-space models, their series connection, and the realization of a velocity estimate.
 
-It is the difference over its window, a shift register, and a filter in the coefficients of zeta = z - 1: filters that
-are slow beside the period keep their digits there.
+A velocity estimate is realized as a shift register, which yields the difference over its window, followed by a filter
+in powers of zeta = z - 1. For a filter that is slow compared with the period, these coefficients are more accurate than
+those in powers of z.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from zwidth.words.showing import shown
 
 @shown(dt="s")
 class StateSpace(NamedTuple):
-    """``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``, a step every ``dt`` seconds."""
+    """``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``, with a step every ``dt`` seconds."""
 
     A: np.ndarray
     B: np.ndarray
@@ -25,32 +26,39 @@ class StateSpace(NamedTuple):
     dt: float = 1.0
 
     def step(self, periods: int) -> np.ndarray:
-        """The output at so many samples, with an input of 1 from the first one on; inf or NaN beyond float64."""
-        state, found = np.zeros(self.A.shape[0]), np.empty(periods)
+        """Return the unit step response at the first ``periods`` samples; inf or NaN after an overflow."""
+        state, response = np.zeros(self.A.shape[0]), np.empty(periods)
         with np.errstate(all="ignore"):
             for k in range(periods):
-                found[k] = (self.C @ state)[0] + self.D[0, 0]
+                response[k] = (self.C @ state)[0] + self.D[0, 0]
                 state = self.A @ state + self.B[:, 0]
-        return found
+        return response
 
 
-def _filter(estimate: Estimate) -> StateSpace:
-    """What follows the window's difference, in controllable form around z = 1; it has no more zeros than poles."""
+def _realize_filter(estimate: Estimate) -> StateSpace:
+    """Return the filter of an estimate, without its window, in controllable canonical form in powers of z - 1."""
+    # A factor z^-lag adds poles or zeros at z = 0, whose offset 1 - z is 1. Afterwards there are at least as many poles
+    # as zeros, because the filter is causal.
     zeros = np.concatenate([estimate.zeros, np.ones(max(-estimate.lag, 0))])
     poles = np.concatenate([estimate.poles, np.ones(max(estimate.lag, 0))])
     size = poles.size
-    bottom = np.atleast_1d(np.poly(-poles)).real
-    top = float(estimate.gain) * np.atleast_1d(np.poly(-zeros)).real
-    top = np.concatenate([np.zeros(bottom.size - top.size), top])
+    denominator = np.atleast_1d(np.poly(-poles)).real
+    numerator = float(estimate.gain) * np.atleast_1d(np.poly(-zeros)).real
+    numerator = np.concatenate([np.zeros(denominator.size - numerator.size), numerator])
     A = np.eye(size, k=-1) + np.eye(size)
     B = np.zeros((size, 1))
-    A[:1] -= bottom[1:]
+    A[:1] -= denominator[1:]
     B[:1] = 1.0
-    return StateSpace(A, B, (top[1:] - top[0] * bottom[1:])[None, :], top[:1, None])
+    return StateSpace(A, B, (numerator[1:] - numerator[0] * denominator[1:])[None, :], numerator[:1, None])
 
 
 def in_series(first: StateSpace, second: StateSpace) -> StateSpace:
-    """The second behind the first; of many second ones, along leading axes, all behind it."""
+    """Return the series connection of two systems.
+
+    Args:
+        first: system that receives the input.
+        second: system that receives the output of ``first``; a batch of systems if its matrices have leading axes.
+    """
     n = len(first.A)
     A = np.zeros((*second.A.shape[:-2], *2 * (n + second.A.shape[-1],)))
     B = np.zeros((*A.shape[:-1], 1))
@@ -60,12 +68,12 @@ def in_series(first: StateSpace, second: StateSpace) -> StateSpace:
 
 
 def estimate_matrices(estimate: Estimate) -> StateSpace:
-    """The velocity estimate, from sampled position."""
-    behind, count = _filter(estimate), estimate.window
+    """Return the state-space model of a velocity estimate, from measured position to velocity."""
+    filtered, count = _realize_filter(estimate), estimate.window
     if not count:
-        return behind
+        return filtered
     weights = np.zeros((1, count + 1))
     weights[0, [0, -1]] = 1.0 / count, -1.0 / count
-    # A register of the last inputs, the newest first.
+    # The states are the last ``count`` positions, the newest first.
     difference = StateSpace(np.eye(count, k=-1), np.eye(count, 1), weights[:, 1:], weights[:, :1])
-    return in_series(difference, behind)
+    return in_series(difference, filtered)

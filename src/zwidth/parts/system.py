@@ -1,4 +1,10 @@
-"""From a linear system to a loop: a device of which nothing is known but what its position answers to a force."""
+"""Plant of a linear device: a system given only by its response from commanded force to measured position.
+
+The device is a transfer function in s, or in z if it was sampled. This module builds a state-space realization whose
+first state is the output. Times are in sampling periods T and forces in units of mass/T^2, as for a device with known
+bodies (`zwidth.parts.chain`). In float64, sections of order 1 or 2 in series keep each root accurate; in ball
+arithmetic (python-flint), the companion form of the exact coefficients does.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +17,13 @@ from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 
-# Faster parts than this, in radians or decays a period, leave no digits of e^A; dampers may stop sooner what moves.
-FASTEST, STRONGEST = 1e4, 1e10
+# Limits of the accuracy of e^A.
+FASTEST = 1e4  # largest magnitude of a pole in rad per period
+STRONGEST = 1e10  # largest rate of decay by a damper, per period
 
 
 class Realization(NamedTuple):
-    """``x' = A x + B u + push f``, the first number of x what is sensed; f a force held on the device itself."""
+    """``x' = A x + B u + push f``: u is the commanded force, f an external force, and the first state the output."""
 
     A: Any
     B: Any
@@ -25,77 +32,88 @@ class Realization(NamedTuple):
 
 @dataclass(frozen=True)
 class System:
-    """A linear device, normalized by the period and by its unit of mass; a sampled one holds its force itself."""
+    """A linear device, normalized by the sampling period and a unit of mass; a sampled one includes its hold."""
 
     device: LinearDevice
-    period: Any
-    mass: Any  # in which forces are counted
-    d: Any
-    whole: int
+    period: Any  # T in s
+    mass: Any  # unit of mass in kg
+    d: Any  # delay in periods
+    whole: int  # integer part of d
     estimate: Estimate
 
     @property
     def sampled(self) -> bool:
-        """Whether it is given from sample to sample."""
+        """True if the device is a discrete-time system."""
         return self.device.dt is not None
 
     @property
     def free(self) -> bool:
-        """Whether nothing pulls a device at rest back: a pole at s = 0 or z = 1."""
-        bottom = self.device.system.denominator
-        return sum(bottom) == 0 if self.sampled else bottom[-1] == 0
+        """True if the device has an integrator, a pole at s = 0 or z = 1."""
+        denominator = self.device.system.denominator
+        return sum(denominator) == 0 if self.sampled else denominator[-1] == 0
 
     def state_units(self, speed: float, force: float) -> list[float]:
-        """The units of the state's numbers: its own."""
+        """Return 1 for each state, because the units of its states are unknown; the arguments are those of `Chain`."""
         return [1.0] * self.device.poles.size
 
     def realize(self) -> Realization:
-        """The matrices of its motion; of a sampled one, of its change from sample to sample."""
-        rate, push = _companion(self.device) if hasattr(self.mass, "mid") else _sections(self.device)
+        """Return the matrices of x'; for a sampled device, those of x[k+1]."""
+        A, B = _realize_companion(self.device) if hasattr(self.mass, "mid") else _realize_sections(self.device)
         if self.sampled:
-            push = push * (self.mass / self.period**2)
-            return Realization(rate, push, push)
-        push = push * (self.mass / self.period)
-        return Realization(rate * self.period, push, push)
+            B = B * (self.mass / self.period**2)
+            return Realization(A, B, B)
+        B = B * (self.mass / self.period)
+        return Realization(A * self.period, B, B)
 
     def check(self) -> None:
-        """Refuse what cannot be sampled at the loop's period."""
+        """Raise `InputError` if the period or the delay does not fit the device."""
         if self.sampled:
             dt, period = self.device.dt or 0.0, float(self.period)
             if abs(dt - period) > 1e-9 * period:
-                raise InputError(f"device: got a system sampled at {dt:g} s in a loop of {period:g} s; give it anew")
+                raise InputError(
+                    f"device: got a system sampled at {dt:g} s in a loop of {period:g} s; use a system sampled at the "
+                    "loop's period"
+                )
             if self.d != self.whole:
                 raise InputError(
-                    f"delay: got {float(self.d):g} periods; a sampled device has its hold inside and may be later by "
-                    "whole periods alone; put the rest into the device"
+                    f"delay: got {float(self.d):g} periods; a sampled device allows only whole periods; include the "
+                    "fraction in the device"
                 )
             return
         fastest = float(np.abs(self.device.poles).max() * self.period)
         if fastest > FASTEST:
             raise InputError(
-                f"device: a pole of {fastest:.3g} radians a period cannot be resolved; leave so fast a one out"
+                f"device: got a pole of {fastest:.3g} rad per period; at most {FASTEST:g} is possible; omit this pole"
             )
 
 
-def _sections(device: LinearDevice) -> tuple[np.ndarray, np.ndarray]:
-    """A and B of sections in series, each with one pole or two, so that no root depends on another's rounding."""
-    rate, push, seen, through = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
-    for top, bottom in _pair(device.zeros, device.poles):
-        order = bottom.size - 1
-        own = np.eye(order, k=1)
-        own[-1] = -bottom[:0:-1]
-        sees = (top[1:] - top[0] * bottom[1:])[::-1]
+def _realize_sections(device: LinearDevice) -> tuple[np.ndarray, np.ndarray]:
+    """Return A and B of sections of order 1 or 2 in series.
+
+    The rounding errors of one root then do not affect other roots.
+    """
+    # A, B, C and D are the matrices of the sections connected so far, without the gain.
+    A, B, C, D = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
+    for numerator, denominator in _pair_roots(device.zeros, device.poles):
+        order = denominator.size - 1
+        section = np.eye(order, k=1)
+        section[-1] = -denominator[:0:-1]
+        section_C = (numerator[1:] - numerator[0] * denominator[1:])[::-1]
         entry = np.eye(order)[-1]
-        size = len(rate)
-        rate = np.block([[rate, np.zeros((size, order))], [np.outer(entry, seen), own]])
-        push = np.append(push, entry * through)
-        seen, through = np.append(top[0] * seen, sees), top[0] * through
-    return _see_first(rate, push * device.gain, seen)
+        size = len(A)
+        A = np.block([[A, np.zeros((size, order))], [np.outer(entry, C), section]])
+        B = np.append(B, entry * D)
+        C, D = np.append(numerator[0] * C, section_C), numerator[0] * D
+    return _output_as_first_state(A, B * device.gain, C)
 
 
-def _pair(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Numerator and denominator of each section, slow ones first: two poles each, a last real one alone."""
-    # A pair of zeros finds its section, for there are more poles than zeros.
+def _pair_roots(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Distribute zeros and poles to sections of two poles each, the last with one if the number of poles is odd.
+
+    Returns:
+        Numerator and denominator of each section: sections with two poles first, and slow ones first among them. The
+        numerators have leading zeros.
+    """
 
     def group(roots: Any) -> list[np.ndarray]:
         real, pairs = (
@@ -105,42 +123,51 @@ def _pair(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, np.nda
         return sorted([*pairs, *(real[k : k + 2] for k in range(0, real.size, 2))], key=lambda each: np.abs(each).min())
 
     sections = sorted(group(poles), key=lambda each: each.size, reverse=True)
+    # Assign each group of zeros to the free section with the most similar magnitude. A pair of zeros always finds a
+    # section with two poles, because there are more poles than zeros.
     left, chosen = list(range(len(sections))), {}
     for each in sorted(group(zeros), key=lambda each: each.size, reverse=True):
         far = [abs(np.log((1e-300 + np.abs(sections[k]).max()) / (1e-300 + np.abs(each).max()))) for k in left]
         far = [np.inf if sections[k].size < each.size else value for k, value in zip(left, far, strict=True)]
         chosen[left.pop(int(np.argmin(far)))] = each
-    found = []
-    for k, own in enumerate(sections):
-        top = np.atleast_1d(np.poly(chosen.get(k, np.zeros(0)))).real
-        found.append((np.concatenate([np.zeros(own.size + 1 - top.size), top]), np.poly(own).real))
-    return found
+    pairs = []
+    for k, section in enumerate(sections):
+        numerator = np.atleast_1d(np.poly(chosen.get(k, np.zeros(0)))).real
+        pairs.append((np.concatenate([np.zeros(section.size + 1 - numerator.size), numerator]), np.poly(section).real))
+    return pairs
 
 
-def _companion(device: LinearDevice) -> tuple[Any, Any]:
-    """The same in balls, by the exact coefficients."""
+def _realize_companion(device: LinearDevice) -> tuple[Any, Any]:
+    """Return A and B as balls, in companion form, from the exact coefficients."""
     import flint
 
     def ball(value: Any) -> Any:
         return flint.arb(flint.fmpq(value.numerator, value.denominator))
 
-    bottom = [value / device.system.denominator[0] for value in device.system.denominator]
-    top = [value / device.system.denominator[0] for value in device.system.numerator]
-    size = len(bottom) - 1
-    rate = np.array([[flint.arb(int(j == i + 1)) for j in range(size)] for i in range(size)], object)
-    rate[-1] = [-ball(value) for value in bottom[:0:-1]]
-    push = np.array([flint.arb(int(i == size - 1)) for i in range(size)], object)
-    seen = np.array([ball(value) for value in top[::-1]] + [flint.arb(0)] * (size - len(top)), object)
-    return _see_first(rate, push, seen)
+    denominator = [value / device.system.denominator[0] for value in device.system.denominator]
+    numerator = [value / device.system.denominator[0] for value in device.system.numerator]
+    size = len(denominator) - 1
+    A = np.array([[flint.arb(int(j == i + 1)) for j in range(size)] for i in range(size)], object)
+    A[-1] = [-ball(value) for value in denominator[:0:-1]]
+    B = np.array([flint.arb(int(i == size - 1)) for i in range(size)], object)
+    C = np.array([ball(value) for value in numerator[::-1]] + [flint.arb(0)] * (size - len(numerator)), object)
+    return _output_as_first_state(A, B, C)
 
 
-def _see_first(rate: Any, push: Any, seen: Any) -> tuple[Any, Any]:
-    """The same system with what is sensed in place of the state that it sees best, which comes first."""
-    best = max(range(len(seen)), key=lambda k: abs(float(seen[k])))
-    order = [best, *(k for k in range(len(seen)) if k != best)]
-    rate, push, seen = rate[order][:, order], push[order], seen[order]
-    # x1 = (y - the other parts of y)/seen1.
-    columns = rate[:, :1] / seen[0]
-    rate = np.concatenate([columns, rate[:, 1:] - columns * seen[None, 1:]], 1)
-    first = seen @ rate
-    return np.concatenate([first[None], rate[1:]]), np.concatenate([[seen @ push], push[1:]])
+def _output_as_first_state(A: Any, B: Any, C: Any) -> tuple[Any, Any]:
+    """Return A and B of the same system with the output y = C x as first state.
+
+    Args:
+        A: state matrix.
+        B: input vector.
+        C: output vector. The output replaces the state with the largest coefficient, so that the transformation is
+            well-conditioned.
+    """
+    best = max(range(len(C)), key=lambda k: abs(float(C[k])))
+    order = [best, *(k for k in range(len(C)) if k != best)]
+    A, B, C = A[order][:, order], B[order], C[order]
+    # Substitute x1 = (y - c2 x2 - c3 x3 - ..)/c1.
+    columns = A[:, :1] / C[0]
+    A = np.concatenate([columns, A[:, 1:] - columns * C[None, 1:]], 1)
+    first = C @ A
+    return np.concatenate([first[None], A[1:]]), np.concatenate([[C @ B], B[1:]])

@@ -1,4 +1,4 @@
-"""Sampling period and delay of a loop."""
+"""Timing of a loop: its sampling period, and the delay from a sample to the start of the force computed from it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Timing(Part):
     """The sampling period of a loop and the delay of the wall's force.
 
     Args:
-        period: T in s, > 0; or pass ``rate``.
-        delay: t_d from a sample to the start of its force, in s, >= 0, integer or fractional periods; or exactly in
-            periods, as "1.5 periods". If the period changes, a delay given in periods keeps its number of periods.
-        rate: 1/T in Hz, > 0, instead of ``period``.
+        period: sampling period T in s, > 0. Pass either ``period`` or ``rate``.
+        delay: delay t_d from a sample to the start of its force in s, >= 0, or a text in periods, "1.5 periods". It
+            need not be a multiple of the period. If the period changes, a delay in periods keeps its number of periods.
+        rate: sampling rate 1/T in Hz, > 0.
 
     Example:
         >>> import zwidth
@@ -32,13 +32,14 @@ class Timing(Part):
     period: Any = None
     delay: Any = 0.0
     rate: Any = None
-    # Store a delay given in periods, because its quotient in seconds over the period may have a rounding error.
+    # The delay in periods if it was given in periods. It is stored, because the quotient of delay and period in seconds
+    # may have a rounding error.
     _periods: ClassVar[float | None] = None
 
     def __post_init__(self) -> None:
         if (self.period is None) == (self.rate is None):
-            both = "" if self.rate is None else "both are given; "
-            raise InputError(f"timing: {both}give either the period (s) or the rate (Hz), and only one of them")
+            both = "" if self.rate is None else "got both; "
+            raise InputError(f"timing: {both}pass either period (s) or rate (Hz), and only one of them")
         if self.rate is not None:
             object.__setattr__(self, "period", 1.0 / check_number("rate", self.rate))
             object.__setattr__(self, "rate", None)
@@ -49,13 +50,13 @@ class Timing(Part):
             object.__setattr__(self, "delay", delay.seconds(self.period))
 
     def __repr__(self) -> str:
-        """Return an expression that creates this timing, with the delay in its original unit, seconds or periods."""
+        """Return the expression that creates this timing, with the delay in its original unit, seconds or periods."""
         text = super().__repr__()
         return text if self._periods is None else text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
 
     @property
     def in_periods(self) -> bool:
-        """True if the delay was given in periods. It then keeps its number of periods if the period changes."""
+        """True if the delay was given in periods; its number of periods is then constant if the period changes."""
         return self._periods is not None
 
     @property
@@ -65,14 +66,14 @@ class Timing(Part):
 
     @property
     def kept_delay(self) -> str:
-        """The delay that stays constant if the period changes, as text: "1 period" or "1.000 ms"."""
+        """The delay as text in its original unit, in which it is constant if the period changes: "1 period", "1 ms"."""
         if self._periods is None:
             return with_unit(float(self.delay), "s")
         return spell_periods(self._periods)
 
     @property
     def d(self) -> Any:
-        """The delay in periods: as given, or the quotient, an exact integer if it differs by rounding errors only."""
+        """The delay in periods; an exact integer if it differs from one only by rounding errors."""
         if self._periods is not None:
             return np.float64(self._periods)
         return in_periods(*(value if is_jax(value) else np.float64(value) for value in (self.delay, self.period)))

@@ -1,9 +1,12 @@
-"""Velocity estimates: transfer functions from the sampled position to the velocity that the wall's damper uses.
+"""Velocity estimates: transfer functions F(z) from measured position to the velocity that the wall's damper uses.
 
-Each is ``F(z)`` from position in m to velocity in m/s. Its method ``estimate`` returns it normalized to T = 1, as
-`Estimate`. The coded period of an estimate is the sampling period that its formulas were written for. If the loop has
-another period, the program divides the difference by the wrong time and shifts the cut-off frequency. The loop is
-computed with these errors.
+Parameters are in SI units; the method ``estimate`` of each class returns F for time in sampling periods, as `Estimate`.
+The *coded period* is the sampling period that the constants of an estimate were computed for. If the loop runs at
+another period T, the program divides position differences by the wrong time, and its cut-off frequency is shifted;
+`Estimate` includes these errors.
+
+Estimates are evaluated with floats, JAX arrays, and balls of python-flint (``flint.arb``). Zeros and poles are stored
+as offsets ``1 - root``, which are accurate for roots near z = 1.
 """
 
 from __future__ import annotations
@@ -31,33 +34,34 @@ from zwidth.words.xp import is_jax, namespace
 
 @dataclass(frozen=True)
 class Estimate:
-    """The velocity estimate F: a difference over ``window`` periods, then a filter.
+    """A velocity estimate F for T = 1: a difference over ``window`` periods, followed by a filter.
 
-    ``F(z) = gain prod(z - zeros)/(z^lag prod(z - poles)) (1 - z^-window)/window``, without the last factor for a window
-    of 0.
+    ``F(z) = gain prod(z - z_i)/(z^lag prod(z - p_i)) (1 - z^-window)/window`` with zeros z_i and poles p_i. The last
+    factor is omitted for a window of 0.
     """
 
     window: int = 1
     gain: Any = 1.0
     lag: int = 0
-    zeros: Any = field(default_factory=lambda: np.zeros(0, complex))
-    poles: Any = field(default_factory=lambda: np.zeros(0, complex))
+    zeros: Any = field(default_factory=lambda: np.zeros(0, complex))  # 1 - z_i
+    poles: Any = field(default_factory=lambda: np.zeros(0, complex))  # 1 - p_i
 
-    def jet(self, at: CirclePoints) -> Jet:
-        """Return F and its derivative in w."""
-        xp = namespace(at.w)
-        parts = product_jet(at, self.zeros, self.gain)
+    def jet(self, points: CirclePoints) -> Jet:
+        """Return F and its derivative with respect to w at points e^(jw) of the unit circle."""
+        xp = namespace(points.w)
+        product = product_jet(points, self.zeros, self.gain)
         if self.poles.size:
-            parts = parts.over(product_jet(at, self.poles, 1.0))
+            product = product.over(product_jet(points, self.poles, 1.0))
         if self.lag:
-            parts = parts.times(lag_jet(at, -self.lag))
+            product = product.times(lag_jet(points, -self.lag))
         if self.window:
-            back = lag_jet(at, -self.window)
+            delayed = lag_jet(points, -self.window)
             n = self.window
-            s = xp.sin(0.5 * n * at.w)
-            value = xp.where(at.w >= np.pi, 1.0 - back.value, 2.0 * s * s - 1j * back.value.imag) / n
-            parts = parts.times(Jet(value, -back.slope / n))
-        return parts
+            s = xp.sin(0.5 * n * points.w)
+            # 1 - cos(n w) = 2 sin^2(n w/2) avoids cancellation at low frequencies.
+            value = xp.where(points.w >= np.pi, 1.0 - delayed.value, 2.0 * s * s - 1j * delayed.value.imag) / n
+            product = product.times(Jet(value, -delayed.slope / n))
+        return product
 
     @property
     def is_difference(self) -> bool:
@@ -68,22 +72,22 @@ class Estimate:
 
     @property
     def degree(self) -> int:
-        """The number of zeros, poles and delays; bounds the rate of change of the phase of F."""
+        """The number of zeros, poles and delays; larger than ``window`` if the estimate has a filter."""
         return self.window + abs(self.lag) + self.zeros.size + self.poles.size
 
 
 class _Checked(Part):
-    """Base of the estimates whose fields have ranges."""
+    """Base class of the estimates whose fields have ranges in `words.quantities`."""
 
     _owner = "velocity"
 
 
 @dataclass(frozen=True, repr=False)
 class BackwardDifference(_Checked):
-    """``v = (x_k - x_(k-1))/T``, the default and the paper's.
+    """The backward difference ``v = (x_k - x_(k-1))/T``, the default, as in the paper.
 
     Args:
-        coded_period: period in s by which the difference is divided; the period of the loop if left out.
+        coded_period: period T in s by which the difference is divided. Default: the period of the loop.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section II.
@@ -92,17 +96,17 @@ class BackwardDifference(_Checked):
     coded_period: Any = None
 
     def estimate(self, period: Any) -> Estimate:
-        """Return the estimate for a loop of this period, normalized."""
+        """Return the estimate for a loop with a period in s, normalized to T = 1."""
         return Estimate(window=1, gain=_ratio(period, self.coded_period))
 
 
 @dataclass(frozen=True, repr=False)
 class WindowedDifference(_Checked):
-    """``v = (x_k - x_(k-n))/(n T)``, the mean velocity of the last n periods.
+    """The difference over n periods, ``v = (x_k - x_(k-n))/(n T)``: the mean velocity of these periods.
 
     Args:
-        samples: n, from 1 (the backward difference) to 1000.
-        coded_period: period in s in the formula; the period of the loop if left out.
+        samples: window n in periods, from 1 (the backward difference) to 1000.
+        coded_period: period T in s in the formula. Default: the period of the loop.
 
     References:
         chai3d/chai3d ``src/devices/CGenericHapticDevice.cpp`` (15 ms), Force Dimension SDK ``dhdc.h`` (20 ms).
@@ -112,21 +116,23 @@ class WindowedDifference(_Checked):
     coded_period: Any = None
 
     def estimate(self, period: Any) -> Estimate:
-        """Return the estimate for a loop of this period, normalized."""
+        """Return the estimate for a loop with a period in s, normalized to T = 1."""
         return Estimate(window=self.samples, gain=_ratio(period, self.coded_period))
 
 
 @dataclass(frozen=True, repr=False)
 class LowPass(_Checked):
-    """The backward difference, followed by one or two equal first-order low-passes: ``v <- p v + (1 - p) input``.
+    """The backward difference, followed by one or two equal first-order low-passes.
 
-    ``p = exp(-T/tau)``, ``tau = 1/(2 pi cutoff)``; ``F = (1 - 1/z)/T ((1 - p) z/(z - p))^order``.
+    Each low-pass computes ``v <- p v + (1 - p) input`` in every period, with ``p = exp(-T/tau)`` and
+    ``tau = 1/(2 pi cutoff)``. Therefore ``F = (1 - 1/z)/T ((1 - p) z/(z - p))^order``.
 
     Args:
-        cutoff: in Hz, > 0 and below half the sampling rate; or
+        cutoff: cut-off frequency in Hz, > 0 and below the Nyquist frequency. Pass either ``cutoff`` or
+            ``time_constant``.
         time_constant: tau in s, > 0.
-        order: 1 or 2.
-        coded_period: period in s for which p and the difference are computed; the period of the loop if left out.
+        order: number of low-passes, 1 or 2.
+        coded_period: period T in s for which p and the difference are computed. Default: the period of the loop.
 
     References:
         HannesRovina/HapticHumanRobotInterfaces-Lab ``Firmware/src/haptic_controller.c``;
@@ -140,14 +146,14 @@ class LowPass(_Checked):
 
     def __post_init__(self) -> None:
         if (self.cutoff is None) == (self.time_constant is None):
-            got = "none of the two" if self.cutoff is None else "both"
+            got = "neither cutoff nor time_constant" if self.cutoff is None else "both cutoff and time_constant"
             raise InputError(
-                f"velocity: got {got}; give either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them"
+                f"velocity: got {got}; pass either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them"
             )
         super().__post_init__()
 
     def estimate(self, period: Any) -> Estimate:
-        """Return the estimate for a loop of this period, normalized."""
+        """Return the estimate for a loop with a period in s, normalized to T = 1."""
         coded = period if self.coded_period is None else self.coded_period
         if self.time_constant is None:
             check_cutoff(self.cutoff, coded)
@@ -163,12 +169,12 @@ class LowPass(_Checked):
 
 @dataclass(frozen=True, repr=False)
 class Butterworth(_Checked):
-    """The backward difference, followed by a Butterworth low-pass, as `scipy.signal.butter` designs it.
+    """The backward difference, followed by a digital Butterworth low-pass as designed by `scipy.signal.butter`.
 
     Args:
-        cutoff: in Hz, > 0 and below half the sampling rate.
-        order: 1 to 8.
-        coded_period: period in s for which the filter was designed; the period of the loop if left out.
+        cutoff: cut-off frequency in Hz, > 0 and below the Nyquist frequency.
+        order: order of the filter, 1 to 8.
+        coded_period: period in s for which the filter was designed. Default: the period of the loop.
 
     References:
         mahilab/HapticPaddle ``src/main.cpp`` (order 4, 25 Hz at 1 kHz); Butterworth 1930, Wireless Engineer 7.
@@ -179,10 +185,11 @@ class Butterworth(_Checked):
     coded_period: Any = None
 
     def estimate(self, period: Any) -> Estimate:
-        """Return the estimate for a loop of this period, normalized."""
+        """Return the estimate for a loop with a period in s, normalized to T = 1."""
         coded = period if self.coded_period is None else self.coded_period
         check_cutoff(self.cutoff, coded)
-        # Bilinear transform s = (z - 1)/(z + 1), prewarped to keep the cut-off frequency; analog poles on a circle.
+        # The analog poles are on a circle, whose radius is prewarped so that the bilinear transform s = (z - 1)/(z + 1)
+        # yields the cut-off frequency.
         xp = namespace(self.cutoff, coded)
         size = xp.tan(_pi(coded) * self.cutoff * coded)
         angles = _pi(coded) * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
@@ -197,11 +204,11 @@ class VelocityFilter(Part):
     """Any linear estimate ``F(z) = numerator/denominator``, from position in m to velocity in m/s.
 
     Args:
-        numerator: coefficients in 1/s, highest power first; or a list of sections in series, each with its
+        numerator: coefficients in 1/s, highest power of z first; or a list of sections in series, each a list of
             coefficients.
-        denominator: likewise. Its degree must be at least that of the numerator (a causal filter), and its poles must
-            be inside the unit circle. Use sections for filters of high order, because the rounding errors of a single
-            polynomial's coefficients move the poles.
+        denominator: coefficients or sections, as for the numerator. The degree must be at least that of the numerator
+            (a causal filter), and all roots must be inside the unit circle. Use sections for a filter of high order,
+            because rounding errors in the coefficients of a single polynomial move its poles.
 
     Example:
         >>> import zwidth
@@ -223,19 +230,20 @@ class VelocityFilter(Part):
         top, bottom = (sum(len(section) - 1 for section in part) for part in self._sections)
         if top > bottom:
             raise InputError(
-                f"velocity.numerator: its degree {top} exceeds that of the denominator, {bottom}, so the filter needs "
+                f"velocity.numerator: got degree {top} over a denominator of degree {bottom}, so the filter needs "
                 "future samples; multiply the denominator by z"
             )
         self._check_poles()
 
     def _check_poles(self) -> None:
-        """Raise `InputError` if a pole is on or outside the unit circle, with the likely cause."""
+        """Raise `InputError` with the likely cause if a pole is on or outside the unit circle."""
         poles = self._roots[1]
         largest = np.max(np.abs(1.0 - poles), initial=0.0)
         if largest < 1.0:
             return
         got = f"velocity.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
-        # A single pole at z = 1 is an integrator. Rounding errors of the coefficients move several poles near z = 1.
+        # Rounding errors of the coefficients move poles only if there are several near z = 1. A single pole there is
+        # intended: an integrator.
         slow = np.abs(poles) < NEXT_TO_ONE
         if np.sum(slow) != 1 and any(is_rounding(section) for section in self._sections[1]):
             cause = "Cause: rounding errors of the coefficients; use sections in series (scipy.signal: output='sos')"
@@ -247,23 +255,23 @@ class VelocityFilter(Part):
 
     @property
     def _sections(self) -> tuple[Any, Any]:
-        """The sections of the numerator and of the denominator, each a tuple of coefficients."""
+        """The sections of numerator and denominator; each section is a tuple of coefficients."""
         both: Any = self.numerator, self.denominator
         top, bottom = (part if isinstance(part[0], tuple) else (part,) for part in both)
         return top, bottom
 
     @cached_property
     def _roots(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """Zeros and poles as 1 - z, without those at z = 0, and the number of poles minus zeros at z = 0."""
-        found, trailing = [], []
+        """The offsets of zeros and poles, without roots at z = 0; and the number of poles minus zeros at z = 0."""
+        roots, trailing = [], []
         for part in self._sections:
             sections = [np.array(section) for section in part]
             trailing.append(sum(map(count_trailing_zeros, sections)))
-            found.append(np.concatenate([offsets(np.trim_zeros(section, "b")) for section in sections]))
-        return found[0], found[1], trailing[1] - trailing[0]
+            roots.append(np.concatenate([offsets(np.trim_zeros(section, "b")) for section in sections]))
+        return roots[0], roots[1], trailing[1] - trailing[0]
 
     def estimate(self, period: Any) -> Estimate:
-        """Return the estimate for a loop of this period, normalized."""
+        """Return the estimate for a loop with a period in s, normalized to T = 1."""
         tops, bottoms = self._sections
         gain = period
         for section in tops:
@@ -271,8 +279,7 @@ class VelocityFilter(Part):
         for section in bottoms:
             gain = gain / section[0]
         if hasattr(period, "mid"):
-            # Compute the roots as balls from the exact coefficients, because rounded roots would lose exact zeros at
-            # z = 1.
+            # Compute the roots as balls from the exact coefficients, because zeros at z = 1 must be exact.
             exact = (np.concatenate([ball_offsets(section) for section in part]) for part in (tops, bottoms))
             return Estimate(0, gain, 0, *exact)
         zeros, poles, lag = self._roots
@@ -283,12 +290,12 @@ class VelocityFilter(Part):
 class FOAW(_Checked):
     """First-order adaptive windowing, for simulations only: the estimate is nonlinear, so the loop has no poles.
 
-    The estimate is the slope of the line from the oldest to the newest position of a window. The window is extended by
-    one period at a time, up to ``samples``, until a position in it deviates from this line by more than ``noise``.
+    The velocity is the slope of the line from the oldest to the newest position of a window. The window grows by one
+    period at a time, up to ``samples``, as long as no position in it deviates from this line by more than ``noise``.
 
     Args:
-        noise: largest error of a measured position in m, > 0; one count of an encoder.
-        samples: longest window in periods, 1 to 64.
+        noise: largest error of the measured position in m, > 0; for an encoder, one count.
+        samples: length of the longest window in periods, 1 to 64.
 
     References:
         Janabi-Sharifi, Hayward, Chen 2000, IEEE Trans. Control Systems Technology 8(6):1003-1009 (end-fit).
@@ -314,11 +321,11 @@ ESTIMATES = {
     "filter": VelocityFilter,
     "foaw": FOAW,
 }
-"""Velocity estimates by their names in configurations and on the command line."""
+"""Classes of velocity estimates by the name of their kind in configurations and on the command line."""
 
 
 def name_estimate(velocity: Velocity) -> str:
-    """Return the name of the kind of an estimate in configurations."""
+    """Return the name that selects an estimate in configurations; raise `InputError` for other classes."""
     for kind, part in ESTIMATES.items():
         if type(velocity) is part:
             return kind
@@ -329,7 +336,7 @@ def name_estimate(velocity: Velocity) -> str:
 
 
 def is_plain(velocity: Velocity, period: Any) -> bool:
-    """Return whether an estimate is the backward difference over the period of the loop, without any parameters."""
+    """Return whether an estimate is the backward difference over the period of the loop, without parameters."""
     if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
         return False
     estimate = velocity.estimate(period)
@@ -342,7 +349,7 @@ def check_cutoff(cutoff: Any, period: Any) -> None:
         return
     if cutoff * period >= 0.5:
         raise InputError(
-            f"velocity.cutoff: got {cutoff:g} Hz; it must lie below half the sampling rate, {0.5 / period:g} Hz; "
+            f"velocity.cutoff: got {cutoff:g} Hz; it must be below half the sampling rate, {0.5 / period:g} Hz; "
             "lower it, or remove the filter"
         )
 
@@ -352,17 +359,16 @@ def _ratio(period: Any, coded: Any) -> Any:
     return 1.0 if coded is None else period / coded
 
 
-# The estimates are evaluated with floats, JAX arrays and balls of python-flint (``flint.arb``). The next functions
-# provide operations that differ between these types.
+# Operations that differ between floats, JAX arrays and balls.
 
 
 def _pi(like: Any) -> Any:
-    """Return pi as a number of the same type as the argument."""
+    """Return pi as a ball if the argument is a ball, otherwise as a float."""
     return like.pi() if hasattr(like, "pi") else np.pi
 
 
 def _as_complex(value: Any) -> Any:
-    """Return an array with complex dtype. Arrays of balls are returned unchanged, because balls convert themselves."""
+    """Convert an array to complex dtype; return an array of balls unchanged, because balls need no conversion."""
     return value if value.dtype == object else value + 0j
 
 

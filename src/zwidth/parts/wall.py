@@ -1,4 +1,4 @@
-"""The virtual wall of a scene, and the wall that arguments select."""
+"""The virtual wall of a scene, and the choice between this wall and stiffness and damping passed as arguments."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from zwidth.words.units import to_float
 
 @dataclass(frozen=True, repr=False)
 class VirtualWall(Part):
-    """A spring and a damper; the damper acts on the velocity estimate.
+    """A virtual wall: a spring and a damper, computed by the controller.
+
+    The force is -(K x + B v), with the measured position x and the velocity estimate v.
 
     Args:
         stiffness: K in N/m.
@@ -26,21 +28,21 @@ class VirtualWall(Part):
 
 @dataclass(frozen=True, repr=False)
 class NoWall(VirtualWall):
-    """Placeholder in scenes without a wall: no force, and no default for stiffness and damping."""
+    """Placeholder for the wall of a scene without wall: no force, and no default for stiffness and damping."""
 
     stiffness: Any = field(default=0.0, init=False, repr=False)
     virtual_damping: Any = field(default=0.0, init=False, repr=False)
 
 
 def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any, system: UnitSystem) -> tuple[Any, Any]:
-    """Return K and B in SI units: those given as arguments, or those of the scene's wall if both are None.
+    """Return K and B in SI units: the arguments, or the parameters of the scene's wall if both arguments are None.
 
-    K without B means B = 0 if the scene has no wall. If it has one, K without B is ambiguous and an error.
+    K without B means B = 0 if the scene has no wall. If it has one, K without B is ambiguous and raises `InputError`.
     """
-    # Integers that overflow float64 become infinite.
+    # Convert integers that overflow float64 to infinity, which the range checks of the caller reject.
     both = stiffness, virtual_damping
     stiffness, virtual_damping = (to_float(v) if isinstance(v, int) and v.bit_length() > 1023 else v for v in both)
-    # Skip plain numbers, because most calls have no text to convert.
+    # Test for numbers first, because the search for texts would slow down most calls.
     if not (isinstance(stiffness, int | float) and isinstance(virtual_damping, int | float | None)):
         stiffness = read_texts("stiffness", stiffness, system["N/m"])
         virtual_damping = read_texts("virtual_damping", virtual_damping, system["N s/m"])

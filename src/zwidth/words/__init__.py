@@ -1,1 +1,1 @@
-"""What is said: errors, statuses, types, units, formats, and every parameter and output declared once."""
+"""Shared definitions: errors, status codes, types, units, quantities, formatting, tables and array namespaces."""

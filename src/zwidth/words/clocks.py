@@ -1,4 +1,4 @@
-"""Read times in text form: ISO 8601 dates and times, times of day, and durations such as "0.001 sec"."""
+"""Conversion of times from text to seconds: ISO 8601 dates and times, times of day, durations such as "0.001 sec"."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from contextlib import suppress
 
 import numpy as np
 
-# Optional date, time of day, optional time zone: 2024-05-01T12:00:00.001Z, with T or a blank before the time.
+# Optional date, time of day and optional time zone, as in 2024-05-01T12:00:00.001Z, with T or a blank before the time.
 CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?(\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?)(Z|[+-]\d\d:?\d\d)?")
 _DAY = "1970-01-01T"  # date assumed for times of day without a date
-_BATCH = 20_000  # texts converted at once; limits the memory
-# Durations in the format of MATLAB timetables.
+_BATCH = 20_000  # texts converted at once; bounds the memory
+# Durations in the format of MATLAB timetables, as in "0.001 sec".
 _DURATION = re.compile(r"([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s+(sec|min|hr)")
 _SECONDS = {"sec": 1.0, "min": 60.0, "hr": 3600.0}  # units of durations, in s
 
 
 def read_duration(cell: str) -> str:
-    """Return a duration such as "0.001 sec" in seconds, as text without unit. Any other cell is returned unchanged."""
+    """Convert a duration such as "0.001 sec" to a text in seconds without unit; return any other text unchanged."""
     match = _DURATION.fullmatch(cell)
     return cell if match is None else repr(float(match[1]) * _SECONDS[match[2]])
 
 
 def is_time(text: str) -> bool:
-    """Return whether a text is a date with a time, or a time of day."""
+    """Return whether a text is a time of day, with or without a date."""
     with suppress(ValueError):
         return read_clock(np.array([text])).size == 1
     return False
 
 
 def read_clock(texts: np.ndarray) -> np.ndarray:
-    """Return the seconds that have passed since the first of several times.
+    """Convert texts to seconds since the first of these times.
 
     Raises:
         ValueError: a text is not a time, or the time zones differ.
@@ -46,5 +46,5 @@ def read_clock(texts: np.ndarray) -> np.ndarray:
 
 
 def to_seconds(times: np.ndarray) -> np.ndarray:
-    """Return the seconds between the first and each of several `numpy.datetime64`; NaN for NaT."""
+    """Convert an array of `numpy.datetime64` to seconds since its first entry; NaT becomes NaN."""
     return (times - times[0]) / np.timedelta64(1, "s") if times.size else times.astype(float)

@@ -1,63 +1,70 @@
-"""Exceptions raised by zwidth, all below one base class.
+"""Exceptions and warnings of zwidth. All exceptions are subclasses of `ZwidthError`.
 
-A message names the field, the value received, what is allowed and the remedy.
+A message names the field, the value received, the allowed values and the remedy.
 """
 
 from __future__ import annotations
 
 
 class ZwidthError(Exception):
-    """Base class of every error that zwidth raises on purpose."""
+    """Base class of all exceptions that zwidth raises deliberately."""
 
 
 class InputError(ZwidthError, ValueError):
-    """An argument that cannot be used as given.
+    """An invalid argument.
 
-    Every public function raises it where an argument is no real number, a single number is beyond its range, shapes do
-    not broadcast, or a name is not one of those listed. A bad entry of an array becomes NaN and spoils no other.
+    Every public function raises this error if an argument is not a real number, a single number is out of range, shapes
+    do not broadcast, or a name is not in the list of allowed names. For an invalid entry of an array, functions return
+    NaN at this entry instead.
     """
 
 
 class UnusableValueError(InputError):
-    """One value that cannot be used: what it is, what is allowed, and the remedy; who raises it knows no field."""
+    """An invalid value, raised by functions that do not have the name of its field; callers add the name.
 
-    def __init__(self, what: str, allowed: str = "", remedy: str = "") -> None:
-        super().__init__(what, allowed, remedy)
-        self.parts = what, allowed, remedy
+    Args:
+        received: description of the value, "got ...".
+        allowed: allowed values.
+        remedy: suggested correction.
+    """
+
+    def __init__(self, received: str, allowed: str = "", remedy: str = "") -> None:
+        super().__init__(received, allowed, remedy)
+        self.parts = received, allowed, remedy
 
     def __str__(self) -> str:
         return "; ".join(part for part in self.parts if part)
 
 
 class ConfigError(ZwidthError, ValueError):
-    """A configuration file that cannot be used; the message lists every fault with its place."""
+    """An invalid configuration file; the message lists all faults with line and column."""
 
 
 class StoreExistsError(ZwidthError, FileExistsError):
-    """An output folder that already holds a run."""
+    """An output folder that already contains a run."""
 
 
 class StoreError(ZwidthError):
-    """A store that cannot be used: damaged, of another configuration, or of another version."""
+    """An unusable store: damaged, of another configuration, or of another version of zwidth."""
 
 
 class StoreBusyError(StoreError):
-    """A folder of results in which another run computes."""
+    """An output folder in use by another run."""
 
 
 class ResourceError(ZwidthError):
-    """Work that does not fit into the memory or onto the disk there is."""
+    """A computation that needs more memory or disk space than is available."""
 
 
 class PrecisionWarning(UserWarning):
-    """A transformation of JAX in which zwidth computes in float32, because JAX's default precision holds there."""
+    """Warning: inside a JAX transformation zwidth computes in float32, because that is JAX's default precision."""
 
 
 class TracedDelayError(ZwidthError, TypeError):
-    """A traced delay where the number of poles, hence an array shape, depends on its value."""
+    """A traced delay in a function whose array shapes depend on the value of the delay, through the number of poles."""
 
 
-# Common names of quantities, and the names of the corresponding fields.
+# Common names of quantities, and the names of the corresponding fields, for suggestions in messages.
 SYNONYMS = {"weight": "mass", "inertia": "mass", "frequency": "rate", "latency": "delay", "dead_time": "delay"}
 
 
@@ -72,15 +79,16 @@ def how_to_install(extra: str) -> str:
 
 
 def describe_choice(value: object, allowed: tuple[str, ...]) -> str:
-    """Say which values are allowed and which of them looks most like the one received."""
+    """Return a text with the received name, the allowed names, and the most similar allowed name if there is one."""
     import difflib
 
-    meant = SYNONYMS.get(str(value))
-    nearest = [meant] if meant in allowed else difflib.get_close_matches(str(value), allowed, n=1)
+    synonym = SYNONYMS.get(str(value))
+    nearest = [synonym] if synonym in allowed else difflib.get_close_matches(str(value), allowed, n=1)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     return f"got {value!r}, allowed are {', '.join(repr(name) for name in allowed)}{hint}"
 
 
 def check_choice(field: str, value: object, allowed: tuple[str, ...]) -> None:
+    """Raise `InputError` if a value is not one of the allowed names."""
     if not isinstance(value, str) or value not in allowed:
         raise InputError(f"{field}: {describe_choice(value, allowed)}")

@@ -1,4 +1,8 @@
-"""Files that are whole or absent whatever stops their writing, and what helps where the system refuses one."""
+"""Atomic writing of files and folders, and remedies for errors of the operating system.
+
+A file is written under a temporary name and renamed when it is complete. An interruption therefore never leaves an
+incomplete file under the final name.
+"""
 
 from __future__ import annotations
 
@@ -11,39 +15,42 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 REMEDIES = {
-    errno.ENOSPC: "make room on the disk",
-    errno.EDQUOT: "make room within your quota",
-    errno.EFBIG: "raise the limit on the size of files (ulimit -f)",
-    errno.EROFS: "choose a folder that can be written",
-    errno.EACCES: "choose a folder that you may write",
-    errno.EPERM: "choose a folder that you may write",
-    errno.ENOTDIR: "choose a folder whose path holds no file",
-    errno.ENOENT: "choose a folder that can be made",
+    errno.ENOSPC: "free space on the disk",
+    errno.EDQUOT: "free space within your quota",
+    errno.EFBIG: "raise the limit on file sizes (ulimit -f)",
+    errno.EROFS: "choose a folder on a writable file system",
+    errno.EACCES: "choose a folder with write permission",
+    errno.EPERM: "choose a folder with write permission",
+    errno.ENOTDIR: "choose a path without files among its folders",
+    errno.ENOENT: "choose a folder that can be created",
     errno.EEXIST: "choose another name",
 }
-"""What helps against errors of the system, the first six of them whatever is written."""
+"""Remedies by error number. The first six errors do not depend on the name of the file that is written."""
 
 
 @contextmanager
 def hidden_beside(path: Path) -> Iterator[Path]:
-    """A name beside ``path`` for a file or folder in the making; what is left of it goes when the block ends."""
+    """Yield a temporary path next to ``path``, for a file or folder that is renamed to ``path`` when complete.
+
+    At the end of the context, a file or folder that still has the temporary name is removed.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
     try:
         yield partial
     except OSError as error:
-        # What the system says of it, or of a full disk without any name, is meant of the path.
+        # Report the final name instead of the temporary one, also if the error has no name, as for a full disk.
         if error.filename is None or str(error.filename) == str(partial):
             error.filename = str(path)
         raise
     finally:
-        # A folder that cannot be written says so once.
+        # Ignore errors here, because a folder without write permission has raised one already.
         with suppress(OSError):
             remove_quietly(partial)
 
 
 def remove_quietly(path: Path) -> None:
-    """Remove a file or a folder, as far as the system lets it."""
+    """Remove a file or a folder; ignore files of the folder that cannot be removed."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -51,10 +58,10 @@ def remove_quietly(path: Path) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file under another name and rename it when all of it is on its way to the disk."""
+    """Write a file atomically: under a temporary name, and rename it when it is complete."""
     with hidden_beside(path) as partial:
         if path.exists() and not path.is_file():
-            # A pipe or a device takes what is written; a file must not come in its place.
+            # Write directly to a pipe or a device such as /dev/stdout, because a file must not replace it.
             path.write_bytes(data)
         else:
             partial.write_bytes(data)

@@ -1,4 +1,8 @@
-"""Formatting of values in output and messages: numbers with SI prefixes, received values, and cells of CSV files."""
+"""Formatting of numbers and other values in output, messages, CSV files and JSON.
+
+A *sufficient side* of a limit, "above" or "below", is the side on which values meet a requirement. Limits are rounded
+toward this side, so that a printed limit meets the requirement as well.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +14,15 @@ from typing import Any
 
 from zwidth.words.unit_system import UNIT_PAIRS, UnitSystem
 
-PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
-LONGEST_VALUE = 60
+PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}  # SI prefixes by power of ten
+LONGEST_VALUE = 60  # characters of a received value in a message
 
 
 def plain(value: float, digits: int = 4) -> str:
-    """Return a number with a fixed number of significant digits, without exponent between 1e-4 and 1e6."""
+    """Format a number with a fixed number of significant digits, without exponent between 1e-4 and 1e6."""
     if not math.isfinite(value):
         return "none" if math.isnan(value) else ("infinite" if value > 0 else "-infinite")
-    # A zero has no sign.
+    # Add 0 to remove the sign of a negative zero.
     value = float(f"{value:.{digits - 1}e}") + 0.0
     if value != 0 and not 1e-4 <= abs(value) < 1e6:
         return f"{value:.{digits - 1}e}"
@@ -27,7 +31,7 @@ def plain(value: float, digits: int = 4) -> str:
 
 
 def with_unit(value: float, unit: str, digits: int = 4) -> str:
-    """Return a quantity with an SI prefix on its unit: ``19.87 kN/m``, and ``100.0 g`` for kilograms.
+    """Format a quantity with an SI prefix of its unit, as in ``19.87 kN/m``, and masses in grams, ``100.0 g``.
 
     Numbers without unit, "1" or "", have no prefix. Inertias are in g cm^2, as in data sheets of motors.
     """
@@ -47,56 +51,55 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
 
 
 def spell_periods(count: float) -> str:
-    """Return a number of sampling periods, to four significant digits, with its noun: ``1 period``, ``0.7 periods``."""
+    """Format a number of sampling periods to four significant digits: ``1 period``, ``0.7 periods``."""
     rounded = float(f"{count:.4g}" if count < 1000 else f"{count:.0f}")
     return f"{short(rounded)} period{'' if count == 1 else 's'}"
 
 
 def spell_short(value: float, unit: str, digits: int = 3) -> str:
-    """Return a quantity with its unit, rounded and without trailing zeros: ``1 mm``, ``349 mrad``."""
+    """Format a quantity with its unit, rounded and without trailing zeros: ``1 mm``, ``349 mrad``."""
     number, space, name = with_unit(value, unit, digits).partition(" ")
     return f"{float(number):g}{space}{name}" if math.isfinite(value) else number
 
 
 def name_wall(stiffness: Any, virtual_damping: Any, system: UnitSystem) -> str:
-    """Return K and B of a wall with units, K rounded down, so that the printed wall is stable if this one is."""
+    """Format K and B of a wall with units; K is rounded down, so that it does not exceed a limit of stability."""
     K = with_unit(round_safely(float(stiffness), "below"), system["N/m"])
     return f"K = {K}, B = {with_unit(float(virtual_damping), system['N s/m'])}"
 
 
-# Words after a limit, by the side on which values are sufficient.
-ENOUGH = {"above": "or more", "below": "or less"}
+ENOUGH = {"above": "or more", "below": "or less"}  # words after a limit, by sufficient side
 
 
 def round_safely(value: float, enough: str, digits: int = 4) -> float:
-    """Round a limit to a few digits, toward the side on which values are sufficient."""
+    """Round a limit to a few digits, toward its sufficient side; return it unchanged if ``enough`` is no side."""
     if not (value and math.isfinite(value) and enough in ENOUGH):
         return value
     step = 10.0 ** (math.floor(math.log10(abs(value))) + 1 - digits)
-    # Keep a value that has few digits, in spite of the rounding error of the quotient.
+    # Tolerate the rounding error of the quotient, so that a value with few digits is not changed.
     steps = math.ceil(value / step - 1e-9) if enough == "above" else math.floor(value / step + 1e-9)
     return steps * step
 
 
 def count_digits(holds: Callable[[int], Any], least: int = 4) -> int:
-    """Return the smallest number of digits, at least ``least``, for which ``holds`` returns True."""
+    """Return the smallest number of digits, at least ``least``, for which ``holds`` returns True; at most 17."""
     return next((digits for digits in range(least, 17) if holds(digits)), 17)
 
 
 def count_digits_apart(values: list[float], least: int = 4) -> int:
-    """Return the smallest number of digits, at least ``least``, that distinguishes different numbers."""
+    """Return the smallest number of digits, at least ``least``, with which different numbers have different texts."""
     return count_digits(lambda digits: len({f"{value:.{digits}g}" for value in values}) == len(set(values)), least)
 
 
 def spell_stiffness(value: float, system: UnitSystem, digits: int = 4) -> str:
-    """Return a stiffness with its unit, rounded down because most are upper limits; rotary ones also per degree."""
+    """Format a stiffness, rounded down because most are upper limits; a rotary one also in mN m/deg."""
     text = with_unit(round_safely(value, "below", digits), system["N/m"], digits)
     per_degree = round_safely(value * 1e3 * math.pi / 180, "below", digits)
     return f"{text} ({plain(per_degree, digits)} mN m/deg)" if system.rotary and math.isfinite(value) else text
 
 
 def tell_apart(low: float, high: float, unit: str = "", least: int = 4) -> tuple[str, str]:
-    """Return both ends of an interval with unit, rounded inward, with enough digits that they stay different."""
+    """Format both ends of an interval with unit, rounded inward, with so many digits that their texts differ."""
     for digits in range(least, 18):
         ends = round_safely(low, "above", digits), round_safely(high, "below", digits)
         if ends[0] < ends[1]:
@@ -105,7 +108,15 @@ def tell_apart(low: float, high: float, unit: str = "", least: int = 4) -> tuple
 
 
 def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, digits: int = 4) -> str:
-    """Return the sufficient values as text: on one side of a limit, up to the next of ``others`` if there is one."""
+    """Format the interval of sufficient values, such as "2.5 mm or more" or "1 N/m to 2 N/m".
+
+    Args:
+        value: limit of the interval.
+        enough: sufficient side of the limit, "above" or "below".
+        others: further limits. The nearest one on the sufficient side ends the interval.
+        unit: unit of all limits.
+        digits: significant digits.
+    """
     side = 1.0 if enough == "above" else -1.0
     beyond = [side * other for other in others if side * other > side * value]
     if beyond:
@@ -116,18 +127,18 @@ def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, 
 
 
 def header(name: str, unit: str) -> str:
-    """Return the name of a column with its unit, as ``stiffness_N_per_m``; only the name if it has no unit."""
+    """Return the header of a column in CSV files, such as ``stiffness_N_per_m``; the name alone if it has no unit."""
     if unit in ("", "1", "sampling periods"):
         return name
     return f"{name}_{unit.replace('/', '_per_').replace(' ', '_').replace('^', '')}"
 
 
-# Endings of headers for linear and for rotary devices, the longest first, because "_m" also ends "_N_per_m".
+# Units in headers, for linear and for rotary devices. Long ones come first, because "_N_per_m" also ends with "_m".
 _ENDINGS = sorted(([header("", unit) for unit in pair] for pair in UNIT_PAIRS), key=lambda pair: -len(pair[0]))
 
 
 def convert_header(name: str, system: UnitSystem) -> str:
-    """Return the name of a column, such as ``stiffness_N_per_m``, with the unit of the given system."""
+    """Replace the unit in a header, as in ``stiffness_N_per_m``, by that of a linear or rotary device."""
     for pair in _ENDINGS:
         old = pair[not system.rotary]
         if name.endswith(old):
@@ -136,7 +147,7 @@ def convert_header(name: str, system: UnitSystem) -> str:
 
 
 def to_json(value: Any) -> Any:
-    """Convert a value for JSON: None replaces NaN and infinities, lists replace tuples."""
+    """Convert a value for JSON: NaN and infinities become None, tuples become lists."""
     if isinstance(value, Mapping):
         return {name: to_json(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
@@ -145,21 +156,22 @@ def to_json(value: Any) -> Any:
 
 
 def to_cell(value: Any) -> Any:
-    """Convert a value to a cell of CSV; an apostrophe precedes a text that a spreadsheet would run as a formula."""
+    """Convert a value to a CSV cell; put an apostrophe before a text that a spreadsheet would evaluate as a formula."""
     return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) else value
 
 
 def from_cell(cell: str) -> str:
-    """Return the text that `to_cell` converted."""
+    """Return the original text of a CSV cell from `to_cell`."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
-# Also in the wide forms that East Asian programs take for the same; with apostrophes of its own a text gets one more.
+# Start of a formula, also in full-width characters, which East Asian versions of spreadsheets accept. Leading
+# apostrophes are included, so that `from_cell` restores a text that begins with an apostrophe of its own.
 _FORMULA = re.compile(r"'*\s*[=+\-@\uff1d\uff0b\uff0d\uff20\t\r\n]")
 
 
 def describe(value: Any) -> str:
-    """Return a received value as YAML spells it, on one line."""
+    """Format a received value for a message, in the notation of YAML and on one line."""
     if value is None:
         return "nothing"
     if isinstance(value, bool):
@@ -177,25 +189,26 @@ def describe(value: Any) -> str:
 
 
 def _count(number: int, noun: str) -> str:
+    """Format a number of items with their noun in singular or plural."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def resembling(name: Any, known: Iterable[str]) -> str | None:
-    """Return the known name that is most similar to ``name``; None if none is."""
+def resembling(name: Any, names: Iterable[str]) -> str | None:
+    """Return the name in ``names`` that is most similar to ``name``, ignoring case; None if none is similar."""
     if not isinstance(name, str):
         return None
-    by_lower = {candidate.lower(): candidate for candidate in known}
-    found = difflib.get_close_matches(name.lower(), by_lower, n=1)
-    return by_lower[found[0]] if found else None
+    by_lower = {candidate.lower(): candidate for candidate in names}
+    matches = difflib.get_close_matches(name.lower(), by_lower, n=1)
+    return by_lower[matches[0]] if matches else None
 
 
-def suggestion(name: Any, known: Iterable[str], otherwise: str) -> str:
-    """Return a question that suggests the most similar known name; ``otherwise`` if none is similar."""
-    found = resembling(name, known)
-    return f"did you mean {found!r}?" if found else otherwise
+def suggestion(name: Any, names: Iterable[str], otherwise: str) -> str:
+    """Return the question "did you mean ...?" with the most similar names name; ``otherwise`` if none is similar."""
+    similar = resembling(name, names)
+    return f"did you mean {similar!r}?" if similar else otherwise
 
 
 def short(value: float) -> str:
-    """Return the shortest text of a number, without ``.0`` for integers."""
+    """Format a number as the shortest text that is read as the same float, without ``.0`` for integers."""
     text = f"{value:g}"
     return text if float(text) == value else repr(value)

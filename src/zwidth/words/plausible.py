@@ -1,4 +1,4 @@
-"""Warnings about implausible values, such as a wrong unit or a period in place of a rate; the values are accepted."""
+"""Plausibility warnings: values far from any real device, probably because of a wrong unit; the values are accepted."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from zwidth.words.formatting import short
 from zwidth.words.quantities import FIELDS
 from zwidth.words.unit_system import UnitSystem
 
-# Smallest and largest plausible values by kind of quantity, in SI units. The smallest mass is also that of inertias of
-# rotary devices, in kg m^2.
+# Smallest and largest plausible values by kind of quantity, in SI units. The smallest mass is so small because the
+# range is also used for inertias of rotary devices, in kg m^2.
 _PLAUSIBLE = {
     "mass": (1e-9, 20.0),
     "damping": (0.0, 1e4),
@@ -23,15 +23,15 @@ _PLAUSIBLE = {
     "time_constant": (1e-7, 5.0),
     "resolution": (1e-10, 0.01),
 }
-# Plausible steps of rotary encoders in rad, from 32 bits per turn to 6 steps per turn.
-_STEP_ANGLE = (1e-9, 1.1)
-# Kinds of quantities with another name.
+_STEP_ANGLE = (1e-9, 1.1)  # plausible resolutions of rotary encoders in rad: from 32 bits to 6 steps per revolution
+# Kinds of quantities by unit, for parameters whose name is not a kind.
 _OF_UNIT = {"N s/m": "damping", "N/m": "spring", "s": "period", "kg": "mass"}
-# Likely mistakes: another unit for the same number, its size, and the quantity if another one is meant; or a text.
+# Likely mistakes by kind of quantity: the intended parameter ("" if it is the same), the intended unit of the number,
+# its size in SI, and a text that replaces the suggestion.
 _SLIPS = {
     "mass": (("", "g", 1e-3, ""),),
     "damping": (("", "mN s/m", 1e-3, ""),),
-    "stiffness": (("", "", 1e-3, "a thousandth of it, with kN/m or N/mm counted once"),),
+    "stiffness": (("", "", 1e-3, "a thousandth of it (kN/m or N/mm converted twice)"),),
     "period": (("", "ms", 1e-3, ""), ("rate", "Hz", 1.0, "")),
     "rate": (("", "kHz", 1e3, ""), ("period", "s", 1.0, "")),
     "delay": (("", "ms", 1e-3, ""), ("", "us", 1e-6, "")),
@@ -41,11 +41,11 @@ _SLIPS = {
 
 
 def list_doubts(given: Mapping[str, Any], spell: Callable[[str, str], str], system: UnitSystem) -> list[str]:
-    """Return a warning for each implausible value.
+    """Return a warning for each implausible value, with a suggestion.
 
     Args:
         given: values in SI units by path.
-        spell: returns the text of a path with a value, or of the path alone if the value is "".
+        spell: formats a path with a value, as the user would write it; formats only the path if the value is "".
         system: units of the device.
     """
     lines = []
@@ -54,18 +54,18 @@ def list_doubts(given: Mapping[str, Any], spell: Callable[[str, str], str], syst
         kind = name if name in _PLAUSIBLE and path != "coupling.stiffness" else _OF_UNIT.get(unit, "")
         if isinstance(value, int | float) and kind in _PLAUSIBLE and not _is_plausible(kind, value, system):
             number = short(value)
-            meant = [
+            suggestions = [
                 text or spell(other or path, f"{number} {smaller}")
                 for other, smaller, scale, text in _SLIPS.get(kind, ())
                 if _is_plausible(other or kind, value * scale, system) and system[unit] == unit
             ]
-            if kind == "delay" and meant:
-                meant[0] += f" or {spell(path, f'{number} periods')}"
-            remedy = f"did you mean {meant[0]}?" if meant else "check its unit"
+            if kind == "delay" and suggestions:
+                suggestions[0] += f" or {spell(path, f'{number} periods')}"
+            remedy = f"did you mean {suggestions[0]}?" if suggestions else "check its unit"
             if kind == "resolution" and value > 1:
                 per = "rev" if system.rotary else "mm"
                 remedy = f"write counts as {spell(path, f'{number} counts/{per}')}"
-            lines.append(f"{spell(path, '')} is {number} {system[unit]}, far from any device; {remedy}")
+            lines.append(f"{spell(path, '')} is {number} {system[unit]}, an implausible value; {remedy}")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""What every loop answers of its walls: stiffest wall, margins and labels, arrays of one shape."""
+"""Result types of all kinds of loops: stiffest wall, stability margins, and stability labels of walls."""
 
 from __future__ import annotations
 
@@ -11,32 +11,35 @@ from zwidth.words.types import Array
 
 @shown(omega="", kind=RidgeKind)
 class RidgePoint(NamedTuple):
-    """The stiffest stable wall of a device, or an array of them."""
+    """The stiffest stable wall of a device in normalized parameters; arrays for several devices."""
 
-    alpha: Array
-    beta: Array
-    omega: Array
-    kind: Array
-    status: Array
+    alpha: Array  # normalized stiffness
+    beta: Array  # normalized damping
+    omega: Array  # frequency of the pole pair on the unit circle, in rad per period
+    kind: Array  # `RidgeKind`
+    status: Array  # `Status`
 
 
 @shown(phase_margin="degrees", delay_margin="periods")
 class Margins(NamedTuple):
-    """Margins of a wall and where they are taken, in radians a period; python-control's names in brackets."""
+    """Stability margins of a wall and the frequencies at which they occur, in rad per period.
 
-    gain_margin: Array  # (gm)
-    phase_margin: Array  # degrees (pm)
-    delay_margin: Array  # periods
-    modulus_margin: Array  # (sm)
-    phase_crossover: Array  # (wpc)
-    gain_crossover: Array  # (wgc)
-    modulus_frequency: Array  # (wms)
+    The comments give the names of python-control.
+    """
+
+    gain_margin: Array  # gm
+    phase_margin: Array  # in degrees; pm
+    delay_margin: Array  # in periods
+    modulus_margin: Array  # smallest distance of the open loop from -1; sm
+    phase_crossover: Array  # wpc
+    gain_crossover: Array  # wgc
+    modulus_frequency: Array  # wms
 
 
 @shown(method=Method)
 class Stability(NamedTuple):
-    """Labels with their status and the `Method` that decided each point, all of the broadcast shape."""
+    """Stability labels of walls, with the status and the deciding method of each wall; arrays of one shape."""
 
-    stable: Array
-    status: Array
-    method: Array
+    stable: Array  # True if all poles are inside the unit circle
+    status: Array  # `Status`
+    method: Array  # `Method`

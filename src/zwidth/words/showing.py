@@ -1,4 +1,4 @@
-"""Display of results at the prompt and in notebooks: short, with units, names of codes, and reasons for NaN."""
+"""Display of results at the prompt and in notebooks: short texts with units, names of codes, and reasons for NaN."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from zwidth.words.unit_system import ROTARY, UnitSystem
 
 Kind = TypeVar("Kind", bound=type)
 Result = TypeVar("Result")
-# A unit, or the names of codes.
-Unit = str | type[IntEnum]
+Unit = str | type[IntEnum]  # a unit as text, or the enumeration of a code
 
 # Default units of fields, by name.
-_USUAL: dict[str, Unit] = {"stiffness": "N/m", "virtual_damping": "N s/m", "status": Status}
-_BARE = ("", "1", "degrees", "periods")  # units without prefixes
-_FEW = 4  # largest number of entries of an array that are shown
-_LINE = 120  # characters per line
-_ROWS = 40  # rows per table
+_DEFAULT_UNITS: dict[str, Unit] = {"stiffness": "N/m", "virtual_damping": "N s/m", "status": Status}
+_BARE = ("", "1", "degrees", "periods")  # units without SI prefixes
+_FEW = 4  # arrays with up to this number of entries are displayed with all entries
+_LINE = 120  # characters per line; longer results are displayed with one field per line
+_ROWS = 40  # largest number of rows of a table
 
 
 def shown(
@@ -34,23 +33,23 @@ def shown(
     missing: Mapping[str, str] = MappingProxyType({}),
     **units: Unit,
 ) -> Callable[[Kind], Kind]:
-    """Return a decorator that gives a result class, dataclass or named tuple, a short ``repr`` and an HTML table.
+    """Return a class decorator that adds a short ``repr`` and an HTML table to a dataclass or named tuple of results.
 
     The attribute ``unit_system`` of a result, which `with_units` sets, selects linear or rotary units.
 
     Args:
-        only: names of the fields to show; all if empty.
-        picture: returns an HTML picture of the result, which follows the table.
+        only: names of the displayed fields; empty for all fields.
+        picture: function that returns an HTML picture of the result, to be displayed after the table.
         missing: reasons for NaN, by field.
-        **units: units of linear devices, or enumerations of codes, by field; stiffness, virtual damping and status have
-            defaults.
+        **units: units on a linear device, or enumerations of codes, by field. Defaults exist for ``stiffness``,
+            ``virtual_damping`` and ``status``.
     """
 
     def decorate(kind: Kind) -> Kind:
         shown_kind: Any = kind
         base: Any = kind
         if issubclass(kind, tuple):
-            # Use a subclass, because named tuples cannot have further attributes. JAX treats it as a named tuple, too.
+            # Create a subclass, because named tuples cannot have further attributes. JAX handles it like a named tuple.
             names = ("__module__", "__qualname__", "__doc__")
             shown_kind = type(kind.__name__, (kind,), {name: getattr(kind, name) for name in names})
             shown_kind._replace = lambda self, **changes: with_units(base._replace(self, **changes), self.unit_system)
@@ -61,10 +60,10 @@ def shown(
             or getattr(kind, "_fields", None)
             or tuple(name for name in getattr(kind, "__dataclass_fields__", ()) if name != "unit_system")
         )
-        known = _USUAL | units
+        all_units = _DEFAULT_UNITS | units
 
         def spell(self: Any, name: str, value: Any) -> str:
-            text = spell_value(value, find_unit(self, known.get(name, "")))
+            text = spell_value(value, find_unit(self, all_units.get(name, "")))
             if name in missing and "NaN" in text:
                 text += f"{',' if text == 'NaN' else '; NaN:'} {missing[name]}"
             return text
@@ -89,33 +88,36 @@ def shown(
 
 
 class ResultList(list[Any]):
-    """List of `shown` results, displayed as tables in notebooks."""
+    """A list of `shown` results, displayed as tables in notebooks."""
 
     def _repr_html_(self) -> str:
         return "\n".join(each._repr_html_() for each in self)
 
 
 def find_unit(result: Any, unit: Any) -> Any:
-    """Return a unit in the unit system of a result; "" for units that depend on the system if it is not known."""
+    """Return a unit in the unit system of a result.
+
+    If the result has no unit system, return "" for a unit that differs between linear and rotary devices.
+    """
     if isinstance(unit, type) or ROTARY[unit] == unit:
         return unit
     return result.unit_system[unit] if result.unit_system else ""
 
 
 def with_units(result: Result, system: UnitSystem | None) -> Result:
-    """Return a result, or a list of results, after setting the unit system in which it is shown.
+    """Set the unit system in which a result, or each result of a list, is displayed; return the result.
 
-    JAX ignores the unit system: results returned by `jit`, `vmap` and `tree.map` are shown in SI units without symbols.
+    JAX does not pass the unit system on: results of `jit`, `vmap` and `tree.map` are displayed without unit symbols.
     """
     for each in result if isinstance(result, list) else [result]:
-        # Scenes have a unit system of their own.
+        # Skip objects such as scenes that define their unit system themselves.
         if getattr(type(each), "unit_system", "") is None:
             object.__setattr__(each, "unit_system", system)
     return result
 
 
 def spell_value(value: Any, unit: Unit = "") -> str:
-    """Return a short text for a value; for an array its shape, range and number of NaN."""
+    """Format a value as a short text; a large array as its shape, range and number of NaN."""
     if isinstance(value, str):
         return value or "''"
     if isinstance(value, bool | np.bool_) or value is None:
@@ -141,7 +143,7 @@ def spell_value(value: Any, unit: Unit = "") -> str:
 
 
 def _spell_number(value: Any, unit: Unit) -> str:
-    """Return one number with its unit, or the name of a code."""
+    """Format one number with its unit, or a code by its name."""
     if isinstance(unit, type):
         return unit(int(value)).name
     if isinstance(value, np.bool_ | np.integer):
@@ -151,7 +153,7 @@ def _spell_number(value: Any, unit: Unit) -> str:
     if math.isnan(value):
         return "NaN"
     if unit in _BARE or not (value == 0 or 1e-12 < abs(value) < 1e12):
-        # A zero has no sign.
+        # Add 0 to remove the sign of a negative zero.
         return f"{float(value) + 0.0:.6g} {'' if unit == '1' else unit}".strip()
     # Round stiffnesses down, because most are upper limits.
     value = round_safely(float(value), "below" if unit == "N/m" else "", 6)
@@ -160,7 +162,7 @@ def _spell_number(value: Any, unit: Unit) -> str:
 
 
 def _spell_range(array: np.ndarray, unit: Unit) -> str:
-    """The least and the largest, or how often each code stands there."""
+    """Format the range of an array, or the number of its entries per code or truth value."""
     if array.dtype.kind == "b":
         return f"{np.count_nonzero(array)} True"
     if isinstance(unit, type):
@@ -168,22 +170,28 @@ def _spell_range(array: np.ndarray, unit: Unit) -> str:
         return ", ".join(f"{count} {unit(int(code)).name}" for code, count in zip(codes, counts, strict=True))
     if array.dtype.kind == "c":
         return "complex"
-    known = array[np.isfinite(array)] if array.dtype.kind == "f" else array
-    nans = f", {np.count_nonzero(np.isnan(array))} NaN" if known.size < array.size else ""
-    if not known.size:
+    finite = array[np.isfinite(array)] if array.dtype.kind == "f" else array
+    nans = f", {np.count_nonzero(np.isnan(array))} NaN" if finite.size < array.size else ""
+    if not finite.size:
         return "none of them finite"
-    ends = [_spell_number(end, unit) for end in (known.min(), known.max())]
+    ends = [_spell_number(end, unit) for end in (finite.min(), finite.max())]
     return f"{' to '.join(dict.fromkeys(ends))}{nans}"
 
 
 def _is_table(columns: Iterable[Any]) -> bool:
-    """Whether all are columns of one length that fits."""
+    """Return whether all fields are one-dimensional arrays of the same length, at most ``_ROWS``."""
     shapes = {each.shape if isinstance(each, np.ndarray) else () for each in columns}
     return len(shapes) == 1 and all(len(shape) == 1 and 0 < shape[0] <= _ROWS for shape in shapes)
 
 
 def write_table(title: str, rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
-    """A table of HTML."""
+    """Return an HTML table.
+
+    Args:
+        title: caption of the table.
+        rows: cells of each row.
+        head: cells of the header row; empty for a table without header.
+    """
 
     def write(cells: Sequence[str], tag: str) -> str:
         return "<tr>" + "".join(f'<{tag} style="text-align:left">{escape(cell)}</{tag}>' for cell in cells) + "</tr>"
@@ -193,12 +201,18 @@ def write_table(title: str, rows: Iterable[Sequence[str]], head: Sequence[str] =
 
 
 def draw_line(x: np.ndarray, y: np.ndarray, words: str) -> str:
-    """A small picture of a curve, as SVG: what is not finite is left out."""
-    known = np.isfinite(x) & np.isfinite(y)
-    if np.count_nonzero(known) < 2:
+    """Return a small SVG picture of a curve without its infinite and NaN points; "" if fewer than 2 points are left.
+
+    Args:
+        x: horizontal coordinates.
+        y: vertical coordinates.
+        words: title of the picture.
+    """
+    finite = np.isfinite(x) & np.isfinite(y)
+    if np.count_nonzero(finite) < 2:
         return ""
-    # So many points as there are places for them.
-    pick = np.flatnonzero(known)[np.unique(np.linspace(0, np.count_nonzero(known) - 1, 600).astype(int))]
+    # Draw at most 600 points, because the picture is only 320 pixels wide.
+    pick = np.flatnonzero(finite)[np.unique(np.linspace(0, np.count_nonzero(finite) - 1, 600).astype(int))]
     across, up = ((part[pick] - part[pick].min()) / (np.ptp(part[pick]) or 1.0) for part in (x, y))
     points = " ".join(f"{4 + 312 * a:.1f},{76 - 72 * b:.1f}" for a, b in zip(across, up, strict=True))
     return (

@@ -1,6 +1,7 @@
-"""Codes: statuses that accompany a result point by point, with their messages.
+"""Integer codes of results: the status of each point, the method that decided it, and the kind of an optimum.
 
-Traced code cannot raise, and one bad point must not spoil a batch: it gets NaN and one of these codes.
+Compiled code cannot raise exceptions, and one invalid point must not prevent results at other points. A point without
+result is therefore NaN and has one of these status codes.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from enum import IntEnum
 
 
 class Status(IntEnum):
-    """Why a point has the value it has; 0 is success."""
+    """Status of a point: 0 if its value is valid, otherwise the reason why it has none."""
 
     OK = 0
     INVALID_INPUT = 1
@@ -23,22 +24,27 @@ class Status(IntEnum):
 
     @property
     def message(self) -> str:
-        """One sentence: the cause, then the remedy."""
+        """One sentence with the cause and the remedy."""
         return _MESSAGES[self]
 
 
 def note_failures(counts: Iterable[int], of: str = "points") -> tuple[str, ...]:
-    """A note of how many of a result's points, counted by their status, are not OK, and why; none where all are."""
+    """Return a note with the number of points without result, by status; an empty tuple if all points are OK.
+
+    Args:
+        counts: number of points by status code, starting with OK.
+        of: noun for the points, in plural.
+    """
     ok, *others = counts
     failed = [(count, Status(code).name.lower().replace("_", " ")) for code, count in enumerate(others, 1) if count]
     if not failed:
         return ()
-    why = ", ".join(f"{count:,} {name}" for count, name in failed)
-    return (f"{sum(others):,} of {ok + sum(others):,} {of} have no answer: {why}",)
+    reasons = ", ".join(f"{count:,} {name}" for count, name in failed)
+    return (f"{sum(others):,} of {ok + sum(others):,} {of} have no result: {reasons}",)
 
 
 class Method(IntEnum):
-    """What decided a point, in `zwidth.decide_stability`."""
+    """Method that decided the stability of a wall in `zwidth.decide_stability`."""
 
     COMPANION = 0
     CROSSOVER = 1
@@ -46,30 +52,29 @@ class Method(IntEnum):
 
 
 class RidgeKind(IntEnum):
-    """Kind of optimum at the stiffest stable wall."""
+    """Kind of the optimum at the stiffest stable wall."""
 
     SMOOTH = 0
     CORNER = 1
-    NO_DAMPING = 2  # of a scene where only B >= 0 counts: the end of the row B = 0
-    NONE = 3  # no stiffest wall exists; the status contains the reason
+    NO_DAMPING = 2  # B = 0, if walls are restricted to B >= 0 and the optimum is at this bound
+    NONE = 3  # there is no stiffest wall; the status contains the reason
 
 
 _MESSAGES = {
-    Status.OK: "The value is right to the stated accuracy.",
+    Status.OK: "The value is accurate to the documented tolerance.",
     Status.INVALID_INPUT: (
-        "An input is NaN, infinite or negative where it must not be; alpha and beta are finite, delta and d finite "
-        "and >= 0."
+        "An input is invalid: alpha and beta must be finite, delta and d finite and >= 0; correct it."
     ),
-    Status.NOT_CONVERGED: "The solver stopped before its tolerance; ask for a nearby point or another method.",
-    Status.NO_BOUNDARY: "No stable wall lies on the given line; choose another alpha or beta.",
+    Status.NOT_CONVERGED: "The solver stopped before it reached its tolerance; use a nearby point or another method.",
+    Status.NO_BOUNDARY: "No wall on the given line of constant alpha or beta is stable; choose another value.",
     Status.UNDECIDED: (
-        "What is given does not decide it; of a model method='certified' decides walls, with the extra 'certified' "
-        "installed, of a fit or a measured response its doubts say what to measure."
+        "The precision or the data do not suffice to decide; use method='certified' (extra 'certified'); for a "
+        "measured device, resolve its warnings."
     ),
-    Status.ON_BOUNDARY: "A pole lies exactly on the unit circle, or too close to it for the largest precision allowed.",
+    Status.ON_BOUNDARY: "A pole is on the unit circle, or too close to it for the largest precision; change the wall.",
     Status.OUT_OF_RANGE: (
-        "An input is beyond the range that is computed; alpha and beta are 0 or 1e-60 to 1e60 in magnitude, delta is "
-        "at most 1e12 and d at most 1e5, SI quantities are 0 or 1e-30 to 1e30."
+        "An input is out of range: |alpha|, |beta| 1e-60 to 1e60, delta <= 1e12, d <= 1e5, SI values 1e-30 to 1e30; "
+        "check the units."
     ),
-    Status.UNREACHABLE: "Nothing that was free to vary reaches what was asked for; change another quantity.",
+    Status.UNREACHABLE: "No value of the free parameter meets the requirement; change another parameter.",
 }

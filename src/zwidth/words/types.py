@@ -1,7 +1,7 @@
-"""What arrays are in annotations, with the meaning of their axes in jaxtyping's notation.
+"""Array types for annotations, with names of axes in the notation of jaxtyping.
 
-``*points`` are the axes of the walls or devices, however many; ``#`` lets an axis be 1 or absent where others have it;
-a name that begins with ``_`` may differ from one argument to the next.
+``*points`` stands for any number of axes of walls or devices. An axis with ``#`` is broadcast: it may have length 1 or
+be absent. An axis whose name begins with ``_`` may have different lengths in different arguments.
 """
 
 from __future__ import annotations
@@ -13,28 +13,33 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxtyping import Complex, Float, Inexact, Integer, Num
 else:
-    # Loading jaxtyping takes time, and nothing is checked while the program runs; tests/project/test_types.py does.
+    # Do not import jaxtyping at run time, because the import is slow and nothing checks the types then. The test
+    # tests/project/test_types.py checks them.
     Complex = Float = Inexact = Integer = Num = Annotated
 
-# Of any shape. NumPy's arrays and numbers, JAX's and traced ones are all accepted and told apart at run time.
+# Array of any shape: of NumPy or JAX, traced or not, or a number.
 Array: TypeAlias = Any
-# What a caller gives, plain numbers and lists as well: it broadcasts with the other arguments.
+# Argument of a public function, broadcast with the other arguments; numbers and lists are accepted, too.
 ArrayLike: TypeAlias = Num[Any, "*#points"]
-# One real number a point: what kernels take, all arguments of one shape.
+# One real number per point: an argument of a kernel, whose arguments all have the same shape.
 Reals: TypeAlias = Float[Array, "*points"]
-# How many, one whole number a point.
+# One nonnegative integer per point, for numbers of items.
 Counts: TypeAlias = Integer[Array, "*points"]
-# Of a polynomial, highest power first.
+# Coefficients of a polynomial per point, highest power first.
 Coefficients: TypeAlias = Inexact[Array, "*points coefficients"]
-# Zeros or poles, in no particular order; those that a caller gives; and those of a kernel that goes over the poles.
+# Zeros or poles, in no particular order.
 Roots: TypeAlias = Complex[Array, "*points roots"]
+# Zeros or poles in an argument of a public function.
 RootsLike: TypeAlias = Num[Any, "*#points _roots"]
+# Zeros or poles along the first axis, for kernels that iterate over them.
 RootsFirst: TypeAlias = Complex[Array, "roots *points"]
-# The distance within which each root is.
+# Bound on the error of each root.
 Radii: TypeAlias = Float[Array, "*points roots"]
+# Bound on the error of each root, with the roots along the first axis.
 RadiiFirst: TypeAlias = Float[Array, "roots *points"]
 # Companion matrices.
 Matrices: TypeAlias = Inexact[Array, "*points roots roots"]
-# Along a curve, and along time.
+# Values along a curve.
 Vertices: TypeAlias = Float[np.ndarray, "vertices"]
+# Values along time.
 Samples: TypeAlias = Float[np.ndarray, "samples"]

@@ -1,8 +1,8 @@
-"""Parse unit expressions: products, quotients and powers of unit symbols, with SI prefixes.
+"""Parser of unit expressions: products, quotients and powers of unit symbols with SI prefixes.
 
 Examples are ``N m/deg``, ``mNm/°``, ``N*m*s / rad``, ``kgf/cm`` and ``ozf in``. The result is the conversion factor to
 SI and the exponents of kg, m, s and rad. Powers of ten are stored separately from other factors, because a shift of the
-decimal exponent has a single rounding error: 0.3 ms is exactly the float64 of 0.0003.
+decimal exponent causes a single rounding error: 0.3 ms becomes exactly the float64 number 0.0003.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 Exponents = tuple[int, int, int, int]
-"""Exponents of kg, m, s and rad."""
+"""Exponents of kg, m, s and rad: the dimension of a unit."""
 
 
 class UnitSize(NamedTuple):
@@ -31,11 +31,16 @@ class UnitSize(NamedTuple):
         return float(f"1e{self.power}") * self.factor
 
 
-# SI prefixes and their powers of ten; u stands for micro.
+# Powers of ten of the SI prefixes; u stands for micro.
 _PREFIXES = {"": 0, "n": -9, "u": -6, "μ": -6, "m": -3, "c": -2, "d": -1, "k": 3, "M": 6}
-_MASS, _LENGTH, _TIME, _ANGLE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
-_FORCE, _PER_TIME = (1, 1, -2, 0), (0, 0, -1, 0)
-# For each symbol: power of ten, further factor, exponents, and the allowed prefixes.
+# Dimensions of the unit symbols.
+_MASS = (1, 0, 0, 0)
+_LENGTH = (0, 1, 0, 0)
+_TIME = (0, 0, 1, 0)
+_ANGLE = (0, 0, 0, 1)
+_FORCE = (1, 1, -2, 0)
+_PER_TIME = (0, 0, -1, 0)
+# For each symbol: power of ten, further factor, dimension, and the allowed prefixes.
 _SYMBOLS: dict[str, tuple[int, float, Exponents, str]] = {
     "m": (0, 1.0, _LENGTH, "nuμmck"),
     "g": (-3, 1.0, _MASS, "uμmk"),
@@ -64,8 +69,8 @@ _READINGS = {
     for prefix in ("", *prefixes)
 }
 _LONGEST = max(map(len, _READINGS))  # characters of the longest symbol with its prefix
-_GRAVITY = 9.80665  # m/s^2, standard gravity
-# Mass units that stand for forces, as in "oz in" or "kg cm": as masses they would not yield a torque.
+_GRAVITY = 9.80665  # standard gravity, m/s^2
+# Mass units that denote weights in units of torque and other derived units, as in "oz in" or "kg cm".
 _WEIGHT = re.compile(r"(?<![A-Za-z])(kg|g|lb|oz)(?![A-Za-z])|^(kg|g)(?=[cm]?m)")
 # Symbols and an exponent, as in "m^2", "m**2" or "m2".
 _POWER = re.compile(r"(.*?)(?:\^|\*\*)?(-?[1-4])?", re.DOTALL)
@@ -74,7 +79,7 @@ _DIVIDED_RATE = re.compile(r"/\(([^()/]+)/([^()/]+)\)")
 
 
 def normalize_symbols(text: str) -> str:
-    """Return a unit with normalized characters: micro sign, degree sign, minus sign and superscripts."""
+    """Replace variants of micro sign, degree sign, minus sign and superscripts in a unit by standard characters."""
     text = text.replace("º", "°").replace("˚", "°").replace("−", "-")
     return unicodedata.normalize("NFKC", text)
 
@@ -83,13 +88,12 @@ def normalize_symbols(text: str) -> str:
 def measure_unit(text: str, exponents: Exponents | None = None) -> UnitSize | None:
     """Return the size of a unit; None if the unit is unknown or ambiguous.
 
-    Adjacent symbols may have two interpretations: "ms" are milliseconds or metre seconds. The exponents decide between
-    them.
+    Letters may have several interpretations: "ms" denotes milliseconds or metre seconds. The required exponents select
+    one of them.
 
     Args:
         text: the unit.
-        exponents: required exponents of kg, m, s and rad. None to allow all; the interpretation with the fewest symbols
-            is then returned.
+        exponents: required exponents of kg, m, s and rad; None to return the interpretation with the fewest symbols.
     """
     sizes = [size for size in _read(normalize_symbols(text)) if exponents in (None, size.exponents)]
     if exponents is None:
@@ -101,10 +105,10 @@ def measure_unit(text: str, exponents: Exponents | None = None) -> UnitSize | No
 
 
 def _read_weights(text: str, exponents: Exponents) -> UnitSize | None:
-    """Return the size of a unit if kg, g, lb or oz denotes a weight, as in "oz in"; None if the exponents differ."""
+    """Return the size of a unit in which kg, g, lb or oz denotes a weight, as in "oz in"; None if exponents differ."""
     text = normalize_symbols(text)
     mass = _WEIGHT.search(text)
-    # Exclude plain forces, because "2 kg" in place of a force may be a mass by mistake.
+    # Exclude forces, because "2 kg" for a force may be a mass given by mistake.
     if mass is None or exponents[1] == 1:
         return None
     sizes = [size for size in _read(f"{text[: mass.start()]}N {text[mass.end() :]}") if size.exponents == exponents]
@@ -135,14 +139,14 @@ def _read(text: str) -> list[UnitSize]:
 
 
 def _read_run(atom: str) -> Iterator[UnitSize]:
-    """Yield the possible SI sizes of unit symbols in a row, as in "mNm"; an exponent belongs to the last symbol."""
+    """Yield the possible sizes of symbols without separators, as in "mNm"; an exponent applies to the last symbol."""
     match = _POWER.fullmatch(atom)
     letters, power = (match[1], int(match[2] or 1)) if match else (atom, 1)
-    # Try long symbols first, so that interpretations with few symbols come first.
+    # Try long symbols first, so that interpretations with few symbols are yielded first.
     for length in range(min(len(letters), _LONGEST), 0, -1):
         first = _READINGS.get(letters[:length])
         rest = letters[length:]
-        # An m directly before N is the prefix milli, not a metre.
+        # Interpret m directly before N as milli, not as metre.
         if first is None or (letters[:length] == "m" and rest.startswith("N")):
             continue
         if not rest:

@@ -1,13 +1,15 @@
 """SI units of linear and of rotary devices.
 
-The equations of both kinds of device are the same; only the units differ. Code names a quantity by its unit on a linear
-device, and a `UnitSystem` returns the unit on the device at hand: ``ROTARY["N/m"]`` is ``"N m/rad"``.
+The equations of linear and of rotary devices are the same, only their units differ. The source code identifies a
+quantity by its unit on a linear device. A `UnitSystem` converts this unit to the unit on its kind of device:
+``ROTARY["N/m"]`` is ``"N m/rad"``.
 """
 
 from __future__ import annotations
 
 from enum import Enum
 
+# Units on rotary devices by unit on linear devices.
 _ROTARY_UNITS = {
     "kg": "kg m^2",
     "N s/m": "N m s/rad",
@@ -19,11 +21,11 @@ _ROTARY_UNITS = {
     "N/s": "N m/s",
 }
 UNIT_PAIRS = tuple(_ROTARY_UNITS.items())
-"""Pairs of units of the same quantity: of a linear and of a rotary device."""
+"""Pairs of units of one quantity: on linear devices and on rotary devices."""
 
 
 class UnitSystem(Enum):
-    """SI units of a kind of device, "linear" or "rotary"."""
+    """The SI units of one kind of device, linear or rotary."""
 
     LINEAR = "linear"
     ROTARY = "rotary"
@@ -34,11 +36,11 @@ class UnitSystem(Enum):
         return self is ROTARY
 
     def __getitem__(self, unit: str) -> str:
-        """Return the unit of this system for a unit of linear devices, also for a quotient such as ``N/m per kg``."""
+        """Return the unit on this kind of device for a unit on linear devices; quotients "N/m per kg" are allowed."""
         if self is LINEAR:
             return unit
         return " per ".join(_ROTARY_UNITS.get(part, part) for part in unit.split(" per "))
 
 
 SYSTEMS = LINEAR, ROTARY = tuple(UnitSystem)
-"""Both systems, indexed by "is rotary"."""
+"""Both unit systems, indexed by a Boolean: True for rotary."""

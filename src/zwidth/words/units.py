@@ -1,7 +1,8 @@
-"""Read quantities with units, such as ``10 kN/m``. Numbers without a unit are in the SI unit of their field.
+"""Conversion of quantities with units, such as ``10 kN/m``, to SI, and messages for invalid ones.
 
-Messages list the usual units of each dimension. `zwidth.words.unit_symbols` reads these and any other unit of the same
-dimension, such as ``N/um`` or ``ozf in``.
+A number without unit is in the SI unit of its field, the *base unit* of its dimension. Messages list the usual units of
+a dimension; `zwidth.words.unit_symbols` accepts all other units of the dimension, too, such as ``N/um`` or ``ozf in``.
+The *kind* of a device is linear or rotary.
 """
 
 from __future__ import annotations
@@ -20,32 +21,36 @@ from zwidth.words.quantities import ANY, SI_RANGE, Range
 from zwidth.words.unit_symbols import Exponents, UnitSize, measure_unit, normalize_symbols
 from zwidth.words.unit_system import UNIT_PAIRS
 
-# Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.
+# Mantissa, exponent and unit. The length of the exponent is limited, so that conversions do not create huge integers.
 _QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-9]{1,6}))?\s*(\S.{0,30})", re.DOTALL)
 
-# One way only to match a run of digits: a second one costs quadratic time on a long run that fails in the end.
+# The pattern matches a sequence of digits in one way only, because alternatives would cost quadratic time for long
+# texts that do not match.
 _NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
 
-# The leading number of a quantity, with thousands separators and a decimal separator; and an integer with thousands
-# separators.
+# The number at the start of a quantity, possibly with thousands separators and a decimal separator.
 _DIGITS = re.compile(r"\s*[-+]?[0-9][0-9.,'’_\u00a0\u2009\u202f ]*[0-9](?![0-9])")
+# An integer with thousands separators.
 _GROUPED = re.compile(r"[1-9][0-9]{0,2}(?:(?P<mark>[.,'’_\u00a0\u2009\u202f ])[0-9]{3})(?:(?P=mark)[0-9]{3})*")
 
 
 @dataclass(frozen=True, eq=False)
 class Dimension:
-    """A physical dimension with the units that messages list; all other units of the dimension are read as well."""
+    """A physical dimension and its usual units; all other units of the dimension are accepted as well."""
 
     names: str  # usual units, separated by commas, the base unit first; "" for ratios
-    example: str
-    factors: dict[str, float] = field(default_factory=dict)  # further units with other exponents, such as rad/s for Hz
+    example: str  # a quantity, for messages
+    # Factors to the base unit for units with other exponents of kg, m, s and rad, such as rad/s for frequencies in Hz.
+    factors: dict[str, float] = field(default_factory=dict)
 
     @property
     def units(self) -> tuple[str, ...]:
+        """All usual units, the base unit first."""
         return (*self.names.split(", "), *self.factors)
 
     @property
     def base(self) -> str:
+        """The base unit, in SI."""
         return self.units[0]
 
     @cached_property
@@ -59,11 +64,11 @@ class Dimension:
         return measure_unit(unit, self.exponents) if self.exponents and unit else None
 
     def in_base(self, mantissa: str, exponent: int, unit: str) -> float | None:
-        """Return ``mantissa * 10**exponent`` units in the base unit; None for a unit of another dimension."""
+        """Convert the quantity ``mantissa * 10**exponent`` with a unit to the base unit; None for another dimension."""
         if unit in self.factors:
             return float(f"{mantissa}e{exponent}") * self.factors[unit]
         size = self.measure(unit)
-        # Shift the decimal exponent, because a product would round twice: 0.3 ms is exactly the float64 of 0.0003.
+        # Shift the decimal exponent, because a product would round twice: 0.3 ms must be exactly the float64 of 0.0003.
         return None if size is None else float(f"{mantissa}e{exponent + size.power}") * size.factor
 
 
@@ -89,21 +94,23 @@ _SCALES = (
     *(INERTIA, ANGULAR_DAMPING, ANGULAR_STIFFNESS, TORQUE, TORQUE_RATE, ANGLE, ANGULAR_SPEED),
 )
 DIMENSIONS = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
+# Base unit on the other kind of device, by base unit.
 _OTHER_KIND = {one: other for pair in UNIT_PAIRS for one, other in (pair, pair[::-1])}
 _ROTARY_UNITS = [rotary for _, rotary in UNIT_PAIRS]
 
 PERIOD_WORDS = ("periods", "period")
+"""Units of times in sampling periods."""
 COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
-"""Units of encoder positions, which are converted with the resolution of the encoder."""
+"""Units of encoder positions; the resolution of the encoder converts them to SI."""
 
 
 def find_other(dimension: Dimension) -> Dimension | None:
-    """Return the dimension of the same quantity of the other kind of device, linear or rotary; None if it has none."""
+    """Return the dimension of the same quantity on the other kind of device; None if it has the same dimension."""
     return DIMENSIONS.get(_OTHER_KIND.get(dimension.base, ""))
 
 
 def tell_kind(value: Any) -> bool | None:
-    """Return True for a quantity with a unit of a rotary device, False for that of a linear device, None otherwise."""
+    """Return True for a text with a unit of rotary devices, False for one of linear devices, None for other values."""
     if not isinstance(value, str):
         return None
     match = _QUANTITY.fullmatch(_drop_separators(value, strict=False))
@@ -112,30 +119,37 @@ def tell_kind(value: Any) -> bool | None:
         return True
     size = measure_unit(unit) if unit else None
     if size is None:
-        # Classify unknown units by their denominator: units per angle are rotary.
+        # Classify an unknown unit by its denominator: a unit per angle is rotary.
         return True if _canonical(unit).endswith(("/rad", "/deg", "/°", "/turn", "/rev")) else None
     return _KIND_OF_EXPONENTS.get(size.exponents, True if size.exponents[3] else None)
 
 
 def spell_exactly(value: float, unit: str) -> str:
-    """Return a quantity in SI units as the shortest text that is read as the same float64: 0.1 kg as ``100 g``."""
+    """Format a quantity in SI as the shortest text that is converted to the same float64: 0.1 kg as ``100 g``."""
     number, dimension = Decimal(repr(float(value))), DIMENSIONS[unit]
     sizes = [(name, size) for name in dimension.units if (size := dimension.measure(name)) is not None]
     powers = {name: size.power for name, size in sizes if size.factor == 1.0 and not size.power % 3}
     fitting = [name for name, power in powers.items() if abs(number.scaleb(-power)) >= 1]
-    # The first name of a power is the usual one.
+    # If several units have the same power of ten, `max` selects the first one, which is the usual one.
     chosen = max(fitting, key=lambda name: powers[name]) if fitting else unit
     digits = number.scaleb(-powers[chosen]).normalize()
     return f"{digits:{'f' if -6 < digits.adjusted() < 15 else ''}} {chosen}"
 
 
 def looks_like_number(text: str) -> bool:
-    """Return whether a text would be a number without its quotes."""
+    """Return whether a text is a number without unit."""
     return _NUMBER_TEXT.fullmatch(text) is not None
 
 
 def check_range(value: float, allowed: Range, unit: str = "", remedy: str = "") -> float:
-    """Return a finite, admissible value or raise `UnusableValueError`."""
+    """Return a value that is finite and in its range; raise `UnusableValueError` for others.
+
+    Args:
+        value: the value.
+        allowed: allowed range.
+        unit: unit of the value in messages.
+        remedy: remedy in messages. Default: to write a number in the range.
+    """
     bounds = str(allowed)
     needed = f"it must be {bounds}{f' {unit}' if unit else ''}" if bounds else "it must be finite"
     if not math.isfinite(value):
@@ -149,7 +163,7 @@ def check_range(value: float, allowed: Range, unit: str = "", remedy: str = "") 
 
 
 def to_float(value: Any) -> float:
-    """Return a float; infinity for an integer that overflows, which `check_range` refuses."""
+    """Convert a number to float; an integer that overflows becomes infinite, and `check_range` then rejects it."""
     try:
         return float(value)
     except OverflowError:
@@ -157,7 +171,7 @@ def to_float(value: Any) -> float:
 
 
 def _canonical(unit: str) -> str:
-    """Return the standard spelling of a unit: ``N s/m`` for ``N*s/m``, ``N·s / m`` and ``Ns/m``."""
+    """Convert a unit to its standard notation: ``N*s/m``, ``N·s / m`` and ``Ns/m`` become ``N s/m``."""
     unit = normalize_symbols(unit)
     unit = re.sub(r"\s*/\s*", "/", unit)
     unit = re.sub(r"([kmµu]?g)[\s*·⋅.]*([cm]?m)\^?2$", r"\1 \2^2", unit)
@@ -165,23 +179,24 @@ def _canonical(unit: str) -> str:
     return re.sub(r"N[\s*·⋅.]*(?=[scm])", "N ", unit)
 
 
+# True for rotary units and False for linear ones, by exponents of kg, m, s and rad.
 _KIND_OF_EXPONENTS = {
     DIMENSIONS[base].exponents: kind == 1 for pair in UNIT_PAIRS for kind, base in enumerate(pair) if base in DIMENSIONS
 }
 
 
 def _drop_separators(text: str, *, strict: bool = True) -> str:
-    """Return a quantity with a decimal point and without thousands separators.
+    """Remove thousands separators from a quantity, and convert a decimal comma to a point.
 
-    "1.000,5 N/m" and "1,000.5 N/m" are 1000.5 N/m, and "1,5 N/m" is 1.5 N/m. "1,000 N/m" is ambiguous. A single point
-    is always the decimal point.
+    "1.000,5 N/m" and "1,000.5 N/m" become 1000.5 N/m, and "1,5 N/m" becomes 1.5 N/m. "1,000 N/m" is ambiguous. A single
+    point is always a decimal point.
 
     Args:
         text: the quantity.
-        strict: raise an error for ambiguous numbers; otherwise return the text unchanged.
+        strict: raise an error for ambiguous or invalid numbers; otherwise return such a text unchanged.
 
     Raises:
-        UnusableValueError: the number is ambiguous, or its separators are not thousands separators.
+        UnusableValueError: the number is ambiguous, or its digits are not in groups of three.
     """
     text = normalize_symbols(text.strip())
     match = _DIGITS.match(text)
@@ -192,34 +207,38 @@ def _drop_separators(text: str, *, strict: bool = True) -> str:
         return text
     sign = digits[: len(digits) - len(number)]
     decimal = next((mark for mark in ",." if number.count(mark) == 1 and number.rindex(mark) > _last(number, mark)), "")
-    whole, _, fraction = number.rpartition(decimal) if decimal else (number, "", "")
-    grouped = _GROUPED.fullmatch(whole) is not None
-    plain_digits = re.sub("[^0-9]", "", whole)
+    integer_part, _, fraction = number.rpartition(decimal) if decimal else (number, "", "")
+    grouped = _GROUPED.fullmatch(integer_part) is not None
+    plain_digits = re.sub("[^0-9]", "", integer_part)
     if decimal == "," and marks == "," and _GROUPED.fullmatch(number):
         if not strict:
             return text
-        ways = " or ".join(repr(f"{sign}{way}{rest}") for way in (plain_digits + fraction, f"{whole}.{fraction}"))
-        raise UnusableValueError(
-            f"got {describe(text)}", "the comma is ambiguous: decimal or thousands separator", f"write {ways}"
+        readings = " or ".join(
+            repr(f"{sign}{each}{rest}") for each in (plain_digits + fraction, f"{integer_part}.{fraction}")
         )
-    if whole.isdigit() or grouped or (_GROUPED.fullmatch(number) and not decimal):
+        raise UnusableValueError(
+            f"got {describe(text)}", "the comma is ambiguous: decimal or thousands separator", f"write {readings}"
+        )
+    if integer_part.isdigit() or grouped or (_GROUPED.fullmatch(number) and not decimal):
         return f"{sign}{plain_digits}{'.' if decimal else ''}{fraction}{rest}"
     if not strict:
         return text
     raise UnusableValueError(
-        f"got {describe(text)}", "its digits are not in groups of three", "omit thousands separators, as '1000.5'"
+        f"got {describe(text)}", "its digits are not in groups of three", "omit thousands separators, e.g. '1000.5'"
     )
 
 
 def _last(number: str, mark: str) -> int:
-    """Return the index of the last separator other than ``mark``, -1 if there is none."""
+    """Return the index of the last separator other than ``mark``; -1 if there is none."""
     return max((k for k, sign in enumerate(number) if not sign.isdigit() and sign != mark), default=-1)
 
 
 def _read_counts(mantissa: str, unit: str) -> tuple[float, Dimension] | None:
-    """Return the encoder step in rad or m that a number of counts defines, and its dimension; None for other units.
+    """Convert counts per revolution or per length to the resolution of the encoder.
 
-    "2000 counts/rev" and "14 bit" define steps in rad, "50 counts/mm" defines a step in m.
+    Returns:
+        The resolution and its dimension: in rad for "2000 counts/rev" or "14 bit", in m for "50 counts/mm". None for
+        other units.
     """
     number = float(mantissa)
     if unit.lower() in ("bit", "bits", "-bit") and 1 <= number <= 64 and number.is_integer():
@@ -237,7 +256,7 @@ def _read_counts(mantissa: str, unit: str) -> tuple[float, Dimension] | None:
 
 
 def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> tuple[float, str]:
-    """Return a quantity in the base unit and that unit, or a number of periods and "periods"; see `read_quantity`."""
+    """Convert a quantity to its base unit, without a check of its range; see `read_quantity`."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return to_float(value), dimension.base
     units = (*dimension.units, *PERIOD_WORDS) if periods else dimension.units
@@ -245,7 +264,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
     allowed = f"it must be a number in {dimension.base} or a number with one of the units {names}"
     remedy = f"write a number and a unit, as in {dimension.example!r}"
     if dimension is RATIO:
-        allowed, remedy = "it must be a number without a unit", f"write a number, as {dimension.example}"
+        allowed, remedy = "it must be a number without a unit", f"write a number, e.g. {dimension.example}"
     text = _drop_separators(text)
     if looks_like_number(text) and not looks_like_number(str(value)):
         raise UnusableValueError(got, "numbers without a unit have no separators", f"write {text}")
@@ -273,30 +292,30 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
         raise UnusableValueError(got, allowed, remedy)
     other = find_other(dimension)
     if other is not None and other.in_base(mantissa, 0, unit) is not None:
-        that = "linear" if dimension.base in _ROTARY_UNITS else "rotary"
+        other_kind = "linear" if dimension.base in _ROTARY_UNITS else "rotary"
         _refuse_kind(
             got,
             dimension,
-            f"write one of these, or every quantity of the device in {that} units, as {other.example!r} here",
+            f"write one of these, or write all quantities in {other_kind} units, e.g. {other.example!r}",
         )
-    meant = _find_same_letters(unit, (*units, *(other.units if other else ())))
-    raise UnusableValueError(got, f"the units allowed are {names}", meant or remedy)
+    suggestion = _find_same_letters(unit, (*units, *(other.units if other else ())))
+    raise UnusableValueError(got, f"the units allowed are {names}", suggestion or remedy)
 
 
 def _refuse_kind(got: str, dimension: Dimension, remedy: str) -> NoReturn:
-    """Raise `UnusableValueError` for a rotary unit in a linear device or a linear unit in a rotary device."""
-    this, that = ("rotary", "linear") if dimension.base in _ROTARY_UNITS else ("linear", "rotary")
+    """Raise `UnusableValueError` for a rotary unit on a linear device or a linear unit on a rotary device."""
+    kind, other_kind = ("rotary", "linear") if dimension.base in _ROTARY_UNITS else ("linear", "rotary")
     names = ", ".join(dimension.units)
     raise UnusableValueError(
-        f"{got}, a unit of a {that} device where the device is {this}", f"the units allowed are {names}", remedy
+        f"{got}, a {other_kind} unit for a {kind} device", f"the units allowed are {names}", remedy
     )
 
 
 def _find_same_letters(unit: str, candidates: Sequence[str]) -> str:
-    """Return a question that suggests the unit which a misspelled one stands for, "" if there is none.
+    """Return the question "did you mean ...?" for a misspelled unit; "" if no unit is similar enough.
 
-    The suggestion has the same magnitude for certain: the two differ only in the case of letters other than m and M,
-    which may be prefixes, or in the spelling of symbols of three letters or more.
+    The suggestion must have the intended magnitude. Therefore it differs from the misspelled unit only in the case of
+    letters other than m and M, which may be prefixes, or in the spelling of symbols with three or more letters.
     """
 
     def fold(name: str) -> str:
@@ -322,49 +341,57 @@ def _find_same_letters(unit: str, candidates: Sequence[str]) -> str:
 def read_quantity(
     value: Any, dimension: Dimension, allowed: Range = ANY, *, periods: bool = False, counts: bool = False
 ) -> tuple[float, str]:
-    """Return a quantity in its base unit, and that unit.
+    """Convert a quantity to its base unit.
 
     Args:
         value: a number in the base unit, or a text with a number and a unit.
         dimension: dimension of the quantity.
-        allowed: range of the quantity.
-        periods: allow numbers of sampling periods. These are returned unchanged, with the unit "periods".
-        counts: allow counts per revolution: "2000 counts" is the step of an encoder with 2000 counts per revolution.
+        allowed: allowed range of the quantity, in the base unit.
+        periods: accept numbers of sampling periods, "1.5 periods".
+        counts: accept "2000 counts" as the resolution of an encoder with 2000 counts per revolution.
+
+    Returns:
+        The quantity in the base unit, and the base unit; for sampling periods, their number and "periods".
 
     Raises:
-        UnusableValueError: the value is no quantity of this dimension, or out of range.
+        UnusableValueError: the value is not a quantity of this dimension, or it is out of range.
     """
     amount, unit = _parse(value, dimension, periods=periods, counts=counts)
     check_range(amount, allowed, unit)
     least, most = SI_RANGE
     if amount and not least <= abs(amount) <= most:
-        within = f"it must be 0 or {least:g} to {most:g} {unit} in magnitude"
-        raise UnusableValueError(f"got {short(amount)} {unit}", within, "check the units")
+        limits = f"it must be 0 or {least:g} to {most:g} {unit} in magnitude"
+        raise UnusableValueError(f"got {short(amount)} {unit}", limits, "check the units")
     return amount, unit
 
 
 def read_share(text: str) -> float:
-    """Return the value of a share such as ``2%`` or ``0.02``; raise `ValueError` for other texts."""
+    """Convert a fraction such as "2%" or "0.02" to a number; raise `ValueError` for other texts."""
     text = text.strip()
     return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
 
 
-# Of logs and responses; and their units besides.
-_KNOWN = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
-_FURTHER = ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s", "krad/s", "dB", "m/N", "mm/N", "um/N", "µm/N")
+# Dimensions of the columns of logs and frequency responses.
+_COLUMN_DIMENSIONS = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
+# Further units of these columns.
+_COLUMN_UNITS = ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s", "krad/s", "dB", "m/N", "mm/N", "um/N", "µm/N")
+# A name and a unit in brackets, as in "time [s]" or "time (s)".
 _TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
-# Where a unit may begin behind a name without brackets: time_s, time/s, time s.
+# Separators between a name and a unit without brackets, as in time_s, time/s and time s.
 _JOINT = re.compile(r"\s*[/,]\s*|_|\s+")
 
 
 def split_title(title: str) -> tuple[str, str]:
-    """The name of a column, and its unit, which stands in brackets at its end."""
+    """Split the title of a column into its name and the unit in brackets at its end; "" without unit."""
     match = _TITLE.fullmatch(title.strip())
     return (match[1], (match[2] or match[3] or "").strip()) if match else (title, "")
 
 
 def split_head(head: str) -> tuple[str, str]:
-    """The name of a column and its unit: in brackets, or behind a slash, an underscore or a blank where it is known."""
+    """Split the title of a column into its name and its unit.
+
+    The unit is in brackets, or it is a known unit after a slash, a comma, an underscore or a blank.
+    """
     name, unit = split_title(head)
     if unit or name != head.strip():
         return name, unit
@@ -375,5 +402,9 @@ def split_head(head: str) -> tuple[str, str]:
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text is the unit of some column of logs or responses."""
-    return text in _FURTHER or text.lower() in COUNTS or any(each.in_base("1", 0, text) is not None for each in _KNOWN)
+    """Return whether a text is a unit of columns of logs or frequency responses."""
+    return (
+        text in _COLUMN_UNITS
+        or text.lower() in COUNTS
+        or any(each.in_base("1", 0, text) is not None for each in _COLUMN_DIMENSIONS)
+    )

@@ -1,9 +1,9 @@
-"""Support for kernels with the same source code for NumPy and JAX.
+"""Array functions that work with NumPy and JAX, for kernels with the same source code for both.
 
-A kernel selects the namespace of its arguments, computes elementwise, iterates a fixed number of steps and selects by
-``xp.where``. Comments give the reason and the gain of code that is written for the compiler (XLA on a CPU): ratios of
-times to compile and to run without and with it, by `benchmarks/bench_xla.py` on 2 cores with AVX-512. Importing this
-module does not import JAX.
+A *kernel* is a function of arrays of one shape. It computes elementwise with the *namespace* of its arguments, NumPy or
+`jax.numpy`, iterates a fixed number of steps, and selects values by ``xp.where``. Some code is written for the compiler
+of JAX (XLA on a CPU); its comments give the gain, as the ratio of compile times or run times without and with it,
+measured by `benchmarks/bench_xla.py` on 2 cores with AVX-512. Importing this module does not import JAX.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import numpy as np
 from zwidth.words.types import Array
 
 State = TypeVar("State")
-_STEP = 1e-100  # complex step of numerical derivatives; its square is negligible
+_STEP = 1e-100  # step of complex-step derivatives, so small that its square is negligible
+# Types that are never JAX arrays.
 _HOST_TYPES = (float, int, np.ndarray, np.generic, bool, list, tuple, str, type(None))
 
 
@@ -29,7 +30,7 @@ def is_jax(value: Any) -> bool:
     if isinstance(value, _HOST_TYPES):
         return False
     kind = getattr(sys.modules.get("jax"), "Array", None)
-    # The attribute is missing while another thread imports JAX.
+    # ``Array`` does not exist yet while another thread imports JAX.
     return kind is not None and isinstance(value, kind)
 
 
@@ -41,7 +42,7 @@ def is_traced(*values: Any) -> bool:
 
 @contextmanager
 def compute_concretely() -> Iterator[None]:
-    """Compute in float64 without tracing inside the context, also during a JAX transformation of other values."""
+    """Compute in float64 without tracing inside the context, even during a JAX transformation of other values."""
     import jax
 
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
@@ -50,7 +51,7 @@ def compute_concretely() -> Iterator[None]:
 
 def namespace(*values: Any) -> Any:
     """Return `jax.numpy` if any argument is a JAX array, otherwise NumPy."""
-    # Repeat the code of `is_jax`, because its calls would take half of the time of a single wall.
+    # Repeat the code of `is_jax`, because calls of it would take half of the computation time for a single wall.
     kind = getattr(sys.modules.get("jax"), "Array", None)
     if kind is not None:
         for value in values:
@@ -68,8 +69,16 @@ def repeat(
     xp: Any,
     arrived: Callable[[State, State], bool] = lambda old, new: False,
 ) -> State:
-    """Apply ``step`` a number of times; in NumPy only until ``arrived(old, new)`` returns True."""
-    # Use a loop of the compiler for JAX, because its length does not increase the time to compile.
+    """Iterate ``step`` a fixed number of times; with NumPy, stop as soon as the iteration has converged.
+
+    Args:
+        steps: number of steps.
+        step: function from a state to the next state.
+        state: initial state.
+        xp: namespace.
+        arrived: convergence test, a function of the previous and the new state. JAX ignores it.
+    """
+    # For JAX, use a compiled loop, because the compile time then does not depend on the number of steps.
     if xp is np:
         for _ in range(steps):
             old, state = state, step(state)
@@ -82,7 +91,7 @@ def repeat(
 
 
 def apply_each(function: Callable[[Any], State], values: Sequence[Any], xp: Any) -> list[State]:
-    """Apply a function to each value; JAX traces and compiles it only once."""
+    """Apply a function to each value, such that JAX traces and compiles the function only once."""
     if xp is np:
         return [function(value) for value in values]
     import jax
@@ -92,7 +101,7 @@ def apply_each(function: Callable[[Any], State], values: Sequence[Any], xp: Any)
 
 
 def frozen(values: State, xp: Any) -> State:
-    """Return the values as constants for differentiation."""
+    """Return the values as constants for differentiation; see `jax.lax.stop_gradient`."""
     if xp is np:
         return values
     from jax.lax import stop_gradient
@@ -101,7 +110,7 @@ def frozen(values: State, xp: Any) -> State:
 
 
 def tree_map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
-    """Apply a function to the arrays of a (named) tuple, or to a single array."""
+    """Apply a function to each array of nested (named) tuples, or to a single array."""
     if not isinstance(tree, tuple):
         return function(tree, *others)
     parts = [tree_map(function, *leaves) for leaves in zip(tree, *others, strict=True)]
@@ -109,7 +118,16 @@ def tree_map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
 
 
 def push_forward(function: Callable[..., Any], values: tuple[Any, ...], changes: tuple[Any, ...], xp: Any) -> Any:
-    """Return the derivative of an analytic function along changes of its arguments, as a tree of (named) tuples."""
+    """Return the directional derivative of an analytic function.
+
+    With NumPy it is computed by a complex step, with JAX by `jax.jvp`.
+
+    Args:
+        function: function of arrays and (named) tuples of arrays.
+        values: arguments at which the derivative is computed.
+        changes: direction, of the same structure as ``values``.
+        xp: namespace.
+    """
     if xp is not np:
         from jax import jvp
 
@@ -119,18 +137,18 @@ def push_forward(function: Callable[..., Any], values: tuple[Any, ...], changes:
 
 
 def along(values: np.ndarray, like: Any) -> Any:
-    """Return values along a new last axis after those of ``like``, with the type of ``like``."""
+    """Reshape a vector for broadcasting along a new last axis of ``like``, and convert it to the type of ``like``."""
     return namespace(like).asarray(values, like.dtype).reshape((1,) * like.ndim + (-1,))
 
 
 def epsilon(value: Any) -> float:
-    """Return the machine epsilon of the type of a value; that of float64 for plain numbers."""
+    """Return the machine epsilon of the type of an array; of float64 for numbers."""
     return float(np.finfo(getattr(value, "dtype", np.float64)).eps)
 
 
 def horner(x: Any, coefficients: Sequence[Any]) -> Any:
-    """Evaluate a polynomial, lowest power first, by Horner's rule."""
-    # Test the type before `is_jax`, because single walls evaluate many polynomials and a call costs time.
+    """Evaluate a polynomial at x by Horner's rule; the coefficients start with the lowest power."""
+    # Test the type first, because this avoids most calls of `is_jax` when single walls are computed.
     if not isinstance(x, _HOST_TYPES) and is_jax(x) and all(isinstance(each, float) for each in coefficients):
         return _polynomial(tuple(coefficients))(x)
     total = coefficients[-1]
@@ -141,86 +159,99 @@ def horner(x: Any, coefficients: Sequence[Any]) -> Any:
 
 @cache
 def _polynomial(coefficients: tuple[float, ...]) -> Callable[[Any], Any]:
-    """Return a fixed polynomial as a JAX function, traced once; derivatives of all orders are polynomials, too."""
+    """Return a polynomial with constant coefficients as a JAX function that is traced once.
+
+    Its derivatives of all orders are functions of the same kind.
+    """
     import jax
 
     if len(coefficients) == 1:
         return lambda x: jax.numpy.full_like(x, *coefficients)
     function = jax.custom_jvp(jax.jit(lambda x: reduce(lambda total, each: total * x + each, reversed(coefficients))))
-    slope = tuple(k * coefficient for k, coefficient in enumerate(coefficients))[1:]
-    function.defjvp(lambda x, change: (function(*x), _polynomial(slope)(*x) * change[0]))
+    derivative = tuple(k * coefficient for k, coefficient in enumerate(coefficients))[1:]
+    function.defjvp(lambda x, change: (function(*x), _polynomial(derivative)(*x) * change[0]))
     return function
 
 
 def roots(*values: Any) -> tuple[Any, ...]:
-    """Return the square roots of arrays, or of numbers with a method ``sqrt``."""
+    """Return the square roots of arrays, or of objects with a method ``sqrt`` such as balls."""
     if hasattr(values[0], "sqrt"):
         return tuple([value.sqrt() for value in values])
     return tuple(map(namespace(*values).sqrt, values))
 
 
 def within(value: Array, limits: tuple[float, float]) -> Array:
-    """Return whether a value is 0 or has a magnitude within ``limits``."""
+    """Return whether a value is 0 or has a magnitude within ``limits``, elementwise."""
     size = abs(value)
-    # In single precision the limits would overflow.
+    # Reduce the upper limit to the largest number of the type, because it would overflow in float32.
     kind = getattr(size, "dtype", np.float64)
     most = limits[1] if kind == np.float64 else min(limits[1], float(np.finfo(kind).max))
     return (size <= most) & ((size >= limits[0]) | (size == 0)) if limits[0] else size <= most
 
 
 def nan_beyond(limits: tuple[float, float], *values: Array) -> list[np.ndarray]:
-    """Return the values, with NaN for each value that is not `within` the limits."""
+    """Return the values, with NaN in place of each value that is not `within` the limits."""
     return [np.where(within(value, limits), value, np.nan) for value in values]
 
 
-# The values and derivatives of an invalid point are NaN. `where(ok, value, nan)` would have the derivative 0 instead.
-# Apply `nan_unless` to the arguments if the kernel can compute with NaN. For solvers, searches and exponents, replace
-# invalid arguments by valid ones and add `nan_with_nan_slopes` to the results.
+# At an invalid point, values and derivatives must both be NaN. `where(ok, value, nan)` does not suffice, because its
+# derivative would be 0. If a kernel can compute with NaN, apply `nan_unless` to its arguments. Otherwise, as in
+# solvers, replace invalid arguments by valid ones and add `nan_with_nan_slopes` to the results.
 
 
 def nan_unless(ok: Array, *values: Array) -> tuple[Array, ...]:
-    """Return the values where ``ok``, otherwise NaN, so that results and derivatives computed from them are NaN."""
+    """Multiply the values by NaN where not ``ok``, so that results and derivatives computed from them are NaN."""
     xp = namespace(ok, *values)
     factor = xp.where(ok, 1.0, np.nan)
     return tuple([value * factor for value in values])
 
 
 def nan_with_nan_slopes(ok: Array, *inputs: Array) -> Array:
-    """Return a term to add to a result: 0 where ``ok``, otherwise NaN with NaN first and second derivatives."""
+    """Return a term to be added to a result: 0 where ``ok``, otherwise NaN with first and second derivatives NaN.
+
+    Args:
+        ok: True at valid points.
+        *inputs: arguments with respect to which derivatives are taken.
+    """
     xp = namespace(ok, *inputs)
-    # Select twice, because the square of a large valid input overflows and would turn 0 into NaN.
+    # Replace valid inputs by 0 first, because the square of a large one would overflow, and 0 times infinity is NaN.
     total = sum(xp.where(ok, 0.0, value) for value in inputs)
     return xp.where(ok, 0.0, np.nan) * total * (1.0 + total)
 
 
 Values = TypeVar("Values")
 
-# Vector registers twice as wide as XLA's default, on processors that have them; no effect on others. Radii run 1.2 and
-# verdicts 1.04 times as fast.
+# Compiler option for vector registers twice as wide as XLA's default, without effect on processors that lack them. The
+# spectral radius is computed 1.2 times as fast, and stability 1.04 times as fast.
 WIDE = ("xla_cpu_prefer_vector_width", 512)
 
 
 @cache
 def known_options(*options: tuple[str, int]) -> dict[str, int]:
-    """Return the options that the installed XLA accepts, because an unknown option would stop every run."""
+    """Return those compiler options that the installed XLA accepts, because an unknown option raises an error."""
     import jax
 
-    def are_known(wanted: dict[str, int]) -> bool:
+    def are_accepted(values: dict[str, int]) -> bool:
         try:
-            jax.jit(abs, compiler_options=wanted).lower(0.0).compile()
+            jax.jit(abs, compiler_options=values).lower(0.0).compile()
         except jax.errors.JaxRuntimeError:
             return False
         return True
 
     # Test all options together first, because usually all are accepted.
-    return wanted if are_known(wanted := dict(options)) else {k: v for k, v in options if are_known({k: v})}
+    return values if are_accepted(values := dict(options)) else {k: v for k, v in options if are_accepted({k: v})}
 
 
 def store_once(values: Values, witness: Array) -> Values:
-    """Return ``values`` such that XLA computes them once for all later steps that use them."""
-    # XLA repeats a chain of cheap operations in every loop that uses its result, but never a division. The divisor is
-    # 1, or NaN where ``witness`` (any run-time value) is NaN, so the compiler cannot remove it. The ridge of the rigid
-    # loop compiles 1.3 times and runs 1.3 to 1.5 times as fast.
+    """Return ``values`` such that XLA computes them only once, even if several fused loops use them.
+
+    Args:
+        values: arrays.
+        witness: any array whose values are unknown at compile time.
+    """
+    # XLA repeats cheap operations in every fused loop that uses their result, but it does not repeat a division.
+    # Therefore divide by 1, which is computed from ``witness`` so that the compiler cannot remove the division. For the
+    # maximum stiffness of rigid loops, this makes compilation 1.3 times and computation 1.3 to 1.5 times as fast.
     if not is_jax(witness):
         return values
     import jax
@@ -231,29 +262,33 @@ def store_once(values: Values, witness: Array) -> Values:
 
 
 def fit_arcsine(terms: int) -> list[float]:
-    """Fit ``asin(sqrt y)/sqrt y`` on [0, 1/2] by powers of 4 y - 1; error 2e-16 with 19 terms, 6e-15 with 16."""
+    """Fit asin(sqrt(y))/sqrt(y) on [0, 1/2] by a polynomial in 4 y - 1, and return its coefficients.
+
+    The coefficients start with the lowest power. The error is 2e-16 for 19 terms and 6e-15 for 16 terms.
+    """
     node = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
     y = 0.25 * (node + 1.0)
     fit = np.polynomial.chebyshev.chebfit(node, np.arcsin(np.sqrt(y)) / np.sqrt(y), terms - 1)
     return np.polynomial.chebyshev.cheb2poly(fit).tolist()
 
 
-# Polynomials replace library calls, which have to handle every argument. With the series of the sine, radii run 2.9
-# times as fast, and `angle` alone 2.1 times. With `angle` and `find_turn`, radii run 1.06 times as fast and compile in
-# 0.7 of the time.
-ARCSINE = fit_arcsine(19)
-# Taylor series of sin(x)/x and cos(x) by x^2; on [0, pi/2] the first term left out is below 1e-17.
+# For JAX, polynomials replace library functions, which are slower because they handle all arguments. With SINE and
+# COSINE, the spectral radius is computed 2.9 times as fast. `angle` is 2.1 times as fast as the library function. With
+# `angle` and `find_turn`, the spectral radius is computed 1.06 times as fast and compiled in 0.7 of the time.
+ARCSINE = fit_arcsine(19)  # coefficients of asin(sqrt(y))/sqrt(y) in powers of 4 y - 1
+# Taylor coefficients of sin(x)/x and cos(x) in powers of x^2. On [0, pi/2] the first omitted term is below 1e-17.
 SINE = [(-1.0) ** k / factorial(2 * k + 1) for k in range(11)]
 COSINE = [(-1.0) ** k / factorial(2 * k) for k in range(12)]
 
 
 def angle(re: Array, im: Array) -> Array:
-    """Return the argument of a complex number, in (-pi, pi]."""
+    """Return the argument of the complex number re + j im, in (-pi, pi]."""
     xp = namespace(re, im)
     if xp is np:
         return np.arctan2(im, re)
     size = xp.abs(re)
     length = xp.sqrt(re * re + im * im)
+    # half = sin^2(w/2) for the argument w of |re| + j |im|, without cancellation. Therefore w = 2 asin(sqrt(half)).
     half = 0.5 * im * im / (length * (length + size))
     value = 2.0 * xp.sqrt(half) * horner(4.0 * half - 1.0, ARCSINE)
     value = xp.where(re < 0, np.pi - value, value)
@@ -261,10 +296,16 @@ def angle(re: Array, im: Array) -> Array:
 
 
 def find_turn(x: Array, y: Array, xp: Any) -> Array:
-    """Return the w in [0, pi] for which ``x = sin^2(w/2)``; y = 1 - x."""
+    """Return the angle w in [0, pi] with ``sin^2(w/2) = x``.
+
+    Args:
+        x: sin^2(w/2).
+        y: cos^2(w/2), i.e. 1 - x.
+        xp: namespace.
+    """
     if xp is np:
         return 2.0 * np.arctan2(np.sqrt(x), np.sqrt(y))
-    # Do not use the minimum, because its derivative at x = y is the mean of both derivatives.
+    # Select with ``where``, because the derivative of ``minimum`` at x = y is the mean of the derivatives of x and y.
     beyond = x > y
     low = xp.where(beyond, y, x)
     value = 2.0 * xp.sqrt(low) * horner(4.0 * low - 1.0, ARCSINE)

@@ -198,7 +198,7 @@ def test_rate_and_period_are_one_thing():
 @pytest.mark.parametrize(
     ("arguments", "doubt"),
     [
-        (["--mass", "70", *RATE], "--mass is 70 kg, far from any device; did you mean --mass '70 g'?"),
+        (["--mass", "70", *RATE], "--mass is 70 kg, an implausible value; did you mean --mass '70 g'?"),
         (["--mass", "1", "--period", "4000"], "--period is 4000 s, .* did you mean --rate '4000 Hz'?"),
         (["--mass", "1", "--period", "1"], "--period is 1 s, .* did you mean --period '1 ms'?"),
         (["--mass", "1", "--rate", "1"], "--rate is 1 Hz, .* did you mean --rate '1 kHz'?"),
@@ -269,12 +269,15 @@ def test_a_coded_period_that_is_not_the_loop_s_is_pointed_out():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--velocity-cutoff", "800"], "'--velocity-cutoff': got 800 Hz; it must lie below half the sampling rate"),
-        (["--velocity-cutoff", "10", "--velocity-order", "3"], "'--velocity-order': got 3; a whole number from 1 to 2"),
+        (["--velocity-cutoff", "800"], "'--velocity-cutoff': got 800 Hz; it must be below half the sampling rate"),
+        (
+            ["--velocity-cutoff", "10", "--velocity-order", "3"],
+            "'--velocity-order': got 3; it must be a whole number from 1 to 2",
+        ),
         (["--velocity-order", "2"], "--velocity-order does not belong to a velocity estimate of kind"),
         (["--velocity-kind", "butterworth"], "needs --velocity-cutoff"),
         (["--coupling-mass", "1"], "a coupling has a mass and a stiffness; give --coupling-stiffness"),
-        (["--operator-coupling-damping", "1"], "'--operator-coupling-damping': got 1.0 without a spring"),
+        (["--operator-coupling-damping", "1"], "'--operator-coupling-damping': got 1.0 without a coupling spring"),
         (["--operator-mass", "70 gg"], "'--operator-mass': got '70 gg'; the units allowed are kg, g, mg"),
     ],
 )

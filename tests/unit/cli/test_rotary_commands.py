@@ -69,8 +69,8 @@ def test_code_of_a_rotary_wall_says_what_goes_in_and_out():
     ("arguments", "words"),
     [
         (["ridge", "--mass", "12 g", "--damping", "0.02 mN m s/rad", "--rate", "1 kHz"], "--damping: got '0.02 mN m s"),
-        (["ridge", "--device", "haptic_wheel", "--damping", "2 N s/m", "--rate", "1 kHz"], "beside --damping"),
-        (["check", *DEVICE, "--stiffness", "2 N/m"], "in units of a linear device"),
+        (["ridge", "--device", "haptic_wheel", "--damping", "2 N s/m", "--rate", "1 kHz"], "together with --damping"),
+        (["check", *DEVICE, "--stiffness", "2 N/m"], "in linear units"),
         (["check", *DEVICE, "--stiffness", "2", "--friction", "1 N"], "--friction"),
         (["ridge", *DEVICE, "--coupling-mass", "1 g", "--coupling-stiffness", "1"], "--coupling-mass"),
         (["ridge", *DEVICE, "--operator-mass", "1 kg"], "--operator-mass"),
@@ -82,4 +82,4 @@ def test_mixing_is_refused(arguments, words):
     assert result.exit_code
     text = result.output + str(result.exception)
     assert words in text
-    assert "write all of them in" in text
+    assert "write all quantities in" in text

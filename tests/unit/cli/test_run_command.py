@@ -75,14 +75,14 @@ def test_a_scene_that_no_device_has_is_doubted_before_anything_is_computed(tmp_p
         return [line.removeprefix("zwidth: small.yaml: scene.") for line in doubts.splitlines()]
 
     assert doubts_of("{mass: 100, damping: 10, rate: 1, delay: 1}") == [
-        "mass is 100 kg, far from any device; did you mean 'mass: 100 g'?",
-        "delay is 1 s, far from any device; did you mean 'delay: 1 ms' or 'delay: 1 periods'?",
-        "rate is 1 Hz, far from any device; did you mean 'rate: 1 kHz'?",
+        "mass is 100 kg, an implausible value; did you mean 'mass: 100 g'?",
+        "delay is 1 s, an implausible value; did you mean 'delay: 1 ms' or 'delay: 1 periods'?",
+        "rate is 1 Hz, an implausible value; did you mean 'rate: 1 kHz'?",
     ]
     (of_a_part,) = doubts_of("{mass: 1, rate: 1 kHz, operator: {mass: 70, stiffness: 100}}")
-    assert of_a_part == "operator.mass is 70 kg, far from any device; did you mean 'operator.mass: 70 g'?"
+    assert of_a_part == "operator.mass is 70 kg, an implausible value; did you mean 'operator.mass: 70 g'?"
     (of_a_turn,) = doubts_of("{rotary: true, mass: 50, rate: 1 kHz}")
-    assert of_a_turn == "mass is 50 kg m^2, far from any device; check its unit"
+    assert of_a_turn == "mass is 50 kg m^2, an implausible value; check its unit"
     assert doubts_of("{mass: 0.1, damping: 10, period: 1e-3, delay: 2 periods, stiffness: 5 kN/m}") == []
 
 

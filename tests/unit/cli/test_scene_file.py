@@ -123,7 +123,7 @@ def test_a_rotary_file_is_read_in_rotary_units(write):
     done = run("check", file, "--stiffness", "0.05")
     assert done.exit_code == 0, done.output
     assert "mN m/rad" in done.output
-    assert "in units of a linear device, beside scene.yaml" in refused("check", file, "--stiffness", "10 N/m")
+    assert "in linear units, together with scene.yaml" in refused("check", file, "--stiffness", "10 N/m")
 
 
 def test_the_folder_of_a_run_stands_for_its_configuration(write, tmp_path):

@@ -84,7 +84,7 @@ FAULTS = {
     "velocity: {kind: filter, numerator: 3, denominator: [1]}": ("velocity.numerator", "a list, highest power first"),
     "operator: {mass: -1}": ("operator.mass", "at least 0"),
     "operator: {coupling_stiffness: 1000}": ("operator.mass", "greater than 0"),
-    "operator: {mass: 1, coupling_damping: 1}": ("operator.coupling_damping", "without a spring"),
+    "operator: {mass: 1, coupling_damping: 1}": ("operator.coupling_damping", "without a coupling spring"),
     "coupling: {mass: 1}": ("coupling.stiffness", "missing"),
     "coupling: {mass: 1, stiffness: 1 kN/m, sensor: middle}": ("coupling.sensor", "'motor', 'tip'"),
     "velocity: {kind: butterworth, cutoff: 30}, delay_model: held": ("delay_model", "remove it"),

@@ -86,7 +86,7 @@ def test_mixing_is_refused_where_it_stands(change, field):
 
 def test_a_study_of_the_file_is_not_of_the_other_kind():
     motion = {"kind": "simulate", "name": "m", "duration": "0.1 s", "start_position": "1 mm"}
-    assert "studies[0].start_position: got '1 mm', a unit of a linear device" in refuse(SCENE | WALL, motion)
+    assert "studies[0].start_position: got '1 mm', a linear unit for a rotary device" in refuse(SCENE | WALL, motion)
 
 
 def test_a_typing_error_is_not_taken_for_a_linear_unit(tmp_path):
@@ -102,7 +102,7 @@ def test_a_typing_error_is_not_taken_for_a_linear_unit(tmp_path):
     with pytest.raises(zwidth.ConfigError) as refused:
         load_config(file)
     assert "mN s/m" not in str(refused.value)
-    assert re.search(r"a\.yaml:3:15: scene\.mass: got '100 g', a unit of a linear device", str(refused.value))
+    assert re.search(r"a\.yaml:3:15: scene\.mass: got '100 g', a linear unit for a rotary device", str(refused.value))
 
 
 def test_the_width_of_a_figure_stays_a_length():

@@ -155,15 +155,15 @@ def pack_sheet(opened):
 REFUSED = {
     "a workbook": (pack_sheet, "save the sheet as CSV"),
     "an old workbook": (b"\xd0\xcf\x11\xe0" + bytes(20), "save the sheet as CSV"),
-    "a picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "it is no text"),
-    "half of a gzip": (gzip.compress(ROWS.encode())[:-9], "pack it again"),
+    "a picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "it is not a text"),
+    "half of a gzip": (gzip.compress(ROWS.encode())[:-9], "compress it again"),
     "a current alone": (b"t,x,current_A\n0,1,2\n", "motor_constant: got nothing for a force in A"),
     "no time": (b"t;x;F\n10:00:00;1;2\n10:00:6x;1;2\n", ":3: got '10:00:6x' under 't'; a time"),
     "no such time": (b"t;x;F\n10:00:00;1;2\n10:00:61;1;2\n", ":3: got '10:00:61' under 't'; a time"),
     "a cell between blanks": (b"t x F\n0 1 2\n1 no 3\n", ":3: got 'no' under 'x'; a number is needed"),
-    "objects": (lambda opened: np.save(opened, np.array([{}, 1], dtype=object)), "it holds objects"),
-    "no column": (lambda opened: np.savez(opened, a=1.0), "a (); give a column of numbers for each"),
-    "lengths": (lambda opened: np.savez(opened, t=TIME, x=PLACE[:2], F=FORCE), "'t' 3, 'x' 2, 'F' 3; save them"),
+    "objects": (lambda opened: np.save(opened, np.array([{}, 1], dtype=object)), "got Python objects"),
+    "no column": (lambda opened: np.savez(opened, a=1.0), "a (); save a column of numbers for each"),
+    "lengths": (lambda opened: np.savez(opened, t=TIME, x=PLACE[:2], F=FORCE), "'t' 3, 'x' 2, 'F' 3; save one value"),
     "no number": (lambda opened: np.savez(opened, t=TIME, x=3 * [np.nan], F=FORCE), "column 'x' contains no number"),
     "no names": (lambda opened: np.save(opened, np.eye(3)), "its columns have no names; add a header such as"),
 }
@@ -184,7 +184,7 @@ def test_other_files_are_refused_in_a_line(name, tmp_path):
 def test_an_old_file_of_matlab_that_is_broken_is_refused(tmp_path):
     file = tmp_path / "log.mat"
     file.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
-    with pytest.raises(InputError, match="no arrays that can be read"):
+    with pytest.raises(InputError, match="no readable arrays"):
         read_log(file, {})
 
 
@@ -194,7 +194,7 @@ def test_a_file_of_matlab_7_3_says_how_to_save_it(tmp_path):
     file.write_bytes(
         b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + bytes(8) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n"
     )
-    with pytest.raises(InputError, match=r"log.mat: it is of MATLAB's version 7.3; save it again with save\('log.mat'"):
+    with pytest.raises(InputError, match=r"log.mat: got MATLAB format 7.3; save it again with save\('log.mat'"):
         read_log(file, {})
 
 

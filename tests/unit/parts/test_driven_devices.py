@@ -29,16 +29,16 @@ def scene():
     "make, words",
     [
         (lambda: zwidth.Actuator(), "actuator: got neither cutoff nor"),
-        (lambda: zwidth.Actuator(100, 1e-3), "actuator: got cutoff and time_constant; one"),
+        (lambda: zwidth.Actuator(100, 1e-3), "actuator: got cutoff and time_constant; pass either"),
         (lambda: zwidth.Actuator(-1), "actuator.cutoff: got -1"),
         (lambda: zwidth.Actuator(100, order=3), "actuator.order: got 3"),
-        (lambda: zwidth.Actuator(100, damping_ratio=0.7), "of first order; leave it out, or say order=2"),
+        (lambda: zwidth.Actuator(100, damping_ratio=0.7), "for a first-order actuator; omit it, or pass order=2"),
         (lambda: zwidth.Actuator("100 N"), "actuator.cutoff: got '100 N'"),
         (lambda: zwidth.Mode(100, 0.0, 1), "mode.damping_ratio: got 0;"),
         (lambda: zwidth.Mode(100, "2 N", 1), "it must be a number without a unit"),
-        (lambda: zwidth.Mode(100, 0.1, 0), "mode.mass: got 0.0; a mass is needed"),
-        (lambda: zwidth.Device(1, modes=[3]), "modes: got \\[3\\]; a list of zwidth.Mode is needed"),
-        (lambda: zwidth.Device(1, actuator=cast(Any, 3)), "actuator: got 3; a zwidth.Actuator is needed, or None"),
+        (lambda: zwidth.Mode(100, 0.1, 0), "mode.mass: got 0.0; it must not be 0"),
+        (lambda: zwidth.Device(1, modes=[3]), "modes: got \\[3\\]; it must be a list of zwidth.Mode"),
+        (lambda: zwidth.Device(1, actuator=cast(Any, 3)), "actuator: got 3; it must be a zwidth.Actuator or None"),
     ],
 )
 def test_bad_numbers_are_named(make, words):
@@ -50,7 +50,7 @@ def test_bad_numbers_are_named(make, words):
 def test_what_is_too_fast_for_the_period_is_refused(part):
     parts = {"actuator": zwidth.Actuator(1e8), "modes": [zwidth.Mode(1e8, 0.1, 1)]}[part]
     scene = zwidth.Scene(zwidth.Device(0.1, 1.0), zwidth.Timing(1e-3)).replace(**{part: parts})
-    with pytest.raises(zwidth.InputError, match=f"{part}.*rings 1e\\+05 times a period"):
+    with pytest.raises(zwidth.InputError, match=f"{part}.*oscillates 1e\\+05 times per period"):
         scene.is_stable(1e3, 1.0)
 
 

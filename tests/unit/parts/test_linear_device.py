@@ -212,18 +212,18 @@ def test_a_factor_of_numerator_and_denominator_is_not_there():
     assert zwidth.LinearDevice(SIGNAL.dlti([1.0], [1.0, 1.0, 0.5], 1e-5, dt=1e-3)).zeros.size == 0
     # Matrices say that there is such a motion.
     hidden = [[0.0, 1.0, 0.0], [0.0, -100.0, 0.0], [0.0, 0.0, 0.5]], [0.0, 10.0, 0.0], [1.0, 0.0, 0.0]
-    with pytest.raises(zwidth.InputError, match=r"a mode of s = 0.5 is not moved by the force"):
+    with pytest.raises(zwidth.InputError, match=r"the mode s = 0.5 does not decay"):
         zwidth.LinearDevice(hidden)
 
 
 @pytest.mark.parametrize(
     "system, words",
     [
-        (3, "got '3'; needed are finite numbers as"),
-        ({}, "got '{}'; needed are finite numbers as"),
-        (([1.0], [1.0]), "a force does not move"),
-        (([0.0], [1.0, 2.0]), "a force does not move"),
-        (([1.0, 2.0], [1.0, 2.0]), "numerator of degree 1 over a denominator of degree 1"),
+        (3, "got '3'; it must be finite numbers as"),
+        ({}, "got '{}'; it must be finite numbers as"),
+        (([1.0], [1.0]), "does not depend on the force"),
+        (([0.0], [1.0, 2.0]), "does not depend on the force"),
+        (([1.0, 2.0], [1.0, 2.0]), "numerator of degree 1 over one of degree 1"),
         (([1.0], [1.0, np.nan]), "finite numbers"),
         (([], [1j, 2.0], 1.0), "finite numbers"),
         ((np.eye(2), [1.0], [1.0, 2.0]), "finite numbers"),
@@ -243,7 +243,7 @@ def test_what_needs_bodies_is_refused():
     with pytest.raises(zwidth.InputError, match="passivity with a linear device"):
         scene.passivity_margin(1e3, 1.0)
     assert zwidth.assess(scene.replace(stiffness=1e3)).passive is None
-    with pytest.raises(zwidth.InputError, match="a pole of 1e\\+06 radians a period"):
+    with pytest.raises(zwidth.InputError, match="got a pole of 1e\\+06 rad per period"):
         zwidth.Scene(zwidth.LinearDevice(([1.0], [1.0, 1e9])), TIMING).is_stable(1.0)
 
 

@@ -22,15 +22,15 @@ def device(frequency: Any = F, response: Any = G, deviation: Any = None) -> zwid
 
 REFUSED = {
     "lines that fall": (lambda: device(F[::-1]), "frequency", "sort"),
-    "double lines": (lambda: device(np.repeat(F[:20], 2)), "frequency", "double"),
+    "double lines": (lambda: device(np.repeat(F[:20], 2)), "frequency", "remove duplicates"),
     "a line at rest": (lambda: device(F - F[0]), "frequency", "> 0"),
     "few lines": (lambda: device(F[:5], G[:5]), "frequency", "at least 8"),
-    "other count": (lambda: device(F[1:]), "response", "one a frequency"),
+    "other count": (lambda: device(F[1:]), "response", "one value per frequency"),
     "NaN": (lambda: device(response=np.where(F > 300, np.nan, G)), "response", "not finite"),
-    "no numbers": (lambda: device(response=["fast"] * 40), "response", "no complex"),
-    "complex frequency": (lambda: device(F + 0j), "frequency", "no float"),
+    "no numbers": (lambda: device(response=["fast"] * 40), "response", "list of complex"),
+    "complex frequency": (lambda: device(F + 0j), "frequency", "list of float"),
     "a matrix": (lambda: device(response=G[:, None]), "response", "list of numbers"),
-    "negative radius": (lambda: device(deviation=-1e-9), "deviation", "at least 0"),
+    "negative radius": (lambda: device(deviation=-1e-9), "deviation", ">= 0"),
     "dead": (lambda: device(response=0 * G), "response", "column of the position"),
 }
 
@@ -118,10 +118,10 @@ def test_arrays_of_numpy_and_matlab_are_read(tmp_path):
 
 
 BAD_TABLES = {
-    "no unit of the phase": ("frequency [Hz],magnitude [m/N],phase", "phase in no unit"),
-    "no unit of the frequency": ("frequency,magnitude [m/N],phase [deg]", "frequency in no unit"),
-    "a speed": ("frequency [Hz],magnitude [m/s],phase [deg]", "magnitude in m/s"),
-    "no phase": ("frequency [Hz],magnitude [m/N],force [N]", "needed are"),
+    "no unit of the phase": ("frequency [Hz],magnitude [m/N],phase", "no unit for column phase"),
+    "no unit of the frequency": ("frequency,magnitude [m/N],phase [deg]", "no unit for column frequency"),
+    "a speed": ("frequency [Hz],magnitude [m/s],phase [deg]", "got m/s for column magnitude"),
+    "no phase": ("frequency [Hz],magnitude [m/N],force [N]", "required are"),
     "two phases": ("frequency [Hz],phase [deg],arg [deg]", "rename one"),
 }
 

@@ -67,8 +67,8 @@ def test_whole_parts():
         ({"velocity.cutof": 50}, "parameter: got 'velocity.cutof', .*did you mean 'velocity.cutoff'"),
         ({"velocity.samples": 5}, "parameter: got 'velocity.samples', allowed are 'mass', "),
         ({"operator.mass": -1.0}, "operator.mass: got -1 kg"),
-        ({"velocity.time_constant": 0.1}, "velocity: got both; give either cutoff"),
-        ({"rate": 1000, "period": 1e-3}, "give either"),
+        ({"velocity.time_constant": 0.1}, "velocity: got both cutoff and time_constant; pass either"),
+        ({"rate": 1000, "period": 1e-3}, "either"),
         ({"operator": 3}, "operator: got 3; pass an object such as"),
     ],
 )

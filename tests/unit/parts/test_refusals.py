@@ -41,12 +41,12 @@ CASES = {
     "damper without a spring": (
         lambda: zwidth.Operator(mass=0.5, coupling_damping=1.0),
         "operator.coupling_damping",
-        "give operator.coupling_stiffness",
+        "pass operator.coupling_stiffness",
     ),
     "traced damper without a spring": (
         lambda: jax.jit(lambda c: zwidth.Operator(mass=0.5, coupling_damping=c).mass)(0.0),
         "operator.coupling_damping",
-        "give operator.coupling_stiffness",
+        "pass operator.coupling_stiffness",
     ),
     "negative stiffness of a hand": (lambda: zwidth.Operator(0.5, stiffness=-1.0), "operator.stiffness", "at least 0"),
     "window of no sample": (lambda: zwidth.WindowedDifference(0), "velocity.samples", "from 1 to 1000"),
@@ -76,14 +76,14 @@ CASES = {
         "velocity.numerator",
         "multiply the denominator by z",
     ),
-    "filter of nothing": (lambda: zwidth.VelocityFilter([0.0], [1.0]), "velocity.numerator", "not all 0"),
+    "filter of nothing": (lambda: zwidth.VelocityFilter([0.0], [1.0]), "velocity.numerator", "not all of them 0"),
     "filter with NaN": (lambda: zwidth.VelocityFilter([1.0, np.nan], [1.0, 0.0]), "velocity.numerator", "finite"),
     "something else than a part": (lambda: zwidth.Scene(DEVICE, TIMING, velocity=5), "velocity", "zwidth.LowPass"),  # type: ignore[arg-type]
     "coupling of a number": (lambda: zwidth.Device(0.1, coupling=5), "coupling", "zwidth.Coupling"),  # type: ignore[arg-type]
     "link that cannot be resolved": (
         lambda: zwidth.Scene(zwidth.Device(0.1, coupling=zwidth.Coupling(0.1, 1e14)), TIMING).check_parts(),
         "coupling.stiffness",
-        "leave the coupling out",
+        "omit the coupling",
     ),
     "damper that cannot be resolved": (
         lambda: zwidth.Scene(zwidth.Device(0.1, coupling=zwidth.Coupling(0.1, 1e4, 1e14)), TIMING).check_parts(),

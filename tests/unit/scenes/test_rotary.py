@@ -122,7 +122,7 @@ def test_functions_of_numbers_answer_in_the_units_they_were_asked_in():
     assert found.stiffness_max == zwidth.sensitivities(mass=12e-7, damping=[2e-5], period=1e-3).stiffness_max
     assert "mN m/rad" in repr(found)
     assert "per kg m^2" in repr(found)
-    with pytest.raises(zwidth.InputError, match=r"^damping: got '2 N s/m', in units of a linear device, beside mass"):
+    with pytest.raises(zwidth.InputError, match=r"^damping: got '2 N s/m', in linear units, together with mass"):
         zwidth.max_stiffness(mass="12 g cm^2", damping=["2 N s/m"], period=1e-3)
 
 
@@ -166,7 +166,7 @@ def test_mixing_is_refused(field, make):
 def test_no_typing_error_of_a_rotary_unit_is_taken_for_a_linear_one():
     with pytest.raises(zwidth.InputError, match=r"did you mean 'mN m s/rad'\?"):
         zwidth.Device(1e-6, "0.02 mN m s/rd")
-    with pytest.raises(zwidth.InputError, match=r"a unit of a rotary device where the device is linear"):
+    with pytest.raises(zwidth.InputError, match=r"a rotary unit for a linear device"):
         zwidth.Scene(LINEAR_DEVICE, TIMING).is_stable(10, "0.02 mN m s/rad")
 
 

@@ -132,7 +132,7 @@ SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
         (lambda: zwidth.Device(mass=1.0, damping=-1), "damping: got -1 N s/m; it must be at least 0 N s/m"),
         (
             lambda: zwidth.Device(mass=np.ones(2)),  # pyright: ignore[reportArgumentType]
-            r"mass: got an array of shape \(2,\); a scene holds single numbers",
+            r"mass: got an array of shape \(2,\); it must be a single number",
         ),
         (lambda: zwidth.VirtualWall(stiffness=np.nan), "stiffness: got nan; it must be finite"),
         (lambda: zwidth.Timing(period=1e-3, delay=-1.0), "delay: got -1 s; it must be at least 0 s"),

@@ -254,7 +254,7 @@ def test_walls_out_of_range_leave_the_rest_of_a_map_alone():
     np.testing.assert_array_equal(outcome.arrays["status"], np.where(good, Status.OK, Status.OUT_OF_RANGE))
     np.testing.assert_array_equal(outcome.arrays["stable"], good)
     np.testing.assert_array_equal(np.isfinite(outcome.arrays["spectral_radius"]), good)
-    assert outcome.notes == ("4 of 8 points have no answer: 4 out of range",)
+    assert outcome.notes == ("4 of 8 points have no result: 4 out of range",)
     for draw in outcome.figures.values():
         (legend,) = draw()[0].figure.legends
         assert "no answer" in [text.get_text() for text in legend.get_texts()]

@@ -272,7 +272,7 @@ def test_walls_that_a_measured_response_leaves_open_are_undecided(tmp_path):
     np.testing.assert_array_equal(found.stable, told.stable)
     np.testing.assert_array_equal(found.status, told.status)
     many, failed = told.status.size, np.count_nonzero(told.status)
-    note = f"{failed} of {many} walls have no answer: {failed} undecided"
+    note = f"{failed} of {many} walls have no result: {failed} undecided"
     assert (result.studies[0].notes, zwidth.run(config, out=tmp_path / "run", resume=True).studies[0].notes) == (
         (note,),
     ) * 2

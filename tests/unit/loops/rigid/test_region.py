@@ -116,7 +116,7 @@ def test_the_lobe_is_the_closed_form():
         ((0.1, np.nan), "d: got nan; a single finite number"),
         (([0.1, 0.2], 1), r"delta: got \[0.1, 0.2\]; a single finite number"),
         (("0.1", 1), "delta: got '0.1', a real number"),
-        ((0.1, 1, 3), "points: got 3; a whole number from 8"),
+        ((0.1, 1, 3), "points: got 3; it must be a whole number from 8"),
     ],
 )
 def test_what_is_refused(arguments, message):

@@ -106,7 +106,7 @@ def test_a_scene_responds_in_si_units():
         ({"force": np.inf}, r"force: got inf; a single finite number is needed"),
         ({"alpha": "1"}, r"alpha: got '1', a real number"),
         ({"alpha": 1j}, r"alpha: got 1j, a real number"),
-        ({"periods": 0}, r"periods: got 0; a whole number from 1 to 10000000 is needed"),
+        ({"periods": 0}, r"periods: got 0; it must be a whole number from 1 to 10000000"),
         ({"periods": 10**400}, r"periods: got 1000"),
         ({"periods": True}, r"periods: got True"),
         ({"substeps": 2.5}, r"substeps: got 2.5"),
