@@ -19,8 +19,8 @@ from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, in_order, sele
 from zwidth.words.formatting import ENOUGH, count_digits_apart, header, round_safely, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS
 
-_STIFFNESS = SI_COLUMNS[0]  # column of K_max
-_NOISE = "velocity_noise_m_per_s"  # column of the velocity noise
+_STIFFNESS = SI_COLUMNS[0]  # name of the column of K_max
+_NOISE = "velocity_noise_m_per_s"  # name of the column of the velocity noise
 # Column and axis label of the parameter of each kind of filter, over which K_max is drawn.
 _OVER = {
     "low_pass": ("cutoff_Hz", "cut-off of the low-pass  $f_c$  in Hz"),
@@ -212,7 +212,7 @@ def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[f
 
 
 def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, color: Any) -> None:
-    """Mark a required stiffness, the values of the parameter at which K_max is sufficient, and the required value.
+    """Draw a required stiffness as a line, and mark the values of the parameter at which K_max reaches it.
 
     Args:
         ax: Axes of the curve.

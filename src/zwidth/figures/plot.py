@@ -350,7 +350,9 @@ def nyquist(
     virtual_damping: float | str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the Nyquist plot of the open loop of a wall, with the point -1, which a stable loop leaves on its left.
+    """Draw the Nyquist plot of the open loop of a wall, with the point -1.
+
+    With increasing frequency, the curve of a stable loop has the point -1 on its left.
 
     Args:
         scene: The scene.

@@ -47,7 +47,7 @@ DASHED = (0, (5.0, 2.2))
 DASH_DOTTED = (0, (6.0, 1.8, 1.2, 1.8))
 DOTTED = (0, (1.2, 1.6))
 STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED, (0, (11.0, 2.5)), (0, (6.0, 1.8, 1.2, 1.8, 1.2, 1.8)))
-# Markers of curves whose line styles already have a meaning.
+# Markers that distinguish curves if their line styles already have a meaning.
 MARKERS = ("o", "s", "^", "v", "P", "X", "*")
 
 # Units whose spelling in labels differs from that in datasets (UDUNITS).

@@ -243,7 +243,7 @@ class Record:
         self.note({**entry, "files": both})
 
     def files(self) -> set[str]:
-        """Return the names of all files that the run has written, according to the record."""
+        """Return the names of all files that the run has written, as listed in the record."""
         names = {RUN_FILE}
         if self.content.get("config_file"):
             names.add(CONFIG_FILE)
@@ -312,7 +312,7 @@ def hash_file(path: Path) -> str:
 
 
 def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[str, str]]:
-    """Collect the files that a valid configuration reads, so that the run can be repeated from its own folder.
+    """Collect the files that a valid configuration reads, to copy them into the folder of the run.
 
     Args:
         text: Text of the configuration.

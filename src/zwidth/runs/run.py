@@ -63,9 +63,9 @@ class RunResult:
     studies: tuple[StudyResult, ...]  # outcome of each study, sweeps last
     seconds: float  # run time in s
     repaired: tuple[str, ...] = ()  # damaged or missing files and chunks that were created again
-    hopeless: str = ""  # error that ended the run because it affects every study, for example a full disk
-    interrupted: bool = False  # stopped by the user with Ctrl-C; results computed until then are kept
-    lost: str = ""  # error of the cluster that ended the run; results computed until then are kept
+    hopeless: str = ""  # error that ended the run, because it affects every study, such as a full disk
+    interrupted: bool = False  # True if the user stopped the run with Ctrl-C; earlier results are kept
+    lost: str = ""  # error of the cluster that ended the run; earlier results are kept
     whole: int = 0  # number of computed studies in the configuration
 
     @property
@@ -75,7 +75,7 @@ class RunResult:
 
     @property
     def sweeps(self) -> dict[str, SweepResult]:
-        """The outcomes of the sweeps, by name of the study."""
+        """The outcome of each sweep, by name of the study."""
         return {study.name: study.sweep for study in self.studies if study.sweep is not None}
 
     @property
@@ -306,8 +306,8 @@ class _Run:
         """
         clock = time.perf_counter()
         number = {plan.study.name: len(self.results) + k for k, plan in enumerate(plans, start=1)}
-        # Workers compute chunks of several sweeps in parallel. Assign the time between two completed chunks to the
-        # sweep of the second one.
+        # Assign the time between two completed chunks to the sweep of the second chunk, because workers compute chunks
+        # of several sweeps in parallel.
         spent = dict.fromkeys(number, 0.0)
 
         def report_chunk(progress: Progress) -> None:

@@ -81,7 +81,7 @@ def build_model(scene: Any) -> Model:
 def run_scenes(
     scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray], settings: Settings
 ) -> dict[str, np.ndarray]:
-    """Simulate scenes of one structure.
+    """Simulate scenes of equal structure, in groups of at most `GROUP` simulations.
 
     Args:
         scenes: distinct scenes.
@@ -114,7 +114,7 @@ def run_scenes(
     unknown = set() if isinstance(scenes[0].device, Device) else OF_ENERGY
 
     def run(rows: np.ndarray) -> dict[str, np.ndarray]:
-        # Import JAX only here, because importing zwidth must not load it.
+        # Import the engine only here, because it loads JAX, which importing zwidth must not do.
         from zwidth.simulation.engine import run_batch
 
         used, scene_of = np.unique(which[rows], return_inverse=True)

@@ -24,7 +24,7 @@ from zwidth.simulation.propagation import BodyState, advance, dot, propagate_wit
 from zwidth.words.types import Array
 from zwidth.words.xp import known_options
 
-BLOCK = 128  # periods per compiled call
+BLOCK = 128  # number of sampling periods that one call of the compiled program simulates
 SEGMENTS = 6  # number of equal segments of the tail; even, because the trend compares the two halves of the tail
 # Factor on the noise bound of FOAW, because rounding errors must not exclude deviations of exactly one encoder count.
 SLACK = 1.0 + 1e-9
@@ -172,7 +172,7 @@ def _adapt_window(ring: Array, k: Array, newest: Array, bound: Array, longest: i
     past = ring[(k - np.arange(longest + 1)) & (len(ring) - 1)]
     back = np.arange(1, longest + 1)[:, None]
     slopes = (newest - past[1:]) / back
-    missed = jnp.abs(past[1:] - (newest - slopes[:, None] * back))  # (window, sample, batch)
+    missed = jnp.abs(past[1:] - (newest - slopes[:, None] * back))  # of shape (window, sample, batch)
     within = jnp.all((missed <= bound * SLACK) | (back > back[:, None]), axis=1)
     length = jnp.sum(jnp.cumprod(within, 0), 0)
     return jnp.take_along_axis(slopes, jnp.maximum(length - 1, 0)[None], 0)[0]
@@ -366,8 +366,8 @@ def compile_block(options: Options) -> Any:
         def one(j: Array, carry: Any) -> Any:
             state, kept = carry
             period = jax.tree.map(lambda part: read(part, j), inputs)
-            state, found = _simulate_period(params, options, ends, state, period)
-            return state, jax.tree.map(lambda rows, row: _write(rows, row, j), kept, found)
+            state, record = _simulate_period(params, options, ends, state, period)
+            return state, jax.tree.map(lambda rows, row: _write(rows, row, j), kept, record)
 
         return jax.lax.fori_loop(0, jnp.minimum(BLOCK, ends[-1] - inputs.k[0]), one, (state, rows))
 
@@ -404,9 +404,9 @@ def run_batch(
         )
         # Allow rank promotion even if the caller forbids it, because arrays without a batch axis broadcast by design.
         with jax.numpy_rank_promotion("allow"):
-            state, found = compile_block(options)(placed, ends, state, block)
+            state, block_records = compile_block(options)(placed, ends, state, block)
         if options.record:
-            recorded.append(jax.tree.map(np.asarray, found))
+            recorded.append(jax.tree.map(np.asarray, block_records))
     final = jax.tree.map(np.asarray, state)
     if not options.record:
         return final, None, None

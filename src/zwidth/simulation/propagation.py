@@ -31,7 +31,7 @@ FRACTION = 8
 
 
 class BodyState(NamedTuple):
-    """State of the bodies and slip of the first one."""
+    """State of the bodies, and slip of the first body."""
 
     x: Array  # state, (n, batch)
     slip: Array  # slip of the first body: -1, 0 or 1, (batch,)
@@ -254,8 +254,8 @@ class _Joint(NamedTuple):
                 bounds = jnp.stack([self.slope(after, slip, side) < 0, self.reserve(after, slip, side) >= 0])
                 return (turn == 0) | read(bounds, turn - 1)
 
-            found = advance(digits, held, x, driven, jnp.where(wanted, trip.time, 0.0), keep, which)
-            there, time, lost = (jnp.where(wanted, *each) for each in zip(found, trip[:3], strict=True))
+            reached = advance(digits, held, x, driven, jnp.where(wanted, trip.time, 0.0), keep, which)
+            there, time, lost = (jnp.where(wanted, *each) for each in zip(reached, trip[:3], strict=True))
             far, spent = (jnp.where(turn == 0, *each) for each in ((there, trip.far), (lost, trip.spent)))
             return _Trip(there, time, lost, far, spent, wanted), None
 
@@ -309,5 +309,5 @@ def propagate_with_friction(
         state = finish(joint, state, None)
     else:
         state = jax.lax.while_loop(lambda state: jnp.any(state.pending), finish_few, joint.glide(state, whole))
-    known = state.left <= 0
-    return BodyState(jnp.where(known, state.body.x, jnp.nan), state.body.slip), state.lost, state.rubbed
+    finished = state.left <= 0
+    return BodyState(jnp.where(finished, state.body.x, jnp.nan), state.body.slip), state.lost, state.rubbed

@@ -31,11 +31,13 @@ class MotionKind(IntEnum):
     REST = 0
     """In the second half of the tail no body moves by more than 1e-9 of the largest magnitude of all positions."""
     DECAYING = 1
-    """The width decreases from each segment to the next, or is below 1 % of the earlier motion and halves."""
+    """The width decreases from each segment to the next; or, in a slow oscillation, the width of the second half of the
+    tail is below 1 % of the width before the tail and less than half that of the first half."""
     STEADY = 2
     """The position oscillates, and the width has no trend."""
     GROWING = 3
-    """The width increases from each segment to the next, or is twice that of the earlier motion and doubles."""
+    """The width increases from each segment to the next; or, in a slow oscillation, the width of the second half of the
+    tail is more than twice the width before the tail and more than twice that of the first half."""
     DIVERGED = 4
     """A body is farther than 1e100 m from the surface of the wall."""
     UNCLEAR = 5
@@ -56,10 +58,11 @@ FRAME = (
     *("velocity", "wall_force", "sticking"),
     *("energy", "wall_work", "push_work", "damping_loss", "friction_loss"),
 )
-"""Fields of `Motion` at an instant, in the order of the recorded rows, after the positions."""
+"""Fields of `Motion` with one value per recorded instant, in the order of a frame, which begins with the positions."""
 READING = ("measured", "estimated_velocity", "command", "contact")
-"""Fields of `Motion` at a sample, in the order of the recorded rows."""
+"""Fields of `Motion` with one value per sample, in the order of a reading."""
 
+# Description and SI unit of each field of `Motion` over time.
 OF_MOTION = {
     "position": ("position of the device, into the wall", "m"),
     "velocity": ("velocity of the device", "m/s"),
@@ -77,6 +80,7 @@ OF_MOTION = {
     "friction_loss": ("energy dissipated by friction", "J"),
     "energy": ("kinetic and elastic energy of all bodies", "J"),
 }
+# Description and SI unit of each field of `Motion` with one value per simulation.
 OF_WHOLE = {
     "amplitude": ("half of the peak-to-peak position in the tail", "m"),
     "trend": ("ratio of the peak-to-peak positions in the second and first half of the tail", "1"),
@@ -88,6 +92,7 @@ OF_WHOLE = {
     "outcome": ("code of the observed behavior", "1"),
     "status": ("status code", "1"),
 }
+# Fields of `Motion` that are unknown for a linear system.
 OF_ENERGY = {"wall_work", "push_work", "damping_loss", "friction_loss", "energy", "energy_given"}
 
 
@@ -247,19 +252,19 @@ def classify(summary: Any, memory: np.ndarray, tail: int) -> np.ndarray:
 
 @np.errstate(all="ignore")
 def convert_to_si(
-    found: Any, inputs: Any, dry: np.ndarray, memory: np.ndarray, bodies: tuple[str, ...], settings: Any
+    simulated: Any, inputs: Any, dry: np.ndarray, memory: np.ndarray, bodies: tuple[str, ...], settings: Any
 ) -> dict[str, np.ndarray]:
     """Return the fields of `Motion` by name, in SI units and with one row per simulation.
 
     Args:
-        found: result of `run_batch`: final state, readings and frames.
+        simulated: result of `run_batch`: final state, readings and frames.
         inputs: external inputs, including the units of time and mass in SI.
         dry: mask of the simulations with friction.
         memory: number of past samples that can affect the next command.
         bodies: fields of `Motion` with the positions of the bodies.
         settings: settings that all simulations share.
     """
-    state, readings, frames = found
+    state, readings, frames = simulated
     period, mass, instants = inputs.period, inputs.mass, inputs.instants
     summary, force = state.summary, mass / period**2
     first, second = _measure_halves(summary)

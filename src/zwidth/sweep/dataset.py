@@ -66,7 +66,7 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
     check_installed()
     import xarray
 
-    # Import here, because this module loads Zarr, which `check_installed` must have found before.
+    # Import `sweep.checked` only here, because it loads Zarr, whose absence `check_installed` reports.
     from zwidth.sweep.checked import CheckedStore
 
     checked = CheckedStore(store)

@@ -34,12 +34,12 @@ class Progress:
     """The progress of the sweeps of a run, reported after every chunk."""
 
     study: str  # name of the study of this chunk
-    chunks: int  # chunks finished so far in this run
-    total_chunks: int  # chunks to be computed in this run
-    points: int  # points finished so far in this run
-    total_points: int  # points to be computed in this run
-    rate: float  # points per second since the start
-    seconds_left: float  # remaining time at this rate; NaN before the first computed chunk
+    chunks: int  # number of chunks finished so far in this run
+    total_chunks: int  # number of chunks to be computed in this run
+    points: int  # number of points of the grids finished so far in this run
+    total_points: int  # number of points of the grids to be computed in this run
+    rate: float  # mean number of points computed per second since the start
+    seconds_left: float  # estimated remaining time in s; NaN before the first computed chunk
     error: str = ""  # error of this chunk; empty if it was computed
 
 
@@ -47,12 +47,12 @@ class Progress:
 class SweepResult:
     """The outcome of one sweep."""
 
-    store: Path  # folder of its store
-    computed: int = 0  # chunks computed by this run
-    skipped: int = 0  # chunks computed by earlier runs
-    total: int = 0  # all chunks of the sweep
-    repaired: tuple[str, ...] = ()  # damaged chunks, computed again, and restored files
-    failed: dict[str, str] = field(default_factory=dict)  # failed chunks, each with its error
+    store: Path  # path of the store of the sweep
+    computed: int = 0  # number of chunks computed by this run
+    skipped: int = 0  # number of chunks computed by earlier runs
+    total: int = 0  # number of all chunks of the sweep
+    repaired: tuple[str, ...] = ()  # names of damaged chunks, which are computed again, and of restored files
+    failed: dict[str, str] = field(default_factory=dict)  # error of each failed chunk, by name of the chunk
 
     @property
     def ok(self) -> bool:
@@ -64,9 +64,9 @@ class SweepResult:
 class Sweeps:
     """The outcome of all sweeps of one run."""
 
-    results: dict[str, SweepResult]  # by name of the study
+    results: dict[str, SweepResult]  # outcome of each sweep, by name of the study
     fatal_error: str = ""  # error that ended the run because it affects every chunk, for example a full disk
-    interrupted: bool = False  # stopped by the user with Ctrl-C
+    interrupted: bool = False  # True if the user stopped the run with Ctrl-C
     lost: str = ""  # error of the cluster that ended the run
 
 
@@ -210,7 +210,7 @@ def _collect_outcomes(
     except KeyboardInterrupt:
         sweeps.interrupted = True
     finally:
-        # Closing the generator ends the workers.
+        # Close the generator, because this ends the worker processes.
         results.close()
 
 

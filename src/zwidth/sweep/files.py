@@ -29,7 +29,7 @@ _PACKAGES = ("jax", "jaxlib", "numpy")  # packages whose version can change the 
 LOCKS = ".locks"  # name of the folder of the locks, within a folder of results
 ELSEWHERE = "choose another folder with --out DIR"  # remedy in error messages, which always helps
 LOCK_TIMEOUT = 1.0  # longest time to wait for the lock, in s, because a killed run needs some time to end
-# Error codes of file systems that do not support locks.
+# Error codes by which file systems report that they do not support locks.
 _NO_LOCKS = frozenset({errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK})
 
 
@@ -65,7 +65,7 @@ def find_existing(folder: Path) -> Path:
 
 
 def read_or_empty(path: Path) -> bytes:
-    """Return the content of a file; empty if there is no such file."""
+    """Return the content of a file; an empty content if the file does not exist."""
     with suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return path.read_bytes()
     return b""

@@ -108,7 +108,7 @@ def perform(path: str, family: str, index: int) -> None:
         block = store.plan.grid.scene_block(task.slices)
         values = compute_scenes(plan.family, plan.outputs, store.study, block)
     else:
-        # Import here, because this module loads JAX, which the parent process of workers does not need.
+        # Import `sweep.compute` only here, because it loads JAX, which the parent process of workers does not need.
         from zwidth.sweep.compute import compute_block
 
         values = compute_block(plan.family, plan.outputs, store.plan.grid.block(task.slices), store.study.accuracy)
@@ -153,7 +153,7 @@ def run_in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generat
 
 
 class _Worker:
-    """One of ``count`` worker processes, and its current job."""
+    """Worker process ``number`` of ``count``, and its current job."""
 
     def __init__(self, number: int, count: int, perform: Perform) -> None:
         self.number = number

@@ -58,7 +58,7 @@ class FamilyPlan:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """The outputs and the status of the family; each of them has one file per chunk."""
+        """Names of the outputs and of the status of the family; each of these variables has one file per chunk."""
         return (*self.outputs, STATUS_OF[self.family])
 
     @property
@@ -274,7 +274,7 @@ def _bytes_per_point(outputs: tuple[str, ...]) -> int:
 
 
 def _format_size(count: float) -> str:
-    """Return a number of bytes with a binary prefix."""
+    """Format a number of bytes as text with a binary prefix."""
     for unit in ("B", "KiB", "MiB", "GiB"):
         if count < 1024:
             return f"{count:.3g} {unit}"
@@ -283,7 +283,7 @@ def _format_size(count: float) -> str:
 
 
 def _format_time(seconds: float) -> str:
-    """Return an estimated time with its unit."""
+    """Format an estimated time in s as text with a suitable unit."""
     if seconds < _MIN_SECONDS:
         return f"less than {_MIN_SECONDS:g} s"
     for limit, unit, length in ((120, "s", 1.0), (7200, "min", 60.0), (172800, "h", 3600.0)):

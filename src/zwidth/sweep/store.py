@@ -89,7 +89,7 @@ class Store:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """Attributes of the group."""
+        """Attributes of the Zarr group, as contained in the description."""
         return self.description["attributes"]
 
     @property
@@ -150,7 +150,7 @@ class Store:
         return [task for task in self.plan.tasks() if not self.is_done(task)]
 
     def write(self, task: Task, values: Mapping[str, np.ndarray]) -> None:
-        """Write all variables of a chunk, the status last."""
+        """Write the values of all variables of a chunk, those of the status last."""
         shape = tuple(part.stop - part.start for part in task.slices)
         with silence_zarr():
             for name, file in zip(task.plan.variables, self.files(task), strict=True):
