@@ -103,7 +103,7 @@ def find_family(data: xarray.Dataset) -> tuple[str, str] | None:
 
 @draws_tables
 def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, edges: Edges | None = None) -> np.ndarray:
-    """Draw the stability boundaries of many devices into one panel, with panels for a further parameter.
+    """Draw families of stability boundaries, one curve per device, with one panel per value of a further parameter.
 
     Args:
         data: Results of a sweep over walls and devices as returned by `zwidth.open_dataset`, or a part of them.

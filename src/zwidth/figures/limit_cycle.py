@@ -66,7 +66,7 @@ def draw_limit_cycles(
     for k, (ax, label) in enumerate(zip(panels, labels, strict=False)):
         x, y = arrays[across] * scales[across][0], arrays[along] * scales[along][0]
         if beyond[k].any():
-            # Hatch the whole panel below the colored cells, so that the hatching is visible only between them.
+            # Hatch the whole panel before drawing colored cells, which cover the hatching except for large amplitudes.
             ax.fill_between([x.min(), x.max()], y.min(), y.max(), **_BEYOND, zorder=0.5)
         shown = np.where(beyond[k], np.nan, np.maximum(arrays["amplitude_m"][k], 1e-300)) * factor
         look: dict[str, Any] = {"shading": "nearest", "rasterized": True, "zorder": 1}

@@ -223,7 +223,7 @@ def _mark_walls(
         ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
         middle = float(np.max(kinds["stiffest"][2]))
         for x, y, frequency in zip(K, B, selected["frequency_Hz"], strict=True):
-            # Write the frequency outside the region of stable walls.
+            # Write the frequency of an onset outside the region of stable walls, where the background is white.
             place = (11, -10) if y < middle else (11, 5)
             ax.annotate(f"{frequency:.3g} Hz", (x, y), xytext=place, color=style.VERMILION, **_TEXT)
         handles.append(style.line("onset of instability, with frequency", "", **look))

@@ -21,12 +21,12 @@ from zwidth.figures.table import Table, curves, draws_tables
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}  # mark of the settling time
 _ZERO_ORDER_HOLD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}  # line of the sampled wall force
-# If a motion grows without bound, the limit of the axis, relative to the largest value of the smallest motion.
+# Limit of an axis if a motion grows without bound, as a multiple of the largest value of the smallest motion.
 _CLIP = 8.0
 # A motion grows without bound if the largest value in the last quarter of its time exceeds the largest value before by
 # this factor. It must be above 4/3, the ratio for a motion of constant velocity.
 _GROWTH = 1.5
-# If all motions leave the wall, the length of the time axis, relative to the end of the last contact.
+# Length of the time axis if all motions leave the wall, as a multiple of the time at which the last contact ends.
 _WINDOW = 3.0
 _MAX_PANELS = 6  # largest number of motions in a figure of energies; if there are more, evenly spaced ones are drawn
 # Legend entry, color and line style of each energy.
@@ -88,7 +88,7 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
     """Draw the position of each step response over time; return the scaling factor and the unit of the time axis.
 
-    They are 1 and "" if the table is normalized.
+    The factor is 1 and the unit "" if the table is normalized.
     """
     responses, physical = _read_responses(table), "time_s" in table
     clock, unit, factor, length = 1.0, "", 1.0, ""

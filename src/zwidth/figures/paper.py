@@ -44,7 +44,7 @@ def _list_curves(table: Table, **wanted: object) -> list[Any]:
 
 @draws_tables
 def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
-    """Draw the interval of virtual damping beta that is stable for alpha -> 0 over delta, shaded.
+    """Draw over delta the interval of virtual damping beta that is stable for alpha -> 0, and shade it.
 
     Solid lines are for exact delays, dashed ones for the paper's fractional power, dash-dotted ones for the passivity
     condition. The lower bound ``beta = -delta`` is the same for all delays.
@@ -167,8 +167,8 @@ def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -
     """Draw alpha_max/delta over delta with its limit g(d) for large delta, and g over the delay d.
 
     Args:
-        table: Columns of a ridge study: d, delta, alpha_max; of a study of kind paper_fig10, only curves of the exact
-            delay are drawn.
+        table: Columns of a ridge study: d, delta, alpha_max. If it is the table of a study of kind paper_fig10, only
+            its curves for the exact delay are drawn.
         slopes: Columns d and slope, the limit g(d), over a range of delays that includes those of ``table``.
         axes: An existing Axes for the first panel only, or two.
     """

@@ -160,7 +160,7 @@ def recommendation(
         response: Columns of a step study of this wall, in SI units. Default: computed at the samples.
     """
     scene, verdict, recommended = found.scene, found.verdict, found.as_dict()["recommended"]
-    # A measured device has no response, because it has no model from which the response could be computed.
+    # Leave out the response of a measured device, because no model exists from which it could be computed.
     has_model = not isinstance(scene.device, MeasuredDevice)
     if axes is None:
         axes = (

@@ -219,8 +219,8 @@ class _Run:
     Args:
         config: The configuration.
         record: The record of the run.
-        inputs: The inputs of each study, by its name, as recorded.
-        report: Called with every event.
+        inputs: Inputs of each study for the record, by name of the study.
+        report: Function that is called with every event.
         total: Number of studies.
     """
 

@@ -28,10 +28,11 @@ from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
 from zwidth.words.unit_system import LINEAR, UnitSystem
 from zwidth.words.xp import compute_concretely, is_traced
 
-# Memory estimate of one call of `simulate`, in bytes.
-RECORDED_BYTES = 2 * 14 * 8  # per recorded instant: about 14 float64 values, held twice during conversion to SI units
-JITTER_BYTES = 20 * 8  # per instant, for the durations between jittered samples; only for simulations that are running
-DRAWN_BYTES = 4 * 8  # per period, for noise and again for external forces; only for simulations that are running
+# Estimated memory of one call of `simulate`, in bytes. JITTER_BYTES and DRAWN_BYTES count only for the simulations that
+# run at the same time.
+RECORDED_BYTES = 2 * 14 * 8  # memory per recorded instant: 14 float64 values, twice for the conversion to SI units
+JITTER_BYTES = 20 * 8  # memory per instant for the durations between jittered samples
+DRAWN_BYTES = 4 * 8  # memory per period for noise, and again for external forces
 MOST_BYTES = 4 << 30  # largest estimate that is accepted: 4 GiB
 
 STARTS = ("start_position", "start_velocity")  # arguments with one initial value per body
@@ -70,9 +71,9 @@ def find_system(scenes: list[Any]) -> UnitSystem:
 
 
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments with one initial position and velocity per body, named "start_position.tip_position" etc.
+    """Return the arguments with one initial position and velocity per body, such as "start_position.tip_position".
 
-    A body for which the user specifies no initial value starts at that of the device.
+    A body for which the user specifies no initial value has that of the device.
     """
     bodies = dict.fromkeys(["position", *(name for scene in scenes for name in name_bodies(scene))])
     for name in STARTS:

@@ -193,7 +193,9 @@ def build_batch(
 
 
 def draw_noise(seeds: np.ndarray, sizes: np.ndarray, periods: int) -> np.ndarray | None:
-    """Draw the errors of the measured positions in m; equal seeds yield equal errors up to their standard deviation.
+    """Draw the errors of the measured positions in m from normal distributions.
+
+    Simulations with equal seeds have the same sequence of errors, scaled by their standard deviations.
 
     Args:
         seeds: seed of each simulation.

@@ -283,7 +283,7 @@ def _simulate_period(
     """
     controller, reading = control(params, options, state.controller, inputs.k, state.body.x[0] + inputs.noise)
     # List the commands that may act before the next sample, in the order in which they take effect, by their age: the
-    # number of samples that they precede the latest command whose integer delay has passed.
+    # number of samples by which a command precedes that of sample k - late, where late is the integer delay.
     ages = {1: (0,), 2: (1, 0), 4: (2, 1, 0, -1)}[options.pieces]
     forces = [look_back(controller.commands, inputs.k, params.late + age) for age in ages]
     durations = inputs.durations if options.jitter else params.durations

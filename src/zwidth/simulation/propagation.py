@@ -163,7 +163,8 @@ class _Joint(NamedTuple):
             stopped: mask of the batch entries whose first body has stopped; the others are left unchanged.
         """
         push = self.pressed(x)
-        # Set the velocity of the first body to exactly 0 by an impulse on it, because a rounding error remains.
+        # Set the velocity of the first body to exactly 0 by an impulse on it, because the search for the event leaves a
+        # rounding error.
         x = jnp.where(stopped, x - self.rate[:, -1] * self.speed(x), x)
         return BodyState(x, jnp.where(stopped, jnp.where(jnp.abs(push) > self.static, jnp.sign(push), 0.0), slip))
 

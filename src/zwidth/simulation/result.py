@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class MotionKind(IntEnum):
-    """Observed behavior of a motion in the tail of its simulation; no statement on later times.
+    """Observed behavior of a motion in the tail of its simulation, which implies nothing about later times.
 
     The tail is divided into six equal segments. The width of a segment is the peak-to-peak position of the device
     (docs/theory/simulation.md, T7).
@@ -121,8 +121,9 @@ class Motion:
 
     Attributes:
         time: instants in s, ``substeps`` per period, the first 0; one axis if all simulations share the period.
-        position, velocity: of the device, the body that the forces act on, in m and m/s; positive into the wall.
-        tip_position, hand_position: of the bodies at the far ends of a coupling and of a grasp; None without.
+        position, velocity: motion of the device, the body that the forces act on, in m and m/s; positive into the wall.
+        tip_position, hand_position: positions of the bodies at the far ends of a coupling and of a grasp, in m; None
+            if there is no such body.
         wall_force: force of the wall from the instant on, in N; with an actuator, its commanded force.
         sticking: True if friction holds the device.
         measured, estimated_velocity, command, contact: result of the control program at each sample.

@@ -154,7 +154,7 @@ def simulate(
                 results[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
             results[name][indices] = column
     for column in results.values():
-        # Discard the motions of simulations with invalid arguments, because these were simulated with 0 instead.
+        # Discard the motions of simulations with invalid arguments, because 0 replaced these arguments.
         column[~good] = _missing(column.dtype)
     results["status"][~good] = Status.INVALID_INPUT
     results["outcome"][~good] = MotionKind.INVALID
@@ -174,7 +174,7 @@ def _build_time(distinct: list[Any], which: np.ndarray, steps: np.ndarray, drawn
         distinct: distinct scenes.
         which: index of the scene of each simulation.
         steps: recorded instants in sampling periods.
-        drawn: instants of the simulations with jitter in s, NaN for the others; None without any jitter.
+        drawn: instants of the simulations with jitter in s, NaN for the others; None if no simulation has jitter.
     """
     clock = np.array([float(scene.timing.period) for scene in distinct])
     if drawn is None and len(set(clock.tolist())) == 1:

@@ -41,7 +41,7 @@ class _MissingFolderError(InputError):
 
 @contextmanager
 def connect(address: str) -> Iterator[Client]:
-    """Connect to a scheduler for the duration of the block; raise `InputError` if it does not reply."""
+    """Connect to a scheduler within the context; raise `InputError` if the scheduler does not reply."""
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
@@ -63,7 +63,7 @@ def connect(address: str) -> Iterator[Client]:
 
 @contextmanager
 def _silence_logs() -> Iterator[None]:
-    """Remove the log handlers of distributed that write to the terminal, because zwidth reports its errors itself."""
+    """Silence the log messages of distributed in the terminal within the context, because zwidth reports its errors."""
     names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in ("distributed", "tornado")]
     terminal = (sys.stderr, sys.__stderr__)
     before = {logging.getLogger(name): logging.getLogger(name).handlers for name in (*names, "asyncio")}
@@ -80,8 +80,8 @@ def _silence_logs() -> Iterator[None]:
 
 def run_on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[Finished]:
     """Run jobs on the workers of a cluster and yield their outcomes, in the order of completion."""
-    # Run a job whose worker died again at the end, alone, before reporting a failure. dask abandons a job after several
-    # deaths of its worker, even if another job on the same worker was the cause.
+    # Repeat the jobs whose workers died, one at a time after all others, before reporting a failure, because dask
+    # abandons a job after several deaths of its worker even if another job on the same worker was the cause.
     given_up = []
     for finished in _submit_jobs(client, jobs, perform):
         if finished.error.startswith(_KILLED):

@@ -65,7 +65,7 @@ def find_existing(folder: Path) -> Path:
 
 
 def read_or_empty(path: Path) -> bytes:
-    """Return the content of a file; an empty content if the file does not exist."""
+    """Return the content of a file, or empty bytes if the file does not exist."""
     with suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return path.read_bytes()
     return b""
@@ -87,7 +87,7 @@ def list_versions(*more: str) -> dict[str, str]:
 
 
 def list_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield the differences of two JSON values: dotted path, old value and new value; an absent value is None."""
+    """Yield each difference between two JSON values as dotted path, old value and new value (None if absent)."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys((*old, *new)):
             yield from list_differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
@@ -101,7 +101,7 @@ def list_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
     """Create a folder of results if missing and lock it; raise `StoreBusyError` if another run holds the lock."""
-    # Import here, because loading filelock takes longer than many commands that import this module.
+    # Import filelock only here, because loading it takes longer than many commands that import this module.
     from filelock import FileLock, Timeout
 
     check_folder(folder)

@@ -123,7 +123,7 @@ class Grid:
     def block(self, slices: tuple[slice, ...]) -> Block:
         """Return a block with normalized parameters, including the walls of the whole grid.
 
-        ``slices`` is that of `scene_block`.
+        ``slices`` has the same meaning as for `scene_block`.
         """
         alphas = betas = slice(0, 1)
         if len(slices) == len(self.dims):

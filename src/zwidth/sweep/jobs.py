@@ -46,7 +46,10 @@ _STOP_TIMEOUT = 3.0  # longest time in s for a worker to end by itself, after wh
 
 
 class LostSchedulerError(ZwidthError):
-    """Error if the cluster is lost during a run; its message continues a sentence that begins with the address."""
+    """Error if the cluster is lost during a run.
+
+    Its message continues a sentence that begins with the address of the scheduler.
+    """
 
 
 class Job(NamedTuple):
