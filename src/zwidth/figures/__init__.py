@@ -1,10 +1,10 @@
-"""Figures in matplotlib: each function draws a table or a dataset and returns the Axes.
+"""Draw figures in matplotlib: each function draws a table or a dataset and returns the Axes.
 
-A function draws into existing Axes if they are passed, otherwise into a new figure, which pyplot does not manage.
-Functions change no global settings of matplotlib; modules are loaded on first use and do not import JAX. `draw_plane`,
-`draw_curves` and `draw_outlines` take the dataset of a sweep as returned by `zwidth.open_dataset`, or a part of it. The
-other functions take the table of a study, as in its CSV file, or for maps and limit cycles the arrays of its npz file.
-``help(zwidth.figures)`` lists all functions.
+A function draws into existing Axes if they are passed, otherwise into a new figure that pyplot does not manage. No
+function changes the global settings of matplotlib. Modules are loaded on first use and do not import JAX. `draw_plane`,
+`draw_curves` and `draw_outlines` draw the dataset of a sweep as returned by `zwidth.open_dataset`, or a part of it. The
+other functions draw the table of a study, as in its CSV file; those for maps and limit cycles draw the arrays of its
+npz file. ``help(zwidth.figures)`` lists all functions.
 
 Example:
     >>> import numpy as np, zwidth

@@ -1,6 +1,7 @@
 """Draw outputs of a sweep over one parameter, and stability boundaries of many devices in one panel.
 
-A *family* of curves shows one curve per value of a further parameter.
+A *panel* is one Axes of a figure. The *family* of curves in a panel has one curve per value of a further parameter.
+*Edges* are the exact boundaries of the stable walls (`figures.plane`).
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from zwidth.words.quantities import OUTPUTS, VARIABLES, WALL
 if TYPE_CHECKING:
     import xarray
 
-_LEGEND_LETTERS = 56  # letters of labels that fit into one row of the legend
-_MAX_CURVES = 9  # curves per panel, because more cannot be distinguished; of more, evenly spaced ones are drawn
+_LEGEND_LETTERS = 56  # number of letters that fit into one row of the legend
+_MAX_CURVES = 9  # largest number of curves per panel that can be distinguished; more are thinned evenly
 
 
 @draws_tables
@@ -36,11 +37,12 @@ def draw_curves(
 
     Args:
         data: Results of a sweep as returned by `zwidth.open_dataset`, or a part of them.
-        name: Name of the output, which must be a number.
+        name: Name of an output with numeric values.
         axes: Existing Axes, at most one per panel.
-        x: Parameter of the horizontal axis; by default the one with more values among the first two that vary.
-        hue: Parameter with one curve per value.
-        col: Parameter with one panel per value; further parameters then have their first value.
+        x: Parameter of the horizontal axis; by default, of the first two parameters that vary the one with more values.
+        hue: Parameter of the family of curves.
+        col: Parameter with one panel per value. If it is set, all parameters other than these three have their first
+            value.
     """
     output, data = OUTPUTS[name], grid.prepare(data, [name])
     dims = grid.choose_axes(data, name, x, but=(hue, col))
@@ -59,7 +61,7 @@ def draw_curves(
     for part, ax in zip(parts, panels, strict=False):
         curves = [part.isel({several[0]: k}) for k in picked] if several else [part]
         values_of_curves = np.stack([curve[name].values for curve in curves])
-        # Leave out values that are not positive on a logarithmic axis, such as delay margins of unstable walls.
+        # On a logarithmic axis, leave out values that are not positive, such as delay margins of unstable walls.
         shown = np.where(
             np.isfinite(values_of_curves) & ((values_of_curves > 0) | (not output.logarithmic)),
             values_of_curves,
@@ -87,9 +89,10 @@ def draw_curves(
 
 
 def find_family(data: xarray.Dataset) -> tuple[str, str] | None:
-    """Return the output whose contours are stability boundaries of walls, and the parameter of the family of them.
+    """Return the output to draw as a family of stability boundaries, and the parameter of this family.
 
-    None if the data contain no boundaries of several devices.
+    The boundaries are contours of the output over stiffness and damping. Return None if the data do not contain the
+    boundaries of several devices.
     """
     planes = {name: grid.choose_axes(data, name) for name in (*SMOOTH, "stable") if name in data}
     name = next((name for name, axes in planes.items() if len(axes) == 2 and axes[1] in WALL), None)
@@ -100,7 +103,7 @@ def find_family(data: xarray.Dataset) -> tuple[str, str] | None:
 
 @draws_tables
 def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, edges: Edges | None = None) -> np.ndarray:
-    """Draw the stability boundaries of many devices into one panel, with panels for a further parameter.
+    """Draw families of stability boundaries, one curve per device, with one panel per value of a further parameter.
 
     Args:
         data: Results of a sweep over walls and devices as returned by `zwidth.open_dataset`, or a part of them.
@@ -132,9 +135,10 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
 
 
 def _list_looks(family: str, count: int) -> list[dict[str, Any]]:
-    """Return color and line style of each curve: colors ordered by value, and for devices also line styles.
+    """Return color and line style of each of ``count`` curves.
 
-    ``family`` is the parameter with one curve per value. Devices have no order, so their line styles differ as well.
+    The colors of curves are ordered by the value of the parameter ``family``. Devices have no order; their curves
+    differ in color and in line style.
     """
     if family == "device":
         return [style.look(k) for k in range(count)]
@@ -144,7 +148,15 @@ def _list_looks(family: str, count: int) -> list[dict[str, Any]]:
 def _add_legend(
     axes: np.ndarray, names: list[str], looks: list[dict[str, Any]], *, outside: bool, title: str | None = None
 ) -> None:
-    """Add a legend with name, color and line style of each curve, above the panels or in the first one."""
+    """Add a legend of the curves.
+
+    Args:
+        axes: The panels.
+        names: Name of each curve; curves with an empty name get no entry.
+        looks: Color and line style of each curve.
+        outside: Place the legend above the panels instead of in the first one.
+        title: Title of the legend.
+    """
     longest = max(10 if "$" in name else len(name) for name in names)
     columns = max(1, min(len(names), 6, _LEGEND_LETTERS // max(longest, 1)))
     handles = [

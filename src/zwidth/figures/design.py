@@ -1,6 +1,9 @@
 """Draw design aids: maximum stiffness with different velocity filters, and over the parameter to be designed.
 
-b is the physical damping of the device, K_max the stiffness of its stiffest stable wall.
+b is the physical damping of the device, K_max the stiffness of its stiffest stable wall. A *filters study* computes
+K_max and the velocity noise for velocity estimates of several *kinds*: low-pass filters, differences over windows, and
+the one-sample difference. A *design study* computes the value of one parameter of the device at which K_max reaches a
+*required* stiffness times a *reserve* (a safety factor).
 """
 
 from __future__ import annotations
@@ -16,9 +19,9 @@ from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, in_order, sele
 from zwidth.words.formatting import ENOUGH, count_digits_apart, header, round_safely, spell_enough, with_unit
 from zwidth.words.quantities import PARAMETERS
 
-_STIFFNESS = SI_COLUMNS[0]  # column of K_max
-_NOISE = "velocity_noise_m_per_s"  # column of the velocity noise
-# Column and axis label of the parameter of each kind of filter.
+_STIFFNESS = SI_COLUMNS[0]  # name of the column of K_max
+_NOISE = "velocity_noise_m_per_s"  # name of the column of the velocity noise
+# Column and axis label of the parameter of each kind of filter, over which K_max is drawn.
 _OVER = {
     "low_pass": ("cutoff_Hz", "cut-off of the low-pass  $f_c$  in Hz"),
     "windowed_difference": ("samples", "length of the window  $n$  in periods"),
@@ -98,7 +101,7 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
 
 
 def _scale(table: Table) -> tuple[dict[float, Any], float, str]:
-    """Return the color of each damping, and factor and label of the stiffness axis."""
+    """Return the color of each physical damping, and the scaling factor and the label of the stiffness axis."""
     factor, unit = style.si_unit(table[_STIFFNESS], "N/m")
     words = f"maximum stable stiffness  $K_{{\\max}}$  in {unit}"
     return style.color_by_value(table["damping_N_s_per_m"]), factor, words
@@ -110,9 +113,13 @@ def _name_damping(damping: float) -> str:
 
 
 def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) -> str:
-    """Mark the stiffest wall within the noise limit; return its filter and stiffness for the legend.
+    """Mark the stiffest wall within the noise limit, and return its filter and stiffness as text for the legend.
 
-    ``factors`` scale noise and stiffness to the units of the axes.
+    Args:
+        ax: Axes to draw into.
+        rows: Rows of the table to mark, at most one.
+        color: Color of the mark.
+        factors: Factors from SI units to the units of the axes, for noise and stiffness.
     """
     text = ""
     for row in zip(*(rows[name] for name in (_NOISE, _STIFFNESS, "cutoff_Hz", "samples")), strict=True):
@@ -125,7 +132,7 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) 
 
 
 def _dots(rows: Table) -> dict[str, Any]:
-    """Return line properties that mark each point with a dot if there are few."""
+    """Return line properties that mark each point with a dot if there are few points; {} otherwise."""
     return {"marker": "o", "markersize": 3.5} if len(rows[_STIFFNESS]) <= 24 else {}
 
 
@@ -135,8 +142,8 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
 
     Args:
         curve: Columns parameter, value with its unit (such as ``value_Hz``), stiffness_N_per_m.
-        required: Columns of a design study: stiffness_N_per_m, reserve, present, value and other_crossings with their
-            unit, enough, and with tolerances stable_share.
+        required: Columns of a design study: stiffness_N_per_m, reserve; present, value and other_crossings with the
+            unit of the parameter in their names; enough; and with tolerances stable_share.
         axes: An existing Axes.
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 3.8)
@@ -161,7 +168,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     for target, value, enough, others in zip(targets, *columns, strict=True):
         all_known = enough in ENOUGH
         _mark_required(ax, curve_drawn, target * factor, value * scale if all_known else np.nan, colors[target])
-        # A design study writes the other crossings as quantities separated by semicolons.
+        # Split the column other_crossings, in which quantities are separated by semicolons.
         crossings = [float(each.split()[0]) for each in str(others).split("; ") if each]
         name = spell_enough(float(value), enough, crossings, style.units()[parameter.unit], 3) if all_known else ""
         names.append(name.replace("g cm^2", style.write_unit("g cm^2")))
@@ -173,7 +180,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
         xlabel=f"{parameter.label_in(style.units())}  in {value_unit}",
         ylabel=f"maximum stable stiffness  $K_{{\\max}}$  in {unit}",
     )
-    # Write the values to the right of the panel, because next to its dot a value would cover the line of the next one.
+    # Write the required values to the right of the panel, because next to their dots they would cover the dashed lines.
     style.name_heights(ax, names, (targets * factor).tolist(), [colors[target] for target in targets])
     entries = _name_targets(required, factor, unit)
     handles = [style.line(words, style.DASHED, color=colors[target]) for target, words in entries]
@@ -185,22 +192,27 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
 
 
 def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[float, str]]:
-    """Yield the height and the legend entry of each dashed line.
+    """Yield the height in N/m and the legend entry of the dashed line of each required stiffness.
 
-    The entry states the required stiffness, its reserve, and with tolerances the share of devices stable with it.
+    The entry states the required stiffness, its reserve, and with tolerances the percentage of stable devices.
+
+    Args:
+        required: Columns of a design study.
+        factor: Factor from N/m to the unit of the axis.
+        unit: Unit of the axis.
     """
     with_shares = "stable_share" in required
     shares = required["stable_share"] if with_shares else np.full(len(required["reserve"]), np.nan)
     digits = count_digits_apart(np.asarray(required[SI_COLUMNS[0]]).tolist(), 3)
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
         words = f"{wanted * factor:.{digits}g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
-        # Round down, so that 100 % is never printed if a single device is unstable.
+        # Round down, because 100 % must not be printed if even one device is unstable.
         percent = f"{round_safely(100.0 * share, 'below', 3):.3g}"
         yield wanted * reserve, words + (f": stable on {percent} % of devices" if np.isfinite(share) else "")
 
 
 def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, color: Any) -> None:
-    """Mark a required stiffness, the values of the parameter at which K_max is sufficient, and the required value.
+    """Draw a required stiffness as a line, and mark the values of the parameter at which K_max reaches it.
 
     Args:
         ax: Axes of the curve.

@@ -1,7 +1,10 @@
 """Draw limit cycles of walls: amplitude over two parameters, and amplitude and frequency over one parameter.
 
-A *condition* is a set of simulation conditions, such as friction and encoder, with one panel or column of panels each.
-Motions with an amplitude below the lower bound count as at rest; above the upper bound they are not drawn.
+A *condition* is a set of simulation conditions, such as friction and encoder resolution; each condition has its own
+panel, or column of panels. Each point of a figure is a wall whose simulated motion has an amplitude. The *bounds* are
+the smallest and the largest amplitude that counts as a limit cycle. Below them the motion counts as at rest; above
+them it is not drawn as a limit cycle (in the plane of two parameters such points are hatched). *Edges* are the
+stability boundary of the linear theory.
 """
 
 from __future__ import annotations
@@ -22,15 +25,15 @@ from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import count_digits_apart, header, spell_short
 from zwidth.words.quantities import FIELDS
 
-# Parameters that may be an axis of these figures, by name of the column.
+# Parameters that may be an axis of the figures, by the name of their array.
 AXES = {
     header(name, FIELDS[name].unit): FIELDS[name] for name in ("stiffness", "virtual_damping", "resolution", "coulomb")
 }
-_MAX_DOTS = 12  # points of a curve up to which each is drawn as a large dot
-_CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
-# Look of points with an amplitude above the upper bound.
+_MAX_DOTS = 12  # largest number of points of a curve for which each point is drawn as a large dot
+_CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")  # names of the arrays with one value per wall
+# Colors and hatching of walls with an amplitude above the upper bound.
 _BEYOND: dict[str, Any] = {"facecolor": grid.MISSING, "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
-_PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
+_PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # formatter of tick labels without powers of ten
 
 
 @draws_tables
@@ -39,7 +42,7 @@ def draw_limit_cycles(
 ) -> np.ndarray:
     """Draw the amplitude of limit cycles over two parameters, one panel per condition.
 
-    White: at rest. Hatched: amplitude above the upper bound. Line: stability boundary of the linear theory.
+    White marks walls at rest, hatching amplitudes above the upper bound, a line the boundary of the linear theory.
 
     Args:
         arrays: Arrays of the npz file of a limit_cycle study.
@@ -63,7 +66,7 @@ def draw_limit_cycles(
     for k, (ax, label) in enumerate(zip(panels, labels, strict=False)):
         x, y = arrays[across] * scales[across][0], arrays[along] * scales[along][0]
         if beyond[k].any():
-            # Hatch the whole panel first. The hatching remains visible where no cells are drawn above it.
+            # Hatch the whole panel before drawing colored cells, which cover the hatching except for large amplitudes.
             ax.fill_between([x.min(), x.max()], y.min(), y.max(), **_BEYOND, zorder=0.5)
         shown = np.where(beyond[k], np.nan, np.maximum(arrays["amplitude_m"][k], 1e-300)) * factor
         look: dict[str, Any] = {"shading": "nearest", "rasterized": True, "zorder": 1}
@@ -92,7 +95,7 @@ def draw_limit_cycles(
 
 
 def _find_beyond(arrays: Mapping[str, np.ndarray], bounds: tuple[float, float]) -> np.ndarray:
-    """Return which motions diverge, or have no amplitude or one above the upper bound."""
+    """Return a mask of the motions that diverge, have no amplitude, or have an amplitude above the upper bound."""
     return (arrays["outcome"] == MotionKind.DIVERGED) | ~(arrays["amplitude_m"] <= bounds[1])
 
 
@@ -104,16 +107,16 @@ def draw_limit_cycle_curves(
     family: str = "",
     axes: style.AnyAxes | None = None,
 ) -> np.ndarray:
-    """Draw amplitude (above) and frequency (below) of limit cycles over one parameter, one column per condition.
+    """Draw amplitude (top) and frequency (bottom) of limit cycles over one parameter, one column per condition.
 
-    Gap in a curve: at rest, or amplitude above the upper bound. Text in a panel: curves without any limit cycle.
-    Vertical line: stability boundary of the linear theory.
+    A curve has a gap where the motion is at rest or its amplitude exceeds the upper bound. A text in a panel names the
+    curves without any limit cycle. A vertical line marks the stability boundary of the linear theory.
 
     Args:
         arrays: Arrays of the npz file of a limit_cycle study.
         edges: Columns condition, number and the parameter; empty if there is no linear boundary.
         bounds: Smallest and largest amplitude counted as a limit cycle, in m.
-        family: Column of the parameter with one curve per value; "" if there is none.
+        family: Name of the array of a second parameter, with one curve per value; "" if there is none.
         axes: Existing Axes, those of the amplitudes first.
     """
     names = [name for name in AXES if name in arrays]
@@ -123,7 +126,7 @@ def draw_limit_cycle_curves(
     size = (max(1.0 + 2.7 * len(labels), 5.8), 4.8)
     panels = style.panels(axes, 2 * len(labels), *size, len(labels), sharex=True, sharey="row")
     scale, unit = style.si_unit(arrays[over], AXES[over].unit)
-    # Arrange the arrays as (condition, curve, point).
+    # Arrange all arrays with the axes condition, curve and point of the curve.
     grids = {name: arrays[name] if family else arrays[name][:, None] for name in _CYCLES}
     cycles = {name: values.swapaxes(1, 2) if names[-1] == family else values for name, values in grids.items()}
     oscillating = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
@@ -132,7 +135,7 @@ def draw_limit_cycle_curves(
     amplitudes = cycles["amplitude_m"][oscillating] * factor
     quantities = (("amplitude_m", factor, f"amplitude  in {meter}"), ("frequency_Hz", 1.0, "frequency  in Hz"))
     looks = _list_looks(arrays, family, cycles["linearly_stable"])
-    # Draw dots as well as lines, because a limit cycle between two points without one has no line.
+    # Draw dots in addition to lines, because a single limit cycle between two walls at rest has no line.
     dots = {"marker": "o", "markersize": 3.5 if arrays[over].size <= _MAX_DOTS else 1.25, "clip_on": False}
     largest = spell_short(bounds[1], style.units()["m"])
     for row, (name, scaling, words) in enumerate(quantities):
@@ -160,13 +163,13 @@ def draw_limit_cycle_curves(
 
 
 def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest: np.ndarray, widest: str) -> None:
-    """Write into a panel which curves have no limit cycle, with the reason.
+    """Write into a panel the labels of the curves without any limit cycle, with the reason.
 
     Args:
         ax: Axes of the panel.
-        looks: Look and label of each curve.
-        cycles: Whether each point of each curve is a limit cycle.
-        rest: Whether each point of each curve is at rest.
+        looks: Line properties and label of each curve.
+        cycles: Mask of the points that are limit cycles, of shape (curve, point).
+        rest: Mask of the points at rest, of shape (curve, point).
         widest: Upper bound of the amplitude, as text.
     """
     reasons: dict[str, list[str]] = {}
@@ -189,7 +192,15 @@ def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest
 
 
 def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarray) -> list[dict[str, Any]]:
-    """Return line properties and label of each curve; the label states its value, and if all its walls are unstable."""
+    """Return line properties and label of each curve.
+
+    The label states the value of the parameter, and whether all walls of the curve are unstable.
+
+    Args:
+        arrays: Arrays of the npz file of a limit_cycle study.
+        family: Name of the array of the parameter with one curve per value; "" if there is none.
+        stable: Mask of the walls that are stable by the linear theory, of shape (condition, curve, point).
+    """
     if not family:
         return [{**style.look(0), "label": "limit cycle"}]
     values, parameter = arrays[family], AXES[family]

@@ -1,7 +1,9 @@
-"""Draw what is identified from measurements: a fitted device with its stability boundary, and a measured response.
+"""Draw results of identification: a fitted device with its stability boundary, and a measured frequency response.
 
-An *onset of instability* is a wall at which the operator observed the beginning of a limit cycle; the columns and
-kinds of the tables call such walls "buzzing". The *set* wall is the one recommended for use on the device.
+A device is fitted either to *logs*, recorded motions, or to *onsets of instability*, walls at which the operator
+observed the beginning of a limit cycle. Tables call such walls "buzzing", and the wall that is recommended for use
+"set". Columns of tables are named as in the CSV files of fit studies. K and B are the stiffness and the virtual damping
+of a wall, G the measured response from force to position, L the open loop with a wall.
 """
 
 from __future__ import annotations
@@ -17,13 +19,14 @@ from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select
 from zwidth.words.formatting import round_safely
 
-_MAX_SAMPLES = 4000  # samples drawn per panel; of longer logs every n-th
-_TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder": 6}
-_DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}
-_LOW = "stiffness_low_N_per_m"  # column of the lower end of the 95 % band
-_HIGH = "stiffness_high_N_per_m"  # column of its upper end
-_FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))  # line, band and dash per fit
-_ROWS = ("position", "residuals", "autocorrelation", "walls")
+_MAX_SAMPLES = 4000  # largest number of samples drawn per panel; longer logs are thinned evenly
+_TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder": 6}  # properties of texts at walls
+_DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}  # dots of residuals
+_LOW = "stiffness_low_N_per_m"  # name of the column with the lower end of the 95 % band of the boundary
+_HIGH = "stiffness_high_N_per_m"  # name of the column with the upper end of the 95 % band of the boundary
+# Color of the boundary, color of its band, and line style, for the first and for the second fit.
+_FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))
+_ROWS = ("position", "residuals", "autocorrelation", "walls")  # names of the panels on the left, from top to bottom
 
 
 @draws_tables
@@ -70,7 +73,7 @@ def draw_device_fit(
 
 
 def _make_panels(axes: style.AnyAxes | None, rows: int) -> Any:
-    """Return the given Axes, or ``rows`` panels below each other and a high one to the right of them."""
+    """Return the given Axes, or those of a new figure: ``rows`` panels on the left and one panel on the right."""
     if axes is not None:
         return np.asarray(axes, dtype=object).ravel()[: rows + 1]
     figure, _ = style.new_figure(8.8, max(3.6, 1.55 * rows + 0.7))
@@ -81,7 +84,13 @@ def _make_panels(axes: style.AnyAxes | None, rows: int) -> Any:
 
 
 def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
-    """Draw the positions and the residuals of the first log."""
+    """Draw measured and modelled position, and the residuals, of the first log.
+
+    Args:
+        panels: Axes by name; "position" and "residuals" are optional.
+        motion: Columns log, time, position, modelled and residual.
+        step: Encoder step, drawn with the residuals; 0 for none.
+    """
     logs = np.asarray(motion["log"])
     first = select(motion, log=logs[0])
     thin = slice(None, None, max(1, -(-logs[logs == logs[0]].size // _MAX_SAMPLES)))
@@ -128,7 +137,7 @@ def _draw_correlation(ax: Axes, correlation: Table) -> None:
 
 
 def _put_above(ax: Axes, handles: Any = None) -> None:
-    """Add a legend in one row above the panel, to the right of its letter."""
+    """Add a legend in one row above a panel, to the right of its title; by default with the labeled lines."""
     entries = handles or ax.get_legend_handles_labels()[0]
     place = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "borderaxespad": 0.0}
     ax.legend(handles=entries, ncols=len(entries), columnspacing=1.2, **place)
@@ -163,17 +172,17 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
         K, low, up = (columns[name] * to_spring for name in (SI_COLUMNS[0], _LOW, _HIGH))
         B = columns[SI_COLUMNS[1]] * to_damper
         ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {source}")
-        # Draw the part of the boundary with K > 0, and one point beyond each of its ends, where it meets K = 0.
+        # Draw the part of the boundary with K > 0, and one more point at each end, so that it reaches the line K = 0.
         ends = np.flatnonzero(K > 0)
         shown = slice(max(int(ends[0]) - 1, 0), int(ends[-1]) + 2) if ends.size else slice(0)
         ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)
         ax.plot(K[shown], B[shown], color=color, linestyle=dash, label=f"boundary, {source}", zorder=3)
         handles.append(style.line(f"boundary with its 95 % band, {source}", dash, color=color))
-    # Draw the marks of a single fit in black, those of two fits in the colors of their boundaries.
+    # Mark the walls of two fits in the colors of their boundaries, to distinguish them; those of a single fit in black.
     colors = colors if len(colors) > 1 else dict.fromkeys(colors, style.BLACK)
     handles += _mark_walls(ax, walls, colors, (to_spring, spring), (to_damper, damper))
     ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to_spring)
-    # Leave room for the legend.
+    # Extend the axis upwards by the height of the legend.
     highest = float(np.max(dampings)) * to_damper
     ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
     name_axes(ax, spring, damper)
@@ -187,10 +196,10 @@ def _mark_walls(
 
     Args:
         ax: Axes of the boundary.
-        walls: The walls, see `draw_device_fit`.
+        walls: Table of walls, with the columns that `draw_device_fit` describes.
         colors: Color of each fit.
-        stiffness: Factor and unit of the stiffness axis.
-        damping: Factor and unit of the damping axis.
+        stiffness: Factor from N/m to the unit of the stiffness axis, and this unit.
+        damping: Factor from N s/m to the unit of the damping axis, and this unit.
     """
     handles, kinds = [], {}
     for kind in ("stiffest", "set", "buzzing"):
@@ -202,7 +211,7 @@ def _mark_walls(
         for fit, K, B in zip(selected["fitted_to"], *values, strict=True):
             color = colors.get(fit, style.BLACK)
             mark_wall(ax, (K, B), kind, kind=mark, color=color)
-            # Print four digits and round K down, so that the printed wall is stable, too.
+            # Round K down, because the printed wall must be stable, too.
             numbers = f"$K = {round_safely(K, 'below'):.4g}$ {stiffness[1]}, $B = {B:.4g}$ {damping[1]}"
             handles.append(style.line(f"{words}: {numbers}", "", color=color, **MARKS[mark]))
     if not kinds["set"][1].size:
@@ -214,23 +223,24 @@ def _mark_walls(
         ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
         middle = float(np.max(kinds["stiffest"][2]))
         for x, y, frequency in zip(K, B, selected["frequency_Hz"], strict=True):
-            # Write the frequency outside the region of stable walls.
+            # Write the frequency of an onset outside the region of stable walls, where the background is white.
             place = (11, -10) if y < middle else (11, 5)
             ax.annotate(f"{frequency:.3g} Hz", (x, y), xytext=place, color=style.VERMILION, **_TEXT)
         handles.append(style.line("onset of instability, with frequency", "", **look))
     return handles
 
 
-_REQUIRED_COLUMNS = ("frequency_Hz", "real_m_per_N", "imag_m_per_N")
-_OPTIONAL_COLUMNS = ("deviation_m_per_N", "open_loop_real", "open_loop_imag")
-_REACH = 1.6  # half the width of the panel around -1
+_REQUIRED_COLUMNS = ("frequency_Hz", "real_m_per_N", "imag_m_per_N")  # columns of every measured response
+_OPTIONAL_COLUMNS = ("deviation_m_per_N", "open_loop_real", "open_loop_imag")  # columns for the band and a wall
+_REACH = 1.6  # half the width of the panel of the open loop, which is centered at -1
 
 
 @draws_tables
 def draw_response(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw a measured frequency response with its band; for a given wall, also the open loop L around -1.
+    """Draw a measured frequency response G with its uncertainty band; for a wall, also the open loop L around -1.
 
-    A stable wall stays stable with every response of the band if no disc around the open loop contains -1.
+    The band consists of discs around the points of G, which become discs around the points of L. A stable wall remains
+    stable for every response in the band if no disc around L contains -1.
 
     Args:
         table: Columns frequency_Hz, real_m_per_N, imag_m_per_N; optionally deviation_m_per_N, the radius of the band,
@@ -271,9 +281,9 @@ def draw_response(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
 
 
 def _draw_loop(ax: Any, L: np.ndarray, share: np.ndarray) -> None:
-    """Draw the open loop, the disc around each of its points given by the band of the response, and the point -1.
+    """Draw the open loop L, the uncertainty disc around each of its points, and the point -1.
 
-    ``share`` is the radius of the band relative to the magnitude of the response.
+    ``share`` is the radius of each disc relative to |L|, equal to the radius of the band of G relative to |G|.
     """
     near = np.abs(1.0 + L) < 2.0 * _REACH
     wide = 2.0 * (share * np.abs(L))[near]

@@ -1,7 +1,9 @@
 """Draw motions over time: step responses (Fig. 11 of the paper), and simulated motions, phase planes and energies.
 
 Quantities of a step response are in SI units, or normalized: time by the sampling period T, position by F T^2/m for a
-force F on a mass m. Positions are positive inside the wall, whose surface is at 0.
+force F on a mass m. Positions are positive inside the wall, whose surface is at 0. A *motion* is read from a table as
+an object with one array per column as attribute. A motion *grows without bound* if its values increase much at its end
+(`_grows`). alpha and beta are the normalized stiffness and virtual damping of a wall.
 """
 
 from __future__ import annotations
@@ -15,18 +17,18 @@ from matplotlib.lines import Line2D
 from zwidth.figures import style
 from zwidth.figures.table import Table, curves, draws_tables
 
-# Suffix of the columns of a step study in SI units.
+# Suffix of each column of a step study in SI units.
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
-_DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
-_ZERO_ORDER_HOLD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}  # look of the sampled wall force
-# Axis limit if a motion grows without bound, as a multiple of the smallest motion's largest value.
+_DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}  # mark of the settling time
+_ZERO_ORDER_HOLD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}  # line of the sampled wall force
+# Limit of an axis if a motion grows without bound, as a multiple of the largest value of the smallest motion.
 _CLIP = 8.0
-# Growth criterion: ratio of the largest value in the last quarter to that before. A motion of constant velocity, which
-# must not count as growing, has 4/3.
+# A motion grows without bound if the largest value in the last quarter of its time exceeds the largest value before by
+# this factor. It must be above 4/3, the ratio for a motion of constant velocity.
 _GROWTH = 1.5
-# Length of the time axis if all motions leave the wall, as a multiple of the end of the last contact.
+# Length of the time axis if all motions leave the wall, as a multiple of the time at which the last contact ends.
 _WINDOW = 3.0
-_MAX_PANELS = 6  # motions in a figure of energies; of more, evenly spaced ones are drawn
+_MAX_PANELS = 6  # largest number of motions in a figure of energies; if there are more, evenly spaced ones are drawn
 # Legend entry, color and line style of each energy.
 _ENERGIES = {
     "energy_J": ("energy of the bodies", style.BLACK, style.SOLID),
@@ -38,17 +40,17 @@ _ENERGIES = {
 
 
 def _name_force() -> str:
-    """Return the name of the wall force for axis labels."""
+    """Return the name of the wall force, or of the wall torque of a rotary device, for axis labels."""
     return "wall torque" if style.units().rotary else "wall force"
 
 
 def _name_position() -> str:
-    """Return name and symbol of the position for axis labels."""
+    """Return the name and the symbol of the position, or of the angle of a rotary device, for axis labels."""
     return r"angle  $\theta$" if style.units().rotary else "position  $x$"
 
 
 def _name_velocity() -> str:
-    """Return name and symbol of the velocity for axis labels."""
+    """Return the name and the symbol of the velocity, linear or angular, for axis labels."""
     return r"angular velocity  $\dot\theta$" if style.units().rotary else "velocity  $v$"
 
 
@@ -72,7 +74,7 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
         ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
         ax.set_ylabel(f"{_name_force()} in {style.units()['N']}" if unit else "wall force  in $F$")
     for ax in panels:
-        # Extend the axis by one sampling period, because the last sample holds until then.
+        # Extend the axis by one sampling period, because the wall force of the last sample is held for a period.
         ax.set_xlim(0.0, max(float(each.time[-1] + each.time[1]) for each in responses) * clock)
     panels[-1].set_xlabel(f"time  $t$  in {unit}" if unit else "time  $t/T$  in sampling periods")
     handles = [line for line in panels[0].lines if not line.get_label().startswith("_")]
@@ -84,7 +86,10 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 
 
 def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
-    """Draw the position of each response over time; return factor and unit of time, 1 and "" if normalized."""
+    """Draw the position of each step response over time; return the scaling factor and the unit of the time axis.
+
+    The factor is 1 and the unit "" if the table is normalized.
+    """
     responses, physical = _read_responses(table), "time_s" in table
     clock, unit, factor, length = 1.0, "", 1.0, ""
     if physical:
@@ -110,9 +115,9 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
 
 
 def _read_responses(table: Table) -> list[Any]:
-    """Return the step responses in a table, with their columns and line properties as attributes.
+    """Return the step responses of a table as objects with the columns and the line properties as attributes.
 
-    The attribute ``settled`` states whether the response has settled by the end of its time; None if unknown.
+    The attribute ``settled`` is True if the response settles within its time; None if the table has no settling times.
     """
     keys = ((name, key) for name, unit in _UNITS.items() for key in (name + unit, name))
     columns = {name: np.asarray(table[key]) for name, key in keys if key in table}
@@ -127,7 +132,7 @@ def _read_responses(table: Table) -> list[Any]:
 
 @draws_tables
 def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the position of each motion and the wall force over time; thin lines: tip and hand, if they are modeled.
+    """Draw the position and the wall force of each motion over time; thin lines show the positions of tip and hand.
 
     If all motions leave the wall, the time axis ends at three times the end of the last contact. A motion that grows
     without bound is clipped at eight times the largest value of the smallest motion.
@@ -215,9 +220,9 @@ def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 
 
 def _read_motions(table: Table, time: str = "time_s") -> list[Any]:
-    """Return the motions in a table, with their columns and line properties (``look``) as attributes."""
+    """Return the motions of a table as objects with the columns and the line properties (``look``) as attributes."""
     columns = {str(name): np.asarray(table[name]) for name in table}
-    # Separate the motions by their start at time 0, because all other columns of two motions may be equal.
+    # Separate the motions by their start at time 0, because the labels of two motions may be equal.
     motions = curves({**columns, "number": np.cumsum(columns[time] == 0.0)}, "number")
     for k, each in enumerate(motions):
         each.label = style.literal(each.label[0])
@@ -226,7 +231,7 @@ def _read_motions(table: Table, time: str = "time_s") -> list[Any]:
 
 
 def _trim(motions: list[Any]) -> list[Any]:
-    """Truncate motions that all leave the wall, so that their contacts fill a third of the time axis."""
+    """Truncate the motions if all of them leave the wall, so that their contacts fill a third of the time axis."""
     ends = []
     for each in motions:
         contact = np.asarray(each.contact) > 0
@@ -242,12 +247,19 @@ def _trim(motions: list[Any]) -> list[Any]:
 
 
 def _begin_at_zero(ax: Axes, end: float) -> None:
-    """Set the range of a time axis; an arbitrary one if a motion consists of a single instant."""
+    """Set the range of a time axis to begin at 0; it ends at 1 if the motions consist of a single instant."""
     ax.set_xlim(0.0, end or 1.0)
 
 
 def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[float, str]:
-    """Set the range of an axis, with a limit for motions that grow without bound; return its factor and unit."""
+    """Set the range of an axis, and return its scaling factor and unit; motions that grow without bound are clipped.
+
+    Args:
+        ax: Axes to change.
+        which: Axis, "x" or "y".
+        values: Values of each motion along the axis, in SI units.
+        unit: SI unit of the values, that of a linear device.
+    """
     finite = [each[np.isfinite(each)] for each in values]
     largest = [float(np.abs(each).max(initial=0.0)) for each in finite]
     growing = any(_grows(np.abs(each)) for each in values)
@@ -260,13 +272,19 @@ def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[f
 
 
 def _grows(sizes: np.ndarray) -> bool:
-    """Return whether a motion grows without bound, from its absolute values over time."""
+    """Return whether a motion grows without bound, given its absolute values over time (`_GROWTH`)."""
     early, late = np.split(sizes, [3 * sizes.size // 4])
     return not np.all(np.isfinite(sizes)) or bool(late.max(initial=0.0) > _GROWTH * early.max(initial=0.0) > 0)
 
 
 def _mark_wall(ax: Axes, which: str, motions: list[Any]) -> None:
-    """Mark the surface of the wall, and shade its inside unless the wall is bilateral."""
+    """Mark the surface of the wall, and shade its inside unless all motions are always in contact.
+
+    Args:
+        ax: Axes with the range of the position axis set.
+        which: Axis of the position, "x" or "y".
+        motions: Motions in the panel.
+    """
     line = ax.axhline if which == "y" else ax.axvline
     line(0.0, color=style.GRAY, linewidth=1.0, zorder=2)
     if all(np.all(each.contact) for each in motions):
@@ -279,12 +297,19 @@ def _mark_wall(ax: Axes, which: str, motions: list[Any]) -> None:
 
 
 def _in_math(label: str) -> str:
-    """Return a label with K_max set as mathematics."""
+    """Return a label in which K_max is typeset as mathematics."""
     return label.replace("K_max", r"$K_{\max}$")
 
 
 def _add_legend(panels: np.ndarray, motions: list[Any], *more: Line2D, outside: bool) -> None:
-    """Add a legend of the motions with labels, in fewer columns if labels are long; ``more`` are further entries."""
+    """Add a legend of the motions that have labels, in fewer columns if labels are long.
+
+    Args:
+        panels: The panels.
+        motions: The motions.
+        more: Further legend entries.
+        outside: Place the legend above the panels instead of in the first one.
+    """
     named = [each for each in motions if each.label]
     lines = [style.line(_in_math(each.label), each.look["linestyle"], color=each.look["color"]) for each in named]
     columns = 2 if max(len(each.label) for each in motions) > 20 else 4

@@ -1,8 +1,11 @@
 """Draw normalized figures of the paper: (alpha, beta) planes (Figs. 5, 7, 8), and walls over delta (Figs. 6, 9, 10).
 
 alpha and beta are the normalized stiffness and damping of the wall, delta the normalized physical damping of the
-device, d its delay in sampling periods, and alpha_max the largest stable alpha. The *delay model* is "held" (exact
-fractional delay) or "fractional_power" (the paper's z^d).
+device, d its delay in sampling periods, and alpha_max the largest stable alpha. g(d) is the limit of alpha_max/delta
+for large delta. The *delay model* is "held" (exact fractional delay) or "fractional_power" (the paper's z^d). The
+*curves* of a table are groups of rows with equal delay (`figures.table`), with the columns as attributes. In an (alpha,
+beta) plane, the boundary of the stable walls is parameterized by omega, the angle of the pole on the unit circle, and
+the *path of maximum stiffness* (ridge) consists of the stiffest walls for all delta.
 """
 
 from __future__ import annotations
@@ -26,22 +29,25 @@ from zwidth.words.formatting import round_safely
 from zwidth.words.quantities import OUTPUTS
 from zwidth.words.status import Status
 
-_ZOOM = 0.1  # fraction of the range of delta shown in the first scaling of Fig. 10
-_MIN_DELTA = 0.1  # smallest delta of alpha_max/delta, because alpha_max hardly depends on smaller ones
+_ZOOM = 0.1  # fraction of the range of delta that the enlarged panel of Fig. 10 shows
+_MIN_DELTA = 0.1  # smallest delta for which alpha_max/delta is drawn; below, alpha_max itself is nearly constant
 
 
 def _list_curves(table: Table, **wanted: object) -> list[Any]:
-    """Return the curves of a table over delta, one per delay and, if it is a column, per delay model."""
+    """Return the curves of a table over delta, one per delay and, if the table has this column, per delay model.
+
+    ``wanted`` selects the rows with the given values, by column.
+    """
     models = ("delay_model",) if "delay_model" in table else ()
     return curves(table, "d", *models, over="delta", **wanted)
 
 
 @draws_tables
 def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
-    """Draw the virtual damping that is stable for alpha -> 0 over delta, with the stable side shaded.
+    """Draw over delta the interval of virtual damping beta that is stable for alpha -> 0, and shade it.
 
-    Solid: exact delay; dashed: the paper's fractional power; dash-dotted: the passivity condition. The lower bound
-    ``beta = -delta`` is common to all delays.
+    Solid lines are for exact delays, dashed ones for the paper's fractional power, dash-dotted ones for the passivity
+    condition. The lower bound ``beta = -delta`` is the same for all delays.
 
     Args:
         table: Columns of a boundary study in the plane delta_beta: curve, d, delta, beta_lower, beta_upper; or of a
@@ -85,7 +91,7 @@ def _draw_curve(ax: Axes, curve: Any, x: Any, y: Any, colors: dict[float, Any], 
 
     Args:
         ax: Axes to draw into.
-        curve: Row group of a table with the attribute ``d`` and possibly ``delay_model``.
+        curve: Curve of a table, with the attribute ``d`` and optionally ``delay_model``.
         x: Horizontal coordinates.
         y: Vertical coordinates.
         colors: Color of each delay.
@@ -99,20 +105,20 @@ def _draw_curve(ax: Axes, curve: Any, x: Any, y: Any, colors: dict[float, Any], 
 
 
 def _shade(ax: Axes, interval: Any, color: Any, **keywords: Any) -> None:
-    """Shade an interval of beta over delta."""
+    """Shade the interval of beta over delta between the columns beta_lower and beta_upper of a curve."""
     look = {"color": color, "alpha": 0.08, "linewidth": 0.0, **keywords}
     ax.fill_between(interval.delta, interval.beta_lower, interval.beta_upper, **look)
 
 
 @draws_tables
 def draw_ridge(table: Table, axes: style.AnyAxes | None = None, *, two_scalings: bool = False) -> np.ndarray:
-    """Draw alpha_max over delta, one curve per delay; below a curve some wall is stable.
+    """Draw alpha_max over delta, one curve per delay; below a curve, some wall with this alpha is stable.
 
     Args:
         table: Columns of a ridge study: d, delta, alpha_max; or of a study of kind paper_fig10, which also has
             delay_model ("held" or "fractional_power").
-        axes: An existing Axes; or two of them if there are two scalings, that of the small deltas first.
-        two_scalings: Show small deltas, if any, in a separate panel, as the paper does.
+        axes: An existing Axes; or two Axes if there are two scalings, that of the small deltas first.
+        two_scalings: Show small deltas, if the table contains any, in a separate enlarged panel, as the paper does.
     """
     delta = np.asarray(table["delta"])
     two_scalings = bool(two_scalings and delta.min() <= _ZOOM * delta.max())
@@ -127,7 +133,7 @@ def draw_ridge(table: Table, axes: style.AnyAxes | None = None, *, two_scalings:
 
 
 def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
-    """Draw the curves up to a fraction of the range of delta."""
+    """Draw the curves of alpha_max up to the fraction ``share`` of the largest delta."""
     delta = np.asarray(table["delta"])
     end = share * float(delta.max())
     columns = {name: column[delta <= end * (1.0 + 1e-12)] for name, column in select(table).items()}
@@ -148,7 +154,7 @@ def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
 
 
 def _scale_stiffness(ax: Axes, delta: np.ndarray, stiffness: np.ndarray) -> None:
-    """Scale the stiffness axis from 0 upwards, or logarithmically if delta is spaced logarithmically."""
+    """Set the range of the stiffness axis from 0; make the axis logarithmic if delta is spaced logarithmically."""
     highest = float(np.nanmax(stiffness))
     ax.set_ylim(0.0, 1.04 * highest)
     if grid.logarithmic(delta):
@@ -158,11 +164,11 @@ def _scale_stiffness(ax: Axes, delta: np.ndarray, stiffness: np.ndarray) -> None
 
 @draws_tables
 def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw alpha_max/delta over delta with its limit g(d), and g over the delay.
+    """Draw alpha_max/delta over delta with its limit g(d) for large delta, and g over the delay d.
 
     Args:
-        table: Columns of a ridge study: d, delta, alpha_max; of a study of kind paper_fig10, only curves of the exact
-            delay are drawn.
+        table: Columns of a ridge study: d, delta, alpha_max. If it is the table of a study of kind paper_fig10, only
+            its curves for the exact delay are drawn.
         slopes: Columns d and slope, the limit g(d), over a range of delays that includes those of ``table``.
         axes: An existing Axes for the first panel only, or two.
     """
@@ -179,7 +185,7 @@ def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -
 
 
 def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
-    """Draw alpha_max/delta on logarithmic axes, with the limits as dotted lines."""
+    """Draw alpha_max/delta over delta on logarithmic axes, with dotted lines at its limits g(d) for large delta."""
     for path in paths:
         shown = path.delta >= _MIN_DELTA
         delta = path.delta[shown]
@@ -199,7 +205,15 @@ def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
 
 
 def _draw_limit(ax: Axes, paths: list[Any], d: np.ndarray, slope: np.ndarray, colors: dict[float, Any]) -> None:
-    """Draw the limit slope g over the delay, with a dot at the delay of each path of maximum stiffness."""
+    """Draw the limit g over the delay d.
+
+    Args:
+        ax: Axes to draw into.
+        paths: Curves of alpha_max over delta, whose delays are marked by dots.
+        d: Delays.
+        slope: g at these delays.
+        colors: Color of each delay in ``paths``.
+    """
     ax.plot(d, slope, label="g", color=style.GRAY, zorder=2)
     for path in paths:
         ax.plot([path.d], [path.limit], "o", color=colors[path.d], markersize=5, zorder=3, clip_on=False)
@@ -232,7 +246,7 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     style.label_ends(maxima, costs, [cost.alpha_max[-1] for cost in costs], colors)
     maxima.set_ylabel(style.label_quantity("alpha"))
     stable = style.line(r"stiffest stable wall, $\alpha_{\max}$")
-    # Single points are in the middle of the panel, and curves rise to the right.
+    # Place the legend away from the data: single points are in the middle of the panel, and curves rise to the right.
     place = "upper left" if costs[0].delta.size > 1 else "center left"
     maxima.legend(handles=[stable, style.line("stiffest passive wall", style.DASH_DOTTED)], loc=place)
     for ax in shares:
@@ -245,16 +259,17 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     return panels
 
 
-_MAX_LEGEND_ENTRIES = 8  # largest number of deltas in a legend; more are easier to read from a color bar
-_MAX_PANELS = 3  # largest number of deltas and of delays in a grid of panels; of more, evenly spaced ones are drawn
+_MAX_LEGEND_ENTRIES = 8  # largest number of deltas in a legend; more have a color bar, which is easier to read
+# Largest number of deltas, and of delays, in a grid of panels. If there are more, evenly spaced ones are drawn.
+_MAX_PANELS = 3
 
 
 @draws_tables
 def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw stability boundaries, one panel per delay, with the stable side shaded.
+    """Draw stability boundaries in (alpha, beta) planes, one panel per delay, with the stable side shaded.
 
-    Solid: a complex pair of poles crosses the unit circle; dotted: a real pole at z = -1; dashed: the path of maximum
-    stiffness; dash-dotted: the passivity condition.
+    On solid lines a complex pair of poles is on the unit circle, on dotted lines a real pole is at z = -1. A dashed
+    line is the path of maximum stiffness, a dash-dotted one the passivity condition.
 
     Args:
         table: Columns of a boundary study: curve, d, delta, omega in rad per sample, alpha, beta; with
@@ -293,7 +308,14 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
 
 
 def _draw_boundaries(ax: Axes, table: Table, colors: dict[float, Any], scale: tuple[float, float] | None) -> None:
-    """Draw all curves of a table into one Axes, without labels; ``scale`` converts alpha and beta to SI units."""
+    """Draw all boundaries, paths of maximum stiffness and passivity conditions of a table into one Axes.
+
+    Args:
+        ax: Axes to draw into.
+        table: Columns of a boundary study.
+        colors: Color of each delta.
+        scale: K at alpha = 1 and B at beta = 1, in SI units; None if unknown.
+    """
     edges = curves(table, "d", "delta", curve="boundary")
     # Draw the largest region, that of the largest delta, first, so that it does not hide the others.
     shade = min(0.10, 0.7 / len(edges))
@@ -316,7 +338,16 @@ def _draw_boundaries(ax: Axes, table: Table, colors: dict[float, Any], scale: tu
 
 
 def _draw_edge(ax: Axes, edge: Any, color: Any, shade: float) -> None:
-    """Draw a shaded region with its boundary, dotted on the straight part with a real pole at z = -1."""
+    """Draw a stability boundary with the shaded region inside.
+
+    The part with a real pole at z = -1, a straight line, is dotted.
+
+    Args:
+        ax: Axes to draw into.
+        edge: Boundary, with the attributes omega, alpha, beta, delta and d.
+        color: Color of the boundary and of the region.
+        shade: Opacity of the region.
+    """
     shade_region(ax, [(np.stack([edge.alpha, edge.beta], -1), False)], color, alpha=shade)
     line = np.flatnonzero(edge.omega >= np.pi)
     curve = slice(None) if line.size < 2 else slice(0, line[0] + 1)
@@ -329,7 +360,10 @@ def _draw_edge(ax: Axes, edge: Any, color: Any, shade: float) -> None:
 
 
 def _mark_maximum(ax: Axes, edge: Any, scale: tuple[float, float] | None) -> None:
-    """Mark the stiffest stable wall with a dot and a label inside the region."""
+    """Mark the stiffest wall of a stability boundary with a dot, and write alpha_max inside the region.
+
+    ``scale`` contains K at alpha = 1, by which the text also states K_max in SI units; None if unknown.
+    """
     top = int(np.argmax(edge.alpha))
     place = (edge.alpha[top], edge.beta[top])
     text = rf"$\alpha_{{\max}} = {round_safely(place[0], 'below'):.4g}$"
@@ -340,7 +374,7 @@ def _mark_maximum(ax: Axes, edge: Any, scale: tuple[float, float] | None) -> Non
 
 
 def _legend_handles(table: Table, colors: dict[float, Any]) -> list[Line2D]:
-    """Return legend entries for the colors and the line styles of the drawn curves."""
+    """Return legend entries for the color of each delta and for the line styles that occur in a table."""
     edges = curves(table, "d", "delta", curve="boundary")
     handles = [style.line(rf"$\delta = {delta:g}$", color=color) for delta, color in colors.items()]
     if any(np.count_nonzero(edge.omega >= np.pi) >= 2 for edge in edges):
@@ -369,7 +403,8 @@ def draw_map(
         output: "stable", "spectral_radius" or "passive".
         axes: An existing Axes for the first delta and d only, or one per panel.
         edges: Function of delta and d that returns the exact boundary of the stable walls, or of the passive walls if
-            the output is "passive". If all cells agree with it, it replaces the edges of the cells.
+            the output is "passive"; None if there is none. A boundary is drawn in place of the edges of the cells if
+            all cells agree with it.
     """
     scale = si_scale(arrays)
     arrays = grid_in_order(arrays, ("alpha", "beta", "delta", "d"))

@@ -1,4 +1,4 @@
-"""Figures of scenes, drawn into an existing Axes or pyplot's current one; each function returns its Axes.
+"""Draw figures of scenes into an existing Axes or pyplot's current one; each function returns its Axes.
 
     region          stable walls, islands and holes, with the stiffest wall and the passive set
     ridge           maximum stiffness over a parameter of the scene
@@ -9,10 +9,10 @@
     motion          position of a simulated motion over time
     recommendation  recommended wall among the stable ones, and its response to a step of force
 
-Without an Axes they draw into ``matplotlib.pyplot.gca()``; functions with two panels create a pyplot figure. The house
-style applies while drawing; matplotlib's settings do not change. Use ``zwidth.figures.save(ax, path)`` or
-``ax.figure.savefig(path)`` to write the figure. K and B are the stiffness and the virtual damping of a wall, L is the
-open loop.
+Without an Axes, the functions draw into ``matplotlib.pyplot.gca()``; functions with two panels create a pyplot figure.
+The house style applies while drawing; matplotlib's settings do not change. Use ``zwidth.figures.save(ax, path)`` or
+``ax.figure.savefig(path)`` to write the figure. A *scene* (`zwidth.Scene`) is a device with its timing and, optionally,
+wall. K and B are the stiffness and the virtual damping of a wall, L is the open loop.
 """
 
 from __future__ import annotations
@@ -48,21 +48,22 @@ from zwidth.words.formatting import name_wall
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.types import ArrayLike
 
-N_ANGLES = 181  # points of the outline of the passive walls
-N_FREQUENCIES = 2000  # frequencies of an open loop on the logarithmic grid, and as many on the linear grid above it
-MIN_PERIODS = 100  # least number of periods of a step response
-MAX_PERIODS = 20_000  # largest number of periods of a step response
+N_ANGLES = 181  # number of points on the outline of the passive walls
+# Number of frequencies of an open loop on a logarithmic grid, and again on a linear grid up to the Nyquist frequency.
+N_FREQUENCIES = 2000
+MIN_PERIODS = 100  # least number of sampling periods in the step response of a recommended wall
+MAX_PERIODS = 20_000  # largest number of sampling periods in the step response of a recommended wall
 
 __all__ = ["bode", "motion", "nyquist", "poles", "recommendation", "region", "ridge", "step"]
 
 
 def __dir__() -> list[str]:
-    """Return the public names without imported ones."""
+    """Return the names of the public functions, without the names that this module imports."""
     return sorted(__all__)
 
 
 def _with_house_style(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Wrap a function to draw in the house style, in the units of its first argument."""
+    """Wrap a function so that it draws in the house style, in the unit system of its first argument."""
 
     @wraps(function)
     def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
@@ -76,7 +77,7 @@ def _with_house_style(function: Callable[Parameters, Result]) -> Callable[Parame
 def _with_checked_scene(
     function: Callable[Concatenate[Scene, Parameters], Result],
 ) -> Callable[Concatenate[Scene, Parameters], Result]:
-    """Wrap a function of a scene as `_with_house_style` does, and check the scene."""
+    """Wrap a function so that it raises an error if its first argument is no scene, and draws in the house style."""
     return wrap_function(_with_house_style(function))
 
 
@@ -92,7 +93,14 @@ def _choose_axes(ax: Axes | None) -> Axes:
 def _choose_two_axes(
     axes: style.AnyAxes | None, rows: int, columns: int, size: tuple[float, float] | None
 ) -> np.ndarray:
-    """Return two Axes to draw into: the given ones, or those of a new pyplot figure."""
+    """Return the Axes to draw into: at most two of the given ones, or those of a new pyplot figure.
+
+    Args:
+        axes: Existing Axes, or None for a new figure.
+        rows: Number of rows of panels in a new figure.
+        columns: Number of columns of panels in a new figure.
+        size: Size of a new figure in inches; None for the default.
+    """
     if axes is None:
         import matplotlib.pyplot as plt
 
@@ -101,7 +109,7 @@ def _choose_two_axes(
 
 
 def _make_complex_plane(ax: Axes | None, real: tuple[float, float], imaginary: tuple[float, float]) -> Axes:
-    """Return an Axes with the complex plane and the unit circle."""
+    """Prepare an Axes as the complex plane with the unit circle, for given ranges of real and imaginary parts."""
     ax = _choose_axes(ax)
     ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor=style.BLACK, linewidth=0.7))
     ax.set(xlim=real, ylim=imaginary, xlabel="real part", ylabel="imaginary part", aspect="equal")
@@ -121,7 +129,7 @@ def region(
         passive: Also draw the passive walls with stiffness > 0 (dash-dotted).
 
     Returns:
-        The Axes. Solid: the largest outline; dashed: islands; dotted: holes; the stable walls are shaded.
+        The Axes. Stable walls are shaded; the largest outline is solid, outlines of islands dashed, of holes dotted.
 
     Raises:
         InputError: if a value is no scene, or ``passive`` is set and a scene has no passivity condition.
@@ -152,7 +160,7 @@ def recommendation(
         response: Columns of a step study of this wall, in SI units. Default: computed at the samples.
     """
     scene, verdict, recommended = found.scene, found.verdict, found.as_dict()["recommended"]
-    # A measured device has no model to compute a response.
+    # Leave out the response of a measured device, because no model exists from which it could be computed.
     has_model = not isinstance(scene.device, MeasuredDevice)
     if axes is None:
         axes = (
@@ -179,7 +187,7 @@ def recommendation(
     look = {"color": style.GRAY, "linewidth": 1.0, "label": "virtual_damping_interval"}
     panels[0].plot([K * spring] * 2, interval * damper, **look)
     if response is None and has_model:
-        # Cover one and a half times the decay of the dominant pole.
+        # Choose a duration of one and a half times the decay time of the dominant pole, within bounds.
         periods = int(
             min(max(MIN_PERIODS, 1.5 * (recommended["decay_time"] or 0.0) / scene.timing.period), MAX_PERIODS)
         )
@@ -195,7 +203,7 @@ def recommendation(
 
 
 def _draw_response(ax: Axes, response: Table) -> None:
-    """Draw positions over time and mark the settling time."""
+    """Draw the position of a step response over time, and mark its settling time if the table contains it."""
     clock, unit = draw_positions(ax, response)
     time = np.asarray(response["time_s"])
     ax.set(xlim=(0.0, float(time[-1] + time[1]) * clock), xlabel=f"time  $t$  in {unit}")
@@ -265,7 +273,7 @@ def step(
 
 
 def _tabulate_step(scene: Scene, stiffness: float, virtual_damping: float, periods: int) -> dict[str, Any]:
-    """Return the response to a step of 1 N at the samples, as columns of a step study."""
+    """Return the response of a scene with a wall (K, B) to a step of 1 N at the samples, as columns of a step study."""
     label = name_wall(stiffness, virtual_damping, scene.unit_system)
     columns = {**tabulate_walls(scene, stiffness, virtual_damping), "label": label}
     columns["time_s"] = np.arange(periods) * scene.timing.period
@@ -274,7 +282,7 @@ def _tabulate_step(scene: Scene, stiffness: float, virtual_damping: float, perio
 
 
 def _choose_frequencies(scene: Scene) -> np.ndarray:
-    """Return frequencies in Hz that resolve an open loop, up to the Nyquist frequency."""
+    """Return a grid of frequencies in Hz that resolves an open loop; for a measured response, its own frequencies."""
     if isinstance(scene.device, MeasuredDevice):
         return scene.device.frequency
     nyquist_frequency = 0.5 / float(scene.timing.period)
@@ -311,7 +319,7 @@ def bode(
     stable = bool(scene.is_stable(stiffness, virtual_damping))
     rounded = {name: round_margin(f"{name}_margin", margins, stable, 3) for name in ("gain", "phase")}
     gain_crossover, phase_crossover = float(margins.gain_crossover), float(margins.phase_crossover)
-    # Shift the phase by full turns so that it starts between -360 and 0 degrees.
+    # Shift the phase by a multiple of 360 degrees to start between -360 and 0, because its branch is arbitrary.
     angles = np.unwrap(np.angle(L))
     angles = np.degrees(angles - 2.0 * np.pi * np.round((angles[0] + np.pi) / (2.0 * np.pi)))
     upper.plot(hertz, np.abs(L), color=style.BLUE, label="$|L|$")
@@ -323,7 +331,7 @@ def bode(
         upper.plot([phase_crossover] * 2, [1.0, 1.0 / gain], label=f"gain margin {rounded['gain']:.3g}", **bar)
     if np.isfinite(phase):
         angle = float(np.interp(gain_crossover, hertz, angles))
-        # The bar begins at the odd multiple of 180 degrees nearest to the phase.
+        # Let the bar begin at the odd multiple of 180 degrees next to the phase, because there L would be negative.
         foot = angle - (angle + 180.0 + 180.0) % 360.0 + 180.0
         lower.plot([gain_crossover] * 2, [foot, angle], label=f"phase margin {rounded['phase']:.3g}°", **bar)
     upper.set(yscale="log", ylabel="$|L|$")
@@ -342,7 +350,9 @@ def nyquist(
     virtual_damping: float | str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the Nyquist plot of the open loop of a wall, with the point -1, which a stable loop leaves on its left.
+    """Draw the Nyquist plot of the open loop of a wall, with the point -1.
+
+    With increasing frequency, the curve of a stable loop has the point -1 on its left.
 
     Args:
         scene: The scene.

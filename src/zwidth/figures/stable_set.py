@@ -1,8 +1,10 @@
-"""Draw the stable set in the plane of stiffness and virtual damping: its exact boundary, and marked walls.
+"""Draw the stable set in the plane of stiffness K and virtual damping B: its exact boundary, and marked walls.
 
 The boundary consists of *outlines*, closed lines of three kinds: the outline of the set connected to K = 0 (in
 figures: "outline"), outlines of *islands*, stable sets not connected to it, and outlines of *holes*, unstable sets
-inside a stable one. A *cell* is one point of a grid of walls, drawn as a colored rectangle.
+inside a stable one. Tables call these kinds ``piece``, together with "passive", the outline of the passive walls. A
+*cell* is one point of a grid of walls, drawn as a colored rectangle; outlines *agree* with cells if they separate the
+stable from the unstable ones.
 """
 
 from __future__ import annotations
@@ -22,34 +24,44 @@ from zwidth.words.formatting import round_safely, with_unit
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
 
-# For each closed line, its points (x, y) of shape (n, 2), and whether it surrounds a hole.
+# Points (x, y) of each outline, of shape (n, 2), and True if it is the outline of a hole.
 Outlines: TypeAlias = Sequence[tuple[np.ndarray, bool]]
-# Light colors, so that labels and curves drawn over them stay legible; printed in gray, passive is the darker one.
+# Colors of regions, light because labels and curves drawn over them must stay legible. In a gray print, that of the
+# passive walls is the darker one.
 SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
-_INTERPOLATION = 32  # points per straight step of an outline, which is curved on a logarithmic axis
-# Marks of walls, in panels and legends.
+# Number of points by which each straight line of an outline is replaced on a logarithmic axis, where it is curved.
+_INTERPOLATION = 32
+# Marks of walls by kind, in panels and legends.
 MARKS: dict[str, dict[str, Any]] = {
     "stiffest": {"marker": "o", "markersize": 4.5},
     "recommended": {"marker": "D", "markersize": 5.0},
 }
-_LETTER_WIDTH = 4.4  # points; mean width of a letter of the text at a mark
-_FRAME_MARGIN = 0.8  # inches; width of a panel outside its axes
-# Line style by kind of outline.
+_LETTER_WIDTH = 4.4  # mean width of a letter of the text next to a mark, in points
+_FRAME_MARGIN = 0.8  # width of a panel outside the frame of its axes, in inches
+# Line style of each kind of outline.
 _DASHES = {"outline": style.SOLID, "island": style.DASHED, "hole": style.DOTTED, "passive": style.DASH_DOTTED}
 
 
 def shade_region(ax: Axes, outlines: Outlines, face: Any, *, alpha: float | None = None, zorder: float = 1.0) -> None:
-    """Shade the region within outlines, without their holes."""
+    """Shade the region inside outlines, except for holes.
+
+    Args:
+        ax: Axes to draw into.
+        outlines: Outlines of the region.
+        face: Color of the region; "none" to draw nothing.
+        alpha: Opacity.
+        zorder: Drawing order.
+    """
     if outlines and face != "none":
         path = to_path(outlines)
-        # Update the data limits by the vertices. `add_patch` computes them segment by segment, which takes as long as
-        # all other drawing.
+        # Update the data limits by the vertices and add the patch as an artist, because `add_patch` computes the limits
+        # segment by segment, which takes as long as all other drawing.
         ax.update_datalim(path.vertices)
         ax.add_artist(PathPatch(path, facecolor=face, alpha=alpha, linewidth=0.0, zorder=zorder))
 
 
 def to_path(outlines: Outlines) -> Path:
-    """Return the path of a region, in which holes run clockwise, so that they stay empty."""
+    """Return the path of the region inside outlines, with clockwise holes, which matplotlib does not fill."""
     paths = []
     for closed, hole in ((_close(points), hole) for points, hole in outlines):
         x, y = closed[:-1].T
@@ -83,15 +95,17 @@ def mark_wall(
         kind: Kind of the mark, a key of `MARKS`.
         text: Text next to the mark.
         right: Write the text to the right of the mark instead of the left.
-        room: Room to the left of the mark, in points. If the text does not fit, it begins at the axis above the mark.
-        look: Properties of the mark that differ from those of its kind.
+        room: Width available to the left of the mark, in points. A wider text is written above the mark, beginning at
+            the vertical axis.
+        look: Properties of the mark that replace those of its kind.
     """
     look = {"linestyle": "", "color": style.BLACK, "zorder": 5, "clip_on": False, **MARKS[kind], **look}
     ax.plot(*wall, label=label, **look)
     if text:
         place: Any = {"xytext": (6 if right else -8, 0), "ha": "left" if right else "right", "va": "center"}
         if room < _LETTER_WIDTH * max(map(len, text.split("\n"))) + 8:
-            # Begin at the axis, above the mark, on a white background, because lines may cross the text.
+            # Write the text above the mark from the vertical axis on, with a white background, because lines may cross
+            # the text there.
             background = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 1.0}
             place = {"xytext": (4 - room, 6), "ha": "left", "va": "bottom", "bbox": background}
         ax.annotate(text, wall, textcoords="offset points", fontsize=8, zorder=6, **place)
@@ -104,7 +118,13 @@ def draw_zeros(ax: Axes) -> None:
 
 
 def name_axes(ax: Axes, spring: str, damper: str) -> None:
-    """Label the axes of stiffness and damping, normalized if the units are empty, and draw the lines of zero."""
+    """Label the axes of stiffness and damping, and draw the lines of zero stiffness and damping.
+
+    Args:
+        ax: Axes to label.
+        spring: Unit of the stiffness; "" if the axes are normalized (alpha and beta).
+        damper: Unit of the damping; "" if the axes are normalized.
+    """
     draw_zeros(ax)
     in_si = f"stiffness  $K$  in {spring}", f"virtual damping  $B$  in {damper}"
     style.label_axes(
@@ -115,20 +135,22 @@ def name_axes(ax: Axes, spring: str, damper: str) -> None:
 
 
 def agrees(outlines: Outlines, x: np.ndarray, y: np.ndarray, good: np.ndarray) -> bool:
-    """Return whether cells agree with outlines: exactly those inside are ``good``, except for cells at the boundary.
+    """Return whether cells agree with outlines: all cells inside are ``good`` and all others are not.
+
+    Cells next to the boundary are not compared.
 
     Args:
         outlines: The outlines.
         x: Horizontal coordinates of the cells.
         y: Vertical coordinates of the cells.
-        good: Whether each cell is stable, or passive; of shape (y, x).
+        good: Mask of the stable cells, or of the passive ones, of shape (y, x).
     """
     inside = _cells_inside(outlines, x, y)
     return not np.any((inside != good) & ~_changes(inside) & ~_changes(good))
 
 
 def _cells_inside(outlines: Outlines, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return which cells, of shape (y, x), lie inside outlines: those with an odd number of crossings to their left.
+    """Return a mask of the cells inside outlines, of shape (y, x): an odd number of outlines is crossed to their left.
 
     The coordinates x and y may be ascending or descending.
     """
@@ -158,7 +180,7 @@ def draw_exact(
         outlines: The outlines; None if there are none.
         x: Horizontal coordinates of the cells.
         y: Vertical coordinates of the cells.
-        good: Whether each cell is stable, or passive; of shape (y, x).
+        good: Mask of the stable cells, or of the passive ones, of shape (y, x).
         face: Color of the region.
         look: Properties of the lines.
 
@@ -175,7 +197,7 @@ def draw_exact(
 
 
 def _changes(cells: np.ndarray) -> np.ndarray:
-    """Return the cells at a change: those with true and false values among themselves and their eight neighbors."""
+    """Return a mask of the cells that differ in value from at least one of their eight neighbors."""
     padded = np.pad(cells, 1, mode="edge").view(np.uint8)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     true = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
@@ -183,9 +205,9 @@ def _changes(cells: np.ndarray) -> np.ndarray:
 
 
 def fit_axes(outlines: Outlines, ax: Axes) -> Outlines:
-    """Return outlines that can be drawn on logarithmic axes: zero and negative coordinates become small positive ones.
+    """Return outlines that can be drawn on the scales of an Axes.
 
-    The replaced points lie outside the frame.
+    On a logarithmic axis, zero and negative coordinates become small positive ones below the limits of the axis.
     """
     both = ax.xaxis, ax.yaxis
     least = [0.1 * min(axis.get_view_interval()) if axis.get_scale() == "log" else -np.inf for axis in both]
@@ -198,16 +220,16 @@ def fit_axes(outlines: Outlines, ax: Axes) -> Outlines:
 
 
 def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
-    """Yield the outlines of the stable set of a scene as columns of a table, the largest outline first."""
+    """Yield each outline of the stable set of a scene as columns of a table, together with further ``columns``."""
     for number, outline in enumerate(scene.stable_region(), start=1):
         piece = "hole" if outline.hole else ("island" if outline.island else "outline")
-        # Close the line by repeating its first point.
+        # Repeat the first point at the end, because tables contain closed lines.
         closed = (np.append(part, part[0]) for part in outline[:2])
         yield {**columns, "number": number, "piece": piece, **tabulate_walls(scene, *closed)}
 
 
 def tabulate_walls(scene: Scene, stiffness: Any, virtual_damping: Any) -> dict[str, Any]:
-    """Return walls as columns of a table, normalized and in SI units."""
+    """Return walls as columns of a table, normalized by the units of a scene and in SI units."""
     normalized = {"alpha": stiffness / scene.units.stiffness, "beta": virtual_damping / scene.units.virtual_damping}
     return {**normalized, **dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))}
 
@@ -225,8 +247,8 @@ def draw_stable_set(
 ) -> np.ndarray:
     """Draw the stable walls of one or several devices over stiffness and virtual damping.
 
-    Solid: walls connected to K = 0; dashed: islands, stable walls not connected to them; dotted: holes, unstable walls
-    surrounded by stable ones; dash-dotted: passive walls.
+    The outline of the walls connected to K = 0 is solid, that of islands (not connected to K = 0) dashed, that of holes
+    (unstable walls inside) dotted, and that of the passive walls dash-dotted.
 
     Args:
         outlines: Columns label, number, piece (outline, island, hole or passive), stiffness_N_per_m,
@@ -249,11 +271,12 @@ def draw_stable_set(
         pieces |= _draw_pieces(ax, select(outlines, label=label), names, color, factors, 0.5 / (1 + len(labels)))
     rows, spec = select(walls), ax.get_subplotspec()
     width = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
-    # Leave room for the text to the right of the stiffest wall; its width does not shrink with the panel.
+    # Extend the stiffness axis for the text to the right of the stiffest wall, by a larger part if the panel is narrow,
+    # because the width of the text does not shrink with the panel.
     right_margin, most = 0.28 * max(1.0, 5.6 / width), max(rows[names[0]], default=np.nan) * factors[0]
     rows = {"digits": np.full(len(rows["wall"]), 4), **rows}
     for kind, label, digits, *wall in zip(*(rows[name] for name in ("wall", "label", "digits", *names)), strict=True):
-        # Round K down, so that the printed wall is stable.
+        # Round K down, because the printed wall must be stable.
         read = round_safely(wall[0], "below", digits), wall[1]
         wall = [value * factor for value, factor in zip(wall, factors, strict=True)]
         which = kind.split()[0]
@@ -285,7 +308,15 @@ def draw_stable_set(
 
 
 def scale_walls(tables: Sequence[Table], names: Sequence[str] = SI_COLUMNS) -> tuple[list[float], list[str]]:
-    """Return factors and units for stiffness and damping that give few digits; factor 1, no unit, if normalized."""
+    """Choose units with SI prefixes that keep the stiffness and damping of walls short in print.
+
+    Args:
+        tables: Tables of walls.
+        names: Columns of stiffness and damping.
+
+    Returns:
+        The factors to these units, and the units; factors of 1 and empty units for normalized columns.
+    """
     units = ("N/m", "N s/m") if tuple(names) == SI_COLUMNS else ("1", "1")
     scales = [
         style.si_unit(np.concatenate([np.asarray(table[name], float) for table in tables]), unit)
@@ -297,7 +328,19 @@ def scale_walls(tables: Sequence[Table], names: Sequence[str] = SI_COLUMNS) -> t
 def _draw_pieces(
     ax: Axes, table: Table, names: tuple[str, ...], color: Any, factors: Sequence[float], shade: float
 ) -> set[str]:
-    """Draw the outlines of one device and shade its stable and its passive walls; return the kinds of its outlines."""
+    """Draw the outlines of one device, and shade its stable and its passive walls.
+
+    Args:
+        ax: Axes to draw into.
+        table: Outlines of the device.
+        names: Columns of stiffness and damping.
+        color: Color of the device.
+        factors: Factors from the units of these columns to those of the axes.
+        shade: Opacity of the regions.
+
+    Returns:
+        The kinds of the outlines.
+    """
     edges: dict[bool, list[Any]] = {False: [], True: []}
     pieces = curves(table, "number", "piece")
     for outline in pieces:

@@ -1,7 +1,8 @@
-"""Tables of named columns, as in the CSV files of studies, and the curves that they contain.
+"""Select, sort, split and stack the rows of tables, as in the CSV files of studies.
 
-A *curve* is a group of consecutive rows of a table with the same values in some columns, the *keys*. Names of columns
-end with the unit, for example ``stiffness_N_per_m``; tables of rotary devices have the units of rotary devices.
+A *table* has named columns of equal length. A *curve* is a group of consecutive rows with equal values in some columns,
+the *keys*. Names of columns end with the unit, for example ``stiffness_N_per_m``; tables of rotary devices have the
+units of rotary devices. *Arrays* of npz files have several dimensions, one per parameter at the end.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from zwidth.figures.style import house_style
 from zwidth.words.formatting import convert_header
 from zwidth.words.unit_system import LINEAR, ROTARY, UNIT_PAIRS
 
-_ROTARY_UNITS = [rotary for _, rotary in UNIT_PAIRS]
-# Columns of walls in SI units, in addition to alpha and beta.
+_ROTARY_UNITS = [rotary for _, rotary in UNIT_PAIRS]  # units that only datasets of rotary devices have
+# Names of the columns with the stiffness and the virtual damping of walls in SI units.
 SI_COLUMNS = ("stiffness_N_per_m", "virtual_damping_N_s_per_m")
 
 
@@ -37,7 +38,10 @@ Result = TypeVar("Result")
 
 
 def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Wrap a function to draw in the house style, and in rotary units if one of its tables or datasets has them."""
+    """Wrap a function so that it draws in the house style, and in rotary units if one of its arguments has these.
+
+    Tables with rotary units are passed on with the column names of linear devices.
+    """
 
     @wraps(function)
     def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
@@ -51,19 +55,19 @@ def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters,
 
 
 def is_of_rotary(data: Any) -> bool:
-    """Return whether a sweep's dataset contains units of rotary devices."""
+    """Return whether an object is the dataset of a sweep with units of rotary devices."""
     variables = getattr(data, "variables", {})
     return any(str(each.attrs.get("units", "")) in _ROTARY_UNITS for each in variables.values())
 
 
 def name_as_linear(table: Any) -> Any:
-    """Rename the columns of a table of rotary devices to those of linear devices; return other objects unchanged."""
+    """Return a table of rotary devices with the column names of linear devices; return other objects unchanged."""
     names = {str(name): convert_header(str(name), LINEAR) for name in table} if hasattr(table, "keys") else {}
     return {linear: table[name] for name, linear in names.items()} if any(k != v for k, v in names.items()) else table
 
 
 def select(table: Table, **wanted: object) -> dict[str, np.ndarray]:
-    """Return the rows of a table with the given values, by column."""
+    """Return the rows of a table that have the given values; the keywords are column names."""
     columns = {str(name): np.asarray(table[name]) for name in table}
     for name, value in wanted.items():
         keep = columns[name] == value
@@ -72,17 +76,18 @@ def select(table: Table, **wanted: object) -> dict[str, np.ndarray]:
 
 
 def in_order(columns: Mapping[str, np.ndarray], over: str) -> dict[str, np.ndarray]:
-    """Return the rows of a table in ascending order of a column."""
+    """Return the rows of a table, sorted in ascending order of the column ``over``."""
     order = np.argsort(columns[over], kind="stable")
     return {name: column[order] for name, column in columns.items()}
 
 
 def grid_in_order(arrays: Mapping[str, np.ndarray], axes: Iterable[str]) -> dict[str, np.ndarray]:
-    """Sort arrays in ascending order of their axes.
+    """Sort multi-dimensional arrays in ascending order of each of their parameters.
 
     Args:
-        arrays: The arrays by name, including one 1-D array per axis.
-        axes: Names of the axes, in the order of the last dimensions of the arrays with the most dimensions.
+        arrays: The arrays by name, including one 1-D array per parameter. Only the arrays with the most dimensions are
+            sorted, together with those of the parameters.
+        axes: Names of the parameters, in the order of the last dimensions of these arrays.
     """
     names, n_dims = list(axes), max(values.ndim for values in arrays.values())
     ordered = dict(arrays)
@@ -94,10 +99,13 @@ def grid_in_order(arrays: Mapping[str, np.ndarray], axes: Iterable[str]) -> dict
 
 
 def curves(table: Table, *keys: str, over: str = "", **wanted: object) -> list[Any]:
-    """Return the curves of a table: consecutive rows with the same values of ``keys``.
+    """Return the curves of a table as objects with the columns as attributes.
 
-    A curve has the columns as attributes: single values of the keys, arrays of the others, sorted by the column
-    ``over`` if given. Only rows with the values ``wanted``, by column, count.
+    Args:
+        table: Table.
+        keys: Columns with equal values along a curve, which become single values; the others become arrays.
+        over: Column by which the rows of each curve are sorted; "" to keep their order.
+        wanted: Values that rows must have to be selected, by column.
     """
     columns = select(table, **wanted)
     changes = [columns[key][1:] != columns[key][:-1] for key in keys]
@@ -111,7 +119,11 @@ def curves(table: Table, *keys: str, over: str = "", **wanted: object) -> list[A
 
 
 def stack(parts: Iterable[Mapping[str, object]]) -> dict[str, np.ndarray]:
-    """Stack curves into one table; repeat numbers and texts along their curve, and fill missing columns with NaN."""
+    """Stack curves, given as columns by name, into one table.
+
+    A number or text in place of a column is repeated along its curve. Columns that a curve lacks are filled with NaN,
+    or with "" for texts.
+    """
     blocks = []
     for part in filter(None, parts):
         arrays = [np.asarray(value) for value in part.values()]
@@ -128,7 +140,7 @@ def stack(parts: Iterable[Mapping[str, object]]) -> dict[str, np.ndarray]:
 
 
 def si_scale(table: Table) -> tuple[float, float] | None:
-    """Return K at alpha = 1 and B at beta = 1; None if a table has no walls in SI units."""
+    """Return the stiffness at alpha = 1 and the damping at beta = 1 in SI units; None without columns in SI units."""
     if SI_COLUMNS[0] not in table:
         return None
     scales = []

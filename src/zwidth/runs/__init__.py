@@ -1,4 +1,4 @@
-"""Runs: compute the studies of a configuration into a folder of stores, tables, figures and texts, and report them."""
+"""Compute the studies of a configuration into a folder of stores, tables, figures and texts, and write reports."""
 
 from zwidth.runs.run import ProgressCallback, RunResult, StudyEvent, StudyResult, plan_run, run
 

@@ -1,7 +1,9 @@
 """Draw figures from the store of a sweep: choose its variables, their axes and slices, and add exact boundaries.
 
-A *plane* is a figure of an output over two parameters; *edges* are the exact boundaries of the stable and of the
-passive walls, drawn as lines on a plane of walls. A *slice* is the part of a sweep at given values of some parameters.
+A *store* is the Zarr group with the results of one sweep. A *plane* is a figure of an output over two parameters; a
+plane *of walls* has the axes stiffness and damping. *Edges* are the exact boundaries of the stable and of the passive
+walls, drawn as lines on a plane of walls; an *outline* is one of their closed lines. A *slice* is the part of a sweep
+at selected values of some parameters.
 """
 
 from __future__ import annotations
@@ -32,16 +34,17 @@ if TYPE_CHECKING:
     import xarray
 
 _PLANES = ({"alpha", "beta"}, {"stiffness", "virtual_damping"})  # dimensions of a plane of walls
-FOLDER = "figures"  # default folder of the figures, next to the stores
-_MIN_SURFACE = 6  # values along the shorter axis from which an output of devices is drawn as a plane, not as curves
+FOLDER = "figures"  # default name of the folder of the figures, next to the stores
+# Smallest number of values along both axes for which an output of devices is drawn as a plane; fewer become curves.
+_MIN_SURFACE = 6
 
 
 def make_edges(store: Store) -> Edges:
-    """Return a function that computes the edges of the stable and the passive walls for a part of a sweep.
+    """Return a function that computes the edges for a part of a sweep with one device.
 
-    The part must contain one device and be prepared by `zwidth.figures.grid.prepare`. The function returns outlines by
-    name ("stable", "passive") in the units of the part, stiffness first; none if the part is not a plane of walls, or
-    if the parameters of its device are invalid.
+    The part must be prepared by `zwidth.figures.grid.prepare`. The function returns outlines by name ("stable",
+    "passive"), as points (stiffness, damping) in the units of the part. It returns an empty dict if the part is not a
+    plane of walls, or if the parameters of its device are invalid.
     """
     grid = store.plan.grid
     coordinates, dims = grid.coordinates(), [dim.replace(".", "_") for dim in grid.device_dims]
@@ -63,14 +66,14 @@ def make_edges(store: Store) -> Edges:
 
 
 def _find_index(values: np.ndarray, coordinate: xarray.DataArray) -> int:
-    """Return the index of the value of a part among the values of the sweep."""
+    """Return the index of a scalar coordinate of a part among the values of this parameter in the sweep."""
     if values.dtype.kind == "U":
         return values.tolist().index(str(coordinate.values))
     return int(np.argmin(np.abs(values - float(coordinate) / coordinate.attrs["factor"])))
 
 
 def _compute_outlines(store: Store, indices: tuple[int, ...]) -> dict[str, Outlines]:
-    """Compute the edges of one device of a sweep, given by its index along each device dimension; none if invalid."""
+    """Compute the edges of the device with the given index along each device dimension; {} if the device is invalid."""
     parameters = store.plan.grid.scene_block(tuple(slice(k, k + 1) for k in indices)).parameters
     try:
         return find_edges(store.study.make_scene({name: float(values[0]) for name, values in parameters.items()}))
@@ -95,15 +98,16 @@ def draw_stores(
     Args:
         path: Store, or folder with stores.
         out: Folder of the figures; by default ``figures`` next to the stores.
-        at: Slices, as values by name of the parameter: a number in the units of the store, a quantity with its unit
-            such as "1 ms", or the label of a device. The nearest value of the sweep is drawn. Of a parameter without a
-            value, up to three values are drawn.
+        at: Values by name of the parameter that select a slice: a number in the units of the store, a quantity with its
+            unit such as "1 ms", or the label of a device. The nearest value of the sweep is drawn. For every other
+            parameter that is not an axis, up to three values are drawn.
         formats: File formats.
-        dpi: Resolution of pixel graphics.
-        size: Width, or width and height, of the figures.
-        style: Matplotlib style sheet.
-        progress: Called with the path of every figure.
-        note: Called with messages for the user: another value than the requested one, missing chunks, no figure.
+        dpi: Resolution of pixel graphics, in dots per inch.
+        size: Width of the figures, or width and height, in inches.
+        style: Path of a matplotlib style sheet.
+        progress: Function that is called with the path of every figure.
+        note: Function that is called with messages for the user: a value other than the requested one is drawn, chunks
+            are missing, or a sweep has no figure.
 
     Returns:
         The paths of the figures.
@@ -115,7 +119,7 @@ def draw_stores(
     stores = list_stores(folder)
     beside = folder.parent if stores == [folder] else folder
     target = beside / FOLDER if out is None else Path(os.fsdecode(out))
-    # Stores contain underscores in place of the dots of parameter names.
+    # Replace dots by underscores, because the names of dimensions in stores have underscores in place of dots.
     wanted = {name.replace(".", "_"): value for name, value in (at or {}).items()}
     datasets = {store: open_dataset(store).reset_coords(drop=True) for store in stores}
     for store in (store for store, data in datasets.items() if not data.attrs["complete"]):
@@ -142,14 +146,14 @@ def draw_stores(
 
 def _explain_absence(data: xarray.Dataset) -> str:
     """Return the reason why a sweep has no figure."""
-    # Use the declared order of the variables, because the order in a store differs between file systems.
+    # Use the order of `VARIABLES`, because the order in which a store lists its variables differs between file systems.
     varied = [name for name in ("device", *VARIABLES) if data.sizes.get(name, 0) > 1]
     return f"no figure shows its outputs over {', '.join(varied)}" if varied else "it is a single point"
 
 
 def list_figures(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Yield the name of each figure of a sweep or slice, and the function that draws it."""
-    # Use the declared order of the outputs, because the order in a store differs between file systems.
+    # Use the order of `OUTPUTS`, because the order in which a store lists its variables differs between file systems.
     for name in OUTPUTS:
         if name not in data or name == "kind" or (name == "passive" and "stable" in data):
             continue
@@ -166,7 +170,14 @@ def list_figures(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[t
 def _select_slice(
     store: Path, data: xarray.Dataset, wanted: Mapping[str, float | str], note: Callable[[str], None]
 ) -> xarray.Dataset:
-    """Return the slice of a sweep at the values nearest to the requested ones; report differing values by ``note``."""
+    """Return the slice of a sweep at the values nearest to the requested ones.
+
+    Args:
+        store: Path of the store, for messages.
+        data: Dataset of the sweep.
+        wanted: Requested values by name of the parameter; parameters that the sweep does not vary are ignored.
+        note: Function that is called with a message for every parameter whose value differs from the requested one.
+    """
     nearest = {str(dim): _find_nearest(data, str(dim), wanted[str(dim)]) for dim in data.dims if dim in wanted}
     for dim, (index, exact) in nearest.items():
         if not exact:
@@ -176,7 +187,7 @@ def _select_slice(
 
 
 def _format_value(value: float, unit: str) -> str:
-    """Return a value with its unit; no unit if it is 1."""
+    """Return a value with its unit as text, without the unit if this is 1."""
     return f"{short(value)} {unit}".removesuffix(" 1")
 
 
@@ -202,7 +213,7 @@ def _find_nearest(data: xarray.Dataset, dim: str, value: float | str) -> tuple[i
         raise InputError(f"at: {dim}: got {value!r}; write a finite number")
     values = np.asarray(data[dim].values, dtype=float)
     index, ordered = int(np.argmin(np.abs(values - wanted))), np.sort(values)
-    # Allow half a step beyond either end. A single value has no step.
+    # Accept values up to half a step of the grid outside its range, for a single value only the value itself.
     steps = np.diff(ordered) if values.size > 1 else np.zeros(1)
     slack = 1e-9 * abs(wanted)
     if not ordered[0] - 0.5 * steps[0] - slack <= wanted <= ordered[-1] + 0.5 * steps[-1] + slack:

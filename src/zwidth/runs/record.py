@@ -1,8 +1,10 @@
-"""The record of a run, ``run.json``: its studies, inputs, package versions, outcomes, and the files it has written.
+"""Read and write the record of a run, ``run.json``: its studies, inputs, package versions, outcomes and written files.
 
-The record is written again after every study, so that a run that is killed at any moment leaves a correct record. The
-files of a study are created in a hidden folder, then entered in the record, and only then moved to their names. So no
-file of a run is ever incomplete under its name, and a file that is not in the record is never replaced or removed.
+The record contains one *entry* per study. It is written again after every study, so that a run that is killed at any
+time leaves a correct record. The files of a study are created in a hidden folder, then entered in the record, and only
+then moved to their names in the folder of the run. So no file of a run is ever incomplete under its name, and a file
+that is not in the record, a file *of the user*, is never replaced or removed. *Inputs* of a study are its configuration
+and the files that this configuration reads, of which the folder ``inputs`` contains copies.
 """
 
 from __future__ import annotations
@@ -34,14 +36,14 @@ from zwidth.words.errors import InputError, StoreError, StoreExistsError
 from zwidth.words.files import remove_quietly, write_whole
 from zwidth.words.formatting import describe
 
-RUN_FILE = "run.json"  # the record
-CONFIG_FILE = "config.yaml"  # copy of the configuration, with the names of the copied inputs
-INPUTS = "inputs"  # folder with copies of the files that the configuration reads
+RUN_FILE = "run.json"  # name of the file with the record
+CONFIG_FILE = "config.yaml"  # name of the copy of the configuration, in which file names are those of the copied inputs
+INPUTS = "inputs"  # name of the folder with copies of the files that the configuration reads
 RUN_FORMAT = 2  # format version of the record
-_CHECKSUM = "record_sha256"  # key of the checksum of the record
-_MOVE = f"move it away, or {ELSEWHERE}"  # remedy for files of the user, for messages
-_PACKAGES = ("scipy", "matplotlib", "optimistix", "jaxopt")  # recorded together with the packages that affect results
-_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}\.partial")  # names of incomplete files and folders, made by `hidden_beside`
+_CHECKSUM = "record_sha256"  # key of the checksum in the record
+_MOVE = f"move it away, or {ELSEWHERE}"  # remedy in messages about files of the user
+_PACKAGES = ("scipy", "matplotlib", "optimistix", "jaxopt")  # further packages whose versions are recorded
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}\.partial")  # names of unfinished files and folders, from `hidden_beside`
 _KEYS = ("csv", "device")  # keys of the configuration whose value may be the name of a file
 
 
@@ -55,7 +57,7 @@ class Record:
         self._read()
 
     def _read(self) -> None:
-        """Read the record; raise `StoreError` if it cannot be used."""
+        """Read the record, if any; raise `StoreError` if the file is unreadable or not a record."""
         where, remedy = self.folder / RUN_FILE, f"{ELSEWHERE}, or remove it"
         try:
             content = json.loads(where.read_text(encoding="utf-8"))
@@ -69,7 +71,8 @@ class Record:
         if checksum is not None and hash_json(content) != checksum:
             self.damaged = True
             if content.get("format") == RUN_FORMAT:
-                # Keep the lists of files, because the studies are computed again anyway; discard the results.
+                # Mark all studies as unfinished, so that they are computed again. Keep only the lists of their files,
+                # which a run must have in order to replace these files.
                 entries = [entry for entry in content["studies"] if isinstance(entry, dict)]
                 content["studies"] = [
                     {**entry, "state": "open"}
@@ -87,7 +90,7 @@ class Record:
         return bool(self.content)
 
     def entry(self, name: str) -> dict[str, Any] | None:
-        """Return the entry of a study; None if the record has none."""
+        """Return the entry of a study by its name; None if the record contains no such study."""
         return next((entry for entry in self.content.get("studies", ()) if entry.get("name") == name), None)
 
     def check_free(self, config: str, *, overwrite: bool, resume: bool) -> None:
@@ -95,16 +98,16 @@ class Record:
 
         Args:
             config: Text of the configuration, which identifies a run whose record is lost.
-            overwrite: An existing run may be replaced.
-            resume: An existing run may be resumed.
+            overwrite: True if an existing run may be replaced.
+            resume: True if an existing run may be resumed.
         """
         if (self.folder.exists() or self.folder.is_symlink()) and not self.folder.is_dir():
             raise StoreExistsError(f"out: {self.folder} is a file, a folder is needed; choose another with --out DIR")
         check_folder(self.folder)
         if resume or not self.folder.is_dir():
             return
-        # Names that a run without a record may leave. Stores are checked one by one later, because each of them
-        # contains its study.
+        # Accept the files that a run leaves if its record is lost. Stores are checked later (`check_stores`), because
+        # each of them contains its study.
         names, expected = [path.name for path in self.folder.iterdir()], (LOCKS, CONFIG_FILE, "figures")
         strange = [name for name in names if not name.endswith((SUFFIX, ".partial")) and name not in expected]
         fault = ""
@@ -126,9 +129,9 @@ class Record:
         return False
 
     def check_same(self, inputs: dict[str, dict[str, Any]]) -> None:
-        """Raise `StoreError` if the run cannot be resumed: it was computed by other releases or from other inputs.
+        """Raise `StoreError` if the run cannot be resumed, because other releases or other inputs produced it.
 
-        ``inputs`` contains the present inputs of each study, by its name.
+        ``inputs`` contains the inputs of each study in the present configuration, by name of the study.
         """
         if not self.exists:
             return
@@ -138,7 +141,8 @@ class Record:
                 f"with --overwrite, or {ELSEWHERE}"
             )
         if self.damaged:
-            # Skip the comparison, because all studies are computed again, and each store contains its own study.
+            # Skip the comparison of a damaged record, because all studies are computed again, and each sweep is
+            # compared with the study in its store.
             return
         where = self.folder / RUN_FILE
         for name, now in inputs.items():
@@ -148,13 +152,21 @@ class Record:
         refuse_versions(where, self.content.get("versions", {}))
 
     def start(self, **about: Any) -> None:
-        """Write the start of a run: the attributes ``about``, the time and the package versions."""
+        """Record the start of a run: the time, the package versions, and the attributes ``about``."""
         about |= {"format": RUN_FORMAT, "started": datetime.now(UTC).isoformat(timespec="seconds")}
         about |= {"precision": "float64", "versions": list_versions(*_PACKAGES)}
         self._update({**about, "started": self.content.get("started", about["started"])})
 
     def keep_config(self, text: str, inputs: Mapping[str, bytes]) -> None:
-        """Write the configuration and the files that it reads into the folder; never replace files of the user."""
+        """Write the configuration and copies of the files that it reads into the folder.
+
+        Args:
+            text: Text of the configuration.
+            inputs: Content of each file by the name of its copy.
+
+        Raises:
+            StoreExistsError: A file of the user has the name of a copy.
+        """
         path, input_dir = self.folder / CONFIG_FILE, self.folder / INPUTS
         digests = {name: hashlib.sha256(data).hexdigest() for name, data in inputs.items()}
         missing = {name: data for name, data in inputs.items() if hash_file(input_dir / name) != digests[name]}
@@ -165,8 +177,8 @@ class Record:
         if strange:
             raise StoreExistsError(f"out: {input_dir / strange[0]} was not written by this run; {_MOVE}")
         written = CONFIG_FILE in self.files()
-        # If the folder contains this configuration but no record of it, the record was lost. Then files with the names
-        # of the run's files belong to the run.
+        # If the folder contains this configuration but the record does not list it, the record was lost. Record this,
+        # so that files with the names of the run's results count as files of the run.
         lost = not written and self._contains_config(text)
         self._update(({"inputs": {**recorded, **digests}} if digests else {}) | ({"lost": True} if lost else {}))
         for name, data in missing.items():
@@ -176,11 +188,16 @@ class Record:
             write_whole(path, text.encode("utf-8"))
 
     def note(self, entry: dict[str, Any]) -> None:
-        """Write the outcome of a study to the record, replacing its earlier entry."""
+        """Record the entry of a study in place of its earlier entry."""
         self._update({}, entry)
 
     def _update(self, about: dict[str, Any], entry: dict[str, Any] | None = None) -> None:
-        """Update the content, replacing the entry of the same study if ``entry`` is given, and write it to the file."""
+        """Update the record and write its file.
+
+        Args:
+            about: Attributes of the run to be set.
+            entry: Entry of a study, which replaces an earlier entry of the same study; None for no change.
+        """
         content = {**self.content, **about}
         studies = [old for old in content.get("studies", ()) if entry is None or old["name"] != entry["name"]]
         content["studies"] = [*studies, *([] if entry is None else [entry])]
@@ -199,17 +216,23 @@ class Record:
         ]
 
     def keep(self, stage: Path, entry: dict[str, Any]) -> None:
-        """Move the files of a study from the folder ``stage`` to their names, and write its entry to the record.
+        """Move the files of a study into the folder of the run, and record its entry.
 
-        If the study is done, files that it had written earlier and does not have any more are removed. Raise
-        `StoreExistsError` if a file of the user has one of the names.
+        If the study is done, its earlier files that were not written again are removed.
+
+        Args:
+            stage: Hidden folder with the files.
+            entry: Entry of the study, without its files.
+
+        Raises:
+            StoreExistsError: A file of the user has the name of one of the files.
         """
         before = self.entry(entry["name"]) or {}
         files = {path.name: hash_file(path) for path in sorted(stage.iterdir())}
         for file in files:
             if (self.folder / file).exists() and file not in self.files() and not self.content.get("lost"):
                 raise StoreExistsError(f"out: {self.folder / file} was not written by this run; {_MOVE}")
-        # Write the names first, so that the record of a run killed between two files contains all of them.
+        # Record the names before moving the files, so that the record of a run that is killed meanwhile is complete.
         both = {**before.get("files", {}), **files}
         self.note({**entry, "state": "open", "files": both})
         for file in files:
@@ -220,7 +243,7 @@ class Record:
         self.note({**entry, "files": both})
 
     def files(self) -> set[str]:
-        """Return the names of all files that the run has written, according to the record."""
+        """Return the names of all files that the run has written, as listed in the record."""
         names = {RUN_FILE}
         if self.content.get("config_file"):
             names.add(CONFIG_FILE)
@@ -258,7 +281,7 @@ class Record:
 
 
 def _find_fault(content: Any) -> str:
-    """Return the reason why a JSON value is no record of a run; "" if it is one."""
+    """Return the reason why a JSON value is not a record of a run; "" if it is a record."""
     kinds = {"studies": list, "versions": dict, "inputs": dict}
     if not all(isinstance(content.get(key, kind()), kind) for key, kind in kinds.items()):
         return "no record of a run"
@@ -267,7 +290,7 @@ def _find_fault(content: Any) -> str:
         if not isinstance(entry, dict) or not isinstance(entry.get("files", {}), dict):
             return "a damaged record of a run"
         names += [entry.get("name"), *entry.get("files", ())]
-    # Refuse names outside the folder, because a run removes and replaces the files named in its record.
+    # Reject names of files outside the folder, because a run removes and replaces the files named in its record.
     outside = [name for name in names if not isinstance(name, str) or not is_plain_name(name)]
     return f"lists {describe(outside[0])}, which is not the name of a file in its folder" if outside else ""
 
@@ -289,7 +312,7 @@ def hash_file(path: Path) -> str:
 
 
 def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[str, str]]:
-    """Collect the files that a valid configuration reads, so that the run can be repeated from its own folder.
+    """Collect the files that a valid configuration reads, to copy them into the folder of the run.
 
     Args:
         text: Text of the configuration.
@@ -315,7 +338,7 @@ def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[
 
 
 def _choose_name(name: str, taken: dict[str, bytes]) -> str:
-    """Return a name for the copy of a file; it is valid on all file systems and in YAML, and differs from ``taken``."""
+    """Return a name for the copy of a file that is valid on all file systems and in YAML, and not yet ``taken``."""
     plain = re.sub(r"[^A-Za-z0-9._-]", "_", PurePath(name).name)
     stem, suffix = PurePath(plain).stem, PurePath(plain).suffix
     number = 1
@@ -327,7 +350,7 @@ def _choose_name(name: str, taken: dict[str, bytes]) -> str:
 
 
 def rename_inputs(value: Any, names: dict[str, str]) -> Any:
-    """Return the JSON of a configuration with the names of its files replaced, given the new name by the old one."""
+    """Return the JSON of a configuration in which the names of files are replaced, given the new names by old name."""
     if isinstance(value, list):
         return [rename_inputs(item, names) for item in value]
     if not isinstance(value, dict):

@@ -1,7 +1,9 @@
 """Run the studies of a configuration: compute them, write results and figures into one folder, and record the run.
 
 A study is either a sweep, computed chunk by chunk into a store (`sweep.engine`), or a *computed study*, computed as a
-whole and written to a table and figures (`studies`). The computed studies run first, one by one, then all sweeps.
+whole and written to a table and figures (`studies`). The computed studies run first, one by one, then all sweeps
+together. The *record* of a run is the file ``run.json`` in its folder, with one *entry* per study (`runs.record`). A
+*part* of a long study is a step of it whose completion is reported.
 """
 
 from __future__ import annotations
@@ -43,55 +45,56 @@ class StudyResult:
     name: str
     kind: str
     state: Literal["done", "kept", "failed", "open"]
-    seconds: float = 0.0  # computing time; sweeps are computed together, so theirs is a share of the total
-    files: tuple[str, ...] = ()  # files written in the folder of the run; of a sweep, its store
+    seconds: float = 0.0  # computing time in s; for a sweep, its part of the time in which all sweeps were computed
+    files: tuple[str, ...] = ()  # names of the files written in the folder of the run; for a sweep, that of its store
     notes: tuple[str, ...] = ()  # remarks that affect the use of the results, such as points without a result
-    answer: tuple[str, ...] = ()  # the main result, if a line or two can state it
-    error: str = ""  # type and message of the exception; empty if there was none
-    exception: Exception | None = field(default=None, repr=False, compare=False)  # of a failed computed study
-    sweep: SweepResult | None = None  # outcome of the chunks of a sweep
+    answer: tuple[str, ...] = ()  # main result in one or two lines; empty if it is longer
+    error: str = ""  # type and message of the exception that ended the study; empty if there was none
+    # Exception that ended a computed study.
+    exception: Exception | None = field(default=None, repr=False, compare=False)
+    sweep: SweepResult | None = None  # outcome of the chunks; None for a computed study
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """A finished run."""
+    """Outcome of a run."""
 
     folder: Path
     studies: tuple[StudyResult, ...]  # outcome of each study, sweeps last
-    seconds: float
+    seconds: float  # run time in s
     repaired: tuple[str, ...] = ()  # damaged or missing files and chunks that were created again
-    hopeless: str = ""  # error that ended the run because it affects every study, for example a full disk
-    interrupted: bool = False  # stopped by the user with Ctrl-C; results computed until then are kept
-    lost: str = ""  # error of the cluster that ended the run; results computed until then are kept
-    whole: int = 0  # number of studies in the configuration that are not sweeps
+    hopeless: str = ""  # error that ended the run, because it affects every study, such as a full disk
+    interrupted: bool = False  # True if the user stopped the run with Ctrl-C; earlier results are kept
+    lost: str = ""  # error of the cluster that ended the run; earlier results are kept
+    whole: int = 0  # number of computed studies in the configuration
 
     @property
     def failed(self) -> tuple[StudyResult, ...]:
-        """The studies without results because of an error."""
+        """The outcomes of the studies that failed because of an error."""
         return tuple(study for study in self.studies if study.state == "failed")
 
     @property
     def sweeps(self) -> dict[str, SweepResult]:
-        """The outcomes of the sweeps, by name of the study."""
+        """The outcome of each sweep, by name of the study."""
         return {study.name: study.sweep for study in self.studies if study.sweep is not None}
 
     @property
     def ok(self) -> bool:
-        """True if all studies of the run are done."""
+        """True if no study failed, and neither the user nor an error ended the run early."""
         return not (self.failed or self.interrupted or self.hopeless or self.lost)
 
 
 @dataclass(frozen=True)
 class StudyEvent:
-    """An event for progress callbacks: start or end of a study, completion of a part of it or of a chunk of a sweep."""
+    """Event that a run reports: start or end of a study, completion of a part of it, or of a chunk of a sweep."""
 
     index: int  # number of the study, from 1
     total: int  # number of studies
     name: str
     kind: str
-    result: StudyResult | None = None  # outcome, at the end of a study
-    progress: Progress | None = None  # progress of the sweeps, after a chunk
-    parts: tuple[int, int] | None = None  # finished parts and all parts of a long study, after a part
+    result: StudyResult | None = None  # outcome of the study; only at its end
+    progress: Progress | None = None  # progress of all sweeps; only after a chunk
+    parts: tuple[int, int] | None = None  # numbers of finished and of all parts; only after a part of a long study
 
 
 ProgressCallback: TypeAlias = Callable[[StudyEvent], None]
@@ -128,8 +131,8 @@ def run(
         scheduler: Address of a dask.distributed scheduler whose workers compute sweeps. The workers need access to the
             folder under the same path.
         memory: Bytes available to a chunk of a sweep during its computation.
-        progress: Called with a `StudyEvent` at the start and the end of a study, after every chunk of a sweep, and
-            after each part of a long study.
+        progress: Function that is called with a `StudyEvent` at the start and the end of a study, after every chunk of
+            a sweep, and after each part of a long study.
 
     Returns:
         RunResult: ``folder``, ``studies`` with the outcome of each study, ``seconds``. If a study fails, its error is
@@ -216,8 +219,8 @@ class _Run:
     Args:
         config: The configuration.
         record: The record of the run.
-        inputs: The inputs of each study, by its name, as recorded.
-        report: Called with every event.
+        inputs: Inputs of each study for the record, by name of the study.
+        report: Function that is called with every event.
         total: Number of studies.
     """
 
@@ -236,7 +239,10 @@ class _Run:
         return bool(self.hopeless) or self.interrupted
 
     def compute_studies(self, computed: list[ComputedStudy]) -> None:
-        """Compute the studies that are not done; record errors and continue, because studies are independent."""
+        """Compute the studies that are not done yet.
+
+        An error of a study is recorded and does not stop the others, because studies are independent.
+        """
         for index, study in enumerate(computed, start=1):
             event = StudyEvent(index, self.total, study.name, study.kind_name())
             entry, faults = self.record.entry(study.name), self.record.faults(study.name)
@@ -257,7 +263,7 @@ class _Run:
                 return
 
     def _compute(self, study: ComputedStudy) -> StudyResult:
-        """Compute a study, write its files, and record it."""
+        """Compute a study, write its files, record its entry, and return its outcome."""
         clock, outcome, error = time.perf_counter(), Outcome(), None
         entry = {"name": study.name, "kind": study.kind_name(), "inputs": self.inputs[study.name]}
         alone = sum(type(other) is type(study) for other in self.config.studies) == 1
@@ -293,12 +299,15 @@ class _Run:
     def run_sweeps(self, plans: list[Plan], about: dict[str, Any], **options: Any) -> None:
         """Compute all sweeps together, so that worker processes are started only once.
 
-        ``about`` contains attributes of the stores, ``options`` the workers or the scheduler.
+        Args:
+            plans: The plan of each sweep.
+            about: Attributes of the stores.
+            options: Arguments of `compute_sweeps` that select workers or a scheduler.
         """
         clock = time.perf_counter()
         number = {plan.study.name: len(self.results) + k for k, plan in enumerate(plans, start=1)}
-        # Workers compute chunks of several sweeps in parallel. Assign the time between two completed chunks to the
-        # sweep of the second one.
+        # Assign the time between two completed chunks to the sweep of the second chunk, because workers compute chunks
+        # of several sweeps in parallel.
         spent = dict.fromkeys(number, 0.0)
 
         def report_chunk(progress: Progress) -> None:
@@ -312,12 +321,12 @@ class _Run:
             self.report(event)
 
         for plan in plans:
-            # Enter the store in the record before it is created, so that the record of a killed run contains it.
+            # Record the store before it is created, so that the record of a killed run contains it.
             self.record.note(self._make_sweep_entry(plan.study, "open"))
         try:
             sweeps = compute_sweeps(plans, self.record.folder, about, progress=report_chunk, **options)
         except KeyboardInterrupt:
-            # The user interrupted before the first chunk; later interrupts are handled in `compute_sweeps`.
+            # Handle an interrupt before the first chunk; `compute_sweeps` handles later ones itself.
             self.interrupted = True
             return
         self.hopeless, self.interrupted, self.lost = sweeps.fatal_error, sweeps.interrupted, sweeps.lost
@@ -339,18 +348,20 @@ class _Run:
             self.report(StudyEvent(number[study.name], self.total, study.name, "sweep", result))
 
     def _make_sweep_entry(self, study: SweepStudy, state: str) -> dict[str, Any]:
-        """Return the entry of a sweep for the record, without checksums, because the store contains its own."""
+        """Return the entry of a sweep for the record; its file has no checksum, because the store contains its own."""
         files = {store_path(Path(), study).name: None}
         return {"name": study.name, "kind": "sweep", "state": state, "inputs": self.inputs[study.name], "files": files}
 
 
 def _list_inputs(config: Config, names: dict[str, str], files: dict[str, bytes]) -> dict[str, dict[str, Any]]:
-    """Return all inputs that determine the results of each study, by its name; files as path and checksum of the copy.
+    """Return all inputs that determine the results of each study, by name of the study.
+
+    In the inputs, the name of a file is replaced by the path and the checksum of its copy.
 
     Args:
         config: The configuration.
-        names: Path of the copy of each file, by its original name.
-        files: Content of each copy, by its name.
+        names: Path of the copy of each file, by the original name of the file.
+        files: Content of each copy, by the name of the copy.
     """
     digests = {name: hashlib.sha256(files[Path(copy).name]).hexdigest()[:16] for name, copy in names.items()}
     names = {name: f"{copy}, sha256 {digests[name]}..." for name, copy in names.items()}
@@ -371,7 +382,7 @@ def _to_json(model: Any) -> dict[str, Any]:
 
 
 def _read_config(config: AnyConfig) -> tuple[Config, str]:
-    """Return a configuration and its text."""
+    """Read a configuration, as accepted by `run`, and return it with its text in YAML."""
     if isinstance(config, Mapping):
         config = read_mapping(config, Config)
     if isinstance(config, Config):

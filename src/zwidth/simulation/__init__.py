@@ -1,1 +1,4 @@
-"""The time domain: what the linear theory leaves out, and its independent judge (docs/theory/simulation.md)."""
+"""Simulate virtual walls in the time domain, with contact, friction, encoder and other nonlinear effects.
+
+The simulation also tests the stability theory independently (docs/theory/simulation.md).
+"""

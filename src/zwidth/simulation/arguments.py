@@ -1,4 +1,11 @@
-"""Arguments of `zwidth.simulate`: conversion to SI units, checks, and broadcasting to the batch."""
+"""Read the arguments of `zwidth.simulate`: convert them to SI units, check them, and broadcast them to the batch.
+
+A *scene* (`zwidth.Scene`) is a device with its timing, velocity estimate and, optionally, wall. A *batch* is an array
+of simulations; the array ``which`` contains the index of the scene of each simulation. A *force law* is a function of
+the user that replaces the spring and the damper of the wall. A *history* has one value per sampling period (a recorded
+hand position one per sample) along its last axis. The *bodies* are the device ("position"), the mass after a coupling
+("tip_position") and a grasping hand ("hand_position").
+"""
 
 from __future__ import annotations
 
@@ -21,22 +28,24 @@ from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
 from zwidth.words.unit_system import LINEAR, UnitSystem
 from zwidth.words.xp import compute_concretely, is_traced
 
-RECORDED_BYTES = 2 * 14 * 8  # per recorded instant: about 14 numbers, twice because of the conversion to SI units
-JITTER_BYTES = 20 * 8  # per instant of the running simulations
-DRAWN_BYTES = 4 * 8  # per period of the running simulations, for noise and for external forces
-MOST_BYTES = 4 << 30  # per call of `simulate`
+# Estimated memory of one call of `simulate`, in bytes. JITTER_BYTES and DRAWN_BYTES count only for the simulations that
+# run at the same time.
+RECORDED_BYTES = 2 * 14 * 8  # memory per recorded instant: 14 float64 values, twice for the conversion to SI units
+JITTER_BYTES = 20 * 8  # memory per instant for the durations between jittered samples
+DRAWN_BYTES = 4 * 8  # memory per period for noise, and again for external forces
+MOST_BYTES = 4 << 30  # largest estimate that is accepted: 4 GiB
 
-STARTS = ("start_position", "start_velocity")
+STARTS = ("start_position", "start_velocity")  # arguments with one initial value per body
 ARGUMENTS = {
     name: (FIELDS[name].unit, ANY if FIELDS[name].allowed == ANY else NOT_NEGATIVE)
     for name in ("stiffness", "virtual_damping", *OF_MOTIONS)
 } | {"jitter": ("s", NOT_NEGATIVE)}
 """Unit and range of each numeric argument of `simulate`."""
-LIMITS = ("max_force", "max_rate")  # may be infinite: the motor then has no such limit
+LIMITS = ("max_force", "max_rate")  # limits of the motor; the only arguments that may be infinite (no limit)
 
 
 def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
-    """Return the distinct scenes, and the index of the scene of each batch entry."""
+    """Return the distinct scenes, and an array with the index of the scene of each simulation."""
     listed = isinstance(scenes, Iterable) and not isinstance(scenes, np.ndarray)
     array = np.array(list(scenes) if listed else scenes, object)
     numbers: dict[int, int] = {}
@@ -55,14 +64,17 @@ def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
 
 
 def find_system(scenes: list[Any]) -> UnitSystem:
-    """Return the unit system of the scenes; raise `InputError` if they have two."""
+    """Return the unit system of the scenes; raise `InputError` if some devices are rotary and others linear."""
     if len(systems := {scene.device.unit_system for scene in scenes}) > 1:
         raise InputError("scenes: got both rotary and linear devices; simulate one kind per call")
     return systems.pop() if systems else LINEAR
 
 
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments with initial values of every body; bodies without their own start with the device."""
+    """Return the arguments with one initial position and velocity per body, such as "start_position.tip_position".
+
+    A body for which the user specifies no initial value has that of the device.
+    """
     bodies = dict.fromkeys(["position", *(name for scene in scenes for name in name_bodies(scene))])
     for name in STARTS:
         start = given.pop(name)
@@ -75,7 +87,15 @@ def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
 
 
 def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, push: Any, periods: int) -> Any:
-    """Return the mean external force on the device per period, including the force of the moving hand."""
+    """Return the external force on the device, averaged over each period, including the force of the moving hand.
+
+    Args:
+        scenes: distinct scenes, each with a rigid operator.
+        which: index of the scene of each simulation.
+        hand: recorded positions of the hand, (..., periods + 1); it moves the operator's spring and damper.
+        push: other external force, (..., periods), or None.
+        periods: number of sampling periods.
+    """
     places = _read_history("hand_history", hand, periods + 1, find_system(scenes)["m"])
     for scene in scenes:
         if scene.operator is None or not scene.operator.rigid or scene.device.coupling is not None:
@@ -91,7 +111,7 @@ def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, push: Any, per
 
 
 def _read_history(name: str, values: Any, length: int, unit: str) -> np.ndarray:
-    """Return values over time, one per period along the last axis."""
+    """Return a history as float64 in SI units; raise `InputError` unless its last axis has the required length."""
     history = as_float64(name, read_texts(name, values, unit))
     if not history.ndim or history.shape[-1] != length:
         raise InputError(f"{name}: got an array of shape {history.shape}; its last axis needs {length} values")
@@ -101,7 +121,12 @@ def _read_history(name: str, values: Any, length: int, unit: str) -> np.ndarray:
 
 
 def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
-    """Return the traced law; raise `InputError` if a wall is also given or the law has memory or cannot be traced."""
+    """Return a force law traced by JAX.
+
+    Raises:
+        InputError: stiffness or damping is also specified, JAX cannot trace the law, or the law keeps values between
+            calls.
+    """
     if stiffness is not None or virtual_damping is not None:
         raise InputError("force: got a law and a stiffness or damping; include the wall in the law, or remove one")
     # Import JAX only here, because importing zwidth must not load it.
@@ -115,9 +140,9 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
     with compute_concretely(), jax.numpy_rank_promotion("allow"):
         try:
             hash(force)
-            # Trace twice, because a law with memory yields another program or an error in the second trace.
+            # Trace twice, because a law that keeps values between calls changes its program or fails the second time.
             for _ in range(2):
-                # Wrap the law in a new function, because JAX would reuse constants cached for a known function.
+                # Wrap the law in a new function, because JAX would reuse the cached trace of the same function.
                 trace = jax.jit(lambda *args: force(*args)).trace(*[jax.ShapeDtypeStruct((2,), float)] * 3)
                 traces.append((trace.lower().as_text(), len(trace.jaxpr.in_avals), trace.out_info))
         except Exception as error:
@@ -129,7 +154,7 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
                 "jax.numpy, jnp.where in place of if"
             ) from error
     program, inputs, result = traces[0]
-    # A value kept from an earlier trace appears as an additional input.
+    # JAX passes a value that the law kept from an earlier trace as a fourth input.
     if traces[1] != traces[0] or inputs != 3:
         raise memory
     kind = getattr(result, "dtype", np.dtype(object)).kind
@@ -141,7 +166,20 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
 def read_arguments(
     scenes: list[Any], which: np.ndarray, given: dict[str, Any], seed: Any, history: Any, periods: int
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    """Return numbers by name, one per simulation; scene indices in the batch shape; and a mask of valid simulations."""
+    """Return the checked arguments of all simulations.
+
+    Args:
+        scenes: distinct scenes.
+        which: index of the scene of each simulation, in the shape of the argument ``scenes`` of `simulate`.
+        given: numeric arguments by name.
+        seed: seeds of noise and jitter.
+        history: external force per period, (..., periods), or None.
+        periods: number of sampling periods.
+
+    Returns:
+        Arguments by name in SI units, one row per simulation and 0 in place of invalid values; the scene indices,
+        broadcast to the batch shape; and a mask of the simulations whose arguments are all valid, one row each.
+    """
     if given["static"] is None:
         given = {**given, "static": given["coulomb"]}
     system = find_system(scenes)
@@ -185,7 +223,7 @@ def read_arguments(
 
 
 def refuse_bodies(scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray]) -> None:
-    """Raise `InputError` for friction or initial values of a linear system, whose bodies are unknown."""
+    """Raise `InputError` if friction or initial values are specified for a `LinearDevice`, whose bodies are unknown."""
     system = np.array([isinstance(scene.device, LinearDevice) for scene in scenes])[which.ravel()]
     for name in ("static", *(name for name in numbers if name.startswith(STARTS))):
         if np.any((numbers[name] != 0) & system):
@@ -197,7 +235,7 @@ def refuse_bodies(scenes: list[Any], which: np.ndarray, numbers: dict[str, np.nd
 
 
 def check_memory(numbers: dict[str, np.ndarray], settings: Settings) -> None:
-    """Raise `ResourceError` if the simulations need too much memory."""
+    """Raise `ResourceError` if the simulations need more memory than `MOST_BYTES`."""
     count, instants = numbers["seed"].size, settings.periods * settings.substeps
     together = min(count, GROUP * count_processors())
     kept = count * instants * RECORDED_BYTES if settings.record else 0
@@ -214,17 +252,24 @@ def check_memory(numbers: dict[str, np.ndarray], settings: Settings) -> None:
 
 
 def _unit(name: str) -> str:
-    """Return the unit of an argument, also if its name includes a body."""
+    """Return the unit of an argument; its name may end with a body, as in "start_position.tip_position"."""
     return ARGUMENTS[name.partition(".")[0]][0]
 
 
 def _spell(name: str) -> str:
-    """Return the name of an argument as the user writes it: the initial value of the device names all bodies."""
+    """Return an argument's name as users write it: "start_position" in place of "start_position.position"."""
     return name.removesuffix(".position")
 
 
 def _check(name: str, array: np.ndarray, arrays: dict[str, np.ndarray], period: Any) -> tuple[Any, str]:
-    """Return a mask of the usable values of an argument, and the allowed range in words."""
+    """Return a mask of the valid values of an argument, and its allowed range in words.
+
+    Args:
+        name: name of the argument.
+        array: values of the argument.
+        arrays: values of all arguments, because the range of ``static`` depends on ``coulomb``.
+        period: sampling period in s, the upper bound of ``jitter``.
+    """
     _, rule = ARGUMENTS[name.partition(".")[0]]
     usable = rule.holds(array) & (np.isfinite(array) | ((name in LIMITS) & (array > 0)))
     allowed = "it must be finite" if rule == ANY else f"it must be {rule}" + ("" if name in LIMITS else " and finite")

@@ -1,4 +1,11 @@
-"""Simulations of scenes of one structure: normalize the parameters, run groups of a fixed size, collect the results."""
+"""Simulate scenes of equal structure: normalize their parameters, run groups of a fixed size, collect the results.
+
+Scenes have equal *structure* if they can share one compiled program (`find_structure`). The *chain* of a scene is the
+open loop in normalized units, from the commanded force to the velocity estimate; its delay is an integer delay
+(``late``) plus a fraction of a period. FOAW is the adaptive velocity estimate of Janabi-Sharifi et al. 2000. *Rings*
+are circular buffers of the last measured positions and of the last commands. ``which`` contains the index of the scene
+of each simulation, and ``numbers`` the arguments of `zwidth.simulate` in SI units by name.
+"""
 
 from __future__ import annotations
 
@@ -27,42 +34,42 @@ from zwidth.simulation.parameters import (
 from zwidth.simulation.result import OF_ENERGY, convert_to_si
 from zwidth.words.xp import compute_concretely
 
-GROUP = 1 << 10  # simulations per call: enough for vector units, few enough that a state stays in the cache
+GROUP = 1 << 10  # simulations per compiled call: enough for vector units, few enough for their states to fit the cache
 
 
 def find_structure(scene: Parts) -> tuple[Any, ...]:
     """Return the properties that must be equal for scenes to share a compiled program."""
     sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
     orders = len(scene.device.modes), 0 if scene.device.actuator is None else scene.device.actuator.order
-    # Linear systems have no common structure, so each device and period has a program of its own.
+    # Linear systems have no common structure, so compile a separate program for each system and period.
     system = None if isinstance(scene.device, Device) else (scene.device, scene.timing.period)
     longest = scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
     return *name_bodies(scene), sensor, *orders, longest, system
 
 
 def name_bodies(scene: Parts) -> tuple[str, ...]:
-    """Return the fields of `Motion` with the positions of the bodies."""
+    """Return the names of the fields of `Motion` that contain the positions of the bodies."""
     tip = ("tip_position",) if scene.device.coupling is not None else ()
     hand = ("hand_position",) if scene.operator is not None and not scene.operator.rigid else ()
     return "position", *tip, *hand
 
 
 class Model(NamedTuple):
-    """Loop of one scene."""
+    """Simulation model of one scene: its chain, velocity estimate, delay, and units."""
 
-    chain: Any
-    estimate: Any
-    late: int  # integer delay
-    fraction: float  # remaining delay, in periods
-    window: int  # in samples
-    period: float  # in s
-    mass: float  # in kg
+    chain: Any  # without the estimate if that is FOAW
+    estimate: Any  # velocity estimate
+    late: int  # integer delay, in periods
+    fraction: float  # fractional delay, in periods
+    window: int  # number of past samples that the estimate uses
+    period: float  # sampling period, in s
+    mass: float  # mass that the force of the wall acts on, in kg
 
 
 def build_model(scene: Any) -> Model:
-    """Return the loop of a scene."""
+    """Build the simulation model of a scene."""
     estimate, period, mass = scene.velocity, float(scene.timing.period), float(scene.mass)
-    # FOAW is not a filter, so its parameters bypass the chain.
+    # FOAW is not a linear filter, so build the chain with another estimate and keep the FOAW parameters separately.
     adapts = isinstance(estimate, FOAW)
     chain: Any = chain_of(replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene)
     fraction = float(chain.d - chain.whole)
@@ -74,12 +81,12 @@ def build_model(scene: Any) -> Model:
 def run_scenes(
     scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray], settings: Settings
 ) -> dict[str, np.ndarray]:
-    """Simulate scenes of one structure.
+    """Simulate scenes of equal structure, in groups of at most `GROUP` simulations.
 
     Args:
-        scenes: the scenes.
+        scenes: distinct scenes.
         which: index of the scene of each simulation.
-        numbers: arguments of `simulate` in SI units by name, with one row per simulation.
+        numbers: arguments of `zwidth.simulate` in SI units by name, with one row per simulation.
         settings: settings that all simulations share.
 
     Returns:
@@ -96,18 +103,18 @@ def run_scenes(
         record=settings.record,
         law=settings.law,
     )
-    # Lengths of the rings of positions and of commands. The minimum lengths save compilations; longer rings than needed
-    # take no more time.
+    # Lengths of the rings of positions and of commands. Use a common minimum length, because each length needs a
+    # compilation, and a ring that is longer than necessary costs no time.
     rings = (
         round_up(max(3, *(model.window for model in models)) + 1),
         round_up(max(5, *(model.late for model in models)) + 3),
     )
     names, count = name_bodies(scenes[0]), which.size
-    # The energies of a linear system are unknown, because its masses and springs are unknown.
+    # Return NaN for the energies of a linear system, because its masses and springs are unknown.
     unknown = set() if isinstance(scenes[0].device, Device) else OF_ENERGY
 
     def run(rows: np.ndarray) -> dict[str, np.ndarray]:
-        # Import JAX only here, because importing zwidth must not load it.
+        # Import the engine only here, because it loads JAX, which importing zwidth must not do.
         from zwidth.simulation.engine import run_batch
 
         used, scene_of = np.unique(which[rows], return_inverse=True)
@@ -120,9 +127,10 @@ def run_scenes(
         return columns | {name: np.full_like(columns[name], np.nan) for name in unknown & columns.keys()}
 
     size = min(GROUP, 1 << (count - 1).bit_length())
-    # Repeat the last simulation to fill the last group, because each size needs a compilation.
+    # Fill the last group by repeating the last simulation, because each group size needs a compilation.
     groups = [np.minimum(np.arange(first, first + size), count - 1) for first in range(0, count, size)]
-    # Compile with the first group; threads run the others in parallel, because JAX releases the interpreter lock.
+    # Run the first group alone, so that it compiles the program. Threads then run the other groups in parallel, because
+    # JAX releases the interpreter lock.
     results = [run(groups[0]), *run_in_threads(run, groups[1:])]
     return {name: np.concatenate([each[name] for each in results])[:count] for name in results[0]}
 
@@ -135,7 +143,16 @@ def build_batch(
     options: Options,
     names: tuple[str, ...],
 ) -> tuple[Parameters, ExternalInputs]:
-    """Return the normalized parameters and inputs of one group; ``which``: index of the model of each simulation."""
+    """Build the normalized parameters and external inputs of one group of simulations.
+
+    Args:
+        models: models of the scenes in the group.
+        which: index of the model of each simulation.
+        numbers: arguments of `zwidth.simulate` in SI units by name, with one row per simulation.
+        settings: settings that all simulations share.
+        options: structure of the compiled program.
+        names: fields of `Motion` with the positions of the bodies.
+    """
     chains, estimates, late, fractions, _, periods, masses = zip(*models, strict=True)
     period, mass = np.array(periods)[which], np.array(masses)[which]
     force = period * period / mass
@@ -176,7 +193,18 @@ def build_batch(
 
 
 def draw_noise(seeds: np.ndarray, sizes: np.ndarray, periods: int) -> np.ndarray | None:
-    """Return the errors of the measured positions, (periods, batch); equal seeds give equal errors."""
+    """Draw the errors of the measured positions in m from normal distributions.
+
+    Simulations with equal seeds have the same sequence of errors, scaled by their standard deviations.
+
+    Args:
+        seeds: seed of each simulation.
+        sizes: standard deviation in m of each simulation.
+        periods: number of sampling periods.
+
+    Returns:
+        Errors of shape (periods, batch), or None if all standard deviations are 0.
+    """
     if not np.any(sizes > 0):
         return None
     each, index = np.unique(seeds, return_inverse=True)
@@ -187,17 +215,18 @@ def draw_noise(seeds: np.ndarray, sizes: np.ndarray, periods: int) -> np.ndarray
 def draw_instants(
     seeds: np.ndarray, most: np.ndarray, whole: np.ndarray, fractions: np.ndarray, settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the instants of the samples, (periods + 1, batch), and the durations of constant force (T3).
+    """Draw the jittered instants of the samples, and compute the durations of constant force (simulation.md, T3).
 
     Args:
-        seeds: equal seeds give equal jitter.
-        most: largest jitter, in periods.
-        whole: integer delay.
-        fractions: remaining delay, in periods.
-        settings: length of the simulation, and substeps.
+        seeds: seed of each simulation; equal seeds yield equal jitter.
+        most: largest jitter of each simulation, in periods.
+        whole: integer delay, in periods.
+        fractions: fractional delay, in periods.
+        settings: number of periods and of substeps.
 
     Returns:
-        Instants in periods, and durations of shape (periods, substeps, pieces, batch).
+        Instants in periods, of shape (periods + 1, batch), and durations of constant force, of shape (periods,
+        substeps, pieces, batch).
     """
     each, index = np.unique(seeds, return_inverse=True)
     periods = settings.periods
@@ -208,7 +237,8 @@ def draw_instants(
     k = np.arange(periods)[:, None]
     effective = []
     for age in (1, 0, -1):
-        # Time at which the command of this age takes effect; there is no command before the first sample.
+        # Compute the time within the period at which the command of this age takes effect. Clip the index of its
+        # sample, because no command exists before the first sample.
         sample = np.clip(k - whole - age, 0, periods)
         effective.append(fractions - age + np.take_along_axis(late, sample, 0) - late[:-1])
     durations = cut_period(1.0 + np.diff(late, axis=0), effective, settings.substeps)

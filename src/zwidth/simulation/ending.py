@@ -1,4 +1,4 @@
-"""Description of the observed behavior of a simulated motion, for studies, commands and the explorer."""
+"""Describe the observed behavior of a simulated motion in words, for studies, commands and the explorer."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def describe_ending(motion: Motion, index: Any = ()) -> str:
     if kind in (MotionKind.DIVERGED, MotionKind.INVALID):
         return WORDS[kind]
     time, contact = motion.time if motion.time.ndim == 1 else motion.time[index], motion.contact[index]
-    # The last instant precedes the end of the simulation by one step.
+    # Extend the time by one step, because the last recorded instant precedes the end of the simulation by one step.
     duration = with_unit(float(time[-1]) * time.size / max(time.size - 1, 1), "s", 3)
     hits = np.flatnonzero(contact[1:] & ~contact[:-1]) + 1
     if not contact[-max(contact.size // 4, 1) :].any():

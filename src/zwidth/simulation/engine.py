@@ -1,8 +1,12 @@
-"""Simulation of all sampling periods of a batch: measure, estimate, command, and propagate until the next sample.
+"""Simulate a batch period by period: measure, estimate, command, and propagate the bodies until the next sample.
 
-Pure functions of JAX arrays whose last axis is the batch (docs/theory/simulation.md, T2 and T3). A compiled block has a
-fixed number of periods, so a longer simulation needs no further compilation. Frames are recorded at instants between
-samples, readings at samples.
+All functions are pure functions of JAX arrays whose last axis is the batch (docs/theory/simulation.md, T2 and T3). k is
+the index of a sample. One compiled *block* simulates a fixed number of periods, so that a longer simulation needs no
+further compilation. A period is divided into *substeps*, at whose starts a *frame* is recorded, and a substep into
+*pieces* with constant force; a *reading* is the result of the control program at one sample. A *ring* is a circular
+buffer of positions or commands, indexed by k modulo its length. The *tail* is the last part of a simulation, in which
+its behavior is classified. ``x`` is the state of the bodies, of which the rows ``params.place`` and ``params.motion``
+compute their positions and velocities. FOAW is the adaptive velocity estimate of Janabi-Sharifi et al. 2000.
 """
 
 from __future__ import annotations
@@ -20,11 +24,12 @@ from zwidth.simulation.propagation import BodyState, advance, dot, propagate_wit
 from zwidth.words.types import Array
 from zwidth.words.xp import known_options
 
-BLOCK = 128  # periods per compiled call
-SEGMENTS = 6  # equal parts of the tail; an even number, because the trend compares the halves
-SLACK = 1.0 + 1e-9  # factor on the bound of FOAW; rounding errors must not exclude deviations of exactly one count
-# XLA's older loop emitters without splitting: half the compile time at the same speed. Full optimization even if
-# XLA_FLAGS asks for less, because a simulation runs for thousands of periods.
+BLOCK = 128  # number of sampling periods that one call of the compiled program simulates
+SEGMENTS = 6  # number of equal segments of the tail; even, because the trend compares the two halves of the tail
+# Factor on the noise bound of FOAW, because rounding errors must not exclude deviations of exactly one encoder count.
+SLACK = 1.0 + 1e-9
+# Use XLA's older loop emitters without splitting, because they halve the compile time at the same speed. Require full
+# optimization even if XLA_FLAGS sets a lower level, because a simulation runs for thousands of periods.
 COMPILER_OPTIONS = (
     ("xla_cpu_use_fusion_emitters", False),
     ("xla_cpu_parallel_codegen_split_count", 1),
@@ -36,56 +41,62 @@ class Controller(NamedTuple):
     """State of the control program between two samples."""
 
     positions: Array  # ring of measured positions, (length, batch)
-    filtered: Array  # state of the velocity filter
+    filtered: Array  # state of the velocity filter, (order, batch)
     commands: Array  # ring of commands, (length, batch)
-    touching: Array
+    touching: Array  # True if the last sample was in contact with the wall, (batch,)
 
 
 class Reading(NamedTuple):
-    """Result of the control program at one sample."""
+    """Result of the control program at one sample; each array has the shape (batch,)."""
 
-    measured: Array
-    velocity: Array
-    command: Array
-    touching: Array
+    measured: Array  # measured position
+    velocity: Array  # estimated velocity
+    command: Array  # commanded force
+    touching: Array  # True if in contact with the wall
 
 
 class Summary(NamedTuple):
-    """Statistics of a motion. Axis 0 of `far` and `turns`: before the tail, then the segments of the tail."""
+    """Statistics of the motion up to the current sample.
 
-    exits: Array  # number of samples at which contact ends
-    impact: Array  # velocity at the first sample in contact
-    given: Array  # largest energy that the wall has supplied so far
-    far: Array  # largest -x and x of the bodies, (1 + SEGMENTS, 2, bodies, batch); -inf without samples
-    turns: Array  # number of times the velocity becomes positive, (1 + SEGMENTS, batch)
-    turned: Array  # first and last instant of this kind in the tail, in periods, (2, batch)
+    Index 0 of the first axis of `far` and `turns` is the time before the tail; the others are the segments of the tail.
+    """
+
+    exits: Array  # number of samples at which contact ends, (batch,)
+    impact: Array  # velocity at the first sample at which contact begins, (batch,); NaN before
+    given: Array  # maximum over time of the energy supplied by the wall, (batch,)
+    far: Array  # maximum of -position and of position per body, (1 + SEGMENTS, 2, bodies, batch); initially -inf
+    turns: Array  # number of times that the velocity of the device becomes positive, (1 + SEGMENTS, batch)
+    turned: Array  # first and last instant in the tail at which it becomes positive, in periods, (2, batch)
 
 
 class State(NamedTuple):
-    """State of a simulation at a sample."""
+    """State of the simulations at a sample."""
 
-    body: BodyState
-    controller: Controller
-    work: Array  # energy supplied by wall and external force, dissipated by dampers and friction, (4, batch)
-    summary: Summary
+    body: BodyState  # state of the bodies
+    controller: Controller  # state of the control program
+    work: Array  # energies supplied by the wall and the external force, dissipated by dampers and friction, (4, batch)
+    summary: Summary  # statistics of the motion
 
 
 class PeriodInputs(NamedTuple):
-    """External inputs of one period."""
+    """External inputs of one period, or of a block of periods along a first axis."""
 
-    k: Array
-    noise: Array
-    push: Array
-    durations: Array  # with jitter, (substeps, pieces, batch)
+    k: Array  # index of the period and of the sample at its start
+    noise: Array  # error of the measured position
+    push: Array  # external force on the device
+    durations: Array  # durations of constant force, (substeps, pieces, batch); used with jitter only
 
 
 def _write(rows: Array, row: Array, index: Array) -> Array:
-    """Return rows with one of them replaced."""
+    """Return an array in which the row at an index (first axis) is replaced."""
     return jax.lax.dynamic_update_index_in_dim(rows, row, index, 0, allow_negative_indices=False)
 
 
 def look_back(ring: Array, k: Array, back: Array) -> Array:
-    """Return the entry of a ring ``back`` samples ago; the length of a ring is a power of 2."""
+    """Return the entry that was written into a ring ``back`` samples before sample k.
+
+    ``back`` has the shape (batch,), or (1,) if it is equal for all simulations. The length of a ring is a power of 2.
+    """
     index = (k - back) & (len(ring) - 1)
     if back.shape[-1] == 1:
         return read(ring, index[0])
@@ -94,7 +105,7 @@ def look_back(ring: Array, k: Array, back: Array) -> Array:
 
 @np.errstate(all="ignore")
 def quantize(quantum: Any, position: Any) -> Any:
-    """Round a position to multiples of ``quantum``; leave it unchanged if the quantum is 0 or the count overflows."""
+    """Round a position to multiples of ``quantum``; return it unchanged if the quantum is 0 or rounding overflows."""
     xp = np if isinstance(position, np.ndarray) else jnp
     rounded = quantum * xp.floor(position / quantum + 0.5)
     return xp.where(xp.isfinite(rounded), rounded, position)
@@ -103,7 +114,18 @@ def quantize(quantum: Any, position: Any) -> Any:
 def control(
     params: Parameters, options: Options, controller: Controller, k: Array, sensed: Array
 ) -> tuple[Controller, Reading]:
-    """Measure the position, estimate the velocity and compute the command (T2)."""
+    """Run the control program at one sample: measure, estimate the velocity and compute the command (T2).
+
+    Args:
+        params: parameters of the simulations.
+        options: structure of the compiled program.
+        controller: state of the control program before the sample.
+        k: index of the sample.
+        sensed: position at the sensor, including noise, before quantization.
+
+    Returns:
+        The state of the control program after the sample, and the reading.
+    """
     measured = quantize(params.resolution, sensed)
     positions = _write(controller.positions, measured, k & (len(controller.positions) - 1))
     estimator, filtered = params.estimator, controller.filtered
@@ -122,7 +144,7 @@ def control(
         force = -(params.alpha * measured + params.beta * velocity)
     else:
         force = options.law(measured, velocity / params.period, k * params.period) / params.force
-        # Contact of a force law means a nonzero force, because a law has no surface.
+        # Count a force law as in contact if its force is nonzero, because a law has no surface.
         touching &= force != 0
     force = jnp.where(touching, force, 0.0)
     force = jnp.where(params.pulling, force, jnp.minimum(force, 0.0))
@@ -135,21 +157,29 @@ def control(
 
 
 def _adapt_window(ring: Array, k: Array, newest: Array, bound: Array, longest: int) -> Array:
-    """Return the FOAW velocity: the slope between both ends of the longest window.
+    """Return the FOAW velocity estimate: the slope between both ends of the longest admissible window.
 
-    The window grows until a position within it deviates by more than ``bound`` from the line between both ends.
+    A window of past samples is admissible if the positions in it deviate by at most ``bound`` from the straight line
+    between its ends, and if all shorter windows are admissible, too.
+
+    Args:
+        ring: ring of measured positions.
+        k: index of the current sample.
+        newest: measured position at the current sample.
+        bound: noise bound of the positions.
+        longest: largest length of the window, in samples.
     """
     past = ring[(k - np.arange(longest + 1)) & (len(ring) - 1)]
     back = np.arange(1, longest + 1)[:, None]
     slopes = (newest - past[1:]) / back
-    missed = jnp.abs(past[1:] - (newest - slopes[:, None] * back))  # (window, sample, batch)
+    missed = jnp.abs(past[1:] - (newest - slopes[:, None] * back))  # of shape (window, sample, batch)
     within = jnp.all((missed <= bound * SLACK) | (back > back[:, None]), axis=1)
     length = jnp.sum(jnp.cumprod(within, 0), 0)
     return jnp.take_along_axis(slopes, jnp.maximum(length - 1, 0)[None], 0)[0]
 
 
 def stored_energy(params: Parameters, x: Array) -> Array:
-    """Return the kinetic and elastic energy of all bodies."""
+    """Return the kinetic and elastic energy of all bodies in the state ``x``."""
     return dot(x, jnp.stack([dot(row, x) for row in params.energy]))
 
 
@@ -163,7 +193,21 @@ def propagate(
     indices: tuple[Array | int, Array | int],
     time: Array,
 ) -> tuple[BodyState, Array]:
-    """Propagate the bodies over one piece of a period and update the energies; ``indices``: substep and piece."""
+    """Propagate the bodies over one piece of a period, with constant forces, and update the energies.
+
+    Args:
+        params: parameters of the simulations.
+        options: structure of the compiled program.
+        body: state of the bodies at the start of the piece.
+        work: the four energies of `State` at the start of the piece.
+        force: force of the wall (with an actuator, its command).
+        push: external force on the device.
+        indices: indices of the substep and of the piece.
+        time: duration of the piece, in periods.
+
+    Returns:
+        The state of the bodies and the energies at the end of the piece.
+    """
     zero, direct = 0.0 * body.x[0], params.rate.shape[1] == params.rate.shape[0] + 1
     forces = jnp.stack([force + push + zero] if direct else [force + zero, push + zero])
     step = None if options.jitter else Flow(*(read(read(part, indices[0], 1), indices[1], 1) for part in params.pieces))
@@ -181,16 +225,21 @@ def propagate(
     if direct:
         given = force * dot(params.place[0], after.x - body.x)
     else:
-        # The force downstream of an actuator or modes varies within the piece, so use the energy balance.
+        # Compute the work of the wall from the energy balance, because with an actuator or modes the force on the
+        # bodies varies within the piece.
         given = stored_energy(params, after.x) - stored_energy(params, body.x) + lost + rubbed - pushed
     return after, work + jnp.stack([given, pushed, lost, rubbed])
 
 
 def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, int]) -> State:
-    """Return the state before the first sample: uniform motion until then, no commands, modes at rest (T2)."""
+    """Return the state before the first sample, reached by uniform motion without commands and with modes at rest (T2).
+
+    ``rings`` contains the lengths of the rings of positions and of commands.
+    """
     count, size = params.place.shape[:2]
     body = np.zeros((size, inputs.positions.shape[1]))
-    # Solve for the coordinates of the bodies only; links are then unstretched if all bodies start together.
+    # Set only the coordinates of the bodies and leave the modes at 0. Links between bodies at equal positions are then
+    # unstretched.
     inverse, first = np.linalg.inv(params.place[:, :count, 0]), np.argmax(params.motion[0, :, 0])
     body[:count], body[first : first + count] = inverse @ inputs.positions, inverse @ inputs.velocities
     x, v = body[0], body[first]
@@ -206,7 +255,10 @@ def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, 
 
 
 def _settle(estimator: Any, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return the filter state after a long uniform motion: a constant input after a difference, otherwise a ramp."""
+    """Return the stationary state of the velocity filter in uniform motion, at position x with velocity v per period.
+
+    The input of the filter is constant if the filter follows a difference over a window; otherwise it is a ramp.
+    """
     A, B, window = (np.asarray(part) for part in (estimator.A, estimator.B, estimator.window))
     level, slope = np.where(window > 0, v, x), np.where(window > 0, 0.0, v)
     left = np.eye(len(B)) - np.moveaxis(A, -1, 0)
@@ -217,9 +269,21 @@ def _settle(estimator: Any, x: np.ndarray, v: np.ndarray) -> np.ndarray:
 def _simulate_period(
     params: Parameters, options: Options, ends: Array, state: State, inputs: PeriodInputs
 ) -> tuple[State, Any]:
-    """Simulate one period; ``ends``: periods at which the segments of the tail begin, and the end."""
+    """Simulate one period.
+
+    Args:
+        params: parameters of the simulations.
+        options: structure of the compiled program.
+        ends: indices of the periods at which the segments of the tail begin, and the number of periods.
+        state: state at the sample at the start of the period.
+        inputs: external inputs of the period.
+
+    Returns:
+        The state at the next sample, and the reading and the frames of the period; None if nothing is recorded.
+    """
     controller, reading = control(params, options, state.controller, inputs.k, state.body.x[0] + inputs.noise)
-    # Ages in samples of the commands that may act until the next sample, in the order of their start.
+    # List the commands that may act before the next sample, in the order in which they take effect, by their age: the
+    # number of samples by which a command precedes that of sample k - late, where late is the integer delay.
     ages = {1: (0,), 2: (1, 0), 4: (2, 1, 0, -1)}[options.pieces]
     forces = [look_back(controller.commands, inputs.k, params.late + age) for age in ages]
     durations = inputs.durations if options.jitter else params.durations
@@ -227,7 +291,8 @@ def _simulate_period(
     def substep(carry: Any, j: Any) -> Any:
         (body, work), frame, lasting = carry, None, read(durations, j)
         if options.record:
-            # Skip the forces of pieces without duration, because they never act.
+            # Record the force of the first piece with a positive duration, because forces of pieces without duration
+            # never act.
             acting = forces[-1]
             for piece in reversed(range(options.pieces - 1)):
                 acting = jnp.where(lasting[piece] > 0, forces[piece], acting)
@@ -240,7 +305,7 @@ def _simulate_period(
             body, work = carry
             return propagate(params, options, body, work, force, inputs.push, (j, number), read(lasting, number)), None
 
-        # With friction or jitter a piece is a long program, so compile it only once.
+        # Loop over the pieces by `scan` with friction or jitter, so that the long program of a piece is compiled once.
         if options.friction or options.jitter:
             return jax.lax.scan(one, carry, (np.arange(options.pieces), jnp.stack(forces)))[0], frame
         for piece in enumerate(forces):
@@ -260,7 +325,17 @@ def _simulate_period(
 def _summarize(
     params: Parameters, state: State, reading: Reading, body: BodyState, work: Array, k: Array, ends: Array
 ) -> Summary:
-    """Return the statistics after period k."""
+    """Return the statistics updated by period k.
+
+    Args:
+        params: parameters of the simulations.
+        state: state at the start of the period.
+        reading: reading at the start of the period.
+        body: state of the bodies at the end of the period.
+        work: energies at the end of the period.
+        k: index of the period.
+        ends: indices of the periods at which the segments of the tail begin, and the number of periods.
+    """
     summary, before = state.summary, state.controller.touching
     places = jnp.stack([dot(row, state.body.x) for row in params.place])
     v, next_v = dot(params.motion[0], state.body.x), dot(params.motion[0], body.x)
@@ -279,9 +354,9 @@ def _summarize(
     )
 
 
-@lru_cache(256)  # each force law is a program of its own
+@lru_cache(256)  # bound the number of cached programs, because each force law needs a separate one
 def compile_block(options: Options) -> Any:
-    """Return the compiled simulation of one block of periods."""
+    """Return the compiled function that simulates one block of periods."""
 
     def block(params: Parameters, ends: Array, state: State, inputs: PeriodInputs) -> tuple[State, Any]:
         size, bodies = state.work.shape[-1], len(params.place)
@@ -291,8 +366,8 @@ def compile_block(options: Options) -> Any:
         def one(j: Array, carry: Any) -> Any:
             state, kept = carry
             period = jax.tree.map(lambda part: read(part, j), inputs)
-            state, found = _simulate_period(params, options, ends, state, period)
-            return state, jax.tree.map(lambda rows, row: _write(rows, row, j), kept, found)
+            state, record = _simulate_period(params, options, ends, state, period)
+            return state, jax.tree.map(lambda rows, row: _write(rows, row, j), kept, record)
 
         return jax.lax.fori_loop(0, jnp.minimum(BLOCK, ends[-1] - inputs.k[0]), one, (state, rows))
 
@@ -302,9 +377,21 @@ def compile_block(options: Options) -> Any:
 def run_batch(
     params: Parameters, options: Options, settings: Settings, inputs: ExternalInputs, rings: tuple[int, int]
 ) -> tuple[State, np.ndarray | None, np.ndarray | None]:
-    """Return the final state, the readings (periods, 4, batch) and the frames (periods, substeps, rows, batch)."""
+    """Simulate a batch.
+
+    Args:
+        params: parameters of the simulations.
+        options: structure of the compiled program.
+        settings: settings that all simulations share.
+        inputs: initial state and external inputs.
+        rings: lengths of the rings of positions and of commands.
+
+    Returns:
+        The final state; the readings, of shape (periods, 4, batch); and the frames, of shape (periods, substeps, rows,
+        batch). Readings and frames are None if nothing is recorded.
+    """
     edges = settings.periods - settings.tail * np.arange(SEGMENTS, -1, -1) // SEGMENTS
-    # Transfer all arrays in one call, because separate transfers take as long as the simulation.
+    # Transfer all arrays to JAX in one call, because separate transfers would take as long as the simulation.
     start: Any = initial_state(params, inputs, rings)
     state, placed, ends = jax.device_put((start, params, edges))
     recorded: Any = []
@@ -315,11 +402,11 @@ def run_batch(
             params.push[None] + _select_block(inputs.history, first, (1,)),
             _select_block(inputs.durations, first, (0, 0, 1)),
         )
-        # Allow rank promotion whatever the caller's setting, because the batch is the last axis by design.
+        # Allow rank promotion even if the caller forbids it, because arrays without a batch axis broadcast by design.
         with jax.numpy_rank_promotion("allow"):
-            state, found = compile_block(options)(placed, ends, state, block)
+            state, block_records = compile_block(options)(placed, ends, state, block)
         if options.record:
-            recorded.append(jax.tree.map(np.asarray, found))
+            recorded.append(jax.tree.map(np.asarray, block_records))
     final = jax.tree.map(np.asarray, state)
     if not options.record:
         return final, None, None
@@ -328,7 +415,16 @@ def run_batch(
 
 
 def _select_block(values: np.ndarray | None, first: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the values of one block of periods, zeros after the last; zeros of the given shape if there are none."""
+    """Return the values of the block of periods that begins at ``first``.
+
+    Args:
+        values: values per period along the first axis; None if all are 0.
+        first: index of the first period of the block.
+        shape: shape of the zeros that are returned per period if ``values`` is None.
+
+    Returns:
+        Values of shape (BLOCK, ...), padded with zeros after the last period.
+    """
     if values is None:
         return np.zeros((BLOCK, *shape))
     part = values[first : first + BLOCK]

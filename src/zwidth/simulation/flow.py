@@ -1,9 +1,11 @@
-"""Exact motion of a mechanism over given times, and the energy that its dampers dissipate (docs/theory/simulation.md).
+"""Compute the exact motion of mechanisms over given times, and the energy dissipated by their dampers.
 
-With the state x, constant forces u and ``z = (x, u)``: over a time t the state changes by ``change @ z``, and the
-dampers dissipate ``z @ loss @ z`` (T1, T6). Both follow from a series for a fraction of t and repeated doubling, for
-all times and mechanisms at once. With an actuator or modes the command is the first force, and the last force acts on
-the first body directly. Units: the sampling period and the mass of the first body.
+A *mechanism* is the linear model ``x' = rate @ (x, u)`` of the bodies, links, modes and actuator of a scene, with the
+state x and constant forces u. Over a time t the state changes by ``change @ z``, and the dampers dissipate the energy
+``z @ loss @ z``, with ``z = (x, u)`` (docs/theory/simulation.md, T1 and T6). Both matrices are computed by a Taylor
+series for the time t/2^k and k doublings (scaling and squaring), for all times and mechanisms at once. With an actuator
+or modes, u consists of the command and of the external force on the first body, otherwise of their sum. Units are the
+sampling period and the mass of the first body. n is the length of x.
 """
 
 from __future__ import annotations
@@ -18,30 +20,36 @@ from zwidth.parts.chain import Resonance, body_position
 from zwidth.parts.system import System
 from zwidth.words.errors import InputError
 
-TERMS = 15  # of the series; for a norm of 1/2 its error is below 1e-18 in the motion and 5e-14 in the loss
-DIGITS = 53  # binary digits of a time below 2 periods: 1, 1/2, ... 2^-52
+# Number of terms of the series; for a matrix norm of 1/2 its error is below 1e-18 in ``change``, 5e-14 in ``loss``.
+TERMS = 15
+DIGITS = 53  # number of binary digits of a float64 time below 2 periods: 1, 1/2, ... 2^-52
 
 
 class Flow(NamedTuple):
-    """Change of the state and dissipated energy over a time, along leading axes."""
+    """Matrices of the change of state and of the dissipated energy, for an array of times (leading axes)."""
 
-    change: np.ndarray  # (..., n, n + forces)
-    loss: np.ndarray  # (..., n + forces, n + forces)
+    change: np.ndarray  # change of state per z, (..., n, n + forces)
+    loss: np.ndarray  # quadratic form in z of the energy dissipated by dampers, (..., n + forces, n + forces)
 
 
 class Mechanics(NamedTuple):
-    """Matrices of mechanisms of one structure."""
+    """Matrices of the mechanisms of scenes with equal structure."""
 
-    rate: np.ndarray  # (scenes, n, n + forces): x' = rate @ (x, u)
-    held: np.ndarray  # (scenes, n, n + forces): the same while friction holds the first body
-    place: np.ndarray  # (bodies, n): positions of the bodies, equal for all scenes
-    motion: np.ndarray  # (bodies, n): their velocities
+    rate: np.ndarray  # (scenes, n, n + forces): x' = rate @ z while the first body slips
+    held: np.ndarray  # (scenes, n, n + forces): x' = held @ z while friction holds the first body
+    place: np.ndarray  # (bodies, n): positions place @ x of the bodies; equal for all scenes
+    motion: np.ndarray  # (bodies, n): velocities motion @ x of the bodies; equal for all scenes
     energy: np.ndarray  # (scenes, n, n): kinetic and elastic energy x @ energy @ x
-    drain: np.ndarray  # (scenes, n + forces, n + forces): power that the dampers dissipate
+    drain: np.ndarray  # (scenes, n + forces, n + forces): power z @ drain @ z dissipated by the dampers
 
 
 def build_mechanics(chains: Sequence[Any]) -> Mechanics:
-    """Return the matrices of chains that differ in their parameters only, or of one linear system."""
+    """Build the matrices of mechanisms.
+
+    Args:
+        chains: open loops of the scenes (`parts.chain`), with equal numbers of bodies, links, modes and actuator
+            states; or one linear system (`parts.system.System`) with several delays.
+    """
     first: Any = chains[0]
     if isinstance(first, System):
         return _build_system(chains)
@@ -63,7 +71,8 @@ def build_mechanics(chains: Sequence[Any]) -> Mechanics:
     motion = np.roll(place, count, axis=1)
     axes = np.eye(size)
     stretch, swing = axes[1:first_mode], axes[first_mode:count]
-    # A mode that is driven and measured at points of equal displacement has the energy of its modal mass.
+    # Use the absolute modal masses for the energies. They are exact for a mode whose displacements at the actuator and
+    # at the sensor are equal.
     inertia = [np.abs(mode.mass) for mode in modes]
     springs = [mass * mode.rate**2 for mass, mode in zip(inertia, modes, strict=True)]
     dampers = [2.0 * mass * mode.damping_ratio * mode.rate for mass, mode in zip(inertia, modes, strict=True)]
@@ -79,14 +88,19 @@ def build_mechanics(chains: Sequence[Any]) -> Mechanics:
     energy = energy + weigh(differentiate(swing), inertia)
     drain = weigh(motion, [body.damping for body in bodies]) + weigh(differentiate(swing), dampers)
     drain = drain + weigh(differentiate(stretch), [link.damping for link in links])
-    # The holding force acts on the first body as the last force does (T4), and the mass of that body is the unit.
+    # Add the holding force, which acts like the last force, such that the acceleration of the first body is 0 (T4). No
+    # division by a mass is needed, because the mass of the first body is 1.
     held = rate - rate[..., -1:] * (motion[0] @ rate)[:, None, :]
     wide = (0, len(forces))
     return Mechanics(rate, held, place, motion, 0.5 * energy, np.pad(drain, ((0, 0), wide, wide)))
 
 
 def _build_system(systems: Sequence[Any]) -> Mechanics:
-    """Return the matrices of one linear system with several delays: one position, the output; energies set to 0."""
+    """Build the matrices of one linear system with several delays; its only position is the output, its energies are 0.
+
+    Raises:
+        InputError: the system is a discrete-time one, or its velocity jumps with the force.
+    """
     A, _, push = systems[0].realize()
     if systems[0].sampled:
         raise InputError(
@@ -101,12 +115,18 @@ def _build_system(systems: Sequence[Any]) -> Mechanics:
 
 
 def _stack(parts: Sequence[Any]) -> Any:
-    """Return named tuples of one type as a single one, with an array over the tuples in each field."""
+    """Stack named tuples of one type: return one tuple whose fields are arrays over the given tuples."""
     return type(parts[0])(*(np.array(column, float) for column in zip(*parts, strict=True)))
 
 
 def flow(rate: np.ndarray, drain: np.ndarray, times: np.ndarray) -> Flow:
-    """Return the flow of ``x' = rate @ (x, u)`` over times of shape (scenes, ...); ``drain``: power of the dampers."""
+    """Compute the flow of ``x' = rate @ (x, u)`` over given times.
+
+    Args:
+        rate: matrices of shape (scenes, n, n + forces).
+        drain: matrices of the power dissipated by the dampers, of shape (scenes, n + forces, n + forces).
+        times: times of shape (scenes, ...), in sampling periods.
+    """
     count, size = rate.shape[-2:]
     inner = (rate.shape[0], *(1,) * (times.ndim - 1), size, size)
     whole = np.concatenate([rate, np.zeros((rate.shape[0], size - count, size))], 1).reshape(inner)
@@ -124,6 +144,6 @@ def flow(rate: np.ndarray, drain: np.ndarray, times: np.ndarray) -> Flow:
     for _ in range(doublings):
         moved = step.mT @ lost
         lost = 2.0 * lost + moved + moved.mT + moved @ step
-        # Double e^A - 1 instead of e^A, to keep the digits of slow motions.
+        # Double e^A - 1 instead of e^A, because adding 1 would lose the last digits of slow motions.
         step = 2.0 * step + step @ step
     return Flow(step[..., :count, :], lost)

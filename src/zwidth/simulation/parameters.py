@@ -1,7 +1,9 @@
-"""Parameters of a batch of simulations, as arrays whose last axis is the batch.
+"""Build the parameters of a batch of simulations, as arrays whose last axis is the batch.
 
-Units: the sampling period and the mass that the wall's force acts on are 1; positions are in m. A last axis of length 1
-broadcasts over the batch.
+Units are the sampling period, the mass that the force of the wall acts on, and m. A last axis of length 1 broadcasts
+over the batch. A period is divided into equal *substeps*, and a substep into *pieces* with constant force. n is the
+length of the state x of the bodies (`simulation.flow`). The first body *slips*, or friction *holds* it. FOAW is the
+adaptive velocity estimate of Janabi-Sharifi et al. 2000. T1 to T7 are steps of docs/theory/simulation.md.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from zwidth.simulation.flow import DIGITS, Flow, Mechanics, flow
 from zwidth.words.errors import InputError
 from zwidth.words.types import Array
 
-LONGEST_ANGLE = 0.25  # rad of the fastest motion per step with friction; a longer step could hide two events (T5)
+# Longest step with friction, as a phase of the fastest motion in rad; a longer step could hide two events (T5).
+LONGEST_ANGLE = 0.25
 MOST_STEPS = 256  # largest number of steps per period with friction, to limit the run time
 
 
@@ -28,10 +31,10 @@ s. All arguments are JAX arrays with one value per simulation."""
 
 
 class TracedLaw(NamedTuple):
-    """Force law and its program."""
+    """Force law, and the program that JAX traces from it."""
 
-    force: Law
-    program: str  # changes with every constant that the law reads, so equal tuples compile once
+    force: Law  # function of the user
+    program: str  # text of the traced program, so that laws with different constants do not share a compiled block
 
     def __call__(self, position: Any, velocity: Any, time: Any) -> Any:
         return self.force(position, velocity, time)
@@ -40,85 +43,95 @@ class TracedLaw(NamedTuple):
 class Options(NamedTuple):
     """Structure of the compiled program."""
 
-    substeps: int
-    pieces: int  # largest number of different forces within a substep
-    friction: bool
-    jitter: bool
-    foaw: int  # longest window of FOAW; 0 for a linear estimate
-    record: bool
-    law: TracedLaw | None
+    substeps: int  # number of substeps per period
+    pieces: int  # number of pieces per substep, that is, of different forces within it
+    friction: bool  # some simulation has dry friction
+    jitter: bool  # some simulation has timestamp jitter
+    foaw: int  # longest window of FOAW in samples; 0 for a linear velocity estimate
+    record: bool  # readings and frames are recorded
+    law: TracedLaw | None  # force law in place of the wall's spring and damper
 
 
 class Settings(NamedTuple):
     """Settings that all simulations of a batch share."""
 
-    periods: int
-    substeps: int
-    tail: int
-    contact: str
-    record: bool
-    law: TracedLaw | None = None
+    periods: int  # number of sampling periods
+    substeps: int  # number of substeps per period
+    tail: int  # number of periods at the end whose motion is classified
+    contact: str  # "bilateral", "unilateral" or "push_only"
+    record: bool  # readings and frames are recorded
+    law: TracedLaw | None = None  # force law in place of the wall's spring and damper
 
 
 class ExternalInputs(NamedTuple):
-    """Initial state, external forces and random numbers in normalized units, and the units in SI."""
+    """Initial state, external forces and random numbers in normalized units, and these units in SI."""
 
-    positions: np.ndarray  # (bodies, batch)
-    velocities: np.ndarray  # (bodies, batch)
-    noise: np.ndarray | None  # (periods, batch), in m
-    history: np.ndarray | None  # external force, (periods, batch)
-    durations: np.ndarray | None  # with jitter, (periods, substeps, pieces, batch)
-    instants: np.ndarray | None  # with jitter, (periods + 1, batch), in periods
-    period: np.ndarray  # in s
-    mass: np.ndarray  # in kg
+    positions: np.ndarray  # initial positions, (bodies, batch)
+    velocities: np.ndarray  # initial velocities, (bodies, batch)
+    noise: np.ndarray | None  # errors of the measured positions in m, (periods, batch); None without noise
+    history: np.ndarray | None  # external force per period, (periods, batch); None without a history
+    durations: np.ndarray | None  # durations of the pieces, (periods, substeps, pieces, batch); None without jitter
+    instants: np.ndarray | None  # instants of the samples in periods, (periods + 1, batch); None without jitter
+    period: np.ndarray  # sampling period, in s
+    mass: np.ndarray  # mass that the force of the wall acts on, in kg
 
 
 class Motor(NamedTuple):
-    """Limits of the motor (infinite for none) and dry friction of its bearings (0 for none)."""
+    """Limits of the motor (infinite if it has none) and its dry friction (0 if it has none)."""
 
-    max_force: Array
-    max_rate: Array
-    coulomb: Array
-    static: Array
+    max_force: Array  # largest magnitude of the command
+    max_rate: Array  # largest change of the command per period
+    coulomb: Array  # Coulomb friction while the first body slips
+    static: Array  # static friction while the first body is held
 
 
 class Estimator(NamedTuple):
-    """Velocity estimate: a difference over a window, followed by a filter in state space; or FOAW."""
+    """Velocity estimate: a position difference over a window, followed by a filter in state space; or FOAW."""
 
-    A: Array  # (p, p, batch)
-    B: Array  # (p, batch)
-    C: Array  # (p, batch)
-    D: Array  # (batch,)
-    window: Array  # in samples; 0 if the filter takes the position
+    A: Array  # filter matrix of order p, (p, p, batch)
+    B: Array  # input vector of the filter, (p, batch)
+    C: Array  # output vector of the filter, (p, batch)
+    D: Array  # direct feedthrough of the filter, (batch,)
+    window: Array  # length of the window in samples; 0 if the input of the filter is the position
     bound: Array  # noise bound of FOAW, in m
 
 
 class Parameters(NamedTuple):
     """Parameters of the simulations of a batch."""
 
-    alpha: Array
-    beta: Array
-    period: Array  # in s
+    alpha: Array  # normalized stiffness
+    beta: Array  # normalized virtual damping
+    period: Array  # sampling period, in s
     force: Array  # unit of force, in N
-    resolution: Array
-    push: Array
-    bilateral: Array  # the wall acts on both sides of its surface
-    pulling: Array  # the wall may pull
-    late: Array  # integer delay
-    motor: Motor
-    estimator: Estimator
-    rate: Array  # (n, n + forces, batch)
-    place: Array  # (bodies, n, batch)
-    motion: Array  # (bodies, n, batch)
-    energy: Array  # (n, n, batch)
-    durations: Array  # of the pieces without jitter, (substeps, pieces, batch)
-    pieces: Flow  # over these durations, slipping and held, (1 or 2, substeps, pieces, ..., batch)
-    digits: Flow  # over the binary digits of time, slipping and held, (1 or 2, DIGITS, ..., batch)
-    longest: Array  # longest step with friction
+    resolution: Array  # step of the encoder, in m
+    push: Array  # constant external force
+    bilateral: Array  # True if the wall acts on both sides of its surface
+    pulling: Array  # True if the wall may pull the device
+    late: Array  # integer delay, in periods
+    motor: Motor  # limits of the motor and friction
+    estimator: Estimator  # velocity estimate
+    rate: Array  # matrix of x' = rate @ (x, u), (n, n + forces, batch)
+    place: Array  # rows of the positions of the bodies, (bodies, n, batch)
+    motion: Array  # rows of the velocities of the bodies, (bodies, n, batch)
+    energy: Array  # quadratic form in x of the kinetic and elastic energy, (n, n, batch)
+    durations: Array  # durations of the pieces without jitter, (substeps, pieces, batch)
+    # Flows over these durations, (1 or 2, substeps, pieces, ..., batch): slipping and, with friction, held.
+    pieces: Flow
+    # Flows over the binary digits of time, (1 or 2, DIGITS, ..., batch): slipping and, with friction, held.
+    digits: Flow
+    longest: Array  # longest step with friction, in periods
 
 
 def spread_scenes(parts: Any, which: np.ndarray) -> Any:
-    """Return arrays over the scenes (first axis) as arrays over the batch (last axis, of length 1 for one scene)."""
+    """Return values per scene as values per simulation.
+
+    Args:
+        parts: array whose first axis is the scene, or a named tuple of such arrays.
+        which: index of the scene of each simulation.
+
+    Returns:
+        The arrays with the batch as their last axis, of length 1 if there is only one scene.
+    """
     if isinstance(parts, tuple):
         return type(parts)(*(spread_scenes(part, which) for part in parts))
     last = np.moveaxis(parts, 0, -1)
@@ -126,14 +139,17 @@ def spread_scenes(parts: Any, which: np.ndarray) -> Any:
 
 
 def round_up(size: int) -> int:
-    """Return 0 for 0, otherwise the next power of 2, at least 2, so that few sizes are compiled."""
+    """Return a size rounded up to a power of 2, at least 2, to limit the number of compilations; 0 for 0."""
     return 0 if size == 0 else max(2, 1 << (size - 1).bit_length())
 
 
 def build_estimators(estimates: Sequence[Any], which: np.ndarray) -> Estimator:
-    """Return the velocity estimates of all scenes, the filters padded to the largest order."""
+    """Return the velocity estimates of a batch, with all filters padded to the largest order.
+
+    ``estimates`` contains the estimate of each scene, ``which`` the index of the scene of each simulation.
+    """
     count, adapts = len(estimates), isinstance(estimates[0], FOAW)
-    # The ring of measured positions replaces the shift register of a window.
+    # Leave the window out of the state space, because the engine keeps the last measured positions in a ring.
     filters = {
         k: estimate_matrices(replace(each, window=0))
         for k, each in enumerate(estimates)
@@ -152,15 +168,16 @@ def build_estimators(estimates: Sequence[Any], which: np.ndarray) -> Estimator:
 
 
 def cut_period(lengths: np.ndarray, effective: Sequence[np.ndarray], substeps: int) -> np.ndarray:
-    """Return the durations of constant force within periods.
+    """Divide periods into substeps, and these into pieces with constant force.
 
     Args:
         lengths: lengths of the periods, (..., batch).
-        effective: times since the start of the period at which the force changes, each (..., batch), increasing.
-        substeps: number of substeps.
+        effective: instants at which the force changes, relative to the start of the period, in increasing order; each
+            an array of shape (..., batch).
+        substeps: number of substeps per period.
 
     Returns:
-        Durations (..., substeps, pieces, batch), with one piece more than there are changes.
+        Durations of the pieces, (..., substeps, pieces, batch). The number of pieces is that of the changes plus 1.
     """
     substep = np.arange(substeps)[:, None] * lengths[..., None, :] / substeps
     part = np.broadcast_to(lengths[..., None, :] / substeps, substep.shape)
@@ -169,7 +186,11 @@ def cut_period(lengths: np.ndarray, effective: Sequence[np.ndarray], substeps: i
 
 
 def find_longest_steps(machine: Mechanics) -> np.ndarray:
-    """Return the longest steps with friction, in periods: powers of 2, and 2 for a single body without spring (T5)."""
+    """Return the longest step with friction of each scene, in periods (T5).
+
+    The steps are powers of 2, of at most `LONGEST_ANGLE` of the fastest motion. For a single body without spring the
+    result is 2, more than any period. Raise `InputError` if a period would need more than `MOST_STEPS` steps.
+    """
     size = machine.rate.shape[1]
     fastest = np.abs(np.linalg.eigvals(machine.rate[:, :, :size])).max(-1)
     steps = 0.5 ** np.maximum(0, np.ceil(np.log2(np.maximum(fastest, 1e-9) / LONGEST_ANGLE)))
@@ -184,7 +205,14 @@ def find_longest_steps(machine: Mechanics) -> np.ndarray:
 
 
 def build_flows(machine: Mechanics, durations: np.ndarray, which: np.ndarray, options: Options) -> dict[str, Any]:
-    """Return the fields of `Parameters` that follow from the bodies and the links between them."""
+    """Return the fields of `Parameters` that follow from the mechanisms.
+
+    Args:
+        machine: matrices of the mechanisms of all scenes.
+        durations: durations of the pieces without jitter, (scenes, substeps, pieces).
+        which: index of the scene of each simulation.
+        options: structure of the compiled program.
+    """
     ways = (machine.rate, machine.held) if options.friction else (machine.rate,)
 
     def stack(flows: Iterable[Flow]) -> Flow:

@@ -1,9 +1,11 @@
-"""Propagation over any duration by its binary digits, with the events of dry friction.
+"""Propagate the bodies over any duration by its binary digits, and find the events of dry friction.
 
-Pure functions of JAX arrays whose last axis is the batch. The slip of the first body is -1 or 1 while it slips in that
-direction, 0 while friction holds it. Events start and end slip (docs/theory/simulation.md, T4 and T5). The reserve of
-the first body is positive between events and 0 at an event. While the body slips, it is the speed. While the body is
-held, it is the static friction minus the sum of the other forces, in the mean direction of this sum during the step.
+All functions are pure functions of JAX arrays whose last axis is the batch. ``x`` is the state of the bodies, of length
+n. Dry friction acts on the first body. Its *slip* is -1 or 1 while the body slips in that direction, and 0 while
+friction holds the body. An *event* starts or ends slip (docs/theory/simulation.md, T4 and T5). The *reserve* of the
+body is positive between events and 0 at an event. While the body slips, the reserve is its speed. While the body is
+held, the reserve is the static friction minus the sum of the other forces, taken in the mean direction of this sum
+during the step, the *side* (-1 or 1). A *piece* is a time interval with constant forces, a *step* a part of a piece.
 """
 
 from __future__ import annotations
@@ -21,22 +23,22 @@ from zwidth.simulation.flow import DIGITS, Flow
 from zwidth.simulation.parameters import Parameters
 from zwidth.words.types import Array
 
-MOST_EVENTS = 512  # events per piece; a simulation with more is NaN
+MOST_EVENTS = 512  # largest number of steps per piece, nearly all to an event; beyond it the state is set to NaN
 LAST_DIGIT = 0.5 ** (DIGITS - 1)  # shortest step, in sampling periods
-# Simulations with events continue in groups of 1/FRACTION of the batch, because a piece with an event takes a hundred
-# times as long as one without.
+# Propagate simulations with events in groups of 1/FRACTION of the batch, because a piece with an event takes a hundred
+# times as long as a piece without one.
 FRACTION = 8
 
 
 class BodyState(NamedTuple):
-    """State of the bodies and slip of the first one."""
+    """State of the bodies, and slip of the first body."""
 
-    x: Array  # (n, batch)
-    slip: Array
+    x: Array  # state, (n, batch)
+    slip: Array  # slip of the first body: -1, 0 or 1, (batch,)
 
 
 def read(rows: Array, index: Array | int, axis: int = 0) -> Array:
-    """Return the row at an index >= 0; `jax.Array.__getitem__` compiles more operations."""
+    """Return the entry at an index >= 0 along an axis, with fewer compiled operations than `jax.Array.__getitem__`."""
     return jax.lax.dynamic_index_in_dim(rows, index, axis, keepdims=False, allow_negative_indices=False)
 
 
@@ -46,7 +48,7 @@ def times(matrix: Array, vector: Array) -> Array:
 
 
 def dot(row: Array, vector: Array) -> Array:
-    """Return the sum of products for each batch entry."""
+    """Return the scalar product of a row and a vector for each batch entry."""
     return reduce(add, (a * x for a, x in zip(row, vector, strict=True)))
 
 
@@ -59,19 +61,21 @@ def advance(
     keep: Callable[[Array], Array] | None = None,
     which: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Propagate for the longest time up to ``limit`` at whose end ``keep`` holds.
+    """Propagate by decreasing binary digits of time, and take each step at whose end the condition ``keep`` is true.
+
+    This bisects to the instant at which the condition becomes false, or propagates up to ``limit`` if it stays true.
 
     Args:
-        digits: flows over the binary digits of time, slipping and held.
+        digits: flows over the binary digits of time, while the first body slips and while it is held.
         held: mask of the batch entries whose first body is held.
         x: state of the bodies.
         forces: constant forces.
         limit: longest time, in sampling periods.
-        keep: condition on the state; always true if left out.
-        which: indices of the batch entries in ``x``; all if left out.
+        keep: function that returns the condition for a state; always true if left out.
+        which: indices in the batch of the entries of ``x``; all if left out.
 
     Returns:
-        State, time, and energy dissipated by the dampers.
+        State at the end, time, and energy dissipated by the dampers.
     """
 
     def pick(part: Array, k: Array) -> Array:
@@ -90,24 +94,24 @@ def advance(
         lost = jnp.where(taken, lost + dot(z, times(pick(digits.loss, k), z)), lost)
         return k + 1, jnp.where(taken, after, x), jnp.where(taken, longer, time), lost
 
-    # Skip the digits that are longer than the longest limit.
+    # Begin with the largest binary digit that does not exceed the longest limit.
     first = jnp.floor(-jnp.log(jnp.max(limit)) / np.log(2.0)).clip(0, DIGITS - 1).astype(int)
     return jax.lax.while_loop(remain, step, (first, x, 0.0 * limit, 0.0 * limit))[1:]
 
 
 def _take(part: Array, which: Array | None) -> Array:
-    """Return the selected batch entries; the last entry in place of an index out of range."""
+    """Return the selected batch entries of an array; an index out of range selects the last entry."""
     return part if which is None or part.shape[-1] == 1 else part.at[..., which].get(mode="clip")
 
 
 class _Slide(NamedTuple):
-    """State of a piece with friction."""
+    """Intermediate state of the propagation over a piece with friction."""
 
-    body: BodyState
+    body: BodyState  # state of the bodies
     left: Array  # remaining duration
-    lost: Array  # energy dissipated by dampers
-    rubbed: Array  # energy dissipated by friction
-    events: Array
+    lost: Array  # energy dissipated by dampers so far
+    rubbed: Array  # energy dissipated by friction so far
+    events: Array  # number of steps so far, each of which ends with an event or at the longest step
 
     @property
     def pending(self) -> Array:
@@ -116,30 +120,30 @@ class _Slide(NamedTuple):
 
 
 class _Trip(NamedTuple):
-    """State, time and loss at the end of a step, with and without an event."""
+    """State, time and dissipated energy at the end of a step, with and without an event."""
 
-    x: Array
-    time: Array
-    lost: Array
+    x: Array  # state at the end of the step
+    time: Array  # duration of the step
+    lost: Array  # energy dissipated by the dampers
     far: Array  # state at the end of the step if no event occurs
     spent: Array  # energy dissipated by the dampers if no event occurs
-    over: Array  # an event ends the step
+    over: Array  # True if an event ends the step
 
 
 class _Joint(NamedTuple):
-    """Dry friction of the first body under constant forces; friction adds to the last force."""
+    """Dry friction of the first body during a piece; the friction force is added to the last of the constant forces."""
 
-    motion: Array  # row of the velocity that friction acts on
-    place: Array  # row of its position
-    rate: Array
-    pull: Array  # row of its acceleration, which equals the force, because its mass is the unit
-    longest: Array
-    coulomb: Array
-    static: Array
-    forces: Array
+    motion: Array  # row that computes the velocity of the first body from x
+    place: Array  # row that computes the position of the first body from x
+    rate: Array  # matrix of x' = rate @ (x, forces)
+    pull: Array  # row of the acceleration of the first body, which equals the force because its mass is 1
+    longest: Array  # longest step, in sampling periods
+    coulomb: Array  # Coulomb friction while the body slips
+    static: Array  # static friction while the body is held
+    forces: Array  # constant forces without friction
 
     def pressed(self, x: Array) -> Array:
-        """Return the force on the first body without friction."""
+        """Return the sum of all forces on the first body except friction."""
         return dot(self.pull[:-1], [*x, *self.forces[:-1]]) + self.forces[-1]
 
     def speed(self, x: Array) -> Array:
@@ -147,38 +151,56 @@ class _Joint(NamedTuple):
         return dot(self.motion, x)
 
     def drive(self, slip: Array) -> Array:
-        """Return the forces including Coulomb friction."""
+        """Return the constant forces, with Coulomb friction added to the last one."""
         return jnp.stack([*self.forces[:-1], self.forces[-1] - slip * self.coulomb])
 
     def decide(self, x: Array, slip: Array, stopped: Array) -> BodyState:
-        """Hold or release a stopped body."""
+        """Decide whether a stopped first body is held or slips, by comparing the other forces with static friction.
+
+        Args:
+            x: state of the bodies.
+            slip: slip before.
+            stopped: mask of the batch entries whose first body has stopped; the others are left unchanged.
+        """
         push = self.pressed(x)
-        # Remove the remaining velocity as an impulse on the first body does.
+        # Set the velocity of the first body to exactly 0 by an impulse on it, because the search for the event leaves a
+        # rounding error.
         x = jnp.where(stopped, x - self.rate[:, -1] * self.speed(x), x)
         return BodyState(x, jnp.where(stopped, jnp.where(jnp.abs(push) > self.static, jnp.sign(push), 0.0), slip))
 
     def reserve(self, x: Array, slip: Array, side: Array) -> Array:
-        """Return the reserve; ``side``: direction of the force on a held body."""
+        """Return the reserve, for a state, the slip and the side."""
         return jnp.where(slip == 0, self.static - side * self.pressed(x), slip * self.speed(x))
 
     def slope(self, x: Array, slip: Array, side: Array) -> Array:
-        """Return the rate of change of the reserve."""
+        """Return the time derivative of the reserve, for a state, the slip and the side."""
         change = times(self.rate, jnp.concatenate([x, self.drive(slip)]))
         stuck = -side * dot(self.pull[: len(x)], change - self.rate[:, -1] * self.speed(change))
         return jnp.where(slip == 0, stuck, slip * (self.pressed(x) - slip * self.coulomb))
 
     def find_side(self, x: Array, far: Array) -> Array:
-        """Return the direction of the mean force on a held body during a step that ends at ``far``."""
+        """Return the side: the sign of the mean force on a held body during a step from ``x`` to ``far``."""
         return jnp.sign(self.pressed(x) + self.pressed(far))
 
     def dips(self, x: Array, slip: Array, far: Array, side: Array) -> Array:
-        """Return a mask of the steps at whose start the reserve decreases and at whose end it increases."""
+        """Return a mask of the steps from ``x`` to ``far`` within which the reserve has a minimum.
+
+        Steps at whose end the reserve is negative are excluded, because they contain an event in any case.
+        """
         dips = (self.slope(x, slip, side) < 0) & (self.slope(far, slip, side) > 0)
-        # Exclude a body just released, because its velocity is a rounding error.
+        # Exclude a body that slips with velocity 0, because it has just been released and no event can follow at once.
         return (self.reserve(far, slip, side) > 0) & dips & ((slip == 0) | (self.speed(x) != 0))
 
     def account(self, state: _Slide, moving: Array, after: BodyState, left: Array, lost: Array) -> _Slide:
-        """Return the state after a step of the moving batch entries."""
+        """Return the intermediate state after a step, including the energy dissipated by friction.
+
+        Args:
+            state: intermediate state before the step.
+            moving: mask of the batch entries that take the step; the others are left unchanged.
+            after: state of the bodies after the step.
+            left: remaining duration after the step.
+            lost: energy dissipated by the dampers in the step.
+        """
         (x, slip), way = state.body, dot(self.place, after.x - state.body.x)
         return _Slide(
             BodyState(jnp.where(moving, after.x, x), jnp.where(moving, after.slip, slip)),
@@ -189,7 +211,7 @@ class _Joint(NamedTuple):
         )
 
     def glide(self, state: _Slide, whole: Flow) -> _Slide:
-        """Propagate the batch entries without an event over the whole duration in one step."""
+        """Propagate the batch entries without an event over the whole piece, in one step with a precomputed flow."""
         x, slip = state.body
 
         def go(_: Any) -> Any:
@@ -201,30 +223,40 @@ class _Joint(NamedTuple):
             calm = (self.reserve(far, slip, side) >= 0) & monotone & (state.left > 0) & (state.left <= self.longest)
             return far, dot(z, times(loss, z)), calm
 
-        # Skip a piece without duration; the conditional also computes the mask once instead of in each use.
+        # Skip the computation if the piece has no duration. In addition, the conditional prevents XLA from computing
+        # the mask again at each use.
         far, lost, calm = jax.lax.cond(
             jnp.any(state.left > 0), go, lambda _: (x, 0.0 * state.left, state.left < 0), None
         )
         return self.account(state, calm, BodyState(far, slip), 0.0 * state.left, lost)
 
     def step(self, state: _Slide, digits: Flow, which: Array | None) -> _Slide:
-        """Propagate to the next event, or by the longest step."""
+        """Propagate all batch entries to their next event, or by the longest step if it contains no event.
+
+        Args:
+            state: intermediate state before the step.
+            digits: flows over the binary digits of time.
+            which: indices in the batch of the entries of ``state``; all if None.
+        """
         x, slip = state.body
         held, driven, limit = slip == 0, self.drive(slip), jnp.minimum(state.left, self.longest)
 
         def search(trip: _Trip, turn: Array) -> Any:
-            """Propagate over the whole step (turn 0), to the minimum of the reserve (1), and to the event (2)."""
+            """Propagate over the whole step (turn 0), to the minimum of the reserve (turn 1), or to the event (turn 2).
+
+            Turns 1 and 2 apply only to the batch entries whose reserve has a minimum, or is negative after turn 1.
+            """
             side = self.find_side(x, trip.far)
             wanted = jnp.stack([self.dips(x, slip, trip.far, side), self.reserve(trip.x, slip, side) < 0])
-            # Turn 0 ignores the value that it reads.
+            # In turn 0 all entries are propagated, and the index -1 reads a value that is not used.
             wanted = (turn == 0) | read(wanted, turn - 1)
 
             def keep(after: Array) -> Array:
                 bounds = jnp.stack([self.slope(after, slip, side) < 0, self.reserve(after, slip, side) >= 0])
                 return (turn == 0) | read(bounds, turn - 1)
 
-            found = advance(digits, held, x, driven, jnp.where(wanted, trip.time, 0.0), keep, which)
-            there, time, lost = (jnp.where(wanted, *each) for each in zip(found, trip[:3], strict=True))
+            reached = advance(digits, held, x, driven, jnp.where(wanted, trip.time, 0.0), keep, which)
+            there, time, lost = (jnp.where(wanted, *each) for each in zip(reached, trip[:3], strict=True))
             far, spent = (jnp.where(turn == 0, *each) for each in ((there, trip.far), (lost, trip.spent)))
             return _Trip(there, time, lost, far, spent, wanted), None
 
@@ -232,7 +264,7 @@ class _Joint(NamedTuple):
         trip = jax.lax.scan(search, _Trip(x, limit, zero, x, zero, zero > 0), np.arange(3))[0]
         over, side = trip.over & (state.left > 0), self.find_side(x, trip.far)
         after = self.decide(trip.x, slip, over)
-        # Release a body whose reserve has ended, whatever the rounding error of the force.
+        # Release a held body at its event even if, by a rounding error, the force does not exceed static friction.
         after = BodyState(jnp.where(over, after.x, trip.far), jnp.where(over & held, side, after.slip))
         left, lost = state.left - jnp.where(over, trip.time, limit), jnp.where(over, trip.lost, trip.spent)
         return self.account(state, state.left > 0, after, left, lost)
@@ -241,22 +273,23 @@ class _Joint(NamedTuple):
 def propagate_with_friction(
     params: Parameters, body: BodyState, forces: Array, duration: Array, whole: Flow | None
 ) -> tuple[BodyState, Array, Array]:
-    """Propagate under constant forces and dry friction, which adds to the last force.
+    """Propagate over one piece with constant forces and dry friction.
 
     Args:
         params: parameters of the batch.
-        body: state at the beginning.
-        forces: constant forces.
-        duration: in sampling periods.
-        whole: flow over the duration, slipping and held; None if it varies.
+        body: state at the start of the piece.
+        forces: constant forces; friction is added to the last one.
+        duration: duration of the piece, in sampling periods.
+        whole: flows over the whole piece, while the first body slips and while it is held; None with jitter, because
+            the durations then vary from period to period.
 
     Returns:
-        State at the end, energy dissipated by the dampers and by friction.
+        State at the end, energy dissipated by the dampers, and energy dissipated by friction.
     """
     motion, motor, zero = params.motion[0], params.motor, 0.0 * forces[-1]
     pull = jnp.stack([dot(motion, column) for column in jnp.moveaxis(params.rate, 1, 0)])
     joint = _Joint(motion, params.place[0], params.rate, pull, params.longest, motor.coulomb, motor.static, forces)
-    # A changed force may release a held body, and a body may start at rest.
+    # Decide again for bodies that are held or at rest, because the forces have changed since the last piece.
     start = joint.decide(body.x, body.slip, (body.slip == 0) | (joint.speed(body.x) == 0))
     state = _Slide(start, duration + zero, zero, zero, zero)
     size = zero.shape[-1]
@@ -277,5 +310,5 @@ def propagate_with_friction(
         state = finish(joint, state, None)
     else:
         state = jax.lax.while_loop(lambda state: jnp.any(state.pending), finish_few, joint.glide(state, whole))
-    known = state.left <= 0
-    return BodyState(jnp.where(known, state.body.x, jnp.nan), state.body.slip), state.lost, state.rubbed
+    finished = state.left <= 0
+    return BodyState(jnp.where(finished, state.body.x, jnp.nan), state.body.slip), state.lost, state.rubbed

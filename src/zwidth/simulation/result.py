@@ -1,4 +1,9 @@
-"""Result of a simulation in SI units: the motion, its statistics and its observed behavior."""
+"""Convert simulations to their results in SI units: the motion over time, its statistics and its observed behavior.
+
+The *tail* is the last part of a simulation, divided into equal segments. The *width* of a segment is the peak-to-peak
+position in it. ``summary`` is the record of the extreme positions and of the oscillations per segment
+(`simulation.engine.Summary`); index 0 of its arrays is the time before the tail.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class MotionKind(IntEnum):
-    """Observed behavior of a motion in the tail of its simulation; no statement on later times.
+    """Observed behavior of a motion in the tail of its simulation, which implies nothing about later times.
 
     The tail is divided into six equal segments. The width of a segment is the peak-to-peak position of the device
     (docs/theory/simulation.md, T7).
@@ -26,11 +31,13 @@ class MotionKind(IntEnum):
     REST = 0
     """In the second half of the tail no body moves by more than 1e-9 of the largest magnitude of all positions."""
     DECAYING = 1
-    """The width decreases from each segment to the next, or is below 1 % of the earlier motion and halves."""
+    """The width decreases from each segment to the next; or, in a slow oscillation, the width of the second half of the
+    tail is below 1 % of the width before the tail and less than half that of the first half."""
     STEADY = 2
     """The position oscillates, and the width has no trend."""
     GROWING = 3
-    """The width increases from each segment to the next, or is twice that of the earlier motion and doubles."""
+    """The width increases from each segment to the next; or, in a slow oscillation, the width of the second half of the
+    tail is more than twice the width before the tail and more than twice that of the first half."""
     DIVERGED = 4
     """A body is farther than 1e100 m from the surface of the wall."""
     UNCLEAR = 5
@@ -39,21 +46,23 @@ class MotionKind(IntEnum):
     """The ``status`` of the simulation is not 0."""
 
 
+# Thresholds of `classify`.
 AT_REST = 1e-9  # largest width at rest, relative to the largest magnitude of all positions
-LEAST_REST = 3  # samples without motion that do not yet count as rest
-EQUAL = 1e-3  # largest relative difference of equal widths
-NO_TREND = 1.25  # ratio of the widths of both halves up to which fluctuations count as no trend
-DECAYED = 0.01  # width relative to the earlier motion that counts as decayed, even if it oscillates slowly
-BEYOND = 1e100  # m; distance beyond which a motion has diverged
+LEAST_REST = 3  # number of samples; without motion for at most this many, a body does not yet count as at rest
+EQUAL = 1e-3  # largest relative difference of the widths of a steady oscillation
+NO_TREND = 1.25  # largest ratio of the widths of both halves of the tail that counts as no trend
+DECAYED = 0.01  # width relative to the motion before the tail; smaller widths that halve count as decaying
+BEYOND = 1e100  # distance from the surface of the wall in m; a motion beyond it has diverged
 
 FRAME = (
     *("velocity", "wall_force", "sticking"),
     *("energy", "wall_work", "push_work", "damping_loss", "friction_loss"),
 )
-"""Fields of `Motion` at an instant, in the order of the recorded rows, after the positions."""
+"""Fields of `Motion` with one value per recorded instant, in the order of a frame, which begins with the positions."""
 READING = ("measured", "estimated_velocity", "command", "contact")
-"""Fields of `Motion` at a sample, in the order of the recorded rows."""
+"""Fields of `Motion` with one value per sample, in the order of a reading."""
 
+# Description and SI unit of each field of `Motion` over time.
 OF_MOTION = {
     "position": ("position of the device, into the wall", "m"),
     "velocity": ("velocity of the device", "m/s"),
@@ -71,6 +80,7 @@ OF_MOTION = {
     "friction_loss": ("energy dissipated by friction", "J"),
     "energy": ("kinetic and elastic energy of all bodies", "J"),
 }
+# Description and SI unit of each field of `Motion` with one value per simulation.
 OF_WHOLE = {
     "amplitude": ("half of the peak-to-peak position in the tail", "m"),
     "trend": ("ratio of the peak-to-peak positions in the second and first half of the tail", "1"),
@@ -82,6 +92,7 @@ OF_WHOLE = {
     "outcome": ("code of the observed behavior", "1"),
     "status": ("status code", "1"),
 }
+# Fields of `Motion` that are unknown for a linear system.
 OF_ENERGY = {"wall_work", "push_work", "damping_loss", "friction_loss", "energy", "energy_given"}
 
 
@@ -110,8 +121,9 @@ class Motion:
 
     Attributes:
         time: instants in s, ``substeps`` per period, the first 0; one axis if all simulations share the period.
-        position, velocity: of the device, the body that the forces act on, in m and m/s; positive into the wall.
-        tip_position, hand_position: of the bodies at the far ends of a coupling and of a grasp; None without.
+        position, velocity: motion of the device, the body that the forces act on, in m and m/s; positive into the wall.
+        tip_position, hand_position: positions of the bodies at the far ends of a coupling and of a grasp, in m; None
+            if there is no such body.
         wall_force: force of the wall from the instant on, in N; with an actuator, its commanded force.
         sticking: True if friction holds the device.
         measured, estimated_velocity, command, contact: result of the control program at each sample.
@@ -192,29 +204,36 @@ class Motion:
 
 
 def _measure_width(summary: Any, start: int, stop: int) -> np.ndarray:
-    """Return the peak-to-peak position of each body in segments ``start`` to ``stop - 1``; NaN without samples."""
+    """Return the width of the motion of each body, over segments ``start`` to ``stop - 1``; NaN if they are empty."""
     width = summary.far[start:stop].max(0).sum(0)
     return np.where(width >= 0, width, np.nan)
 
 
 def _measure_halves(summary: Any) -> list[np.ndarray]:
-    """Return the peak-to-peak positions in both halves of the tail, (bodies, batch)."""
+    """Return the widths of the motions in both halves of the tail, two arrays of shape (bodies, batch)."""
     count = len(summary.far)
     return [_measure_width(summary, *half) for half in ((1, (1 + count) // 2), ((1 + count) // 2, count))]
 
 
 def find_largest(summary: Any) -> np.ndarray:
-    """Return the largest magnitude of the positions of all bodies at all samples."""
+    """Return the largest magnitude of the positions of all bodies at all samples, for each simulation."""
     return np.maximum(summary.far.max((0, 1, 2)), 0.0)
 
 
 def classify(summary: Any, memory: np.ndarray, tail: int) -> np.ndarray:
-    """Return the code of `MotionKind` of each motion; ``memory``: samples that can affect the next command."""
+    """Return the code of `MotionKind` of each motion.
+
+    Args:
+        summary: extreme positions and oscillations per segment.
+        memory: number of past samples that can affect the next command.
+        tail: number of periods in the tail.
+    """
     widest = find_largest(summary)
     width = np.stack([_measure_width(summary, k, k + 1)[0] for k in range(1, len(summary.turns))])
     before, (first, second) = _measure_width(summary, 0, 1), _measure_halves(summary)
     still = (second.max(0) <= AT_REST * widest) & (first.max(0) <= np.sqrt(AT_REST) * widest)
-    # The rest must outlast the delay, because a command computed before it can still move the bodies.
+    # Require that the second half of the tail is longer than the delay plus the window of the velocity estimate,
+    # because commands computed from earlier positions can still move the bodies.
     still &= tail // 2 > np.maximum(memory, LEAST_REST)
     before, trend, second = before[0], second[0] / first[0], second[0]
     oscillating = summary.turns[1:].min(0) >= 1
@@ -234,25 +253,26 @@ def classify(summary: Any, memory: np.ndarray, tail: int) -> np.ndarray:
 
 @np.errstate(all="ignore")
 def convert_to_si(
-    found: Any, inputs: Any, dry: np.ndarray, memory: np.ndarray, bodies: tuple[str, ...], settings: Any
+    simulated: Any, inputs: Any, dry: np.ndarray, memory: np.ndarray, bodies: tuple[str, ...], settings: Any
 ) -> dict[str, np.ndarray]:
-    """Return the fields of `Motion` by name, with one row per simulation.
+    """Return the fields of `Motion` by name, in SI units and with one row per simulation.
 
     Args:
-        found: result of `run_batch`.
-        inputs: external inputs, with the units.
+        simulated: result of `run_batch`: final state, readings and frames.
+        inputs: external inputs, including the units of time and mass in SI.
         dry: mask of the simulations with friction.
-        memory: number of samples that can affect the next command.
-        bodies: names of the positions of all bodies.
-        settings: settings of the batch.
+        memory: number of past samples that can affect the next command.
+        bodies: fields of `Motion` with the positions of the bodies.
+        settings: settings that all simulations share.
     """
-    state, readings, frames = found
+    state, readings, frames = simulated
     period, mass, instants = inputs.period, inputs.mass, inputs.instants
     summary, force = state.summary, mass / period**2
     first, second = _measure_halves(summary)
     turns = summary.turns[1:].sum(0)
     frequency = (turns - 1) / (np.diff(summary.turned, axis=0)[0] * period)
-    # A small motion that is not finite has too many friction events, or a force law without a finite force.
+    # A state that is not finite although the motion was small is a failure: of the search for friction events, or of a
+    # force law that returned no finite force.
     lost = ~np.isfinite(state.body.x).all(0) & (find_largest(summary) < BEYOND)
     outcome = np.where(lost, MotionKind.INVALID, classify(summary, memory, settings.tail))
     columns = {
@@ -273,7 +293,7 @@ def convert_to_si(
     units = {"velocity": 1.0 / period, "estimated_velocity": 1.0 / period}
     units |= dict.fromkeys(("wall_force", "command", *FRAME[3:]), force)
     for rows, names in ((frames, (*bodies, *FRAME)), (readings[:, None], READING)):
-        # (periods, substeps, rows, batch) to one (batch, samples) per row
+        # Reorder the axes (periods, substeps, rows, batch) to (rows, batch, instants).
         flat = np.moveaxis(rows, (2, 3), (0, 1)).reshape(len(names), len(period), -1)
         columns |= {name: row * units.get(name, np.ones(1))[:, None] for name, row in zip(names, flat, strict=True)}
     columns["sticking"] = (columns["sticking"] == 0) & dry[:, None]

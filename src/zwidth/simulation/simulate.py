@@ -1,4 +1,8 @@
-"""Simulation in SI units: check the arguments, simulate scenes of equal structure together, assemble the result."""
+"""Simulate scenes in SI units: check the arguments, simulate scenes of equal structure together, collect the results.
+
+A *scene* (`zwidth.Scene`) is a device with its timing, velocity estimate and, optionally, wall. Scenes have equal
+*structure* if they can share one compiled program.
+"""
 
 from __future__ import annotations
 
@@ -150,7 +154,7 @@ def simulate(
                 results[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
             results[name][indices] = column
     for column in results.values():
-        # Discard the motions of invalid arguments, which were replaced by 0 for the simulation.
+        # Discard the motions of simulations with invalid arguments, because 0 replaced these arguments.
         column[~good] = _missing(column.dtype)
     results["status"][~good] = Status.INVALID_INPUT
     results["outcome"][~good] = MotionKind.INVALID
@@ -164,7 +168,14 @@ def simulate(
 
 
 def _build_time(distinct: list[Any], which: np.ndarray, steps: np.ndarray, drawn: np.ndarray | None) -> np.ndarray:
-    """Return the instants, on one axis if all simulations share them; ``drawn``: instants with jitter, else NaN."""
+    """Return the recorded instants in s; on a single axis if all simulations have the same sampling period.
+
+    Args:
+        distinct: distinct scenes.
+        which: index of the scene of each simulation.
+        steps: recorded instants in sampling periods.
+        drawn: instants of the simulations with jitter in s, NaN for the others; None if no simulation has jitter.
+    """
     clock = np.array([float(scene.timing.period) for scene in distinct])
     if drawn is None and len(set(clock.tolist())) == 1:
         return steps * clock[0]
@@ -173,5 +184,5 @@ def _build_time(distinct: list[Any], which: np.ndarray, steps: np.ndarray, drawn
 
 
 def _missing(dtype: np.dtype) -> Any:
-    """Return the value of a missing result: NaN, or 0 for integers."""
+    """Return the value that replaces a missing result: NaN, or 0 for integers and booleans."""
     return np.nan if dtype.kind == "f" else 0

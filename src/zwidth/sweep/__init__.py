@@ -1,4 +1,4 @@
-"""Parameter sweeps: division of a grid into chunks, computation of the chunks, and the stores of their results.
+"""Compute parameter sweeps: divide a grid into chunks, compute the chunks, and store their results.
 
-Import the modules by name. This package imports none of them, so that planning a sweep loads neither JAX nor Zarr.
+The package imports none of its modules, so that planning a sweep loads neither JAX nor Zarr; import them by name.
 """

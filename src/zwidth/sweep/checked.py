@@ -1,7 +1,9 @@
-"""Read access to the store of a sweep that raises errors for missing and damaged files.
+"""Read the store of a sweep, and raise an error for each missing or damaged file.
 
-`zwidth.open_dataset` reads through `CheckedStore`. A *chunk* is one block of the grid of a sweep (`sweep.plan`); each
-variable of the store has one file per chunk, which ends with a checksum (`sweep.store`).
+A *store* is the Zarr group with the results of one sweep (`sweep.store`); `zwidth.open_dataset` reads it through
+`CheckedStore`. A *chunk* is one block of the grid of a sweep (`sweep.plan`). Each variable of the store has one file
+of values per chunk, which ends with a checksum. A chunk is *finished* once all its files are written. The *description*
+of the store is a JSON document, of which the store contains two copies.
 """
 
 from __future__ import annotations
@@ -23,11 +25,11 @@ if TYPE_CHECKING:
 
 
 class CheckedStore(LocalStore):
-    """The files of a store for Zarr, with an error for each missing or damaged file.
+    """Storage backend for Zarr that raises an error for each missing or damaged file of a store.
 
     Zarr itself would replace a missing file by fill values, and its error for a damaged file would not name that file.
-    The unfinished chunks are listed once, when the store is opened, and then stay absent: all variables of a chunk
-    remain consistent even if a run completes that chunk in the meantime.
+    A chunk that is unfinished when the store is opened stays absent until the store is opened again. So all variables
+    of a chunk remain consistent, even if a run completes that chunk in the meantime.
     """
 
     def __init__(self, store: Store) -> None:
@@ -43,13 +45,14 @@ class CheckedStore(LocalStore):
     def get_sync(
         self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """Return the content of a file, None if the file is absent; raise `StoreError` if a file of values is damaged.
+        """Return the content of a file; None if the file is absent or belongs to an unfinished chunk.
 
-        A missing file of a finished chunk is an error, too. Files of unfinished chunks are absent.
+        Raises:
+            StoreError: A file of values is damaged, or a file of a finished chunk is missing.
         """
         assert byte_range is None, "chunks are read as a whole"
         file, is_chunk = self._checked_store.path / key, "c" in key.split("/")
-        # Use the description whose checksum was verified, because one of the two files that contain it may be damaged.
+        # Return the description whose checksum was verified, because one of its two copies may be damaged.
         data = json.dumps(self._checked_store.description).encode() if key == "zarr.json" else read_or_empty(file)
         if file in self._absent or not (data or is_chunk):
             return None
@@ -60,5 +63,5 @@ class CheckedStore(LocalStore):
     async def get(
         self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """Return the content of a file as `get_sync` does, in a thread, so that Zarr reads several files at once."""
+        """Return the content of a file by `get_sync`, called in a thread, so that Zarr reads several files at once."""
         return await asyncio.to_thread(self.get_sync, key, prototype=prototype, byte_range=byte_range)

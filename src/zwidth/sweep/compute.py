@@ -1,13 +1,14 @@
 """Compute the outputs of one block of a sweep over rigid devices.
 
-The *family* of an output is "wall" (one value per wall) or "device" (one value per device). A block contains D devices
-with A x B walls each: A normalized stiffnesses alpha and B normalized dampings beta per device, with the normalized
-physical damping delta and the delay of d sampling periods (`sweep.grid`).
+The *family* of an output is "wall" (one value per wall) or "device" (one value per device). A *block* of the grid
+contains D devices with A x B walls each: A normalized stiffnesses alpha and B normalized dampings beta per device, with
+the normalized physical damping delta and the delay of d sampling periods (`sweep.grid`). A *line* is the set of walls
+of one device with the same beta.
 
-The value of a point must depend neither on the other points of its chunk nor on the process that computes it. But two
-compilations of a kernel for two batch sizes may round differently, and so may NumPy in the last elements of an array,
-outside its vectorized loop. Therefore every kernel runs on *pieces* of one fixed size, and all points of a piece belong
-to the same compiled variant of the kernel.
+The value of a point must depend neither on the other points of its chunk nor on the process that computes it. But a
+kernel may round differently if it is compiled for another batch size, and NumPy may round differently in the last
+elements of an array, outside its vectorized loop. Therefore every kernel is called with *pieces*: batches of one fixed
+size, whose points are all computed by the same compiled variant of the kernel.
 """
 
 from __future__ import annotations
@@ -37,14 +38,17 @@ from zwidth.words.status import Status
 Columns: TypeAlias = list[np.ndarray]
 Leaves: TypeAlias = Sequence[np.ndarray]
 
-# Piece sizes in points. A sweep of a few points costs as much as a full piece, so expensive kernels have small pieces.
-_PIECE = 1 << 9  # ridge and margins
-_LINE_PIECE = 1 << 12  # stability limits of lines of constant beta
-_WALL_PIECE = 1 << 12  # passivity
-MAX_EXPANDED = 1 << 20  # points whose parameters are expanded to full arrays at once; bounds the memory
-# Walls or lines of the whole grid up to which NumPy finishes before JAX has been imported and has compiled the kernel.
+# Numbers of points per piece. Expensive kernels have small pieces, because even a single point costs a full piece.
+_PIECE = 1 << 9  # points per piece for the ridge and the stability margins
+_LINE_PIECE = 1 << 12  # lines per piece for the largest stable alpha of each line
+_WALL_PIECE = 1 << 12  # walls per piece for the passivity margin
+MAX_EXPANDED = 1 << 20  # largest number of points whose parameters are expanded to full arrays at once, to limit memory
+# Largest number of walls or lines in the whole grid that NumPy computes; it is then faster than importing JAX and
+# compiling the kernel.
 MAX_NUMPY = 1 << 20
-MIN_GRID_WALLS = 1 << 8  # walls of one device from which the poles are tracked across the grid instead of one by one
+# Smallest number of walls per device for which the dominant poles are computed by series over the grid (`pole_map`).
+# For fewer walls they are computed one by one.
+MIN_GRID_WALLS = 1 << 8
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
 
@@ -61,14 +65,14 @@ def compute_block(family: Family, outputs: tuple[str, ...], block: Block, accura
         accuracy: Largest error of the spectral radius.
 
     Returns:
-        The arrays by name, of shape (D, A, B) for walls and (D,) for devices, and the status of the family.
+        The outputs and the status of the family by name: arrays of shape (D, A, B) for walls, (D,) for devices.
     """
     values = _compute_devices(block) if family == "device" else _compute_walls(outputs, block, accuracy)
     return {name: values[name] for name in (*outputs, STATUS_OF[family])}
 
 
 def _compute_devices(block: Block) -> dict[str, np.ndarray]:
-    """Return all outputs of the family "device", of shape (D,): the maximum stiffness and its status."""
+    """Return the wall of maximum stiffness of each device and its status, as outputs by name, of shape (D,)."""
     alpha, beta, _, kind, status = _map_pieces(alpha_max, (block.delta, block.d), _PIECE)
     rate = block.mass / block.period
     return {
@@ -82,7 +86,13 @@ def _compute_devices(block: Block) -> dict[str, np.ndarray]:
 
 
 def _compute_walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
-    """Return the requested outputs of the family "wall", of shape (D, A, B), and their status."""
+    """Return outputs of the family "wall" and their status by name, of shape (D, A, B).
+
+    Args:
+        outputs: Names of the outputs. Further outputs that need the same computation are also returned.
+        block: Normalized parameters of the block.
+        accuracy: Largest error of the spectral radius.
+    """
     shape = (block.delta.size, block.alpha.shape[1], block.beta.shape[1])
     values: dict[str, np.ndarray] = {}
     not_certified, period = False, block.period[:, None, None]
@@ -100,7 +110,7 @@ def _compute_walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> d
             )
             radius, certified, rate = _apply_to_walls(listed, block, shape, leaves=3)
         values["spectral_radius"], not_certified = radius, certified == 0
-        # Compute these from the decay rate, because the spectral radius rounds to 1 for slow decay.
+        # Compute these outputs from the decay rate, because the spectral radius rounds to 1 for slow decay.
         values |= {"decay_rate": rate / period, "margin": -np.expm1(-rate), "settling_time": decay_time(rate) * period}
     if MARGIN_OUTPUTS & set(outputs):
         compute = partial(_compute_margins, "delay_margin" in outputs, "modulus_margin" in outputs)
@@ -111,7 +121,7 @@ def _compute_walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> d
     if {"passive", "passivity_margin"} & set(outputs):
         (margin,) = _apply_to_walls(_compute_passivity, block, shape, one_delay=True)
         values |= {"passivity_margin": margin, "passive": margin > 0}
-    # Leave out the margins: they are NaN for unstable walls, which is no failure.
+    # Leave out the stability margins, because they are NaN for unstable walls, although the computation succeeded.
     numbers = [values[name] for name in outputs if OUTPUTS[name].dtype == "float64" and name not in MARGIN_OUTPUTS]
     device = block.delta[:, None, None], block.d[:, None, None]
     walls = block.alpha[:, :, None], block.beta[:, None, :]
@@ -121,7 +131,10 @@ def _compute_walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> d
 
 
 def _decide_stability(block: Block, shape: tuple[int, ...]) -> np.ndarray:
-    """Return whether each wall is stable: whether alpha is below the limit on its line of constant beta."""
+    """Return a mask of the stable walls of a block, by comparing alpha with the largest stable alpha of each line.
+
+    ``shape`` is (D, A, B).
+    """
     stable = np.empty(shape, dtype=bool)
     limit = _compute_limits(block)
     for plane, alpha, ends in zip(stable, block.alpha, limit, strict=True):
@@ -133,19 +146,20 @@ def _decide_stability(block: Block, shape: tuple[int, ...]) -> np.ndarray:
 def _choose_route(count: int) -> Route:
     """Return "numpy" for small grids and "jax" for large ones, given the number of points of the whole grid.
 
-    The size of a chunk must not decide: the results of both may differ in the last digit, so that the value of a point
-    would depend on the division into chunks.
+    The choice must not depend on the size of a chunk. The results of NumPy and JAX may differ in the last digit, and
+    the value of a point must not depend on the division of the grid into chunks.
     """
     return "numpy" if count <= MAX_NUMPY else "jax"
 
 
 def _compute_limits(block: Block) -> np.ndarray:
-    """Return the largest stable alpha of every device and beta, of shape (D, B)."""
+    """Return the largest stable alpha of every line, of shape (D, B)."""
     columns = [part.ravel() for part in np.broadcast_arrays(block.beta, block.delta[:, None], block.d[:, None])]
     limit = np.empty(block.beta.size)
-    # `row_limits` uses another kernel for d < 1. With both ranges of d in a piece, their batch sizes would vary.
+    # Compute d < 1 and d >= 1 separately, because `row_limits` has one kernel for each. The batch sizes of both kernels
+    # would vary if a piece contained delays of both ranges.
     for long in (False, True):
-        # The same comparison as in `row_limits`, which does not count d = NaN as a long delay.
+        # Write the comparison as `row_limits` does, so that d = NaN counts as a short delay in both.
         index = np.flatnonzero((columns[2] >= 1) == long)
         if index.size:
             by_rows = partial(row_limits, route=_choose_route(block.lines))
@@ -163,14 +177,14 @@ def _apply_to_walls(
     """Apply a function to all walls of a block, with a bounded number of walls per call.
 
     Args:
-        function: Maps flat arrays of alpha, beta, delta and d to a sequence of ``leaves`` flat arrays.
+        function: Function that maps flat arrays of alpha, beta, delta and d to ``leaves`` flat arrays.
         block: Block with D devices and A x B walls each.
         shape: (D, A, B).
         leaves: Number of arrays that the function returns.
-        one_delay: Pass only walls with the same delay in one call.
+        one_delay: True if all walls of one call must have the same delay.
 
     Returns:
-        The arrays of the function, each of shape (D, A, B).
+        The results of the function for all walls: ``leaves`` arrays of shape (D, A, B).
     """
     results = tuple(np.empty(shape) for _ in range(leaves))
     rows = min(shape[1], max(1, MAX_EXPANDED // shape[2]))
@@ -189,9 +203,12 @@ def _apply_to_walls(
 
 
 def _compute_margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Leaves:
-    """Return the four stability margins; the delay and modulus margins, which need a search, only if requested.
+    """Compute the gain, phase, delay and modulus margin of walls.
 
-    A margin that was not requested is NaN.
+    Args:
+        with_delay: Compute the delay margin, which needs a search; otherwise it is NaN.
+        with_modulus: Compute the modulus margin, which needs a search; otherwise it is NaN.
+        columns: Flat arrays of alpha, beta, delta and d.
     """
 
     def compute_piece(*piece: np.ndarray) -> Leaves:
@@ -203,6 +220,6 @@ def _compute_margins(with_delay: bool, with_modulus: bool, columns: Columns) -> 
 
 
 def _compute_passivity(columns: Columns) -> Leaves:
-    """Return the passivity margin of walls with the same delay."""
+    """Return the passivity margin of walls with the same delay, from flat arrays of alpha, beta, delta and d."""
     *walls, d = columns
     return (_map_pieces(partial(margin_at_one_delay, d=float(d[0])), walls, _WALL_PIECE),)

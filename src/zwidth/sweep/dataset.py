@@ -1,6 +1,7 @@
 """Open the results of a sweep as an xarray dataset, export them to netCDF and CSV, and verify their files.
 
-A *store* is the Zarr group ``<study>.zarr`` with the results of one sweep (`sweep.store`), divided into chunks.
+A *store* is the Zarr group ``<study>.zarr`` with the results of one sweep (`sweep.store`). Its arrays, the *variables*,
+are divided into *chunks*, rectangular blocks of the grid with one file each.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
 if TYPE_CHECKING:
     import xarray
 
-MAX_CSV_POINTS = 1_000_000  # rows of an exported table; spreadsheets open about as many
+MAX_CSV_POINTS = 1_000_000  # largest number of rows of an exported CSV table; spreadsheets open about as many
 
 
 def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
@@ -65,13 +66,13 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
     check_installed()
     import xarray
 
-    # Import here, because this module loads Zarr.
+    # Import `sweep.checked` only here, because it loads Zarr, whose absence `check_installed` reports.
     from zwidth.sweep.checked import CheckedStore
 
     checked = CheckedStore(store)
     with silence_zarr():
         dataset = xarray.open_zarr(checked, consolidated=store.has_checksums, chunks={})
-    # Drop the arrays with the checksums, which stores of the old format contain.
+    # Select the variables, because stores of the old format also contain arrays with checksums.
     dataset = dataset[[name for family in store.plan.families for name in family.variables]]
     if "device" in dataset.coords:
         # Convert the labels, because netCDF and pandas do not support NumPy's strings of variable length.
@@ -85,7 +86,7 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
 def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
     """Write the results of a sweep to a new netCDF-4 file, chunk by chunk.
 
-    Boolean values are written as bytes, and nested attributes as JSON.
+    Boolean values are written as bytes, and nested attributes as JSON. Raise `StoreExistsError` if the file exists.
     """
     target = _check_target(file)
     dataset = open_dataset(path)
@@ -104,8 +105,11 @@ def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> Non
 def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
     """Write the results of a small sweep to a new CSV table: one row per point, one column per parameter and output.
 
-    Names of columns in SI units end with the unit, for example ``stiffness_N_per_m``; normalized quantities have no
-    unit. `StoreError` if the sweep has more than a million points.
+    The name of a column ends with its unit, for example ``stiffness_N_per_m``; normalized quantities have no unit.
+
+    Raises:
+        StoreError: The sweep has more than a million points.
+        StoreExistsError: The file exists.
     """
     target = _check_target(file)
     dataset = open_dataset(path)
@@ -132,12 +136,12 @@ _ORDER = (*VARIABLES, *OUTPUTS)
 
 
 def _rank_variable(name: str) -> int:
-    """Return the position of a variable in the declared order of all variables; undeclared ones come last."""
+    """Return the rank of a variable in the order of `words.quantities`; variables not listed there rank last."""
     return _ORDER.index(name) if name in _ORDER else len(_ORDER)
 
 
 def _convert_attribute(value: Any) -> Any:
-    """Return an attribute in a type that netCDF supports: integer lists as arrays, nested values as JSON."""
+    """Convert an attribute to a type that netCDF supports: lists of integers to arrays, nested values to JSON."""
     if isinstance(value, list) and all(isinstance(item, int) for item in value):
         return np.array(value, dtype=np.int64 if max(value, default=0) > NOT_COMPUTED else np.uint8)
     return json.dumps(value) if value is None or isinstance(value, dict | list) else value
@@ -158,8 +162,8 @@ class Verification:
     path: Path
     chunks: int = 0  # number of chunks of the whole sweep
     done: int = 0  # number of chunks marked as done
-    damaged: tuple[str, ...] = ()  # damaged and missing chunks and files, each with its fault
-    error: str = ""  # reason why the store cannot be read at all; empty if it can
+    damaged: tuple[str, ...] = ()  # names of damaged and missing chunks and files, each with its fault
+    error: str = ""  # reason why the store is unreadable; empty if it is readable
 
     @property
     def ok(self) -> bool:
@@ -168,12 +172,12 @@ class Verification:
 
 
 def verify(path: str | os.PathLike[str]) -> tuple[Verification, ...]:
-    """Read every file of one store, or of all stores in a folder, and compare its checksum; change nothing."""
+    """Verify the checksum of every file of one store, or of all stores in a folder, without changing any file."""
     return tuple(map(_verify_store, list_stores(path)))
 
 
 def _verify_store(path: Path) -> Verification:
-    """Verify one store; an unreadable store is reported in the ``error`` of the result."""
+    """Verify the checksums of one store; report an unreadable store in the field ``error`` of the result."""
     store = Store(path)
     try:
         if not store.has_checksums:

@@ -1,7 +1,9 @@
 """Compute the chunks of sweeps on the workers of an existing dask.distributed cluster.
 
-A *job* is one chunk of one store (`sweep.jobs`). The workers write the chunks into the stores themselves, so they need
-access to the stores under the same path as this process. Only this module imports distributed.
+A *job* is the computation of one chunk of one store (`sweep.jobs`). The *scheduler* of the cluster assigns jobs to
+*worker* processes, each with one or more threads. A *future* is dask's handle of a submitted job. The workers write the
+chunks into the stores themselves, so they need access to the stores under the same path as this process. Only this
+module imports distributed.
 """
 
 from __future__ import annotations
@@ -21,14 +23,16 @@ from zwidth.words.errors import InputError, how_to_install
 if TYPE_CHECKING:
     from distributed import Client
 
-_CONNECT_SECONDS = 30  # timeout of the connection to the scheduler
-_REPLY_SECONDS = 15  # a scheduler without a message for this time is queried, and must reply within the same time
-# Longest time without any worker. Workers may start late, because they wait in the queue of a batch system.
+_CONNECT_SECONDS = 30  # timeout for connecting to the scheduler, in s
+# If no job ends for this time in s, the scheduler is queried, and must reply within the same time.
+_REPLY_SECONDS = 15
+# Longest time in s without any worker, because workers may have to wait in the queue of a batch system.
 _NO_WORKER_SECONDS = 600
-# Submitted jobs per thread of the workers: keeps every worker busy, and bounds the memory of the scheduler.
+# Number of submitted jobs per worker thread, large enough to keep every worker busy and small enough to limit the
+# memory of the scheduler.
 _JOBS_PER_THREAD = 4
-_KILLED = "KilledWorker"
-_GONE = "no longer replies, or has been restarted"
+_KILLED = "KilledWorker"  # name of dask's exception for a job whose worker died repeatedly
+_GONE = "no longer replies, or has been restarted"  # end of a message that begins with the scheduler's address
 
 
 class _MissingFolderError(InputError):
@@ -37,7 +41,7 @@ class _MissingFolderError(InputError):
 
 @contextmanager
 def connect(address: str) -> Iterator[Client]:
-    """Connect to a scheduler for the duration of the block; raise `InputError` if it does not reply."""
+    """Connect to a scheduler within the context; raise `InputError` if the scheduler does not reply."""
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
@@ -52,14 +56,14 @@ def connect(address: str) -> Iterator[Client]:
         try:
             yield client
         finally:
-            # Ignore the error of a scheduler that no longer replies.
+            # Ignore the error if the scheduler no longer replies, because the connection is closed in any case.
             with suppress(OSError):
                 client.close(timeout=_REPLY_SECONDS)
 
 
 @contextmanager
 def _silence_logs() -> Iterator[None]:
-    """Remove the log handlers of distributed that write to the terminal, because zwidth reports its errors itself."""
+    """Silence the log messages of distributed in the terminal within the context, because zwidth reports its errors."""
     names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in ("distributed", "tornado")]
     terminal = (sys.stderr, sys.__stderr__)
     before = {logging.getLogger(name): logging.getLogger(name).handlers for name in (*names, "asyncio")}
@@ -75,9 +79,9 @@ def _silence_logs() -> Iterator[None]:
 
 
 def run_on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[Finished]:
-    """Run jobs on the workers of a scheduler and yield their outcomes, in the order of completion."""
-    # dask gives up a job after several deaths of its worker, even if another job on that worker was the cause.
-    # Therefore run such jobs again at the end, one at a time, before reporting a failure.
+    """Run jobs on the workers of a cluster and yield their outcomes, in the order of completion."""
+    # Repeat the jobs whose workers died, one at a time after all others, before reporting a failure, because dask
+    # abandons a job after several deaths of its worker even if another job on the same worker was the cause.
     given_up = []
     for finished in _submit_jobs(client, jobs, perform):
         if finished.error.startswith(_KILLED):
@@ -89,9 +93,12 @@ def run_on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generat
 
 
 def _submit_jobs(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finished]:
-    """Keep a bounded number of jobs on the cluster and yield their outcomes; only names of chunks are transferred."""
+    """Submit jobs to the cluster, a bounded number at a time, and yield their outcomes.
+
+    Only the names of chunks are transferred, not their values.
+    """
     waiting = iter(jobs)
-    # Keep a reference to each future, because dask cancels the task of a future that has been deleted.
+    # Keep a reference to each future, because dask cancels a job whose future is deleted.
     jobs_by_key: dict[str, tuple[Job, Any]] = {}
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
@@ -121,7 +128,7 @@ def _submit_jobs(client: Client, jobs: list[Job], perform: Perform) -> Generator
         job, _ = jobs_by_key.pop(future.key)
         if future.status == "cancelled":
             raise LostSchedulerError(_GONE)
-        # Ignore the result of the future: it is None, and `engine` checks in the stores which chunks are done.
+        # Ignore the result of the future, which is None; `sweep.engine` checks in the stores which chunks are done.
         yield _describe_error(job, future.exception()) if future.status == "error" else Finished(job)
         with_workers = time.monotonic()
         submit_next()

@@ -1,8 +1,9 @@
 """Compute the sweeps of a run: create or repair their stores, then compute the missing chunks one by one.
 
-The chunks are computed in this process, in worker processes (`sweep.jobs`) or on a cluster (`sweep.distributed`). Each
-sweep has one store, ``<study>.zarr`` in the folder of the run (`sweep.store`). A chunk is done once its status file is
-in the store; so an interrupted run can be resumed from the stores alone.
+A *chunk* is one block of the grid of a sweep (`sweep.plan`), a *job* the computation of one chunk. Chunks are computed
+in this process, in worker processes (`sweep.jobs`) or on a cluster (`sweep.distributed`). Each sweep has one *store*,
+``<study>.zarr`` in the folder of the run (`sweep.store`). A chunk is done once its status file is in the store;
+therefore an interrupted run can be resumed from the stores alone.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from zwidth.sweep.store import SUFFIX, Store, create_store
 from zwidth.words.errors import StoreError, StoreExistsError
 from zwidth.words.formatting import describe
 
-_SHOWN_DIFFERENCES = 10  # differing keys named in one message
+_SHOWN_DIFFERENCES = 10  # largest number of differing configuration keys that one message lists
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,12 @@ class Progress:
     """The progress of the sweeps of a run, reported after every chunk."""
 
     study: str  # name of the study of this chunk
-    chunks: int  # chunks finished so far in this run
-    total_chunks: int  # chunks to be computed in this run
-    points: int  # points finished so far in this run
-    total_points: int  # points to be computed in this run
-    rate: float  # points per second since the start
-    seconds_left: float  # remaining time at this rate; NaN before the first computed chunk
+    chunks: int  # number of chunks finished so far in this run
+    total_chunks: int  # number of chunks to be computed in this run
+    points: int  # number of points of the grids finished so far in this run
+    total_points: int  # number of points of the grids to be computed in this run
+    rate: float  # mean number of points computed per second since the start
+    seconds_left: float  # estimated remaining time in s; NaN before the first computed chunk
     error: str = ""  # error of this chunk; empty if it was computed
 
 
@@ -46,12 +47,12 @@ class Progress:
 class SweepResult:
     """The outcome of one sweep."""
 
-    store: Path  # folder of its store
-    computed: int = 0  # chunks computed by this run
-    skipped: int = 0  # chunks computed by earlier runs
-    total: int = 0  # all chunks of the sweep
-    repaired: tuple[str, ...] = ()  # damaged chunks, computed again, and restored files
-    failed: dict[str, str] = field(default_factory=dict)  # failed chunks, each with its error
+    store: Path  # path of the store of the sweep
+    computed: int = 0  # number of chunks computed by this run
+    skipped: int = 0  # number of chunks computed by earlier runs
+    total: int = 0  # number of all chunks of the sweep
+    repaired: tuple[str, ...] = ()  # names of damaged chunks, which are computed again, and of restored files
+    failed: dict[str, str] = field(default_factory=dict)  # error of each failed chunk, by name of the chunk
 
     @property
     def ok(self) -> bool:
@@ -63,9 +64,9 @@ class SweepResult:
 class Sweeps:
     """The outcome of all sweeps of one run."""
 
-    results: dict[str, SweepResult]  # by name of the study
+    results: dict[str, SweepResult]  # outcome of each sweep, by name of the study
     fatal_error: str = ""  # error that ended the run because it affects every chunk, for example a full disk
-    interrupted: bool = False  # stopped by the user with Ctrl-C
+    interrupted: bool = False  # True if the user stopped the run with Ctrl-C
     lost: str = ""  # error of the cluster that ended the run
 
 
@@ -86,9 +87,9 @@ def compute_sweeps(
         plans: The plan of each sweep.
         folder: Folder of the run.
         about: Attributes of the stores: name, description, config, and config_sha256 (of config.yaml).
-        workers: Number of worker processes; None for this process.
-        scheduler: Address of a dask.distributed scheduler; None for this machine.
-        progress: Called after every chunk.
+        workers: Number of worker processes; None to compute in this process.
+        scheduler: Address of a dask.distributed scheduler; None to compute on this machine.
+        progress: Function that is called after every chunk.
 
     Raises:
         InputError: The scheduler does not reply, or its workers have no access to the folder.
@@ -129,7 +130,17 @@ def compute_sweeps(
 
 
 def check_stores(studies: Sequence[SweepStudy], folder: Path, *, resume: bool) -> None:
-    """Raise `StoreExistsError` if a store exists and the run does not resume; check existing stores by `check_same`."""
+    """Raise an error if a store exists and cannot be continued.
+
+    Args:
+        studies: The sweeps of the run.
+        folder: Folder of the run.
+        resume: True if existing stores are to be continued.
+
+    Raises:
+        StoreExistsError: A store exists, and ``resume`` is False.
+        StoreError: An existing store differs from the study or the release (`check_same`).
+    """
     for study in studies:
         path = store_path(folder, study)
         if not path.exists():
@@ -157,7 +168,7 @@ def _prepare_store(plan: Plan, folder: Path, about: Mapping[str, Any]) -> tuple[
         }
         return create_store(path, attributes), ()
     store = Store(path)
-    # Remove unfinished files of a killed run.
+    # Remove files that a killed run left unfinished, because nothing else removes them.
     for left in path.rglob("*.partial"):
         left.unlink(missing_ok=True)
     return store, tuple(f"{plan.study.name}/{each}" for each in repair_store(store, store.plan.tasks()))
@@ -170,7 +181,15 @@ def _collect_outcomes(
     sweeps: Sweeps,
     progress: Callable[[Progress], None],
 ) -> None:
-    """Record the outcomes of all jobs in ``sweeps`` and report the progress; stop at a fatal error or Ctrl-C."""
+    """Record the outcomes of jobs and report the progress after each of them; stop at a fatal error or Ctrl-C.
+
+    Args:
+        results: Outcomes of the jobs, in the order of completion.
+        jobs: All jobs.
+        stores: The stores by path.
+        sweeps: Outcome of all sweeps, which is updated.
+        progress: Function that is called after every chunk.
+    """
     start, ended, computed = time.perf_counter(), 0, 0
     total = sum(job.task.points for job in jobs)
     try:
@@ -191,19 +210,25 @@ def _collect_outcomes(
     except KeyboardInterrupt:
         sweeps.interrupted = True
     finally:
-        # Closing the generator ends the workers.
+        # Close the generator, because this ends the worker processes.
         results.close()
 
 
 def _count_chunks(jobs: list[Job], stores: dict[str, Store], sweeps: Sweeps) -> None:
-    """Count the computed chunks in the stores themselves, not by the reported outcomes."""
+    """Count the computed chunks of each sweep by the files in its store, not by the outcomes that jobs report.
+
+    Args:
+        jobs: All jobs of the run.
+        stores: The stores by path.
+        sweeps: Outcome of all sweeps, which is updated.
+    """
     over = sweeps.fatal_error or sweeps.interrupted or sweeps.lost
     for path, task in jobs:
         store = stores[path]
         sweep = sweeps.results[store.study.name]
         if store.is_visible(task):
             sweep.computed += 1
-            # Another process has computed the chunk in the meantime, for example a worker believed dead.
+            # Discard the error, because another process has computed the chunk, for example a worker believed dead.
             sweep.failed.pop(store.label(task), None)
         elif not over:
             sweep.failed.setdefault(store.label(task), "reported as computed but missing from the store")
@@ -233,7 +258,7 @@ def refuse_changes(where: Path, name: str, noun: str, old: Any, new: Any) -> Non
         old: Recorded study, as JSON.
         new: Study of the present configuration, as JSON.
     """
-    # Ignore the keys delay_model and delay_models of earlier releases if they have the only value still supported.
+    # Ignore the keys delay_model and delay_models of earlier releases if they have the value that is now the only one.
     changed = [each for each in list_differences(old, new) if each[1:] not in (("held", None), (["held"], None))]
     if changed:
         lines = [
@@ -248,7 +273,11 @@ def refuse_changes(where: Path, name: str, noun: str, old: Any, new: Any) -> Non
 
 
 def refuse_versions(where: Path, old: dict[str, str]) -> None:
-    """Raise `StoreError` if results were computed by other releases, because a mixture is not reproducible by any."""
+    """Raise `StoreError` if results were computed by other releases of zwidth or of the packages it computes with.
+
+    No single set of releases could reproduce results of mixed origin. ``where`` is the file that records the releases
+    ``old``, by package.
+    """
     for key, now in list_versions().items():
         if key != "python" and old.get(key) != now:
             fault = f"{where}: created with {key} {old.get(key)}, now {now} is installed"
@@ -256,7 +285,7 @@ def refuse_versions(where: Path, old: dict[str, str]) -> None:
 
 
 def repair_store(store: Store, tasks: Iterable[Task]) -> list[str]:
-    """Restore damaged coordinates and mark damaged chunks as not done; return a list of the repairs."""
+    """Restore damaged coordinates and descriptions, mark damaged chunks as not done, and list the repairs."""
     repairs = []
     names = store.damaged_files()
     if names:
@@ -271,7 +300,10 @@ def repair_store(store: Store, tasks: Iterable[Task]) -> list[str]:
 
 
 def remove_store(folder: Path, study: SweepStudy) -> None:
-    """Delete the store of a sweep; keep a folder of that name that is no store, which `check_stores` then refuses."""
+    """Delete the store of a sweep; keep any folder of the same name that is not a store.
+
+    `check_stores` raises an error for such a folder.
+    """
     path = store_path(folder, study)
     if path.is_dir() and not path.is_symlink():
         with suppress(StoreError):

@@ -1,7 +1,8 @@
-"""Files and folders of results: checks, checksums, package versions, and the lock that admits one writing run.
+"""Check, hash and lock files and folders of results, and list the versions of packages.
 
-The lock is an operating system lock on ``DIR/.locks/run``. It ends with its process, even if the process is killed, so
-that the remaining file blocks no later run. On NFS it also excludes runs on other machines.
+A lock ensures that only one run at a time writes to a folder. It is an operating system lock on ``DIR/.locks/run``. The
+operating system releases it when its process ends, even if the process is killed, so that the remaining file does not
+block later runs. On NFS the lock also excludes runs on other machines.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from zwidth import __version__
 from zwidth.words.errors import InputError, StoreBusyError
 from zwidth.words.files import REMEDIES
 
-_FATAL_ERRORS = frozenset(list(REMEDIES)[:6])  # error codes that every further write would meet as well
+_FATAL_ERRORS = frozenset(list(REMEDIES)[:6])  # system error codes that would also affect every further write
 _PACKAGES = ("jax", "jaxlib", "numpy")  # packages whose version can change the last digit of a result
-LOCKS = ".locks"  # folder of the locks, within a folder of results
-ELSEWHERE = "choose another folder with --out DIR"  # the remedy that always helps, for messages
-LOCK_TIMEOUT = 1.0  # s; waiting time for the lock, because a killed run needs some time to end
-# Error codes of file systems that do not support locks.
+LOCKS = ".locks"  # name of the folder of the locks, within a folder of results
+ELSEWHERE = "choose another folder with --out DIR"  # remedy in error messages, which always helps
+LOCK_TIMEOUT = 1.0  # longest time to wait for the lock, in s, because a killed run needs some time to end
+# Error codes by which file systems report that they do not support locks.
 _NO_LOCKS = frozenset({errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK})
 
 
 def is_fatal(error: BaseException | None) -> bool:
-    """Return whether an exception was caused by a system error that every further write would meet, as a full disk."""
+    """Return whether an exception was caused by a system error that affects every later write, such as a full disk."""
     while error is not None:
         if isinstance(error, OSError) and error.errno is not None:
             return error.errno in _FATAL_ERRORS
@@ -42,7 +43,7 @@ def is_fatal(error: BaseException | None) -> bool:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise `InputError` if a folder for results cannot be created or written; test this without writing."""
+    """Raise `InputError` if a folder for results cannot be created or written; the check itself writes nothing."""
     nearest = find_existing(folder)
     if not nearest.is_dir():
         where = "is a file" if nearest == folder.absolute() else f"cannot be created because {nearest} is a file"
@@ -53,7 +54,7 @@ def check_folder(folder: Path) -> None:
 
 
 def is_plain_name(name: str) -> bool:
-    """Return whether a string names a file within a folder, that is, contains no path to any other folder."""
+    """Return whether a string is the name of a file in a folder, without any path to another folder."""
     return Path(name).name == name and name not in ("", "..") and "\0" not in name
 
 
@@ -64,7 +65,7 @@ def find_existing(folder: Path) -> Path:
 
 
 def read_or_empty(path: Path) -> bytes:
-    """Return the content of a file; empty if there is no such file."""
+    """Return the content of a file, or empty bytes if the file does not exist."""
     with suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return path.read_bytes()
     return b""
@@ -86,7 +87,7 @@ def list_versions(*more: str) -> dict[str, str]:
 
 
 def list_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield the differences of two JSON values: dotted path, old value and new value; an absent value is None."""
+    """Yield each difference between two JSON values as dotted path, old value and new value (None if absent)."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys((*old, *new)):
             yield from list_differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
@@ -100,7 +101,7 @@ def list_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
     """Create a folder of results if missing and lock it; raise `StoreBusyError` if another run holds the lock."""
-    # Import here, because loading filelock takes longer than many commands that import this module.
+    # Import filelock only here, because loading it takes longer than many commands that import this module.
     from filelock import FileLock, Timeout
 
     check_folder(folder)
@@ -109,8 +110,8 @@ def lock_folder(folder: Path) -> Iterator[None]:
         raise InputError(f"out: {lock_dir} is a link; remove it, or {ELSEWHERE}")
     lock_dir.mkdir(parents=True, exist_ok=True)
     holder = lock_dir / "holder"
-    # Make the file writable by all, because other users of the folder lock it too. Do not fall back to plain lock
-    # files, because the one of a killed run would block later runs.
+    # Make the lock file writable by all users, because other users of the folder lock it, too. Do not fall back to
+    # plain lock files, whose existence is the lock, because the file of a killed run would block later runs.
     lock = FileLock(lock_dir / "run", timeout=LOCK_TIMEOUT, mode=0o666, fallback_to_soft=False)
     try:
         lock.acquire()
@@ -119,13 +120,15 @@ def lock_folder(folder: Path) -> Iterator[None]:
         fault = f"another run is writing to this folder{who and f' ({who})'}"
         raise StoreBusyError(f"out: {folder}: {fault}; wait until it ends, stop it, or {ELSEWHERE}") from None
     except OSError as error:
-        # Continue without a lock if the file system has none: each file of a store is still either complete or absent.
+        # Continue without a lock if the file system does not support locks. Two runs may then compute the same chunk,
+        # but each file of a store is still either complete or absent.
         if error.errno not in _NO_LOCKS:
             raise
     try:
         since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")
         who = f"process {os.getpid()} on {socket.gethostname()}, since {since} UTC"
-        # Ignore errors, because this file is used only in messages. Remove it first, because it may be a link.
+        # Ignore errors, because the file with the holder of the lock is used only in messages. Remove an existing file
+        # first, because it may be a link.
         with suppress(OSError):
             holder.unlink(missing_ok=True)
             holder.write_text(who, encoding="utf-8")

@@ -1,9 +1,11 @@
-"""The grid of a sweep: its dimensions, their values, and the parameters of any block of the grid.
+"""Build the grid of a sweep: its dimensions, their values, and the parameters of any block of the grid.
 
-A sweep varies parameters of walls (stiffness K and virtual damping B, or their normalized values alpha and beta) and
+A sweep varies parameters of walls (stiffness and virtual damping, or their normalized values alpha and beta) and
 parameters of devices. A *block* of the grid contains D devices with the same A values of stiffness and B values of
-virtual damping each. In a *physical* sweep the parameters are in SI units and are normalized here; in a normalized
-sweep they are used as given: alpha, beta, delta (physical damping), d (delay in sampling periods).
+virtual damping each. In a *physical* sweep the parameters are in SI units, and this module normalizes them; in a
+*normalized* sweep they are used as specified: alpha, beta, delta (physical damping), d (delay in sampling periods). The
+*family* of an output is "wall" (one value per wall) or "device" (one value per device). A *line* is the set of walls
+of one device with the same beta.
 """
 
 from __future__ import annotations
@@ -27,11 +29,11 @@ class Block(NamedTuple):
     d: np.ndarray  # delay in sampling periods, shape (D,)
     all_alpha: np.ndarray  # every alpha of the whole grid, shape (D, number of alphas)
     all_beta: np.ndarray  # every beta of the whole grid, shape (D, number of betas)
-    alphas: slice  # alphas of the block
-    betas: slice  # betas of the block
-    mass: np.ndarray  # kg, or kg m^2 for a rotary device; 1 in a normalized sweep; shape (D,)
-    period: np.ndarray  # sampling period, s; 1 in a normalized sweep; shape (D,)
-    lines: int  # number of lines of constant beta in the whole grid
+    alphas: slice  # range of the block in ``all_alpha``
+    betas: slice  # range of the block in ``all_beta``
+    mass: np.ndarray  # mass in kg, or kg m^2 for a rotary device; 1 in a normalized sweep; shape (D,)
+    period: np.ndarray  # sampling period in s; 1 in a normalized sweep; shape (D,)
+    lines: int  # number of lines in the whole grid
 
     @property
     def alpha(self) -> np.ndarray:
@@ -45,15 +47,18 @@ class Block(NamedTuple):
 
 
 class SceneBlock(NamedTuple):
-    """The parameters of a block as given in the configuration: D devices with A x B walls each."""
+    """The parameters of a block as specified in the configuration: D devices with A x B walls each."""
 
     parameters: dict[str, np.ndarray]  # parameters of the devices by name, each of shape (D,)
-    stiffness: np.ndarray  # N/m, or N m/rad; alpha in a normalized sweep; shape (D, A)
-    virtual_damping: np.ndarray  # N s/m, or N m s/rad; beta in a normalized sweep; shape (D, B)
+    stiffness: np.ndarray  # stiffness in N/m or N m/rad; alpha in a normalized sweep; shape (D, A)
+    virtual_damping: np.ndarray  # virtual damping in N s/m or N m s/rad; beta in a normalized sweep; shape (D, B)
 
 
 class Grid:
-    """The grid of a sweep: its dimensions, those of devices before those of walls, and the parameters of its points."""
+    """The grid of a sweep: its dimensions, and the parameters of its points.
+
+    The dimensions of devices precede those of walls.
+    """
 
     def __init__(self, study: SweepStudy) -> None:
         self.axes, self.unit_system = study.axes, study.unit_system
@@ -75,7 +80,7 @@ class Grid:
 
     @cached_property
     def _values(self) -> dict[str, np.ndarray]:
-        """The values of every given parameter, as flat arrays by name."""
+        """The values of every parameter that the configuration specifies, as 1-D arrays by name."""
         table = self.axes.devices
         columns = {name: table.values(name) for name in table.columns} if table else {}
         axes = {name: getattr(self.axes, name) for name in PARAMETERS}
@@ -84,7 +89,8 @@ class Grid:
     def coordinates(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]]:
         """Return the coordinate variables of a store: dimensions, values and attributes by name of the variable.
 
-        They are the given parameters and, if the devices come from a table, the labels of the devices.
+        The coordinates are the parameters that the configuration specifies and, if it reads the devices from a table,
+        the labels of the devices.
         """
         table = self.axes.devices
         variables: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
@@ -101,10 +107,10 @@ class Grid:
         return variables
 
     def scene_block(self, slices: tuple[slice, ...]) -> SceneBlock:
-        """Return a block with its parameters as given.
+        """Return a block with its parameters as specified in the configuration.
 
-        ``slices`` has one slice per dimension, or only those of the device dimensions: then the first value of each
-        wall dimension is used.
+        ``slices`` contains one slice per dimension, or one per device dimension only. In the second case the block has
+        the first value of each wall dimension.
         """
         by_dim = dict(zip(self.dims, slices, strict=False))
         for name in self.wall_dims:
@@ -115,7 +121,10 @@ class Grid:
         return SceneBlock(parameters, *(np.broadcast_to(part, (math.prod(shape), part.shape[1])) for part in walls))
 
     def block(self, slices: tuple[slice, ...]) -> Block:
-        """Return a block with normalized parameters, including the walls of the whole grid; slices as above."""
+        """Return a block with normalized parameters, including the walls of the whole grid.
+
+        ``slices`` has the same meaning as for `scene_block`.
+        """
         alphas = betas = slice(0, 1)
         if len(slices) == len(self.dims):
             by_dim = dict(zip(self.dims, slices, strict=True))
@@ -132,7 +141,7 @@ class Grid:
         rate = given.parameters.get("rate")
         period = given.parameters["period"] if rate is None else 1.0 / rate
         in_periods = self.axes.delay_in_periods
-        # Suppress warnings, because a parameter that overflows is reported in the status of its point.
+        # Suppress NumPy's warnings, because the status of a point reports parameters that overflow.
         with np.errstate(all="ignore"):
             device = normalize(mass=mass, damping=damping, period=period, delay=zeros if in_periods else delay)
             units = {"mass": mass[:, None], "period": period[:, None]}
@@ -142,7 +151,7 @@ class Grid:
         return Block(device.delta, d, alpha, beta, alphas, betas, mass, period, lines)
 
     def _device_values(self, name: str, by_dim: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
-        """Return the values of a parameter for all devices of a block, flat; 0 if the parameter is not given.
+        """Return the values of a parameter for all devices of a block, as a 1-D array; 0 if it is not specified.
 
         Args:
             name: Name of the parameter.
@@ -157,7 +166,7 @@ class Grid:
         return np.broadcast_to(values, shape or (1,)).ravel()
 
     def _wall_values(self, name: str, by_dim: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
-        """Return the values of a wall parameter of a block; arguments as for `_device_values`.
+        """Return the values of a wall parameter of a block, for the same arguments as `_device_values`.
 
         The shape is (1, number of values) if the parameter is a dimension of the walls, otherwise (D, 1).
         """
@@ -166,7 +175,7 @@ class Grid:
         return self._device_values(name, by_dim, shape)[:, None]
 
     def _dim_of(self, name: str) -> str | None:
-        """Return the dimension along which a parameter varies, None if it is constant."""
+        """Return the name of the dimension along which a parameter varies; None if the parameter is constant."""
         table = self.axes.devices
         if table is not None and name in table.columns:
             return "device"

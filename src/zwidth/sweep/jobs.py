@@ -1,7 +1,9 @@
 """Compute single chunks of stores, in this process or in worker processes that are replaced if they are killed.
 
-A *job* is one chunk of one store. `perform` computes and writes it; sweeps over rigid devices use the kernels of
-`sweep.compute`, sweeps over devices with further parts evaluate one scene per device (`compute_scenes`).
+A *job* is the computation of one *chunk*, a block of the grid of a sweep, and its *store* the Zarr group of that sweep.
+`perform` computes and writes a chunk. Sweeps over rigid devices use the kernels of `sweep.compute`; sweeps over devices
+with further parts evaluate one *scene*, a device with its timing and walls, per device (`compute_scenes`). The *family*
+of an output is "wall" (one value per wall) or "device" (one value per device).
 """
 
 from __future__ import annotations
@@ -32,26 +34,29 @@ from zwidth.words.errors import InputError, ZwidthError
 from zwidth.words.quantities import OUTPUTS, STATUS_OF, Family
 from zwidth.words.status import Status
 
-# Function that computes one chunk, given the path of the store, the family and the index of the chunk. It is `perform`,
-# or a failing replacement in tests.
+# Function that computes and writes one chunk, given the path of the store, the family and the index of the chunk. It is
+# `perform`, or a failing replacement in tests.
 Perform: TypeAlias = Callable[[str, str, int], None]
 
-MAX_ATTEMPTS = 3  # attempts at a chunk whose worker process is killed
-# Spawn the workers instead of forking: a fork after the start of JAX inherits its locks but not the threads that
-# release them.
+MAX_ATTEMPTS = 3  # largest number of attempts to compute a chunk whose worker process is killed
+# Spawn the workers instead of forking this process, because a fork after the start of JAX inherits the locks of JAX but
+# not the threads that release them.
 _CONTEXT = multiprocessing.get_context("spawn")
-_STOP_TIMEOUT = 3.0  # s; a worker that has not ended by itself after this time is killed
+_STOP_TIMEOUT = 3.0  # longest time in s for a worker to end by itself, after which it is killed
 
 
 class LostSchedulerError(ZwidthError):
-    """Loss of the cluster during a run; the message continues a sentence that begins with the scheduler's address."""
+    """Error if the cluster is lost during a run.
+
+    Its message continues a sentence that begins with the address of the scheduler.
+    """
 
 
 class Job(NamedTuple):
-    """One chunk of one store."""
+    """Computation of one chunk of one store."""
 
-    path: str
-    task: Task
+    path: str  # path of the store
+    task: Task  # chunk
 
 
 class Finished(NamedTuple):
@@ -59,11 +64,14 @@ class Finished(NamedTuple):
 
     job: Job
     error: str = ""  # error message; empty if the job succeeded
-    fatal: bool = False  # the error would affect every other job, too
+    fatal: bool = False  # True if the error would affect every other job, too
 
 
 def try_job(perform: Perform, job: Job) -> Finished:
-    """Run one job and return its outcome; return an exception as an error, because the other jobs are independent."""
+    """Run one job and return its outcome.
+
+    An exception becomes the error of the outcome, because other jobs must still run.
+    """
     try:
         perform(job.path, job.task.family, job.task.index)
     except Exception as error:
@@ -78,16 +86,23 @@ def describe_failure(job: Job, error: BaseException) -> Finished:
 
 @lru_cache(maxsize=4)
 def _open_store(path: str, described: bytes) -> Store:
-    """Open a store, or return the one opened earlier if its description is the same.
+    """Open a store, or return it from the cache if its description has not changed.
 
-    The description identifies the store; the path alone does not, because a store may have been replaced.
+    The key of the cache contains the text ``described`` of the description, because another store may have replaced the
+    one at the same path.
     """
     return Store(Path(path))
 
 
 def perform(path: str, family: str, index: int) -> None:
-    """Compute and write one chunk of a store, given by its index within a family of outputs, unless it is done."""
-    # Identify the store by its description and not by an inode number, which a later store may reuse.
+    """Compute one chunk of a store and write it, unless it is done.
+
+    Args:
+        path: Path of the store.
+        family: "wall" or "device".
+        index: Index of the chunk among those of the family.
+    """
+    # Identify the store by its description and not by an inode number, because a later store may have the same number.
     store = _open_store(path, read_or_empty(Path(path) / "zarr.json"))
     task = Task(plan := store.plan.family(family), index)
     if store.is_done(task):
@@ -96,7 +111,7 @@ def perform(path: str, family: str, index: int) -> None:
         block = store.plan.grid.scene_block(task.slices)
         values = compute_scenes(plan.family, plan.outputs, store.study, block)
     else:
-        # Import here, because this module loads JAX, which the parent process of workers does not need.
+        # Import `sweep.compute` only here, because it loads JAX, which the parent process of workers does not need.
         from zwidth.sweep.compute import compute_block
 
         values = compute_block(plan.family, plan.outputs, store.plan.grid.block(task.slices), store.study.accuracy)
@@ -108,7 +123,7 @@ def perform(path: str, family: str, index: int) -> None:
 def run_in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generator[Finished]:
     """Run jobs in ``count`` worker processes and yield their outcomes, in the order of completion.
 
-    A job whose worker dies is run again after all other jobs, in at most `MAX_ATTEMPTS` attempts.
+    A job whose worker process dies is run again after all waiting jobs, in at most `MAX_ATTEMPTS` attempts.
     """
     waiting = deque(jobs)
     deaths: Counter[Job] = Counter()
@@ -141,7 +156,7 @@ def run_in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generat
 
 
 class _Worker:
-    """One of ``count`` worker processes, and its current job."""
+    """Worker process ``number`` of ``count``, and its current job."""
 
     def __init__(self, number: int, count: int, perform: Perform) -> None:
         self.number = number
@@ -154,7 +169,7 @@ class _Worker:
     def start(self, job: Job) -> None:
         """Send a job to the process."""
         self.job = job
-        # Ignore the error if the process is dead, because `run_in_workers` detects its death by the sentinel.
+        # Ignore the error if the process is dead, because `run_in_workers` detects this by the sentinel of the process.
         with suppress(OSError):
             self.pipe.send(job)
 
@@ -166,8 +181,11 @@ class _Worker:
         return None
 
     def stop(self) -> None:
-        """End the process. An interrupted write is harmless, because a file gets its name only when it is complete."""
-        # An idle process ends by itself when its pipe is closed.
+        """End the process.
+
+        Interrupting a write is harmless, because a file appears under its name only when it is complete.
+        """
+        # Close the pipe of an idle process, because the process then ends by itself.
         if self.job is None:
             self.pipe.close()
         else:
@@ -179,13 +197,21 @@ class _Worker:
 
 
 def _run_worker(pipe: Connection, number: int, count: int, perform: Perform) -> None:
-    """Run jobs received through a pipe until it is closed; this is the main function of worker ``number``."""
-    # Ignore Ctrl-C, which is sent to all processes of the group: the parent ends the workers.
+    """Run the jobs that arrive through a pipe until it is closed; this is the main function of a worker process.
+
+    Args:
+        pipe: Connection to the parent process.
+        number: Number of the worker, from 0.
+        count: Number of workers.
+        perform: Function that computes one chunk.
+    """
+    # Ignore Ctrl-C, which the terminal sends to all processes of the group, because the parent ends the workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Exit normally on SIGTERM, so that Python's resource tracker does not report leaked semaphores.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    # Restrict the worker to its share of the processors: otherwise JAX starts one thread per processor in each worker.
+    # Restrict the worker to a subset of the processors, because otherwise JAX starts one thread per processor in each
+    # worker.
     available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
     if 1 < count <= len(available):
         os.sched_setaffinity(0, available[number::count])
@@ -207,7 +233,7 @@ def _end_with_parent() -> None:
 
 @lru_cache(maxsize=64)
 def _reuse_equal_scene(scene: Scene) -> Scene:
-    """Return an equal scene from the cache if there is one, because its stability boundary is already computed."""
+    """Return an equal scene from the cache if there is one, whose stability boundary is then already computed."""
     return scene
 
 
@@ -223,7 +249,7 @@ def compute_scenes(
         block: Parameters of D devices with A x B walls each.
 
     Returns:
-        The arrays by name, of shape (D, A, B) for walls and (D,) for devices, and the status of the family.
+        The outputs and the status of the family by name: arrays of shape (D, A, B) for walls, (D,) for devices.
     """
     devices = block.stiffness.shape[0]
     shape = (devices, block.stiffness.shape[1], block.virtual_damping.shape[1]) if family == "wall" else (devices,)
@@ -262,7 +288,7 @@ def _compute_walls(
     """Compute outputs of the walls of one device.
 
     Args:
-        scene: The device.
+        scene: The scene of the device.
         outputs: Names of the outputs.
         stiffness: K or alpha, of shape (A, 1).
         virtual_damping: B or beta, of shape (1, B).
@@ -274,8 +300,8 @@ def _compute_walls(
     alpha, beta = scene.normalize_walls(stiffness, virtual_damping)
     status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
     if "stable" in outputs:
-        # Transpose, because `decide` computes the stable intervals of K once per row, here once per damping. Walls of
-        # a measured response may be undecided, which their status reports.
+        # Transpose the walls, so that all walls of a row have the same damping, because `decide` computes the stable
+        # intervals of K once per row. The status reports walls of a measured response that remain undecided.
         labels = scene.loop.decide(alpha.T, beta.T, "auto", (stiffness.T, virtual_damping.T))
         results["stable"], status = np.asarray(labels.stable).T, np.asarray(labels.status).T
     unknown = np.zeros(status.shape, bool)

@@ -2,7 +2,8 @@
 
 The outputs of a sweep belong to two *families*, "wall" (one value per wall) and "device" (one value per device). Each
 family has its own grid, which is divided into *chunks*: rectangular blocks that are computed, written and repaired as a
-unit. The plan depends only on the study, so that every machine computes the same chunks by the same methods.
+unit. A *point* is one point of a grid. The plan depends only on the study (the sweep as configured), so that every
+machine computes the same chunks by the same methods. A *worker* is a process that computes chunks.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ from zwidth.sweep.grid import Grid
 from zwidth.words.errors import ResourceError
 from zwidth.words.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
-MEMORY = 2**28  # bytes available to one chunk during its computation, in addition to `IDLE_MEMORY`
-IDLE_MEMORY = 500 * 2**20  # bytes of a worker before its first chunk: Python, JAX and compiled kernels
-_CHUNK_SECONDS = 10.0  # longest computation of a chunk on one core, which is lost if the worker is killed
-_MAX_CHUNK = 2**25  # points
-_MIN_CHUNKS = 16  # desired number of chunks, so that workers share the work and the progress is visible
-_MIN_CHUNK = 2**15  # points; in smaller chunks writing the files takes longer than computing the points
-_BUFFER_BYTES = 96 * 2**20  # parameters and results of the points that `sweep.compute` processes at once
-_MIN_SECONDS = 0.01  # estimates below this are printed as "less than"
-_SCENE_SECONDS = 0.1  # time to compute the stability boundary of one device with parts
+MEMORY = 2**28  # default memory for the computation of one chunk, in bytes, in addition to `IDLE_MEMORY`
+IDLE_MEMORY = 500 * 2**20  # memory of a worker before its first chunk, in bytes: Python, JAX and compiled kernels
+_CHUNK_SECONDS = 10.0  # longest computing time of a chunk on one core, in s, because a killed worker loses its chunk
+_MAX_CHUNK = 2**25  # largest number of points per chunk
+_MIN_CHUNKS = 16  # desired number of chunks per family, so that workers share the work and progress is visible
+_MIN_CHUNK = 2**15  # smallest number of points per chunk; writing smaller chunks takes longer than computing them
+_BUFFER_BYTES = 96 * 2**20  # memory for the points that `sweep.compute` processes at once, in bytes
+_MIN_SECONDS = 0.01  # shortest estimated time in s that is printed as a number
+_SCENE_SECONDS = 0.1  # estimated time to compute the stability boundary of one device with further parts, in s
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ class FamilyPlan:
     family: Family
     outputs: tuple[str, ...]
     dims: tuple[str, ...]  # names of the dimensions of the grid
-    shape: tuple[int, ...]  # points along each dimension
-    chunks: tuple[int, ...]  # points of a chunk along each dimension
+    shape: tuple[int, ...]  # number of points along each dimension of the grid
+    chunks: tuple[int, ...]  # number of points along each dimension of a chunk
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -57,12 +58,12 @@ class FamilyPlan:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """The outputs and the status of the family; each of them has one file per chunk."""
+        """Names of the outputs and of the status of the family; each of these variables has one file per chunk."""
         return (*self.outputs, STATUS_OF[self.family])
 
     @property
     def extent(self) -> str:
-        """The dimensions and their sizes, for messages."""
+        """The dimensions of the grid and their sizes as text, for messages."""
         return " x ".join(f"{dim} {size}" for dim, size in zip(self.dims, self.shape, strict=True)) or "one point"
 
 
@@ -91,7 +92,7 @@ class Task:
 
     @property
     def points(self) -> int:
-        """Number of points."""
+        """Number of points of the chunk."""
         return math.prod(part.stop - part.start for part in self.slices)
 
     def __str__(self) -> str:
@@ -107,11 +108,11 @@ class Plan:
     study: SweepStudy
     grid: Grid
     families: tuple[FamilyPlan, ...]
-    methods: dict[str, tuple[str, str]]  # method and reason for each output with a choice of methods
-    model: str  # description of the model
-    memory: int  # bytes; upper bound for one chunk during its computation
-    disk: int  # bytes; upper estimate for the store
-    seconds: float  # rough estimate of the computing time on one core
+    methods: dict[str, tuple[str, str]]  # method and its reason, for each output that several methods can compute
+    model: str  # description of the device model, for the printed plan
+    memory: int  # upper bound of the memory for the computation of one chunk, in bytes
+    disk: int  # upper estimate of the size of the store, in bytes
+    seconds: float  # rough estimate of the computing time on one core, in s
 
     def family(self, name: str) -> FamilyPlan:
         """Return the plan of one family by its name."""
@@ -124,11 +125,11 @@ class Plan:
 
     @property
     def extent(self) -> str:
-        """The dimensions of the largest family and their sizes, for messages."""
+        """The dimensions of the largest grid and their sizes as text, for messages."""
         return max(self.families, key=lambda family: math.prod(family.shape)).extent
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the part of the plan that a store records, because later work on the store must use the same."""
+        """Return chunks and methods, which a store records because a resumed run must use the same ones."""
         return {
             "chunks": {family.family: list(family.chunks) for family in self.families},
             "methods": {name: method for name, (method, _) in sorted(self.methods.items())},
@@ -152,7 +153,14 @@ class Plan:
 
 
 def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
-    """Plan a sweep with chunks of at most ``memory`` bytes, using the computing speed of each output in points/s."""
+    """Plan a sweep.
+
+    The size of chunks follows from the memory and from the computing speed of each output (`words.quantities.OUTPUTS`).
+
+    Args:
+        study: The sweep.
+        memory: Memory available for the computation of one chunk, in bytes.
+    """
     grid = Grid(study)
     families, seconds = [], 0.0
     for family, outputs in study.families.items():
@@ -168,7 +176,8 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
         families.append(FamilyPlan(family, outputs, grid.dims_of(family), shape, chunk_shape(shape, target)))
         seconds += size * slowness
     largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
-    # Assume that compression does not reduce float64 values, that booleans take 1 bit, and a status, mostly 0, 1 bit.
+    # Estimate the size on disk: compression does not shrink float64 values, booleans are packed to 1 bit, and a status
+    # takes at most 1 bit, because nearly all statuses are 0.
     bits = [1 + sum(64 if OUTPUTS[name].dtype == "float64" else 1 for name in plan.outputs) for plan in families]
     disk = sum(math.prod(plan.shape) * each for plan, each in zip(families, bits, strict=True)) // 8 + 2**16
     longest, model = study.axes.most_periods, "device with parts, held delay"
@@ -179,16 +188,17 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
 
 
 def restore_plan(study: SweepStudy, recorded: dict[str, Any]) -> Plan:
-    """Return the plan of an existing store from the part that the store records (`Plan.as_dict`)."""
+    """Return the plan of an existing store, with the chunks that the store records (`Plan.as_dict`)."""
     fresh = make_plan(study)
     families = tuple(replace(plan, chunks=tuple(recorded["chunks"][plan.family])) for plan in fresh.families)
     return replace(fresh, families=families)
 
 
 def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
-    """Return the shape of chunks of about equal size and at most ``target`` points; the first dimensions are divided.
+    """Return the shape of chunks of about equal size, with at most ``target`` points each.
 
-    The last dimensions stay undivided as far as possible, because their points are adjacent in memory.
+    The first dimensions of the grid ``shape`` are divided first, because the points of the last ones are adjacent in
+    memory.
     """
     chunks, room = [], target
     for size in reversed(shape):
@@ -201,7 +211,7 @@ def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
 
 
 def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
-    """Return method and reason for each output with a choice of methods; they depend only on the study."""
+    """Return the method and its reason for each output that several methods can compute."""
     methods = {}
     if study.with_parts:
         reason = "one stability boundary per device; unstable poles are counted along lines of constant B"
@@ -215,13 +225,13 @@ def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
 
 
 def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collection[str] = ()) -> None:
-    """Raise `ResourceError` if sweeps do not fit on the disk or into memory, before any of them starts.
+    """Raise `ResourceError` if the results of sweeps do not fit on the disk, or the workers do not fit into memory.
 
     Args:
         plans: The plan of each sweep.
         folder: Folder of the results.
         workers: Number of worker processes.
-        begun: Names of the studies whose stores exist, and hence do not count for the disk space.
+        begun: Names of the studies whose stores exist already; their disk space is not counted.
     """
     check_folder(folder)
     if not plans:
@@ -246,16 +256,16 @@ def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collec
 
 
 def _available_memory() -> int:
-    """Return the memory available to this process in bytes: that of the machine, or the limit of a container."""
+    """Return the memory available to this process in bytes: that of the machine, or the limit of its container."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    # The file is missing outside containers, and contains "max" if there is no limit.
+    # Ignore errors, because the file does not exist outside containers, and contains "max" if there is no limit.
     with suppress(OSError, ValueError):
         return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
     return total
 
 
 def _bytes_per_point(outputs: tuple[str, ...]) -> int:
-    """Return the bytes per point of a chunk: results, intermediate values, and copies during writing."""
+    """Return the memory per point of a chunk in bytes: results, intermediate values, and copies during writing."""
     floats = sum(OUTPUTS[name].dtype == "float64" for name in outputs)
     intermediate = 56 if RADIUS_OUTPUTS & set(outputs) else 0
     intermediate += 32 if MARGIN_OUTPUTS & set(outputs) else 0
@@ -264,7 +274,7 @@ def _bytes_per_point(outputs: tuple[str, ...]) -> int:
 
 
 def _format_size(count: float) -> str:
-    """Return a number of bytes with a binary prefix."""
+    """Format a number of bytes as text with a binary prefix."""
     for unit in ("B", "KiB", "MiB", "GiB"):
         if count < 1024:
             return f"{count:.3g} {unit}"
@@ -273,7 +283,7 @@ def _format_size(count: float) -> str:
 
 
 def _format_time(seconds: float) -> str:
-    """Return an estimated time with its unit."""
+    """Format an estimated time in s as text with a suitable unit."""
     if seconds < _MIN_SECONDS:
         return f"less than {_MIN_SECONDS:g} s"
     for limit, unit, length in ((120, "s", 1.0), (7200, "min", 60.0), (172800, "h", 3600.0)):

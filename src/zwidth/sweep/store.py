@@ -1,12 +1,14 @@
-"""The store of one sweep: a Zarr group ``<study>.zarr`` with checksums, which xarray can open.
+"""Create, write, check and repair the store of one sweep: a Zarr group ``<study>.zarr`` that xarray can open.
 
-A *task* is one chunk of the plan (`sweep.plan`), and at the same time one chunk of every variable of its family, so no
-two tasks write the same file. The status file is written last: its existence marks the chunk as done. Every file
-appears under its name only when it is complete, even if the program is killed. After a power failure this is not
-guaranteed, because writes are not synchronized with the disk. Therefore every file of values ends with a checksum
-(Zarr's codec crc32c). The description of the group contains the descriptions of all arrays and has a checksum as well.
+The *variables* of a store are its outputs and the status of each *family* of outputs. A *task* is one chunk of the plan
+(`sweep.plan`); it is one chunk of every variable of its family, each in a separate *file of values*. The file of the
+status is written last, and its existence marks the chunk as done. The *description* of a store, a JSON document, is the
+metadata of the group and of all its arrays.
 
-Only this module, which writes, and `dataset` with `checked`, which read, import zarr or xarray.
+Every file appears under its name only when it is complete, even if the program is killed. This is not guaranteed after
+a power failure, because writes are not synchronized with the disk. Therefore every file of values ends with a checksum
+(Zarr's codec crc32c), and the description contains one. Only this module, which writes, and `dataset` with `checked`,
+which read, import zarr or xarray.
 """
 
 from __future__ import annotations
@@ -33,15 +35,15 @@ from zwidth.words.status import Status
 
 SUFFIX = ".zarr"  # suffix of the name of a store, which is a folder
 FORMAT = 2  # format version of new stores
-OLD_FORMAT = 1  # format of earlier releases, whose checksums are kept in separate arrays and no longer read
-CHECKSUM = "attributes_sha256"  # attribute with the checksum of the description
-# Zarr reads the first file; the second is a copy, because one flipped bit in a single file would lose the whole store.
+OLD_FORMAT = 1  # format version of earlier releases, whose checksums are in separate arrays and are no longer read
+CHECKSUM = "attributes_sha256"  # name of the attribute that contains the checksum of the description
+# Files of the description: the one that Zarr reads, and a copy, because without a description the store is lost.
 _DESCRIPTIONS = ("zarr.json", "zwidth.json")
 
 
 @contextmanager
 def silence_zarr() -> Iterator[None]:
-    """Suppress the warnings of zarr about codecs and types outside its core specification."""
+    """Suppress zarr's warnings about codecs and data types that do not belong to the Zarr 3 core specification."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*Zarr", category=UserWarning)
         warnings.filterwarnings("ignore", message=".*Zarr", category=FutureWarning)
@@ -56,14 +58,14 @@ def check_installed() -> None:
 
 
 class Store:
-    """A store on disk, in a folder ``<study>.zarr``."""
+    """An existing store, in a folder ``<study>.zarr``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     @cached_property
     def description(self) -> dict[str, Any]:
-        """Description of the group and its arrays; `StoreError` if neither copy has a valid checksum."""
+        """The description, read from the first file with a valid checksum; `StoreError` if neither file has one."""
         faults = []
         for name in _DESCRIPTIONS:
             try:
@@ -81,18 +83,18 @@ class Store:
             raise StoreError(f"{self.path}: {'; '.join(faults)}; start again in a new folder")
         if (version := description["attributes"].get("zwidth_format")) not in (OLD_FORMAT, FORMAT):
             raise StoreError(f"{self.path}: format {version}, this release reads format {FORMAT}; use another release")
-        # Ignore a key of earlier releases, whose only value was "held" (exact fractional delay).
+        # Drop the key delay_model of earlier releases, which always had the value "held" (exact fractional delay).
         description["attributes"]["study"].pop("delay_model", None)
         return description
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """Attributes of the group."""
+        """Attributes of the Zarr group, as contained in the description."""
         return self.description["attributes"]
 
     @property
     def has_checksums(self) -> bool:
-        """False for stores of the old format, whose files do not end with checksums."""
+        """True unless the store has the old format, whose files do not end with checksums."""
         return self.attributes["zwidth_format"] != OLD_FORMAT
 
     @cached_property
@@ -102,7 +104,7 @@ class Store:
 
     @cached_property
     def plan(self) -> Plan:
-        """The plan by which the results are computed."""
+        """The plan of the sweep, with the chunks that the store records."""
         return restore_plan(self.study, self.attributes["plan"])
 
     @cached_property
@@ -113,20 +115,20 @@ class Store:
         with silence_zarr():
             group = zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=True)
             arrays: dict[str, Any] = {name: group[name] for family in self.plan.families for name in family.variables}
-        # Write chunks that contain only the fill value, too: detecting them takes Zarr longer than writing them.
+        # Also write chunks that contain only the fill value, because Zarr takes longer to detect than to write them.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
 
     def label(self, task: Task) -> str:
-        """Return the name of a chunk together with its study, for messages."""
+        """Return a name of a chunk that includes the study, for messages."""
         return f"{self.study.name}/{task}"
 
     def files(self, task: Task) -> list[Path]:
-        """Return the files of a chunk in the order of its variables; the status is the last one."""
+        """Return the files of values of a chunk in the order of its variables; the status is the last one."""
         key = "/".join(("c", *map(str, task.position)))
         return [self.path / name / key for name in task.plan.variables]
 
     def status_file(self, task: Task) -> Path:
-        """Return the file whose existence marks a chunk as done, which is the status file."""
+        """Return the status file of a chunk, whose existence marks the chunk as done."""
         return self.files(task)[-1]
 
     def is_done(self, task: Task) -> bool:
@@ -134,9 +136,10 @@ class Store:
         return self.status_file(task).exists()
 
     def is_visible(self, task: Task) -> bool:
-        """Return whether a chunk is marked as done, even if another machine has just written it."""
+        """Return whether a chunk is marked as done, even if another machine has only just written it."""
         if not self.is_done(task):
-            # List the folders, because network file systems cache for a while that a file does not exist.
+            # List the folders to refresh the cache of a network file system, which may still report a new file as
+            # missing.
             for folder in reversed(self.status_file(task).parents[: len(task.position) + 1]):
                 with suppress(OSError):
                     os.listdir(folder)
@@ -147,40 +150,48 @@ class Store:
         return [task for task in self.plan.tasks() if not self.is_done(task)]
 
     def write(self, task: Task, values: Mapping[str, np.ndarray]) -> None:
-        """Write all variables of a chunk, the status last."""
+        """Write the values of all variables of a chunk, those of the status last."""
         shape = tuple(part.stop - part.start for part in task.slices)
         with silence_zarr():
             for name, file in zip(task.plan.variables, self.files(task), strict=True):
-                # Remove an old file first, because Zarr would read it (possibly damaged) before overwriting a chunk
-                # at the edge of the grid, which the grid fills only in part.
+                # Remove an old file first. Zarr reads an existing file before it overwrites a chunk that extends beyond
+                # the grid, and would fail if that file is damaged.
                 remove_quietly(file)
                 self._arrays[name][task.slices or ...] = np.ascontiguousarray(values[name]).reshape(shape)
 
     def count_statuses(self) -> dict[str, np.ndarray]:
-        """Count the points of each family by status value; leave out damaged and missing chunks."""
+        """Count the points of each family by their status; damaged and missing chunks are not counted."""
         counts = {family.family: np.zeros(NOT_COMPUTED, int) for family in self.plan.families}
         for task in self.plan.tasks():
             name = STATUS_OF[task.family]
             if self.is_done(task) and not self.find_fault(self.status_file(task)):
                 with silence_zarr():
                     status = np.asarray(self._arrays[name][task.slices or ...])
-                # Count only the nonzero values by bincount, because nearly all are 0.
+                # Apply bincount only to nonzero statuses, because nearly all are 0 and can be counted faster.
                 failed = status[status.view(bool)]
                 counts[task.family][Status.OK] += status.size - failed.size
                 counts[task.family] += np.bincount(failed, minlength=NOT_COMPUTED)
         return counts
 
     def unmark(self, task: Task) -> None:
-        """Remove the mark of a chunk as done."""
+        """Mark a chunk as not done, by removing its status file."""
         remove_quietly(self.status_file(task))
 
     def find_task_faults(self, task: Task) -> str:
-        """Return the names of the damaged and missing variables of a chunk that is marked as done; "" if none."""
+        """Return the damaged and missing variables of a chunk that is marked as done, as text; "" if there are none."""
         faults = zip(task.plan.variables, map(self.find_fault, self.files(task)), strict=True)
         return ", ".join(f"{name} is {fault}" for name, fault in faults if fault)
 
     def find_fault(self, file: Path, data: bytes | None = None) -> str:
-        """Return "missing" or "damaged" for a file of values with content ``data``; "" if its checksum is correct."""
+        """Check a file of values against its checksum.
+
+        Args:
+            file: The file.
+            data: Content of the file, if it has been read before.
+
+        Returns:
+            "missing" or "damaged"; "" if the checksum is correct.
+        """
         import google_crc32c
 
         data = read_or_empty(file) if data is None else data
@@ -190,7 +201,7 @@ class Store:
         return "" if right or not self.has_checksums else "damaged"
 
     def damaged_files(self) -> list[str]:
-        """Return the names of damaged coordinate files, and those of the description if its two copies differ."""
+        """Return the names of damaged files of coordinates, and of both files of the description if these differ."""
         n_dims = ((name, len(dims)) for name, (dims, *_) in self.plan.grid.coordinates().items())
         names = ["/".join((name, "c", *["0"] * count)) for name, count in n_dims]
         damaged = [name for name in names if self.find_fault(self.path / name)]
@@ -198,7 +209,7 @@ class Store:
         return damaged if first == second else [*_DESCRIPTIONS, *damaged]
 
     def restore(self, names: list[str]) -> None:
-        """Write damaged files of coordinates or the description again, which the attributes of the store determine."""
+        """Write damaged files of coordinates and of the description again, from the attributes of the store."""
         attributes = self.attributes
         with _temporary_store(self.path, attributes) as fresh:
             for name in names:
@@ -209,7 +220,7 @@ class Store:
 
 
 def create_store(path: Path, attributes: dict[str, Any]) -> Store:
-    """Create an empty store, which appears under its name only when it is complete."""
+    """Create a store without values; the folder appears under its name only when it is complete."""
     with _temporary_store(path, attributes) as fresh:
         os.rename(fresh, path)
     return Store(path)
@@ -217,7 +228,7 @@ def create_store(path: Path, attributes: dict[str, Any]) -> Store:
 
 @contextmanager
 def _temporary_store(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
-    """Create an empty store with a temporary name in the folder of ``path``; remove it when the block ends."""
+    """Create a store without values under a temporary name, next to ``path``; remove it when the block ends."""
     import zarr
 
     plan = restore_plan(SweepStudy.model_validate(attributes["study"]), attributes["plan"])
@@ -239,14 +250,14 @@ def _temporary_store(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
 
 
 def _compute_checksum(description: dict[str, Any]) -> str:
-    """Return the checksum of a description, computed without its checksum attribute."""
+    """Return the checksum of a description, computed without the attribute that contains the checksum."""
     attributes = {key: value for key, value in description["attributes"].items() if key != CHECKSUM}
     old = attributes.get("zwidth_format") == OLD_FORMAT
     return hash_json(attributes if old else {**description, "attributes": attributes})
 
 
 def _write_arrays(path: Path, plan: Plan) -> None:
-    """Write the coordinates, and create the variables without values."""
+    """Write the coordinates of a new store, and create its variables without values."""
     import zarr
     from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
     from zarr.codecs.numcodecs import PackBits
@@ -261,7 +272,8 @@ def _write_arrays(path: Path, plan: Plan) -> None:
             chunks=values.shape,
             dtype=values.dtype,
             compressors=[ZstdCodec(level=3), Crc32cCodec()],
-            # NaN is no valid value. With the default 0, Zarr would not write chunks of zeros, which then seem missing.
+            # Use a fill value that no coordinate has, because Zarr does not write chunks that contain only the fill
+            # value, and such a chunk would later be reported as missing.
             fill_value="" if values.dtype.kind == "T" else np.nan,
             dimension_names=dims,
             attributes=attributes,
@@ -291,7 +303,7 @@ def _write_arrays(path: Path, plan: Plan) -> None:
 
 
 def list_stores(path: str | os.PathLike[str]) -> list[Path]:
-    """Return the store at a path, or all stores in the folder; raise `StoreError` if there is none."""
+    """Return the path if it is a store, otherwise all stores in the folder; raise `StoreError` if there are none."""
     folder = Path(os.fsdecode(path))
     if (folder / "zarr.json").is_file() or folder.name.endswith(SUFFIX):
         return [folder]
@@ -303,7 +315,7 @@ def list_stores(path: str | os.PathLike[str]) -> list[Path]:
 
 
 def find_store(path: str | os.PathLike[str]) -> Store:
-    """Return the store at a path, or the only store in the folder; raise `StoreError` if there are none or several."""
+    """Return the store at a path, or the only store in a folder; raise `StoreError` if it has none or several."""
     first, *others = list_stores(path)
     if others:
         names = ", ".join(store.name for store in (first, *others))

@@ -1,1 +1,1 @@
-"""The report of a finished run: one HTML file that works without a server and without a network."""
+"""Write the report of a finished run: one HTML file that needs neither a server nor a network."""

@@ -1,8 +1,10 @@
 """Write the report of a run: an HTML page with its results, methods, package versions and configuration.
 
-A *section* contains one study. Outputs of a sweep over two parameters are shown as interactive maps: a *map* is an
-image of the values over two *axes* of the page, with a slider for every other parameter. The page contains the values
-of the maps, encoded in single precision, and draws them with the script ``report.js``.
+The page has one *section* per study. Each output of a sweep over two or more parameters is shown as an interactive
+*map*: a color image over two parameters, the *axes*, with a slider for every other parameter. A *slice* is the part of
+the output at one setting of all sliders. The page contains the values of the maps, encoded in single precision, and
+draws them with the script ``report.js``. The *record* of a run is the content of its file ``run.json``, with one
+*entry* per study (`runs.record`).
 """
 
 from __future__ import annotations
@@ -44,12 +46,12 @@ if TYPE_CHECKING:
     import xarray
 
 FILE = "report.html"
-_GRAY = "infinite, or no result"  # meaning of gray in the maps
-_LINES = " Lines: exact boundary of the stable walls; dashed: of the passive walls."
-MAX_ALONG_AXIS = 120  # values of a map along each of its two axes
-MAX_ALONG_SLIDER = 9  # values of each slider
-MAX_VALUES = 120_000  # values of a map with all its slices; half a megabyte
-_COLORS = 21  # colors of a map; odd, so that they include the center of a diverging colormap
+_GRAY = "infinite, or no result"  # explanation of gray in the caption of a map
+_LINES = " Lines: exact boundary of the stable walls; dashed: of the passive walls."  # sentence of the caption
+MAX_ALONG_AXIS = 120  # largest number of values of a map along each of its two axes
+MAX_ALONG_SLIDER = 9  # largest number of values of each slider
+MAX_VALUES = 120_000  # largest number of values of a map with all its slices, which take half a megabyte
+_COLORS = 21  # number of colors of a map; odd, so that they include the center of a diverging colormap
 
 
 def write_report(folder: str | os.PathLike[str], out: str | os.PathLike[str] | None = None) -> Path:
@@ -93,7 +95,10 @@ def write_report(folder: str | os.PathLike[str], out: str | os.PathLike[str] | N
 
 
 def _check_files(record: Record, done: list[dict[str, Any]]) -> None:
-    """Raise `StoreError` for damaged and missing files; stores are checked later, when they are read."""
+    """Raise `StoreError` if files of the finished studies ``done`` are damaged or missing.
+
+    The content of stores is checked later, when it is read.
+    """
     faults = [f"{RUN_FILE} is damaged"] if record.damaged else []
     for entry in () if record.damaged else done:
         faults += record.faults(entry["name"])
@@ -107,7 +112,13 @@ def _check_files(record: Record, done: list[dict[str, Any]]) -> None:
 
 
 def _write_page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> str:
-    """Return the page of a run, given its folder, the content of its record, and the entries of finished studies."""
+    """Return the HTML page of a run.
+
+    Args:
+        where: Folder of the run.
+        content: Record of the run.
+        done: Entries of the finished studies.
+    """
     html, style, script = (
         files("zwidth.runs.report").joinpath(f"report.{kind}").read_text(encoding="utf-8")
         for kind in ("html", "css", "js")
@@ -118,9 +129,9 @@ def _write_page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]
     versions = content["versions"]
     rows = [f'<th scope="row">{escape(name)}</th><td>{escape(str(each))}</td>' for name, each in versions.items()]
     facts = {name: content[name] for name in ("name", "description", "precision", "config_sha256")}
-    # Print the start to the minute. The record contains it in UTC.
+    # Print the start of the run to the minute. The page states that the time is UTC, as in the record.
     facts["started"] = content["started"][:16].replace("T", " at ")
-    # A study that an interrupted run never began has no entry.
+    # Create an entry for each planned study without one, because an interrupted run did not begin all studies.
     begun = {entry["name"]: entry for entry in content["studies"]}
     planned = [begun.get(name, {"name": name}) for name in content.get("planned", begun)]
     return Template(html).substitute(
@@ -140,14 +151,14 @@ def _write_page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]
 
 
 def _write_absence(entry: dict[str, Any]) -> str:
-    """Return the paragraph on a study that has no section, with the reason."""
+    """Return the paragraph that states that a study is missing on the page, with the reason."""
     reason = f"it failed: {entry['error']}" if entry.get("error") else "it is not finished"
     remedy = "'zwidth run CONFIG --resume' computes it"
     return f"<p><strong>{escape(entry['name'])} is missing</strong> because {escape(reason)}; {remedy}.</p>"
 
 
 def _write_section(where: Path, entry: dict[str, Any]) -> str:
-    """Return the section of a study."""
+    """Return the HTML section of a study, from the folder of the run and the entry of the study."""
     kind, name = str(entry["kind"]), escape(str(entry["name"]))
     remarks = [*entry.get("answer", ()), *entry.get("notes", ())]
     notes = f'<div class="told">{"".join(f"<p>{escape(str(each))}</p>" for each in remarks)}</div>' if remarks else ""
@@ -161,7 +172,7 @@ def _write_section(where: Path, entry: dict[str, Any]) -> str:
 
 
 def _write_contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
-    """Yield the figures, tables and maps of a study."""
+    """Yield the figures, tables and maps of a study as HTML."""
     for file in sorted(entry.get("files", {})):
         path = where / file
         if file.endswith(".svg"):
@@ -185,14 +196,14 @@ def _write_contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
 
 
 def _embed_figure(path: Path, study: str) -> str:
-    """Return an SVG figure of a study as an embedded image."""
+    """Return an SVG figure of a study as an HTML figure with an embedded image."""
     data, text = base64.b64encode(path.read_bytes()).decode(), f"Figure {path.stem} of the study {study}"
     image = f'<img alt="{escape(text)}" src="data:image/svg+xml;base64,{data}">'
     return f"<figure>{image}<figcaption>{escape(path.stem)}</figcaption></figure>"
 
 
 def _draw_curves(data: xarray.Dataset, study: str) -> Iterator[str]:
-    """Yield the outputs of a sweep over one parameter, as figures like those of `zwidth figures`."""
+    """Yield the outputs of a sweep over one parameter as HTML figures, drawn as by the command `zwidth figures`."""
     data = data.reset_coords(drop=True)
     with TemporaryDirectory() as folder:
         for name, draw in list_figures(data):
@@ -205,12 +216,12 @@ _AGREEMENT = {True: "agrees", False: "differs", None: "cited"}
 
 
 def _format_computed(row: dict[str, Any]) -> str:
-    """Return the computed value of a row of the comparison with the paper, or the note in its place."""
+    """Return the computed value of a row of the comparison with the paper; the note of the row if it has no value."""
     return escape(row["note"]) if row["computed"] is None else f"{row['computed']:.10g}"
 
 
 def _write_comparison(content: dict[str, Any]) -> str:
-    """Return the table that compares the numbers of the paper with computed ones."""
+    """Return the HTML table that compares the numbers printed in the paper with computed ones."""
     rows = [
         f"<td>{escape(row['quantity'])}</td><td>{escape(row['where'])}</td><td>{escape(str(row['printed']))}</td>"
         f'<td class="number">{_format_computed(row)}</td><td>{_AGREEMENT[row["agrees"]]}</td>'
@@ -222,16 +233,25 @@ def _write_comparison(content: dict[str, Any]) -> str:
 
 
 def _write_table(name: str, rows: list[str], head: str = "") -> str:
-    """Return a table that scrolls horizontally on narrow pages, also by keyboard."""
+    """Return an HTML table that scrolls horizontally on narrow pages, by mouse and by keyboard.
+
+    Args:
+        name: Accessible name of the table.
+        rows: Cells of each row as HTML.
+        head: Head of the table as HTML.
+    """
     body = "".join(f"<tr>{row}</tr>" for row in rows)
     table = f"<table>{head}<tbody>{body}</tbody></table>"
     return f'<div class="wide" tabindex="0" role="region" aria-label="{name}">{table}</div>'
 
 
 def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[str]:
-    """Yield the maps of a sweep as HTML, with the exact boundaries of the stable and the passive walls."""
+    """Yield the maps of a sweep as HTML.
+
+    The function ``edges`` computes the exact boundaries of the stable and the passive walls, which are drawn on them.
+    """
     data = in_order(data)
-    # Use the declared order of the outputs, because the order in a store differs between file systems.
+    # Use the order of `OUTPUTS`, because the order in which a store lists its variables differs between file systems.
     for name in (name for name in OUTPUTS if name in data and name != "kind"):
         axes = choose_axes(data, name)
         if len(axes) == 2 and "device" not in axes:
@@ -249,7 +269,7 @@ def _write_map(values: xarray.DataArray, name: str, axes: tuple[str, str], edges
         values: The output over all parameters of the sweep.
         name: Name of the output.
         axes: Horizontal and vertical parameter.
-        edges: Computes the boundaries of one slice.
+        edges: Function that computes the exact boundaries of one slice.
     """
     x, y = axes
     output = OUTPUTS[name]
@@ -277,7 +297,7 @@ def _write_map(values: xarray.DataArray, name: str, axes: tuple[str, str], edges
         "edges": [
             _encode_edges(sample.isel(dict(zip(others, index, strict=True))), x, edges) for index in np.ndindex(*sizes)
         ],
-        # Encode values that overflow only in single precision as NaN, because they are not infinite.
+        # Encode values that overflow in single precision as NaN, because they must not be shown as infinite.
         "values": _encode(np.where(np.isfinite(numbers) | np.isinf(sample.values), numbers, np.nan)),
     }
     caption = f"{output.long_name} over {_describe_dim(x)} (horizontal) and {_describe_dim(y)} (vertical)"
@@ -303,7 +323,7 @@ def _write_map(values: xarray.DataArray, name: str, axes: tuple[str, str], edges
 
 
 def _list_colors(colormap: str) -> list[str]:
-    """Return evenly spaced colors of a colormap as hexadecimal RGB; the page interpolates between them."""
+    """Return evenly spaced colors of a colormap in hexadecimal RGB, between which the script interpolates."""
     return [to_hex(color)[1:] for color in matplotlib.colormaps[colormap](np.linspace(0.0, 1.0, _COLORS))]
 
 
@@ -319,9 +339,12 @@ def _explain_colors(scale: ColorScale, unit: str) -> str:
 
 
 def _encode_edges(part: xarray.DataArray, x: str, edges: Edges) -> dict[str, list[str]]:
-    """Return the boundaries of the stable and the passive walls of one slice, encoded, by name.
+    """Return the exact boundaries of the stable and the passive walls of one slice by name, encoded for the script.
 
-    The points are in the units of the axes, horizontal coordinate first.
+    Args:
+        part: Values of the slice.
+        x: Horizontal parameter. Points of the boundaries are encoded as pairs (x, y) in the units of the axes.
+        edges: Function that computes the boundaries.
     """
     for dim in map(str, part.coords):
         part[dim].attrs.setdefault("factor", 1.0)
@@ -331,12 +354,12 @@ def _encode_edges(part: xarray.DataArray, x: str, edges: Edges) -> dict[str, lis
 
 
 def _encode(numbers: np.ndarray) -> str:
-    """Return numbers in single precision, little-endian, in base 64."""
+    """Encode numbers for the script: in single precision, little-endian, as base-64 text."""
     return base64.b64encode(numbers.astype("<f4").tobytes()).decode()
 
 
 def _describe_axis(values: xarray.DataArray, dim: str) -> dict[str, Any]:
-    """Return name, unit and values of a parameter for the script."""
+    """Return the name, unit and values of a parameter as JSON for the script."""
     along = values[dim]
     labels = along.dtype.kind not in "biuf"
     steps = [str(label) for label in along.values] if labels else np.asarray(along.values, float).tolist()
@@ -344,11 +367,11 @@ def _describe_axis(values: xarray.DataArray, dim: str) -> dict[str, Any]:
 
 
 def _format_unit(values: xarray.DataArray) -> str:
-    """Return the printed unit of a variable, without TeX."""
+    """Return the unit of a variable as text without TeX."""
     unit = write_unit(str(values.attrs.get("units", "")))
     return unit.replace("$", "")
 
 
 def _describe_dim(dim: str) -> str:
-    """Return the description of a parameter, for example "sampling period"."""
+    """Return the name of a parameter in words, for example "sampling period"."""
     return VARIABLES[dim].words_in(units()) if dim in VARIABLES else dim

@@ -31,7 +31,7 @@
       const image = painter.createImageData(columns, rows), start = offset();
       for (let row = 0; row < rows; row++) for (let column = 0; column < columns; column++) {
         const value = values[start + row * columns + column], k = 4 * ((rows - 1 - row) * columns + column);
-        // Gray for values up to 0, because a logarithmic scale cannot show them.
+        // Draw values up to 0 in gray, because a logarithmic scale cannot show them.
         const rgb = Number.isFinite(value) && !(logarithmic && value <= 0) ? color(share(value)) : [138, 138, 138];
         image.data.set([...rgb, 255], k);
       }
