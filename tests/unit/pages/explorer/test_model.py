@@ -231,6 +231,6 @@ def test_captions_follow_the_verdict(stiffness, word, outside):
     assert poles.startswith(f"{word}: {f'{outside} of 4' if outside else ''}")
     captions = model.caption_curves(verdict, False)
     assert captions["nyquist_words"].startswith(f"{word}: ")
-    assert ("go around" in captions["nyquist_words"]) == (word == "Unstable")
+    assert ("mirror image encircle" in captions["nyquist_words"]) == (word == "Unstable")
     assert ("phase" in captions["bode_words"]) == (word != "Marginal")
     assert {"Stable": "decays", "Unstable": "grows", "Marginal": "neither"}[word] in captions["step_words"]

@@ -141,7 +141,7 @@ def test_what_goes_wrong_while_computing_is_said(page, monkeypatch):
     monkeypatch.setattr("zwidth.pages.explorer.model.assess", fail)
     say(page, rest=True)
     page.queue.work()
-    assert page.texts["error"].startswith("this cannot be computed (ZeroDivisionError: far away); ")
+    assert page.texts["error"].startswith("the computation failed (ZeroDivisionError: far away); ")
     assert page.texts["busy"] is False
     # Nothing is left that is of the wall before.
     assert page.texts["verdict"] == ""
