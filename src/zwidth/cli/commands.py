@@ -17,7 +17,7 @@ from zwidth.cli.options import (
     Parsed,
     beyond_safe_option,
     figure_option,
-    find_silent,
+    find_omitted,
     get_hardware,
     json_option,
     quantity_type,
@@ -82,14 +82,14 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
     if diagnosis is not None:
         result["diagnosis"] = diagnosis.as_dict()
     if as_json:
-        result["cautions"] = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
+        result["cautions"] = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_omitted())]
         result["islands"] = [island._asdict() for island in scene.islands()]
         unstable = verdict.stable is False and not verdict.marginal
         if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
             result["damper_range"] = scene.damper_range().tolist()
         result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
     else:
-        told = {"silent": find_silent(), "hardware": spell_hardware_of_file(scene)}
+        told = {"silent": find_omitted(), "hardware": spell_hardware_of_file(scene)}
         lines = check_lines(scene, verdict, limits, **told, diagnosis=diagnosis, verbose=verbose)
     words.tell(result, lines + words.note_lines(notes), as_json, words.LABEL)
 
@@ -143,7 +143,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
     if given is not None:
         slopes, notes = words.list_slopes(scene), words.scene_notes(scene) + _say_stiffer(scene)
         stiffest = scene.replace(wall=VirtualWall(float(wall.stiffness), float(wall.virtual_damping)))
-        cautions = [*words.compare_with_limit(stiffest), *words.silent_cautions(scene, find_silent())]
+        cautions = [*words.compare_with_limit(stiffest), *words.silent_cautions(scene, find_omitted())]
         found = wall.stiffness, wall.virtual_damping, wall.frequency
         named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, found), strict=True))
         result |= named | {
@@ -158,7 +158,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
         lines = [
             words.line("K_max", top),
             *lines,
-            words.line("device", spell_device(scene, find_silent())),
+            words.line("device", spell_device(scene, find_omitted())),
             *words.part_lines(scene),
             *(words.line("CAUTION", text) for text in cautions),
             words.line("next", "zwidth recommend, with the same options, for the wall to set"),
@@ -376,7 +376,7 @@ def recommend(
     if code:
         if found.status != Status.OK:
             raise click.ClickException(found.reason)
-        for caution in words.silent_cautions(scene, find_silent()):
+        for caution in words.silent_cautions(scene, find_omitted()):
             click.echo(f"zwidth: {caution}", err=True)
         click.echo(found.code(code, max_force=hardware.get("max_force", math.inf)), nl=False)
         return
@@ -384,10 +384,10 @@ def recommend(
     notes, lines, result = [*words.coded_period_notes(scene), *found.notes], list[str](), dict[str, Any]()
     if as_json:
         result = found.as_dict() | {"notes": notes}
-        result["cautions"] += words.silent_cautions(scene, find_silent())
+        result["cautions"] += words.silent_cautions(scene, find_omitted())
         result |= {} if diagnosis is None else {"diagnosis": diagnosis.as_dict()}
     else:
-        told = {"silent": find_silent(), "hardware": spell_hardware_of_file(scene)}
+        told = {"silent": find_omitted(), "hardware": spell_hardware_of_file(scene)}
         lines = recommend_lines(found, **told, diagnosis=diagnosis, verbose=verbose)
     words.tell(result, [*lines, *words.note_lines(notes), *wrote], as_json, words.LABEL)
     if found.status != Status.OK:

@@ -13,7 +13,7 @@ from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     Parsed,
-    find_silent,
+    find_omitted,
     flag_of,
     json_option,
     read_pairs,
@@ -144,7 +144,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
-    return result, [line(path, text), line("device", spell_device(scene, find_silent())), *part_lines(scene)]
+    return result, [line(path, text), line("device", spell_device(scene, find_omitted())), *part_lines(scene)]
 
 
 def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, float]:
@@ -170,7 +170,7 @@ def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
         digits = count_digits(lambda digits: scene.is_stable(wanted, float(f"{B:.{digits}g}")))
         text = f"{with_unit(B, units['N s/m'], digits)} settles fastest: spectral radius {radius}"
         text += f", modulus margin {plain(best.modulus_margin)}"
-    return result, [line("B", text), line("device", spell_device(scene, find_silent())), *part_lines(scene)]
+    return result, [line("B", text), line("device", spell_device(scene, find_omitted())), *part_lines(scene)]
 
 
 def _tolerate(

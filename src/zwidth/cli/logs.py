@@ -17,7 +17,7 @@ from zwidth.cli.options import (
     Parsed,
     figure_option,
     get_hardware,
-    get_told,
+    get_options_with_kind,
     json_option,
     quantity_type,
     save_figure,
@@ -243,7 +243,7 @@ def excite(
 
     device = None if response is None else MeasuredDevice.read(response)
     # Infer the kind of device from the options as typed, because their parsed values have no units.
-    implied = find_kind(get_told())
+    implied = find_kind(get_options_with_kind())
     if loop.scene is not None:
         implied = bool(loop.scene.device.rotary)
         device = loop.scene.device if device is None and isinstance(loop.scene.device, MeasuredDevice) else device

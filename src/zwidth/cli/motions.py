@@ -13,7 +13,7 @@ from zwidth.cli.hardware import hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     figure_option,
-    find_silent,
+    find_omitted,
     json_option,
     quantity_type,
     save_figure,
@@ -52,7 +52,7 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
     diagnosis = find_cause(scene, **hardware)
     remedy = diagnosis.advise()
     lines = [row(diagnosis.word, diagnosis.explain()), *([row("to stop it", remedy)] if remedy else [])]
-    cautions = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
+    cautions = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_omitted())]
     lines += [row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
     lines += [row("CAUTION", text) for text in cautions]
     words.tell(diagnosis.as_dict(), lines, as_json)
@@ -119,7 +119,7 @@ def simulate(
     ]
     if cause.cause not in ("none", "undecided"):
         lines.append(row("remedies", "zwidth diagnose, with the same options"))
-    cautions = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
+    cautions = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_omitted())]
     lines += [row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
     lines += [row("CAUTION", text) for text in cautions]
     if figure is not None:

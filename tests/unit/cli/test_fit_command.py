@@ -205,7 +205,7 @@ def test_a_rate_stands_for_the_period():
 def test_a_figure_needs_a_folder(tmp_path):
     arguments = [*WALLS, "--period", "1 ms", "--figure", str(tmp_path / "nowhere" / "fit.png")]
     result = CliRunner().invoke(cli, ["fit", *arguments])
-    assert "there is no folder" in result.output
+    assert "does not exist; create it first" in result.output
 
 
 def test_a_missing_file_is_an_input_error():

@@ -115,7 +115,7 @@ def test_a_picture(ending, tmp_path):
     file = tmp_path / f"chart.{ending}"
     assert recommend("--figure", str(file)).stdout.splitlines()[-1].endswith(str(file))
     assert file.stat().st_size > 5000
-    assert "there is no folder" in recommend("--figure", str(tmp_path / "none" / "a.png"), code=2).output
+    assert "does not exist; create it first" in recommend("--figure", str(tmp_path / "none" / "a.png"), code=2).output
 
 
 def test_no_wall_exits_with_1():

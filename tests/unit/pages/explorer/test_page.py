@@ -111,7 +111,7 @@ def test_what_is_no_message_is_said_and_changes_nothing(page):
     for data in NO_MESSAGES:
         before = page.controls
         page.receive(data)
-        assert "no message" in page.texts["error"], data
+        assert "invalid message" in page.texts["error"], data
         assert page.controls == before, data
         say(page, set={"mass": 200})
         assert page.texts["error"] == "", data
