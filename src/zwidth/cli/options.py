@@ -1,9 +1,9 @@
 """Options shared by several commands: quantities with units, and the parameters of a scene.
 
 A scene is a device with its timing, wall and velocity estimate. Parameters are named by their path in a scene, as in
-configuration files: ``velocity.cutoff`` is given by the option ``--velocity-cutoff``. A scene file (a configuration or the
-folder of a run) supplies all parameters not given as options. The units of the options determine the kind of device,
-linear (N/m) or rotary (N m/rad).
+configuration files: ``velocity.cutoff`` is given by the option ``--velocity-cutoff``. A scene file (a configuration
+or the folder of a run) supplies all parameters not given as options. The units of the options determine the kind
+of device, linear (N/m) or rotary (N m/rad).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import click
 
 from zwidth.cli.help import OF_SCENE as OF_SCENE
 from zwidth.cli.help import show_example as show_example
-from zwidth.pages.words import row
+from zwidth.pages.words import format_row
 from zwidth.parts.checks import Span, find_kind, read_span
 from zwidth.parts.device import Device
 from zwidth.parts.mode import Mode
@@ -341,7 +341,7 @@ def _list_needed(kind: Any) -> list[str]:
 
 
 def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
-    """Return a part of class ``kind`` with the given fields; raise `click.UsageError` if a required field is missing."""
+    """Return a part of class ``kind`` with the given fields; raise `click.UsageError` if a field is missing."""
     needed = _list_needed(kind)
     for key in needed:
         if key not in given:
@@ -407,4 +407,4 @@ def save_figure(drawn: Any, file: Path) -> str:
     from zwidth.figures import save
 
     save(drawn, file.with_suffix(""), (file.suffix[1:],))
-    return row("wrote", str(file))
+    return format_row("wrote", str(file))

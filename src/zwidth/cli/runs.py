@@ -21,7 +21,7 @@ import click
 
 from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.options import Parsed, json_option, read_pairs
-from zwidth.pages.words import print_folded, print_json, row
+from zwidth.pages.words import format_row, print_json, print_lines
 from zwidth.words.errors import ResourceError
 from zwidth.words.formatting import plain
 
@@ -166,7 +166,7 @@ def _report_end(result: RunResult, command: str) -> None:
     parts += [f"{chunks[0] + chunks[1]} of {chunks[2]} chunks done ({chunks[0]} now)"] if sweeps else []
     click.echo(f"{', '.join(parts) or 'nothing done'}, results in {result.folder}")
     for study in result.studies:
-        print_folded(row("" if number else study.name, line) for number, line in enumerate(study.answer))
+        print_lines(format_row("" if number else study.name, line) for number, line in enumerate(study.answer))
     if any(study.sweep and study.state in ("done", "kept") for study in result.studies):
         click.echo(f"figures of the sweeps: {shlex.join(['zwidth', 'figures', str(result.folder)])}")
     if result.hopeless:

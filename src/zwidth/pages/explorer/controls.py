@@ -21,7 +21,7 @@ from urllib.parse import parse_qsl, urlencode
 from zwidth.config.devices import ResponseSection
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.scenes import NormalizedScene
-from zwidth.pages.words import unit_of
+from zwidth.pages.words import get_unit
 from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.paths import PARTS, find_parts, spell_part, spell_scene
@@ -218,7 +218,7 @@ class Controls:
         """Return a part in one of its usual forms, with typical values for linear or rotary devices."""
         given = dict(PARTS[name].usual[kind])
         for key, value in given.items():
-            unit = unit_of(f"{name}.{key}")
+            unit = get_unit(f"{name}.{key}")
             given[key] = _round(value * _SMALLER[unit], 12) if self.rotary and unit in _SMALLER else value
         return PARTS[name](**given)
 
@@ -337,7 +337,7 @@ def _add_units(value: Any, system: UnitSystem, path: str = "") -> Any:
         return {name: _add_units(part, system, f"{path}.{name}".lstrip(".")) for name, part in value.items()}
     if isinstance(value, list | tuple):
         return [_add_units(part, system, f"{path}.{k}") for k, part in enumerate(value)]
-    unit = system[unit_of(path)]
+    unit = system[get_unit(path)]
     return spell_exactly(value, unit) if unit else value
 
 
@@ -377,5 +377,5 @@ def _spell(value: Any, path: str, system: UnitSystem | None) -> str:
         return f"zwidth.{type(value).__name__}({', '.join(words)})"
     if isinstance(value, tuple) and any(hasattr(item, "__dataclass_fields__") for item in value):
         return f"[{', '.join(_spell(item, f'{path}.{k}', system) for k, item in enumerate(value))}]"
-    unit = unit_of(path)
+    unit = get_unit(path)
     return json.dumps(spell_exactly(value, system[unit])) if system and unit else repr(value)  # pyright: ignore

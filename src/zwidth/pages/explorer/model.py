@@ -23,7 +23,7 @@ import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.pages.verdict import write_check
-from zwidth.pages.words import list_slopes, pole_words, row, spell_radius, word_of
+from zwidth.pages.words import format_row, list_slopes, name_verdict, spell_decay, spell_radius
 from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of, passive_edge, round_margin
 from zwidth.scenes.scene import Scene
@@ -192,7 +192,7 @@ def caption_poles(poles: np.ndarray, word: str) -> str:
 
 def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
     """Return the captions of Nyquist curve, Bode plot and step response, by their names on the page."""
-    word, hertz, margins = word_of(verdict).capitalize(), "per period" if normalized else "Hz", []
+    word, hertz, margins = name_verdict(verdict).capitalize(), "per period" if normalized else "Hz", []
     around = "do not encircle the cross at −1" if verdict.stable else "encircle the cross at −1"
     if isfinite(verdict.phase_margin):
         phase = plain(round_margin("phase_margin", verdict, verdict.stable, 3), 3)
@@ -200,7 +200,7 @@ def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
     if verdict.gain_margin > 0 and isfinite(verdict.phase_crossover):
         decibel = plain(round_margin("gain_margin", verdict, verdict.stable, 3, decibel=True), 3)
         margins.append(f"gain {decibel} dB at {plain(verdict.phase_crossover)} {hertz} (diamond)")
-    slowest = pole_words(verdict.time_constant, verdict.frequency)
+    slowest = spell_decay(verdict.time_constant, verdict.frequency)
     if normalized and isfinite(verdict.time_constant):
         verb = "decays" if verdict.time_constant >= 0 else "grows"
         slowest = f"{verb} with time constant {plain(abs(verdict.time_constant))} periods"
@@ -223,7 +223,7 @@ def normalized_lines(verdict: Assessment) -> list[str]:
         for end in (verdict.stiffness_limit, verdict.passivity_margin, verdict.alpha_max)
     )
     rows = {
-        "verdict": f"{word_of(verdict)}, {spell_radius(verdict.spectral_radius)}",
+        "verdict": f"{name_verdict(verdict)}, {spell_radius(verdict.spectral_radius)}",
         "stable alpha": f"up to {limit} at this beta",
         "stable beta": f"{span} at this alpha",
         "passive": f"{'yes' if verdict.passive else 'no'}, margin {spare} of delta",
@@ -231,7 +231,7 @@ def normalized_lines(verdict: Assessment) -> list[str]:
         "dominant pole": f"time constant {plain(verdict.time_constant)} periods",
         "margins": f"gain {gain}, phase {phase} degrees, delay {delay} periods, modulus {modulus}",
     }
-    return [row(*each) for each in rows.items()]
+    return [format_row(*each) for each in rows.items()]
 
 
 # Lock of the import of JAX, because another thread that imports it at the same time would get a partial module.
@@ -255,7 +255,7 @@ def compute_details(
     verdict = assess(scene)
     normalized_text = normalized_lines(verdict) if normalized else None
     text = "\n".join(normalized_text) if normalized_text else write_check(scene, verdict, None)
-    word = word_of(verdict)
+    word = name_verdict(verdict)
     captions = {"poles_words": caption_poles(scene.poles(), word), **caption_curves(verdict, normalized)}
     time, position = step_motion(scene, length_of(scene, verdict))
     curves = {

@@ -11,7 +11,7 @@ from tolerances import CONTOUR, EDGE_RADIUS, RESPONSE, RIDGE
 import zwidth
 from zwidth.pages.explorer import model
 from zwidth.pages.explorer.controls import Controls, normalized_controls
-from zwidth.pages.words import spell_radius, word_of
+from zwidth.pages.words import name_verdict, spell_radius
 
 CHOICES = {
     "rigid": {},
@@ -227,7 +227,7 @@ def test_islands_are_named_above_themselves():
 def test_captions_follow_the_verdict(stiffness, word, outside):
     scene = Controls().scene.replace(stiffness=stiffness)
     verdict = zwidth.assess(scene)
-    poles = model.caption_poles(scene.poles(), word_of(verdict))
+    poles = model.caption_poles(scene.poles(), name_verdict(verdict))
     assert poles.startswith(f"{word}: {f'{outside} of 4' if outside else ''}")
     captions = model.caption_curves(verdict, False)
     assert captions["nyquist_words"].startswith(f"{word}: ")
