@@ -60,6 +60,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _report(message: str) -> None:
+    """Print an error message on stderr."""
     click.echo(f"Error: {message}", err=True)
 
 

@@ -18,8 +18,8 @@ from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     Parsed,
     find_omitted,
-    flag_of,
     json_option,
+    name_option,
     read_pairs,
     scene_options,
 )
@@ -115,7 +115,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     values = {**scene.parameters(), "rate": 1.0 / scene.timing.period}
     if path not in values:
         raise click.UsageError(
-            f"--find {find}: not a parameter of this scene; give {flag_of(path)} as a starting value"
+            f"--find {find}: not a parameter of this scene; give {name_option(path)} as a starting value"
         )
     present = values[path]
     # The default range is relative to the present value. If that is 0, search a range that covers any device.

@@ -123,7 +123,7 @@ def _read_figure(text: str) -> Path:
     return file
 
 
-def flag_of(path: str) -> str:
+def name_option(path: str) -> str:
     """Return the option of a parameter: ``--velocity-cutoff`` for ``velocity.cutoff``."""
     return "--" + path.replace(".", "-").replace("_", "-")
 
@@ -149,7 +149,7 @@ def _add_option(command: Command, path: str) -> Command:
             f"; {parameter.note}" if parameter.note else "",
         )
         text = f"{parameter.sentence}{unit}{note}"
-    return click.option(flag_of(path), path.replace(".", "__"), type=kind, help=f"{text}.")(command)
+    return click.option(name_option(path), path.replace(".", "__"), type=kind, help=f"{text}.")(command)
 
 
 def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
@@ -209,7 +209,7 @@ def take_options(
 def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
     """Write a warning to the error stream for each implausible value of ``given``, a dict of SI values by path."""
     for line in list_doubts(
-        given, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path), system
+        given, lambda path, value: f"{name_option(path)} '{value}'" if value else name_option(path), system
     ):
         click.echo(f"zwidth: {line}", err=True)
 
@@ -282,7 +282,7 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
     except InputError as error:
         if not str(error).startswith("parameter: "):
             raise
-        flags = ", ".join(map(flag_of, sorted(_BARE & given.keys())))
+        flags = ", ".join(map(name_option, sorted(_BARE & given.keys())))
         raise click.UsageError(
             f"{flags}: the file gives the device as a linear system or a response; change it in the file"
         ) from None
@@ -321,7 +321,9 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
         timing, device = device.to_timing, device.to_device(**select("mass", "damping"))
     else:
         for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _CONTAINED):
-            raise click.UsageError(f"{flag_of(path)}: the given --device already contains it; give only one of the two")
+            raise click.UsageError(
+                f"{name_option(path)}: the given --device already contains it; give only one of the two"
+            )
     wall = VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0))
     velocity = make_velocity(_select_part(given, "velocity"))
     return Scene(device, timing(**select("period", "rate", "delay")), wall, velocity).replace(**parts)
@@ -346,7 +348,7 @@ def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
     for key in needed:
         if key not in given:
             fields_needed = " and ".join(f"a {each}" for each in needed)
-            raise click.UsageError(f"a {name} requires {fields_needed}; give {flag_of(f'{name}.{key}')}")
+            raise click.UsageError(f"a {name} requires {fields_needed}; give {name_option(f'{name}.{key}')}")
     return kind(**given)
 
 
@@ -365,9 +367,11 @@ def make_velocity(given: dict[str, Any]) -> Any:
     needed = ["cutoff"] if kind == "low_pass" and "time_constant" not in given else _list_needed(part)
     for name in needed:
         if name not in given:
-            raise click.UsageError(f"a velocity estimate of kind {kind} requires {flag_of(f'velocity.{name}')}")
+            raise click.UsageError(f"a velocity estimate of kind {kind} requires {name_option(f'velocity.{name}')}")
     for name in sorted(set(given) - set(part.__dataclass_fields__)):
-        raise click.UsageError(f"{flag_of(f'velocity.{name}')} does not belong to a velocity estimate of kind {kind}")
+        raise click.UsageError(
+            f"{name_option(f'velocity.{name}')} does not belong to a velocity estimate of kind {kind}"
+        )
     return part(**given)
 
 

@@ -17,10 +17,10 @@ from zwidth.cli.options import (
     BOTH_PERIODS,
     Command,
     change_scene,
-    flag_of,
     get_hardware,
     get_options_with_kind,
     make_velocity,
+    name_option,
     take_options,
 )
 from zwidth.parts.checks import find_kind
@@ -108,7 +108,7 @@ def loop_options(*, logs: bool) -> Callable[[Command], Command]:
 def log_options(command: Command) -> Command:
     """Add the options for the columns of a log, the encoder step and the motor constant."""
     for name, text in reversed(OF_LOGS.items()):
-        command = click.option(flag_of(name), help=text)(command)
+        command = click.option(name_option(name), help=text)(command)
     return command
 
 

@@ -68,6 +68,7 @@ class Slider(NamedTuple):
 
 
 def _make_slider(parameter: Parameter, system: UnitSystem) -> Slider:
+    """Return the slider of a parameter for linear or rotary devices."""
     unit, per_si = _SHOWN.get(parameter.unit, (parameter.unit.removeprefix("1"), 1.0))
     low, high = parameter.slider or (0.0, 0.0)
     if system.rotary and parameter.unit in _ROTARY_UNITS:
@@ -260,6 +261,7 @@ def _find_form(part: Any) -> str:
 
 
 def normalized_controls(alpha: float, beta: float, delta: float, d: float) -> Controls:
+    """Return the controls of a normalized scene."""
     scene = Scene(Device(1.0, float(delta)), Timing(1.0, float(d)), VirtualWall(float(alpha), float(beta)))
     return Controls(scene, normalized=True)
 

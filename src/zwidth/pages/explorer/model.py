@@ -44,7 +44,7 @@ _RIDGE_POINTS = 61  # points on the ridge
 _MOST_DAMPING = 4.0  # largest damping on the ridge, in dampings of the device
 _SHORTEST = 30  # sampling periods; shortest response
 _LONGEST = 3000  # sampling periods; longest response
-_IMPACT = 0.1  # m/s; speed of a hit on the wall
+_IMPACT = 0.1  # speed of a hit on the wall, in m/s; for normalized scenes without a unit
 _APPROACH = 5.0  # sampling periods of motion before contact
 
 
@@ -57,7 +57,7 @@ def show_outlines(scene: Scene) -> Update:
     return {"area": {"xs": [[xs]], "ys": [[ys]]}, "edge": {"x": x, "y": y}, "islands": name_islands(scene)}
 
 
-def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
+def choose_ranges(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
     """Return rounded axis ranges that contain a curve, and the wall if it is within two curve sizes."""
     ranges = []
     for axis in (0, 1):
@@ -73,7 +73,7 @@ def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
     return ranges[0], ranges[1]
 
 
-def point_at(wall: tuple[float, float], across: Range, up: Range) -> dict[str, list[Any]]:
+def place_arrow(wall: tuple[float, float], across: Range, up: Range) -> dict[str, list[Any]]:
     """Return an arrow at the border of a chart that points to a wall outside; empty columns if the wall is inside."""
     sides = [int(value > high) - int(value < low) for value, (low, high) in zip(wall, (across, up), strict=True)]
     if not any(sides):
@@ -93,7 +93,7 @@ def name_islands(scene: Scene) -> dict[str, list[Any]]:
     return {"x": x, "y": y, "text": names}
 
 
-def open_loop(scene: Scene, verdict: Assessment) -> dict[str, dict[str, Any]]:
+def compute_open_loop(scene: Scene, verdict: Assessment) -> dict[str, dict[str, Any]]:
     """Return the open loop L up to the Nyquist frequency, as Nyquist curve and Bode plot, with both crossovers."""
     gain_crossover, phase_crossover = verdict.gain_crossover, verdict.phase_crossover
     marked = np.array([gain_crossover, phase_crossover])
@@ -120,41 +120,41 @@ def open_loop(scene: Scene, verdict: Assessment) -> dict[str, dict[str, Any]]:
     }
 
 
-def length_of(scene: Scene, verdict: Assessment) -> int:
+def count_periods(scene: Scene, verdict: Assessment) -> int:
     """Return the number of sampling periods to simulate: six time constants of the dominant pole, within limits."""
     periods = 6.0 * abs(verdict.time_constant) / scene.timing.period
     return int(min(max(periods, _SHORTEST), _LONGEST)) if isfinite(periods) else 10 * _SHORTEST
 
 
-def step_motion(scene: Scene, periods: int) -> Curve:
+def compute_step_response(scene: Scene, periods: int) -> Curve:
     """Return times and positions of the response to a step of the external force of 1, with a bilateral wall."""
     return np.arange(periods + 1) * scene.timing.period, scene.state_space().step(periods + 1)
 
 
-def passive_set(scene: Scene) -> Curve | None:
+def find_passive_boundary(scene: Scene) -> Curve | None:
     """Return the boundary of the passive walls, empty if there are none; None if no condition is known."""
     if find_obstacle(**vars(scene.device)):
         return None
     return passive_edge(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
 
 
-def ridge_path(scene: Scene) -> Curve:
+def compute_ridge(scene: Scene) -> Curve:
     """Return the stiffest stable walls for dampings of the device from 0 to four times the present value."""
     most = _MOST_DAMPING * (float(scene.device.damping) or 0.25 * scene.units.virtual_damping)
     dampings = np.linspace(0.0, most, min(_RIDGE_POINTS, 1 + scene.loop.draws // 25))
     return scene.loop.vary({"damping": dampings}).stiffest()
 
 
-def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
+def simulate_hit(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
     """Return times, positions and wall forces of a simulated hit, and its asymptotic behavior in words."""
-    # Start at least five periods before contact at 0.1 m/s (normalized: 0.1 units), but at most half the distance in
-    # which the damping of the device would stop it.
+    # Start five periods of motion before contact, or at half the distance in which the damping of the device would stop
+    # it, if that is shorter.
     start = -_APPROACH * _IMPACT * scene.timing.period / max(1.0, 2.0 * _APPROACH * float(scene.delta))
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
     return hit.time, hit.position, hit.wall_force, f"({describe_ending(hit)})"
 
 
-def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
+def find_contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
     """Return the contours of the spectral radius at `LEVELS`, with the positions and texts of their labels."""
     from contourpy import contour_generator
 
@@ -170,7 +170,7 @@ def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
             # decreases with the level, which moves each label closer to the tip and separates the labels.
             named = line[np.argmax(line[:, 0] / np.ptp(across) - (2.0 - 0.35 * k) * line[:, 1] / np.ptp(up))]
             text = f"{level:g}" if line is max(lines, key=len) else ""
-            # Drop unlabeled pieces smaller than two cells of the grid, because they are interpolation artifacts.
+            # Drop unlabeled pieces smaller than two cells of the grid, because the grid does not resolve them.
             if not text and all(np.ptp(line, axis=0) < (2.0 * (x[1] - x[0]), 2.0 * (y[1] - y[0]))):
                 continue
             for name, value in zip(columns, (line[:, 0], line[:, 1], *named, text), strict=True):
@@ -212,7 +212,7 @@ def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
     }
 
 
-def normalized_lines(verdict: Assessment) -> list[str]:
+def format_normalized_verdict(verdict: Assessment) -> list[str]:
     """Return the lines of the verdict on a normalized wall, in units of the sampling period and the mass."""
     span = " to ".join(tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper))
     gain, phase, delay, modulus = (
@@ -253,26 +253,26 @@ def compute_details(
     """
     length = 1.0 if normalized else 1e3  # the page shows millimeters
     verdict = assess(scene)
-    normalized_text = normalized_lines(verdict) if normalized else None
+    normalized_text = format_normalized_verdict(verdict) if normalized else None
     text = "\n".join(normalized_text) if normalized_text else write_check(scene, verdict, None)
     word = name_verdict(verdict)
     captions = {"poles_words": caption_poles(scene.poles(), word), **caption_curves(verdict, normalized)}
-    time, position = step_motion(scene, length_of(scene, verdict))
+    time, position = compute_step_response(scene, count_periods(scene, verdict))
     curves = {
-        **open_loop(scene, verdict),
+        **compute_open_loop(scene, verdict),
         "step": {"x": time, "y": position * length},
         "best": {"x": [verdict.stiffness_max], "y": [verdict.virtual_damping_at_max]},
     }
     yield {"word": word, "verdict": text, **captions, **curves}
     if of_device:
-        x, y = passive_set(scene) or (np.empty(0), np.empty(0))
-        yield {"passive": {"x": x, "y": y}, "contours": contours(scene, across, up)}
+        x, y = find_passive_boundary(scene) or (np.empty(0), np.empty(0))
+        yield {"passive": {"x": x, "y": y}, "contours": find_contours(scene, across, up)}
     if not normalized_text:
         yield {"verdict": write_check(scene, verdict, limits_of(scene))}
     # Omit ridge and hit for a linear system: its damping is not a parameter, and it has no body with a velocity.
     bodies = isinstance(scene.device, Device)
     if of_device:
-        x, y = ridge_path(scene) if bodies else (np.empty(0), np.empty(0))
+        x, y = compute_ridge(scene) if bodies else (np.empty(0), np.empty(0))
         yield {"ridge": {"x": x, "y": y}}
         yield {"slopes": "\n".join([] if normalized else [slope.line() for slope in list_slopes(scene)])}
     if contact and not bodies:
@@ -284,6 +284,6 @@ def compute_details(
     elif contact:
         with IMPORTING:
             import jax  # noqa: F401
-        time, position, force, text = contact_motion(scene, 2 * length_of(scene, verdict))
+        time, position, force, text = simulate_hit(scene, 2 * count_periods(scene, verdict))
         position = position * length
         yield {"contact": {"x": time, "position": position, "force": force}, "contact_words": text}

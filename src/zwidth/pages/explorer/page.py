@@ -91,6 +91,7 @@ class Page:
         self._paint()
 
     def _new(self, height: int, **keywords: Any) -> figure:
+        """Return an empty figure in the style of the page."""
         tools = "pan,wheel_zoom,box_zoom,reset"
         plot = figure(height=height, sizing_mode="stretch_width", tools=tools, output_backend="canvas", **keywords)
         plot.toolbar.logo, plot.toolbar.autohide, plot.toolbar.active_drag = None, True, None  # pyright: ignore
@@ -114,6 +115,7 @@ class Page:
         return drawn
 
     def _draw_plane(self) -> figure:
+        """Return the chart of walls: stable and passive region, contours, ridge, and the wall of the user."""
         plot = self._new(460, x_range=(0, 1), y_range=(0, 1))
         # Fill areas only faintly, because the lines carry the meaning.
         area = {"line_color": None, "fill_alpha": 0.13}
@@ -153,6 +155,7 @@ class Page:
         return plot
 
     def _draw_poles(self) -> figure:
+        """Return the figure of the poles in the complex plane."""
         plot = self._draw_circle(["poles"])
         poles = self._add(plot, "scatter", "poles", "edge", x="x", y="y", marker="x", size=11, line_width=2.5)
         for axis in (plot.x_range, plot.y_range):
@@ -161,6 +164,7 @@ class Page:
         return plot
 
     def _draw_nyquist(self) -> figure:
+        """Return the Nyquist curve with its gain crossover and the critical point -1."""
         plot = self._draw_circle(["crossover"])
         self._add(plot, "line", "nyquist", "edge", x="x", y="y", line_width=2)
         critical = plot.scatter([-1.0], [0.0], marker="cross", size=13, line_width=2.5)
@@ -171,6 +175,7 @@ class Page:
         return plot
 
     def _draw_bode(self, column: str, critical: float) -> figure:
+        """Return magnitude or phase of the open loop over frequency, with a line at the critical value."""
         plot = self._new(170, x_axis_type="log")
         self._add(plot, "line", "bode", "edge", x="x", y=column, line_width=2)
         line = Span(location=critical, dimension="width", line_dash=[4, 4], line_width=1.5)
@@ -183,11 +188,13 @@ class Page:
         return plot
 
     def _draw_motion(self, source: str, column: str) -> figure:
+        """Return a column of a motion over time."""
         plot = self._new(220)
         self._add(plot, "line", source, "edge", x="x", y=column, line_width=2)
         return plot
 
     def _paint(self) -> None:
+        """Set all colors of the figures for the light or dark theme."""
         # Leave the background transparent until the browser has reported its theme.
         inks = (_DARK if self.dark else _LIGHT) | ({"paper": None} if self.dark is None else {})
         for glyph, name, ink in self.inks:
@@ -201,6 +208,7 @@ class Page:
         self.plots["plane"].legend.label_text_color = inks["ink"]
 
     def _name_axes(self) -> None:
+        """Set the labels of all axes, with the units of the scene."""
         units = self.controls.scene.unit_system
         spring, damper = units["N/m"], units["N s/m"]
         hertz, time, walls = "frequency in Hz", "time in s", (f"stiffness K in {spring}", f"damping B in {damper}")
@@ -243,6 +251,7 @@ class Page:
         self.update(message.get("set", {}), rest=bool(message.get("rest")), link=link)
 
     def _tap(self, event: Any) -> None:
+        """Set the wall to the position of a click in the chart."""
         names = ("alpha", "beta") if self.controls.normalized else ("stiffness", "virtual_damping")
         place = [float(f"{value:.4g}") if isinstance(value, int | float) else value for value in (event.x, event.y)]
         self.update(dict(zip(names, place, strict=True)), rest=True)
@@ -268,6 +277,7 @@ class Page:
             self.executor.submit(self._compute, self.generation, controls.scene, *self.frame, **wanted)
 
     def _show_at_once(self, controls: Controls, rest: bool) -> None:
+        """Compute and show the fast results; export texts only if the slider rests."""
         scene = controls.scene
         stable, poles = bool(scene.decide_stability(method="companion").stable), scene.poles()
         device = replace(scene, wall=VirtualWall(0.0)), controls.normalized
@@ -281,7 +291,7 @@ class Page:
         wall = {"x": [controls.wall[0]], "y": [controls.wall[1]]}
         self._fill({"wall": wall, "poles": {"x": np.real(poles), "y": np.imag(poles)}})
         x, y = (np.asarray(self.sources["edge"].data[name], float) for name in "xy")
-        frame = model.frame((x, y), controls.wall)
+        frame = model.choose_ranges((x, y), controls.wall)
         if frame != self.frame:
             self.frame = frame
             plane = self.plots["plane"]
@@ -295,9 +305,10 @@ class Page:
         self.send({**texts, **{name: spell(controls) for name, spell in recipes.items()}})
 
     def _point_at_wall(self) -> None:
+        """Update the arrow that points to a wall outside the visible chart."""
         plane = self.plots["plane"]
         across, up = ((axis.start, axis.end) for axis in (plane.x_range, plane.y_range))  # pyright: ignore
-        arrow = model.point_at(self.controls.wall, across, up)
+        arrow = model.place_arrow(self.controls.wall, across, up)
         if arrow != self.sources["away"].data:
             self._fill({"away": arrow})
 
@@ -317,6 +328,7 @@ class Page:
         return buffer.getvalue()
 
     def _fill(self, update: Update) -> None:
+        """Set the columns of data sources, by name of the source."""
         for name, columns in update.items():
             self.sources[name].data = columns
 
@@ -330,19 +342,22 @@ class Page:
             for update in compute_details(scene, *frame, **wanted):
                 if generation != self.generation:
                     return
-                self._hand_over(generation, update)
-            self._hand_over(generation, {"busy": False})
+                self._schedule_update(generation, update)
+            self._schedule_update(generation, {"busy": False})
         except Exception as error:
             # Clear the verdict, which belongs to the previous wall.
-            self._hand_over(generation, {"error": _explain(error), "verdict": "", "busy": False})
+            self._schedule_update(generation, {"error": _explain(error), "verdict": "", "busy": False})
 
     def close(self) -> None:
+        """Cancel the computation in progress."""
         self.generation += 1
 
-    def _hand_over(self, generation: int, update: Update) -> None:
-        self.document.add_next_tick_callback(lambda: self._take(generation, update))
+    def _schedule_update(self, generation: int, update: Update) -> None:
+        """Apply an update of the worker in the thread of the document."""
+        self.document.add_next_tick_callback(lambda: self._apply_update(generation, update))
 
-    def _take(self, generation: int, update: Update) -> None:
+    def _apply_update(self, generation: int, update: Update) -> None:
+        """Show an update, unless a newer change has made it obsolete."""
         if generation != self.generation:
             return
         self._fill({name: columns for name, columns in update.items() if name in self.sources})

@@ -150,6 +150,7 @@ class Explorer:
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="explorer")
 
         def make(document: Document) -> None:
+            """Create the page of a new session."""
             document.title = "zwidth explore"
             page = Page(document, controls, self._executor)
             document.on_session_destroyed(lambda _: page.close())
@@ -160,6 +161,7 @@ class Explorer:
         self._server = BaseServer(self.loop, application, http)
 
     def run(self) -> None:
+        """Serve pages until SIGINT or SIGTERM."""
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: self.loop.add_callback_from_signal(self.loop.stop))
