@@ -341,7 +341,7 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @click.option(
     "--passive",
     is_flag=True,
-    help="Allow only passive walls, which no passive hand can destabilize.",
+    help="Allow only passive walls. They are stable in any grasp, because no passive hand can destabilize them.",
 )
 @click.option(
     "--grasps",
