@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.held_mass import Plant, held_plant, split_delay
+from zwidth.arrays.held_mass import Plant, discretize_mass, split_delay
 from zwidth.loops.rigid.ridge import plant_slopes
 from zwidth.parts.circle import CirclePoints, Jet
 from zwidth.words.types import Array
@@ -52,7 +52,7 @@ class RequiredWall:
     @cached_property
     def plant(self) -> Plant:
         """The rigid mass."""
-        return held_plant(self.delta, self.fraction)
+        return discretize_mass(self.delta, self.fraction)
 
     def value(self, at: CirclePoints) -> Array:
         """Return q."""

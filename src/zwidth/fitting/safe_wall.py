@@ -20,7 +20,7 @@ import numpy as np
 
 from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
 from zwidth.fitting.required_wall import DeviceRows, RequiredWall, find_highest
-from zwidth.loops.linear.held import Sampled, delay_force
+from zwidth.loops.linear.held import DiscreteChain, add_input_delay
 from zwidth.loops.rigid.normalization import device_status
 from zwidth.parts.chain import Body, Chain, Resonance
 from zwidth.parts.circle import circle
@@ -218,7 +218,7 @@ def _bear(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damp
     borne = np.zeros(len(drawn), bool)
     for n in np.unique(whole):
         own = whole == n
-        plant = delay_force(Sampled(*(part[own] for part in parts)), int(n))
+        plant = add_input_delay(DiscreteChain(*(part[own] for part in parts)), int(n))
         alpha, beta = (
             wall / devices.mass[own, None, None] for wall in (stiffness * fit.period**2, virtual_damping * fit.period)
         )

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.pages.verdict import write_check
 from zwidth.pages.words import format_row, list_slopes, name_verdict, spell_decay, spell_radius
 from zwidth.parts.device import Device
@@ -133,7 +133,7 @@ def compute_step_response(scene: Scene, periods: int) -> Curve:
 
 def find_passive_boundary(scene: Scene) -> Curve | None:
     """Return the boundary of the passive walls, empty if there are none; None if no condition is known."""
-    if find_obstacle(**vars(scene.device)):
+    if find_unsupported_reason(**vars(scene.device)):
         return None
     return passive_edge(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
 
