@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 """Find the cheapest device that renders a wall of 20 kN/m, with exact gradients of the stiffest stable wall.
 
-A 100 g device whose force acts one period after its sample. Damping costs (the hand feels it in free space), and so
-does sampling fast (a better computer and sensor). Among all pairs (damping, rate) that reach the stiffness the
-cheapest one is wanted. SciPy solves it as a constrained problem. Where optax is installed, its Adam answers the dual
-question, the stiffest wall for that price: it must come to 20 kN/m again.
+The device has a mass of 100 g and a delay of one sampling period. Damping has a price, because the hand feels it in
+free space, and so has a high sampling rate, which requires a better computer and sensor. SciPy finds the cheapest pair
+of damping and rate that reaches the stiffness, as a constrained problem. If optax is installed, its Adam optimizer
+solves the dual problem, the stiffest wall for this price; the result must be 20 kN/m again.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ RATE_PRICE = 80.0  # per kHz
 
 
 def price(damping, rate):
-    """What the device costs; damping in N s/m, rate in Hz."""
+    """Return the price of a device; damping in N s/m, rate in Hz."""
     return DAMPING_PRICE * damping + RATE_PRICE * rate / 1e3
 
 
 def with_scipy() -> tuple[float, float]:
-    """Minimize the price subject to K_max >= WANTED; the constraint comes with its gradient."""
+    """Minimize the price subject to K_max >= WANTED, with the exact gradient of the constraint."""
 
     def device(x):
-        """x = (damping in N s/m, rate in kHz); the delay is one period."""
+        """Return the parameters for x = (damping in N s/m, rate in kHz); the delay is one period."""
         period = 1e-3 / x[1]
         return {"mass": MASS, "damping": x[0], "period": period, "delay": period}
 
@@ -42,7 +42,7 @@ def with_scipy() -> tuple[float, float]:
 
     def stiffness_slope(x):
         gain = sensitivities(**device(x))
-        # The delay moves along with the period, and the period falls with the rate.
+        # Chain rule: the delay equals the period, and the period is the reciprocal of the rate.
         per_rate = (gain.per_period + gain.per_delay) * (-1e-3 / x[1] ** 2)
         return np.array([gain.per_damping, per_rate], dtype=float) / WANTED
 
@@ -59,7 +59,7 @@ def with_scipy() -> tuple[float, float]:
 
 
 def with_optax(budget: float) -> tuple[float, float]:
-    """Find the stiffest wall for a budget: whatever the rate leaves of it buys damping."""
+    """Find the stiffest wall for a budget; the budget not spent on the rate is spent on damping."""
     import optax
 
     def damping_and_rate(log_rate):
@@ -86,7 +86,7 @@ def with_optax(budget: float) -> tuple[float, float]:
 
 
 def report(name: str, damping: float, rate: float) -> None:
-    """One line: the device, the stiffness it reaches, and its price."""
+    """Print the device, its maximum stiffness and its price in one line."""
     gain = sensitivities(mass=MASS, damping=damping, period=1 / rate, delay=1 / rate)
     print(
         f"{name:<7} b = {damping:.3f} N s/m, rate = {rate:.1f} Hz: K_max = {float(gain.stiffness_max) / 1e3:.3f} kN/m, "

@@ -106,7 +106,7 @@ def test_results_are_not_overwritten(tmp_path):
 
 def test_without_a_checkout_one_line_says_what_is_needed(monkeypatch, tmp_path):
     monkeypatch.setattr("zwidth.cli.runs.__file__", str(tmp_path / "lib" / "zwidth" / "cli" / "bench.py"))
-    with pytest.raises(ResourceError, match=r"bench: needs a checkout .*zwidth bench$"):
+    with pytest.raises(ResourceError, match=r"bench: requires a checkout .*zwidth bench$"):
         CliRunner().invoke(cli, ["bench"], catch_exceptions=False)
 
 

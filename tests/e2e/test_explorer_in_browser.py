@@ -215,13 +215,13 @@ def test_a_rate_is_a_period_and_one_that_is_none_is_refused(page):
     for text in ("0", "-3", ""):
         page.fill("#rate", text)
         page.press("#rate", "Enter")
-        wait(page, "document.getElementById('error').textContent.startsWith('rate 1/T in Hz: no number above 0')")
+        wait(page, "document.getElementById('error').textContent.startsWith('rate 1/T in Hz: not a number above 0')")
         page.press("#rate", "Escape")
         settle(page)
         assert page.inner_text("#error") == ""
         assert value_of(page, "rate") == pytest.approx(1e3 / before, rel=1e-5)
     page.fill("#rate", "800")
-    assert "before this entry" in page.inner_text("#verdict-line")
+    assert "before this input" in page.inner_text("#verdict-line")
     page.press("#rate", "Enter")
     settle(page)
     assert value_of(page, "period") == 1.25

@@ -99,7 +99,7 @@ def test_the_address_brings_the_scene_back(page, browser):
     settle(page, "document.getElementById('velocity').value === 'BackwardDifference'")
 
 
-@pytest.mark.parametrize("entry, says", [("-5", "mass m: got -5 g; it must be greater than 0 g"), ("", "no number")])
+@pytest.mark.parametrize("entry, says", [("-5", "mass m: got -5 g; it must be greater than 0 g"), ("", "not a number")])
 def test_the_badge_is_stale_while_an_entry_is_wrong(page, entry, says):
     badge = page.inner_text("#word")
     page.fill("#mass", entry)

@@ -173,7 +173,7 @@ def test_stopped_a_run_says_how_to_go_on(config, tmp_path, number, options):
     _, errors = process.communicate(timeout=LONGEST)
     assert process.returncode == 128 + number, errors
     again = shlex.join(["zwidth", "run", str(config), "--out", str(tmp_path / "an out"), "--resume", *options])
-    assert errors.endswith(f"zwidth: stopped; what is done is kept, go on with: {again}\n")
+    assert errors.endswith(f"zwidth: stopped; results so far are kept. Resume with: {again}\n")
     assert "Traceback" not in errors
 
 
@@ -186,7 +186,7 @@ def test_stopped_before_its_first_chunk_a_run_says_the_same(config, tmp_path, mo
     kill_group(process)
     monkeypatch.setattr("zwidth.sweep.engine.repair_store", stopped)
     assert main_of("run", config, "--out", tmp_path, "--resume") == 130
-    says = f"zwidth: stopped; what is done is kept, go on with: zwidth run {config} --out {tmp_path} --resume\n"
+    says = f"zwidth: stopped; results so far are kept. Resume with: zwidth run {config} --out {tmp_path} --resume\n"
     assert capsys.readouterr().err == says
 
 

@@ -83,7 +83,7 @@ def test_no_room_for_a_file_ends_the_run_and_room_lets_it_go_on(tmp_path):
     first, second = (line for line in result.stderr.splitlines() if line.startswith(("zwidth:", "Error:")))
     assert first.startswith(f"Error: out: {out}: ")
     assert "File too large" in first
-    assert f"make room and go on with: zwidth run {config} --out {out} --resume" in second
+    assert f"make room and resume with: zwidth run {config} --out {out} --resume" in second
     for noise in ("Traceback", "UserWarning", "compilation cache"):
         assert noise not in result.stderr
     assert list(out.rglob("*.partial")) == []
@@ -129,7 +129,7 @@ def test_a_store_that_became_read_only_ends_the_run_with_a_message(config, copy,
     with as_nobody():
         assert main_of("run", config, "--out", copy, "--resume") == 1
     assert "Permission denied" in (message := capsys.readouterr().err)
-    assert "go on with: zwidth run" in message
+    assert "esume with: zwidth run" in message
     assert main_of("run", config, "--out", copy, "--resume") == 0
 
 
@@ -177,7 +177,7 @@ def test_a_chunk_that_fails_is_named_and_the_exit_code_is_1(config, tmp_path, mo
     out, err = capsys.readouterr()
     assert "7 of 8 chunks done" in out
     assert "Error: chunk map/wall/2 (d 1:2, delta 0:2, alpha 0:40, beta 0:300) failed: ArithmeticError: no" in err
-    assert f"try again what failed with: zwidth run {config} --out {tmp_path}/out --resume" in err
+    assert f"retry the failed parts with: zwidth run {config} --out {tmp_path}/out --resume" in err
     assert main_of("verify", tmp_path / "out") == 1
     assert "map.zarr: 7 of 8 chunks done, none damaged" in capsys.readouterr().out
 

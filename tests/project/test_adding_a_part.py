@@ -178,7 +178,7 @@ def test_the_command_line_takes_judges_and_doubts_it(copied):
     assert "Stiffness of the mount, in N/m." in copied["help"]
     assert re.search(r"^mount +stiffness 135\.0 N/m, damping 6\.000 N s/m", copied["checked"], re.MULTILINE)
     assert "--mount-stiffness is 1e+12 N/m, an implausible value" in copied["doubted"]
-    assert "a mount has a stiffness; give --mount-stiffness" in copied["needed"]
+    assert "a mount requires a stiffness; give --mount-stiffness" in copied["needed"]
 
 
 def test_configurations_have_its_section_and_stores_its_axis(copied):

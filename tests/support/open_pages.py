@@ -34,7 +34,7 @@ def open_page(controls: Controls) -> Any:
     opened: Any = Page(Document(), controls, queue)
     opened.answer.on_change("data", lambda _, __, data: texts.update(json.loads(data["json"][0])))
     # There is no loop: what is handed over is taken at once.
-    opened._hand_over = opened._take
+    opened._schedule_update = opened._apply_update
     opened.texts, opened.queue = texts, queue
     return opened
 

@@ -1,6 +1,7 @@
-"""The command line.
+"""Command line `zwidth`: load all commands, run them, and convert exceptions to messages and exit codes.
 
-Exit code 0: done; 1: the work failed; 2: the input was wrong. Errors go to stderr, one message a fault.
+Exit codes: 0 for a result, 1 for a failed computation, 2 for invalid input, 130 after Ctrl-C. Each error is one
+message on stderr.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from zwidth.cli.commands import EXIT_FAILED, EXIT_INPUT, cli
 from zwidth.words.errors import ZwidthError
 from zwidth.words.files import REMEDIES
 
-# Every file of this room adds its commands.
+# Import every module of the package, because each adds its commands to `cli` when it is imported.
 for _module in iter_modules(__path__, f"{__name__}."):
     import_module(_module.name)
 
+# Exit codes after SIGINT and SIGTERM.
 _STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 
 
@@ -30,12 +32,12 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit."""
     use_compilation_cache()
     try:
-        # Click knows nothing of NO_COLOR, nor of terminals without colors; without a wish colors stand on others.
+        # Click ignores NO_COLOR and terminals without colors, so check them here; with None, click decides.
         color = False if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" else None
         cli.main(args=arguments, prog_name="zwidth", standalone_mode=False, color=color)
     except SystemExit as end:
         if arguments is None and end.code in _STOPPED:
-            # A compiler may be at work in a thread of JAX's, which the usual end of Python would crash.
+            # End without interpreter shutdown, which would crash if JAX is compiling in another thread.
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(int(end.code))
@@ -58,6 +60,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _report(message: str) -> None:
+    """Print an error message on stderr."""
     click.echo(f"Error: {message}", err=True)
 
 
@@ -71,9 +74,9 @@ def _format_fault(error: click.ClickException) -> str:
 
 
 def _describe(error: Exception) -> str:
-    """What went wrong; of what the system refused the file, why, and what helps."""
+    """Return the message of an exception; for an error of the operating system: file, reason and remedy."""
     if not isinstance(error, OSError):
         return f"{type(error).__name__}: {error} (set ZWIDTH_TRACEBACK=1 for the traceback)"
     reason = os.strerror(error.errno) if error.errno else str(error)
-    what = ": ".join(str(part) for part in (error.filename, reason) if part)
-    return "; ".join(filter(None, (what, REMEDIES.get(error.errno or 0))))
+    fault = ": ".join(str(part) for part in (error.filename, reason) if part)
+    return "; ".join(filter(None, (fault, REMEDIES.get(error.errno or 0))))

@@ -1,4 +1,9 @@
-"""The command ``zwidth`` and its commands for devices, files and pages; each imports the library when it is called."""
+"""Command group ``zwidth`` with ``check``, ``ridge``, ``recommend``, ``devices``, ``init``, ``explore``, ``report``.
+
+The other modules of this package add further commands to `cli`. Commands import the library only when they run, so that
+``zwidth --help`` is fast. A scene is a device with its timing, wall and velocity estimate; K_max is the largest
+stiffness of a stable wall on the device, and the ridge is the path of these walls for rising damping of the device.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +22,7 @@ from zwidth.cli.options import (
     Parsed,
     beyond_safe_option,
     figure_option,
-    find_silent,
+    find_omitted,
     get_hardware,
     json_option,
     quantity_type,
@@ -27,7 +32,7 @@ from zwidth.cli.options import (
     verbose_option,
 )
 from zwidth.pages import words
-from zwidth.pages.words import row
+from zwidth.pages.words import format_row
 from zwidth.parts.device import Device
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
@@ -37,9 +42,10 @@ from zwidth.words.formatting import plain, spell_stiffness, with_unit
 from zwidth.words.quantities import SIZES, Range
 from zwidth.words.status import Status
 
-EXIT_FAILED, EXIT_INPUT = 1, 2
+EXIT_FAILED = 1  # exit code if no wall exists or a computation fails
+EXIT_INPUT = 2  # exit code for invalid input
 _PACKAGE = Path(__file__).resolve().parents[1]
-# Table in the folder of the configuration that names it.
+# Reference of a configuration to a table in its folder.
 _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
 
 
@@ -72,26 +78,26 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
     the folder of a run) supplies parameters not given as options; options override it. The exit code is 0 for every
     verdict.
     """
-    from zwidth.pages.verdict import check_lines
+    from zwidth.pages.verdict import format_check
     from zwidth.scenes.assessment import assess, limits_of
     from zwidth.scenes.stabilization import stabilize
 
-    verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
+    verdict, limits, notes = assess(scene), limits_of(scene), words.list_notes(scene)
     result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
     lines, diagnosis = list[str](), diagnose_wall(scene, hardware, remedies=not get_hardware())
     if diagnosis is not None:
         result["diagnosis"] = diagnosis.as_dict()
     if as_json:
-        result["cautions"] = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
+        result["cautions"] = [*words.list_limit_cautions(scene), *words.list_omission_cautions(scene, find_omitted())]
         result["islands"] = [island._asdict() for island in scene.islands()]
         unstable = verdict.stable is False and not verdict.marginal
         if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
             result["damper_range"] = scene.damper_range().tolist()
         result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
     else:
-        told = {"silent": find_silent(), "hardware": spell_hardware_of_file(scene)}
-        lines = check_lines(scene, verdict, limits, **told, diagnosis=diagnosis, verbose=verbose)
-    words.tell(result, lines + words.note_lines(notes), as_json, words.LABEL)
+        texts = {"omitted": find_omitted(), "hardware": spell_hardware_of_file(scene)}
+        lines = format_check(scene, verdict, limits, **texts, diagnosis=diagnosis, verbose=verbose)
+    words.print_result(result, lines + words.format_notes(notes), as_json, words.LABEL)
 
 
 @cli.command(**show_example("ridge", OF_SCENE))
@@ -100,7 +106,7 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
 @scene_options(wall=False, instead="--delta and --d")
 @json_option
 def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> None:
-    """Print the stiffest stable wall of a device.
+    """Compute the stiffest stable wall of a device.
 
     With a velocity filter, a linear system or a measured response only walls with B >= 0 count, because a negative B
     may cancel damping that exists only in the model. In Python, Scene.max_stiffness(negative_damping=True) includes
@@ -132,45 +138,45 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
         numbers = {"delta": scene.delta, "d": scene.d, "alpha_max": alpha, "beta": beta, "omega": omega}
         result = {name: float(number) for name, number in numbers.items()}
         optimum = f"alpha_max {result['alpha_max']:.12g}, beta {result['beta']:.12g}"
-        lines = [words.line("", f"({optimum}, delta {plain(result['delta'])}, d {plain(result['d'])})")]
+        lines = [words.format_line("", f"({optimum}, delta {plain(result['delta'])}, d {plain(result['d'])})")]
         if given is None:
             lines = [
-                words.line("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
-                words.line("beta", f"{result['beta']:.12g}"),
-                words.line("device", f"delta {plain(result['delta'])}, d {plain(result['d'])}"),
+                words.format_line("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
+                words.format_line("beta", f"{result['beta']:.12g}"),
+                words.format_line("device", f"delta {plain(result['delta'])}, d {plain(result['d'])}"),
             ]
     result["kind"] = kind
     if given is not None:
-        slopes, notes = words.list_slopes(scene), words.scene_notes(scene) + _say_stiffer(scene)
+        slopes, notes = words.list_slopes(scene), words.list_notes(scene) + _list_obstacles(scene)
         stiffest = scene.replace(wall=VirtualWall(float(wall.stiffness), float(wall.virtual_damping)))
-        cautions = [*words.compare_with_limit(stiffest), *words.silent_cautions(scene, find_silent())]
-        found = wall.stiffness, wall.virtual_damping, wall.frequency
-        named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, found), strict=True))
+        cautions = [*words.compare_with_limit(stiffest), *words.list_omission_cautions(scene, find_omitted())]
+        wall_values = wall.stiffness, wall.virtual_damping, wall.frequency
+        named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, wall_values), strict=True))
         result |= named | {
             "sensitivities": {slope.name: slope.as_dict() for slope in slopes},
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
             "cautions": cautions,
         }
-        B, f = with_unit(found[1], scene.unit_system["N s/m"]), with_unit(named["frequency"], "Hz")
+        B, f = with_unit(wall_values[1], scene.unit_system["N s/m"]), with_unit(named["frequency"], "Hz")
         K = spell_stiffness(named["stiffness_max"], scene.unit_system)
         top = f"{K} at B = {B}, {f} ({kind.replace('_', ' ')} optimum)"
         lines = [
-            words.line("K_max", top),
+            words.format_line("K_max", top),
             *lines,
-            words.line("device", spell_device(scene, find_silent())),
-            *words.part_lines(scene),
-            *(words.line("CAUTION", text) for text in cautions),
-            words.line("next", "zwidth recommend, with the same options, for the wall to set"),
+            words.format_line("device", spell_device(scene, find_omitted())),
+            *words.format_parts(scene),
+            *(words.format_line("CAUTION", text) for text in cautions),
+            words.format_line("next", "zwidth recommend, with the same options, for the wall to set"),
             "",
             *(slope.line() for slope in slopes),
-            *words.note_lines(notes),
+            *words.format_notes(notes),
         ]
-    words.tell(result, lines, as_json, words.LABEL)
+    words.print_result(result, lines, as_json, words.LABEL)
 
 
-def _say_stiffer(scene: Any) -> list[str]:
-    """Return notes on what to measure for a stiffer wall on a measured response."""
+def _list_obstacles(scene: Any) -> list[str]:
+    """Return notes that name the measurements required to certify a stiffer wall on a measured response."""
     if not isinstance(scene.device, MeasuredDevice):
         return []
     from zwidth.fitting.respond import find_nominal_limit
@@ -202,15 +208,18 @@ def devices(name: str | None, as_json: bool) -> None:
         for device in chosen:
             numbers = (f"{key.replace('_', ' ')} {each.spell()}" for key, each in device.numbers.items())
             # Omit the name "counts", because it is also the unit.
-            lines.append(row(device.name, ", ".join(number.removeprefix("counts ") for number in numbers)))
+            lines.append(format_row(device.name, ", ".join(number.removeprefix("counts ") for number in numbers)))
     else:
         notes = {quantity: f" ({number.note})" if number.note else "" for quantity, number in chosen[0].numbers.items()}
         lines = [f"{chosen[0].title} ({chosen[0].motion})"]
-        lines += [row(key, f"{each.spell()}{notes[key]}; {each.source}") for key, each in chosen[0].numbers.items()]
-    words.tell([device.as_dict() for device in chosen], lines, as_json)
+        lines += [
+            format_row(key, f"{each.spell()}{notes[key]}; {each.source}") for key, each in chosen[0].numbers.items()
+        ]
+    words.print_result([device.as_dict() for device in chosen], lines, as_json)
 
 
 def _complete(context: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
+    """Return the names of examples that complete the text ``begun`` in a shell."""
     return [name for name in find_examples() if name.startswith(begun)]
 
 
@@ -228,34 +237,34 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
 
     Existing files are never replaced. Without NAME, the file has the name of the example.
     """
-    known = find_examples()
+    examples = find_examples()
     if listing:
-        width = max(map(len, known))
-        for each, path in known.items():
+        width = max(map(len, examples))
+        for each, path in examples.items():
             comments = [line.lstrip("# ") for line in path.read_text(encoding="utf-8").splitlines() if line[:1] == "#"]
             sentence = re.match(r".*?[.?](?= |$)", " ".join(filter(None, comments[1:])))
-            assert sentence is not None, "every example says what it is"
-            words.print_folded([f"{each:<{width}}  {sentence.group()}"], width + 2)
+            assert sentence is not None, "every example begins with a description"
+            words.print_lines([f"{each:<{width}}  {sentence.group()}"], width + 2)
         return
-    example = example or (name if name in known else "quickstart")
-    check_choice("--example", example, tuple(known))
+    example = example or (name if name in examples else "quickstart")
+    check_choice("--example", example, tuple(examples))
     name = (name or example).removesuffix(".yaml")
     if not re.fullmatch("[a-z0-9_-]{1,64}", name):
-        raise InputError(f"NAME: got {name!r}; write 1 to 64 of a-z, 0-9, _ and -, as in my_device")
-    text = known[example].read_text(encoding="utf-8")
+        raise InputError(f"NAME: got {name!r}; write 1 to 64 of a-z, 0-9, _ and -, such as my_device")
+    text = examples[example].read_text(encoding="utf-8")
     # Remove the path of the schema, which exists in a checkout only; rename the results with the configuration.
     text = re.sub(r"\A# yaml-language-server:.*\n(?:#\n)?", "", text)
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", text, count=1)
-    wanted = {Path(f"{name}.yaml"): text}
+    contents = {Path(f"{name}.yaml"): text}
     for table in map(Path, _TABLE.findall(text)):
-        content = known[example].with_name(table.name).read_text(encoding="utf-8")
-        # Keep an existing table with the same content.
+        content = examples[example].with_name(table.name).read_text(encoding="utf-8")
+        # Do not write a table that already exists with the same content.
         if not table.is_file() or table.read_bytes() != content.encode():
-            wanted[table] = content
-    for file in wanted:
+            contents[table] = content
+    for file in contents:
         if file.exists() or file.is_symlink():
-            raise InputError(f"{file}: is there already and stays as it is; give another NAME, or move it away")
-    for file, content in wanted.items():
+            raise InputError(f"{file}: already exists and is not overwritten; give another NAME, or move the file")
+    for file, content in contents.items():
         with open(file, "x", encoding="utf-8") as stream:
             stream.write(content)
         click.echo(f"wrote {file}")
@@ -266,18 +275,18 @@ def find_examples() -> dict[str, Path]:
     """Return the example configurations by name, from the package or from the checkout."""
     packaged = _PACKAGE / "examples"
     folder = packaged if packaged.is_dir() else _PACKAGE.parents[1] / "configs"
-    found = {file.stem: file for file in sorted(folder.glob("*.yaml"))}
-    if not found:
-        raise ZwidthError(f"init: {packaged} holds no examples; install zwidth again")
-    return found
+    examples = {file.stem: file for file in sorted(folder.glob("*.yaml"))}
+    if not examples:
+        raise ZwidthError(f"init: {packaged} contains no examples; reinstall zwidth")
+    return examples
 
 
 @cli.command()
 @click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(path_type=Path))
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free one]")
-@click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")
+@click.option("--no-browser", is_flag=True, help="Print the address without opening a browser.")
 def explore(path: Path | None, port: int, no_browser: bool) -> None:
-    """Open a page with sliders for device and wall that shows the stable walls.
+    """Open a page in the browser with sliders for device and wall, and a chart of the stable walls.
 
     The page starts with the scene of a CONFIG file, or of the run in DIR. The server accepts connections from this
     machine only, with the token in its address. Ctrl-C ends it.
@@ -291,7 +300,7 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
         if (error.name or "").partition(".")[0] not in ("bokeh", "tornado"):
             raise
         raise InputError(
-            f"explore: needs bokeh, which is not installed; install it: {how_to_install('explore')}"
+            f"explore: requires bokeh, which is not installed; install it: {how_to_install('explore')}"
         ) from error
     from zwidth.pages.explorer.controls import read_controls
     from zwidth.runs.record import find_config
@@ -310,18 +319,18 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
 @click.option("--out", type=click.Path(path_type=Path), help="File to write.  [default: DIR/report.html]")
 @json_option
 def report(folder: Path, out: Path | None, as_json: bool) -> None:
-    """Write the run in DIR as one HTML file, with slices of its maps.
+    """Write the results of the run in DIR as one HTML file, with slices of its sweeps.
 
     The file contains figures, methods, versions and configuration, and requires no server and no network.
     """
     from zwidth.runs.report.page import write_report
 
     file = write_report(folder, out)
-    words.tell({"file": str(file), "bytes": file.stat().st_size}, [f"wrote {file}"], as_json)
+    words.print_result({"file": str(file), "bytes": file.stat().st_size}, [f"wrote {file}"], as_json)
 
 
-_FACTOR = Parsed("FACTOR", read_factor, "write a factor, as 2, or 6 dB")
-_DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")), "write degrees, as 30")
+_FACTOR = Parsed("FACTOR", read_factor, "write a factor, such as 2 or 6 dB")
+_DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")), "write degrees, such as 30")
 
 
 @cli.command(**show_example("recommend --phase-margin 30", OF_SCENE))
@@ -332,7 +341,7 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @click.option(
     "--passive",
     is_flag=True,
-    help="Only passive walls: stable in any grasp, because no passive hand can destabilize them.",
+    help="Allow only passive walls. They are stable in any grasp, because no passive hand can destabilize them.",
 )
 @click.option(
     "--grasps",
@@ -343,7 +352,9 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @hardware_options
 @beyond_safe_option
 @figure_option
-@click.option("--code", type=click.Choice(("c", "python")), help="Print only the code of the wall for the loop.")
+@click.option(
+    "--code", type=click.Choice(("c", "python")), help="Print only the code of the wall for the control loop."
+)
 @verbose_option
 @json_option
 def recommend(
@@ -355,40 +366,45 @@ def recommend(
     as_json: bool,
     **wanted: Any,
 ) -> None:
-    """Recommend the wall to set: the stiffest one with the required margins.
+    """Recommend the wall to set: the stiffest wall with the required margins.
 
-    Any given margin, share or --passive replaces all defaults; --grasps does not. With --resolution, --friction or
-    --max-force the wall is also simulated, to find limit cycles and saturation; --max-force also limits the force in
-    the code of --code. A hand (--operator-...) counts as part of the device; the wall is then also checked without it.
-    Required: --mass (or --device) and --rate (or --period); damping and delay default to 0. SCENE.yaml (or the folder
-    of a run) supplies parameters not given as options; options override it. Exit code 1: no wall exists.
+    --stiffness-fraction, --gain-margin, --phase-margin and --passive replace all defaults; --grasps does not. With
+    --resolution, --friction or --max-force the wall is also simulated, to find limit cycles and saturation; --max-force
+    also limits the force in the code of --code. A hand (--operator-...) counts as part of the device; the wall is then
+    also checked without it. Required: --mass (or --device) and --rate (or --period); damping and delay default to 0.
+    SCENE.yaml (or the folder of a run) supplies parameters not given as options; options override it. Exit code 1: no
+    wall exists.
     """
-    from zwidth.pages.verdict import recommend_lines
+    from zwidth.pages.verdict import format_recommendation
 
     if code and as_json:
         raise click.UsageError("give only one of --code or --json: each replaces the whole output")
-    found = scene.recommend(**wanted)
-    wrote = []
+    recommendation = scene.recommend(**wanted)
+    written = []
     if figure is not None:
         from zwidth.studies.responses import draw
 
-        wrote.append(save_figure(draw(found), figure))
+        written.append(save_figure(draw(recommendation), figure))
     if code:
-        if found.status != Status.OK:
-            raise click.ClickException(found.reason)
-        for caution in words.silent_cautions(scene, find_silent()):
+        if recommendation.status != Status.OK:
+            raise click.ClickException(recommendation.reason)
+        for caution in words.list_omission_cautions(scene, find_omitted()):
             click.echo(f"zwidth: {caution}", err=True)
-        click.echo(found.code(code, max_force=hardware.get("max_force", math.inf)), nl=False)
+        click.echo(recommendation.code(code, max_force=hardware.get("max_force", math.inf)), nl=False)
         return
-    diagnosis = diagnose_wall(found.scene, hardware, remedies=not get_hardware()) if found.status == Status.OK else None
-    notes, lines, result = [*words.coded_period_notes(scene), *found.notes], list[str](), dict[str, Any]()
+    diagnosis = (
+        diagnose_wall(recommendation.scene, hardware, remedies=not get_hardware())
+        if recommendation.status == Status.OK
+        else None
+    )
+    notes, lines, result = [*words.list_period_notes(scene), *recommendation.notes], list[str](), dict[str, Any]()
     if as_json:
-        result = found.as_dict() | {"notes": notes}
-        result["cautions"] += words.silent_cautions(scene, find_silent())
+        result = recommendation.as_dict() | {"notes": notes}
+        result["cautions"] += words.list_omission_cautions(scene, find_omitted())
         result |= {} if diagnosis is None else {"diagnosis": diagnosis.as_dict()}
     else:
-        told = {"silent": find_silent(), "hardware": spell_hardware_of_file(scene)}
-        lines = recommend_lines(found, **told, diagnosis=diagnosis, verbose=verbose)
-    words.tell(result, [*lines, *words.note_lines(notes), *wrote], as_json, words.LABEL)
-    if found.status != Status.OK:
+        texts = {"omitted": find_omitted(), "hardware": spell_hardware_of_file(scene)}
+        lines = format_recommendation(recommendation, **texts, diagnosis=diagnosis, verbose=verbose)
+    words.print_result(result, [*lines, *words.format_notes(notes), *written], as_json, words.LABEL)
+    if recommendation.status != Status.OK:
         raise SystemExit(EXIT_FAILED)

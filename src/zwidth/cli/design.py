@@ -1,4 +1,8 @@
-"""`zwidth design`: parameters that a given stiffness requires, and the effect of tolerances."""
+"""Command `zwidth design`: the parameter that a given stiffness requires, and the effect of tolerances.
+
+K_max is the largest stiffness of a stable wall on the device of a scene. The functions return a pair: results as a dict
+for JSON, and printed lines.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +17,14 @@ from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     Parsed,
-    find_silent,
-    flag_of,
+    find_omitted,
     json_option,
+    name_option,
     read_pairs,
     scene_options,
 )
 from zwidth.pages.verdict import spell_device
-from zwidth.pages.words import LABEL, line, note_lines, part_lines, tell
+from zwidth.pages.words import LABEL, format_line, format_notes, format_parts, print_result
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import (
     count_digits,
@@ -35,9 +39,11 @@ from zwidth.words.quantities import PARAMETERS
 from zwidth.words.status import Status
 from zwidth.words.units import read_share
 
+# Values of --find, and the path of the parameter in a scene.
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
-_TRIED = 41  # values of a parameter tried to find the largest K_max in its range
+_TRIED = 41  # values of a parameter at which K_max is computed, to find the largest K_max in a range
+# Parameters with tolerances for which `zwidth.scenes.robust` finds a wall that is stable on all devices.
 _BOX = ("mass", "damping", "period", "delay")
 
 
@@ -47,9 +53,7 @@ def _read_tolerance(text: str) -> tuple[str, float]:
     return name.strip(), read_share(share)
 
 
-_TOLERANCE = Parsed(
-    "NAME=SHARE", _read_tolerance, "write the parameter and its share, as mass=10% or velocity.cutoff=0.05"
-)
+_TOLERANCE = Parsed("NAME=SHARE", _read_tolerance, "write NAME=SHARE, such as mass=10% or velocity.cutoff=0.05")
 
 
 @cli.command(**show_example("design --stiffness '30 kN/m' --find rate", OF_SCENE))
@@ -61,7 +65,7 @@ _TOLERANCE = Parsed(
     type=_TOLERANCE,
     multiple=True,
     callback=read_pairs,
-    help="Relative tolerance of a parameter, as mass=10%; may be repeated.",
+    help="Relative tolerance of a parameter, such as mass=10%; may be repeated.",
 )
 @click.option(
     "--distribution",
@@ -93,10 +97,10 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
         "tolerances": _tolerate(scene, shares, **drawn) if shares else None,
         "every_device": _search_box(scene, shares) if searchable else None,
     }
-    told = {name: part for name, part in parts.items() if part is not None}
-    lines = [line for _, said in told.values() for line in said]
-    result = {name: values for name, (values, _) in told.items()}
-    tell(result, lines, as_json, LABEL)
+    sections = {name: part for name, part in parts.items() if part is not None}
+    lines = [line for _, section_lines in sections.values() for line in section_lines]
+    result = {name: values for name, (values, _) in sections.items()}
+    print_result(result, lines, as_json, LABEL)
     if result.get("required", {}).get("status", "OK") != "OK":
         raise SystemExit(EXIT_FAILED)
 
@@ -110,9 +114,11 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     unit = units[PARAMETERS[path].unit]
     values = {**scene.parameters(), "rate": 1.0 / scene.timing.period}
     if path not in values:
-        raise click.UsageError(f"--find {find}: this scene has none; give {flag_of(path)} to start from")
+        raise click.UsageError(
+            f"--find {find}: not a parameter of this scene; give {name_option(path)} as a starting value"
+        )
     present = values[path]
-    # From nothing there is no range to search: a range that any device has.
+    # The default range is relative to the present value. If that is 0, search a range that covers any device.
     period = scene.timing.period
     within = None if present else {"damping": (1e-6, 1e4), "delay": (1e-3 * period, 500 * period)}[path]
     wanted = float(scene.wall.stiffness)
@@ -144,7 +150,11 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
-    return result, [line(path, text), line("device", spell_device(scene, find_silent())), *part_lines(scene)]
+    return result, [
+        format_line(path, text),
+        format_line("device", spell_device(scene, find_omitted())),
+        *format_parts(scene),
+    ]
 
 
 def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, float]:
@@ -170,37 +180,47 @@ def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
         digits = count_digits(lambda digits: scene.is_stable(wanted, float(f"{B:.{digits}g}")))
         text = f"{with_unit(B, units['N s/m'], digits)} settles fastest: spectral radius {radius}"
         text += f", modulus margin {plain(best.modulus_margin)}"
-    return result, [line("B", text), line("device", spell_device(scene, find_silent())), *part_lines(scene)]
+    return result, [
+        format_line("B", text),
+        format_line("device", spell_device(scene, find_omitted())),
+        *format_parts(scene),
+    ]
 
 
 def _tolerate(
     scene: Any, shares: dict[str, float], distribution: Any, samples: int | None, seed: int
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the share of random devices within tolerances on which the wall is stable, as data and as lines."""
+    """Return the share of random devices within the tolerances on which the wall is stable, as data and as lines."""
     from zwidth.scenes.assessment import describe_islands
     from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 
     count = samples if samples is not None else scene.loop.draws
     named = {name: Tolerance(share, distribution) for name, share in shares.items()}
-    found = simulate_tolerances(scene, named, samples=count, seed=seed)
-    result = {name: value for name, value in asdict(found).items() if name not in ("drawn", "labels")}
+    simulation = simulate_tolerances(scene, named, samples=count, seed=seed)
+    result = {name: value for name, value in asdict(simulation).items() if name not in ("drawn", "labels")}
     result |= {"seed": seed, "distribution": distribution, "shares": shares}
-    percent = f"{100 * found.reliability:g} %"
+    percent = f"{100 * simulation.reliability:g} %"
     unit = scene.unit_system["N/m"]
-    borne, most = (with_unit(round_safely(end, "below"), unit) for end in (found.stiffness, found.stiffness_max))
+    stiffness, stiffness_best = (
+        with_unit(round_safely(end, "below"), unit) for end in (simulation.stiffness, simulation.stiffness_max)
+    )
     # Round towards the safe side, so that 100 % means all devices.
-    ends = (found.stable, "below"), (found.stable_low, "below"), (found.stable_high, "above")
+    ends = (
+        (simulation.stable, "below"),
+        (simulation.stable_low, "below"),
+        (simulation.stable_high, "above"),
+    )
     stable, low, high = (plain(round_safely(100 * each, side)) for each, side in ends)
-    share = f"{stable} % of {found.samples} devices drawn"
-    known = f"{low} to {high} % of all, with 95 % confidence"
+    share = f"{stable} % of {simulation.samples} devices drawn"
+    interval = f"{low} to {high} % of all, with 95 % confidence"
     lines = [
-        line("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping, scene.unit_system)),
-        line("stable", f"{share} ({known})"),
-        line(percent, f"of them are stable for K up to {borne} at this B"),
+        format_line("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping, scene.unit_system)),
+        format_line("stable", f"{share} ({interval})"),
+        format_line(percent, f"of them are stable for K up to {stiffness} at this B"),
     ]
-    if found.stiffness_max == found.stiffness_max:
-        lines.append(line("", f"or up to {most}, each device with its best B"))
-    return result, [*lines, *note_lines(describe_islands(scene))]
+    if simulation.stiffness_max == simulation.stiffness_max:
+        lines.append(format_line("", f"or up to {stiffness_best}, each device with its best B"))
+    return result, [*lines, *format_notes(describe_islands(scene))]
 
 
 def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:
@@ -209,8 +229,8 @@ def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], l
 
     nominal = (scene.mass, scene.damping, scene.timing.period, scene.timing.delay)
     box: dict[str, Any] = dict(zip(_BOX, nominal, strict=True))
-    own = (scene.device.mass, scene.device.damping, 0.0, 0.0)
-    for (name, value), device in zip(list(box.items()), own, strict=True):
+    device_values = (scene.device.mass, scene.device.damping, 0.0, 0.0)
+    for (name, value), device in zip(list(box.items()), device_values, strict=True):
         if name in shares:
             # The mass and damping of a rigid hand have no tolerance.
             reach = shares[name] * (device or value)
@@ -223,8 +243,8 @@ def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], l
     }
     # Round the stiffness down: softer walls of the same damping are stable too.
     units, names = scene.unit_system, ("stiffness", "stiffness_max")
-    stiffness, most = (with_unit(round_safely(result[name], "below"), units["N/m"]) for name in names)
+    stiffness, stiffness_best = (with_unit(round_safely(result[name], "below"), units["N/m"]) for name in names)
     damping = with_unit(result["virtual_damping"], units["N s/m"], DIGITS)
     text = f"of all devices within the tolerances are stable for K up to {stiffness} at B = {damping} (by search), "
-    text += f"or up to {most}, each device with its best B"
-    return result, [line("100 %", text)]
+    text += f"or up to {stiffness_best}, each device with its best B"
+    return result, [format_line("100 %", text)]

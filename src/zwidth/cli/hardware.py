@@ -1,4 +1,7 @@
-"""Command-line options of the encoder, friction and motor for simulations of a wall."""
+"""Command-line options of encoder, friction and motor ("hardware"), with which commands also simulate a wall.
+
+The values come from the options or from the scene file of the command (`options.get_hardware`).
+"""
 
 from __future__ import annotations
 
@@ -15,13 +18,14 @@ from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
 
+# Option, name of the parameter, SI unit, allowed range, and help text.
 _HARDWARE = (
     (
         "--resolution",
         "resolution",
         "m",
         POSITIVE,
-        "Step of the encoder, in m (rotary: rad), or '2000 counts' per revolution.",
+        "Encoder step, in m (rotary: rad), or '2000 counts' per revolution.",
     ),
     ("--friction", "coulomb", "N", NOT_NEGATIVE, "Coulomb friction of the device, in N (rotary: N m)."),
     ("--static-friction", "static", "N", NOT_NEGATIVE, "Static friction, in N (rotary: N m). Default: --friction."),
@@ -46,7 +50,7 @@ def add_option(command: Command, chosen: str) -> Command:
 def hardware_options(command: Command) -> Command:
     """Add the options of encoder, friction and motor; the command receives a dict ``hardware``.
 
-    A scene file supplies what the options leave out.
+    The scene file supplies parameters not given as options.
     """
 
     @wraps(command)
@@ -55,8 +59,8 @@ def hardware_options(command: Command) -> Command:
         if "resolution" in hardware:
             warn_implausible({"resolution": hardware["resolution"]}, given["scene"].unit_system)
         # A measured response has no model to simulate with the hardware of the file.
-        known = {} if isinstance(given["scene"].device, MeasuredDevice) else get_hardware()
-        return command(hardware=known | hardware, **given)
+        from_file = {} if isinstance(given["scene"].device, MeasuredDevice) else get_hardware()
+        return command(hardware=from_file | hardware, **given)
 
     decorated: Callable[..., Any] = with_hardware
     for each in reversed(_HARDWARE):
@@ -65,7 +69,7 @@ def hardware_options(command: Command) -> Command:
 
 
 def spell_hardware_of_file(scene: Scene) -> str:
-    """Return encoder, friction and motor in words, as far as the scene file of the command supplies them; "" if not."""
+    """Return in words the encoder, friction and motor that the scene file of the command supplies; "" if none."""
     from zwidth.scenes.trials import spell_hardware
 
     given = click.get_current_context().params

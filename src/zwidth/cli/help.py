@@ -1,4 +1,4 @@
-"""Help texts of commands: options listed in groups, and an example at the end."""
+"""Help texts of commands: options in groups with headings, and an example at the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""Commands on logs: `zwidth fit`; `zwidth excite` designs a record, and `zwidth respond` evaluates it."""
+"""Commands on logs: `zwidth fit` identifies a device; `zwidth excite` and `zwidth respond` measure its response.
+
+A log is a file with the sampled position of a device and its commanded force. `fit` estimates mass, damping, delay and
+friction from logs, or from walls at the onset of oscillation (option --buzz). `excite` designs the force of a record,
+and `respond` computes the frequency response of the device, with an error band, from logs of that force. A safe wall
+is stable for every response in the band.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +23,7 @@ from zwidth.cli.options import (
     Parsed,
     figure_option,
     get_hardware,
-    get_told,
+    get_options_with_kind,
     json_option,
     quantity_type,
     save_figure,
@@ -25,7 +31,7 @@ from zwidth.cli.options import (
     warn_implausible,
 )
 from zwidth.cli.records import RecordLoop, log_options, loop_options, read_logs
-from zwidth.pages.words import LABEL, line, print_folded, print_json, row, spell_diagnosis, tell
+from zwidth.pages.words import LABEL, format_line, format_row, print_json, print_lines, print_result, spell_diagnosis
 from zwidth.parts.checks import find_kind
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
@@ -37,25 +43,25 @@ from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 from zwidth.words.units import tell_kind
 
-# A letter, "=", and the text up to the next letter with "=".
+# Entry such as "K=3.2kN/m": a letter, "=", and the text up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
 
 
 def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
     """Return K, B and f of a wall at the onset of oscillation, and True if it is rotary; None if it has no unit."""
     entries = _ENTRY.findall(text.replace(",", " "))
-    found = dict(entries)
-    if _ENTRY.sub("", text.replace(",", " ")).strip() or {"K", "f"} - set(found) or len(found) < len(entries):
-        raise ValueError(f"got {text!r}; write K, B and f, as 'K=3.2kN/m B=0 f=71Hz'")
+    amounts = dict(entries)
+    if _ENTRY.sub("", text.replace(",", " ")).strip() or {"K", "f"} - set(amounts) or len(amounts) < len(entries):
+        raise ValueError(f"got {text!r}; write K, B and f, such as 'K=3.2kN/m B=0 f=71Hz'")
     numbers, kinds = {"B": 0.0}, set()
-    for letter, amount in found.items():
+    for letter, amount in amounts.items():
         try:
             numbers[letter] = quantity_type({"K": "N/m", "B": "N s/m", "f": "Hz"}[letter]).read(amount)
         except UnusableValueError as error:
             raise ValueError(f"{letter}: {error}") from None
         kinds |= {tell_kind(amount)} - {None}
     if len(kinds) > 1:
-        raise ValueError(f"got {text!r}; N/m goes with N s/m, N m/rad with N m s/rad")
+        raise ValueError(f"got {text!r}; write K in N/m and B in N s/m, or K in N m/rad and B in N m s/rad")
     return (numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None
 
 
@@ -63,6 +69,7 @@ _WALL = Parsed("WALL", _read_wall)
 _SOFTER = 50  # largest number of reductions of K until the rounded wall is stable
 
 
+# Walls of the example in the help.
 _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 
 
@@ -73,9 +80,9 @@ _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
     "walls",
     type=_WALL,
     multiple=True,
-    help="Wall at the onset of oscillation, as 'K=3.2kN/m B=0 f=71Hz'; may be repeated.",
+    help="Wall at the onset of oscillation, such as 'K=3.2kN/m B=0 f=71Hz'; may be repeated.",
 )
-@click.option("--noise", type=SHARE, help="Relative noise of K and f in --buzz, as 2%.")
+@click.option("--noise", type=SHARE, help="Relative noise of K and f in --buzz, such as 2%.")
 @log_options
 @click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay to search for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Treat samples with timestamp jitter as evenly spaced.")
@@ -84,7 +91,7 @@ _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 @click.option(
     "--code",
     type=click.Choice(("c", "python")),
-    help="Print only a program of the recommended wall.",
+    help="Print only a program for the recommended wall.",
 )
 @click.option(
     "--yaml",
@@ -122,86 +129,86 @@ def fit(
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
     if sum(map(bool, (as_json, as_yaml, code))) > 1:
-        raise click.UsageError("give one of --json, --yaml and --code: each prints the complete output")
+        raise click.UsageError("give only one of --json, --yaml and --code: each replaces the whole output")
     points, motions, period, velocity = (), [], loop.known_period, loop.velocity
     if walls:
         for name, value in of_logs.items():
             if value:
-                raise click.UsageError(f"--{name.replace('_', '-')} belongs to a LOG.csv")
+                raise click.UsageError(f"--{name.replace('_', '-')} applies only to a LOG.csv; omit it")
         if period is None:
             raise click.UsageError("give --period or --rate, or a scene file")
         from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 
         kinds = {rotary for _, rotary in walls} - {None}
         if len(kinds) > 1:
-            raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them apart")
-        usual = loop.scene is not None and loop.scene.unit_system.rotary
-        points, rotary = tuple(BuzzPoint(*point) for point, _ in walls), kinds.pop() if kinds else usual
+            raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them separately")
+        rotary_scene = loop.scene is not None and loop.scene.unit_system.rotary
+        points, rotary = tuple(BuzzPoint(*point) for point, _ in walls), kinds.pop() if kinds else rotary_scene
         loop.check_kind(rotary)
-        found = fit_buzz(points, period=period, velocity=velocity, noise=noise, rotary=rotary)
+        device_fit = fit_buzz(points, period=period, velocity=velocity, noise=noise, rotary=rotary)
         source = f"{len(walls)} buzzing walls"
     else:
         if noise is not None:
-            raise click.UsageError("--noise belongs to --buzz; the noise of a log is found from it")
+            raise click.UsageError("--noise applies only to --buzz; omit it, because the noise of a log is estimated")
         from zwidth.fitting.columns import fit_motions
 
         options = {name: of_logs.pop(name) for name in ("max_delay", "resample")}
         motions = read_logs(logs, loop, **of_logs)
-        found = fit_motions(motions, period=period, velocity=velocity, **options)
+        device_fit = fit_motions(motions, period=period, velocity=velocity, **options)
         source = " and ".join(log.name for log in logs)
     motor = {"max_force": max_force or get_hardware().get("max_force")}
     motor = {name: value for name, value in motor.items() if value}
-    wrote = []
+    written = []
     if figure is not None:
         from zwidth.figures import draw_device_fit
         from zwidth.fitting.evidence import gather_evidence
 
-        evidence: dict[str, Any] = gather_evidence(found, source, points)
-        wrote.append(save_figure(draw_device_fit(**evidence, step=found.resolution), figure))
+        evidence: dict[str, Any] = gather_evidence(device_fit, source, points)
+        written.append(save_figure(draw_device_fit(**evidence, step=device_fit.resolution), figure))
     if code:
-        if found.recommended.status != Status.OK:
-            raise click.ClickException(found.recommended.reason)
-        click.echo(found.recommended.code(code, **motor), nl=False)
+        if device_fit.recommended.status != Status.OK:
+            raise click.ClickException(device_fit.recommended.reason)
+        click.echo(device_fit.recommended.code(code, **motor), nl=False)
         return
     if as_yaml:
         period_given = any(motion.time is None for motion in motions)
-        click.echo("\n".join(write_scene(found, source, period_given=period_given, **motor)))
+        click.echo("\n".join(write_scene(device_fit, source, period_given=period_given, **motor)))
         return
-    diagnosis = _diagnose(found, motor)
+    diagnosis = _diagnose(device_fit, motor)
     if as_json:
         checks = {"diagnosis": None if diagnosis is None else diagnosis.as_dict()}
-        print_json({**found.as_dict(), "units": list_units(found), **checks})
+        print_json({**device_fit.as_dict(), "units": list_units(device_fit), **checks})
     else:
-        print_folded([*_list_lines(found, source, diagnosis, verbose), *wrote], LABEL)
-    if found.recommended.status != Status.OK:
+        print_lines([*_list_lines(device_fit, source, diagnosis, verbose), *written], LABEL)
+    if device_fit.recommended.status != Status.OK:
         raise SystemExit(EXIT_FAILED)
 
 
-def _diagnose(found: Any, motor: dict[str, float]) -> Any:
-    """Return the diagnosis of the recommended wall with the fitted friction and encoder and the motor's largest force.
+def _diagnose(device_fit: Any, motor: dict[str, float]) -> Any:
+    """Return the diagnosis of the recommended wall with fitted friction and encoder, and the motor's largest force.
 
-    The result is None without any of them.
+    Return None if none of these is known, or if no wall is recommended.
     """
     from zwidth.fitting.words import list_hardware
 
-    recommended = found.recommended
+    recommended = device_fit.recommended
     if recommended.status != Status.OK:
         return None
-    return diagnose_wall(recommended.scene, list_hardware(found) | motor, remedies=False)
+    return diagnose_wall(recommended.scene, list_hardware(device_fit) | motor, remedies=False)
 
 
-def _list_lines(found: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
-    """Return the printed lines of a fit, with the results in a hand and of a simulation as `zwidth recommend`."""
+def _list_lines(device_fit: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
+    """Return the printed lines of a fit, including the checks in a hand and by simulation of `zwidth recommend`."""
     from zwidth.fitting.words import detail_fit, summarize_fit
 
     checks, more = [], "details: --verbose; scene for the other commands: --yaml"
-    if found.recommended.status == Status.OK:
-        checks = [("in a hand", found.recommended.spell_hands())]
+    if device_fit.recommended.status == Status.OK:
+        checks = [("in a hand", device_fit.recommended.spell_hands())]
         more += "; program for the loop: --code c"
     checks += spell_diagnosis(diagnosis)
-    details = [("", ""), *detail_fit(found, source)] if verbose else []
-    rows = [*summarize_fit(found, checks), *details, ("more", more)]
-    return [line(*each).rstrip() for each in rows]
+    details = [("", ""), *detail_fit(device_fit, source)] if verbose else []
+    rows = [*summarize_fit(device_fit, checks), *details, ("more", more)]
+    return [format_line(*each).rstrip() for each in rows]
 
 
 _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
@@ -213,7 +220,7 @@ _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
 @click.option(
     "--resolution",
     type=quantity_type("m", POSITIVE, counts=True),
-    help="Encoder step in m, or counts per turn as '2000 counts'.",
+    help="Encoder step in m, or counts per revolution such as '2000 counts'.",
 )
 @click.option("--duration", type=_TIME, default="60 s", show_default=True, help="Length of the record, in s.")
 @click.option("--response", type=_FILE, help="Response to a first record, to design a second one.")
@@ -243,7 +250,7 @@ def excite(
 
     device = None if response is None else MeasuredDevice.read(response)
     # Infer the kind of device from the options as typed, because their parsed values have no units.
-    implied = find_kind(get_told())
+    implied = find_kind(get_options_with_kind())
     if loop.scene is not None:
         implied = bool(loop.scene.device.rotary)
         device = loop.scene.device if device is None and isinstance(loop.scene.device, MeasuredDevice) else device
@@ -266,22 +273,22 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
     low, high = (with_unit(end, "Hz") for end in made.frequency[[0, -1]])
     units = SYSTEMS[made.rotary]
     lines = [
-        row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), units['N'])}"),
-        row("lines", f"{made.frequency.size} from {low} to {high}, repeated after {with_unit(made.cycle, 's')}"),
-        row("deviation", f"{_compliance(made.deviation, units)} expected (median)"),
+        format_row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), units['N'])}"),
+        format_row("lines", f"{made.frequency.size} from {low} to {high}, repeated after {with_unit(made.cycle, 's')}"),
+        format_row("deviation", f"{_compliance(made.deviation, units)} expected (median)"),
     ]
     result: dict[str, Any] = {"file": str(out), "samples": made.force.size, "cycle": made.cycle}
     if made.expected is not None and made.limit is not None:
         share = float(made.expected.stiffness / made.limit.stiffness)
         result |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
         expected = name_wall(made.expected.stiffness, made.expected.virtual_damping, units)
-        lines += [row("expected", f"safe wall {expected}, {100 * share:.0f} % of the present K_max")]
-    tell(result, [*lines, row("wrote", str(out))], as_json)
+        lines += [format_row("expected", f"safe wall {expected}, {100 * share:.0f} % of the present K_max")]
+    print_result(result, [*lines, format_row("wrote", str(out))], as_json)
 
 
 @cli.command(**show_example("respond log.csv --save response.csv --figure response.png"))
 @loop_options(logs=True)
-@click.option("--cycle", type=_TIME, help="Period of the force, in s.  [default: found in a repeating force]")
+@click.option("--cycle", type=_TIME, help="Period of the force, in s.  [default: detected from the force]")
 @log_options
 @click.option("--save", type=_FILE, metavar="FILE.csv", help="File for the response.")
 @figure_option
@@ -306,48 +313,50 @@ def respond(
         raise click.UsageError("give one LOG.csv or several")
     from zwidth.fitting.respond import respond_to_logs
 
-    found = respond_to_logs(read_logs(logs, loop, **of_logs), loop.known_period, cycle)
-    _print_response(found, logs, loop.velocity, save, figure, as_json)
+    response = respond_to_logs(read_logs(logs, loop, **of_logs), loop.known_period, cycle)
+    _print_response(response, logs, loop.velocity, save, figure, as_json)
 
 
 def _print_response(
-    found: Any, logs: tuple[Path, ...], velocity: Any, save: Path | None, figure: Path | None, as_json: bool
+    response: Any, logs: tuple[Path, ...], velocity: Any, save: Path | None, figure: Path | None, as_json: bool
 ) -> None:
-    """Print a measured response and its safe wall, and save and plot the response if asked for."""
+    """Print a measured response and its safe wall; save and plot the response if ``save`` and ``figure`` are given."""
     from zwidth.fitting.respond import find_nominal_limit
     from zwidth.scenes.scene import Scene
 
-    device, period, doubts = found.device, found.period, found.doubts
-    kind = "parts of a repeating force" if found.cycle else "parts"
-    source = f"{' and '.join(log.name for log in logs)}, {found.records} {kind}"
+    device, period, doubts = response.device, response.period, response.doubts
+    kind = "parts of a repeating force" if response.cycle else "parts"
+    source = f"{' and '.join(log.name for log in logs)}, {response.records} {kind}"
     scene = Scene(device, Timing(period), velocity=velocity or BackwardDifference())
     top, safe = find_nominal_limit(scene), scene.max_stiffness()
     low, high = (with_unit(float(end), "Hz") for end in device.frequency[[0, -1]])
-    lines = [row("response of", source), row("lines", f"{device.frequency.size} from {low} to {high}")]
+    lines = [format_row("response of", source), format_row("lines", f"{device.frequency.size} from {low} to {high}")]
     if device.deviation is not None:
-        lines.append(row("deviation", f"{_compliance(device.deviation, device.unit_system)} (median)"))
-    said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
+        lines.append(format_row("deviation", f"{_compliance(device.deviation, device.unit_system)} (median)"))
+    undecided = (
+        scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
+    )
     words = (
         f"{name_wall(*top[:2], device.unit_system)}, for the measured curve without its error band"
         if top.status == Status.OK
         else "undecided"
     )
-    lines.append(row("K_max", words))
+    lines.append(format_row("K_max", words))
     given = safe.status == Status.OK and device.deviation is not None and not doubts
     words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none"
-    lines.append(row("safe wall", words))
-    lines += [row("stiffer wall" if k == 0 else "", text) for k, text in enumerate(said)]
-    lines += [row("warning", text) for text in doubts]
-    lines += [row("note", text) for text in found.notes]
+    lines.append(format_row("safe wall", words))
+    lines += [format_row("stiffer wall" if k == 0 else "", text) for k, text in enumerate(undecided)]
+    lines += [format_row("warning", text) for text in doubts]
+    lines += [format_row("note", text) for text in response.notes]
     if save is not None:
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
-        lines.append(row("wrote", str(save)))
+        lines.append(format_row("wrote", str(save)))
     if figure is not None:
         lines.append(save_figure(_draw(scene, safe if safe.status == Status.OK else None), figure))
     result = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
-    result |= {"safe_wall": _plain(safe) if given else None, "undecided": said, "doubts": list(doubts)}
-    result |= {"notes": list(found.notes), "rotary": device.rotary}
-    tell(result, lines, as_json)
+    result |= {"safe_wall": _plain(safe) if given else None, "undecided": undecided, "doubts": list(doubts)}
+    result |= {"notes": list(response.notes), "rotary": device.rotary}
+    print_result(result, lines, as_json)
 
 
 def spell_safe_wall(scene: Any, wall: Any) -> str:
@@ -363,12 +372,14 @@ def spell_safe_wall(scene: Any, wall: Any) -> str:
 
 
 def _compliance(deviation: Any, system: UnitSystem) -> str:
+    """Return the median of compliances in m/N (rotary: rad/(N m)) in words."""
     import numpy as np
 
     return with_unit(float(np.median(deviation)), system["m/N"], 3)
 
 
 def _plain(wall: Any) -> dict[str, float]:
+    """Return the values of a maximum of stiffness as a dict for JSON."""
     return {name: float(getattr(wall, name)) for name in ("stiffness", "virtual_damping", "frequency", "status")}
 
 

@@ -1,4 +1,7 @@
-"""Commands in the time domain: `zwidth simulate` for one motion, `zwidth diagnose` for a wall that oscillates."""
+"""Commands in the time domain: `zwidth simulate` for one motion, `zwidth diagnose` for a wall that oscillates.
+
+Both simulate the device with encoder, friction and motor limits (`hardware`). The linear loop excludes these.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,14 @@ from zwidth.cli.hardware import hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     figure_option,
-    find_silent,
+    find_omitted,
     json_option,
     quantity_type,
     save_figure,
     scene_options,
 )
 from zwidth.pages import words
-from zwidth.pages.words import row
+from zwidth.pages.words import format_row
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import with_unit
@@ -51,11 +54,11 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
 
     diagnosis = find_cause(scene, **hardware)
     remedy = diagnosis.advise()
-    lines = [row(diagnosis.word, diagnosis.explain()), *([row("to stop it", remedy)] if remedy else [])]
-    cautions = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
-    lines += [row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
-    lines += [row("CAUTION", text) for text in cautions]
-    words.tell(diagnosis.as_dict(), lines, as_json)
+    lines = [format_row(diagnosis.word, diagnosis.explain()), *([format_row("to stop it", remedy)] if remedy else [])]
+    cautions = [*words.list_limit_cautions(scene), *words.list_omission_cautions(scene, find_omitted())]
+    lines += [format_row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
+    lines += [format_row("CAUTION", text) for text in cautions]
+    words.print_result(diagnosis.as_dict(), lines, as_json)
 
 
 @cli.command(**show_example("simulate --hit '0.1 m/s'", _WALL, OF_SCENE))
@@ -69,7 +72,7 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
 @click.option(
     "--duration",
     type=quantity_type("s", POSITIVE, periods=True),
-    help="Simulated time, in s or as '500 periods'.",
+    help="Simulated time, in s, or in periods such as '500 periods'.",
 )
 @figure_option
 @json_option
@@ -110,25 +113,25 @@ def simulate(
     load = "torque" if units.rotary else "force"
     depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}, "
     depth += f"{load} up to {with_unit(force, units['N'], 3)}; "
-    # The extremes of a growing motion depend on the simulated time alone.
+    # Omit the extremes of a growing motion, because they depend only on the simulated time.
     depth = "" if int(motion.outcome) == MotionKind.GROWING else depth
     lines = [
-        row("start", ", ".join(filter(None, start)) or "at rest"),
-        row("motion", depth + ending),
-        row(cause.word, cause.explain()),
+        format_row("start", ", ".join(filter(None, start)) or "at rest"),
+        format_row("motion", depth + ending),
+        format_row(cause.word, cause.explain()),
     ]
     if cause.cause not in ("none", "undecided"):
-        lines.append(row("remedies", "zwidth diagnose, with the same options"))
-    cautions = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
-    lines += [row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
-    lines += [row("CAUTION", text) for text in cautions]
+        lines.append(format_row("remedies", "zwidth diagnose, with the same options"))
+    cautions = [*words.list_limit_cautions(scene), *words.list_omission_cautions(scene, find_omitted())]
+    lines += [format_row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
+    lines += [format_row("CAUTION", text) for text in cautions]
     if figure is not None:
         from zwidth.figures import plot
 
         lines.append(save_figure(plot.motion(motion).figure, figure))
     result = {name: getattr(motion, name) for name in OF_WHOLE if name not in ("outcome", "status")}
     result = {name: value.item() for name, value in result.items()} | {"outcome": MotionKind(int(motion.outcome)).name}
-    words.tell(result | {"ending": ending, "periods": periods, "diagnosis": cause.as_dict()}, lines, as_json)
+    words.print_result(result | {"ending": ending, "periods": periods, "diagnosis": cause.as_dict()}, lines, as_json)
 
 
 def _choose_start(
@@ -136,7 +139,9 @@ def _choose_start(
 ) -> dict[str, Any]:
     """Return the initial conditions of a simulation, as arguments of `zwidth.simulate`."""
     if hit is not None and hold is not None:
-        raise InputError("--hold: given together with --hit; give only one of them, a hit starts outside the wall")
+        raise InputError(
+            "--hold: given together with --hit; give only one of them, because a hit starts outside the wall"
+        )
     if hit is not None:
         before = -APPROACH * hit * scene.timing.period
         return {"start_position": before, "start_velocity": hit, "push": push or 0.0, "contact": "unilateral"}

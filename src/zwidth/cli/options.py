@@ -1,4 +1,10 @@
-"""Options shared by several commands: quantities, and the parameters of a scene."""
+"""Options shared by several commands: quantities with units, and the parameters of a scene.
+
+A scene is a device with its timing, wall and velocity estimate. Parameters are named by their path in a scene, as in
+configuration files: ``velocity.cutoff`` is given by the option ``--velocity-cutoff``. A scene file (a configuration
+or the folder of a run) supplies all parameters not given as options. The units of the options determine the kind
+of device, linear (N/m) or rotary (N m/rad).
+"""
 
 from __future__ import annotations
 
@@ -13,7 +19,7 @@ import click
 
 from zwidth.cli.help import OF_SCENE as OF_SCENE
 from zwidth.cli.help import show_example as show_example
-from zwidth.pages.words import row
+from zwidth.pages.words import format_row
 from zwidth.parts.checks import Span, find_kind, read_span
 from zwidth.parts.device import Device
 from zwidth.parts.mode import Mode
@@ -31,18 +37,21 @@ if TYPE_CHECKING:
     from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
 
-_TOLD = "zwidth.told"  # key of the options whose units determine the kind of device, in the context of a command
-_HARDWARE = "zwidth.hardware"  # key of the hardware of the scene file in the context of a command
-BOTH_PERIODS = "--period and --rate are both given: give one of them"
+# Keys in the context of a command.
+_WITH_KIND = "zwidth.with_kind"  # options whose units determine the kind of device, linear or rotary
+_HARDWARE = "zwidth.hardware"  # encoder, friction and motor of the scene file
+BOTH_PERIODS = "--period and --rate are both given; give only one of them"
 Command: TypeAlias = Callable[..., Any]
 
-# By path in a scene, as in configuration files, one part after the other.
+# Names of the parts of a scene, and the paths of their parameters, sorted by part.
 _PART_NAMES = tuple(dict.fromkeys(path.rpartition(".")[0] for path in OF_PARTS))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
-# What a device that is given as a whole holds already.
-_HELD = ("operator", "coupling", "actuator", "modes")
+# Parts that a linear system or a measured response already contains.
+_CONTAINED = ("operator", "coupling", "actuator", "modes")
+# Names of the resonances, "modes.0" and so on.
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
 _BARE = {"mass", "damping"}  # parameters of a rigid device
+# Parameters of a low-pass filter of which exactly one is given.
 _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
@@ -55,16 +64,16 @@ class Parsed(click.ParamType):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Parse one option."""
         if self.name == "quantity" and ctx is not None and param is not None and tell_kind(value) is not None:
-            ctx.meta.setdefault(_TOLD, {})[param.opts[0]] = value
+            ctx.meta.setdefault(_WITH_KIND, {})[param.opts[0]] = value
         try:
             return self.read(value)
         except ValueError as error:
             self.fail(f"got {value!r}; {self.remedy}" if self.remedy else str(error), param, ctx)
 
 
-def get_told() -> dict[str, Any]:
+def get_options_with_kind() -> dict[str, Any]:
     """Return the option values of the running command whose units imply a linear or a rotary device."""
-    return click.get_current_context().meta.get(_TOLD, {})
+    return click.get_current_context().meta.get(_WITH_KIND, {})
 
 
 def get_hardware() -> dict[str, float]:
@@ -82,7 +91,7 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
 
     def read(text: str) -> Any:
         try:
-            # What is not finite is named as it was written.
+            # Keep the text of inf and nan for the error message.
             number = value if math.isfinite(value := float(text)) else text
         except ValueError:
             number = text
@@ -95,7 +104,7 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
     return Parsed("quantity", read)
 
 
-SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
+SHARE = Parsed("SHARE", read_share, "write a share, such as 2% or 0.02")
 
 
 def read_factor(text: str) -> float:
@@ -110,16 +119,17 @@ def _read_figure(text: str) -> Path:
     if file.suffix not in (".png", ".svg", ".pdf"):
         raise ValueError(f"got {text!r}; name a file that ends with .png, .svg or .pdf")
     if not file.parent.is_dir():
-        raise ValueError(f"there is no folder {file.parent}; make it first")
+        raise ValueError(f"folder {file.parent} does not exist; create it first")
     return file
 
 
-def flag_of(path: str) -> str:
+def name_option(path: str) -> str:
     """Return the option of a parameter: ``--velocity-cutoff`` for ``velocity.cutoff``."""
     return "--" + path.replace(".", "-").replace("_", "-")
 
 
 def _add_option(command: Command, path: str) -> Command:
+    """Add the option of one parameter, given by its path in a scene."""
     if path == "device":
         words = (
             "A published device of `zwidth devices`, with its period and delay; other options add or replace "
@@ -130,13 +140,16 @@ def _add_option(command: Command, path: str) -> Command:
     if path in CHOICES:
         kind, text = click.Choice(CHOICES[path].names), CHOICES[path].sentence
     else:
-        known = PARAMETERS[path]
-        # The parts themselves check the ranges of theirs.
-        allowed = ANY if path in OF_PARTS else known.allowed
-        kind = click.INT if known.whole else quantity_type(known.unit, allowed, periods=path == "delay")
-        unit, note = "" if known.unit == "1" else f", in {known.unit}", f"; {known.note}" if known.note else ""
-        text = f"{known.sentence}{unit}{note}"
-    return click.option(flag_of(path), path.replace(".", "__"), type=kind, help=f"{text}.")(command)
+        parameter = PARAMETERS[path]
+        # Skip the range check of parameters of parts, because the constructors of the parts check them.
+        allowed = ANY if path in OF_PARTS else parameter.allowed
+        kind = click.INT if parameter.whole else quantity_type(parameter.unit, allowed, periods=path == "delay")
+        unit, note = (
+            "" if parameter.unit == "1" else f", in {parameter.unit}",
+            f"; {parameter.note}" if parameter.note else "",
+        )
+        text = f"{parameter.sentence}{unit}{note}"
+    return click.option(name_option(path), path.replace(".", "__"), type=kind, help=f"{text}.")(command)
 
 
 def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
@@ -163,21 +176,21 @@ def take_options(
         @wraps(function)
         def with_made(**given: Any) -> Any:
             named = {path: given.pop(path.replace(".", "__")) for path in paths}
-            known = {path: each for path, each in named.items() if each is not None}
+            values = {path: each for path, each in named.items() if each is not None}
             context = click.get_current_context()
             try:
-                told = context.meta.get(_TOLD, {})
+                with_kind = context.meta.get(_WITH_KIND, {})
                 if (file := given.pop("scene_file", None)) is not None:
-                    known["scene"] = read_scene_file(file)
-                    told = {file.name: known["scene"].device, **told}
-                if "device" in known:
+                    values["scene"] = read_scene_file(file)
+                    with_kind = {file.name: values["scene"].device, **with_kind}
+                if "device" in values:
                     from zwidth.parts.devices import read_device
 
-                    known["device"] = read_device(known["device"])
+                    values["device"] = read_device(values["device"])
                     # Ignore kind and hardware of the file's device, because the option --device replaces it.
                     context.meta.pop(_HARDWARE, None)
-                    told = context.meta.get(_TOLD, {}) | {"--device": known["device"]}
-                return function(**{name: make(known, SYSTEMS[bool(find_kind(told))])}, **given)
+                    with_kind = context.meta.get(_WITH_KIND, {}) | {"--device": values["device"]}
+                return function(**{name: make(values, SYSTEMS[bool(find_kind(with_kind))])}, **given)
             except InputError as error:
                 field, _, text = str(error).partition(": ")
                 flags = {option.name: option.opts[0] for option in context.command.params}
@@ -196,7 +209,7 @@ def take_options(
 def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
     """Write a warning to the error stream for each implausible value of ``given``, a dict of SI values by path."""
     for line in list_doubts(
-        given, lambda path, value: f"{flag_of(path)} '{value}'" if value else flag_of(path), system
+        given, lambda path, value: f"{name_option(path)} '{value}'" if value else name_option(path), system
     ):
         click.echo(f"zwidth: {line}", err=True)
 
@@ -244,18 +257,18 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
     if isinstance(device, KnownDevice):
         _check_published(device, given)
         changes["device"] = device.to_device(**{name: changes.pop(name) for name in _BARE & changes.keys()})
-    if own := _own(given, "velocity"):
-        same = "kind" not in own and own.keys() <= {item.name for item in fields(scene.velocity)}
+    if part_values := _select_part(given, "velocity"):
+        same = "kind" not in part_values and part_values.keys() <= {item.name for item in fields(scene.velocity)}
         kept = {"kind": name_estimate(scene.velocity), **spell_part(scene.velocity)} if same else {}
-        if own.keys() & _ONE_OF_TWO:
+        if part_values.keys() & _ONE_OF_TWO:
             # Drop both, because a low-pass filter takes either a cutoff or a time constant.
             kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
-        changes["velocity"] = make_velocity({**kept, **own})
+        changes["velocity"] = make_velocity({**kept, **part_values})
     parts = {} if device else find_parts(scene)
     modes = list(() if device else scene.device.modes)
     for name, kind in {**PARTS, **dict.fromkeys(_MODES, Mode)}.items():
-        if own := _own(given, name):
-            part = replace(parts[name], **own) if name in parts else _make_part(name, kind, own)
+        if part_values := _select_part(given, name):
+            part = replace(parts[name], **part_values) if name in parts else _make_part(name, kind, part_values)
             if kind is not Mode:
                 changes[name] = part
             elif name in parts:
@@ -269,8 +282,10 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
     except InputError as error:
         if not str(error).startswith("parameter: "):
             raise
-        flags = ", ".join(map(flag_of, sorted(_BARE & given.keys())))
-        raise click.UsageError(f"{flags}: the file gives the device as a whole; change it in the file") from None
+        flags = ", ".join(map(name_option, sorted(_BARE & given.keys())))
+        raise click.UsageError(
+            f"{flags}: the file gives the device as a linear system or a response; change it in the file"
+        ) from None
 
 
 def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scene:
@@ -288,25 +303,30 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
     if missing:
         raise click.UsageError(f"give {f'either {instead} alone, or also ' if instead else ''}{', and '.join(missing)}")
 
-    def some(*names: str) -> dict[str, Any]:
+    def select(*names: str) -> dict[str, Any]:
+        """Return the given values of some parameters."""
         return {name: given[name] for name in names if name in given}
 
     parts: dict[str, Any] = {
-        name: _make_part(name, kind, own) for name, kind in PARTS.items() if (own := _own(given, name))
+        name: _make_part(name, kind, part_values)
+        for name, kind in PARTS.items()
+        if (part_values := _select_part(given, name))
     }
-    modes = [_make_part(name, Mode, own) for name in _MODES if (own := _own(given, name))]
+    modes = [_make_part(name, Mode, part_values) for name in _MODES if (part_values := _select_part(given, name))]
     parts |= {"modes": modes} if modes else {}
     timing = Timing
     if device is None:
-        device = Device(**some("mass", "damping"), rotary=system.rotary)
+        device = Device(**select("mass", "damping"), rotary=system.rotary)
     elif isinstance(device, KnownDevice):
-        timing, device = device.to_timing, device.to_device(**some("mass", "damping"))
+        timing, device = device.to_timing, device.to_device(**select("mass", "damping"))
     else:
-        for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _HELD):
-            raise click.UsageError(f"--device is given as a whole and holds {flag_of(path)}: give one of the two")
+        for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _CONTAINED):
+            raise click.UsageError(
+                f"{name_option(path)}: the given --device already contains it; give only one of the two"
+            )
     wall = VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0))
-    velocity = make_velocity(_own(given, "velocity"))
-    return Scene(device, timing(**some("period", "rate", "delay")), wall, velocity).replace(**parts)
+    velocity = make_velocity(_select_part(given, "velocity"))
+    return Scene(device, timing(**select("period", "rate", "delay")), wall, velocity).replace(**parts)
 
 
 def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[str] = ()) -> None:
@@ -314,7 +334,7 @@ def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[
     remedies = {"mass": "--mass", "damping": "--damping (0 if unknown)"}
     flags = [*(remedies[name] for name in device.list_missing(given)), *more]
     if flags:
-        raise click.UsageError(f"--device {device.name}: give also {', '.join(flags)}: not published for this device")
+        raise click.UsageError(f"--device {device.name}: also give {', '.join(flags)}; not published for this device")
 
 
 def _list_needed(kind: Any) -> list[str]:
@@ -323,15 +343,16 @@ def _list_needed(kind: Any) -> list[str]:
 
 
 def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
+    """Return a part of class ``kind`` with the given fields; raise `click.UsageError` if a field is missing."""
     needed = _list_needed(kind)
     for key in needed:
         if key not in given:
-            has = " and ".join(f"a {each}" for each in needed)
-            raise click.UsageError(f"a {name} has {has}; give {flag_of(f'{name}.{key}')}")
+            fields_needed = " and ".join(f"a {each}" for each in needed)
+            raise click.UsageError(f"a {name} requires {fields_needed}; give {name_option(f'{name}.{key}')}")
     return kind(**given)
 
 
-def _own(given: dict[str, Any], name: str) -> dict[str, Any]:
+def _select_part(given: dict[str, Any], name: str) -> dict[str, Any]:
     """Return the given parameters of one part, by field name."""
     return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
 
@@ -346,9 +367,11 @@ def make_velocity(given: dict[str, Any]) -> Any:
     needed = ["cutoff"] if kind == "low_pass" and "time_constant" not in given else _list_needed(part)
     for name in needed:
         if name not in given:
-            raise click.UsageError(f"a velocity estimate of kind {kind} needs {flag_of(f'velocity.{name}')}")
+            raise click.UsageError(f"a velocity estimate of kind {kind} requires {name_option(f'velocity.{name}')}")
     for name in sorted(set(given) - set(part.__dataclass_fields__)):
-        raise click.UsageError(f"{flag_of(f'velocity.{name}')} does not belong to a velocity estimate of kind {kind}")
+        raise click.UsageError(
+            f"{name_option(f'velocity.{name}')} does not belong to a velocity estimate of kind {kind}"
+        )
     return part(**given)
 
 
@@ -357,30 +380,30 @@ figure_option = click.option(
 )
 beyond_safe_option = click.option("--beyond-safe", is_flag=True, help="Ignore the safe limit of a fitted scene.")
 verbose_option = click.option("--verbose", is_flag=True, help="Print all results.")
-json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print the results as JSON.")
 
 
-def find_silent() -> frozenset[str]:
-    """Return which of damping, delay and friction are 0 because neither an option nor a file gives a value.
+def find_omitted() -> frozenset[str]:
+    """Return the names among damping, delay and friction that are 0 because no option and no file gives a value.
 
     Friction is included only if the command simulates an encoder.
     """
     given, hardware = click.get_current_context().params, get_hardware()
     named = () if given.get("scene_file") is not None else ("damping", "delay")
-    silent = {name for name in named if given.get(name) is None}
+    omitted = {name for name in named if given.get(name) is None}
     values = {name: hardware.get(name) if given[name] is None else given[name] for name in HARDWARE if name in given}
     simulated = values.get("resolution") and "coulomb" in values
-    return frozenset(silent | ({"friction"} if simulated and values["coulomb"] is values["static"] is None else set()))
+    return frozenset(omitted | ({"friction"} if simulated and values["coulomb"] is values["static"] is None else set()))
 
 
 def read_pairs(context: click.Context, option: click.Parameter, pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Return the values of a repeated option by name; raise an error if a name is repeated."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name, value in pairs:
-        if name in found:
-            raise click.BadParameter(f"got {name!r} twice; give each name once", context, option)
-        found[name] = value
-    return found
+        if name in values:
+            raise click.BadParameter(f"got {name!r} twice; give each name only once", context, option)
+        values[name] = value
+    return values
 
 
 def save_figure(drawn: Any, file: Path) -> str:
@@ -388,4 +411,4 @@ def save_figure(drawn: Any, file: Path) -> str:
     from zwidth.figures import save
 
     save(drawn, file.with_suffix(""), (file.suffix[1:],))
-    return row("wrote", str(file))
+    return format_row("wrote", str(file))

@@ -1,4 +1,8 @@
-"""Options of the commands on records: logs, and the control loop in which they were recorded."""
+"""Options of the commands on records (`zwidth fit`, `excite`, `respond`): logs, and the control loop of the recording.
+
+A record is a log of force and position of a device. Its sampling period and velocity estimate come from options or
+from a scene file.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +17,10 @@ from zwidth.cli.options import (
     BOTH_PERIODS,
     Command,
     change_scene,
-    flag_of,
     get_hardware,
-    get_told,
+    get_options_with_kind,
     make_velocity,
+    name_option,
     take_options,
 )
 from zwidth.parts.checks import find_kind
@@ -27,7 +31,7 @@ if TYPE_CHECKING:
     from zwidth.parts.velocity import Velocity
     from zwidth.scenes.scene import Scene
 
-_LONG = 2**23  # bytes; before reading a longer log, a message is printed
+_LONG = 2**23  # bytes; size of a log above which a message is printed before it is read
 
 
 class RecordLoop(NamedTuple):
@@ -45,7 +49,7 @@ class RecordLoop(NamedTuple):
     def check_kind(self, rotary: bool) -> None:
         """Raise an error if a record, the scene of the file and the options belong to different kinds of devices."""
         implied = {"the scene file has": self.scene and self.scene.device.rotary}
-        implied |= {f"{flag} has units of": find_kind({flag: text}) for flag, text in get_told().items()}
+        implied |= {f"{flag} has units of": find_kind({flag: text}) for flag, text in get_options_with_kind().items()}
         kinds = ("rotary", "linear") if rotary else ("linear", "rotary")
         for source, kind in implied.items():
             if kind is not None and bool(kind) != rotary:
@@ -104,7 +108,7 @@ def loop_options(*, logs: bool) -> Callable[[Command], Command]:
 def log_options(command: Command) -> Command:
     """Add the options for the columns of a log, the encoder step and the motor constant."""
     for name, text in reversed(OF_LOGS.items()):
-        command = click.option(flag_of(name), help=text)(command)
+        command = click.option(name_option(name), help=text)(command)
     return command
 
 

@@ -1,4 +1,9 @@
-"""Runs on the command line: ``run`` with its progress, ``verify``, ``export``, ``figures`` and ``bench``."""
+"""Commands on runs: ``zwidth run`` with its progress on stderr, ``verify``, ``export``, ``figures`` and ``bench``.
+
+A run computes the studies of a configuration file and writes their results into one folder. A sweep is a study of up to
+10^11 points; it is computed in chunks, each of which is saved in the store DIR/STUDY.zarr, so that a stopped run can be
+resumed.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +21,7 @@ import click
 
 from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.options import Parsed, json_option, read_pairs
-from zwidth.pages.words import print_folded, print_json, row
+from zwidth.pages.words import format_row, print_json, print_lines
 from zwidth.words.errors import ResourceError
 from zwidth.words.formatting import plain
 
@@ -25,27 +30,29 @@ if TYPE_CHECKING:
     from zwidth.studies.document import Config
     from zwidth.sweep.engine import Progress
 
-_SECONDS_BETWEEN_LINES = 10.0
+_SECONDS_BETWEEN_LINES = 10.0  # shortest time between two lines of progress, if stderr is not a terminal
 
 
 def _read_size(text: str) -> int:
-    found = re.fullmatch(r"(.*?)\s*(B|KiB|MiB|GiB|)", text.strip())
-    assert found is not None, "any text is a number and perhaps a unit"
-    size = float(found[1]) * 1024 ** ("B", "KiB", "MiB", "GiB").index(found[2] or "B")
+    """Parse a memory size such as "512 MiB"; return it in bytes."""
+    match = re.fullmatch(r"(.*?)\s*(B|KiB|MiB|GiB|)", text.strip())
+    assert match is not None, "the pattern matches any text"
+    size = float(match[1]) * 1024 ** ("B", "KiB", "MiB", "GiB").index(match[2] or "B")
     if not 2**27 <= size <= 2**40:
         raise ValueError
     return int(size)
 
 
 def _read_slice(text: str) -> tuple[str, str]:
-    name, _, wanted = (part.strip() for part in text.partition("="))
-    if not name or not wanted:
+    """Parse "NAME=VALUE"; return name and value as texts."""
+    name, _, value = (part.strip() for part in text.partition("="))
+    if not name or not value:
         raise ValueError
-    return name, wanted
+    return name, value
 
 
 def _read_figure_size(text: str) -> tuple[float, float | None]:
-    """Width and height in inches, or in mm; a width in mm alone has no height."""
+    """Parse the size of a figure; return width and height in inches. The height is None for a single width in mm."""
     metric = text.strip().endswith("mm")
     width, *rest = (float(part.replace("mm", "")) / (25.4 if metric else 1.0) for part in text.split("x"))
     if not all(1 <= side <= 100 for side in (width, *rest)) or len(rest) != 1 - (metric and not rest):
@@ -53,30 +60,32 @@ def _read_figure_size(text: str) -> tuple[float, float | None]:
     return width, rest[0] if rest else None
 
 
-_SIZE = Parsed("size", _read_size, "write a size from 128 MiB to 1024 GiB, as in '512 MiB'")
-_SLICE = Parsed("name=value", _read_slice, "write NAME=VALUE, as in delta=0.1")
+_SIZE = Parsed("size", _read_size, "write a size from 128 MiB to 1024 GiB, such as '512 MiB'")
+_SLICE = Parsed("name=value", _read_slice, "write NAME=VALUE, such as delta=0.1")
 _DPI = click.IntRange(10, 2400)
 _FIGURE_SIZE = Parsed(
-    "WxH", _read_figure_size, "write width x height from 1 to 100 inches, as in 7x4.5, or a width, as in 85mm"
+    "WxH", _read_figure_size, "write width x height from 1 to 100 inches, such as 7x4.5, or a width such as 85mm"
 )
 
 
 @cli.command()
 @click.argument("path", metavar="CONFIG", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results.  [default: runs/NAME]")
-@click.option("--overwrite", is_flag=True, help="Replace a run that the folder already holds.")
-@click.option("--resume", is_flag=True, help="Go on with a run that was stopped; repair what is damaged.")
-@click.option("--workers", type=click.IntRange(min=1), help="Processes for sweeps.  [default: this one]")
-@click.option("--scheduler", metavar="ADDRESS", help="A dask.distributed scheduler to compute sweeps.")
-@click.option("--memory", type=_SIZE, default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
-@click.option("--size", type=_FIGURE_SIZE, help="Size of the studies' figures in inches, as 7x4.5, or width, as 85mm.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing run in the folder.")
+@click.option("--resume", is_flag=True, help="Continue a stopped run, and repair damaged files.")
+@click.option("--workers", type=click.IntRange(min=1), help="Number of worker processes for sweeps.  [default: none]")
+@click.option("--scheduler", metavar="ADDRESS", help="Compute sweeps with this dask.distributed scheduler.")
+@click.option("--memory", type=_SIZE, default="256 MiB", show_default=True, help="Memory of one chunk of a sweep.")
+@click.option(
+    "--size", type=_FIGURE_SIZE, help="Size of the studies' figures: 7x4.5 in inches, or a width such as 85mm."
+)
 @click.option("--dpi", type=_DPI, help="Resolution of the studies' figures, in dots per inch.")
-@click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
+@click.option("--dry-run", is_flag=True, help="Print the plan of the run without computing.")
 def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi: int | None, **options: Any) -> None:
     """Run the studies of a CONFIG file.
 
-    Data, figures and a record of the run go into one folder, the results of each sweep into a store DIR/STUDY.zarr.
-    Ctrl-C keeps what is done; --resume goes on.
+    Write data, figures and a record of the run into one folder, and the results of each sweep into DIR/STUDY.zarr.
+    After Ctrl-C the results so far are kept; continue with --resume.
     """
     from zwidth.figures.style import style_sheet
     from zwidth.runs.run import run as run_studies
@@ -89,41 +98,41 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi:
         _print_plan(config, **options)
         return
     command = _spell_resume_command(path, size=size, dpi=dpi, **options)
-    with _interrupt_on_sigterm() as stopped_by:
+    with _interrupt_on_sigterm() as signals:
         try:
             with reporter() as progress, style_sheet(size=size, dpi=dpi):
-                # The options are those of `zwidth.run`, by their names.
+                # The options have the names of the arguments of `zwidth.run`.
                 result = run_studies(path, progress=progress, **options)
         except KeyboardInterrupt:
-            # Before the first study began.
+            # Interrupted before the first study began.
             result = None
     if result is not None:
         _report_end(result, command)
     if result is None or result.interrupted:
-        click.echo(f"zwidth: stopped; what is done is kept, go on with: {command}", err=True)
-        raise SystemExit(128 + (stopped_by[0] if stopped_by else signal.SIGINT))
+        click.echo(f"zwidth: stopped; results so far are kept. Resume with: {command}", err=True)
+        raise SystemExit(128 + (signals[0] if signals else signal.SIGINT))
     if not result.ok:
         raise SystemExit(EXIT_FAILED)
 
 
 @contextmanager
 def _interrupt_on_sigterm() -> Iterator[list[int]]:
-    """End like with Ctrl-C when told to end; yields the signals that came."""
-    came: list[int] = []
+    """Handle SIGTERM like Ctrl-C; yield the list of received signals."""
+    received: list[int] = []
 
     def end(number: int, frame: Any) -> None:
-        came.append(number)
+        received.append(number)
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, end)
     try:
-        yield came
+        yield received
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
 def _print_plan(config: Config, *, out: Path | None, memory: int, workers: int | None, **_: Any) -> None:
-    """The plan, or why it does not fit."""
+    """Print the plan of a run; raise `ResourceError` if memory or disk space is insufficient."""
     from zwidth.runs.run import plan_run
     from zwidth.sweep.plan import Plan, check_resources
 
@@ -138,7 +147,7 @@ def _print_plan(config: Config, *, out: Path | None, memory: int, workers: int |
 
 
 def _spell_resume_command(path: Path, *, out: Path | None, **given: Any) -> str:
-    """The command that goes on with a run, as a shell takes it."""
+    """Return the command that resumes a run, quoted for a shell."""
     words = ["zwidth", "run", path, *(["--out", out] if out else []), "--resume"]
     size = given["size"] and "x".join(f"{25.4 * side:.12g}" for side in given["size"] if side) + "mm"
     for name, value in {**given, "size": size}.items():
@@ -147,9 +156,9 @@ def _spell_resume_command(path: Path, *, out: Path | None, **given: Any) -> str:
 
 
 def _report_end(result: RunResult, command: str) -> None:
-    """The end of a run: what was repaired, what is done, what went wrong and what to do."""
-    for found in result.repaired:
-        click.echo(f"repaired {found}", err=True)
+    """Print the summary of a run: repaired files, results, errors, and the command that resumes the run."""
+    for file in result.repaired:
+        click.echo(f"repaired {file}", err=True)
     sweeps = result.sweeps.values()
     chunks = [sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")]
     done = sum(study.state in ("done", "kept") for study in result.studies if study.sweep is None)
@@ -157,12 +166,12 @@ def _report_end(result: RunResult, command: str) -> None:
     parts += [f"{chunks[0] + chunks[1]} of {chunks[2]} chunks done ({chunks[0]} now)"] if sweeps else []
     click.echo(f"{', '.join(parts) or 'nothing done'}, results in {result.folder}")
     for study in result.studies:
-        print_folded(row("" if number else study.name, line) for number, line in enumerate(study.answer))
+        print_lines(format_row("" if number else study.name, line) for number, line in enumerate(study.answer))
     if any(study.sweep and study.state in ("done", "kept") for study in result.studies):
         click.echo(f"figures of the sweeps: {shlex.join(['zwidth', 'figures', str(result.folder)])}")
     if result.hopeless:
         click.echo(f"Error: out: {result.folder}: {result.hopeless}", err=True)
-        click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {command}", err=True)
+        click.echo(f"zwidth: the disk is full or read-only; make room and resume with: {command}", err=True)
         return
     for study in result.failed:
         for chunk, error in study.sweep.failed.items() if study.sweep else ():
@@ -170,39 +179,39 @@ def _report_end(result: RunResult, command: str) -> None:
         if not study.sweep:
             click.echo(f"Error: study {study.name!r} failed: {study.error}", err=True)
     if result.lost:
-        click.echo(f"Error: {result.lost}; what is done is kept, go on with: {command}", err=True)
+        click.echo(f"Error: {result.lost}; results so far are kept. Resume with: {command}", err=True)
     elif result.failed and not result.interrupted:
-        click.echo(f"zwidth: try again what failed with: {command}", err=True)
+        click.echo(f"zwidth: retry the failed parts with: {command}", err=True)
 
 
 @cli.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @json_option
 def verify(folder: Path, as_json: bool) -> None:
-    """Read the sweeps in DIR again and check every file.
+    """Verify the checksums of all files of the sweeps in DIR.
 
-    Exit code 1 where something is damaged or missing; `zwidth run --resume` repairs it.
+    Exit code 1 if a file is damaged or missing; `zwidth run --resume` repairs it.
     """
     from zwidth.sweep.dataset import verify as verify_stores
 
-    found, keys = verify_stores(folder), ("chunks", "done", "damaged", "error", "ok")
+    stores, keys = verify_stores(folder), ("chunks", "done", "damaged", "error", "ok")
     if as_json:
-        print_json({store.path.name: {key: getattr(store, key) for key in keys} for store in found})
-    for store in () if as_json else found:
+        print_json({store.path.name: {key: getattr(store, key) for key in keys} for store in stores})
+    for store in () if as_json else stores:
         state = store.error or f"{store.done} of {store.chunks} chunks done, {len(store.damaged) or 'none'} damaged"
         click.echo(f"{store.path.name}: {state}")
         for damaged in store.damaged:
             click.echo(f"Error: {store.path}: {damaged}", err=True)
-    if not all(store.ok for store in found):
+    if not all(store.ok for store in stores):
         raise SystemExit(EXIT_FAILED)
 
 
 @cli.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--netcdf", type=click.Path(path_type=Path), help="Write a netCDF-4 file.")
-@click.option("--csv", "table", type=click.Path(path_type=Path), help="Write a table, of a million points at most.")
+@click.option("--csv", "table", type=click.Path(path_type=Path), help="Write a table; at most one million points.")
 def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
-    """Write the sweep in DIR, or a store, as netCDF or CSV."""
+    """Write the sweep in DIR, or in a store, as netCDF or CSV."""
     if netcdf is None and table is None:
         raise click.UsageError("give --netcdf FILE or --csv FILE")
     from zwidth.sweep.dataset import to_csv, to_netcdf
@@ -214,7 +223,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
             write(folder, file)
             click.echo(f"wrote {file}")
     if missing:
-        text = "chunks are missing, their points have the status 255; 'zwidth run CONFIG --resume' computes them"
+        text = "chunks are missing; their points have status 255. Compute them with 'zwidth run CONFIG --resume'"
         click.echo(f"zwidth: {folder}: {missing} {text}", err=True)
 
 
@@ -225,29 +234,29 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
     multiple=True,
     type=_SLICE,
     callback=read_pairs,
-    help="Draw this slice, as in --at delta=0.1 --at delay=1ms.",
+    help="Draw this slice, such as --at delta=0.1 --at delay=1ms.",
 )
 @click.option("--format", "formats", multiple=True, type=click.Choice(("png", "svg", "pdf")), default=("png", "svg"),
-              help="Kind of file; may be repeated.  [default: png, svg]")  # fmt: skip
+              help="File format; may be repeated.  [default: png, svg]")  # fmt: skip
 @click.option("--dpi", type=_DPI, help="Resolution in dots per inch.")
-@click.option("--size", type=_FIGURE_SIZE, help="Size in inches, as 7x4.5, or width, as 85mm.")
+@click.option("--size", type=_FIGURE_SIZE, help="Size: 7x4.5 in inches, or a width such as 85mm.")
 @click.option(
-    "--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib, as one with 'svg.fonttype: none'."
+    "--style", type=click.Path(path_type=Path), help="Style sheet of matplotlib, e.g. with 'svg.fonttype: none'."
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
 @json_option
 def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, **drawing: Any) -> None:
     """Draw the sweeps in DIR, as PNG and SVG.
 
-    Stable and passive walls with their boundaries, contours of margins and decay times, surfaces of the stiffest
-    wall. --at chooses slices by the nearest value that the sweep has, in the units of the store where it has none;
-    without it up to three values of a parameter have a panel each.
+    The figures show stable and passive walls with their boundaries, contours of margins and decay times, and the
+    stiffest wall as a surface. --at selects the nearest value in the sweep; values without a unit have the unit of the
+    store. Without --at, each of up to three values of a parameter has a panel.
     """
     from zwidth.runs.draw import draw_stores
 
-    told: dict[str, Any] = {"note": lambda text: click.echo(f"zwidth: {text}", err=True)}
-    told |= {} if as_json else {"progress": lambda file: click.echo(f"wrote {file}")}
-    files = draw_stores(folder, out, at=at, **drawing, **told)
+    callbacks: dict[str, Any] = {"note": lambda text: click.echo(f"zwidth: {text}", err=True)}
+    callbacks |= {} if as_json else {"progress": lambda file: click.echo(f"wrote {file}")}
+    files = draw_stores(folder, out, at=at, **drawing, **callbacks)
     if as_json:
         print_json({"files": [str(file) for file in files]})
     if not files:
@@ -255,27 +264,27 @@ def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, *
 
 
 @cli.command()
-@click.option("--quick", is_flag=True, help="Use few delays and small maps; takes one to three minutes on two cores.")
+@click.option("--quick", is_flag=True, help="Use few delays and small grids; takes one to three minutes on two cores.")
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
     default=Path("runs/bench"),
     show_default=True,
-    help="Folder of bench.json, bench.md, summary.txt and the picture pareto.png.",
+    help="Folder for bench.json, bench.md, summary.txt and the figure pareto.png.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace the results of an earlier run in that folder.")
 @json_option
 def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
-    """Measure speed and error of every method, beside other tools.
+    """Measure speed and error of every method, and of comparable tools.
 
-    It needs a checkout of the project, whose benchmarks/methods it runs, and for the errors the extra "test".
+    Required: a checkout of the project, whose benchmarks/methods it runs, and the extra "test" for the errors.
     """
-    # Beside the package's sources; nothing of it is installed with a wheel.
+    # The benchmarks exist only in a checkout, because a wheel does not contain them.
     folder = Path(__file__).parents[3] / "benchmarks"
     if not (folder / "methods").is_dir():
         raise ResourceError(
-            "bench: needs a checkout of the project, with its folder benchmarks/; there: scripts/setup test, then "
-            ".venv/bin/zwidth bench"
+            "bench: requires a checkout of the project with its folder benchmarks/; run there: scripts/setup test, "
+            "then .venv/bin/zwidth bench"
         )
     sys.path.insert(0, str(folder))
     from methods.report import run
@@ -320,7 +329,7 @@ def reporter() -> Iterator[Callable[[StudyEvent], None]]:
 
 
 def _lines(event: StudyEvent) -> Iterator[str]:
-    """A study that has ended: its number, name, time and files, and its notes."""
+    """Yield the lines of a finished study: number, name, kind, run time, number of files, and notes."""
     result = event.result
     if result is None:
         return
@@ -336,6 +345,7 @@ def _lines(event: StudyEvent) -> Iterator[str]:
 
 
 def _state(progress: Progress) -> str:
+    """Return the speed of a sweep and the estimated remaining time."""
     left = progress.seconds_left
     text = f"{plain(progress.rate, 3)} points/s"
     if left == left and left > 0:

@@ -1,1 +1,1 @@
-"""The explorer, a page for a browser, and the words in which it and the command line answer."""
+"""Results for the reader: printed lines of the command line (`words`, `verdict`), and the page of `zwidth explore`."""

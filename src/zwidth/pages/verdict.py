@@ -1,6 +1,8 @@
 """Printed results of `zwidth check` and `zwidth recommend`: the verdict in the first line, then margins and advice.
 
-The explorer also shows the result of `zwidth check`.
+The verdict of a wall is an `Assessment` with its margins, decay, passivity and the stiffest stable wall (K_max) of the
+device. A `Limit` is an improvement of the device with the K_max that it yields. The explorer also shows the result of
+`zwidth check`.
 """
 
 from __future__ import annotations
@@ -11,17 +13,17 @@ from typing import TYPE_CHECKING
 
 from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.pages.words import (
-    diagnosis_lines,
-    fold,
-    hardware_lines,
-    limit_cautions,
-    line,
-    part_lines,
-    scene_notes,
-    silent_cautions,
+    format_diagnosis,
+    format_hardware,
+    format_line,
+    format_parts,
+    list_limit_cautions,
+    list_notes,
+    list_omission_cautions,
+    name_verdict,
     spell_alarm,
     spell_radius,
-    word_of,
+    wrap_lines,
 )
 from zwidth.parts.device import Device
 from zwidth.parts.safe_limit import reserve_damping
@@ -45,20 +47,20 @@ MARGINAL_DAMPER = (
 )
 MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
 
-# Requirements on stability in the reference grasps, in words.
-HELD = {
+# Requirements on stability in the reference grasps (hands that hold the device), in words.
+GRASP_WORDS = {
     "all": "stable in all six reference grasps",
     "soft": "stable in the soft reference grasps",
     "none": "not checked in the reference grasps",
 }
 
 
-def spell_device(scene: Scene, silent: frozenset[str] = frozenset()) -> str:
-    """Return device and timing in words; ``silent`` names the options that were not given."""
+def spell_device(scene: Scene, omitted: frozenset[str] = frozenset()) -> str:
+    """Return device and timing in words; ``omitted`` contains the names of options that were not given."""
     device, timing = scene.device, scene.timing
 
     def name_default(name: str) -> str:
-        return f"{name} 0 (not given)" if name in silent else f"{name} 0"
+        return f"{name} 0 (not given)" if name in omitted else f"{name} 0"
 
     if isinstance(device, Device):
         units = scene.unit_system
@@ -73,12 +75,12 @@ def spell_device(scene: Scene, silent: frozenset[str] = frozenset()) -> str:
     return f"{body}, at {with_unit(1.0 / timing.period, 'Hz')}, {delay}"
 
 
-def check_lines(
+def format_check(
     scene: Scene,
     verdict: Assessment,
     limits: Iterable[Limit] | None,
     *,
-    silent: frozenset[str] = frozenset(),
+    omitted: frozenset[str] = frozenset(),
     hardware: str = "",
     diagnosis: Diagnosis | None = None,
     verbose: bool = False,
@@ -88,46 +90,48 @@ def check_lines(
     ``limits=None`` omits gains and remedies, which take longer. ``hardware`` is the encoder, friction and motor of a
     file in words.
     """
-    wall, word, units = scene.wall, word_of(verdict).upper(), scene.unit_system
+    wall, word, units = scene.wall, name_verdict(verdict).upper(), scene.unit_system
     K, B = spell_stiffness(wall.stiffness, units), with_unit(wall.virtual_damping, units["N s/m"])
-    wall_words, device_words = f"K = {K}, B = {B}", spell_device(scene, silent)
+    wall_words, device_words = f"K = {K}, B = {B}", spell_device(scene, omitted)
     if isinstance(scene.device, Device):
         wall_words += f" (alpha {plain(verdict.alpha)}, beta {plain(verdict.beta)})"
         device_words += f" (delta {plain(verdict.delta)}, d {plain(verdict.d)})"
-    alarm = spell_alarm(diagnosis, "exceeds the safe limit" if limit_cautions(scene) else "")
-    lines = [line(word, wall_words + (alarm if word == "STABLE" else "")), line("device", device_words)]
-    lines += [*part_lines(scene), *hardware_lines(hardware)]
-    lines += [line("CAUTION", text) for text in silent_cautions(scene, silent)]
+    alarm = spell_alarm(diagnosis, "exceeds the safe limit" if list_limit_cautions(scene) else "")
+    lines = [format_line(word, wall_words + (alarm if word == "STABLE" else "")), format_line("device", device_words)]
+    lines += [*format_parts(scene), *format_hardware(hardware)]
+    lines += [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
     # A measured response has no poles.
     damper = wall.stiffness == 0 and not isnan(verdict.frequency)
     dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
     if word == "MARGINAL":
-        lines.append(line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
+        lines.append(format_line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
     lines.append("")
     if word == "UNSTABLE" and damper and dampings:
-        lines.append(line("remedy", f"a pure damper: {_spell_intervals('B', dampings, units['N s/m'], 'K')}"))
+        lines.append(format_line("remedy", f"a pure damper: {_spell_intervals('B', dampings, units['N s/m'], 'K')}"))
     elif word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no stabilizing change of one parameter was found"]
-        lines += [line("remedy", changes[0]), *(line("", f"or {change}") for change in changes[1:])]
-        lines.append(line("", "these are limits of stability, without margins: for a wall to set, use recommend"))
-    lines += margin_lines(verdict)
-    lines += decay_lines(verdict)
+        lines += [format_line("remedy", changes[0]), *(format_line("", f"or {change}") for change in changes[1:])]
+        lines.append(
+            format_line("", "these are limits of stability, without margins: for a wall to set, use recommend")
+        )
+    lines += format_margins(verdict)
+    lines += format_decay(verdict)
     if word != "UNSTABLE" or verbose:
-        lines.append(line("room", _spell_room(verdict, dampings)))
-    lines.append(line("passive", spell_passivity(scene, verdict)))
+        lines.append(format_line("room", _spell_room(verdict, dampings)))
+    lines.append(format_line("passive", spell_passivity(scene, verdict)))
     lines += _list_maximum(scene, verdict, verbose)
-    lines += gain_lines("To gain K_max:", limits or (), verbose)
-    return lines if diagnosis is None else [*lines, "", *diagnosis_lines(diagnosis)]
+    lines += format_gains("To gain K_max:", limits or (), verbose)
+    return lines if diagnosis is None else [*lines, "", *format_diagnosis(diagnosis)]
 
 
 def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | None) -> str:
     """Return the lines of `zwidth check` and its notes as one folded text without color."""
-    lines = [*check_lines(scene, verdict, limits), *(line("note", note) for note in scene_notes(scene))]
-    return "\n".join(fold(lines))
+    lines = [*format_check(scene, verdict, limits), *(format_line("note", note) for note in list_notes(scene))]
+    return "\n".join(wrap_lines(lines))
 
 
 def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
-    """Return the stable intervals of K at the wall's B and of B at its K."""
+    """Return the stable intervals of K at the B of the wall, and of B at its K, in words."""
     units = verdict.unit_system
     rooms = (("K", verdict.stable_stiffness, units["N/m"], "B"), ("B", dampings, units["N s/m"], "K"))
     return "; ".join(_spell_intervals(*room) for room in rooms)
@@ -150,19 +154,21 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
     """Return lines with the stiffest stable wall of the device and the share of its K used by this wall."""
     if not isfinite(verdict.stiffness_max):
         none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
-        return [line("K_max", none)]
+        return [format_line("K_max", none)]
     damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
     top = f"{spell_stiffness(verdict.stiffness_max, scene.unit_system)} at B = {damping}"
     used = f"; this wall uses {plain(100.0 * scene.wall.stiffness / verdict.stiffness_max, 3)} %"
-    lines = [line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]
+    lines = [format_line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]
     if verbose:
         kind, frequency = verdict.ridge_kind.replace("_", " "), with_unit(verdict.ridge_frequency, "Hz")
         normalized = f"; alpha_max {plain(verdict.alpha_max)}, beta {plain(verdict.beta_at_max)}"
-        lines.append(line("", f"{kind} optimum at {frequency}{normalized if isinstance(scene.device, Device) else ''}"))
+        lines.append(
+            format_line("", f"{kind} optimum at {frequency}{normalized if isinstance(scene.device, Device) else ''}")
+        )
     return lines
 
 
-def margin_lines(verdict: Assessment) -> list[str]:
+def format_margins(verdict: Assessment) -> list[str]:
     """Return the line with the margins of a stable wall; an empty list for other walls."""
     if not verdict.stable:
         return []
@@ -173,10 +179,10 @@ def margin_lines(verdict: Assessment) -> list[str]:
     if isfinite(phase):
         parts.append(f"phase {plain(phase)} deg at {with_unit(verdict.gain_crossover, 'Hz', 3)}")
     parts += [f"delay {'not known' if isnan(late) else with_unit(late, 's')}", f"modulus {plain(least)}"]
-    return [line("margins", ", ".join(parts))]
+    return [format_line("margins", ", ".join(parts))]
 
 
-def decay_lines(verdict: Assessment) -> list[str]:
+def format_decay(verdict: Assessment) -> list[str]:
     """Return the line with the time constant of decay or growth; an empty list without poles (measured response)."""
     if isnan(verdict.frequency):
         return []
@@ -189,7 +195,7 @@ def decay_lines(verdict: Assessment) -> list[str]:
         text = f"none{place}"
     else:
         text = f"time constant {with_unit(abs(constant), 's')}{place}"
-    return [line(label, f"{text} ({spell_radius(verdict.spectral_radius)})")]
+    return [format_line(label, f"{text} ({spell_radius(verdict.spectral_radius)})")]
 
 
 def spell_passivity(scene: Scene, verdict: Assessment) -> str:
@@ -211,7 +217,7 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
     return f"{'no' if scene.device.coupling is None else 'not certified'}: {size} more physical damping needed"
 
 
-def gain_lines(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:
+def format_gains(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:
     """Return a table of improvements of a device and their gains; small gains are omitted unless ``verbose``."""
     shown = [limit for limit in limits if isfinite(limit.gain) and (verbose or limit.gain > NOTEWORTHY)]
     if not shown:
@@ -222,45 +228,45 @@ def gain_lines(heading: str, limits: Iterable[Limit], verbose: bool = False) -> 
         kept = f"; {limit.note}" if limit.note else ""
         rows.append(f"{limit.words:<{width}}  {stiffness}  (x {plain(limit.gain, 3)}{kept})")
     if len(heading) > LONG:
-        return ["", heading, *(line("", row) for row in rows)]
+        return ["", heading, *(format_line("", row) for row in rows)]
     return ["", *(f"{heading if not k else '':<{len(heading)}}  {row}" for k, row in enumerate(rows))]
 
 
-def recommend_lines(
-    found: Recommendation,
+def format_recommendation(
+    recommendation: Recommendation,
     *,
-    silent: frozenset[str] = frozenset(),
+    omitted: frozenset[str] = frozenset(),
     hardware: str = "",
     diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
-    """Return the lines of `zwidth recommend` without notes; ``hardware`` as in `check_lines`.
+    """Return the lines of `zwidth recommend` without notes; ``hardware`` as in `format_check`.
 
     ``diagnosis`` is that of the recommended wall.
     """
-    scene, verdict = found.scene, found.verdict
-    device = [line("device", spell_device(scene, silent)), *part_lines(scene), *hardware_lines(hardware)]
-    unsaid = [line("CAUTION", text) for text in silent_cautions(scene, silent)]
+    scene, verdict = recommendation.scene, recommendation.verdict
+    device = [format_line("device", spell_device(scene, omitted)), *format_parts(scene), *format_hardware(hardware)]
+    omission_lines = [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
     if verdict is None:
-        return [line("NO WALL", found.reason), *device, *unsaid]
+        return [format_line("NO WALL", recommendation.reason), *device, *omission_lines]
     thin = "small margins" if find_thin(verdict, scene.timing.period) else ""
-    alarm = spell_alarm(diagnosis, thin, "" if all(found.grasps.values()) else "unstable in a hand")
-    margins = [line("margins", found.spell_margins())]
+    alarm = spell_alarm(diagnosis, thin, "" if all(recommendation.grasps.values()) else "unstable in a hand")
+    margins = [format_line("margins", recommendation.spell_margins())]
     if verbose:
         margins = [
-            *margin_lines(verdict),
-            *decay_lines(verdict),
-            line("room", _spell_room(verdict, verdict.stable_damping)),
+            *format_margins(verdict),
+            *format_decay(verdict),
+            format_line("room", _spell_room(verdict, verdict.stable_damping)),
         ]
     lines = [
-        line("SET", f"{found.spell_wall()}; {found.spell_limit()}{alarm}"),
+        format_line("SET", f"{recommendation.spell_wall()}; {recommendation.spell_limit()}{alarm}"),
         *device,
         *margins,
-        *([line("in a hand", hands)] if (hands := found.spell_hands()) else []),
-        *diagnosis_lines(diagnosis),
-        line("passive", spell_passivity(scene, verdict) if verbose else found.spell_passive()),
-        *unsaid,
-        *(line("CAUTION", caution) for caution in found.cautions),
+        *([format_line("in a hand", hands)] if (hands := recommendation.spell_hands()) else []),
+        *format_diagnosis(diagnosis),
+        format_line("passive", spell_passivity(scene, verdict) if verbose else recommendation.spell_passive()),
+        *omission_lines,
+        *(format_line("CAUTION", caution) for caution in recommendation.cautions),
     ]
-    heading = f"To gain stiffness under the same requirements ({HELD[found.wanted.grasps]}):"
-    return lines + gain_lines(heading, found.steps, verbose)
+    heading = f"To gain stiffness under the same requirements ({GRASP_WORDS[recommendation.wanted.grasps]}):"
+    return lines + format_gains(heading, recommendation.steps, verbose)

@@ -1,4 +1,10 @@
-"""Printed results: labeled lines, folding, JSON, and phrases shared by several commands and the explorer."""
+"""Printed results: labeled lines, line wrapping, JSON, and phrases shared by several commands and the explorer.
+
+A printed line has a label and a text. `format_line` has a narrow column for labels (results of ``check``, ``recommend``
+and ``fit``), `format_row` a wide one. The names of functions follow their results: `format_...` returns printed lines,
+`list_...` returns texts of notes and cautions, `spell_...` returns a phrase. A caution is a text labeled CAUTION: the
+result may not hold on the real device. The verdict of a wall is an `Assessment`.
+"""
 
 from __future__ import annotations
 
@@ -31,16 +37,16 @@ COLORS = {"STABLE": "green", "SET": "green", "UNSTABLE": "red", "NO WALL": "red"
 COLORS |= dict.fromkeys(("MARGINAL", "UNDECIDED", "CAUTION"), "yellow")
 _NARROW = 60  # smallest width with a separate column for labels
 _COLUMN = re.compile(r" {2,}")
-# Spaces within quantities such as "B = 3 N s/m", at which lines do not break; also harmless matches after words.
-_BESIDE = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
+# Spaces at which lines do not break: within quantities such as "B = 3 N s/m", and some others, which is harmless.
+_NO_BREAK = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
 
 
-def row(label: str, text: str) -> str:
+def format_row(label: str, text: str) -> str:
     """Return a line of a printed result with a long label."""
     return f"{label:<20}  {text}"
 
 
-def line(label: str, text: str) -> str:
+def format_line(label: str, text: str) -> str:
     """Return a line of a printed result with its label."""
     return f"{label:<{LABEL - 1}} {text}"
 
@@ -50,7 +56,7 @@ def print_json(result: Any) -> None:
     click.echo(json.dumps(to_json(result), indent=2, allow_nan=False))
 
 
-def fold(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) -> Iterator[str]:
+def wrap_lines(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) -> Iterator[str]:
     """Yield lines wrapped to a width, continuation lines indented; no break separates a number from its unit.
 
     A narrow width has no separate column for labels, because the text would wrap after every word.
@@ -61,53 +67,53 @@ def fold(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) -> Itera
         each = _COLUMN.sub("  ", each) if narrow else each
         blank = len(each) - len(each.lstrip())
         wrap.subsequent_indent = (4 if narrow else max(indent, blank)) * " "
-        yield wrap.fill(_BESIDE.sub("\xa0", each)).replace("\xa0", " ")
+        yield wrap.fill(_NO_BREAK.sub("\xa0", each)).replace("\xa0", " ")
 
 
-def print_folded(lines: Iterable[str], indent: int = 24) -> None:
+def print_lines(lines: Iterable[str], indent: int = 24) -> None:
     """Print lines as wide as ``COLUMNS`` or the terminal, at most 100 columns, with colored labels."""
     width = shutil.get_terminal_size((WIDTH, 24)).columns
-    for each in fold(lines, indent, min(width, WIDTH)):
+    for each in wrap_lines(lines, indent, min(width, WIDTH)):
         word = each[: LABEL - 1].rstrip()
         click.echo(click.style(word, fg=COLORS[word], bold=True) + each[len(word) :] if word in COLORS else each)
 
 
-def tell(result: Any, lines: Iterable[str], as_json: bool, indent: int = 24) -> None:
+def print_result(result: Any, lines: Iterable[str], as_json: bool, indent: int = 24) -> None:
     """Print a result as JSON, or its lines."""
     if as_json:
         print_json(result)
     else:
-        print_folded(lines, indent)
+        print_lines(lines, indent)
 
 
-def part_lines(scene: Scene) -> list[str]:
+def format_parts(scene: Scene) -> list[str]:
     """Return a line for each part of a scene apart from the rigid device, in order from the motor outwards."""
     lines = []
     velocity = type(scene.velocity).__name__
     parts, values = find_parts(scene), scene.parameters()
     for name in (name for name in dict.fromkeys(("velocity", "actuator", "coupling", *parts)) if name in parts):
-        own = {path: value for path, value in values.items() if path.startswith(f"{name}.")}
-        if name == "velocity" and velocity == "BackwardDifference" and not own:
+        part_values = {path: value for path, value in values.items() if path.startswith(f"{name}.")}
+        if name == "velocity" and velocity == "BackwardDifference" and not part_values:
             continue
-        named = {path.removeprefix(f"{name}.").replace("_", " "): path for path in own if own[path]}
+        named = {path.removeprefix(f"{name}.").replace("_", " "): path for path in part_values if part_values[path]}
         words = []
         for key, path in named.items():
-            value, unit = own[path], scene.unit_system[unit_of(path)]
+            value, unit = part_values[path], scene.unit_system[get_unit(path)]
             spelled = with_unit(value, unit) if unit else short(value) if isinstance(value, int) else plain(value)
             words.append(f"{key} {spelled}")
         if name == "coupling":
             words.append(f"sensor at the {parts[name].sensor}")
         words = [velocity, *words] if name == "velocity" else words
-        lines.append(line(name.replace("modes.", "mode "), ", ".join(words)))
+        lines.append(format_line(name.replace("modes.", "mode "), ", ".join(words)))
     return lines
 
 
-def unit_of(path: str) -> str:
+def get_unit(path: str) -> str:
     """Return the SI unit of a parameter of a linear device by its path; "" for numbers without a unit."""
     return PARAMETERS[path].unit.removeprefix("1") if path in PARAMETERS else ""
 
 
-def word_of(verdict: Assessment) -> str:
+def name_verdict(verdict: Assessment) -> str:
     """Return the verdict in one word."""
     if verdict.stable is None:
         return "undecided"
@@ -119,7 +125,7 @@ def spell_radius(radius: float) -> str:
     return f"spectral radius {f'{radius:.6f}' if radius < 1e4 else plain(radius)}"
 
 
-def pole_words(constant: float, frequency: float) -> str:
+def spell_decay(constant: float, frequency: float) -> str:
     """Return the decay of the dominant pole in words, from its time constant in s (negative: growth) and frequency."""
     swing = f", oscillating at {with_unit(frequency, 'Hz')}" if frequency else ""
     if isnan(constant):
@@ -130,37 +136,37 @@ def pole_words(constant: float, frequency: float) -> str:
     return f"{verb} with time constant {with_unit(abs(constant), 's')}{swing}"
 
 
-def coded_period_notes(scene: Scene) -> list[str]:
+def list_period_notes(scene: Scene) -> list[str]:
     """Return a note if the velocity estimate was designed for a period other than that of the loop."""
     coded, period = getattr(scene.velocity, "coded_period", None), scene.timing.period
     if coded is None or abs(coded / period - 1) < 1e-9:
         return []
     text = (
-        f"the velocity estimate is written for a period of {with_unit(coded, 's')}, the loop's is "
-        f"{with_unit(period, 's')}: velocities come out {plain(period / coded, 3)} times as large"
+        f"the velocity estimate was designed for a period of {with_unit(coded, 's')}, but that of the loop is "
+        f"{with_unit(period, 's')}: it returns {plain(period / coded, 3)} times the velocity"
     )
     cutoff = getattr(scene.velocity, "cutoff", None)
     if cutoff is not None:
         real = with_unit(cutoff * coded / period, "Hz")
-        text += f", and the cut-off lies at {real} in place of {with_unit(cutoff, 'Hz')}"
+        text += f", and its cutoff is {real} instead of {with_unit(cutoff, 'Hz')}"
     return [text]
 
 
-def scene_notes(scene: Scene) -> list[str]:
+def list_notes(scene: Scene) -> list[str]:
     """Return notes on a scene in addition to its verdict."""
     from zwidth.scenes.assessment import describe_islands
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
-    return [*undecided, *coded_period_notes(scene), *describe_islands(scene), *compare_with_limit(scene)]
+    return [*undecided, *list_period_notes(scene), *describe_islands(scene), *compare_with_limit(scene)]
 
 
 def compare_with_limit(scene: Scene) -> list[str]:
     """Return a warning if the wall exceeds the scene's safe limit, and the warnings that the limit carries."""
     limit = scene.safe_limit
-    return [] if limit is None or isinstance(scene.wall, NoWall) else [*limit_cautions(scene), *limit.warnings]
+    return [] if limit is None or isinstance(scene.wall, NoWall) else [*list_limit_cautions(scene), *limit.warnings]
 
 
-def limit_cautions(scene: Scene) -> list[str]:
+def list_limit_cautions(scene: Scene) -> list[str]:
     """Return the caution that a wall exceeds the safe limit of its scene; an empty list if it does not."""
     limit, wall = scene.safe_limit, scene.wall
     if limit is None or isinstance(wall, NoWall) or limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
@@ -168,13 +174,13 @@ def limit_cautions(scene: Scene) -> list[str]:
     return [f"this wall exceeds the safe limit: the real device may be unstable. {limit.describe(scene.unit_system)}"]
 
 
-def spell_diagnosis(found: Diagnosis | None) -> list[tuple[str, str]]:
+def spell_diagnosis(diagnosis: Diagnosis | None) -> list[tuple[str, str]]:
     """Return pairs of label and text: the result of a diagnosis and, if the device oscillates, its remedies."""
-    if found is None:
+    if diagnosis is None:
         return []
-    advice = found.advise()
-    label = "simulated" if found.cause == "none" else "CAUTION"
-    return [(label, f"{found.word}: {found.explain()}"), *([("", f"to stop it: {advice}")] if advice else [])]
+    advice = diagnosis.advise()
+    label = "simulated" if diagnosis.cause == "none" else "CAUTION"
+    return [(label, f"{diagnosis.word}: {diagnosis.explain()}"), *([("", f"to stop it: {advice}")] if advice else [])]
 
 
 def spell_alarm(diagnosis: Diagnosis | None, *alarms: str) -> str:
@@ -184,22 +190,22 @@ def spell_alarm(diagnosis: Diagnosis | None, *alarms: str) -> str:
     return f"; CAUTION: {', '.join(words)}" if words else ""
 
 
-def diagnosis_lines(found: Diagnosis | None) -> list[str]:
+def format_diagnosis(diagnosis: Diagnosis | None) -> list[str]:
     """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
-    return [line(*each) for each in spell_diagnosis(found)]
+    return [format_line(*each) for each in spell_diagnosis(diagnosis)]
 
 
-def hardware_lines(hardware: str) -> list[str]:
+def format_hardware(hardware: str) -> list[str]:
     """Return the line with encoder, friction and motor of a file, in words; no line for an empty text."""
-    return [line("hardware", hardware)] if hardware else []
+    return [format_line("hardware", hardware)] if hardware else []
 
 
-def silent_cautions(scene: Scene, silent: Collection[str]) -> list[str]:
+def list_omission_cautions(scene: Scene, omitted: Collection[str]) -> list[str]:
     """Return the cautions about a delay and a friction that are 0 only because they were not given.
 
-    ``silent`` names the options that were not given.
+    ``omitted`` contains the names of options that were not given.
     """
-    # A measured response usually contains the delay, and no model to simulate.
+    # Omit both for a measured response, because it usually contains the delay, and it cannot be simulated.
     if isinstance(scene.device, MeasuredDevice):
         return []
     cautions = {
@@ -208,11 +214,12 @@ def silent_cautions(scene: Scene, silent: Collection[str]) -> list[str]:
         "friction": "no friction given: the encoder is simulated without friction, which can stop a limit cycle; give "
         "the device's friction by --friction",
     }
-    return [text for name, text in cautions.items() if name in silent and not (name == "delay" and scene.timing.delay)]
+    return [text for name, text in cautions.items() if name in omitted and not (name == "delay" and scene.timing.delay)]
 
 
-def note_lines(notes: list[str]) -> list[str]:
-    return [line("note", note) for note in notes]
+def format_notes(notes: list[str]) -> list[str]:
+    """Return a printed line for each note."""
+    return [format_line("note", note) for note in notes]
 
 
 class Slope(NamedTuple):
@@ -226,9 +233,10 @@ class Slope(NamedTuple):
     def line(self) -> str:
         """Return the derivative as a printed line."""
         name = "inertia" if self.name == "mass" and self.unit.endswith("kg m^2") else self.name
-        return row(f"dK_max/d({name})", f"{with_unit(self.value, self.unit)}: {self.words}")
+        return format_row(f"dK_max/d({name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
+        """Return derivative and unit for JSON."""
         return {"value": self.value, "unit": self.unit}
 
 
@@ -237,18 +245,18 @@ def list_slopes(scene: Scene) -> list[Slope]:
     if isinstance(scene.device, MeasuredDevice):
         return []
     per, values = scene.sensitivities().per, scene.parameters()
-    found, system = [], scene.unit_system
+    slopes, system = [], scene.unit_system
     for path, slope in per.items():
-        unit, value = system[unit_of(path)], float(slope)
+        unit, value = system[get_unit(path)], float(slope)
         # The scale of a delay is the period, because a delay may be 0; that of a linear damping is 1 N s/m.
         size = scene.timing.period if path == "delay" else values[path]
         by_one = not size or unit == "N s/m"
-        # Use the power of ten nearest to one percent of the scale as step.
+        # The step is the power of ten nearest to one percent of the scale.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
         effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
         if isfinite(value) and (change := value * step):
             effect = f"{'buys' if change > 0 else 'costs'} {with_unit(abs(change), system['N/m'], 3)}"
         note = f" (the delay stays {scene.timing.kept_delay})" if path == "period" and scene.timing.delay else ""
         words = f"{with_unit(step, unit, 1)} more {effect}{note}"
-        found.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))
-    return found
+        slopes.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))
+    return slopes

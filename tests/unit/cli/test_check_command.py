@@ -261,7 +261,7 @@ def test_encoder_friction_and_motor_are_simulated():
 def test_a_coded_period_that_is_not_the_loop_s_is_pointed_out():
     other = ["--velocity-cutoff", "100", "--velocity-coded-period", "0.1 ms"]
     out = " ".join(run("check", *WALL, *DEVICE, *RATE, *other).stdout.split())
-    assert "velocities come out 10.0 times as large, and the cut-off lies at 10.00 Hz in place of 100.0 Hz" in out
+    assert "it returns 10.0 times the velocity, and its cutoff is 10.00 Hz instead of 100.0 Hz" in out
     same = ["--velocity-cutoff", "100", "--velocity-coded-period", "1 ms"]
     assert "note" not in run("check", *WALL, *DEVICE, *RATE, *same).stdout
 
@@ -275,8 +275,8 @@ def test_a_coded_period_that_is_not_the_loop_s_is_pointed_out():
             "'--velocity-order': got 3; it must be a whole number from 1 to 2",
         ),
         (["--velocity-order", "2"], "--velocity-order does not belong to a velocity estimate of kind"),
-        (["--velocity-kind", "butterworth"], "needs --velocity-cutoff"),
-        (["--coupling-mass", "1"], "a coupling has a mass and a stiffness; give --coupling-stiffness"),
+        (["--velocity-kind", "butterworth"], "requires --velocity-cutoff"),
+        (["--coupling-mass", "1"], "a coupling requires a mass and a stiffness; give --coupling-stiffness"),
         (["--operator-coupling-damping", "1"], "'--operator-coupling-damping': got 1.0 without a coupling spring"),
         (["--operator-mass", "70 gg"], "'--operator-mass': got '70 gg'; the units allowed are kg, g, mg"),
     ],

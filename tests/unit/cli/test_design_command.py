@@ -170,11 +170,14 @@ def test_the_damping_for_a_stiffness_is_that_of_the_library():
     ("arguments", "message"),
     [
         ([], "give --find or --tolerance, or both"),
-        (["--find", "cutoff"], "--find cutoff: this scene has none; give --velocity-cutoff to start from"),
+        (
+            ["--find", "cutoff"],
+            "--find cutoff: not a parameter of this scene; give --velocity-cutoff as a starting value",
+        ),
         (["--tolerance", "weight=10%"], "Invalid value for '--tolerance': got 'weight'"),
         (["--tolerance", "weight=10%"], "did you mean 'mass'?"),
-        (["--tolerance", "mass=10%", "--tolerance", "mass=20%"], "got 'mass' twice; give each name once"),
-        (["--tolerance", "mass=ten"], "write the parameter and its share, as mass=10%"),
+        (["--tolerance", "mass=10%", "--tolerance", "mass=20%"], "got 'mass' twice; give each name only once"),
+        (["--tolerance", "mass=ten"], "write NAME=SHARE, such as mass=10%"),
     ],
 )
 def test_what_is_refused(arguments, message):

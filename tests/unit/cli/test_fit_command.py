@@ -87,21 +87,21 @@ def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(unpain
     [
         ([], "give either --buzz"),
         ([*WALLS], "give --period or --rate"),
-        ([*WALLS, "--period", "1 ms", "--time", "t"], "--time belongs to a LOG.csv"),
+        ([*WALLS, "--period", "1 ms", "--time", "t"], "--time applies only to a LOG.csv"),
         (["--buzz", "K=1 B=2"], "write K, B and f"),
         (["--buzz", "K=1 B=2 f=3 g=4"], "got"),
         (["--buzz", "K=1 B=2 f=3 f=4"], "got 'K=1 B=2 f=3 f=4'; write K, B and f"),
         (["--buzz", "K=1kg f=3"], "K: got '1kg'"),
-        (["--buzz", "K=1 N/m B=2 N m s/rad f=3"], "N/m goes with N s/m"),
-        (["--buzz", "K=1 N/m f=3", "--buzz", "K=1Nm/rad f=3", "--period", "1 ms"], "fit them apart"),
+        (["--buzz", "K=1 N/m B=2 N m s/rad f=3"], "write K in N/m and B in N s/m"),
+        (["--buzz", "K=1 N/m f=3", "--buzz", "K=1Nm/rad f=3", "--period", "1 ms"], "fit them separately"),
         (["--buzz", "K=1 furlong/rad f=3", "--period", "1 ms"], "the units allowed are N m/rad"),
         ([*WALLS, "--period", "1 ms", "--noise", "much"], "write a share"),
         (["LOG", "--time", "t", "--period", "1 ms"], "give one of --time, --period and --rate"),
         (["LOG", "--figure", "fit.txt"], "ends with .png"),
-        ([*WALLS, "--period", "1 ms", "--resolution", "1mm"], "--resolution belongs to a LOG.csv"),
-        ([*WALLS, "--period", "1 ms", "--resample"], "--resample belongs to a LOG.csv"),
-        ([*WALLS, "--period", "1 ms", "--json", "--yaml"], "give one of --json, --yaml and --code"),
-        (["LOG", "--noise", "1%"], "--noise belongs to --buzz"),
+        ([*WALLS, "--period", "1 ms", "--resolution", "1mm"], "--resolution applies only to a LOG.csv"),
+        ([*WALLS, "--period", "1 ms", "--resample"], "--resample applies only to a LOG.csv"),
+        ([*WALLS, "--period", "1 ms", "--json", "--yaml"], "give only one of --json, --yaml and --code"),
+        (["LOG", "--noise", "1%"], "--noise applies only to --buzz"),
     ],
 )
 def test_wrong_use_is_told(arguments, words, log):
@@ -205,7 +205,7 @@ def test_a_rate_stands_for_the_period():
 def test_a_figure_needs_a_folder(tmp_path):
     arguments = [*WALLS, "--period", "1 ms", "--figure", str(tmp_path / "nowhere" / "fit.png")]
     result = CliRunner().invoke(cli, ["fit", *arguments])
-    assert "there is no folder" in result.output
+    assert "does not exist; create it first" in result.output
 
 
 def test_a_missing_file_is_an_input_error():

@@ -56,7 +56,7 @@ def test_name_and_example_stand_in_for_each_other(arguments, file, like, folder)
 @pytest.mark.parametrize("name", ["devices.yaml", "devices.csv"])
 def test_nothing_is_replaced_or_half_written(name, folder):
     (folder / name).write_text("mine", encoding="utf-8")
-    with pytest.raises(InputError, match=rf"{name}: is there already.*another NAME"):
+    with pytest.raises(InputError, match=rf"{name}: already exists.*another NAME"):
         run("devices")
     assert {path.name: path.read_text(encoding="utf-8") for path in folder.iterdir()} == {name: "mine"}
 

@@ -166,8 +166,11 @@ def test_a_transfer_function_is_a_device():
         (["--device", "1 / x"], "highest power first"),
         (["--device", "nobody"], "'--device': got 'nobody'"),
         (["--device", "nothing.csv"], "no such file"),
-        (["--device", "1 / 0.1 10 0", "--mass", "1 kg"], "holds --mass"),
-        (["--device", "1 / 0.1 10 0", "--operator-mass", "1 kg"], "holds --operator-mass"),
+        (["--device", "1 / 0.1 10 0", "--mass", "1 kg"], "--mass: the given --device already contains it"),
+        (
+            ["--device", "1 / 0.1 10 0", "--operator-mass", "1 kg"],
+            "--operator-mass: the given --device already contains it",
+        ),
     ],
 )
 def test_what_is_no_device_is_refused_in_one_line(options, words):

@@ -115,7 +115,7 @@ def test_a_picture(ending, tmp_path):
     file = tmp_path / f"chart.{ending}"
     assert recommend("--figure", str(file)).stdout.splitlines()[-1].endswith(str(file))
     assert file.stat().st_size > 5000
-    assert "there is no folder" in recommend("--figure", str(tmp_path / "none" / "a.png"), code=2).output
+    assert "does not exist; create it first" in recommend("--figure", str(tmp_path / "none" / "a.png"), code=2).output
 
 
 def test_no_wall_exits_with_1():
@@ -166,7 +166,7 @@ def test_margins_are_written_as_people_do(written, meant):
             "'--stiffness-fraction': got 60.0; a number greater than 0 and less than 1 is needed, such as 0.6",
         ),
         (["--gain-margin", "1"], "'--gain-margin': got 1.0; a number greater than 1 is needed, such as 2 for 6 dB"),
-        (["--phase-margin", "large"], "'--phase-margin': got 'large'; write degrees, as 30"),
+        (["--phase-margin", "large"], "'--phase-margin': got 'large'; write degrees, such as 30"),
     ],
 )
 def test_a_wish_that_makes_no_sense_is_told_by_its_option(wrong, told):

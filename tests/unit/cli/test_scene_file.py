@@ -142,7 +142,7 @@ def test_the_folder_of_a_run_stands_for_its_configuration(write, tmp_path):
         (
             {"device": "{numerator: [1], denominator: [0.1, 10, 0]}", "rate": "1 kHz"},
             ["check", "--stiffness", "1", "--mass", "1"],
-            "--mass: the file gives the device as a whole; change it in the file",
+            "--mass: the file gives the device as a linear system or a response; change it in the file",
         ),
     ],
 )

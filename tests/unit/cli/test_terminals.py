@@ -6,9 +6,12 @@ import pytest
 from sweeping import main_of
 
 from zwidth.cli.commands import cli
-from zwidth.pages.words import print_folded, row
+from zwidth.pages.words import format_row, print_lines
 
-LINES = [row("margins", "gain 12.19, phase 16.73 degrees at 17.7 Hz"), row("", "delay 2.623 ms, modulus 0.2901")]
+LINES = [
+    format_row("margins", "gain 12.19, phase 16.73 degrees at 17.7 Hz"),
+    format_row("", "delay 2.623 ms, modulus 0.2901"),
+]
 
 
 @pytest.mark.parametrize(
@@ -31,7 +34,7 @@ def test_lines_are_folded_at_the_width_and_a_narrow_terminal_keeps_no_column_for
     width, says, monkeypatch, capsys
 ):
     monkeypatch.setattr("shutil.get_terminal_size", lambda whole: os.terminal_size((width or whole[0], 24)))
-    print_folded(LINES)
+    print_lines(LINES)
     assert capsys.readouterr().out.splitlines() == says
 
 

@@ -226,4 +226,4 @@ def test_a_folder_without_stores_is_refused(tmp_path, capsys):
         draw_stores(tmp_path)
     assert main_of("figures", tmp_path) == 2
     assert main_of("figures", tmp_path, "--at", "delta") == 2
-    assert "write NAME=VALUE, as in delta=0.1" in capsys.readouterr().err
+    assert "write NAME=VALUE, such as delta=0.1" in capsys.readouterr().err

@@ -137,8 +137,8 @@ def test_files_of_the_kind_size_and_style_that_are_wanted(folder, tmp_path, caps
     [
         (["--size", "7"], "got '7'; write width x height"),
         (["--size", "0x4"], "got '0x4'; write width x height"),
-        (["--size", "85 m"], "or a width, as in 85mm"),
-        (["--at", "rate=1", "--at", "rate=2"], "got 'rate' twice; give each name once"),
+        (["--size", "85 m"], "or a width such as 85mm"),
+        (["--at", "rate=1", "--at", "rate=2"], "got 'rate' twice; give each name only once"),
         (["--format", "gif"], "'gif' is not one of"),
         (["--style", "no/such.mplstyle"], "style: no/such.mplstyle: No such file"),
     ],

@@ -153,7 +153,7 @@ def test_on_the_command_line_a_damage_is_one_line(store, words, tmp_path, monkey
 def test_an_export_of_a_store_that_is_not_complete_says_so(store, tmp_path, capsys):
     chunk_file(store, "status", 1).unlink()
     assert main_of("export", store, "--csv", tmp_path / "x.csv") == 0
-    assert "1 chunks are missing, their points have the status 255" in capsys.readouterr().err
+    assert "1 chunks are missing; their points have status 255" in capsys.readouterr().err
 
 
 def test_a_store_of_an_old_format_is_read_and_not_continued(tmp_path):

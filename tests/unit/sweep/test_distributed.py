@@ -142,9 +142,9 @@ def test_a_scheduler_that_dies_or_falls_silent_ends_the_run_in_one_line(
         assert main_of("run", path, "--out", out, "--scheduler", address) == 1
     out_text, err = capfd.readouterr()
     ours = [line for line in err.splitlines() if not line.startswith(("map ", "[1/1] map "))]
-    go_on = f"go on with: zwidth run {path} --out {out} --resume --scheduler {address}"
+    go_on = f"Resume with: zwidth run {path} --out {out} --resume --scheduler {address}"
     assert ours == [
-        f"Error: scheduler: {address} no longer replies, or has been restarted; what is done is kept, {go_on}"
+        f"Error: scheduler: {address} no longer replies, or has been restarted; results so far are kept. {go_on}"
     ]
     told = int(out_text.split(" of 8 chunks done")[0])
     # What it was at may have been finished since.

@@ -1,1 +1,1 @@
-"""A local page on which the parameters of a scene are moved and its stable walls follow."""
+"""Explorer (`zwidth explore`): local web page with sliders for a scene and charts of its stable walls."""

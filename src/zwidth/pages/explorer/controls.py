@@ -1,4 +1,10 @@
-"""Controls of the page, the parameters and parts of a scene; and texts that reproduce the view."""
+"""Controls of the explorer page: sliders and choices of a scene, and texts that reproduce the scene.
+
+The explorer (`zwidth explore`) is a browser page with sliders for the parameters of a scene, and choices for its parts
+(velocity estimate, actuator, coupling, hand). `Controls` converts the values that the page shows, in its units, to a
+`zwidth.Scene` and back. A normalized scene has m = 1 and T = 1, so that K is alpha, B is beta, b is delta and the
+delay is d. `to_link`, `to_yaml` and `to_python` write the scene as an address, a configuration and a script.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +21,7 @@ from urllib.parse import parse_qsl, urlencode
 from zwidth.config.devices import ResponseSection
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.scenes import NormalizedScene
-from zwidth.pages.words import unit_of
+from zwidth.pages.words import get_unit
 from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.paths import PARTS, find_parts, spell_part, spell_scene
@@ -30,10 +36,8 @@ from zwidth.words.quantities import OF_PARTS, PARAMETERS, Parameter
 from zwidth.words.unit_system import LINEAR, ROTARY, UnitSystem
 from zwidth.words.units import spell_exactly
 
-# Beyond so many, the poles cannot follow a drag.
-_MOST_POLES = 80
-# Of a number that the page sends, in its units.
-_LARGEST = 1e100
+_MOST_POLES = 80  # largest number of poles; more poles take too long to follow a dragged slider
+_LARGEST = 1e100  # largest magnitude of a number from the page, in units of the page
 _SCRIPT = """\
 import matplotlib.pyplot as plt
 import zwidth
@@ -64,27 +68,30 @@ class Slider(NamedTuple):
 
 
 def _make_slider(parameter: Parameter, system: UnitSystem) -> Slider:
+    """Return the slider of a parameter for linear or rotary devices."""
     unit, per_si = _SHOWN.get(parameter.unit, (parameter.unit.removeprefix("1"), 1.0))
     low, high = parameter.slider or (0.0, 0.0)
-    if system.rotary and parameter.unit in _TURNED:
+    if system.rotary and parameter.unit in _ROTARY_UNITS:
         # Show walls in SI units, because the chart on which walls are set has SI units.
-        unit, per_si = (ROTARY[parameter.unit], 1.0) if parameter.name in _WALL else _TURNED[parameter.unit]
+        unit, per_si = (ROTARY[parameter.unit], 1.0) if parameter.name in _WALL else _ROTARY_UNITS[parameter.unit]
         low, high = low * _SMALLER[parameter.unit], high * _SMALLER[parameter.unit]
     name = f"{parameter.words_in(system)} {parameter.symbol_in(system).lstrip(chr(92))}"
     return Slider(name, unit, per_si, low * per_si, high * per_si, parameter.whole)
 
 
-# Units of the page and their number per SI unit; _TURNED: those of rotary devices that differ.
+# Units of the page that differ from SI units, and their number per SI unit.
 _SHOWN = {"kg": ("g", 1e3), "s": ("ms", 1e3)}
-_TURNED = {"kg": ("g cm^2", 1e7), "N s/m": ("mN m s/rad", 1e3), "N/m": ("N m/rad", 1.0)}
+# Further units for rotary devices, by the unit of linear devices.
+_ROTARY_UNITS = {"kg": ("g cm^2", 1e7), "N s/m": ("mN m s/rad", 1e3), "N/m": ("N m/rad", 1.0)}
 # Typical ratios of rotary to linear parameters in SI units, for masses at a radius of about 3 cm.
 _SMALLER = {"kg": 1e-3, "N s/m": 1e-3, "N/m": 1e-3}
-_BARE = ("device", "timing", "wall")
-_DEVICE, _WALL = ("mass", "damping", "period", "delay", "delta", "d"), ("stiffness", "virtual_damping", "alpha", "beta")
-# Sliders by path in a scene. Ranges that begin at 0 are cubic on the page, others logarithmic.
-_MOVED = [name for name in (*_DEVICE, *_WALL, *OF_PARTS) if PARAMETERS[name].slider]
-SLIDERS = {name: _make_slider(PARAMETERS[name], LINEAR) for name in _MOVED}
-ROTARY_SLIDERS = {name: _make_slider(PARAMETERS[name], ROTARY) for name in _MOVED}
+_BARE = ("device", "timing", "wall")  # parts whose parameters have no prefix in a path
+_DEVICE = ("mass", "damping", "period", "delay", "delta", "d")
+_WALL = ("stiffness", "virtual_damping", "alpha", "beta")
+# Parameters with a slider, by path in a scene. The page scales ranges from 0 cubically, others logarithmically.
+_WITH_SLIDER = [name for name in (*_DEVICE, *_WALL, *OF_PARTS) if PARAMETERS[name].slider]
+SLIDERS = {name: _make_slider(PARAMETERS[name], LINEAR) for name in _WITH_SLIDER}
+ROTARY_SLIDERS = {name: _make_slider(PARAMETERS[name], ROTARY) for name in _WITH_SLIDER}
 # Parameters of a scene with m = 1 and T = 1 that equal the normalized ones.
 _NORMALIZED = {"delta": "damping", "d": "delay", "alpha": "stiffness", "beta": "virtual_damping"}
 CHOICES = {
@@ -126,41 +133,43 @@ class Controls:
 
     @property
     def sliders(self) -> dict[str, Slider]:
-        """The numbers of the page for this kind of device."""
+        """The sliders for this kind of device, linear or rotary."""
         return ROTARY_SLIDERS if self.rotary else SLIDERS
 
     def shown(self) -> dict[str, Any]:
-        """Every number and choice that the scene has, as the page shows it."""
+        """Return the values of all sliders and choices of the scene, in the units of the page."""
         scene, values = self.scene, self.scene.parameters()
         if self.normalized:
             return {"mode": "normalized"} | {name: values[path] for name, path in _NORMALIZED.items()}
         forms = {name: _find_form(part) for name, part in find_parts(scene).items() if name in PARTS}
-        found = {name: value * self.sliders[name].per_si for name, value in values.items() if name in SLIDERS}
+        numbers = {name: value * self.sliders[name].per_si for name, value in values.items() if name in SLIDERS}
         for part, form in forms.items():
-            # A form has the numbers that it names: without a spring, the damper beside it does nothing.
+            # Hide parameters without effect in this form: without a spring, a parallel damper has no effect.
             idle = {f"{part}.{item.name}" for item in fields(PARTS[part]) if item.name not in PARTS[part].usual[form]}
-            found = {name: value for name, value in found.items() if name not in idle}
+            numbers = {name: value for name, value in numbers.items() if name not in idle}
         choices = {"mode": "physical", "motion": "rotary" if self.rotary else "linear"}
         choices |= {"velocity": type(scene.velocity).__name__}
         if isinstance(scene.device, LinearDevice):
-            # It holds what a hand, a link or an actuator would add.
-            return found | choices
-        return found | choices | {name: forms.get(name, "none") for name in PARTS}
+            # Offer no hand, coupling or actuator, because the linear system already contains them.
+            return numbers | choices
+        return numbers | choices | {name: forms.get(name, "none") for name in PARTS}
 
     def change(self, shown: Mapping[str, Any]) -> Controls:
-        """New controls with some values as the page shows them; what it does not have is an `InputError`."""
+        """Return new controls with changed values in the units of the page; raise `InputError` for other names."""
         new = self
         for name, value in shown.items():
             if name in CHOICES:
                 if not isinstance(value, str) or value not in CHOICES[name]:
                     raise InputError(f"{name}: got {str(value)[:40]!r}; choose one of {', '.join(CHOICES[name])}")
                 if value != new.shown().get(name):
-                    change = {"motion": new._turn, "mode": new._convert}.get(name, partial(new._take, name, value))
+                    change = {"motion": new._change_motion, "mode": new._convert}.get(
+                        name, partial(new._choose_part, name, value)
+                    )
                     new = change()
                 continue
             if name not in new.shown():
-                # A slider that has just gone, or none that ever was.
-                raise InputError(f"{str(name)[:40]!r}: the page has no such number now")
+                # The slider was just hidden by a choice, or never existed.
+                raise InputError(f"{str(name)[:40]!r}: the page has no such parameter now")
             if isinstance(value, bool) or not isinstance(value, int | float) or not -_LARGEST <= value <= _LARGEST:
                 raise InputError(f"{new.sliders[name].label}: got {str(value)[:40]!r}; a finite number is needed")
             slider = new.sliders[name]
@@ -170,29 +179,29 @@ class Controls:
         return new.check()
 
     def check(self) -> Controls:
-        """The same, if the page can follow so many poles."""
-        # Where parts refuse only together, as a cut-off beyond half the sampling rate, the loop does.
+        """Return the controls; raise `InputError` if the loop has too many poles for the page."""
+        # Building the loop also checks combinations of parts, such as a cutoff above the Nyquist frequency.
         order = self.scene.loop.roots.order
         if order > _MOST_POLES:
             raise InputError(
-                f"delay: the loop has {order} poles, by its delay and its window; the page follows "
-                f"{_MOST_POLES}, zwidth check judges any wall"
+                f"delay: the loop has {order} poles, but the page allows {_MOST_POLES}; "
+                "shorten the delay or the window, or use zwidth check"
             )
         return self
 
     def _refuse_change(self, name: str) -> None:
-        """Refuse what belongs to a mass where the device is given as a whole."""
+        """Raise `InputError` if the device is a linear system, which has no separate parts to change."""
         if isinstance(self.scene.device, LinearDevice):
-            raise InputError(f"{name}: this device is given as a linear system, which holds what belongs to it")
+            raise InputError(f"{name}: not available, because the device is a linear system that contains all parts")
 
-    def _turn(self) -> Controls:
-        """A device of the other kind, as this one has no numbers in its units, at the same rate and delay."""
+    def _change_motion(self) -> Controls:
+        """Return a default device of the other kind, linear or rotary, with the same rate and delay."""
         self._refuse_change("motion")
         other = _SMALL_DEVICE if self.rotary else _SMALL_ROTARY
         return Controls(replace(other, timing=self.scene.timing))
 
-    def _take(self, name: str, kind: str) -> Controls:
-        """The scene with another part of a usual kind, or another velocity estimate."""
+    def _choose_part(self, name: str, kind: str) -> Controls:
+        """Return the controls with another part in one of its usual forms, or another velocity estimate."""
         scene = self.scene
         if name in PARTS:
             self._refuse_change(name)
@@ -203,19 +212,19 @@ class Controls:
         usual = BackwardDifference(), WindowedDifference(5), LowPass(cutoff=cutoff), Butterworth(cutoff)
         estimates = {type(each).__name__: each for each in usual}
         if kind not in estimates:
-            raise InputError(f"{name}: coefficients come with a configuration alone; choose another")
+            raise InputError(f"{name}: coefficients can only be set in a configuration file; choose another estimate")
         return replace(self, scene=scene.replace(velocity=estimates[kind]))
 
     def _make_usual(self, name: str, kind: str) -> Any:
-        """A part in one of its usual forms; of a rotary device as much smaller as that is."""
+        """Return a part in one of its usual forms, with typical values for linear or rotary devices."""
         given = dict(PARTS[name].usual[kind])
         for key, value in given.items():
-            unit = unit_of(f"{name}.{key}")
+            unit = get_unit(f"{name}.{key}")
             given[key] = _round(value * _SMALLER[unit], 12) if self.rotary and unit in _SMALLER else value
         return PARTS[name](**given)
 
     def _convert(self) -> Controls:
-        """The device and wall in the other units; normalized it is rigid, its parts are left out."""
+        """Return the controls in normalized or in SI units; normalization keeps only the rigid device."""
         self._refuse_change("mode")
         scene, (mass, period, rotary) = self.scene, self.scale
         if not self.normalized:
@@ -223,8 +232,8 @@ class Controls:
             return replace(normalized_controls(*numbers), scale=(float(scene.mass), scene.timing.period, self.rotary))
         rate, (stiffness, damping) = mass / period, self.wall
         numbers = stiffness * rate / period, damping * rate, scene.damping * rate, float(scene.d) * period
-        *wall, own, delay = (_round(float(number), 12) for number in numbers)
-        return Controls(Scene(Device(mass, own, rotary=rotary), Timing(period, delay), VirtualWall(*wall)))
+        *wall, device_damping, delay = (_round(float(number), 12) for number in numbers)
+        return Controls(Scene(Device(mass, device_damping, rotary=rotary), Timing(period, delay), VirtualWall(*wall)))
 
 
 def _check_range(name: str, slider: Slider, value: float) -> None:
@@ -237,12 +246,12 @@ def _check_range(name: str, slider: Slider, value: float) -> None:
 
 
 def _round(value: float, digits: int) -> float:
-    """A number without the last digits, which are the rounding of a change of units."""
+    """Round to significant digits, which removes rounding errors of unit conversions."""
     return float(f"{value:.{digits}g}")
 
 
 def _find_form(part: Any) -> str:
-    """Which of its usual forms a part has: the one with the same words, and with the same numbers left out."""
+    """Return the usual form of a part: the one with equal values of all fields that are not floating-point numbers."""
 
     def shape(part: Any) -> dict[str, Any]:
         values = {item.name: getattr(part, item.name) for item in fields(part)}
@@ -252,6 +261,7 @@ def _find_form(part: Any) -> str:
 
 
 def normalized_controls(alpha: float, beta: float, delta: float, d: float) -> Controls:
+    """Return the controls of a normalized scene."""
     scene = Scene(Device(1.0, float(delta)), Timing(1.0, float(d)), VirtualWall(float(alpha), float(beta)))
     return Controls(scene, normalized=True)
 
@@ -292,7 +302,9 @@ def _show_scene(given: Any, origin: Any) -> Controls:
 def to_link(controls: Controls) -> str:
     """Return the scene as the fragment of an address, ``mass=100+g&damping=...``, which any explorer opens."""
     section = _spell_section(controls).items()
-    texts = {name: own if isinstance(own, str) else json.dumps(own, separators=(",", ":")) for name, own in section}
+    texts = {
+        name: value if isinstance(value, str) else json.dumps(value, separators=(",", ":")) for name, value in section
+    }
     return urlencode(texts, safe="/{}[]:,")
 
 
@@ -301,7 +313,7 @@ def read_link(link: str) -> Controls:
     try:
         section = {name: _read_value(text) for name, text in parse_qsl(link, strict_parsing=True, max_num_fields=99)}
     except (ValueError, RecursionError):
-        raise InputError("address: what follows its # is no scene; remove it, or copy the whole address") from None
+        raise InputError("address: the text after # is not a scene; remove it, or copy the complete address") from None
     walls = {"kind": "boundary", "name": "stable_walls"}
     document = {"version": 1, "name": "explored", "scene": section, "studies": [walls]}
     return _show_scene(read_mapping(document, Config).scene, "address")
@@ -327,7 +339,7 @@ def _add_units(value: Any, system: UnitSystem, path: str = "") -> Any:
         return {name: _add_units(part, system, f"{path}.{name}".lstrip(".")) for name, part in value.items()}
     if isinstance(value, list | tuple):
         return [_add_units(part, system, f"{path}.{k}") for k, part in enumerate(value)]
-    unit = system[unit_of(path)]
+    unit = system[get_unit(path)]
     return spell_exactly(value, unit) if unit else value
 
 
@@ -363,9 +375,9 @@ def _spell(value: Any, path: str, system: UnitSystem | None) -> str:
         return f"zwidth.LinearDevice({form})"
     if hasattr(value, "__dataclass_fields__"):
         given = spell_part(value).items()
-        words = (f"{name}={_spell(own, f'{path}.{name}'.lstrip('.'), system)}" for name, own in given)
+        words = (f"{name}={_spell(item, f'{path}.{name}'.lstrip('.'), system)}" for name, item in given)
         return f"zwidth.{type(value).__name__}({', '.join(words)})"
-    if isinstance(value, tuple) and any(hasattr(own, "__dataclass_fields__") for own in value):
-        return f"[{', '.join(_spell(own, f'{path}.{k}', system) for k, own in enumerate(value))}]"
-    unit = unit_of(path)
+    if isinstance(value, tuple) and any(hasattr(item, "__dataclass_fields__") for item in value):
+        return f"[{', '.join(_spell(item, f'{path}.{k}', system) for k, item in enumerate(value))}]"
+    unit = get_unit(path)
     return json.dumps(spell_exactly(value, system[unit])) if system and unit else repr(value)  # pyright: ignore

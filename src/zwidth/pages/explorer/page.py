@@ -1,4 +1,13 @@
-"""The figures of the page and what drives them: controls come in as one message, numbers and texts go out."""
+"""Figures of the explorer page and their updates: receive messages of the browser, and send data and texts.
+
+The explorer (`zwidth explore`) is a browser page with sliders for the parameters of a scene. A `Page` belongs to one
+browser tab. Its script (assets/page.js) writes each change as a JSON message into the Bokeh data source ``inputs``; the
+page replies through the data source ``answer``, and Bokeh transfers the columns of the figures.
+
+A change has fast and slow results. While a slider moves, the page computes stable region, poles and verdict at once.
+When the slider rests, a worker thread computes the other results (`model.compute_details`). Each change increases
+``generation``; results of an older generation are discarded.
+"""
 
 from __future__ import annotations
 
@@ -24,24 +33,23 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import ZwidthError
 
-# A message holds some dozen numbers, or an address.
-_LONGEST_MESSAGE = 16_000
-# What of a glyph is a column of its source, unless it is a fixed word.
+_LONGEST_MESSAGE = 16_000  # characters; a message contains some dozen numbers, or an address
+# Properties of a glyph that name a column of its data source, unless they are "center".
 _FROM_SOURCE = ("x", "y", "xs", "ys", "text", "angle", "text_align")
-# What hangs on the device and takes its time: another device's is taken away at once.
+# Sources of slow results that depend only on the device; emptied at once if the device changes.
 _OF_DEVICE = ("contours", "passive", "ridge", "best")
-# What is drawn, on a light page and on a dark one.
+# Color roles of the figures, and their colors on light and dark pages.
 _INKS = ("paper", "ink", "faint", "edge", "passive", "ridge")
 _LIGHT = dict(zip(_INKS, ("#FFFFFF", style.BLACK, "#565656", style.BLUE, "#00735A", style.VERMILION), strict=True))
 _DARK = dict(zip(_INKS, ("#1E2328", "#F2F2F2", "#A6A6A6", style.SKY, "#2FC79C", style.ORANGE), strict=True))
-# What files call the curves of a figure, where that is not the name of their source.
+# Names of the curves in CSV files, if they differ from the names of the data sources.
 _NAMES = {"edge": "stable", "ridge": "stiffest as b grows", "best": "stiffest", "wall": "your wall", "bode": "L"}
 _NAMES |= {"nyquist": "L", "crossover": "|L| = 1", "turned": "phase -180 degrees"}
-_TURN = np.linspace(0.0, 2.0 * np.pi, 361)
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 361)
 
 
 class Page:
-    """One open page."""
+    """Page in one browser tab: controls, figures, and the computations in progress."""
 
     def __init__(self, document: Document, controls: Controls, executor: Executor) -> None:
         self.document, self.controls, self.executor = document, controls, executor
@@ -55,7 +63,7 @@ class Page:
         self.answer = ColumnDataSource({"json": []}, name="answer")
         self.inputs.on_change("data", lambda _, __, data: self.receive(data))
         self.inks: list[tuple[Any, str, str]] = []
-        # What a figure shows of its sources: their names, and the columns across and up.
+        # Curves of each figure: name of the data source, and its columns for the horizontal and the vertical axis.
         self.curves: dict[figure, list[tuple[str, str, str]]] = {}
         self.frame: tuple[model.Range, model.Range] | None = None
         self.plots = {
@@ -69,13 +77,13 @@ class Page:
             "force": self._draw_motion("contact", "force"),
         }
         self.plots["plane"].tags = [self.inputs, self.answer]
-        # A click within 0.3 s of the last one, wherever that was, and a slow one have names of their own.
+        # Listen to three events, because Bokeh reports a second click within 0.3 s and a long click separately.
         for click in (Tap, DoubleTap, PressUp):
             self.plots["plane"].on_event(click, self._tap)
         for axis in (self.plots["plane"].x_range, self.plots["plane"].y_range):
             for end in ("start", "end"):
                 axis.on_change(end, lambda attr, old, new: self._point_at_wall())
-        # Bokeh looks through all that is in the document once, not after each figure.
+        # Freeze the document, because Bokeh would otherwise collect all models after each added figure.
         with document.models.freeze():
             for name, plot in self.plots.items():
                 plot.name = name
@@ -83,19 +91,20 @@ class Page:
         self._paint()
 
     def _new(self, height: int, **keywords: Any) -> figure:
+        """Return an empty figure in the style of the page."""
         tools = "pan,wheel_zoom,box_zoom,reset"
         plot = figure(height=height, sizing_mode="stretch_width", tools=tools, output_backend="canvas", **keywords)
         plot.toolbar.logo, plot.toolbar.autohide, plot.toolbar.active_drag = None, True, None  # pyright: ignore
         plot.outline_line_color = None  # pyright: ignore
         for axis in plot.axis:
-            # A thousandth is written out.
+            # Write small numbers such as 0.001 without an exponent.
             if isinstance(axis.formatter, BasicTickFormatter):
                 axis.formatter.power_limit_low = -6
         self.inks += [(plot, "background_fill_color", "paper"), (plot, "border_fill_color", "paper")]
         return plot
 
     def _add(self, plot: figure, glyph: str, source: str, color: str, *, parts: str = "line", **keywords: Any) -> Any:
-        """A glyph whose colors follow the light."""
+        """Add a glyph whose colors follow the light or dark theme, and return its renderer."""
         data = self.sources.setdefault(source, ColumnDataSource(name=f"{source} data"))
         for name in (name for name in _FROM_SOURCE if keywords.get(name, "center") != "center"):
             data.add([], keywords[name])
@@ -106,8 +115,9 @@ class Page:
         return drawn
 
     def _draw_plane(self) -> figure:
+        """Return the chart of walls: stable and passive region, contours, ridge, and the wall of the user."""
         plot = self._new(460, x_range=(0, 1), y_range=(0, 1))
-        # Lines alone carry the meaning; what is filled is pale.
+        # Fill areas only faintly, because the lines carry the meaning.
         area = {"line_color": None, "fill_alpha": 0.13}
         self._add(plot, "multi_polygons", "area", "edge", parts="fill", xs="xs", ys="ys", legend_label="stable", **area)
         self._add(plot, "multi_line", "contours", "faint", xs="xs", ys="ys", legend_label="spectral radius")
@@ -121,7 +131,7 @@ class Page:
         mark = {"x": "x", "y": "y", "fill_color": None, "line_width": 2}
         self._add(plot, "scatter", "best", "ridge", marker="diamond", size=13, legend_label="stiffest", **mark)
         self._add(plot, "scatter", "wall", "ink", marker="circle_cross", size=17, legend_label="your wall", **mark)
-        # A wall beyond the border has an arrow there; islands have their names.
+        # Arrow to a wall outside the chart, and the labels of islands.
         arrow = {"marker": "triangle", "angle": "angle", "size": 15, "parts": "line fill"}
         self._add(plot, "scatter", "away", "ink", x="x", y="y", **arrow)
         words = {"x": "x", "y": "y", "text": "text", "parts": "text"}
@@ -135,16 +145,17 @@ class Page:
         plot.add_layout(legend, "above")
         return plot
 
-    def _draw_circle(self, seen: list[str]) -> figure:
-        """A plane of complex numbers with the unit circle; the ranges hold what is named."""
+    def _draw_circle(self, sources: list[str]) -> figure:
+        """Return a complex plane with the unit circle; the ranges contain the data of ``sources``."""
         plot = self._new(330, match_aspect=True)
-        circle = plot.line(np.cos(_TURN), np.sin(_TURN), line_width=1.5)
+        circle = plot.line(np.cos(_ANGLES), np.sin(_ANGLES), line_width=1.5)
         self.inks.append((circle.glyph, "line_color", "faint"))
         plot.x_range, plot.y_range = (DataRange1d(renderers=[circle]) for _ in "xy")
-        plot.tags = seen
+        plot.tags = sources
         return plot
 
     def _draw_poles(self) -> figure:
+        """Return the figure of the poles in the complex plane."""
         plot = self._draw_circle(["poles"])
         poles = self._add(plot, "scatter", "poles", "edge", x="x", y="y", marker="x", size=11, line_width=2.5)
         for axis in (plot.x_range, plot.y_range):
@@ -153,6 +164,7 @@ class Page:
         return plot
 
     def _draw_nyquist(self) -> figure:
+        """Return the Nyquist curve with its gain crossover and the critical point -1."""
         plot = self._draw_circle(["crossover"])
         self._add(plot, "line", "nyquist", "edge", x="x", y="y", line_width=2)
         critical = plot.scatter([-1.0], [0.0], marker="cross", size=13, line_width=2.5)
@@ -163,6 +175,7 @@ class Page:
         return plot
 
     def _draw_bode(self, column: str, critical: float) -> figure:
+        """Return magnitude or phase of the open loop over frequency, with a line at the critical value."""
         plot = self._new(170, x_axis_type="log")
         self._add(plot, "line", "bode", "edge", x="x", y=column, line_width=2)
         line = Span(location=critical, dimension="width", line_dash=[4, 4], line_width=1.5)
@@ -175,12 +188,14 @@ class Page:
         return plot
 
     def _draw_motion(self, source: str, column: str) -> figure:
+        """Return a column of a motion over time."""
         plot = self._new(220)
         self._add(plot, "line", source, "edge", x="x", y=column, line_width=2)
         return plot
 
     def _paint(self) -> None:
-        # Until the browser has said which, paper has no color.
+        """Set all colors of the figures for the light or dark theme."""
+        # Leave the background transparent until the browser has reported its theme.
         inks = (_DARK if self.dark else _LIGHT) | ({"paper": None} if self.dark is None else {})
         for glyph, name, ink in self.inks:
             setattr(glyph, name, inks[ink])
@@ -193,6 +208,7 @@ class Page:
         self.plots["plane"].legend.label_text_color = inks["ink"]
 
     def _name_axes(self) -> None:
+        """Set the labels of all axes, with the units of the scene."""
         units = self.controls.scene.unit_system
         spring, damper = units["N/m"], units["N s/m"]
         hertz, time, walls = "frequency in Hz", "time in s", (f"stiffness K in {spring}", f"damping B in {damper}")
@@ -214,18 +230,18 @@ class Page:
             self.plots[name].xaxis.axis_label, self.plots[name].yaxis.axis_label = x, y
 
     def receive(self, data: Any) -> None:
-        """Take what the page sends: changed values, whether the slider rests, what else is wanted."""
+        """Process a message of the browser: changed values, end of a drag, theme, or request for a CSV file."""
         try:
             (text,) = data["json"]
             message = json.loads(text) if isinstance(text, str) and len(text) <= _LONGEST_MESSAGE else None
             if not isinstance(message, dict) or not isinstance(message.get("set", {}), dict):
                 raise ValueError(text)
         except (ValueError, TypeError, KeyError, RecursionError):
-            self.tell({"error": "the page sent something that is no message; reload it"})
+            self.send({"error": "the page sent an invalid message; reload the page"})
             return
-        self.serial, wanted, link = (message.get(name) for name in ("serial", "csv", "open"))
-        if wanted in tuple(self.plots):
-            self.tell({"csv": self.table(wanted)})
+        self.serial, figure_name, link = (message.get(name) for name in ("serial", "csv", "open"))
+        if figure_name in tuple(self.plots):
+            self.send({"csv": self.table(figure_name)})
             return
         if message.get("dark") in (True, False) and message["dark"] != self.dark:
             self.dark = message["dark"]
@@ -235,6 +251,7 @@ class Page:
         self.update(message.get("set", {}), rest=bool(message.get("rest")), link=link)
 
     def _tap(self, event: Any) -> None:
+        """Set the wall to the position of a click in the chart."""
         names = ("alpha", "beta") if self.controls.normalized else ("stiffness", "virtual_damping")
         place = [float(f"{value:.4g}") if isinstance(value, int | float) else value for value in (event.x, event.y)]
         self.update(dict(zip(names, place, strict=True)), rest=True)
@@ -250,7 +267,7 @@ class Page:
                 controls = before.change(changes)
                 self._show_at_once(controls, rest)
         except Exception as error:
-            self.tell({"error": _explain(error), "state": self.controls.shown(), "busy": False})
+            self.send({"error": _explain(error), "state": self.controls.shown(), "busy": False})
             return
         # Cancel older computations only now, because a refused change keeps the state for which they run.
         self.generation += 1
@@ -260,6 +277,7 @@ class Page:
             self.executor.submit(self._compute, self.generation, controls.scene, *self.frame, **wanted)
 
     def _show_at_once(self, controls: Controls, rest: bool) -> None:
+        """Compute and show the fast results; export texts only if the slider rests."""
         scene = controls.scene
         stable, poles = bool(scene.decide_stability(method="companion").stable), scene.poles()
         device = replace(scene, wall=VirtualWall(0.0)), controls.normalized
@@ -267,13 +285,13 @@ class Page:
             self._fill(show_outlines(scene))
             self.device, self.drawn = device, False
             self._fill({name: {column: [] for column in self.sources[name].data} for name in _OF_DEVICE})
-            self.tell({"slopes": ""})
+            self.send({"slopes": ""})
         self.controls = controls
         self._name_axes()
         wall = {"x": [controls.wall[0]], "y": [controls.wall[1]]}
         self._fill({"wall": wall, "poles": {"x": np.real(poles), "y": np.imag(poles)}})
         x, y = (np.asarray(self.sources["edge"].data[name], float) for name in "xy")
-        frame = model.frame((x, y), controls.wall)
+        frame = model.choose_ranges((x, y), controls.wall)
         if frame != self.frame:
             self.frame = frame
             plane = self.plots["plane"]
@@ -281,38 +299,40 @@ class Page:
                 axis.update(start=low, end=high, reset_start=low, reset_end=high)
         self._point_at_wall()
         word = "stable" if stable else "UNSTABLE"
-        said = {"error": "", "word": word, "radius": spell_radius(np.abs(poles).max()), "busy": True}
-        said |= {"poles_words": model.caption_poles(poles, word.lower()), "state": controls.shown(), "frame": frame}
+        texts = {"error": "", "word": word, "radius": spell_radius(np.abs(poles).max()), "busy": True}
+        texts |= {"poles_words": model.caption_poles(poles, word.lower()), "state": controls.shown(), "frame": frame}
         recipes = {"yaml": to_yaml, "python": to_python, "link": to_link} if rest else {}
-        self.tell({**said, **{name: spell(controls) for name, spell in recipes.items()}})
+        self.send({**texts, **{name: spell(controls) for name, spell in recipes.items()}})
 
     def _point_at_wall(self) -> None:
+        """Update the arrow that points to a wall outside the visible chart."""
         plane = self.plots["plane"]
         across, up = ((axis.start, axis.end) for axis in (plane.x_range, plane.y_range))  # pyright: ignore
-        arrow = model.point_at(self.controls.wall, across, up)
+        arrow = model.place_arrow(self.controls.wall, across, up)
         if arrow != self.sources["away"].data:
             self._fill({"away": arrow})
 
     def table(self, name: str) -> str:
-        """The points of a figure as CSV: the curve, which of its pieces, and the two numbers, with eight digits."""
+        """Return the points of a figure as CSV: curve, number of its piece, and coordinates with 8 digits."""
         plot, buffer = self.plots[name], io.StringIO()
         writer = csv.writer(buffer, lineterminator="\n")
         writer.writerow(["curve", "piece", plot.xaxis.axis_label, plot.yaxis.axis_label])
         for source, *columns in self.curves[plot]:
             x, y = (np.asarray(self.sources[source].data[column], float) for column in columns)
-            known = np.isfinite(x) & np.isfinite(y)
-            # A curve of several pieces has a gap between them.
-            pieces = 1 + np.cumsum(~known & np.append(known[1:], False))
-            pieces -= pieces[known][0] - 1 if known.any() else 0
-            for row in zip(pieces[known], x[known], y[known], strict=True):
+            finite = np.isfinite(x) & np.isfinite(y)
+            # Number the pieces of a curve, which are separated by NaN.
+            pieces = 1 + np.cumsum(~finite & np.append(finite[1:], False))
+            pieces -= pieces[finite][0] - 1 if finite.any() else 0
+            for row in zip(pieces[finite], x[finite], y[finite], strict=True):
                 writer.writerow([_NAMES.get(source, source), row[0], *(f"{value:.8g}" for value in row[1:])])
         return buffer.getvalue()
 
     def _fill(self, update: Update) -> None:
+        """Set the columns of data sources, by name of the source."""
         for name, columns in update.items():
             self.sources[name].data = columns
 
-    def tell(self, texts: dict[str, Any]) -> None:
+    def send(self, texts: dict[str, Any]) -> None:
         """Send texts and numbers to the scripts of the page."""
         self.answer.data = {"json": [json.dumps({"serial": self.serial, **texts})]}
 
@@ -322,31 +342,34 @@ class Page:
             for update in compute_details(scene, *frame, **wanted):
                 if generation != self.generation:
                     return
-                self._hand_over(generation, update)
-            self._hand_over(generation, {"busy": False})
+                self._schedule_update(generation, update)
+            self._schedule_update(generation, {"busy": False})
         except Exception as error:
             # Clear the verdict, which belongs to the previous wall.
-            self._hand_over(generation, {"error": _explain(error), "verdict": "", "busy": False})
+            self._schedule_update(generation, {"error": _explain(error), "verdict": "", "busy": False})
 
     def close(self) -> None:
+        """Cancel the computation in progress."""
         self.generation += 1
 
-    def _hand_over(self, generation: int, update: Update) -> None:
-        self.document.add_next_tick_callback(lambda: self._take(generation, update))
+    def _schedule_update(self, generation: int, update: Update) -> None:
+        """Apply an update of the worker in the thread of the document."""
+        self.document.add_next_tick_callback(lambda: self._apply_update(generation, update))
 
-    def _take(self, generation: int, update: Update) -> None:
+    def _apply_update(self, generation: int, update: Update) -> None:
+        """Show an update, unless a newer change has made it obsolete."""
         if generation != self.generation:
             return
         self._fill({name: columns for name, columns in update.items() if name in self.sources})
         texts = {name: text for name, text in update.items() if name not in self.sources}
-        # The last of what hangs on the device.
+        # The sensitivities are the last of the results that depend only on the device.
         self.drawn = self.drawn or "slopes" in update
         if texts:
-            self.tell(texts)
+            self.send(texts)
 
 
 def _explain(error: Exception) -> str:
-    """What the page says of an error; whatever it is, the page stays."""
+    """Return the message of the page for any exception, because the page stays open after every error."""
     if isinstance(error, ZwidthError):
         return str(error)
-    return f"this cannot be computed ({type(error).__name__}: {error}); change a number, or reload the page"
+    return f"the computation failed ({type(error).__name__}: {error}); change a number, or reload the page"

@@ -1,4 +1,8 @@
-"""The local server: one address with a random token, for this machine alone."""
+"""Local HTTP server of the explorer: it accepts connections from this machine only, at an address with a random token.
+
+The address http://127.0.0.1:PORT/TOKEN/ serves the explorer page, its scripts and the websocket of Bokeh. Any other
+address, host name or origin gets status 403, so that no other page in the browser can reach the server.
+"""
 
 from __future__ import annotations
 
@@ -33,9 +37,10 @@ from zwidth.words.errors import InputError
 
 HOST = "127.0.0.1"
 _ASSETS = Path(__file__).parent / "assets"
-# Pages open at one time, bytes of a message, seconds until a page that never connected is forgotten.
-_MOST_PAGES, _LONGEST_MESSAGE, _UNUSED = 16, 1 << 18, 10
-# The page, its socket, Bokeh's scripts and our own; Bokeh would serve more.
+_MOST_PAGES = 16  # largest number of open pages
+_LONGEST_MESSAGE = 1 << 18  # bytes of a message from the browser
+_UNUSED = 10  # seconds until a session without a connection is discarded
+# First parts of the served paths: page, websocket, scripts of Bokeh, files in assets/. Bokeh would serve more.
 _SERVED = ("", "ws", "static", "assets")
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
@@ -44,7 +49,7 @@ _POLICY = (
 
 
 class GuardedServer(BokehTornado):
-    """Bokeh's application behind a token: whatever asks under another address is refused before it is looked at."""
+    """Bokeh application that answers requests without the token with status 403, before it parses them further."""
 
     def __init__(self, make: Callable[[Document], None], token: str, port: int) -> None:
         self.token, self.host = token, f"{HOST}:{port}"
@@ -71,20 +76,20 @@ class GuardedServer(BokehTornado):
         self.add_handlers(".*", pages)
 
     def find_handler(self, request: HTTPServerRequest, **keywords: Any) -> Any:
-        """The handler of an address, that of errors for whoever does not know the token."""
+        """Return the handler of a request; the handler of status 403 if token, path, host or origin is wrong."""
         first, _, rest = request.path.lstrip("/").partition("/")
-        known = hmac.compare_digest(first.encode("utf-8", "replace"), self.token.encode())
-        # No name of ours has other characters; the token alone, without a slash, leads to the page.
-        known = known and rest.partition("/")[0] in _SERVED and unquote(rest).isprintable()
+        valid = hmac.compare_digest(first.encode("utf-8", "replace"), self.token.encode())
+        # Paths with unprintable characters are never ours. The token without a slash is redirected to the page.
+        valid = valid and rest.partition("/")[0] in _SERVED and unquote(rest).isprintable()
         origin = request.headers.get("Origin", f"http://{self.host}")
-        # Another host's name that leads here is another origin, too.
-        if not known or request.host != self.host or origin != f"http://{self.host}":
+        # Compare the host too: another host name that resolves to this address is a different origin (DNS rebinding).
+        if not valid or request.host != self.host or origin != f"http://{self.host}":
             return self.get_handler_delegate(request, ErrorHandler, {"status_code": 403})
         return super().find_handler(request, **keywords)
 
 
-class _Closed(RequestHandler):
-    """What the browser is told of everything of ours."""
+class _SecureHandler(RequestHandler):
+    """Response headers for security and caching, sent with every file of the explorer."""
 
     def set_default_headers(self) -> None:
         self.set_header("Content-Security-Policy", _POLICY.format(host=self.application.host))  # pyright: ignore[reportAttributeAccessIssue]
@@ -93,15 +98,15 @@ class _Closed(RequestHandler):
         self.set_header("Cache-Control", "no-store")
 
 
-class AssetHandler(_Closed, StaticFileHandler):
-    """Our own scripts and styles."""
+class AssetHandler(_SecureHandler, StaticFileHandler):
+    """Handler of the scripts and styles in assets/."""
 
 
-class PageHandler(_Closed, SessionHandler):
-    """The page itself: static text, and a session for its figures."""
+class PageHandler(_SecureHandler, SessionHandler):
+    """Handler of the page: its static HTML, and a Bokeh session with its figures."""
 
     async def get(self) -> None:
-        """Open a page, unless too many are open."""
+        """Send a new page; status 503 if too many pages are open."""
         if len(list(self.application_context.sessions)) >= _MOST_PAGES:
             self.set_status(503)
             self.set_header("Content-Type", "text/plain")
@@ -111,28 +116,31 @@ class PageHandler(_Closed, SessionHandler):
         roots = {root.id: root.name for root in session.document.roots}
         item = {"token": session.token, "roots": roots, "root_ids": list(roots), "use_for_title": False}
         kinds = {"linear": SLIDERS, "rotary": ROTARY_SLIDERS}
-        sliders = {kind: {name: each._asdict() for name, each in known.items()} for kind, known in kinds.items()}
+        sliders = {
+            kind: {name: each._asdict() for name, each in sliders_of_kind.items()}
+            for kind, sliders_of_kind in kinds.items()
+        }
         start = {"items": [item], "sliders": sliders, "choices": CHOICES}
         resources: Resources = self.application.resources()
         page = (_ASSETS / "page.html").read_text(encoding="utf-8")
         script = next(file for file in resources.js_files if file.partition("?")[0].endswith("/bokeh.min.js"))
-        # As JSON in a script element: "<" could end it.
+        # Escape "<" in the JSON, because "</script>" would end the script element.
         page = page.replace("{{ bokeh }}", script).replace("{{ start }}", json.dumps(start).replace("<", "\\u003c"))
         self.set_header("Content-Type", "text/html; charset=utf-8")
         self.finish(page)
 
 
 class Explorer:
-    """A server that listens; `run` serves until it is told to stop."""
+    """Server that listens on a port; `run` serves until SIGINT or SIGTERM."""
 
     def __init__(self, controls: Controls, port: int = 0) -> None:
         try:
             listening = socket.create_server((HOST, port), backlog=256)
         except OSError as error:
             raise InputError(
-                f"--port: {port} cannot be had ({error.strerror}); choose another, or 0 for any"
+                f"--port: {port} is not available ({error.strerror}); choose another port, or 0 for any free one"
             ) from error
-        # What a stranger sends is no news, and what goes wrong in the page is said there.
+        # Silence the logs: refused requests are of no interest, and the page itself shows its errors.
         for name in ("bokeh", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         listening.setblocking(False)
@@ -142,6 +150,7 @@ class Explorer:
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="explorer")
 
         def make(document: Document) -> None:
+            """Create the page of a new session."""
             document.title = "zwidth explore"
             page = Page(document, controls, self._executor)
             document.on_session_destroyed(lambda _: page.close())
@@ -152,6 +161,7 @@ class Explorer:
         self._server = BaseServer(self.loop, application, http)
 
     def run(self) -> None:
+        """Serve pages until SIGINT or SIGTERM."""
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: self.loop.add_callback_from_signal(self.loop.stop))
@@ -160,5 +170,5 @@ class Explorer:
             self.loop.start()
         finally:
             self._server.stop(wait=False)
-            # What is being computed ends with its part.
+            # Wait for the worker, which stops after the current part of its computation.
             self._executor.shutdown(wait=True, cancel_futures=True)

@@ -11,7 +11,7 @@ from tolerances import CONTOUR, EDGE_RADIUS, RESPONSE, RIDGE
 import zwidth
 from zwidth.pages.explorer import model
 from zwidth.pages.explorer.controls import Controls, normalized_controls
-from zwidth.pages.words import spell_radius, word_of
+from zwidth.pages.words import name_verdict, spell_radius
 
 CHOICES = {
     "rigid": {},
@@ -58,7 +58,7 @@ def test_the_verdict_at_once_is_that_of_assess(scene):
 
 
 def test_the_passive_set_ends_where_walls_cease_to_be_passive(scene):
-    edge: Any = model.passive_set(scene)
+    edge: Any = model.find_passive_boundary(scene)
     if scene.device.coupling is not None and scene.device.coupling.sensor == "tip":
         assert edge is None
         return
@@ -68,13 +68,13 @@ def test_the_passive_set_ends_where_walls_cease_to_be_passive(scene):
 
 
 def test_without_damping_nothing_is_passive():
-    edge: Any = model.passive_set(Controls().change({"damping": 0}).scene)
+    edge: Any = model.find_passive_boundary(Controls().change({"damping": 0}).scene)
     assert edge[0].size == edge[1].size == 0
 
 
 def test_the_step_response_is_that_of_the_library():
     scene = Controls().change({"delay": 1.3}).scene
-    time, position = model.step_motion(scene, 60)
+    time, position = model.compute_step_response(scene, 60)
     units = scene.units
     exact = zwidth.step_response(*scene.normalized, periods=61, substeps=1)
     np.testing.assert_allclose(time, exact.time * scene.timing.period, rtol=1e-14)
@@ -83,7 +83,7 @@ def test_the_step_response_is_that_of_the_library():
 
 def test_the_crossover_lies_on_the_unit_circle(scene):
     verdict = zwidth.assess(scene)
-    shown = model.open_loop(scene, verdict)["crossover"]
+    shown = model.compute_open_loop(scene, verdict)["crossover"]
     cross = complex(shown["x"][0], shown["y"][0])
     assert abs(cross) == pytest.approx(1.0, rel=1e-9)
     # The sign of the margin is the verdict's.
@@ -94,7 +94,7 @@ def test_the_ridge_path_goes_through_the_stiffest_wall():
     for change in ({}, {"velocity": "LowPass"}):
         scene = Controls().change(change).scene
         best = scene.max_stiffness()
-        x, y = model.ridge_path(scene)
+        x, y = model.compute_ridge(scene)
         middle = (x.size - 1) // 4
         assert x[middle] == pytest.approx(float(best.stiffness), rel=1e-9)
         assert y[middle] == pytest.approx(float(best.virtual_damping), rel=1e-6)
@@ -102,8 +102,8 @@ def test_the_ridge_path_goes_through_the_stiffest_wall():
 
 
 def test_contours_are_where_they_say(scene):
-    across, up = model.frame(scene.stable_region()[0][:2], (10e3, 40.0))
-    found = model.contours(scene, across, up)
+    across, up = model.choose_ranges(scene.stable_region()[0][:2], (10e3, 40.0))
+    found = model.find_contours(scene, across, up)
     levels = {}
     for x, y in zip(found["xs"], found["ys"], strict=True):
         radius = scene.spectral_radius(x, y)
@@ -124,18 +124,18 @@ def test_contours_are_where_they_say(scene):
 def test_the_frame_holds_the_edge_and_the_wall():
     (edge,) = Controls().scene.stable_region()
     for wall in ((0.0, 0.0), (30e3, 150.0), (-9e3, 40.0)):
-        across, up = model.frame(edge[:2], wall)
+        across, up = model.choose_ranges(edge[:2], wall)
         assert across[0] <= min(edge[0].min(), wall[0]) < max(edge[0].max(), wall[0]) <= across[1]
         assert up[0] <= min(edge[1].min(), wall[1]) < max(edge[1].max(), wall[1]) <= up[1]
     # What is far away does not make the set a dot.
-    assert model.frame(edge[:2], (1e9, 40.0)) == model.frame(edge[:2], (10e3, 40.0))
+    assert model.choose_ranges(edge[:2], (1e9, 40.0)) == model.choose_ranges(edge[:2], (10e3, 40.0))
     nothing = np.empty(0), np.empty(0)
-    assert all(low < high for low, high in model.frame(nothing, (0.0, 0.0)))
+    assert all(low < high for low, high in model.choose_ranges(nothing, (0.0, 0.0)))
 
 
 def test_a_contact_is_the_simulation():
     scene = Controls().scene
-    _, position, force, words = model.contact_motion(scene, 50)
+    _, position, force, words = model.simulate_hit(scene, 50)
     hit = scene.simulate(start_position=-5e-4, start_velocity=0.1, contact="unilateral", periods=50)
     np.testing.assert_array_equal(position, hit.position)
     np.testing.assert_array_equal(force, hit.wall_force)
@@ -146,7 +146,7 @@ def test_a_contact_is_the_simulation():
 
 def test_a_strongly_damped_device_reaches_the_wall_that_it_is_to_hit():
     scene = normalized_controls(0.5, 0.4, 1.0, 1.0).scene
-    _, position, force, _ = model.contact_motion(scene, 50)
+    _, position, force, _ = model.simulate_hit(scene, 50)
     assert position[0] < 0 < position.max()
     assert np.any(force)
 
@@ -158,7 +158,7 @@ def test_a_huge_radius_is_told_in_few_digits():
 
 def test_normalized_words_have_the_numbers_of_the_verdict():
     verdict: Any = zwidth.assess(normalized_controls(0.1, 0.4, 0.1, 1.0).scene)
-    text = "\n".join(model.normalized_lines(verdict))
+    text = "\n".join(model.format_normalized_verdict(verdict))
     for number in (verdict.alpha_max, verdict.beta_at_max, verdict.stiffness_limit, verdict.gain_margin):
         assert f"{number:.4g}" in text
     assert "N/m" not in text
@@ -168,7 +168,7 @@ def test_normalized_words_have_the_numbers_of_the_verdict():
 def test_the_bode_plot_is_that_of_the_loop(delay):
     """Without its delay the loop never turns by half a turn between two frequencies: the reference is unwrapped so."""
     scene = Controls().change({"delay": delay}).scene
-    shown = model.open_loop(scene, zwidth.assess(scene))["bode"]
+    shown = model.compute_open_loop(scene, zwidth.assess(scene))["bode"]
     prompt = scene.replace(delay=0).frequency_response(frequency=shown["x"])
     np.testing.assert_allclose(shown["gain"], 20 * np.log10(np.abs(prompt)), atol=1e-6)
     late = 360 * shown["x"] * delay * 1e-3
@@ -189,7 +189,7 @@ RINGING = zwidth.Device(0.1, 1.0, modes=[zwidth.Mode(frequency=40, damping_ratio
 )
 def test_the_margins_stand_on_the_bode_plot(scene):
     verdict = zwidth.assess(scene)
-    shown = model.open_loop(scene, verdict)
+    shown = model.compute_open_loop(scene, verdict)
     assert shown["crossover"]["phase"][0] + 180 == pytest.approx(verdict.phase_margin, abs=1e-6)
     loop = scene.frequency_response(frequency=shown["turned"]["hertz"])
     assert shown["turned"]["gain"] == pytest.approx(20 * np.log10(np.abs(loop)), abs=1e-6)
@@ -206,7 +206,7 @@ def test_the_margins_stand_on_the_bode_plot(scene):
     ],
 )
 def test_an_arrow_at_the_border_points_to_the_wall(wall, x, y, angle):
-    arrow = model.point_at(wall, (0.0, 10.0), (0.0, 10.0))
+    arrow = model.place_arrow(wall, (0.0, 10.0), (0.0, 10.0))
     if angle is None:
         assert arrow["x"] == []
         return
@@ -227,10 +227,10 @@ def test_islands_are_named_above_themselves():
 def test_captions_follow_the_verdict(stiffness, word, outside):
     scene = Controls().scene.replace(stiffness=stiffness)
     verdict = zwidth.assess(scene)
-    poles = model.caption_poles(scene.poles(), word_of(verdict))
+    poles = model.caption_poles(scene.poles(), name_verdict(verdict))
     assert poles.startswith(f"{word}: {f'{outside} of 4' if outside else ''}")
     captions = model.caption_curves(verdict, False)
     assert captions["nyquist_words"].startswith(f"{word}: ")
-    assert ("go around" in captions["nyquist_words"]) == (word == "Unstable")
+    assert ("mirror image encircle" in captions["nyquist_words"]) == (word == "Unstable")
     assert ("phase" in captions["bode_words"]) == (word != "Marginal")
     assert {"Stable": "decays", "Unstable": "grows", "Marginal": "neither"}[word] in captions["step_words"]

@@ -111,7 +111,7 @@ def test_what_is_no_message_is_said_and_changes_nothing(page):
     for data in NO_MESSAGES:
         before = page.controls
         page.receive(data)
-        assert "no message" in page.texts["error"], data
+        assert "invalid message" in page.texts["error"], data
         assert page.controls == before, data
         say(page, set={"mass": 200})
         assert page.texts["error"] == "", data
@@ -141,7 +141,7 @@ def test_what_goes_wrong_while_computing_is_said(page, monkeypatch):
     monkeypatch.setattr("zwidth.pages.explorer.model.assess", fail)
     say(page, rest=True)
     page.queue.work()
-    assert page.texts["error"].startswith("this cannot be computed (ZeroDivisionError: far away); ")
+    assert page.texts["error"].startswith("the computation failed (ZeroDivisionError: far away); ")
     assert page.texts["busy"] is False
     # Nothing is left that is of the wall before.
     assert page.texts["verdict"] == ""

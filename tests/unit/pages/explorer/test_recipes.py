@@ -78,9 +78,9 @@ def test_the_address_is_the_view(view):
 @pytest.mark.parametrize(
     "link, says",
     [
-        ("nonsense", "address: what follows its # is no scene"),
-        ("a=1&" * 200, "address: what follows its # is no scene"),
-        ("modes=" + "[" * 100_000, "address: what follows its # is no scene"),
+        ("nonsense", "address: the text after # is not a scene"),
+        ("a=1&" * 200, "address: the text after # is not a scene"),
+        ("modes=" + "[" * 100_000, "address: the text after # is not a scene"),
         ("mass=-1&period=1+ms", "scene.mass: got -1 kg"),
         ("mass=NaN&period=1+ms", "scene.mass: got .nan"),
         ("mass=100+g&period=1+ms&stiffness=1&delay=10+s", "delay"),

@@ -1,16 +1,19 @@
 "use strict";
-// Native controls on the left, Bokeh's figures beside them; one source carries changes to Python, one its answers back.
+// Script of the explorer page. The controls are HTML elements, the figures are Bokeh's. One Bokeh data source (`inputs`)
+// sends changed values to Python, another one (`answer`) receives the replies.
 const start = JSON.parse(document.getElementById("start").textContent);
 const by = id => document.getElementById(id);
 const STEPS = 1000;
-const LABELS = { mode: "numbers", velocity: "velocity estimate", coupling: "compliance" };
+const LABELS = { mode: "units", velocity: "velocity estimate", coupling: "compliance" };
 const fields = {};
 const CAPTIONS = ["poles_words", "nyquist_words", "bode_words", "step_words", "contact_words"];
 let inputs = null, serial = 0, answered = 0, waiting = {}, sent = {}, rests = false, scheduled = false;
-// What is being moved, and what the newest entry of the history came from: a whole drag is one entry.
+// Name of the control that the user is moving, and the one that created the latest entry of the browser's history, so
+// that a drag creates only one entry.
 let moved = "", entry = "", opens = false, asked = [0, ""];
 
-// A slider's place, 0 to STEPS, and its value: logarithmic above 0, cubic from 0, linear through 0.
+// Convert between the position of a slider, 0 to STEPS, and its value. The scale is linear for charts and for ranges with
+// negative values, logarithmic for ranges above 0, and cubic for ranges from 0.
 function valueAt(field, place) {
   const { low, high } = field, share = place / STEPS;
   const value = field.linear || low < 0 ? low + (high - low) * share : low > 0 ? low * (high / low) ** share : high * share ** 3;
@@ -31,8 +34,8 @@ function addRow(form, name, label, ...controls) {
   form.append(row);
   return row;
 }
-// A number that is typed, and what it changes.
-function addNumber(field, name, change = value => ({ [name]: value }), kind = "no number") {
+// Add the input field of a number; `change` converts the number to changed parameters.
+function addNumber(field, name, change = value => ({ [name]: value }), kind = "not a number") {
   const number = field.number = element("input", { type: "number", step: "any", id: name });
   number.addEventListener("input", () => doubt(number.value !== String(field.shown)));
   number.addEventListener("keydown", event => { if (event.key === "Escape") send({}, true); });
@@ -58,7 +61,7 @@ function addSlider(form, name) {
   field.range.addEventListener("change", () => slide(true));
   fields[name] = field;
 }
-// Labels, units and ranges of linear devices or of rotary ones.
+// Set labels, units and ranges for linear or for rotary devices.
 function setMotion(motion) {
   for (const [name, field] of Object.entries(fields)) {
     if (!field.slides || field.motion === motion) continue;
@@ -83,7 +86,7 @@ function build() {
     addSlider(form, name);
     if (name === "period") {
       const field = fields.rate = { text: "rate 1/T in Hz" };
-      const number = addNumber(field, "rate", value => ({ period: value > 0 ? 1e3 / value : NaN }), "no number above 0");
+      const number = addNumber(field, "rate", value => ({ period: value > 0 ? 1e3 / value : NaN }), "not a number above 0");
       field.row = addRow(form, "rate", `or ${field.text}`, element("span"), number);
     }
   }
@@ -94,7 +97,7 @@ function build() {
   setMotion("linear");
 }
 
-// The newest values go out when the last answer is in: what lies between is skipped, and nothing queues up.
+// Send the latest values after the previous reply has arrived. Skip intermediate values, so that no queue builds up.
 function send(changes, rest) {
   Object.assign(waiting, changes);
   rests = rests || rest;
@@ -115,7 +118,7 @@ function flush() {
     inputs.data = { json: [JSON.stringify(message)] };
   });
 }
-// An entry that is not the scene's: what the page shows is of the scene before it.
+// Mark the results as stale while an input field differs from the computed scene.
 function doubt(is) {
   document.body.classList.toggle("stale", is);
   by("stale").hidden = !is;
@@ -132,7 +135,7 @@ function accept() {
 }
 function remember(link, number) {
   const [first, hash] = asked, back = number <= first;
-  // Who goes back quickly is further than the answer is.
+  // Ignore the reply if the user has meanwhile gone to another entry of the history.
   if (opens || (back && location.hash !== hash)) return;
   if (location.hash !== `#${link}`) history[back || (moved && moved === entry) ? "replaceState" : "pushState"](null, "", `#${link}`);
   entry = moved || "-";
@@ -195,7 +198,7 @@ async function copy(text, area) {
     await navigator.clipboard.writeText(text);
     by("copied").textContent = "copied";
   } catch {
-    by("copied").textContent = area ? "the text is selected; copy it with Ctrl-C" : "copy it from the browser's own line";
+    by("copied").textContent = area ? "the text is selected: press Ctrl-C" : "not copied: copy it from the address bar";
   }
 }
 function download(blob, kind) {
