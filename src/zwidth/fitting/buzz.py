@@ -19,8 +19,16 @@ from zwidth.fitting.buzz_search import (
     weigh,
 )
 from zwidth.fitting.buzzing import Onsets
-from zwidth.fitting.device_estimate import differentiate, find_stiffest
-from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FurtherExperiment, RivalDevice, doubt_period
+from zwidth.fitting.device_estimate import differentiate, differentiate_stiffness_max
+from zwidth.fitting.device_fit import (
+    BEYOND,
+    MASS_OPEN,
+    VAGUE,
+    DeviceFit,
+    FurtherExperiment,
+    RivalDevice,
+    check_period_unit,
+)
 from zwidth.fitting.words import spell_rival
 from zwidth.parts.checks import check_number, find_kind, read_texts
 from zwidth.parts.velocity import BackwardDifference, Velocity
@@ -144,8 +152,8 @@ def fit_buzz(
     _refuse_blind(slopes, best.theta, table, bool(equals), system)
     information = slopes.T @ slopes / scale
     scene = chosen.scene(best.theta)
-    by_theta = differentiate(lambda theta: onsets.normalize(theta).to_numbers(period), best.theta)
-    stiffest, slope = find_stiffest(scene)
+    by_theta = differentiate(lambda theta: onsets.normalize(theta).to_parameters(period), best.theta)
+    stiffest, slope = differentiate_stiffness_max(scene)
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
     apart = [best.theta]
     for other in equals[1:] if status == Status.OK else ():
@@ -176,7 +184,7 @@ def fit_buzz(
         covariance=covariance,
         noise=share or (float(np.sqrt(scale)), float(np.sqrt(scale))),
         residuals=best.residuals / np.sqrt(scale),
-        doubts=(*doubts, *doubt_period(period)),
+        doubts=(*doubts, *check_period_unit(period)),
         status=int(status),
         freedom=None if share else chosen.freedom,
         rivals=rivals,

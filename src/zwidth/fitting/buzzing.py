@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.fitting.device_estimate import DimensionlessDevice
-from zwidth.fitting.required_wall import RequiredWall
+from zwidth.fitting.required_wall import CriticalController
 from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate, Velocity
 from zwidth.words.unit_system import LINEAR, UnitSystem
@@ -60,7 +60,7 @@ class Onsets:
 
     def follow(self, theta: np.ndarray) -> Followed:
         """Return the walls of the device theta at the measured dampings, with w nearest to the measured one."""
-        mass, required, estimate, w = np.exp(theta[0]), RequiredWall(*theta[1:3]), self._estimate, self.w
+        mass, required, estimate, w = np.exp(theta[0]), CriticalController(*theta[1:3]), self._estimate, self.w
         step = np.full(w.shape, np.inf)
         for _ in range(STEPS):
             at = circle(w)
@@ -77,7 +77,7 @@ class Onsets:
 
         def differentiate() -> np.ndarray:
             # d kappa + e_w dw = m dq - rub dF, with e_w = rub F' - m q'.
-            moved = mass * np.stack([q.value, *required.moves(at, q.value)], -1)
+            moved = mass * np.stack([q.value, *required.differentiate(at, q.value)], -1)
             by_w = (self.rub * f.slope - mass * q.slope)[:, None]
             dw = moved.imag / by_w.imag
             return np.stack([(moved.real - by_w.real * dw) / kappa[:, None], dw / w[:, None]], 1)
@@ -97,7 +97,7 @@ class Onsets:
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)
         at = circle(self.w)
-        q = RequiredWall(deltas[:, None, None], delays[:, None]).jet(at).value
+        q = CriticalController(deltas[:, None, None], delays[:, None]).jet(at).value
         away = np.log((self.kappa + self.rub * self._estimate.jet(at).value) / q)
         log_mass = away.real.mean(-1)
         cost = (away.imag**2).sum(-1) + ((away.real - log_mass[..., None]) ** 2).sum(-1)

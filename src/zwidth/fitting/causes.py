@@ -110,7 +110,7 @@ def _solve(wanted: np.ndarray, columns: list[np.ndarray]) -> tuple[np.ndarray, f
 
 def explain_residuals(best: FittedModel, system: UnitSystem) -> str:
     """Return the cause of residuals that are not white noise as a clause; "" if no cause is identified."""
-    slopes = best.motion.slopes
+    slopes = best.response.derivatives
     basis = np.linalg.qr(slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300))[0]
     left = best.residuals - basis @ (basis.T @ best.residuals)
     squares = float(left @ left)
@@ -160,7 +160,7 @@ def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float, syst
         squares: residual sum of squares.
     """
     forces = np.concatenate([log.force for log in best.model.logs])
-    step, largest = find_steps(forces)[1], best.model.largest
+    step, largest = find_steps(forces)[1], best.model.largest_force
     if step < _MIN_STEP * largest or np.unique(forces).size < _MIN_LEVELS:
         return ""
     rng, expected = np.random.default_rng(0), []

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.buzz import BuzzPoint
-from zwidth.fitting.device_estimate import reach_of
+from zwidth.fitting.device_estimate import compute_reach
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.words import unit_of
 from zwidth.words.errors import InputError
@@ -54,7 +54,7 @@ def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
     return {
         header("lag", "s"): lags * fit.period,
         "autocorrelation": products / size if size > 0 else np.full(most, np.nan),
-        "band": np.full(most, reach_of(None) / np.sqrt(count)),
+        "band": np.full(most, compute_reach(None) / np.sqrt(count)),
     }
 
 

@@ -41,7 +41,7 @@ import numpy as np
 
 from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
-from zwidth.fitting.required_wall import DeviceRows, RequiredWall
+from zwidth.fitting.required_wall import CriticalController, GridLimits
 from zwidth.parts.circle import circle
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.measured_curve import LEAST_DAMPING_RATIO
@@ -214,7 +214,7 @@ def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenR
     order = np.argsort(grid, -1)
     grid, response = (np.take_along_axis(each, order, -1) for each in (grid, np.concatenate(responses, -1)))
     velocity = scene.velocity.estimate(period).jet(circle(2.0 * np.pi * grid)).value
-    reference, *stiffness = DeviceRows(-1.0 / response, velocity / period).stiffest()
+    reference, *stiffness = GridLimits(-1.0 / response, velocity / period).find_stiffness_max()
     return HiddenResonances(odds, np.array(stiffness) / reference) if reference > 0 else None
 
 
@@ -265,7 +265,7 @@ def _build_frequency_grid(scene: Scene, phase_step: float) -> np.ndarray:
 def _evaluate_unit_modes(fit: FittedModel, grid: np.ndarray, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
     """Return the contribution of unit modes to the frequency response."""
     (g, delta, d), mode = fit.theta[:3], (2.0 * np.pi * frequency, ratio, np.sqrt(1.0 - ratio**2))
-    return g * RequiredWall(delta, d, (), [mode]).add(circle(2.0 * np.pi * grid))
+    return g * CriticalController(delta, d, (), [mode]).add(circle(2.0 * np.pi * grid))
 
 
 def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -273,8 +273,8 @@ def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tup
     points = circle(2.0 * np.pi * grid.ravel())
 
     def evaluate(theta: np.ndarray) -> np.ndarray:
-        wall = RequiredWall(*fit.model.normalize(theta, period)[1:])
-        return (-theta[0] / wall.value(points)).reshape(grid.shape)
+        controller = CriticalController(*fit.model.normalize(theta, period)[1:])
+        return (-theta[0] / controller.value(points)).reshape(grid.shape)
 
     count, response = fit.model.parts.stop, evaluate(fit.theta)
     steps = np.abs(fit.theta[:count])
@@ -289,7 +289,7 @@ def truncate_logs(fit: FittedModel) -> FittedModel:
     """Return the fit restricted to the first `MAX_SAMPLES` positions of each log."""
     if max(log.position.size for log in fit.model.logs) <= MAX_SAMPLES:
         return fit
-    part = replace(fit, model=fit.model.begin(MAX_SAMPLES), rivals=())
+    part = replace(fit, model=fit.model.truncate(MAX_SAMPLES), rivals=())
     part = replace(part, squares=float(part.residuals @ part.residuals))
     return replace(part, model=replace(part.model, noise=part.noise)) if fit.model.noise is not None else part
 

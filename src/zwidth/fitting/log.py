@@ -8,8 +8,8 @@ import numpy as np
 
 from zwidth.fitting.causes import Cause, explain_motion, explain_residuals
 from zwidth.fitting.choosing import ALIKE, EXACT, Choice, choose_structure
-from zwidth.fitting.device_estimate import differentiate, reach_of
-from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, doubt_period
+from zwidth.fitting.device_estimate import compute_reach, differentiate
+from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, check_period_unit
 from zwidth.fitting.encoder import fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_response, sample_resonances
 from zwidth.fitting.hidden_lag import bound_lag
@@ -142,7 +142,7 @@ def _fit(
             )
     count = sum(map(len, stretches))
     recordings = tuple(
-        Recording(log.force[each], log.position[each][skip:], skip).begin(_MOST // count)
+        Recording(log.force[each], log.position[each][skip:], skip).truncate(_MOST // count)
         for log, own in zip(logs, stretches, strict=True)
         for each in own
     )
@@ -151,20 +151,22 @@ def _fit(
     step, (best, pole, bank, lags) = _choose_step(recordings, longest, steps)
     model, theta = best.model, best.theta
     _refuse_unmoved(best, period, system)
-    if best.inverse.open[:3].any():
+    if best.inverse.undetermined[:3].any():
         raise InputError(
             "force: mass, damping and delay cannot be told apart by this log; record longer, with a force that changes "
             "its sign at different times, as steps to and fro"
         )
     scene, known = model.normalize(theta, period).to_scene(period, velocity, system), slice(0, model.parts.stop)
-    by_theta = differentiate(lambda theta: model.normalize(theta, period).to_numbers(period), theta)[:, known]
-    (by_period,) = differentiate(lambda time: model.normalize(theta, time[0]).to_numbers(time[0]), np.array([period])).T
+    by_theta = differentiate(lambda theta: model.normalize(theta, period).to_parameters(period), theta)[:, known]
+    (by_period,) = differentiate(
+        lambda time: model.normalize(theta, time[0]).to_parameters(time[0]), np.array([period])
+    ).T
     late = wavers * period * by_period
     covariance = by_theta @ best.covariance[known, known] @ by_theta.T + np.outer(late, late)
     freedom = max(1, best.count - theta.size)
     unexplained = _find_unexplained(best, pole, period, system) if bank else []
     doubts = odd + doubts + _doubt(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
-    status = Status.OK if best.arrived else Status.NOT_CONVERGED
+    status = Status.OK if best.converged else Status.NOT_CONVERGED
     # The true device has another K_max then.
     status = Status.UNDECIDED if status == Status.OK and unexplained else status
     if theta[2] > longest - 1e-3:
@@ -177,7 +179,7 @@ def _fit(
     shown: dict[str, Any] = {}
     if bank and not unexplained:
         shown = {"response": bound_response(best, scene, bank), "hidden": sample_resonances(best, scene, bank)}
-        shown |= {"lag": bound_lag(best, lags, scene, reach_of(freedom))}
+        shown |= {"lag": bound_lag(best, lags, scene, compute_reach(freedom))}
     return DeviceFit(
         nominal=scene,
         covariance=covariance,
@@ -188,7 +190,7 @@ def _fit(
         motions=motions,
         noise=float(np.sqrt(best.variance)),
         residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
-        doubts=(*doubts, *doubt_period(period)),
+        doubts=(*doubts, *check_period_unit(period)),
         status=int(status),
         freedom=freedom,
         notes=notes,
@@ -223,7 +225,7 @@ def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
     slope = np.array([-value / g, 1.0 / g])
     error = float(np.sqrt(slope @ best.covariance[np.ix_(those, those)] @ slope))
     # The lower bound of the friction in the search means no friction.
-    none = k == -1 and value <= 2.0 * LEAST * best.model.largest
+    none = k == -1 and value <= 2.0 * LEAST * best.model.largest_force
     return 0.0 if none else float(value), error
 
 
@@ -258,7 +260,7 @@ def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> Non
     """Raise `InputError` if the force explains too little of the motion, or if the fitted mass is negative."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
     # Residuals of the motion without any force, friction included.
-    alone = model.follow(np.append(theta[:-2], [0.0, 0.0])).slopes[:, model.parts.stop : -2]
+    alone = model.simulate(np.append(theta[:-2], [0.0, 0.0])).derivatives[:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
     if float(rest @ rest) - squares <= _SEEN**2 * squares / model.measured.size:
@@ -305,7 +307,7 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Reco
         slip = light if mass < lightest else heavy
         what = f"a mass of {with_unit(mass, units['kg'])} is far from any device"
         doubts.append(f"{what}; {slip}: {place}, {newton} and s are meant")
-    way, push = max(float(np.ptp(log.position)) for log in logs), best.model.largest
+    way, push = max(float(np.ptp(log.position)) for log in logs), best.model.largest_force
     if way > farthest:
         what = f"a way of {with_unit(way, place)} is far from any device"
         doubts.append(f"{what}; the position may be in {fine}: {place} is meant")
@@ -331,7 +333,7 @@ def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Reco
             f"the damping is hardly seen, its standard error is {with_unit(errors[1], units['N s/m'], 2)}; record "
             f"more than {span} samples, or a faster motion"
         )
-    if delay == 0 and (away := best.step_beyond(2)) < -BEYOND:
+    if delay == 0 and (away := best.estimate_step(2)) < -BEYOND:
         doubts.append(
             f"the delay is 0 at best: a negative delay would fit better, by {plain(-away, 2)} standard errors; check "
             "for a shifted column"
@@ -348,7 +350,7 @@ def _place(
     period: float,
 ) -> tuple[FittedMotion, ...]:
     """Return each log with its fitted positions, NaN for samples that are not fitted (first ones, and after gaps)."""
-    motions, parts = [], iter(best.model.split(best.motion.position))
+    motions, parts = [], iter(best.model.split(best.response.position))
     for log, place, own in zip(logs, places, stretches, strict=True):
         modelled = np.full(log.force.size, np.nan)
         for each in own:

@@ -82,7 +82,7 @@ def test_a_resonance_whose_numbers_are_open_has_no_safe_wall():
     force, position = record(OTHERS["compliance of 50 Hz, encoder at the motor"], 0, step=2e-4)
     fit = zwidth.fit_log(PERIOD, position, force)
     safe = fit.safe_wall()
-    assert fit.is_doubted or fit.respond(0.99, True) is None
+    assert fit.is_doubted or fit.build_response_scene(0.99, True) is None
     assert safe.status == Status.UNDECIDED
     assert np.isnan(safe.stiffness)
     assert fit.recommended.status == Status.UNREACHABLE

@@ -171,7 +171,7 @@ def test_a_lag_that_swings_is_modelled_and_a_hand_refused():
     fit = zwidth.fit_log(PERIOD, move(0.1, 2.0, 1e-3, swinging) + 1e-6 * rng.standard_normal(600), force)
     assert (fit.status, fit.is_structured) == (Status.OK, True)
     rigid = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=PERIOD, delay=1e-3))
-    loop: Any = fit.respond(0.99, True)
+    loop: Any = fit.build_response_scene(0.99, True)
     device = loop.device
     hertz = device.frequency
     turn = np.exp(-2j * np.pi * hertz * PERIOD)
