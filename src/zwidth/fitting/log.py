@@ -333,7 +333,7 @@ def _list_warnings(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tu
         return warnings
     if damping == 0:
         warnings.append(
-            "the damping is at its lower bound, 0: a negative damping would fit better; record longer, or a faster motion"
+            "the damping is at its lower bound, 0: a negative one would fit better; record longer, or a faster motion"
         )
     elif errors[1] > VAGUE * damping:
         longest = max(log.force.size for log in logs)

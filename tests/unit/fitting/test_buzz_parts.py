@@ -54,13 +54,13 @@ def test_walls_and_parameters_have_the_derivatives_of_differences():
     onsets, theta = Onsets(kappa, rub, w, VELOCITY, PERIOD), np.array([np.log(0.1), 0.03, 1.3])
 
     def follow(theta):
-        walls = onsets.follow(theta)
+        walls = onsets.predict_walls(theta)
         return np.log(np.stack([walls.kappa, walls.w], 1))
 
     def to_parameters(theta):
         return onsets.normalize(theta).to_parameters(PERIOD)
 
-    slopes = onsets.follow(theta).slopes()
+    slopes = onsets.predict_walls(theta).differentiate()
     np.testing.assert_allclose(slopes, differ(follow, theta), rtol=1e-6, atol=1e-8 * np.abs(slopes).max())
     np.testing.assert_allclose(differentiate(to_parameters, theta), differ(to_parameters, theta), rtol=1e-7, atol=1e-9)
 
