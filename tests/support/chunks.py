@@ -30,12 +30,6 @@ def replay(path, family, index):
             shutil.copyfile(theirs, ours)
 
 
-def slowly(path, family, index):
-    """A chunk that takes a moment, so that something can happen meanwhile."""
-    time.sleep(0.02)
-    perform(path, family, index)
-
-
 def failing_on_2(path, family, index):
     """Chunk 2 always fails."""
     if index == 2:

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from zwidth import __version__
-from zwidth.cli.hardware import diagnose_wall, hardware_options
+from zwidth.cli.hardware import diagnose_wall, hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     SHARE,
@@ -31,6 +31,7 @@ from zwidth.pages.words import row
 from zwidth.parts.device import Device
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
+from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import InputError, ZwidthError, check_choice, how_to_install
 from zwidth.words.formatting import plain, spell_stiffness, with_unit
 from zwidth.words.quantities import SIZES, Range
@@ -88,7 +89,8 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
             result["damper_range"] = scene.damper_range().tolist()
         result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
     else:
-        lines = check_lines(scene, verdict, limits, silent=find_silent(), diagnosis=diagnosis, verbose=verbose)
+        told = {"silent": find_silent(), "hardware": spell_hardware_of_file(scene)}
+        lines = check_lines(scene, verdict, limits, **told, diagnosis=diagnosis, verbose=verbose)
     words.tell(result, lines + words.note_lines(notes), as_json, words.LABEL)
 
 
@@ -140,12 +142,15 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
     result["kind"] = kind
     if given is not None:
         slopes, notes = words.list_slopes(scene), words.scene_notes(scene) + _say_stiffer(scene)
+        stiffest = scene.replace(wall=VirtualWall(float(wall.stiffness), float(wall.virtual_damping)))
+        cautions = [*words.compare_with_limit(stiffest), *words.silent_cautions(scene, find_silent())]
         found = wall.stiffness, wall.virtual_damping, wall.frequency
         named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, found), strict=True))
         result |= named | {
             "sensitivities": {slope.name: slope.as_dict() for slope in slopes},
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
+            "cautions": cautions,
         }
         B, f = with_unit(found[1], scene.unit_system["N s/m"]), with_unit(named["frequency"], "Hz")
         K = spell_stiffness(named["stiffness_max"], scene.unit_system)
@@ -155,7 +160,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
             *lines,
             words.line("device", spell_device(scene, find_silent())),
             *words.part_lines(scene),
-            *(words.line("CAUTION", text) for text in words.silent_cautions(scene, find_silent())),
+            *(words.line("CAUTION", text) for text in cautions),
             words.line("next", "zwidth recommend, with the same options, for the wall to set"),
             "",
             *(slope.line() for slope in slopes),
@@ -324,7 +329,11 @@ _DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")
 @click.option("--stiffness-fraction", type=SHARE, help="Largest share of K_max.  [default: 75%]")
 @click.option("--gain-margin", type=_FACTOR, help="Smallest gain margin, a factor on K and B together.  [default: 2]")
 @click.option("--phase-margin", type=_DEGREES, help="Smallest phase margin, in degrees.  [default: 30]")
-@click.option("--passive", is_flag=True, help="Only passive walls, which are stable in every passive hand.")
+@click.option(
+    "--passive",
+    is_flag=True,
+    help="Only passive walls: stable in any grasp, because no passive hand can destabilize them.",
+)
 @click.option(
     "--grasps",
     type=click.Choice(("all", "soft", "none")),
@@ -378,7 +387,8 @@ def recommend(
         result["cautions"] += words.silent_cautions(scene, find_silent())
         result |= {} if diagnosis is None else {"diagnosis": diagnosis.as_dict()}
     else:
-        lines = recommend_lines(found, silent=find_silent(), diagnosis=diagnosis, verbose=verbose)
+        told = {"silent": find_silent(), "hardware": spell_hardware_of_file(scene)}
+        lines = recommend_lines(found, **told, diagnosis=diagnosis, verbose=verbose)
     words.tell(result, [*lines, *words.note_lines(notes), *wrote], as_json, words.LABEL)
     if found.status != Status.OK:
         raise SystemExit(EXIT_FAILED)

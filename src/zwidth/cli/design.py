@@ -17,11 +17,10 @@ from zwidth.cli.options import (
     flag_of,
     json_option,
     read_pairs,
-    read_share,
     scene_options,
 )
 from zwidth.pages.verdict import spell_device
-from zwidth.pages.words import LABEL, line, part_lines, tell
+from zwidth.pages.words import LABEL, line, note_lines, part_lines, tell
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import (
     count_digits,
@@ -34,6 +33,7 @@ from zwidth.words.formatting import (
 )
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.status import Status
+from zwidth.words.units import read_share
 
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
@@ -177,6 +177,7 @@ def _tolerate(
     scene: Any, shares: dict[str, float], distribution: Any, samples: int | None, seed: int
 ) -> tuple[dict[str, Any], list[str]]:
     """Return the share of random devices within tolerances on which the wall is stable, as data and as lines."""
+    from zwidth.scenes.assessment import describe_islands
     from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 
     count = samples if samples is not None else scene.loop.draws
@@ -199,7 +200,7 @@ def _tolerate(
     ]
     if found.stiffness_max == found.stiffness_max:
         lines.append(line("", f"or up to {most}, each device with its best B"))
-    return result, lines
+    return result, [*lines, *note_lines(describe_islands(scene))]
 
 
 def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:

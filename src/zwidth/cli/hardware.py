@@ -21,13 +21,26 @@ _HARDWARE = (
         "resolution",
         "m",
         POSITIVE,
-        "Step of the encoder, in m, or '2000 counts' per revolution.",
+        "Step of the encoder, in m (rotary: rad), or '2000 counts' per revolution.",
     ),
-    ("--friction", "coulomb", "N", NOT_NEGATIVE, "Coulomb friction of the device, in N."),
-    ("--static-friction", "static", "N", NOT_NEGATIVE, "Static friction, in N. Default: --friction."),
-    ("--max-force", "max_force", "N", POSITIVE, "Largest force of the motor, in N."),
-    ("--max-rate", "max_rate", "N/s", POSITIVE, "Largest rate of change of the commanded force, in N/s."),
+    ("--friction", "coulomb", "N", NOT_NEGATIVE, "Coulomb friction of the device, in N (rotary: N m)."),
+    ("--static-friction", "static", "N", NOT_NEGATIVE, "Static friction, in N (rotary: N m). Default: --friction."),
+    ("--max-force", "max_force", "N", POSITIVE, "Largest force of the motor, in N (rotary: torque in N m)."),
+    (
+        "--max-rate",
+        "max_rate",
+        "N/s",
+        POSITIVE,
+        "Largest rate of change of the commanded force, in N/s (rotary: N m/s).",
+    ),
 )
+
+
+def add_option(command: Command, chosen: str) -> Command:
+    """Add the option of one hardware parameter, such as "max_force"."""
+    flag, name, unit, allowed, text = next(each for each in _HARDWARE if each[1] == chosen)
+    kind = quantity_type(unit, allowed, counts=name == "resolution")
+    return click.option(flag, name, type=kind, help=text)(command)
 
 
 def hardware_options(command: Command) -> Command:
@@ -46,10 +59,20 @@ def hardware_options(command: Command) -> Command:
         return command(hardware=known | hardware, **given)
 
     decorated: Callable[..., Any] = with_hardware
-    for flag, name, unit, allowed, text in reversed(_HARDWARE):
-        kind = quantity_type(unit, allowed, counts=name == "resolution")
-        decorated = click.option(flag, name, type=kind, help=text)(decorated)
+    for each in reversed(_HARDWARE):
+        decorated = add_option(decorated, each[1])
     return decorated
+
+
+def spell_hardware_of_file(scene: Scene) -> str:
+    """Return encoder, friction and motor in words, as far as the scene file of the command supplies them; "" if not."""
+    from zwidth.scenes.trials import spell_hardware
+
+    given = click.get_current_context().params
+    values = {name: value for name, value in get_hardware().items() if given[name] is None}
+    if not values or isinstance(scene.device, MeasuredDevice):
+        return ""
+    return f"{spell_hardware(values, scene.unit_system)} (from {given['scene_file'].name})"
 
 
 def diagnose_wall(scene: Scene, hardware: dict[str, Any], *, remedies: bool) -> Any:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
 from zwidth.cli.commands import EXIT_FAILED, cli
-from zwidth.cli.hardware import diagnose_wall
+from zwidth.cli.hardware import add_option, diagnose_wall
 from zwidth.cli.help import show_example
 from zwidth.cli.options import (
     SHARE,
@@ -78,6 +79,7 @@ _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 @log_options
 @click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay to search for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Treat samples with timestamp jitter as evenly spaced.")
+@partial(add_option, chosen="max_force")
 @figure_option
 @click.option(
     "--code",
@@ -97,6 +99,7 @@ def fit(
     walls: tuple[Any, ...],
     loop: RecordLoop,
     noise: float | None,
+    max_force: float | None,
     figure: Path | None,
     code: Any,
     as_yaml: bool,
@@ -110,8 +113,9 @@ def fit(
     must be of the same device, with the same columns. Units are in the headers, as 'encoder [counts]', or follow a
     colon. With --buzz: from walls, at two or more values of B, at which the device began to oscillate while K was
     raised, and their frequencies.
-    SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, and the period of walls and of
-    logs without a column of times; options override it. Exit code 1: no wall is recommended (0 with --yaml).
+    SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, the motor's largest force, and
+    the period of walls and of logs without a column of times; options override it. --max-force limits the force in the
+    program of --code and in the simulation. Exit code 1: no wall is recommended (0 with --yaml).
     """
     from zwidth.fitting.words import list_units, write_scene
 
@@ -145,6 +149,8 @@ def fit(
         motions = read_logs(logs, loop, **of_logs)
         found = fit_motions(motions, period=period, velocity=velocity, **options)
         source = " and ".join(log.name for log in logs)
+    motor = {"max_force": max_force or get_hardware().get("max_force")}
+    motor = {name: value for name, value in motor.items() if value}
     wrote = []
     if figure is not None:
         from zwidth.figures import draw_device_fit
@@ -155,13 +161,13 @@ def fit(
     if code:
         if found.recommended.status != Status.OK:
             raise click.ClickException(found.recommended.reason)
-        click.echo(found.recommended.code(code), nl=False)
+        click.echo(found.recommended.code(code, **motor), nl=False)
         return
     if as_yaml:
         period_given = any(motion.time is None for motion in motions)
-        click.echo("\n".join(write_scene(found, source, period_given=period_given)))
+        click.echo("\n".join(write_scene(found, source, period_given=period_given, **motor)))
         return
-    diagnosis = _diagnose(found)
+    diagnosis = _diagnose(found, motor)
     if as_json:
         checks = {"diagnosis": None if diagnosis is None else diagnosis.as_dict()}
         print_json({**found.as_dict(), "units": list_units(found), **checks})
@@ -171,24 +177,26 @@ def fit(
         raise SystemExit(EXIT_FAILED)
 
 
-def _diagnose(found: Any) -> Any:
-    """Return the diagnosis of the recommended wall with the fitted friction and encoder; None without one of them."""
+def _diagnose(found: Any, motor: dict[str, float]) -> Any:
+    """Return the diagnosis of the recommended wall with the fitted friction and encoder and the motor's largest force.
+
+    The result is None without any of them.
+    """
     from zwidth.fitting.words import list_hardware
 
     recommended = found.recommended
     if recommended.status != Status.OK:
         return None
-    return diagnose_wall(recommended.scene, list_hardware(found), remedies=False)
+    return diagnose_wall(recommended.scene, list_hardware(found) | motor, remedies=False)
 
 
 def _list_lines(found: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
     """Return the printed lines of a fit, with the results in a hand and of a simulation as `zwidth recommend`."""
     from zwidth.fitting.words import detail_fit, summarize_fit
-    from zwidth.pages.verdict import spell_hands
 
     checks, more = [], "details: --verbose; scene for the other commands: --yaml"
     if found.recommended.status == Status.OK:
-        checks = [("in a hand", spell_hands(found.recommended))]
+        checks = [("in a hand", found.recommended.spell_hands())]
         more += "; program for the loop: --code c"
     checks += spell_diagnosis(diagnosis)
     details = [("", ""), *detail_fit(found, source)] if verbose else []

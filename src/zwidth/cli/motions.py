@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
-from zwidth.cli.hardware import hardware_options
+from zwidth.cli.hardware import hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
     figure_option,
@@ -53,6 +53,7 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
     remedy = diagnosis.advise()
     lines = [row(diagnosis.word, diagnosis.explain()), *([row("to stop it", remedy)] if remedy else [])]
     cautions = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
+    lines += [row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
     lines += [row("CAUTION", text) for text in cautions]
     words.tell(diagnosis.as_dict(), lines, as_json)
 
@@ -119,6 +120,7 @@ def simulate(
     if cause.cause not in ("none", "undecided"):
         lines.append(row("remedies", "zwidth diagnose, with the same options"))
     cautions = [*words.limit_cautions(scene), *words.silent_cautions(scene, find_silent())]
+    lines += [row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
     lines += [row("CAUTION", text) for text in cautions]
     if figure is not None:
         from zwidth.figures import plot

@@ -23,9 +23,9 @@ from zwidth.parts.velocity import ESTIMATES, name_estimate
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.words.errors import InputError
 from zwidth.words.plausible import list_doubts
-from zwidth.words.quantities import ANY, CHOICES, OF_PARTS, PARAMETERS, Range
+from zwidth.words.quantities import ANY, CHOICES, HARDWARE, OF_PARTS, PARAMETERS, Range
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
-from zwidth.words.units import DIMENSIONS, read_quantity, tell_kind
+from zwidth.words.units import DIMENSIONS, read_quantity, read_share, tell_kind
 
 if TYPE_CHECKING:
     from zwidth.parts.devices import KnownDevice
@@ -93,12 +93,6 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
         return read_quantity(number, dimension, allowed, counts=counts)[0]
 
     return Parsed("quantity", read)
-
-
-def read_share(text: str) -> float:
-    """Parse a share such as ``2%`` or ``0.02``."""
-    text = text.strip()
-    return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
 
 
 SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
@@ -367,11 +361,16 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON f
 
 
 def find_silent() -> frozenset[str]:
-    """Return which of damping and delay are 0 because neither an option nor a file gives a value."""
-    given = click.get_current_context().params
-    if given.get("scene_file") is not None:
-        return frozenset()
-    return frozenset(name for name in ("damping", "delay") if given.get(name) is None)
+    """Return which of damping, delay and friction are 0 because neither an option nor a file gives a value.
+
+    Friction is included only if the command simulates an encoder.
+    """
+    given, hardware = click.get_current_context().params, get_hardware()
+    named = () if given.get("scene_file") is not None else ("damping", "delay")
+    silent = {name for name in named if given.get(name) is None}
+    values = {name: hardware.get(name) if given[name] is None else given[name] for name in HARDWARE if name in given}
+    simulated = values.get("resolution") and "coulomb" in values
+    return frozenset(silent | ({"friction"} if simulated and values["coulomb"] is values["static"] is None else set()))
 
 
 def read_pairs(context: click.Context, option: click.Parameter, pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:

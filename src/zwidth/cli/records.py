@@ -15,9 +15,11 @@ from zwidth.cli.options import (
     change_scene,
     flag_of,
     get_hardware,
+    get_told,
     make_velocity,
     take_options,
 )
+from zwidth.parts.checks import find_kind
 from zwidth.words.quantities import CHOICES, OF_LOGS, OF_PARTS
 from zwidth.words.unit_system import UnitSystem
 
@@ -41,12 +43,13 @@ class RecordLoop(NamedTuple):
         return self.scene.timing.period if self.period is None and self.scene is not None else self.period
 
     def check_kind(self, rotary: bool) -> None:
-        """Raise an error if a record and the scene of the file belong to different kinds of devices."""
-        if self.scene is not None and self.scene.device.rotary != rotary:
-            kinds = ("rotary", "linear") if rotary else ("linear", "rotary")
-            raise click.UsageError(
-                f"the record is that of a {kinds[0]} device, but the scene file has a {kinds[1]} one"
-            )
+        """Raise an error if a record, the scene of the file and the options belong to different kinds of devices."""
+        implied = {"the scene file has": self.scene and self.scene.device.rotary}
+        implied |= {f"{flag} has units of": find_kind({flag: text}) for flag, text in get_told().items()}
+        kinds = ("rotary", "linear") if rotary else ("linear", "rotary")
+        for source, kind in implied.items():
+            if kind is not None and bool(kind) != rotary:
+                raise click.UsageError(f"the record is that of a {kinds[0]} device, but {source} a {kinds[1]} one")
 
 
 def _make_loop(given: dict[str, Any], _: UnitSystem) -> RecordLoop:

@@ -71,17 +71,21 @@ class PartSection(Strict):
             yield path if path[0] in type(self).model_fields else path[1:], what
 
 
-def _read_coefficients(raw: Any) -> tuple[float, ...]:
+def _read_coefficients(raw: Any) -> tuple[Any, ...]:
+    """Return coefficients, or sections in series, each with its coefficients."""
     if not isinstance(raw, list | tuple):
         raise problem(f"got {describe(raw)}", "coefficients are a list, highest power first", "write [1000, -1000]")
-    return read_entries(raw, Quantity().read, distinct=False)
+    sections = any(isinstance(each, list | tuple) for each in raw)
+    entry: Any = _read_coefficients if sections else Quantity().read
+    return read_entries(raw, entry, distinct=False)
 
 
+_NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 1}
 Coefficients = Annotated[
-    tuple[float, ...],
+    tuple[Any, ...],
     BeforeValidator(_read_coefficients),
-    PlainSerializer(list, return_type=list[float]),
-    WithJsonSchema({"type": "array", "items": {"type": "number"}, "minItems": 1}),
+    PlainSerializer(list, return_type=list[Any]),
+    WithJsonSchema({"anyOf": [_NUMBERS, {**_NUMBERS, "items": _NUMBERS}]}),
 ]
 
 
@@ -107,7 +111,10 @@ def _describe(path: str, item: Any) -> tuple[Any, str]:
     if path in CHOICES:
         return Literal[CHOICES[path].names], f"{CHOICES[path].sentence}."
     if path not in FIELDS:
-        return Coefficients, f"Coefficients of the {path.rpartition('.')[2]}, highest power of z first."
+        words = (
+            f"Coefficients of the {path.rpartition('.')[2]}, highest power of z first, or a list of sections in series."
+        )
+        return Coefficients, words
     known, allowed = FIELDS[path], find_range(item, path)
     low, high, low_open, _ = allowed
     bounds = f"{low:g} to {high:g}" if isfinite(high) else f"{'>' if low_open else '>='} {low:g}"
@@ -164,6 +171,9 @@ class SafeLimitSection(PartSection, what="a safe limit"):
 
     warnings: list[str] = Field(default=[])
     """Warnings about the measurements."""
+
+    damping_reserve: Annotated[float, Quantity("N s/m", NOT_NEGATIVE)] = 0.0
+    """Physical damping that passivity does not count, because its estimate is uncertain, in N s/m or with a unit."""
 
 
 def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Strict]:

@@ -41,6 +41,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
+from zwidth.words.units import read_share
 
 CHANCE = 0.003  # probability that the walls of a rigid device are refused because of their noise
 ROUGH = 0.1  # largest standard deviation of K and f if the noise is not given
@@ -67,7 +68,7 @@ def fit_buzz(
     *,
     period: Any,
     velocity: Velocity | None = None,
-    noise: float | tuple[float, float] | None = None,
+    noise: float | str | tuple[float | str, float | str] | None = None,
     rotary: bool | None = None,
 ) -> DeviceFit:
     """Fit mass, damping and delay of a rigid device to walls at the onset of instability.
@@ -84,8 +85,9 @@ def fit_buzz(
             two dampings. Texts with units, such as "0.4 N m/rad", are allowed.
         period: T in s.
         velocity: the velocity estimate; the backward difference by default.
-        noise: relative standard deviation of K and f, one number or one for each. By default it is equal for both and
-            estimated from the residuals, which is inaccurate for two or three walls; identical walls then count once.
+        noise: relative standard deviation of K and f, as 0.02 or "2%", or one for each. By default it is equal for both
+            and estimated from the residuals, which is inaccurate for two or three walls; identical walls then count
+            once.
         rotary: True if K is in N m/rad and B in N m s/rad. By default, the units of the points decide; numbers without
             units are those of a linear device.
 
@@ -255,11 +257,12 @@ def _read_noise(noise: Any) -> tuple[float, float] | None:
     if noise is None:
         return None
     try:
-        pair = np.broadcast_to(np.asarray(noise, float), (2,))
-    except ValueError:
+        shares = [read_share(each) if isinstance(each, str) else each for each in np.ravel(np.array(noise, object))]
+        pair = np.broadcast_to(np.asarray(shares, float), (2,))
+    except (TypeError, ValueError):
         pair = np.zeros(2)
     if not np.all((pair > 0) & (pair < 1)):
-        raise InputError(f"noise: got {noise!r}; give the relative noise of K and f, as 0.02, or (0.03, 0.01)")
+        raise InputError(f"noise: got {noise!r}; give the relative noise of K and f, as 0.02, 2% or (0.03, 0.01)")
     return float(pair[0]), float(pair[1])
 
 

@@ -76,7 +76,10 @@ def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
     stiffness = round_safely(wall.stiffness, "below", LIMIT_DIGITS)
     # Round B toward 0, because at larger |B| the stiffness limit often decreases steeply.
     damping = math.copysign(round_safely(abs(wall.virtual_damping), "below", LIMIT_DIGITS), wall.virtual_damping)
-    return SafeLimit(float(f"{stiffness:.12g}"), float(f"{damping:.12g}"), _explain(fit, wall))
+    limit = SafeLimit(float(f"{stiffness:.12g}"), float(f"{damping:.12g}"), _explain(fit, wall))
+    estimate, low = round_number(fit, "damping"), fit.intervals["damping"].low
+    reserve = estimate - low if low > 0 else estimate
+    return replace(limit, damping_reserve=float(f"{round_safely(max(reserve, 0.0), 'above', LIMIT_DIGITS):.12g}"))
 
 
 def _explain(fit: DeviceFit, wall: SafeWall) -> str:

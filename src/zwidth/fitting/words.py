@@ -241,17 +241,22 @@ def _write_limit(fit: DeviceFit) -> list[str]:
         f"    virtual_damping: {float(limit.virtual_damping)!r} {unit_of('damping', fit.unit_system)}",
         f"    reason: {json.dumps(limit.reason, ensure_ascii=False)}",
     ]
+    reserve = f"    damping_reserve: {limit.damping_reserve!r} {unit_of('damping', fit.unit_system)}"
+    lines += [f"{reserve} # not counted for passivity: b minus its lower end"] if limit.damping_reserve else []
     warnings = [f"      - {json.dumps(text, ensure_ascii=False)}" for text in limit.warnings]
     return lines + (["    warnings:", *warnings] if warnings else [])
 
 
-def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> list[str]:
+def write_scene(
+    fit: DeviceFit, source: str, *, period_given: bool = False, max_force: float | None = None
+) -> list[str]:
     """Return a configuration for `zwidth run`, as lines of YAML: the fitted scene with its safe limit.
 
     Args:
         fit: the fit.
         source: name of the log, or number of walls, for the first comment.
         period_given: whether the user specified the period; otherwise a fit to a log derives it from the times.
+        max_force: largest force of the motor, in N.
     """
     units = fit.unit_system
     origin = "as given" if period_given or not fit.motions else "from the times of the log"
@@ -277,6 +282,7 @@ def write_scene(fit: DeviceFit, source: str, *, period_given: bool = False) -> l
         lines.append(f"  coulomb: {hardware['coulomb']!r} {units['N']} # fitted, {_between(fit, 'friction')}")
     if "resolution" in hardware:
         lines.append(f"  resolution: {hardware['resolution']!r} {units['m']} # encoder step of the log")
+    lines += [] if max_force is None else [f"  max_force: {max_force!r} {units['N']} # as given"]
     lines += _write_limit(fit)
     return [*lines, "studies:", "  - kind: recommend # the recommended wall for this device", "    name: recommended"]
 

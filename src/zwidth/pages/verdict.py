@@ -13,6 +13,7 @@ from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.pages.words import (
     diagnosis_lines,
     fold,
+    hardware_lines,
     limit_cautions,
     line,
     part_lines,
@@ -23,7 +24,7 @@ from zwidth.pages.words import (
     word_of,
 )
 from zwidth.parts.device import Device
-from zwidth.parts.grasps import RADII
+from zwidth.parts.safe_limit import reserve_damping
 from zwidth.scenes.assessment import round_margin
 from zwidth.scenes.cautions import find_thin
 from zwidth.scenes.stabilization import stabilize
@@ -43,8 +44,6 @@ MARGINAL_DAMPER = (
     "a pure damper: marginal only because without stiffness no force restores the position (pole at z = 1)"
 )
 MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
-# Numbers of grasps in words, by value.
-COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 # Requirements on stability in the reference grasps, in words.
 HELD = {
@@ -80,10 +79,15 @@ def check_lines(
     limits: Iterable[Limit] | None,
     *,
     silent: frozenset[str] = frozenset(),
+    hardware: str = "",
     diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
-    """Return the lines of `zwidth check` without notes; ``limits=None`` omits gains and remedies, which take longer."""
+    """Return the lines of `zwidth check` without notes.
+
+    ``limits=None`` omits gains and remedies, which take longer. ``hardware`` is the encoder, friction and motor of a
+    file in words.
+    """
     wall, word, units = scene.wall, word_of(verdict).upper(), scene.unit_system
     K, B = spell_stiffness(wall.stiffness, units), with_unit(wall.virtual_damping, units["N s/m"])
     wall_words, device_words = f"K = {K}, B = {B}", spell_device(scene, silent)
@@ -92,7 +96,7 @@ def check_lines(
         device_words += f" (delta {plain(verdict.delta)}, d {plain(verdict.d)})"
     alarm = spell_alarm(diagnosis, "exceeds the safe limit" if limit_cautions(scene) else "")
     lines = [line(word, wall_words + (alarm if word == "STABLE" else "")), line("device", device_words)]
-    lines += part_lines(scene)
+    lines += [*part_lines(scene), *hardware_lines(hardware)]
     lines += [line("CAUTION", text) for text in silent_cautions(scene, silent)]
     # A measured response has no poles.
     damper = wall.stiffness == 0 and not isnan(verdict.frequency)
@@ -199,6 +203,9 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
     if abs(margin) <= ROUNDED * dampings:
         return "on the limit: no physical damping to spare"
     size = with_unit(abs(round_safely(margin, "below")), scene.unit_system["N s/m"])
+    if verdict.passive and margin < (reserve := reserve_damping(scene)):
+        spread = with_unit(reserve, scene.unit_system["N s/m"])
+        return f"uncertain: {size} of physical damping to spare, but the fitted damping may be lower by {spread}"
     if verdict.passive:
         return f"yes: {size} of physical damping to spare"
     return f"{'no' if scene.device.coupling is None else 'not certified'}: {size} more physical damping needed"
@@ -223,12 +230,16 @@ def recommend_lines(
     found: Recommendation,
     *,
     silent: frozenset[str] = frozenset(),
+    hardware: str = "",
     diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
-    """Return the lines of `zwidth recommend` without notes; ``diagnosis`` is that of the recommended wall."""
+    """Return the lines of `zwidth recommend` without notes; ``hardware`` as in `check_lines`.
+
+    ``diagnosis`` is that of the recommended wall.
+    """
     scene, verdict = found.scene, found.verdict
-    device = [line("device", spell_device(scene, silent)), *part_lines(scene)]
+    device = [line("device", spell_device(scene, silent)), *part_lines(scene), *hardware_lines(hardware)]
     unsaid = [line("CAUTION", text) for text in silent_cautions(scene, silent)]
     if verdict is None:
         return [line("NO WALL", found.reason), *device, *unsaid]
@@ -245,7 +256,7 @@ def recommend_lines(
         line("SET", f"{found.spell_wall()}; {found.spell_limit()}{alarm}"),
         *device,
         *margins,
-        *([line("in a hand", hands)] if (hands := spell_hands(found)) else []),
+        *([line("in a hand", hands)] if (hands := found.spell_hands()) else []),
         *diagnosis_lines(diagnosis),
         line("passive", spell_passivity(scene, verdict) if verbose else found.spell_passive()),
         *unsaid,
@@ -253,15 +264,3 @@ def recommend_lines(
     ]
     heading = f"To gain stiffness under the same requirements ({HELD[found.wanted.grasps]}):"
     return lines + gain_lines(heading, found.steps, verbose)
-
-
-def spell_hands(found: Recommendation) -> str:
-    """Return the stability of a wall in the reference grasps in words; "" if there are none."""
-    labels = {name: stable for name, stable in found.grasps.items() if name != "released"}
-    if not labels:
-        return ""
-    radii = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if found.unit_system.rotary else ""
-    unstable = [name for name, stable in labels.items() if not stable]
-    if not unstable:
-        return f"stable in all {COUNTS[len(labels)]} reference grasps{radii}"
-    return f"stable in {len(labels) - len(unstable)} of {len(labels)} reference grasps{radii}"

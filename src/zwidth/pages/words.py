@@ -151,10 +151,10 @@ def scene_notes(scene: Scene) -> list[str]:
     from zwidth.scenes.assessment import describe_islands
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
-    return [*undecided, *coded_period_notes(scene), *describe_islands(scene), *_compare_with_limit(scene)]
+    return [*undecided, *coded_period_notes(scene), *describe_islands(scene), *compare_with_limit(scene)]
 
 
-def _compare_with_limit(scene: Scene) -> list[str]:
+def compare_with_limit(scene: Scene) -> list[str]:
     """Return a warning if the wall exceeds the scene's safe limit, and the warnings that the limit carries."""
     limit = scene.safe_limit
     return [] if limit is None or isinstance(scene.wall, NoWall) else [*limit_cautions(scene), *limit.warnings]
@@ -189,15 +189,26 @@ def diagnosis_lines(found: Diagnosis | None) -> list[str]:
     return [line(*each) for each in spell_diagnosis(found)]
 
 
+def hardware_lines(hardware: str) -> list[str]:
+    """Return the line with encoder, friction and motor of a file, in words; no line for an empty text."""
+    return [line("hardware", hardware)] if hardware else []
+
+
 def silent_cautions(scene: Scene, silent: Collection[str]) -> list[str]:
-    """Return the caution about a delay that is 0 only because it was not given; ``silent`` names such options."""
-    # A measured response usually contains the delay.
-    if "delay" not in silent or scene.timing.delay or isinstance(scene.device, MeasuredDevice):
+    """Return the cautions about a delay and a friction that are 0 only because they were not given.
+
+    ``silent`` names the options that were not given.
+    """
+    # A measured response usually contains the delay, and no model to simulate.
+    if isinstance(scene.device, MeasuredDevice):
         return []
-    return [
-        "no delay given: the results hold only if the force acts at the sample; if it acts one period later, add "
-        "--delay '1 periods'"
-    ]
+    cautions = {
+        "delay": "no delay given: the results hold only if the force acts at the sample; if it acts one period later, "
+        "add --delay '1 periods'",
+        "friction": "no friction given: the encoder is simulated without friction, which can stop a limit cycle; give "
+        "the device's friction by --friction",
+    }
+    return [text for name, text in cautions.items() if name in silent and not (name == "delay" and scene.timing.delay)]
 
 
 def note_lines(notes: list[str]) -> list[str]:

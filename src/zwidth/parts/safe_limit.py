@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from zwidth.parts.checks import Part
+from zwidth.parts.checks import Part, check_number
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import name_wall
 from zwidth.words.unit_system import UnitSystem
@@ -26,6 +26,8 @@ class SafeLimit(Part):
         virtual_damping: B in N s/m.
         reason: the reason of the limit, and the measurement that can raise it.
         warnings: faults of the measurement, one sentence each.
+        damping_reserve: physical damping of the device in N s/m that passivity does not count, because its estimate is
+            uncertain: the estimate minus the lower end of its 95 % interval, for a fit.
 
     Example:
         >>> import zwidth
@@ -38,6 +40,7 @@ class SafeLimit(Part):
     virtual_damping: Any = 0.0
     reason: str = ""
     warnings: Sequence[str] = ()
+    damping_reserve: Any = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -49,6 +52,8 @@ class SafeLimit(Part):
         if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
             raise InputError(f"safe_limit.warnings: got {self.warnings!r}; it must be a list of strings")
         object.__setattr__(self, "warnings", tuple(texts))
+        reserve = check_number("safe_limit.damping_reserve", self.damping_reserve, self.unit_system["N s/m"])
+        object.__setattr__(self, "damping_reserve", reserve)
 
     @property
     def forbids_all(self) -> bool:
@@ -76,3 +81,8 @@ class SafeLimit(Part):
         """Return a one-line description of the limit and its reason."""
         wall = "no wall is supported" if self.forbids_all else name_wall(self.stiffness, self.virtual_damping, system)
         return f"{wall}: {self.reason}" if self.reason else wall
+
+
+def reserve_damping(scene: Any) -> float:
+    """Return the physical damping that passivity does not count, from the safe limit of a scene."""
+    return 0.0 if scene.safe_limit is None else scene.safe_limit.damping_reserve

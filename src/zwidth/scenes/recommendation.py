@@ -13,7 +13,8 @@ from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_limit
 from zwidth.parts.device import Device
-from zwidth.parts.safe_limit import SafeLimit
+from zwidth.parts.grasps import RADII
+from zwidth.parts.safe_limit import SafeLimit, reserve_damping
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.assessment import (
     Assessment,
@@ -186,8 +187,9 @@ class Recommendation:
         )
         room = f"B from {lower} to {upper} is stable at this K"
         margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"
+        hands = [f"in a hand: {hands}"] if (hands := self.spell_hands()) else []
         cautions = (f"caution: {caution}" for caution in self.cautions)
-        return f"{self.spell_wall()}: {self.spell_limit()}", margins, *cautions
+        return f"{self.spell_wall()}: {self.spell_limit()}", margins, *hands, *cautions
 
     def spell_wall(self) -> str:
         """Return the recommended wall in words."""
@@ -202,8 +204,8 @@ class Recommendation:
 
     def spell_requirement(self) -> str:
         """Return, in words, the active requirement, which limits the stiffness."""
-        within = " within the safe limit" if self.limited_by != "safe_limit" and self.is_held_back else ""
-        return f"limited by {self.wanted.spell(self.limited_by)}{within}"
+        bounded = ", with B limited by the safe limit" if self.limited_by != "safe_limit" and self.is_held_back else ""
+        return f"limited by {self.wanted.spell(self.limited_by)}{bounded}"
 
     @property
     def is_held_back(self) -> bool:
@@ -222,9 +224,21 @@ class Recommendation:
         delay = "not known" if math.isnan(late) else with_unit(late, "s", 3)
         return f"gain {plain(gain, 3)}, phase {plain(phase, 3)} deg, delay {delay}"
 
+    def spell_hands(self) -> str:
+        """Return the stability of the wall in the reference grasps in words; "" if there are none."""
+        labels = {name: stable for name, stable in self.grasps.items() if name != "released"}
+        if not labels:
+            return ""
+        radii = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if self.unit_system.rotary else ""
+        stable = sum(labels.values())
+        count = "all six" if stable == len(labels) else f"{stable} of {len(labels)}"
+        return f"stable in {count} reference grasps{radii}"
+
     def spell_passive(self) -> str:
         """Return the passivity of the wall in words."""
         passive = None if self.verdict is None else self.verdict.passive
+        if passive and self.verdict is not None and self.verdict.passivity_margin < reserve_damping(self.scene):
+            return "uncertain, because the fitted damping is"
         obstacle = find_obstacle(**vars(self.scene.device)).partition(":")[0]
         return {True: "yes", False: "no", None: f"not known {obstacle}".rstrip()}[passive]
 
@@ -305,7 +319,7 @@ class SceneAdvice(SceneOptima):
                 ``stiffness_fraction`` (default 0.75) of the limit's stiffness.
 
         If neither a fraction, a margin nor passivity is given, the defaults are a stiffness fraction of 0.75, a gain
-        margin of 2, a phase margin of 30 degrees and, unless the scene has an operator, ``grasps="soft"``. If one of
+        margin of 2, a phase margin of 30 degrees and, for a `Device` without an operator, ``grasps="soft"``. If one of
         them is given, it replaces all defaults. ``grasps`` leaves the other defaults unchanged.
 
         Returns:
@@ -334,7 +348,7 @@ class SceneAdvice(SceneOptima):
             raise InputError(f"passive: got True {obstacle}")
         if not isinstance(self.device, Device) and wanted.grasps != "none" and grasps is not None:
             raise InputError(f"grasps: got {grasps!r}, but the device is no Device with a mass; only 'none' is allowed")
-        if grasps is None and self.operator is not None:
+        if grasps is None and (self.operator is not None or not isinstance(self.device, Device)):
             wanted = wanted._replace(grasps="none")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)

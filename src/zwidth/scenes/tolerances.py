@@ -45,7 +45,7 @@ class ToleranceEstimate:
     stable_low: float
     stable_high: float
     reliability: float  # the share for which the next two hold
-    stiffness: float  # in N/m: that share of devices bears any stiffness up to it at the wall's damping B
+    stiffness: float  # in N/m: upper end of K at which that share of devices is stable, at the wall's damping B
     stiffness_max: float  # the same where each device has the damping that suits it best; NaN for a scene with parts
     drawn: dict[str, np.ndarray]  # what was drawn, by parameter
     labels: np.ndarray  # whether each device bears the wall

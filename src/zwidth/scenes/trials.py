@@ -15,6 +15,9 @@ from zwidth.parts.linear_device import LinearDevice
 from zwidth.simulation.result import MotionKind
 from zwidth.simulation.simulate import simulate
 from zwidth.words.errors import InputError
+from zwidth.words.formatting import with_unit
+from zwidth.words.quantities import FIELDS
+from zwidth.words.unit_system import UnitSystem
 
 DISPLACEMENTS = (0.6, 1.3, 2.2, 3.7, 7.1, 13.0, 26.0, 50.0)  # initial displacements, in steps of the encoder
 # Initial spring forces, as multiples of max_force and, in further trials, of max_rate times the sampling period.
@@ -29,6 +32,10 @@ RUNAWAY = 1.1  # trend above which a response without a frequency counts as grow
 TRIALS = 16  # trials per call of `simulate`; constant, because JAX compiles once per batch size
 LONG_DELAY = 50.0  # sampling periods; with a longer delay one trial takes seconds, so trials run one by one
 
+# Fields of `Hardware` in words.
+_LABELS = {"resolution": "encoder step", "coulomb": "friction", "static": "static friction"}
+_LABELS |= {"max_force": "largest motor output", "max_rate": "largest rate of the motor output"}
+
 
 class Hardware(NamedTuple):
     """Encoder, friction and motor of a device, in SI units."""
@@ -38,6 +45,12 @@ class Hardware(NamedTuple):
     static: float  # static friction
     max_force: float  # largest force of the motor; infinite for none
     max_rate: float  # largest rate of change of the commanded force; infinite for none
+
+
+def spell_hardware(values: dict[str, float], system: UnitSystem) -> str:
+    """Return encoder, friction and motor in words, by the names of the fields of `Hardware`."""
+    texts = (f"{_LABELS[name]} {with_unit(value, system[FIELDS[name].unit], 3)}" for name, value in values.items())
+    return ", ".join(texts)
 
 
 class Starts(NamedTuple):

@@ -37,8 +37,14 @@ class Variants:
         return np.array([bool(scene.is_stable(stiffness, damping)) for scene in self.scenes()])
 
     def row_ends(self, damping: np.ndarray) -> np.ndarray:
-        """Up to which K every softer wall is stable, for each variant and each B of a row; 0 where none is."""
+        """Return the largest K up to which walls are stable, for each variant and each B; 0 if no wall is stable.
+
+        The stable interval starts at K = 0, or is the softest one with K > 0 if the device is unstable without a wall.
+        """
         rows = (np.moveaxis(scene.stable_stiffness(damping), -1, 0) for scene in self.scenes())
+        if self.scene.loop.least_stiffness(-np.inf) is not None:
+            ends = np.array([np.min(np.where(high > 0, high, np.inf), -1, initial=np.inf) for _, high in rows])
+            return np.where(np.isfinite(ends), ends, 0.0)
         firsts = (np.where(reaches_down(low, high), high, 0.0) for low, high in rows)
         return np.array([first.max(-1, initial=0.0) for first in firsts])
 

@@ -15,7 +15,7 @@ import numpy as np
 from zwidth.arrays.roots import false_position, find_lowest
 from zwidth.parts.device import Device
 from zwidth.parts.grasps import list_grasps
-from zwidth.parts.safe_limit import SafeLimit
+from zwidth.parts.safe_limit import SafeLimit, reserve_damping
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall, choose_damping, explain_missing, soft_dampings
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
@@ -30,6 +30,7 @@ SAMPLES = 18  # values of B per stiffness; a weakly damped device is passive onl
 NEAR = 5.0  # tolerance of the best B over the tolerance of K
 LEAST = 1e-9  # smallest stiffness tried, relative to the largest allowed one
 STEP_DOWN = 0.25  # factor by which K is lowered until a wall satisfies the requirements
+STEP_DOWN_UNSTABLE = 0.95  # the same for a device unstable without a wall, whose stable walls have a lower end in K
 HELD_GAIN = 1.1  # factor on K and B with which a wall must be stable in a required grasp, because grasps vary
 HELD = 0.95  # factor on K for the initial guess if a grasp destabilizes the wall
 FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which is usually close
@@ -132,6 +133,7 @@ def measure_slack(scene: SceneOptima, wanted: Wanted, held: Sequence[SceneOptima
     wall, so that a search for the largest slack prefers well-damped walls.
     """
     device_damping = float(scene.device.damping)
+    reserve = 0.0 if wanted.beyond_safe else reserve_damping(scene)
     asked = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
     asked += ["modulus_margin"] if held else []
 
@@ -147,7 +149,7 @@ def measure_slack(scene: SceneOptima, wanted: Wanted, held: Sequence[SceneOptima
             if wanted.phase_margin:
                 slacks["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
         if wanted.passive:
-            margin = np.asarray(scene.passivity_margin(stiffness, damping)) / (device_damping or 1.0)
+            margin = (np.asarray(scene.passivity_margin(stiffness, damping)) - reserve) / (device_damping or 1.0)
             # A margin of exactly 0 must yield a negative slack, because such a wall is not passive.
             slacks["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
         if held:
@@ -203,18 +205,21 @@ def find_stiffest(
         # Keep the sign and limit the size, because false_position ends at values close to 0.
         return min(max(-lowest, 1e-12), 1.0) if lowest <= 0 else max(min(-lowest, -1e-12), -1.0)
 
-    top = math.log(most)
+    top, softest = math.log(most), scene.loop.least_stiffness(-math.inf)
+    end, longest = top + math.log(LEAST), math.log(STEP_DOWN)
+    if softest is not None:
+        end, longest = math.log(softest * scene.units.stiffness), math.log(STEP_DOWN_UNSTABLE)
     low = high = top if near is None or not 0 < near < most else math.log(near)
     at_low = at_high = best_slack(low)
-    step = math.log(STEP_DOWN if low == top else FIRST_STEP)
+    step = longest if low == top else math.log(FIRST_STEP)
     while at_high > 0 and high < top:
         low, at_low = high, at_high
         high = min(high - step, top)
         at_high, step = best_slack(high), 2.0 * step
-    while at_low <= 0 and low > top + math.log(LEAST):
+    while at_low <= 0 and low > end:
         high, at_high = low, at_low
         low = low + step
-        at_low, step = best_slack(low), max(2.0 * step, math.log(STEP_DOWN))
+        at_low, step = best_slack(low), max(2.0 * step, longest)
     if at_low <= 0:
         return math.nan, math.nan
     if low < high and at_high <= 0:
@@ -284,6 +289,10 @@ def _choose_free(
             reason = f"no wall satisfies {' and '.join(map(wanted.spell, spare))}; relax a requirement"
             if wanted.passive and scene.device.damping == 0:
                 reason = "no passive wall exists, because the device has no physical damping"
+            elif wanted.passive and safe is not None and scene.device.damping <= safe.damping_reserve:
+                reason = (
+                    "no wall is passive for certain, because the device may have no physical damping; record longer"
+                )
             return WallChoice(nan, nan, "", Status.UNREACHABLE, reason)
         spare = slack(stiffness, damping)
         limit = min(spare, key=lambda name: float(spare[name])) if stiffness < most else active

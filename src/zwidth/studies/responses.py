@@ -22,6 +22,7 @@ from zwidth.config.scenes import (
     DeviceField,
     NormalizedDevice,
     PhysicalDevice,
+    PhysicalScene,
     PhysicalWall,
     normalized_wall,
 )
@@ -34,7 +35,9 @@ from zwidth.loops.rigid.response import step_response
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.checks import Span
 from zwidth.parts.measured import MeasuredDevice
+from zwidth.scenes.diagnosis import diagnose
 from zwidth.scenes.recommendation import Recommendation
+from zwidth.scenes.trials import spell_hardware
 from zwidth.scenes.wall_search import RANGES, Grasps
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import name_wall, plain, to_json, with_unit
@@ -208,6 +211,7 @@ class RecommendStudy(ResponseStudy):
         wanted = ("stiffness_fraction", "gain_margin", "phase_margin", "passive", "grasps", "beyond_safe")
         found = bare.recommend(**{name: getattr(self, name) for name in wanted})
         told, notes, response = found.as_dict(), list(found.notes), None
+        lines = (*found.lines(), *self._simulate(found, scene))
         if not bare.parts_beyond and found.verdict is not None:
             # The wall as it was judged: from SI units and back, a last digit may be another.
             wall = found.verdict.alpha, found.verdict.beta
@@ -220,11 +224,23 @@ class RecommendStudy(ResponseStudy):
             figures={"": partial(draw, found, response)} if table else {},
             documents={
                 f"{stem}.json": json.dumps(told, indent=2, allow_nan=False) + "\n",
-                f"{stem}.md": _describe(found, told),
+                f"{stem}.md": _describe(found, told, lines),
             },
-            answer=found.lines(),
+            answer=lines,
             notes=tuple(notes),
         )
+
+    def _simulate(self, found: Recommendation, scene: AnyScene | None) -> list[str]:
+        """Return a line with the diagnosis of the wall, with encoder, friction and motor of the scene of the file."""
+        hardware = {}
+        if isinstance(scene, PhysicalScene) and self.device == scene.bare():
+            hardware = scene.hardware
+        if found.verdict is None or not hardware or isinstance(found.scene.device, MeasuredDevice):
+            return []
+        diagnosis = diagnose(found.scene, **hardware, remedies=False)
+        used = spell_hardware(hardware, found.unit_system)
+        used += "" if {"coulomb", "static"} & hardware.keys() else ", without friction"
+        return [f"simulated with {used}: {diagnosis.word}: {diagnosis.explain()}"]
 
 
 @house_style()
@@ -236,9 +252,9 @@ def draw(found: Recommendation, response: Table | None = None) -> Any:
     return figures.plot.recommendation(found, axes, response=response)
 
 
-def _describe(found: Recommendation, told: dict[str, Any]) -> str:
+def _describe(found: Recommendation, told: dict[str, Any], lines: Iterable[str]) -> str:
     """A recommendation as Markdown: its device, what a terminal is told of the wall, and what would allow more."""
-    scene, settled, said = found.scene, told["recommended"]["settling_time"], list(found.lines())
+    scene, settled, said = found.scene, told["recommended"]["settling_time"], list(lines)
     times = (with_unit(time, "s") for time in (scene.timing.period, scene.timing.delay))
     parts = [f"{name} = {value}" for name, value in told["device"].items() if name not in _BARE]
     if isinstance(scene.device, MeasuredDevice) and found.verdict is not None:
@@ -249,7 +265,7 @@ def _describe(found: Recommendation, told: dict[str, Any]) -> str:
             f"settles to 2 % of a step of {'torque' if found.unit_system.rotary else 'force'} in about "
             f"{with_unit(settled, 's')}"
         )
-    lines = [
+    page = [
         *("# Recommended virtual wall", ""),
         "Device: {}, sampled every {}, force delayed by {}.".format(scene.device.spell(), *times),
         *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),
@@ -258,4 +274,4 @@ def _describe(found: Recommendation, told: dict[str, Any]) -> str:
         *(("To gain stiffness under the same requirements:", "") if found.steps else ()),
         *(f"- {step.spell()}" for step in found.steps),
     ]
-    return "\n".join(lines).rstrip() + "\n"
+    return "\n".join(page).rstrip() + "\n"

@@ -343,6 +343,12 @@ def read_quantity(
     return amount, unit
 
 
+def read_share(text: str) -> float:
+    """Return the value of a share such as ``2%`` or ``0.02``; raise `ValueError` for other texts."""
+    text = text.strip()
+    return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+
+
 # Of logs and responses; and their units besides.
 _KNOWN = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
 _FURTHER = ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s", "krad/s", "dB", "m/N", "mm/N", "um/N", "µm/N")

@@ -124,3 +124,20 @@ def test_the_reserve_is_the_same_if_the_safe_limit_binds():
     assert wall["stiffness"] < 0.75 * safe["stiffness"]
     assert wall["phase_margin"] > 29.9
     assert wall["virtual_damping"] <= 0.0015
+
+
+def test_a_passive_wall_of_a_fit_is_passive_at_the_lower_end_of_the_damping(tmp_path):
+    walls = "K=6.85kN/m B=0 f=40.1Hz", "K=15.9kN/m B=18.7 f=68.6Hz", "K=19.7kN/m B=37.4 f=89.1Hz"
+    options = ["--rate", "1 kHz", "--noise", "2%", *(part for wall in walls for part in ("--buzz", wall))]
+    low = json.loads(run("fit", *options, "--json"))["intervals"]["damping"][0]
+    file = tmp_path / "fitted.yaml"
+    file.write_text(run("fit", *options, "--yaml"), encoding="utf-8")
+    wall = json.loads(run("recommend", file, "--passive", "--json"))["recommended"]
+    given = "--stiffness", wall["stiffness"], "--virtual-damping", wall["virtual_damping"]
+    assert json.loads(run("check", file, *given, "--damping", low, "--json"))["passive"]
+    free = json.loads(run("recommend", file, "--passive", "--beyond-safe", "--json"))["recommended"]
+    given = "--stiffness", free["stiffness"], "--virtual-damping", free["virtual_damping"]
+    assert not json.loads(run("check", file, *given, "--damping", low, "--json"))["passive"]
+    printed = " ".join(run("check", file, *given).split())
+    assert "passive uncertain: " in printed
+    assert "but the fitted damping may be lower by 574.1 mN s/m" in printed

@@ -9,6 +9,12 @@ from click.testing import CliRunner
 from zwidth.cli.commands import cli
 
 
+def test_help_names_units_of_rotary_devices_and_walls_for_any_grasp():
+    text = " ".join(help_of("recommend").split())
+    assert "Largest force of the motor, in N (rotary: torque in N m)." in text
+    assert "stable in any grasp" in text
+
+
 def help_of(name: str) -> str:
     done = CliRunner().invoke(cli, [name, "--help"], terminal_width=80)
     assert done.exit_code == 0

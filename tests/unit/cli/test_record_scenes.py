@@ -56,7 +56,7 @@ def files(tmp_path):
 
 def test_fit_takes_period_encoder_and_velocity_estimate_from_a_file(files):
     timed, bare, scene = files
-    given = "--resolution", "16384 counts", "--velocity-cutoff", "80 Hz"
+    given = "--resolution", "16384 counts", "--velocity-cutoff", "80 Hz", "--max-force", "20 mN m"
     expected = json.loads(run("fit", timed, *given, "--json"))
     assert json.loads(run("fit", timed, scene, "--json")) == expected
     assert json.loads(run("fit", bare, scene, "--json"))["mass"] == pytest.approx(expected["mass"], rel=1e-12)
@@ -120,6 +120,26 @@ def test_a_fit_hands_friction_and_encoder_to_the_other_commands(files, tmp_path)
         assert "in a hand stable in all six reference grasps" in printed
         # A sentence of the simulation, whether the wall comes to rest or not.
         assert "the linear loop is stable" in printed
+
+
+def test_the_largest_force_limits_the_program_of_a_fit(files, tmp_path):
+    timed, _, scene = files
+    given = "--resolution", "16384 counts", "--velocity-cutoff", "80 Hz"
+    programs = [run("fit", timed, *words, "--code", "c") for words in ([scene], [*given, "--max-force", "20 mN m"])]
+    assert programs[0] == programs[1] != run("fit", timed, *given, "--code", "c")
+    fitted = tmp_path / "fitted.yaml"
+    fitted.write_text(run("fit", timed, scene, "--max-force", "10 mN m", "--yaml"))
+    assert "  max_force: 0.01 N m # as given\n" in fitted.read_text()
+    program = run("fit", timed, scene, "--max-force", "10 mN m", "--code", "c")
+    assert run("recommend", fitted, "--code", "c") == program
+    assert "0.01" in program
+    assert (
+        json.loads(run("fit", timed, scene, "--max-force", "10 mN m", "--json"))["diagnosis"]["hardware"]["max_force"]
+        == 0.01
+    )
+    words = "the record is that of a rotary device, but --max-force has units of a linear one"
+    assert words in refused("fit", timed, *given, "--max-force", "3 N", "--code", "c")
+    assert "must be greater than 0" in refused("fit", timed, *given, "--max-force", "-3 N m")
 
 
 def test_a_scene_supplies_its_hardware_to_studies_that_simulate(files):

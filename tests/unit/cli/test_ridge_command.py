@@ -63,3 +63,26 @@ def test_a_number_without_unit_has_no_prefix():
     ).splitlines()[-1]
     assert last.startswith("dK_max/d(actuator.damping_ratio)  ")
     assert "N/m: 0.01 more " in last
+
+
+FITTED = """\
+version: 1
+name: fitted
+scene:
+  {{mass: 100 g, damping: 10 N s/m, rate: 1 kHz, delay: 1 ms, safe_limit: {}}}
+studies: [{{kind: recommend, name: wall}}]
+"""
+
+
+def test_k_max_beyond_the_safe_limit_of_a_file_has_a_caution(tmp_path):
+    file = tmp_path / "fitted.yaml"
+    file.write_text(
+        FITTED.format('{stiffness: 0, reason: "resolve the warnings first", warnings: ["the clock jumps"]}')
+    )
+    text = " ".join(ridge(str(file)).split())
+    caution = "the real device may be unstable. no wall is supported: resolve the warnings first"
+    assert f"CAUTION this wall exceeds the safe limit: {caution} CAUTION the clock jumps next" in text
+    cautions = json.loads(ridge(str(file), "--json"))["cautions"]
+    assert cautions == [f"this wall exceeds the safe limit: {caution}", "the clock jumps"]
+    file.write_text(FITTED.format("{stiffness: 30 kN/m, virtual_damping: 50 N s/m}"))
+    assert "CAUTION" not in ridge(str(file))

@@ -19,6 +19,8 @@ studies:
 LINEAR = {"mass": "100 g", "damping": "10 N s/m", "rate": "1 kHz", "delay": "1 ms"}
 WALL = {"stiffness": "10 kN/m", "virtual_damping": "40 N s/m"}
 
+DEVICE = [f"--{name}={value}" for name, value in LINEAR.items()]
+
 
 @pytest.fixture
 def write(tmp_path):
@@ -155,3 +157,61 @@ def test_a_file_without_a_scene_or_that_is_missing_is_named(tmp_path):
     assert "absent.yaml" in refused("ridge", tmp_path / "absent.yaml")
     with pytest.raises(zwidth.ConfigError):
         zwidth.load_scene(tmp_path / "absent.yaml")
+
+
+WITH_HARDWARE = """\
+version: 1
+name: fitted
+scene: {{mass: 100 g, damping: 10 N s/m, rate: 1 kHz, delay: 1 ms{}}}
+studies: [{{kind: recommend, name: wall}}]
+"""
+
+
+def test_encoder_and_friction_of_a_file_are_printed(tmp_path):
+    file, wall = tmp_path / "fitted.yaml", ("--stiffness", "5 kN/m", "--virtual-damping", "30 N s/m")
+    file.write_text(WITH_HARDWARE.format(", resolution: 20 um, coulomb: 50 mN, max_force: 3 N"))
+    used = "encoder step 20.0 µm, friction 50.0 mN, largest motor output 3.00 N"
+    for words in (["recommend", str(file)], ["check", str(file), *wall]):
+        text = " ".join(CliRunner().invoke(cli, words).stdout.split())
+        assert f"hardware {used} (from fitted.yaml)" in text
+        assert "no friction given" not in text
+    for name in ("diagnose", "simulate"):
+        text = " ".join(CliRunner().invoke(cli, [name, str(file), *wall, "--max-force", "4 N"]).stdout.split())
+        assert "hardware encoder step 20.0 µm, friction 50.0 mN (from fitted.yaml)" in text
+    done = CliRunner().invoke(cli, ["run", str(file), "--out", str(tmp_path / "run")])
+    text = " ".join(done.stdout.split())
+    assert "in a hand: stable in all six reference grasps" in text
+    assert f"simulated with {used}: " in text
+    assert f"simulated with {used}: " in (tmp_path / "run" / "recommendation.md").read_text("utf-8")
+    assert "hardware" not in CliRunner().invoke(cli, ["check", *wall, *DEVICE, "--resolution", "20 um"]).stdout
+
+
+def test_an_encoder_simulated_without_friction_has_a_caution(tmp_path):
+    file, caution = tmp_path / "fitted.yaml", "no friction given: the encoder is simulated without friction"
+    file.write_text(WITH_HARDWARE.format(", resolution: 20 um"))
+    wall = "--stiffness", "5 kN/m", "--virtual-damping", "30 N s/m"
+    options = [*DEVICE, "--resolution", "20 um"]
+    for words in (["check", str(file)], ["recommend", *options], ["simulate", *options], ["diagnose", str(file)]):
+        words += wall if words[0] != "recommend" else ()
+        text = " ".join(CliRunner().invoke(cli, words).stdout.split())
+        assert text.count(f"CAUTION {caution}, which can stop a limit cycle; give") == 1
+    assert "no friction given" not in CliRunner().invoke(cli, ["check", str(file), *wall, "--friction", "0"]).stdout
+    assert caution in json.loads(CliRunner().invoke(cli, ["recommend", str(file), "--json"]).stdout)["cautions"][-1]
+    assert "friction" not in CliRunner().invoke(cli, ["ridge", str(file)]).stdout
+    run = CliRunner().invoke(cli, ["run", str(file), "--out", str(tmp_path / "run")]).stdout
+    assert "simulated with encoder step 20.0 µm, without friction: " in " ".join(run.split())
+
+
+def test_a_filter_of_sections_is_that_of_python(tmp_path):
+    file = tmp_path / "filtered.yaml"
+    sections = {"numerator": [[1000, -1000], [0.2, 0.1]], "denominator": [[1, 0], [1, -0.7]]}
+    filtered = (
+        f", velocity: {{kind: filter, numerator: {sections['numerator']}, denominator: {sections['denominator']}}}"
+    )
+    file.write_text(WITH_HARDWARE.format(filtered))
+    found = json.loads(CliRunner().invoke(cli, ["ridge", str(file), "--json"]).stdout)["stiffness_max"]
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), velocity=zwidth.VelocityFilter(**sections))
+    assert found == float(scene.max_stiffness().stiffness)
+    file.write_text(file.read_text().replace("[0.2, 0.1]", "3"))
+    with pytest.raises(zwidth.ConfigError, match=r"numerator\[1\]: got 3; coefficients are a list"):
+        CliRunner().invoke(cli, ["ridge", str(file)], catch_exceptions=False)

@@ -256,10 +256,15 @@ def test_walls_of_nearly_the_same_damping_are_refused_in_their_units():
         zwidth.fit_buzz(points, period="1 ms")
 
 
-@pytest.mark.parametrize("noise", [0.0, -0.1, "much", (0.1, 0.1, 0.1), 1.0])
+@pytest.mark.parametrize("noise", [0.0, -0.1, "much", (0.1, 0.1, 0.1), 1.0, "2", ("2%", "x%"), {}])
 def test_noise_is_a_share(noise):
     with pytest.raises(InputError, match="noise: got"):
         zwidth.fit_buzz(HEARD, period=1e-3, noise=noise)
+
+
+@pytest.mark.parametrize("noise", ["2%", " 2 %", "0.02", ("2%", 0.02), ["2%"], np.array([0.02, 0.02])])
+def test_noise_may_be_given_in_percent(noise):
+    assert zwidth.fit_buzz(HEARD, period="1 ms", noise=noise).noise == (0.02, 0.02)
 
 
 def test_the_result_as_plain_numbers():

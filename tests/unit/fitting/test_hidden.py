@@ -152,7 +152,7 @@ def test_a_resonance_that_a_coarse_encoder_hides_bounds_the_safe_wall():
         assert hidden.is_stable(found.stiffness, found.virtual_damping)
     said = summarize_fit(fit)
     assert [label for label, _ in said[:2]] == ["SET", ""]
-    assert "within the safe limit: a resonance near" in said[1][1]
+    assert ", with B limited by the safe limit: a resonance near" in said[1][1]
     assert "zwidth excite --rate '1.000 kHz' --force '3.0 N' --resolution '200 µm'" in dict(said)["next"]
     assert dict(detail_fit(fit, "a log"))["assuming"].startswith("a rigid device: K = ")
     assert any(line.startswith('    reason: "a resonance near') for line in write_scene(fit, "a log"))

@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 
 import zwidth
@@ -147,3 +148,29 @@ def test_a_file_carries_the_limit(tmp_path):
     file.write_text(file.read_text("utf-8").replace("0.484 kN/m", "-1"), encoding="utf-8")
     with pytest.raises(zwidth.ConfigError, match=r"scene.safe_limit.stiffness: got -1"):
         load_scene(file)
+
+
+@pytest.mark.parametrize("reserve", [0.6, "0.6 N s/m", "600 mN s/m", np.float64(0.6)])
+def test_a_passive_wall_counts_only_certain_damping(reserve):
+    limit = zwidth.SafeLimit(15e3, 37.0, damping_reserve=reserve)
+    assert limit.damping_reserve == 0.6
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing("1 ms", "1 ms"), safe_limit=limit)
+    found = scene.recommend(passive=True)
+    margin = scene.passivity_margin(found.stiffness, found.virtual_damping)
+    assert 0.6 <= margin < 0.601
+    assert found.spell_passive() == "yes"
+    # Colgate's condition on the device with the least damping, by a grid of frequencies: the wall with its delay is C.
+    wT = np.linspace(1e-4, np.pi, 20_001)
+    C = (found.stiffness + found.virtual_damping * (1 - np.exp(-1j * wT)) / 1e-3) * np.exp(-1j * wT)
+    needed = 0.5e-3 / (1 - np.cos(wT)) * np.real((1 - np.exp(-1j * wT)) * C)
+    assert 9.399 < needed.max() <= 9.4
+    free = scene.recommend(passive=True, beyond_safe=True)
+    assert scene.passivity_margin(free.stiffness, free.virtual_damping) < 0.1
+
+
+def test_a_reserve_of_all_damping_leaves_no_passive_wall():
+    limit = zwidth.SafeLimit(15e3, 37.0, damping_reserve=10)
+    found = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), safe_limit=limit).recommend(passive=True)
+    assert found.reason.startswith("no wall is passive for certain, because the device may have no physical damping")
+    with pytest.raises(zwidth.InputError, match=r"safe_limit\.damping_reserve: got -1"):
+        zwidth.SafeLimit(15e3, 37.0, damping_reserve=-1)

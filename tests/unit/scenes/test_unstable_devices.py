@@ -61,6 +61,44 @@ def test_commands_agree():
         assert any("unstable without a wall: no wall softer than K = 3" in note for note in notes)
 
 
+@pytest.mark.parametrize("pull", [5000])
+def test_a_wall_in_a_short_stable_range_of_stiffness_is_found(pull):
+    """All walls with K below the gravity stiffness are unstable, so a search that steps over the range finds none."""
+    coefficients = [0.1, 1.0, -pull]
+    device = ["--device", f"1 / 0.1 1 {-pull}", "--rate", "1 kHz", "--delay", "1 ms"]
+    for gain in (1.2,):
+        result = CliRunner().invoke(cli, ["recommend", *device, "--gain-margin", str(gain), "--json"])
+        assert result.exit_code == 0, result.output
+        found = json.loads(result.stdout)["recommended"]
+        K, B = found["stiffness"], found["virtual_damping"]
+        assert all(radius(coefficients, 1, share * K, share * B) < 1.0 for share in (1.0, 0.9999 * gain, 1.0001 / gain))
+        assert not all(radius(coefficients, 1, share * K, share * B) < 1.0 for share in (1.01 * gain, 0.99 / gain))
+        # No stiffer wall of a grid has the gain margin.
+        for stiffer in np.linspace(1.01 * K, 1.2 * K, 4):
+            for damping in np.linspace(0.5 * B, 1.5 * B, 21):
+                shares = 1.0, gain, 1.0 / gain
+                assert max(radius(coefficients, 1, each * stiffer, each * damping) for each in shares) > 1.0
+
+
+def test_tolerances_count_walls_of_the_stable_region():
+    wall = "--stiffness", "1 kN/m", "--virtual-damping", "5 N s/m", "--tolerance", "delay=10%"
+    result = CliRunner().invoke(cli, ["design", *PENDULUM, *wall, "--samples", "40"])
+    assert "note       the device is unstable without a wall: no wall softer than K = 3" in result.stdout
+    result = CliRunner().invoke(cli, ["design", *PENDULUM, *wall, "--samples", "40", "--json"])
+    found = json.loads(result.stdout)["tolerances"]
+    assert found["stable"] == 1.0
+    # The limit lies between those of the shortest and the longest delay.
+    scene = zwidth.Scene(zwidth.LinearDevice("1 / 0.1 0.2 -3"), zwidth.Timing(1e-3, 1e-3))
+    ends = [float(scene.replace(delay=delay).stable_stiffness(5.0)[0, 1]) for delay in (1.1e-3, 0.9e-3)]
+    assert ends[0] <= found["stiffness"] <= ends[1]
+
+
+def test_no_grasps_are_required_of_a_device_without_a_mass():
+    assert zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 50"), zwidth.Timing(1e-3)).recommend().wanted.grasps == "none"
+    result = CliRunner().invoke(cli, ["recommend", *PENDULUM])
+    assert "(not checked in the reference grasps)" in " ".join(result.stdout.split())
+
+
 def test_a_stable_device_says_nothing():
     assert describe_islands(zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))) == []
     assert describe_islands(zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 50"), zwidth.Timing(1e-3, 1e-3))) == []
