@@ -33,7 +33,7 @@ from zwidth.fitting.device_fit import (
     RivalDevice,
     check_period_unit,
 )
-from zwidth.fitting.words import spell_rival
+from zwidth.fitting.words import format_rival
 from zwidth.parts.checks import check_number, find_kind, read_texts
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.scenes.scene import Scene
@@ -170,7 +170,7 @@ def fit_buzz(
     if rivals:
         status = Status.UNDECIDED
         warnings.append(
-            f"another device fits equally well: {spell_rival(rivals[0], system)}; add the measurement proposed as next"
+            f"another device fits equally well: {format_rival(rivals[0], system)}; add the measurement proposed as next"
         )
     if refusal:
         warnings.append(refusal)

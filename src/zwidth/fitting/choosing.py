@@ -100,7 +100,7 @@ def _add_part(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, Hi
         return None, None
     for _, misfit, other, theta in tried:
         if other.modes > model.modes and misfit < least - _BY_CHANCE:
-            return selected, HiddenPole(float(theta[other.parts.stop - 3]) / (2.0 * np.pi), True, instead=True)
+            return selected, HiddenPole(float(theta[other.parts.stop - 3]) / (2.0 * np.pi), True, replaces_lag=True)
     return selected, None
 
 

@@ -92,8 +92,8 @@ class HiddenPole(NamedTuple):
     """A pole that the model lacks, or a resonance that explains the log as well as the model's actuator lag."""
 
     frequency: float  # relative to the sampling rate
-    rings: bool  # complex pole (resonance); otherwise real (lag)
-    instead: bool = False  # alternative to the actuator lag of the model, which explains the log equally well
+    is_resonance: bool  # complex pole; otherwise a real pole, i.e. a lag
+    replaces_lag: bool = False  # alternative to the actuator lag of the model, which explains the log equally well
 
 
 class PoleBank(NamedTuple):
@@ -104,9 +104,7 @@ class PoleBank(NamedTuple):
     score: np.ndarray  # reduction of the sum of squares, in noise variances; chi-square for white noise alone
     signature_size: np.ndarray  # norm of the signature of the unit mode, in standard errors
     projection: np.ndarray  # residuals projected onto that signature, in standard errors
-    error_inflation: (
-        np.ndarray
-    )  # standard error with autocorrelated encoder errors, divided by that with white noise; >= 1
+    error_inflation: np.ndarray  # standard error with autocorrelated encoder errors, relative to white noise; >= 1
     absorbed: np.ndarray  # bias of theta if the unit mode is omitted from the model; one column per parameter
 
     def select(self, mask: np.ndarray) -> PoleBank:
@@ -286,7 +284,7 @@ def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tup
 
 
 def truncate_logs(fit: FittedModel) -> FittedModel:
-    """Return the fit restricted to the first `MAX_SAMPLES` positions of each log."""
+    """Return the fit, restricted to the first `MAX_SAMPLES` positions of each log."""
     if max(log.position.size for log in fit.model.logs) <= MAX_SAMPLES:
         return fit
     part = replace(fit, model=fit.model.truncate(MAX_SAMPLES), rivals=())
@@ -341,7 +339,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
 def _expand_unit_modes(fit: FittedModel, poles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Expand the position of each unit mode in the filtered forces of `_filter_forces`.
 
-    A held force that has acted for a whole period contributes ``(e^p - 1) e^(-f p)/p`` times the filtered force, with f
+    A force that was held for a whole period contributes ``(e^p - 1) e^(-f p)/p`` times the filtered force, with f
     the fractional part of the delay. The latest force has acted for 1 - f periods only, which subtracts
     ``(1 - e^(-f p))/p`` times that force. The position is the imaginary part, multiplied by g/|p|.
 
@@ -349,10 +347,10 @@ def _expand_unit_modes(fit: FittedModel, poles: np.ndarray) -> tuple[np.ndarray,
         The gains of the real and the imaginary part of the filtered force, one row each; and the gain of the latest
         force, to be subtracted. They are 0 for real poles, of which only the score is used.
     """
-    unit, held = fit.theta[0] / np.abs(poles) / poles, np.exp(-(fit.theta[2] % 1.0) * poles)
-    gain = unit * np.expm1(poles) * held
+    unit, delayed = fit.theta[0] / np.abs(poles) / poles, np.exp(-(fit.theta[2] % 1.0) * poles)
+    gain = unit * np.expm1(poles) * delayed
     # Im(gain (x + j y)) = Im(gain) x + Re(gain) y.
-    return np.array([gain.imag, gain.real] if np.iscomplexobj(poles) else [gain.imag]), (unit * (1.0 - held)).imag
+    return np.array([gain.imag, gain.real] if np.iscomplexobj(poles) else [gain.imag]), (unit * (1.0 - delayed)).imag
 
 
 def _build_poles(ratio: float, frequency: np.ndarray) -> Any:

@@ -209,12 +209,12 @@ def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float,
     if cause:
         remedy = "log the force with more digits" if "rounded" in cause else _RECORD_NEXT
         return [f"the residuals are not white noise: {cause}; {remedy}"]
-    if pole is not None and pole.instead:
+    if pole is not None and pole.replaces_lag:
         near = with_unit(pole.frequency / period, "Hz", 3)
         cause = f"an actuator lag and a resonance near {near}, with another K_max, fit equally well"
         return [f"{cause}: {SEE_MORE}"]
     if pole is not None:
-        kind = "a resonance near" if pole.rings else "an actuator lag with a corner frequency near"
+        kind = "a resonance near" if pole.is_resonance else "an actuator lag with a corner frequency near"
         cause = f"they indicate {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
     elif best.excess > ALIKE:
         ratio = plain(np.sqrt(best.excess), 2)
@@ -277,9 +277,9 @@ def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> Non
     left = squares / float(rest @ rest)
     unexplained = left > _UNEXPLAINED and best.excess > _SMOOTH
     cause = explain_motion(model.logs, period, system) if theta[0] <= 0 or unexplained else Cause("")
-    if cause.words:
+    if cause.text:
         raise InputError(
-            f"force: {cause.words}; support the device, or measure its frequency response, which needs no model "
+            f"force: {cause.text}; support the device, or measure its frequency response, which needs no model "
             "(zwidth.excite, zwidth.respond)"
         )
     if theta[0] <= 0 and (cause.reversed or left < _UNEXPLAINED):

@@ -106,7 +106,7 @@ def test_the_interval_of_the_stiffest_wall_reaches_to_a_lag_that_does_not_show()
     assert fit.intervals["stiffness_max"].high >= fit.lag.stiffness_max
     assert fit.lag.delay < fit.delay
     assert fit.as_dict()["lag"]["time_constant"] == fit.lag.time_constant
-    assert any("lag" in text for label, text in detail_fit(fit, "a log") if label == "or as well")
+    assert any("lag" in text for label, text in detail_fit(fit, "a log") if label == "alternative")
 
 
 @pytest.mark.parametrize("top, bottom", [([0.2], [1.0, -0.8]), ([0.2] * 5, [1.0])])
