@@ -174,8 +174,8 @@ def _design(
     scale = most / max(float(np.abs(stretch).max()) for stretch in stretches)
     commanded = scale * np.concatenate([np.tile(stretch, _PERIODS) for stretch in stretches])
     amplitude = scale * shape
-    # White noise of variance sigma^2 causes an amplitude of standard deviation 2 sigma/sqrt(n) at a line, for n samples.
-    # Equal periods of one stretch have equal quantization errors, so they count as one.
+    # In n samples, white noise of standard deviation sigma has amplitudes of 2 sigma/sqrt(n) at a line. The equal
+    # periods of a stretch count as one, because their quantization errors are equal.
     deviation = SURE * step / np.sqrt(12.0) * 2.0 / np.sqrt(_STRETCHES * count) / amplitude
     hertz, expected = lines / (count * period), None
     if scene is not None and response is not None:

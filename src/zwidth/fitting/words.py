@@ -1,4 +1,8 @@
-"""Print a fit: as a summary with details, and as a configuration in YAML."""
+"""Format a fit as text: a summary with details for the terminal, and a configuration in YAML.
+
+A summary is a list of pairs of label and text. Values have units and as many digits as their confidence intervals
+require.
+"""
 
 from __future__ import annotations
 
