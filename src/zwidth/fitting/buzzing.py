@@ -68,7 +68,7 @@ class Onsets:
         step = np.full(w.shape, np.inf)
         for _ in range(STEPS):
             points = circle(w)
-            f, q = estimate.jet(points), controller.jet(points)
+            f, q = estimate.jet(points), controller.evaluate_rigid(points)
             residual, slope = (
                 (self.scaled_damping * f.value - mass * q.value).imag,
                 (self.scaled_damping * f.slope - mass * q.slope).imag,
@@ -79,7 +79,7 @@ class Onsets:
             if not np.any(np.abs(step) > CONVERGED * w):
                 break
         points = circle(w)
-        f, q = estimate.jet(points), controller.jet(points)
+        f, q = estimate.jet(points), controller.evaluate_rigid(points)
         kappa = (mass * q.value - self.scaled_damping * f.value).real
 
         def differentiate() -> np.ndarray:
@@ -104,7 +104,7 @@ class Onsets:
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)
         points = circle(self.w)
-        q = CriticalController(deltas[:, None, None], delays[:, None]).jet(points).value
+        q = CriticalController(deltas[:, None, None], delays[:, None]).evaluate_rigid(points).value
         errors = np.log((self.kappa + self.scaled_damping * self._estimate.jet(points).value) / q)
         log_mass = errors.real.mean(-1)
         cost = (errors.imag**2).sum(-1) + ((errors.real - log_mass[..., None]) ** 2).sum(-1)

@@ -28,7 +28,8 @@ _EXPLAINED = 0.25  # a further force is the cause if it leaves less than this sh
 
 # Test of the residuals.
 _SHARE = 0.5  # a force is the cause if it explains more than this share of the residual sum of squares
-# The same share for rounding errors of the force: lower, because their size is computed and not fitted.
+# Least share that rounding errors of the force must explain: lower than `_SHARE`, because the size of these errors is
+# computed and not fitted.
 _ROUNDING_SHARE = 0.2
 _TRIALS = 4  # random draws of the rounding errors
 _MIN_LEVELS = 8  # least number of distinct forces for which a common step is attributed to rounding

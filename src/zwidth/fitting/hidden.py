@@ -263,7 +263,7 @@ def _build_frequency_grid(scene: Scene, phase_step: float) -> np.ndarray:
 def _evaluate_unit_modes(fit: FittedModel, grid: np.ndarray, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
     """Return the contribution of unit modes to the frequency response."""
     (g, delta, d), mode = fit.theta[:3], (2.0 * np.pi * frequency, ratio, np.sqrt(1.0 - ratio**2))
-    return g * CriticalController(delta, d, (), [mode]).add(circle(2.0 * np.pi * grid))
+    return g * CriticalController(delta, d, (), [mode]).evaluate_parts(circle(2.0 * np.pi * grid))
 
 
 def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -272,7 +272,7 @@ def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tup
 
     def evaluate(theta: np.ndarray) -> np.ndarray:
         controller = CriticalController(*fit.model.normalize(theta, period)[1:])
-        return (-theta[0] / controller.value(points)).reshape(grid.shape)
+        return (-theta[0] / controller.evaluate(points)).reshape(grid.shape)
 
     count, response = fit.model.parts.stop, evaluate(fit.theta)
     steps = np.abs(fit.theta[:count])

@@ -50,7 +50,7 @@ class CriticalController:
         """Compute the quantities that do not depend on the frequency."""
         self.n_delay, fraction = split_delay(np.asarray(d, float))
         self.delta, self.fraction = delta, fraction
-        poles, residues = list_poles(delta, lag, modes)
+        poles, residues = expand_partial_fractions(delta, lag, modes)
         self.has_parts = len(poles) > 0
         if poles:
             both = np.array(np.broadcast_arrays(fraction + np.zeros(1), *poles, *residues)[1:], complex)
@@ -64,39 +64,40 @@ class CriticalController:
         """The sampled rigid mass."""
         return held_plant(self.delta, self.fraction)
 
-    def value(self, at: CirclePoints) -> Array:
+    def evaluate(self, points: CirclePoints) -> Array:
         """Return q."""
-        rigid = self.jet(at).value
-        return rigid / (1.0 - rigid * self.add(at)) if self.has_parts else rigid
+        rigid = self.evaluate_rigid(points).value
+        return rigid / (1.0 - rigid * self.evaluate_parts(points)) if self.has_parts else rigid
 
-    def jet(self, at: CirclePoints) -> Jet:
+    def evaluate_rigid(self, points: CirclePoints) -> Jet:
         """Return q of the rigid mass and its derivative in the frequency w."""
-        plant, turn = self.plant, 1j * at.z
-        numerator, z_minus_c = _evaluate_numerator(plant, at), at.before + plant.em
-        q = -np.exp(1j * self.n_delay * at.w) * at.before * z_minus_c / numerator
-        slopes = turn / at.before + turn / z_minus_c - 1j * (plant.a2 * at.z - plant.a0 / at.z) / numerator
+        plant, turn = self.plant, 1j * points.z
+        numerator, z_minus_c = _evaluate_numerator(plant, points), points.before + plant.em
+        q = -np.exp(1j * self.n_delay * points.w) * points.before * z_minus_c / numerator
+        slopes = turn / points.before + turn / z_minus_c - 1j * (plant.a2 * points.z - plant.a0 / points.z) / numerator
         return Jet(q, q * (1j * self.n_delay + slopes))
 
-    def add(self, at: CirclePoints) -> Array:
+    def evaluate_parts(self, points: CirclePoints) -> Array:
         """Return the part of the response G that is due to lag and modes."""
-        above, below = at.before * self.late_gain + self.gain, at.before - self.growth
-        return (self.residues * (np.exp(-1j * (self.n_delay + 1.0) * at.w) * above / below)).sum(0)
+        above, below = points.before * self.late_gain + self.gain, points.before - self.growth
+        return (self.residues * (np.exp(-1j * (self.n_delay + 1.0) * points.w) * above / below)).sum(0)
 
-    def differentiate(self, at: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def differentiate(self, points: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivatives of q of the rigid mass in delta and d; ``q`` is its value."""
         by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
-        numerator = _evaluate_numerator(self.plant, at)
+        numerator = _evaluate_numerator(self.plant, points)
         return (
-            q * (by_delta.em / (at.before + self.plant.em) - _evaluate_numerator(by_delta, at) / numerator),
-            -q * _evaluate_numerator(by_fraction, at) / numerator,
+            q * (by_delta.em / (points.before + self.plant.em) - _evaluate_numerator(by_delta, points) / numerator),
+            -q * _evaluate_numerator(by_fraction, points) / numerator,
         )
 
 
-def _evaluate_numerator(plant: Plant, at: CirclePoints) -> Any:
-    return plant.a2 * at.z + plant.a1 + plant.a0 / at.z
+def _evaluate_numerator(plant: Plant, points: CirclePoints) -> Any:
+    """Return the numerator of the rigid plant divided by z, ``a2 z + a1 + a0/z``."""
+    return plant.a2 * points.z + plant.a1 + plant.a0 / points.z
 
 
-def list_poles(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:
+def expand_partial_fractions(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:
     """Return the partial fractions of a lag and modes, in addition to ``1/(s (s + delta))`` of the rigid mass.
 
     The expanded function is ``A(s) (1/(s (s + delta)) + sum_i r_i/(s^2 + 2 zeta_i w_i s + w_i^2)) - 1/(s (s + delta))``
@@ -126,7 +127,7 @@ def list_poles(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:
 
 
 def _expand_lag(lag: Sequence[Any] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the poles and residues of a lag along the first axis, none without a lag; arguments as in `list_poles`."""
+    """Return the poles and residues of a lag along the first axis, none without a lag; arguments as in `expand_partial_fractions`."""
     if len(lag) == 0:
         return np.zeros(0), np.zeros(0)
     poles = _solve_quadratic(1.0 / lag[0], lag[1]) if len(lag) == 2 else np.array([-1.0 / lag[0] + 0j])

@@ -190,11 +190,11 @@ class _SearchedDevices:
         drawn, d, rate = drawn[valid], d[valid], rate[valid]
         self.fit, self.drawn = fit, drawn
         even = np.linspace(0.0, np.pi, int(_EVEN + _EVEN_PER_PERIOD * d.max(initial=0.0)))[1:]
-        at = circle(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
+        points = circle(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
         with np.errstate(all="ignore"):
-            velocity = scene.velocity.estimate(period).jet(at).value[None] / period
+            velocity = scene.velocity.estimate(period).jet(points).value[None] / period
             controller = CriticalController(*fit.normalize(drawn[..., None])[1:3])
-            critical = controller.jet(at).value * (rate / period)[:, None]
+            critical = controller.evaluate_rigid(points).value * (rate / period)[:, None]
             # Remove the rounding errors of the imaginary parts at z = -1.
             critical[:, -1], velocity[:, -1] = np.real(critical[:, -1]), np.real(velocity[:, -1])
             self.limits = GridLimits(critical, velocity)

@@ -24,7 +24,7 @@ from zwidth.arrays.held_mass import phi_functions
 from zwidth.fitting.device_estimate import DimensionlessDevice
 from zwidth.fitting.encoder import MeasurementNoise
 from zwidth.fitting.moving import ModelResponse, Recording, recur
-from zwidth.fitting.required_wall import list_poles
+from zwidth.fitting.required_wall import expand_partial_fractions
 
 # Step of central differences: absolute in delta and in the pole of a filter, relative in all other parameters.
 _STEP = 1e-6
@@ -211,7 +211,7 @@ class Recordings:
             of the free responses of the modes, -1 for the poles of the lag.
         """
         device = self.normalize(thetas, 1.0)
-        poles, weights = (np.array(each) for each in list_poles(device.delta, device.lag, device.modes))
+        poles, weights = (np.array(each) for each in expand_partial_fractions(device.delta, device.lag, device.modes))
         states, height = np.maximum(np.arange(-len(poles), 0) + 2 * self.modes, -1), np.imag(poles[:, 0])
         # The upper pole of a complex pair represents both, with twice the weight, because only real parts are used.
         weights = weights * thetas[0] * (1.0 + (height > 0))[:, None]
