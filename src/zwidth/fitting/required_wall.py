@@ -127,7 +127,7 @@ def expand_partial_fractions(delta: Any, lag: Any, modes: Any) -> tuple[list[Any
 
 
 def _expand_lag(lag: Sequence[Any] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the poles and residues of a lag along the first axis, none without a lag; arguments as in `expand_partial_fractions`."""
+    """Return the poles and residues of A(s) along the first axis; none if ``lag`` is empty."""
     if len(lag) == 0:
         return np.zeros(0), np.zeros(0)
     poles = _solve_quadratic(1.0 / lag[0], lag[1]) if len(lag) == 2 else np.array([-1.0 / lag[0] + 0j])
