@@ -182,10 +182,10 @@ def _name_units(
         names = [f"{name} {' + '.join(repr(heads[k]) for k in column.places)}" for name, column in places.items()]
         notes.append(f"columns identified by their headers: {', '.join(names)}")
     for name in ("position", "force"):
-        header_unit, asked = places[name].header_unit, places[name].units[0]
-        sizes = [size for unit in (header_unit, asked) if (size := _measure(name, unit)) is not None]
-        if header_unit != asked and len(sizes) == 2 and abs(sizes[0] / sizes[1] - 1) > _ROUNDING:
-            notes.append(f"the {name} is read in {asked}, as specified, although its header has {header_unit}")
+        header_unit, specified = places[name].header_unit, places[name].units[0]
+        sizes = [size for unit in (header_unit, specified) if (size := _measure(name, unit)) is not None]
+        if header_unit != specified and len(sizes) == 2 and abs(sizes[0] / sizes[1] - 1) > _ROUNDING:
+            notes.append(f"the {name} is read in {specified}, as specified, although its header has {header_unit}")
     if units["force"] in _WEIGHTS:
         mass, units["force"] = units["force"], _WEIGHTS[units["force"]]
         weight = FORCE.in_base("1", 0, units["force"])

@@ -257,7 +257,7 @@ class DeviceFit(DeviceEstimate):
             return float(weights @ stdtr(self.freedom, (value - middles) / error)) - probability
 
         return [
-            float(brentq(exceed, -far, far, args=(0.5 + side * (UPPER - 0.5),)))  # pyright: ignore[reportArgumentType]  (a number unless asked)
+            float(brentq(exceed, -far, far, args=(0.5 + side * (UPPER - 0.5),)))  # pyright: ignore[reportArgumentType]  (a number by default)
             for side in (-1.0, 1.0)
         ]
 
@@ -275,7 +275,7 @@ class DeviceFit(DeviceEstimate):
                 and a wall that such a resonance makes unstable may be far softer than K_max of the rigid mass.
 
         Returns:
-            SafeWall: ``stiffness`` K in N/m and ``virtual_damping`` B in N s/m, both 0 if no wall is stable on so many
+            SafeWall: ``stiffness`` K in N/m and ``virtual_damping`` B in N s/m, both 0 if no wall is stable on enough
             devices; ``share``, the proportion of the random devices on which the wall is stable by their poles;
             ``status``: that of the fit, or UNDECIDED if the fit has warnings, the poles do not confirm the wall, or
             almost no random device is possible; all numbers are NaN unless it is OK; ``resonance``, the frequency in Hz
@@ -299,8 +299,8 @@ class DeviceFit(DeviceEstimate):
 
         Example:
             >>> import zwidth
-            >>> heard = [(6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)]
-            >>> fit = zwidth.fit_buzz(heard, period="1 ms", noise=0.02)
+            >>> walls = [(6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)]
+            >>> fit = zwidth.fit_buzz(walls, period="1 ms", noise=0.02)
             >>> wall = fit.safe_wall()
             >>> print(f"{wall.stiffness / 1e3:.1f} of {fit.stiffness_max / 1e3:.1f} kN/m")
             18.8 of 19.9 kN/m

@@ -64,14 +64,14 @@ class Column(NamedTuple):
 
 
 def find_columns(
-    file: object, heads: Sequence[str], asked: Mapping[str, str | None], wanted: Sequence[str]
+    file: object, heads: Sequence[str], specified: Mapping[str, str | None], wanted: Sequence[str]
 ) -> dict[str, Column]:
     """Return the column of each quantity.
 
     Args:
         file: path of the table, for messages.
         heads: headers of the table.
-        asked: user-specified columns by quantity, as "NAME" or "NAME:unit"; None to identify the column by its header.
+        specified: columns specified by the user, by quantity, as "NAME" or "NAME:unit"; None to use the headers.
         wanted: the quantities to return.
 
     Raises:
@@ -80,7 +80,7 @@ def find_columns(
     columns: dict[str, Column] = {}
     missing, several = [], []
     for name in wanted:
-        text = asked.get(name)
+        text = specified.get(name)
         if text is not None:
             columns[name] = _find_asked(file, heads, name, text)
             continue

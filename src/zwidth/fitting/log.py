@@ -45,10 +45,7 @@ _SEEN = 5.0  # least effect of the force on the positions, in standard errors
 _UNEXPLAINED = 0.01  # residual sum of squares, relative to that of the motion without a force
 _SMOOTH = 5.0  # excess of the residuals over white noise (`FittedModel.excess`)
 # Remedy for residuals with dynamics that the model lacks.
-_RECORD_NEXT = (
-    "the device has dynamics that the model lacks, so K_max is not determined; record a force of zwidth.excite and use "
-    "zwidth.respond, which needs no model"
-)
+_RECORD_NEXT = "measure the response instead (zwidth.excite, zwidth.respond), which needs no model"
 
 
 def fit_log(
@@ -64,7 +61,7 @@ def fit_log(
 ) -> DeviceFit:
     """Fit mass, damping and delay of a device to a log of its free motion under commanded forces.
 
-    The model is ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, with the force held between samples; the positions
+    The model is ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, with zero-order hold of the force; the positions
     are fitted by least squares. The constant force f0 and the friction F_c are always fitted, which increases the
     errors of the other parameters. Omitting them if the log hardly shows them would bias the others by many standard
     errors. An actuator lag of first or second order and resonances are added if Schwarz's criterion requires them.
@@ -218,7 +215,7 @@ def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float,
         cause = f"they indicate {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
     elif best.excess > ALIKE:
         ratio = plain(np.sqrt(best.excess), 2)
-        cause = f"their sums are {ratio} times as large as those of noise, as with a hand or a compliance"
+        cause = f"their sums are {ratio} times too large, as with a hand or a compliance"
     else:
         return []
     return [f"the residuals are not white noise: {cause}; {_RECORD_NEXT}"]

@@ -155,9 +155,9 @@ def _integrate_with_friction(
     decay = np.exp(-delta * np.arange(count // 2 + 1))
     # Decay since the start of a first or of a second part.
     decays = [np.outer(decay, [1.0, each]).ravel() for each in slow]
-    # Part m starts with velocity v in the direction s; `begun` lists the parts at which the direction changes.
+    # Part m starts with velocity v in the direction s; `changes` lists the parts at which the direction changes.
     m, v, s = 0, v0, float(np.sign(v0))
-    begun, stops = [(0, s)], []
+    changes, stops = [(0, s)], []
     while m < count:
         if s == 0.0:
             # The mass sticks until the forces exceed the friction.
@@ -166,7 +166,7 @@ def _integrate_with_friction(
                 break
             m, v = int(able[after]), 0.0
             s = 1.0 if acceleration[m] > 0 else -1.0
-            begun.append((m, s))
+            changes.append((m, s))
         # Find the next part at whose end s v <= 0, in windows of increasing size.
         gain, decay, first, size = gained[s], decays[m % 2], m + 1, 128
         ahead = s * v - gain.item(m)
@@ -190,8 +190,8 @@ def _integrate_with_friction(
         rest, s = h - before, -s if abs(forced) > friction else 0.0
         v = (-expm1(-delta * rest) / delta if delta else rest) * (forced - s * friction) if s else 0.0
         stops.append((k, before, s, v))
-        begun.append((k + 1, s))
-    starts, directions = np.array(begun).T
+        changes.append((k + 1, s))
+    starts, directions = np.array(changes).T
     direction = np.repeat(directions, np.diff(np.append(starts, count)).astype(int))
     sticks = direction == 0
     factors, added = (

@@ -166,8 +166,8 @@ def find_even(place: np.ndarray, least: int) -> list[slice]:
 def find_stretches(log: Recording, system: UnitSystem) -> list[str]:
     """Return warnings about an end stop, a saturated sensor or a saturated motor."""
     warnings = []
-    for end, way in ((log.position.max(), 1.0), (log.position.min(), -1.0)):
-        first, last = _find_longest_run((log.position == end) & (log.force * way > 0))
+    for end, direction in ((log.position.max(), 1.0), (log.position.min(), -1.0)):
+        first, last = _find_longest_run((log.position == end) & (log.force * direction > 0))
         if last - first >= _STUCK:
             warnings.append(
                 f"the position stays at {with_unit(end, system['m'], 4)} from sample {first} to {last - 1} despite a "

@@ -339,17 +339,17 @@ def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list
     u = 4.0 * np.sin(0.5 * w) ** 2
     bend = np.abs(np.diff(u * G, 2))
     deviation = SURE * error + np.pad(bend, 1, mode="edge") / u
-    seen = np.flatnonzero(np.real(coherence) > _COHERENT)
-    if seen.size < _SHORTEST:
+    usable = np.flatnonzero(np.real(coherence) > _COHERENT)
+    if usable.size < _SHORTEST:
         raise InputError("force: the position does not follow it; check that both columns belong to one axis")
-    seen = slice(seen[0], seen[-1] + 1)
+    usable = slice(usable[0], usable[-1] + 1)
     warnings.append(
         f"the force does not repeat, so {pieces} segments of {with_unit(size * period, 's')} are averaged, with a "
         f"resolution of {plain(2.0 / (size * period), 2)} Hz; record a force of zwidth.excite for a finer one"
     )
-    device = MeasuredDevice(w[seen] / (2.0 * np.pi * period), G[seen], deviation[seen])
+    device = MeasuredDevice(w[usable] / (2.0 * np.pi * period), G[usable], deviation[usable])
     _refuse_unmoved(device)
-    return ResponseEstimate(device, period, np.real(coherence[seen]), None, pieces, float("nan"), tuple(warnings))
+    return ResponseEstimate(device, period, np.real(coherence[usable]), None, pieces, float("nan"), tuple(warnings))
 
 
 def _refuse_unmoved(device: MeasuredDevice) -> None:

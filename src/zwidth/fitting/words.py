@@ -28,7 +28,7 @@ NEAR_ROUNDING = (0.5, 1.1)  # range of residuals as expected, in units of the en
 
 STIFFER = 1.005  # least ratio of the stiffnesses of two walls that are printed as different
 _SYMBOLS = {"mass": "m", "damping": "b", "delay": "t_d", "stiffness_max": "K_max"}
-# SI units of a linear device by the last part of a path: of parameters, and of what a fit has beside them.
+# SI units for a linear device, by the last part of the path of a parameter, and of further values of a fit.
 _UNITS = {path.rpartition(".")[2]: field.unit.removeprefix("1") for path, field in FIELDS.items()}
 _UNITS |= {"stiffness_max": "N/m", "friction": "N", "offset": "N", "force": "N", "position": "m"}
 
