@@ -118,17 +118,17 @@ def read_log(
             f"{table.nameless}; add a header such as 'time [s],position [m],force [N]', or specify each column by its "
             "number and unit, as 1:ms, 2:mm and 3:N for time, position and force (1:s+2:ns for a time in two columns)"
         )
-    places = find_columns(file, heads, columns, wanted)
-    taken = [place for column in places.values() for place in column.places]
+    sources = find_columns(file, heads, columns, wanted)
+    taken = [index for column in sources.values() for index in column.indices]
     if len(set(taken)) < len(taken):
-        names = ", ".join(f"{name} {heads[column.places[0]]!r}" for name, column in places.items())
+        names = ", ".join(f"{name} {heads[column.indices[0]]!r}" for name, column in sources.items())
         raise InputError(f"{file}: the same column is used twice: {names}; specify another one")
     cells = dict(zip(taken, table.numbers(taken, gaps=True), strict=True))
-    for place, column in cells.items():
+    for index, column in cells.items():
         if not np.isfinite(column).any():
-            raise InputError(f"{file}: column {heads[place]!r} contains no number; specify another column")
-    is_counts = _look_like_counts(cells[places["position"].places[0]])
-    given, notes = _name_units(heads, places, resolution, is_counts)
+            raise InputError(f"{file}: column {heads[index]!r} contains no number; specify another column")
+    is_counts = _look_like_counts(cells[sources["position"].indices[0]])
+    given, notes = _name_units(heads, sources, resolution, is_counts)
     # The unit of the position if the column is a velocity.
     integrated = _integrate_unit(given["position"])
     units = {**given, "position": integrated or given["position"]}
@@ -147,8 +147,8 @@ def read_log(
             )
         factors["position"] = step
     factors["force"] *= constant
-    numbers = {name: cells[places[name].places[0]] * factors[name] for name in factors}
-    time = None if period is not None else _join_times(places["time"], cells, notes)
+    numbers = {name: cells[sources[name].indices[0]] * factors[name] for name in factors}
+    time = None if period is not None else _join_times(sources["time"], cells, notes)
     if period is not None:
         _compare_period(file, table, period)
     if integrated is not None:
@@ -166,23 +166,23 @@ def _look_like_counts(position: np.ndarray) -> bool:
 
 
 def _name_units(
-    heads: Sequence[str], places: Mapping[str, Column], resolution: Any, is_counts: bool
+    heads: Sequence[str], sources: Mapping[str, Column], resolution: Any, is_counts: bool
 ) -> tuple[dict[str, str], list[str]]:
     """Return the unit of each quantity, and notes on the interpretations that the user should check.
 
     Args:
         heads: headers of the table.
-        places: column of each quantity.
+        sources: column of each quantity.
         resolution: encoder resolution as specified; an angle implies a rotary axis.
         is_counts: whether the positions look like encoder counts; if so, positions without a unit are read in counts.
     """
-    units = {name: column.units[0] for name, column in places.items()}
+    units = {name: column.units[0] for name, column in sources.items()}
     notes = []
-    if any(column.guessed for column in places.values()):
-        names = [f"{name} {' + '.join(repr(heads[k]) for k in column.places)}" for name, column in places.items()]
+    if any(column.guessed for column in sources.values()):
+        names = [f"{name} {' + '.join(repr(heads[k]) for k in column.indices)}" for name, column in sources.items()]
         notes.append(f"columns identified by their headers: {', '.join(names)}")
     for name in ("position", "force"):
-        header_unit, specified = places[name].header_unit, places[name].units[0]
+        header_unit, specified = sources[name].header_unit, sources[name].units[0]
         sizes = [size for unit in (header_unit, specified) if (size := _measure(name, unit)) is not None]
         if header_unit != specified and len(sizes) == 2 and abs(sizes[0] / sizes[1] - 1) > _ROUNDING:
             notes.append(f"the {name} is read in {specified}, as specified, although its header has {header_unit}")
@@ -192,16 +192,16 @@ def _name_units(
         notes.append(f"the force in {mass} is read as a weight: 1 {mass} = {plain(weight or 0)} N")
     if is_counts and not units["position"]:
         units["position"] = COUNTS[0]
-        notes.append(f"the position {heads[places['position'].places[0]]!r} has no unit and is read in counts")
-    if _is_rotary(units, places, resolution):
+        notes.append(f"the position {heads[sources['position'].indices[0]]!r} has no unit and is read in counts")
+    if _is_rotary(units, sources, resolution):
         for name, unit in (("position", "rad"), ("force", "N m")):
-            if not units[name] and places[name].turns is not False:
+            if not units[name] and sources[name].is_rotary is not False:
                 units[name] = unit
-                notes.append(f"the {name} {heads[places[name].places[0]]!r} has no unit and is read in {unit}")
+                notes.append(f"the {name} {heads[sources[name].indices[0]]!r} has no unit and is read in {unit}")
     return units, notes
 
 
-def _is_rotary(units: Mapping[str, str], places: Mapping[str, Column], resolution: Any) -> bool:
+def _is_rotary(units: Mapping[str, str], sources: Mapping[str, Column], resolution: Any) -> bool:
     """Return whether the axis is rotary: by the units, by the resolution, or by the headers, in this order."""
     for name in ("force", "position"):
         linear, angular = DIMENSIONS[name]
@@ -211,7 +211,7 @@ def _is_rotary(units: Mapping[str, str], places: Mapping[str, Column], resolutio
                 return dimension is angular
     if resolution is not None and read_step(resolution)[1] is not None:
         return bool(read_step(resolution)[1])
-    return any(places[name].turns for name in ("force", "position"))
+    return any(sources[name].is_rotary for name in ("force", "position"))
 
 
 def _measure(name: str, unit: str) -> float | None:
@@ -235,8 +235,8 @@ def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[s
         notes: receives a note if the unit is assumed.
     """
     total: Any = 0.0
-    for place, unit in zip(column.places, column.units, strict=True):
-        values = numbers[place]
+    for index, unit in zip(column.indices, column.units, strict=True):
+        values = numbers[index]
         size = _read_unit("time", unit)[0]
         first = float(values[np.isfinite(values)][0])
         if not unit:
@@ -246,7 +246,7 @@ def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[s
                 notes.append(f"the time has no unit and is read in {name} since 1970, according to its magnitude")
         # Subtract the first of the whole seconds, because the rounding error of seconds since 1970 would exceed the
         # resolution of the other column.
-        total = total + (values - first if len(column.places) > 1 and size == 1.0 else values) * size
+        total = total + (values - first if len(column.indices) > 1 and size == 1.0 else values) * size
     return total
 
 
@@ -284,8 +284,8 @@ def _compare_period(file: str | Path, table: NamedColumns, period: float) -> Non
         column = find_columns(file, table.heads, {}, ["time"])["time"]
         if not all(column.units):
             return
-        values = table.numbers(column.places, gaps=True)
-        time = _join_times(column, dict(zip(column.places, values, strict=True)), [])
+        values = table.numbers(column.indices, gaps=True)
+        time = _join_times(column, dict(zip(column.indices, values, strict=True)), [])
         time = time[np.isfinite(time)]
     except InputError:
         # Ignore times that cannot be read, because they may be the reason why the period is specified.
