@@ -39,13 +39,13 @@ HAND = zwidth.Operator(mass=0.554, damping=6.45, stiffness=135)
 SOFT_HAND = zwidth.Operator(0.554, 6.45, 135, coupling_stiffness=2000, coupling_damping=5)
 SCENES = {
     "rigid device, backward difference": zwidth.Scene(DEVICE, TIMING),
-    "hand held rigidly": zwidth.Scene(DEVICE, TIMING, operator=HAND),
+    "hand with a rigid grasp": zwidth.Scene(DEVICE, TIMING, operator=HAND),
     "low-pass 100 Hz": zwidth.Scene(DEVICE, TIMING, velocity=zwidth.LowPass(cutoff=100)),
     "Butterworth 100 Hz, order 4": zwidth.Scene(DEVICE, TIMING, velocity=zwidth.Butterworth(100, 4)),
     "window of 10 samples": zwidth.Scene(DEVICE, TIMING, velocity=zwidth.WindowedDifference(10)),
     "coupling, sensor at the motor": zwidth.Scene(COUPLED["motor"], TIMING),
     "coupling, sensor at the tip": zwidth.Scene(COUPLED["tip"], TIMING),
-    "hand behind a spring": zwidth.Scene(DEVICE, TIMING, operator=SOFT_HAND),
+    "hand with an elastic grasp": zwidth.Scene(DEVICE, TIMING, operator=SOFT_HAND),
     "low-pass, coupling and hand": zwidth.Scene(
         COUPLED["motor"], TIMING, velocity=zwidth.LowPass(cutoff=100), operator=SOFT_HAND
     ),
@@ -94,16 +94,24 @@ def measure(scene: zwidth.Scene) -> tuple[int, float, float, float, float, int, 
 def report() -> str:
     """The table in Markdown."""
     lines = [
-        "# What the parts of a scene cost",
+        "# Run times of scenes",
         "",
-        "Written by `benchmarks/bench_scenes.py --write docs/scenes.md`, one thread, all rows in one process.",
-        "The device is the paper's PHANToM (m = 0.1 kg, b = 10 N s/m, T = 1 ms, one period of delay), with parts",
-        "added. A first verdict lays the boundary out; a wall is one of 100,000 scattered ones, each with a damping of",
-        "its own; a map has 4,000,000 walls. Eigenvalues: batched `numpy.linalg.eigvals` of the same loop's companion",
-        f"matrices, a wall. Wrong: labels of {SAMPLE:,} walls that contradict them, farther than {BLUR:g} from the",
-        "circle.",
+        "`benchmarks/bench_scenes.py --write docs/scenes.md` writes this table. All times are measured in one process",
+        "with one thread. The device is the paper's PHANToM (m = 0.1 kg, b = 10 N s/m, T = 1 ms, delay of one period).",
+        "Each row after the first one adds parts to this device.",
         "",
-        "| scene | poles | first verdict | a wall | a wall of a map | eigenvalues over map | wrong | stiffest wall |",
+        "| column | content |",
+        "|---|---|",
+        "| first query | time of the first stability query for one wall, including the computation of the boundary |",
+        f"| per wall | time per wall for {SCATTERED:,} random walls, each with a different damping |",
+        f"| per grid wall | time per wall for a grid of {MAP**2:,} walls |",
+        "| eigenvalues | time per wall of batched `numpy.linalg.eigvals` for companion matrices of the same loop, "
+        "divided by the time per grid wall |",
+        f"| wrong labels | labels of {SAMPLE:,} walls that differ from those of the eigenvalues; walls with a spectral "
+        f"radius within {BLUR:g} of 1 are excluded |",
+        "| stiffest wall | time to compute the stiffest wall of a new scene |",
+        "",
+        "| scene | poles | first query | per wall | per grid wall | eigenvalues | wrong labels | stiffest wall |",
         "|---|--:|--:|--:|--:|--:|--:|--:|",
     ]
     direct = None
@@ -118,7 +126,7 @@ def report() -> str:
             direct = _rigid_ratio(scene)
     lines += [
         "",
-        f"A rigid scene's map takes {direct:.2f} of the time of `zwidth.is_stable` on the normalized walls.",
+        f"For a rigid scene, the grid takes {direct:.2f} times as long as `zwidth.is_stable` with normalized walls.",
         "",
     ]
     return "\n".join(lines)

@@ -82,11 +82,15 @@ def report() -> str:
     lines = [
         "# Run times of simulations",
         "",
-        "Written by `benchmarks/bench_simulation.py --write docs/simulation.md`.",
+        "This page is written by `benchmarks/bench_simulation.py --write docs/simulation.md`.",
         "",
-        f"{SCENES:,} devices of different masses, dampings and delays, each on a different wall, with a constant",
-        f"external force for {PERIODS:,} periods: time per sample of the whole call. The other methods run a part",
-        "of the devices in the same process. Difference: of the positions, relative to the largest.",
+        "## Linear loops",
+        "",
+        f"The batch contains {SCENES:,} devices with different masses, dampings and delays, each with a different",
+        f"wall. A constant external force acts for {PERIODS:,} periods. The time per sample is the time of the",
+        f"whole call, divided by the number of devices and periods. The other methods simulate {BESIDE} of the",
+        "devices in the same process. The last column is the largest difference of a position from that of",
+        "`zwidth.simulate`, relative to the largest position.",
         "",
         "| method | time per sample | relative to the batch | largest difference |",
         "|---|--:|--:|--:|",
@@ -97,7 +101,7 @@ def report() -> str:
         peers = np.array([method(*wall) for wall in walls])
         error = np.abs(peers - few.position).max() / np.abs(few.position).max()
         lines.append(f"| {name} | {spent * 1e9:,.0f} ns | {spent / own:,.0f} | {error:.0e} |")
-    lines += ["", f"The first call, which compiles, took {cold:.1f} s.", "", *report_parts(), ""]
+    lines += ["", f"The first call includes the compilation and took {cold:.1f} s.", "", *report_parts(), ""]
     return "\n".join(lines)
 
 
@@ -111,7 +115,7 @@ def report_parts() -> list[str]:
         "linear": (bare, {"start_position": 1e-4}),
         "contact": (bare, hit),
         "contact, encoder, saturation": (bare, {**hit, "resolution": 2e-5, "max_force": 8.0}),
-        "and friction": (bare, {**hit, "resolution": 2e-5, "max_force": 8.0, "coulomb": 0.1}),
+        "contact, encoder, saturation, friction": (bare, {**hit, "resolution": 2e-5, "max_force": 8.0, "coulomb": 0.1}),
         "contact and jitter": (bare, {**hit, "jitter": 2e-4}),
         "FOAW and encoder": (
             zwidth.Scene(device, timing, velocity=zwidth.FOAW(noise=2e-5)),
@@ -121,9 +125,13 @@ def report_parts() -> list[str]:
         "coupling, contact and friction": (zwidth.Scene(coupled, timing), {**hit, "coulomb": 0.1}),
     }
     lines = [
-        "Nonlinear parts: one device, 1,000 walls and 1,000 periods; and one of these motions, recorded.",
+        "## Nonlinear effects",
         "",
-        "| scene | first call | time per sample, 1,000 walls | one motion of 1,000 periods |",
+        "One device is simulated with 1,000 walls for 1,000 periods, without recording the trajectories. The last",
+        "column is the time of one simulation with one wall and a recorded trajectory. The first call includes",
+        "the compilation, unless a scene above uses the same compiled program.",
+        "",
+        "| scene | first call | time per sample, 1,000 walls | one recorded simulation |",
         "|---|--:|--:|--:|",
     ]
     stiffness = np.linspace(100.0, 10e3, 1000)

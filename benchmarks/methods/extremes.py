@@ -43,10 +43,10 @@ class Finding(NamedTuple):
 def groups(d: float) -> Iterator[Group]:
     """Every group of walls at one delay."""
     rng = np.random.default_rng(20061101)
-    yield _group("near the boundary", [_near(delta, d, rng) for delta in DELTAS], d)
-    yield _group("near the start, beta = -delta", [_start(delta) for delta in DELTAS], d)
-    yield _group("soft walls, alpha from 1e-60", [_soft(delta) for delta in DELTAS], d)
-    yield _group("around the ridge (double and triple poles)", [_ridge(delta, d) for delta in DELTAS], d)
+    yield _group("walls near the stability boundary", [_near(delta, d, rng) for delta in DELTAS], d)
+    yield _group("walls near the start of the boundary curve, beta = -delta", [_start(delta) for delta in DELTAS], d)
+    yield _group("soft walls, alpha = 1e-60 to 1e-8", [_soft(delta) for delta in DELTAS], d)
+    yield _group("walls near the ridge (double and triple poles)", [_ridge(delta, d) for delta in DELTAS], d)
 
 
 def _group(name: str, parts: list[tuple[np.ndarray, ...]], d: float) -> Group:
@@ -102,14 +102,17 @@ def report(delays: tuple[float, ...] = DELAYS) -> str:
     """A Markdown table of every method and group over the delays: wrong labels, and the farthest of them."""
     found = [outcome for d in delays for outcome in judge(d)]
     lines = [
-        "# Which method holds where",
+        "# Validity of the methods at extreme parameters",
         "",
-        'Labels of each method at the extremes, compared with `method="certified"`, which proves its labels. Devices',
-        f"of delta = {', '.join(map(_shortest, DELTAS))}. A cell has the number of wrong labels and, where",
-        "the distance from the boundary is known, the farthest of them (relative, in alpha). Empty: not offered at",
-        "such delays.",
+        "Each table compares the labels (stable or unstable) of the methods of `zwidth.is_stable` with those of",
+        '`method="certified"`, which have a certificate. The walls belong to devices with the physical damping',
+        f"delta = {', '.join(map(_shortest, DELTAS))}.",
         "",
-        "Written by `scripts/refresh_extremes.py`.",
+        "A cell contains the number of wrong labels and the number of walls. If the distances of the walls from the",
+        "stability boundary are known, the largest distance of a wrong label follows, relative to alpha. A cell is",
+        "empty if the method is not measured at this delay. `1 - ulp` is the largest float64 number below 1.",
+        "",
+        "This page is written by `scripts/refresh_extremes.py`.",
         "",
     ]
     for name in dict.fromkeys(outcome.group for outcome in found):

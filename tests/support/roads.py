@@ -17,7 +17,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli import cli
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.simulation.result import MotionKind
 from zwidth.words.status import Status
 
@@ -145,7 +145,7 @@ def quick_questions(wall: Wall) -> Iterator[Question]:
     """Those that are answered in some hundredths of a second."""
     scene, K, B = wall
     yield Question("stable", verdicts(wall))
-    if not find_obstacle(**vars(scene.device)):
+    if not find_unsupported_reason(**vars(scene.device)):
         margin = float(scene.passivity_margin(K, B))
         yield Question("passive", {"is_passive": bool(scene.is_passive(K, B)), "margin": margin > 0})
 
@@ -205,7 +205,7 @@ def assessed_questions(wall: Wall) -> Iterator[Question]:
         if said and math.isfinite(values["assess"]):
             values["check"] = said[name]
         yield Question(name, values, ALIKE)
-    if not find_obstacle(**vars(scene.device)):
+    if not find_unsupported_reason(**vars(scene.device)):
         yield Question(
             "passive",
             {"scene": bool(scene.is_passive(K, B)), "assess": found.passive, "check": said and said["passive"]},
@@ -246,7 +246,12 @@ def sweep_of(wall: Wall) -> dict[str, Any]:
     scene, K, B = wall
     device, hand, tip = scene.device, scene.operator, scene.device.coupling
     axes = {"mass": device.mass, "damping": device.damping, "period": scene.timing.period, "delay": scene.timing.delay}
-    outputs = ["stable", "spectral_radius", "stiffness_max", *([] if find_obstacle(**vars(device)) else ["passive"])]
+    outputs = [
+        "stable",
+        "spectral_radius",
+        "stiffness_max",
+        *([] if find_unsupported_reason(**vars(device)) else ["passive"]),
+    ]
     study: dict[str, Any] = {"kind": "sweep", "name": "one", "outputs": outputs}
     study["axes"] = {**axes, "stiffness": [K, 2 * K], "virtual_damping": [B]}
     names = {"LowPass": "low_pass", "Butterworth": "butterworth", "WindowedDifference": "windowed_difference"}

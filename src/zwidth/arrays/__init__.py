@@ -1,1 +1,1 @@
-"""Arithmetic that knows nothing of walls, and the way from a kernel to functions of whole arrays."""
+"""Array arithmetic without reference to walls, and the vectorized evaluation of kernels."""

@@ -1,10 +1,11 @@
-"""Ball arithmetic by python-flint, an optional package."""
+"""Settings for ball arithmetic with error bounds by python-flint, an optional package."""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
 
-BITS = tuple(128 << k for k in range(7))  # working precisions, tried in this order until a verdict is certain
+# Working precisions in bits, tried in this order until a result is certain.
+BITS = tuple(128 << k for k in range(7))
 
 
 def available() -> bool:

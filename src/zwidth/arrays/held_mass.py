@@ -1,17 +1,20 @@
-"""Exact discretization of a damped mass under a delayed force with zero-order hold.
+"""Discretize a damped mass exactly under a delayed force with zero-order hold.
 
-Normalized to T = 1 and m = 1. With d = n + f (n whole, 0 <= f < 1) the force computed at sample k acts from
-k + d on: in each period the older force holds during [0, f), the newer one during [f, 1). From computed
-force to sampled position that is
+In normalized units (T = 1, m = 1) the device has the damping delta and the delay d = n + f (n integer, 0 <= f < 1). The
+force computed at sample k acts from k + d on: in each period, the older force acts during [0, f) and the newer one
+during [f, 1). The response from computed force to sampled position is
 
-    x/F = N(z) / (z^(1+n) (z - 1)(z - c))     with N(z) = z n0(z) + n1(z) = a2 z^2 + a1 z + a0,
+    x/F = N(z) / (z^(1+n) (z - 1)(z - c))     with N(z) = z n0(z) + n1(z) = a2 z^2 + a1 z + a0
 
-``phi2 z^2 + psi z`` at f = 0. All three coefficients (docs/theory/model.md) are sums of positive terms, so none of them
-cancels, of the phi-functions of exponential integrators, ``c = e^-x``, ``phi1 = (1 - c)/x``, ``phi2 = (1 - phi1)/x``,
-``psi = phi1 - phi2``, ``gap = phi2 - psi``. As printed, each quotient cancels for small x. Below `_SERIES_BELOW` phi1
-and gap are therefore ``e^(-x/2)`` times a power series in x^2 whose terms are all positive, which cancels nowhere and
-has the right derivatives at 0; ``phi2, psi = (phi1 +- gap)/2`` loses about one bit at the switch and none at 0. Above
-it the closed forms lose less than two bits.
+and ``N(z) = phi2 z^2 + psi z`` for f = 0. The three coefficients (docs/theory/model.md) are sums of positive terms in
+the phi-functions of exponential integrators at x = delta and its fractions:
+
+    c = e^-x     phi1 = (1 - c)/x     phi2 = (1 - phi1)/x     psi = phi1 - phi2     gap = phi2 - psi
+
+For small x these quotients cancel. Below `SERIES_BELOW`, phi1 and gap are therefore computed as ``e^(-x/2)`` times a
+power series in x^2 with positive terms, which does not cancel and has accurate derivatives at 0;
+``phi2, psi = (phi1 +- gap)/2`` then loses about one bit at the switch and none at 0. Above it the closed forms lose
+less than two bits.
 """
 
 from __future__ import annotations
@@ -27,13 +30,12 @@ from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY
 from zwidth.words.types import Array
 from zwidth.words.xp import horner, is_traced, namespace, nan_unless
 
-_SERIES_BELOW = 2.5
-# The first term left out is below 1.25^22/23! = 6e-21 of the sum, and of its first two derivatives.
-_TERMS = 11
+SERIES_BELOW = 2.5  # x below which the series are used
+SERIES_TERMS = 11  # the first omitted term is below 1.25^22/23! = 6e-21 of the sum and of its first two derivatives
 # phi1 = e^(-x/2) sum_k (x/2)^(2k) / (2k + 1)!
-_PHI1 = [1.0 / factorial(2 * k + 1) for k in range(_TERMS)]
+PHI1 = [1.0 / factorial(2 * k + 1) for k in range(SERIES_TERMS)]
 # gap = -x phi2' = e^(-x/2) x sum_k (k + 1) (x/2)^(2k) / (2k + 3)!
-GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(_TERMS)]
+GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(SERIES_TERMS)]
 
 
 class PhiFunctions(NamedTuple):
@@ -47,16 +49,19 @@ class PhiFunctions(NamedTuple):
 
 
 def phi_functions(x: Array) -> PhiFunctions:
-    """Return c, phi1, phi2, psi and gap at x >= 0, accurate to 30 units of 2^-53 if ``xp.exp`` is to 8."""
+    """Return c, phi1, phi2, psi and gap at x >= 0.
+
+    Their relative errors are below 30 units of 2^-53 if that of ``xp.exp`` is below 8 units.
+    """
     xp = namespace(x)
-    small = x < _SERIES_BELOW
+    small = x < SERIES_BELOW
     factor = xp.exp(-0.5 * x)
     c = factor * factor
     # Use a valid argument in the branch that is not selected, because NaN would spoil the derivatives of the other.
-    half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, _SERIES_BELOW, x)
-    square = half * half
-    low1, low_gap = factor * horner(square, _PHI1), factor * (2.0 * half) * horner(square, GAP)
-    # Above the switch 1 - c has no cancellation. Unlike expm1 its derivative has a small relative error.
+    half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, SERIES_BELOW, x)
+    half_squared = half * half
+    low1, low_gap = factor * horner(half_squared, PHI1), factor * (2.0 * half) * horner(half_squared, GAP)
+    # Above `SERIES_BELOW`, 1 - c does not cancel. Its derivative has a small relative error, unlike that of expm1.
     inverse = 1.0 / high
     high1 = (1.0 - c) * inverse
     return PhiFunctions(
@@ -68,69 +73,78 @@ def phi_functions(x: Array) -> PhiFunctions:
     )
 
 
-# x -> `PhiFunctions`, in any arithmetic
+# Maps x to `PhiFunctions`, in any arithmetic.
 Functions = Callable[[Any], Any]
 
 
 class Plant(NamedTuple):
-    """What the loop needs to know of device and delay; scalars, normalized."""
+    """The discretized device: coefficients of its numerator N(z), and its pole c."""
 
-    c: Array  # e^-delta, the pole of the velocity
-    em: Array  # 1 - c without cancellation
+    c: Array  # e^-delta, the pole besides z = 1
+    em: Array  # 1 - c, without cancellation
     a2: Array
     a1: Array
     a0: Array
-    gap: Array  # N(-1) = a2 - a1 + a0 without cancellation
+    gap: Array  # N(-1) = a2 - a1 + a0, without cancellation
 
 
-def held_plant(
-    delta: Any, fraction: Any = None, functions: Functions = phi_functions, at: Any = None, at_t: Any = None
+def discretize_mass(
+    delta: Any, fraction: Any = None, functions: Functions = phi_functions, phi: Any = None, phi_t: Any = None
 ) -> Plant:
-    """Discretize for a delay whose fractional part is ``fraction``, in [0, 1), or None: N(z) = z (phi2 z + psi)."""
-    # In any arithmetic whose phi-functions are given; ``at`` and ``at_t`` are these at delta and at delta (1 -
-    # fraction), where somebody has them.
-    at = functions(delta) if at is None else at
+    """Discretize a mass with damping and a fractional delay, in any arithmetic.
+
+    Args:
+        delta: normalized damping.
+        fraction: fractional part f of the delay, in [0, 1); None for an integer delay, with a0 = 0.
+        functions: evaluates the phi-functions in this arithmetic.
+        phi: phi-functions at delta, if already computed.
+        phi_t: phi-functions at delta (1 - f), if already computed.
+    """
+    phi = functions(delta) if phi is None else phi
     if fraction is None:
-        return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
+        return Plant(phi.c, delta * phi.phi1, phi.phi2, phi.psi, 0.0 * phi.gap, phi.gap)
     f = fraction
     t = 1.0 - f
-    at_t, at_f = functions(delta * t) if at_t is None else at_t, functions(delta * f)
-    e_t = at_t.c
-    a2 = t * t * at_t.phi2
-    a1 = t * t * at_t.psi + t * f * e_t * at_f.phi1 + f * f * at_f.phi2 + t * f * at_t.phi1 * at_f.phi1
-    a0 = e_t * f * f * at_f.psi
+    phi_t, phi_f = functions(delta * t) if phi_t is None else phi_t, functions(delta * f)
+    e_t = phi_t.c
+    a2 = t * t * phi_t.phi2
+    a1 = t * t * phi_t.psi + t * f * e_t * phi_f.phi1 + f * f * phi_f.phi2 + t * f * phi_t.phi1 * phi_f.phi1
+    a0 = e_t * f * f * phi_f.psi
     gap = (
-        t * t * at_t.gap - t * f * at_f.phi1 * (e_t + at_t.phi1) - f * f * (at_f.gap + delta * t * at_t.phi1 * at_f.psi)
+        t * t * phi_t.gap
+        - t * f * phi_f.phi1 * (e_t + phi_t.phi1)
+        - f * f * (phi_f.gap + delta * t * phi_t.phi1 * phi_f.psi)
     )
-    return Plant(at.c, delta * at.phi1, a2, a1, a0, gap)
+    return Plant(phi.c, delta * phi.phi1, a2, a1, a0, gap)
 
 
 def factor_numerator(plant: Plant) -> tuple[Array, Array]:
-    """h and q of ``N(z) = (a2 z + h)(z + q)``: its zeros are real and not positive."""
+    """Return h and q of ``N(z) = (a2 z + h)(z + q)``, both >= 0 because the zeros of N are real and not positive."""
     xp = namespace(plant.a1)
     h = 0.5 * (plant.a1 + xp.sqrt(xp.maximum(plant.a1 * plant.a1 - 4.0 * plant.a2 * plant.a0, 0.0)))
     return h, plant.a0 / h
 
 
 def split_delay(d: Array) -> tuple[Array, Array]:
-    """``d = n + f``; the difference is exact in floating point. Derivatives are those from the right."""
+    """Return n and f of the delay ``d = n + f``; f has no rounding error, and derivatives are those from the right."""
     whole = namespace(d).floor(d)
     return whole, d - whole
 
 
 class DelayClasses(NamedTuple):
-    """Which delays occur among the points of a kernel; what does not occur costs nothing."""
+    """The classes of delays among the points of a kernel, so that code for other classes is not executed."""
 
     short: bool  # below one period
     long: bool  # of one period or more
-    fractional: bool
+    fractional: bool  # not an integer
 
 
+# Delays of any class, for traced delays.
 ANY = DelayClasses(True, True, True)
 
 
 def classify_delays(d: Any) -> DelayClasses:
-    """The `DelayClasses` of an array of delays, `ANY` where they are traced; what is no delay counts as short."""
+    """Return the classes of an array of delays; `ANY` if it is traced. NaN and negative values count as short."""
     if isinstance(d, float | int):
         return DelayClasses(not d >= 1, d >= 1, isinstance(d, float) and not d.is_integer())
     if is_traced(d):
@@ -140,42 +154,47 @@ def classify_delays(d: Any) -> DelayClasses:
     return DelayClasses(not (long.size and np.all(long)), bool(np.any(long)), bool(np.any(np.floor(d) != d)))
 
 
-class DeviceTerms(NamedTuple):
-    """Delay, plant and phi-functions of one device; NaN throughout where delta or d is out of range."""
+class DiscretePlant(NamedTuple):
+    """Delay, discretized device and phi-functions of points (delta, d); all NaN if delta or d is out of range."""
 
     delta: Array
     whole: Array  # n
     f: Array
     c: Array
     em: Array  # 1 - c
-    p1: Array  # phi1 = a2 + a1 + a0
-    p2: Array
-    psi: Array
-    p1_t: Array  # phi1 and psi of delta (1 - f)
-    psi_t: Array
+    p1: Array  # phi1(delta) = a2 + a1 + a0
+    p2: Array  # phi2(delta)
+    psi: Array  # psi(delta)
+    p1_t: Array  # phi1(delta (1 - f))
+    psi_t: Array  # psi(delta (1 - f))
     a2: Array
     a1: Array
     a0: Array
     gap: Array  # N(-1) = a2 - a1 + a0
-    tilt: Array  # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1
+    minus_one_coefficient: Array  # r; P(-1) has the sign of a stable loop if and only if r (alpha + 2 beta) < 1
 
 
-def device(delta: Array, d: Array, kind: DelayClasses = ANY) -> DeviceTerms:
-    """Return the `DeviceTerms` of one (delta, d), or of arrays of one shape."""
-    delta, d = nan_unless(valid_device(delta, d), delta, d)
+def discretize_plant(delta: Array, d: Array, kind: DelayClasses = ANY) -> DiscretePlant:
+    """Discretize the device for arrays of delta and d of one shape, or for scalars.
+
+    Args:
+        delta: normalized damping.
+        d: delay in periods.
+        kind: classes of the delays; if none is fractional, the simpler formulas for f = 0 are used.
+    """
+    delta, d = nan_unless(is_valid_device(delta, d), delta, d)
     whole, f = split_delay(d)
-    at = phi_functions(delta)
-    late = phi_functions(delta * (1.0 - f)) if kind.fractional else at
-    plant = held_plant(delta, f if kind.fractional else None, at=at, at_t=late)
-    # tilt is 0 if N(-1) = 0.
-    tilt = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
-    return DeviceTerms(
-        *(delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi),
-        *(plant.a2, plant.a1, plant.a0, plant.gap, tilt),
+    phi = phi_functions(delta)
+    phi_t = phi_functions(delta * (1.0 - f)) if kind.fractional else phi
+    plant = discretize_mass(delta, f if kind.fractional else None, phi=phi, phi_t=phi_t)
+    # (-1)^n P(-1) = 2 (1 + c) - (-1)^n N(-1) (alpha + 2 beta) is positive if the loop is stable.
+    minus_one_coefficient = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
+    return DiscretePlant(
+        *(delta, whole, f, plant.c, plant.em, phi.phi1, phi.phi2, phi.psi, phi_t.phi1, phi_t.psi),
+        *(plant.a2, plant.a1, plant.a0, plant.gap, minus_one_coefficient),
     )
 
 
-def valid_device(delta: Array, d: Array) -> Array:
-    """Whether a device and its delay lie where the model is computed."""
-    # What is NaN or infinite compares as outside.
+def is_valid_device(delta: Array, d: Array) -> Array:
+    """Return whether delta and d are in range, elementwise; False for NaN."""
     return (delta >= 0) & (delta <= LARGEST_DAMPING) & (d >= 0) & (d <= LONGEST_DELAY)

@@ -1,4 +1,4 @@
-"""The persistent cache of compiled kernels, a folder in the user's cache directory."""
+"""Persistent cache of compiled JAX kernels, a folder in the user's cache directory."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
+FOLDER_VARIABLE = "JAX_COMPILATION_CACHE_DIR"  # environment variable of JAX
 
 
 class KernelCache(NamedTuple):
-    """Where compiled kernels are kept, and how many bytes they take."""
+    """The folder of the cache and its size."""
 
     folder: Path
-    nbytes: int
+    nbytes: int  # total size of its files
 
 
 def use_compilation_cache(folder: str | Path | None = None) -> KernelCache:
@@ -38,22 +38,23 @@ def use_compilation_cache(folder: str | Path | None = None) -> KernelCache:
         >>> cache.folder.is_absolute(), cache.nbytes >= 0
         (True, True)
     """
-    if folder is not None or _VARIABLE not in os.environ:
-        os.environ[_VARIABLE] = str(_own_folder() if folder is None else Path(folder).absolute())
-        # Every kernel is worth keeping: the many small ones add up to most of a cold start.
+    if folder is not None or FOLDER_VARIABLE not in os.environ:
+        os.environ[FOLDER_VARIABLE] = str(_get_default_folder() if folder is None else Path(folder).absolute())
+        # Also store kernels that compile fast, because together these take most of the time of a first call.
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-        # JAX reads its variables when it is imported; later it must be told.
+        # JAX reads its environment variables only when it is imported.
         if "jax" in sys.modules:
             import jax
 
-            jax.config.update("jax_compilation_cache_dir", os.environ[_VARIABLE])
+            jax.config.update("jax_compilation_cache_dir", os.environ[FOLDER_VARIABLE])
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
             jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    used = Path(os.environ[_VARIABLE])
-    return KernelCache(used, sum(entry.stat().st_size for entry in used.glob("*") if entry.is_file()))
+    path = Path(os.environ[FOLDER_VARIABLE])
+    return KernelCache(path, sum(entry.stat().st_size for entry in path.glob("*") if entry.is_file()))
 
 
-def _own_folder() -> Path:
+def _get_default_folder() -> Path:
+    """Return the folder of zwidth in the user's cache directory."""
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "zwidth" / "jax"

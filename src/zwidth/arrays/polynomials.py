@@ -1,4 +1,4 @@
-"""Polynomials by their coefficients, the highest power first: affine in two numbers, and their companion matrices."""
+"""Represent polynomials by their coefficients, highest power first, and compute their companion matrices."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from zwidth.words.xp import namespace
 
 
 class Affine(NamedTuple):
-    """``P = D + alpha N1 + beta N2``: three coefficient vectors of one length, highest power first."""
+    """The characteristic polynomial ``P = D + alpha N1 + beta N2``, affine in the wall (alpha, beta).
+
+    The three coefficient vectors have the same length.
+    """
 
     D: Coefficients
     N1: Coefficients
@@ -17,13 +20,20 @@ class Affine(NamedTuple):
 
 
 def companion(monic: Coefficients) -> Matrices:
-    """The companion matrices whose eigenvalues are the zeros of monic polynomials, highest power first."""
+    """Return companion matrices, whose eigenvalues are the zeros of monic polynomials.
+
+    Args:
+        monic: coefficients, highest power first, shape (..., degree + 1).
+
+    Returns:
+        Matrices of shape (..., degree, degree).
+    """
     xp = namespace(monic)
     size = monic.shape[-1] - 1
-    below = xp.broadcast_to(xp.eye(size - 1, size, dtype=monic.dtype), (*monic.shape[:-1], size - 1, size))
-    return xp.concatenate([-monic[..., None, 1:], below], axis=-2)
+    shift = xp.broadcast_to(xp.eye(size - 1, size, dtype=monic.dtype), (*monic.shape[:-1], size - 1, size))
+    return xp.concatenate([-monic[..., None, 1:], shift], axis=-2)
 
 
-def square(x: Any) -> Array:
-    """``|x|^2``."""
+def abs2(x: Any) -> Array:
+    """Return ``|x|^2``."""
     return x.real * x.real + x.imag * x.imag

@@ -1,7 +1,7 @@
-"""Zeros and integrals of functions of one unknown, elementwise, for NumPy and JAX; of several unknowns for JAX only.
+"""Find zeros and minima of functions of one unknown, and integrate them, elementwise in NumPy and JAX.
 
-The number of steps is fixed, so that no point of a batch waits for another. The result of a point does not depend on
-the other points.
+The same source code runs in both. The number of steps is fixed for JAX; NumPy stops when all points have converged. The
+result of a point does not depend on the other points of its batch. Only `polish` solves for several unknowns, in JAX.
 """
 
 from __future__ import annotations
@@ -14,17 +14,14 @@ import numpy as np
 from zwidth.words.types import Array
 from zwidth.words.xp import along, frozen, namespace, repeat
 
+# Maps points to values; or to values and derivatives.
 Function = Callable[[Array], Array]
 Sloped = Callable[[Array], tuple[Array, Array]]
 
-# Halvings to the last place of float64, with room; also of a logarithm that spans 32 decades.
-_HALVINGS = 60
-# After a step of such a share of x nothing but rounding is left, near a double zero too.
-_SMALL = 1e-11
-# A phase in radians, which false position is for, is not known better.
-_ROUNDING = 1e-15
-# Of optimistix.
-_NEWTON_STEPS = 16
+HALVINGS = 60  # bisection to the last digit of float64, also of the logarithm of a range of 32 decades
+CONVERGED_STEP = 1e-11  # relative step after which the error of Newton's method is rounding, also near a double zero
+ZERO_VALUE = 1e-15  # largest |value| of a zero in `false_position`: rounding error of a phase in rad, its main use
+MAX_NEWTON_STEPS = 16  # of optimistix
 
 
 def bisect(holds: Function, low: Array, high: Array) -> Array:
@@ -32,17 +29,27 @@ def bisect(holds: Function, low: Array, high: Array) -> Array:
     xp = namespace(low, high)
 
     def halve(ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        at = 0.5 * (ends[0] + ends[1])
-        held = holds(at)
-        return xp.where(held, at, ends[0]), xp.where(held, ends[1], at)
+        middle = 0.5 * (ends[0] + ends[1])
+        is_true = holds(middle)
+        return xp.where(is_true, middle, ends[0]), xp.where(is_true, ends[1], middle)
 
-    low, high = repeat(_HALVINGS, halve, (low, high), xp)
+    low, high = repeat(HALVINGS, halve, (low, high), xp)
     return 0.5 * (low + high)
 
 
 def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) -> tuple[Array, Array]:
-    """Newton's method in a bracket below which a function is negative; the zero, and the size of the last step."""
-    # The bracket shrinks with every value, and a step that leaves it becomes a bisection.
+    """Find a zero by Newton's method within a bracket; a step that leaves the bracket is replaced by a bisection.
+
+    Args:
+        function: returns value and derivative; the value is negative below the zero and positive above it.
+        low: lower end of the bracket.
+        high: upper end of the bracket.
+        start: starting value.
+        steps: largest number of steps.
+
+    Returns:
+        The zero, and the magnitude of the last step.
+    """
     xp = namespace(low, start)
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -51,134 +58,191 @@ def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) 
         low, high = xp.where(value < 0, x, low), xp.where(value < 0, high, x)
         new = x - value / slope
         new = xp.where((new >= low) & (new <= high), new, 0.5 * (low + high))
-        done = last <= _SMALL * xp.abs(x)
-        return xp.where(done, x, new), low, high, xp.where(done, last, xp.abs(new - x))
+        converged = last <= CONVERGED_STEP * xp.abs(x)
+        return xp.where(converged, x, new), low, high, xp.where(converged, last, xp.abs(new - x))
 
-    def arrived(_: tuple[Array, ...], new: tuple[Array, ...]) -> bool:
-        return bool(np.all(new[3] <= _SMALL * np.abs(new[0])))
+    def is_done(_: tuple[Array, ...], new: tuple[Array, ...]) -> bool:
+        return bool(np.all(new[3] <= CONVERGED_STEP * np.abs(new[0])))
 
-    x, _, _, last = repeat(steps, step, (start, low, high, xp.full_like(start, xp.inf)[()]), xp, arrived)
+    x, _, _, last = repeat(steps, step, (start, low, high, xp.full_like(start, xp.inf)[()]), xp, is_done)
     return x, last
 
 
-# Of a step of golden section.
-_GOLDEN = 0.3819660112501051
+GOLDEN_SECTION = 0.3819660112501051  # (3 - sqrt(5))/2, the position of a trial point in the longer part
 
 
-def narrow_dips(
+def minimize_golden_section(
     cost: Function, left: Array, middle: Array, right: Array, value: Array, steps: int, close: float = 0.0
 ) -> tuple[Array, Array]:
-    """Lowest places of a function between two others, and its values there, by golden section."""
-    # In NumPy no longer than until each is known to the share ``close`` of itself.
+    """Find local minima by golden-section search.
+
+    Args:
+        cost: the function.
+        left: left ends of the brackets.
+        middle: points inside with a value not above that of either end.
+        right: right ends of the brackets.
+        value: values at ``middle``.
+        steps: number of steps; NumPy stops earlier if all brackets are narrower than ``close``.
+        close: width of a bracket, relative to its middle.
+
+    Returns:
+        The minima, and the values there.
+    """
     xp = namespace(left, value)
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
         left, middle, right, value = state
-        upwards = right - middle > middle - left
-        trial = middle + _GOLDEN * xp.where(upwards, right - middle, left - middle)
-        reached = cost(trial)
-        # Of the trial and the middle the lower one becomes the middle, the other one an end.
-        better = reached < value
+        is_right_longer = right - middle > middle - left
+        trial = middle + GOLDEN_SECTION * xp.where(is_right_longer, right - middle, left - middle)
+        trial_value = cost(trial)
+        # The lower of the trial point and the middle becomes the new middle, and the other one becomes an end.
+        better = trial_value < value
         end, is_right = xp.where(better, middle, trial), better ^ (trial > middle)
         left, right = xp.where(is_right, left, end), xp.where(is_right, end, right)
-        return left, xp.where(better, trial, middle), right, xp.where(better, reached, value)
+        return left, xp.where(better, trial, middle), right, xp.where(better, trial_value, value)
 
-    def arrived(_: tuple[Array, ...], new: tuple[Array, ...]) -> bool:
+    def is_done(_: tuple[Array, ...], new: tuple[Array, ...]) -> bool:
         return bool(np.all(new[2] - new[0] <= close * np.abs(new[1])))
 
-    _, middle, _, value = repeat(steps, step, (left, middle, right, value), xp, arrived)
+    _, middle, _, value = repeat(steps, step, (left, middle, right, value), xp, is_done)
     return middle, value
 
 
-# How many dips between samples are refined, and by how many steps at most; and the share of the first sample at which a
-# function tells whether it falls from 0.
-_DIPS, _STEPS, _HARDLY_ANY = 3, 52, 1e-9
+# Search for the global minimum
+N_MINIMA = 3  # lowest local minima of the samples that are refined
+MAX_GOLDEN_STEPS = 52
+SMALL_SHARE = 1e-9  # argument next to 0, relative to the first sample, that shows if the function rises from 0
 
 
-def find_lowest(cost: Function, low: float, high: float, samples: int, close: float = 0.0) -> tuple[float, float]:
-    """How low a function with kinks and several dips is in NumPy, and where: samples, then golden section."""
-    # At 0 it may have a kink. Ends do not count, but 0 where it rises from there.
+def find_global_minimum(
+    cost: Function, low: float, high: float, samples: int, close: float = 0.0
+) -> tuple[float, float]:
+    """Find the global minimum of a function with kinks and several local minima, in NumPy.
+
+    The function is sampled, and the lowest samples are refined by golden-section search. The ends of the range count as
+    minima only if ``low`` is 0 and the function increases from there.
+
+    Args:
+        cost: the function.
+        low: lower end of the range.
+        high: upper end of the range.
+        samples: number of samples.
+        close: accuracy of the argument, relative to it.
+
+    Returns:
+        The smallest value, and its argument.
+    """
+    # Sample 0 as well, because the function may have a kink there.
     grid = np.union1d(np.linspace(low, high, samples), np.clip(0.0, low, high))
     values = np.pad(cost(grid[1:-1]), 1, constant_values=np.inf)
     if low == 0.0:
-        none, beside = cost(np.array([0.0, _HARDLY_ANY * grid[1]])).tolist()
-        values[0] = none if none <= beside else np.inf
-    dips = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
-    dips = dips[np.argsort(values[dips])][:_DIPS]
-    found = [(float(values[0]), low)]
-    if dips.size:
-        middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], _STEPS, close)
-        found += zip(value.tolist(), middle.tolist(), strict=True)
-    return min(found)
+        at_zero, next_to_zero = cost(np.array([0.0, SMALL_SHARE * grid[1]])).tolist()
+        values[0] = at_zero if at_zero <= next_to_zero else np.inf
+    minima = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
+    minima = minima[np.argsort(values[minima])][:N_MINIMA]
+    candidates = [(float(values[0]), low)]
+    if minima.size:
+        middle, value = minimize_golden_section(
+            cost, grid[minima - 1], grid[minima], grid[minima + 1], values[minima], MAX_GOLDEN_STEPS, close
+        )
+        candidates += zip(value.tolist(), middle.tolist(), strict=True)
+    return min(candidates)
 
 
 class _Bracket(NamedTuple):
+    """State of `false_position`: the brackets, and the best point of each."""
+
     low: Any
     high: Any
-    at_low: Any  # weights: the values, halved where an end stays twice
-    at_high: Any
-    side: Any  # which end moved last, 1 the low one
-    best: Any
-    value: Any
+    at_low: Any  # value at the low end; halved if this end stays twice in a row
+    at_high: Any  # the same at the high end
+    side: Any  # end that moved last: 1 for the low, -1 for the high one
+    best: Any  # point with the smallest |value|
+    value: Any  # value there
 
 
 def false_position(
     function: Function, low: Array, high: Array, at_low: Array, at_high: Array, steps: int, width: Array | float
 ) -> Array:
-    """Where a function that is positive at ``low`` and not at ``high`` changes sign, within two of ``width``."""
-    # With halved weights, every sixth step a bisection, and cut ``width`` from the ends at least, or the end that is
-    # not next to the zero would stay.
+    """Find a sign change by the Illinois variant of false position.
+
+    The value at an end that stays twice in a row is halved, every sixth step is a bisection, and each step is at least
+    ``width`` away from both ends, because otherwise the end far from the zero might never move.
+
+    Args:
+        function: positive at ``low`` and not positive at ``high``.
+        low: lower ends of the brackets.
+        high: upper ends of the brackets.
+        at_low: values at ``low``.
+        at_high: values at ``high``.
+        steps: largest number of steps.
+        width: half the width of a bracket at which the search stops.
+
+    Returns:
+        The points with the smallest |value| in their final brackets.
+    """
     xp = namespace(low, at_low)
 
-    def done(at: _Bracket) -> Array:
-        return (xp.abs(at.value) <= _ROUNDING) | (at.high - at.low <= 2.0 * width)
+    def have_converged(bracket: _Bracket) -> Array:
+        return (xp.abs(bracket.value) <= ZERO_VALUE) | (bracket.high - bracket.low <= 2.0 * width)
 
-    def going(state: tuple[Any, _Bracket]) -> Any:
-        return (state[0] < steps) & ~xp.all(done(state[1]))
+    def is_unfinished(state: tuple[Any, _Bracket]) -> Any:
+        return (state[0] < steps) & ~xp.all(have_converged(state[1]))
 
     def step(state: tuple[Any, _Bracket]) -> tuple[Any, _Bracket]:
-        k, at = state
-        gap = at.at_low - at.at_high
-        trial = at.low + (at.high - at.low) * (at.at_low / xp.where(gap > 0, gap, 1.0))
-        trial = xp.minimum(xp.maximum(trial, at.low + width), at.high - width)
-        inside = (trial > at.low) & (trial < at.high) & (k % 6 != 5)
-        # A scalar of NumPy is five times faster than an array of no dimension.
-        trial = xp.where(inside, trial, 0.5 * (at.low + at.high))[()]
+        k, old = state
+        gap = old.at_low - old.at_high
+        trial = old.low + (old.high - old.low) * (old.at_low / xp.where(gap > 0, gap, 1.0))
+        trial = xp.minimum(xp.maximum(trial, old.low + width), old.high - width)
+        inside = (trial > old.low) & (trial < old.high) & (k % 6 != 5)
+        # ``[()]`` makes a NumPy scalar of a zero-dimensional array, which is five times as fast.
+        trial = xp.where(inside, trial, 0.5 * (old.low + old.high))[()]
         value = function(trial)
         above = value > 0
-        low, high = xp.where(above, trial, at.low), xp.where(above, at.high, trial)
-        # Of a jump the best one is what is left of the bracket, too. A point that is done keeps its value: it must not
-        # depend on the points beside it.
-        better = ((xp.abs(value) < xp.abs(at.value)) | (at.best < low) | (at.best > high)) & ~done(at)
+        low, high = xp.where(above, trial, old.low), xp.where(above, old.high, trial)
+        # Also replace the best point if it has left the bracket, as at a jump. A converged point keeps its result,
+        # which would otherwise depend on the other points of the batch.
+        better = ((xp.abs(value) < xp.abs(old.value)) | (old.best < low) | (old.best > high)) & ~have_converged(old)
         return k + 1, _Bracket(
             low,
             high,
-            xp.where(above, value, xp.where(at.side < 0, 0.5 * at.at_low, at.at_low)),
-            xp.where(above, xp.where(at.side > 0, 0.5 * at.at_high, at.at_high), value),
+            xp.where(above, value, xp.where(old.side < 0, 0.5 * old.at_low, old.at_low)),
+            xp.where(above, xp.where(old.side > 0, 0.5 * old.at_high, old.at_high), value),
             xp.where(above, 1.0, -1.0) + 0.0 * value,
-            xp.where(better, trial, at.best),
-            xp.where(better, value, at.value),
+            xp.where(better, trial, old.best),
+            xp.where(better, value, old.value),
         )
 
     lower = at_low < -at_high
-    none = 0.0 * at_low
+    side = 0.0 * at_low
     best = xp.where(lower, low, high), xp.where(lower, at_low, at_high)
-    state = 0, _Bracket(low, high, at_low, at_high, none, *best)
+    state = 0, _Bracket(low, high, at_low, at_high, side, *best)
     if xp is not np:
         from jax.lax import while_loop
 
-        return while_loop(going, step, state)[1].best
-    while going(state):
+        return while_loop(is_unfinished, step, state)[1].best
+    while is_unfinished(state):
         state = step(state)
     return state[1].best
 
 
-# Steps towards a zero between two nodes at most, and how near, as a share of its place, it is told.
-_BETWEEN_STEPS, _CLOSED = 120, 4e-16
+# Zeros between nodes
+MAX_BETWEEN_STEPS = 120
+BETWEEN_WIDTH = 4e-16  # relative width of the final bracket
 
 
-def zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Where a function changes its sign behind nodes ``k``, given its values at all nodes; in NumPy."""
+def find_zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """Find zeros of a function between nodes, in NumPy.
+
+    Args:
+        function: the function.
+        nodes: ascending arguments, shape (nodes,).
+        values: values at the nodes.
+        k: indices of the nodes after which the sign changes, shape (zeros,).
+
+    Returns:
+        The zeros, shape (zeros,).
+    """
     if not k.size:
         return nodes[k]
     low, high, first, last = nodes[k], nodes[k + 1], values[k], values[k + 1]
@@ -186,53 +250,74 @@ def zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray, k: 
         sizes = np.abs(first) + np.abs(last)
         scale = np.where(first > 0, 1.0, -1.0) / np.where(sizes > 0, sizes, 1.0)
         ends = low, high, first * scale, last * scale
-        return false_position(lambda at: function(at) * scale, *ends, _BETWEEN_STEPS, _CLOSED * high)
+        return false_position(lambda x: function(x) * scale, *ends, MAX_BETWEEN_STEPS, BETWEEN_WIDTH * high)
 
 
-def follow_root(
+def attach_root_derivatives(
     function: Callable[..., Array],
     root: Array,
     usable: Callable[..., Array],
-    *known: Any,
+    *parameters: Any,
     slope: Callable[..., Array] | None = None,
 ) -> Array:
-    """A zero x of ``function(x, *known)``, in JAX with its derivatives of every order in what is known."""
-    # They are those of the implicit function, so that nothing of a search is differentiated, and 0 but where
-    # ``usable(x, slope, step)``, of the function and of Newton's next step. ``slope`` is its derivative where known.
+    """Return a root of ``function(x, *parameters)`` that is differentiable in the parameters to any order, in JAX.
+
+    The derivatives are those of the implicit function, so the search for the root is not differentiated. NumPy returns
+    the root itself.
+
+    Args:
+        function: the function.
+        root: its root.
+        usable: maps root, derivative of the function and next Newton step to True where the derivatives are valid; they
+            are 0 elsewhere.
+        *parameters: arrays or trees of arrays.
+        slope: derivative of the function in x; computed by automatic differentiation if left out.
+    """
     xp = namespace(root)
     if xp is np:
         return root
     import jax
 
-    def differentiate(x: Array, *known: Any) -> Array:
-        return jax.jvp(lambda x: function(x, *known), (x,), (xp.ones_like(x),))[1]
+    def differentiate(x: Array, *parameters: Any) -> Array:
+        return jax.jvp(lambda x: function(x, *parameters), (x,), (xp.ones_like(x),))[1]
 
     @jax.custom_jvp
-    def follow(root: Array, *known: Any) -> Array:
+    def attach(root: Array, *parameters: Any) -> Array:
+        """Return the root; its derivatives follow from ``rule``."""
         return root
 
     def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-        x, known = follow(*primals), primals[1:]
-        leaves, tree = jax.tree.flatten(known)
-        sides = jax.tree.leaves(tangents[1:])
-        # What does not move costs nothing.
-        moving = [k for k, side in enumerate(sides) if not isinstance(side, jax.custom_derivatives.SymbolicZero)]
+        """Return the root and its tangent, by implicit differentiation."""
+        x, parameters = attach(*primals), primals[1:]
+        leaves, tree = jax.tree.flatten(parameters)
+        changes = jax.tree.leaves(tangents[1:])
+        # Differentiate only in the parameters with a nonzero tangent.
+        varied = [k for k, each in enumerate(changes) if not isinstance(each, jax.custom_derivatives.SymbolicZero)]
 
-        def of_moving(*moved: Any) -> Array:
-            among = dict(zip(moving, moved, strict=True))
-            return function(x, *tree.unflatten([among.get(k, leaf) for k, leaf in enumerate(leaves)]))
+        def evaluate_varied(*values: Any) -> Array:
+            replaced = dict(zip(varied, values, strict=True))
+            return function(x, *tree.unflatten([replaced.get(k, leaf) for k, leaf in enumerate(leaves)]))
 
-        value, change = jax.jvp(of_moving, tuple(leaves[k] for k in moving), tuple(sides[k] for k in moving))
-        rate = (slope or differentiate)(x, *known)
-        taken = usable(*frozen((x, rate, value / xp.where(rate == 0, 1.0, rate)), xp))
-        return x, xp.where(taken, -change / xp.where(taken, rate, 1.0), 0.0)
+        value, change = jax.jvp(evaluate_varied, tuple(leaves[k] for k in varied), tuple(changes[k] for k in varied))
+        rate = (slope or differentiate)(x, *parameters)
+        valid = usable(*frozen((x, rate, value / xp.where(rate == 0, 1.0, rate)), xp))
+        return x, xp.where(valid, -change / xp.where(valid, rate, 1.0), 0.0)
 
-    follow.defjvp(rule, symbolic_zeros=True)
-    return follow(frozen(root, xp), *known)
+    attach.defjvp(rule, symbolic_zeros=True)
+    return attach(frozen(root, xp), *parameters)
 
 
 def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes: Sequence[int]) -> Array:
-    """The integral of a function of points along a new last axis, by Gauss and Legendre's nodes between edges."""
+    """Integrate a function by Gauss-Legendre quadrature.
+
+    Args:
+        function: evaluated at points along a new last axis.
+        edges: ends of the intervals of integration, one array per end.
+        nodes: number of nodes in each interval.
+
+    Returns:
+        The integral from the first to the last edge, in their shape.
+    """
     xp, pieces = namespace(*edges), []
     for low, high, count in zip(edges[:-1], edges[1:], nodes, strict=True):
         node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(count))
@@ -242,18 +327,26 @@ def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes:
     return xp.sum(function(points) * weights, axis=-1)
 
 
-def polish(residual: Callable[[Array, Any], Array], start: Array, args: Any, usable: Array) -> Array:
-    """The zero of real equations next to a ``usable`` start by optimistix' Newton method, differentiable in args."""
+def polish_root(residual: Callable[[Array, Any], Array], start: Array, args: Any, usable: Array) -> Array:
+    """Solve real equations from a nearby start by the Newton method of optimistix, differentiably in ``args``.
+
+    Args:
+        residual: maps unknowns and ``args`` to the residuals of the equations, as many as unknowns.
+        start: starting values.
+        args: parameters of the equations.
+        usable: False for starts that are to be returned unchanged.
+    """
     import jax.numpy as jnp
     import optimistix
 
-    def equations(unknowns: Array, known: Any) -> Array:
-        # Another start stays: what is not finite, or has no slope, would stop the solver for all lanes that share it.
-        args, usable, start = known
+    def equations(unknowns: Array, parameters: Any) -> Array:
+        # An unusable start solves trivial equations, because nonfinite values or a singular Jacobian would stop the
+        # solver for all entries of a batch.
+        args, usable, start = parameters
         return jnp.where(usable, residual(unknowns, args), unknowns - start)
 
     tolerance = float(16 * jnp.finfo(start.dtype).eps)
     solver = optimistix.Newton(rtol=tolerance, atol=tolerance)
     return optimistix.root_find(
-        equations, solver, start, args=(args, usable, start), max_steps=_NEWTON_STEPS, throw=False
+        equations, solver, start, args=(args, usable, start), max_steps=MAX_NEWTON_STEPS, throw=False
     ).value

@@ -1,4 +1,4 @@
-"""Functions on every processor."""
+"""Run functions in parallel threads, one per available processor."""
 
 from __future__ import annotations
 
@@ -8,17 +8,23 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 
-def processors() -> int:
-    """How many processors this process may use."""
+def count_processors() -> int:
+    """Return the number of processors that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS
+    except AttributeError:  # macOS has no CPU affinity
         return os.cpu_count() or 1
 
 
 def run_in_threads(function: Callable[[Any], Any], items: Sequence[Any], threads: int | None = None) -> list[Any]:
-    """The function's results for all items, computed on every processor."""
-    threads = min(threads or processors(), len(items))
+    """Return the results of a function for all items, in their order.
+
+    Args:
+        function: called in several threads at once.
+        items: its arguments.
+        threads: number of threads; one per processor if left out.
+    """
+    threads = min(threads or count_processors(), len(items))
     if threads < 2:
         return list(map(function, items))
     with ThreadPoolExecutor(threads) as pool:

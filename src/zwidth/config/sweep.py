@@ -24,7 +24,7 @@ from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_pa
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.parts.device import Device
 from zwidth.parts.paths import PARTS
 from zwidth.parts.timing import Timing
@@ -284,7 +284,7 @@ class SweepStudy(_Parts, Study):
             return
         parts = build_parts(self)
         # A device that is given as a whole has what such a condition asks for inside.
-        obstacle = find_obstacle(**(vars(parts["device"]) if "device" in parts else parts))
+        obstacle = find_unsupported_reason(**(vars(parts["device"]) if "device" in parts else parts))
         for index, name in enumerate(self.outputs):
             if name not in OUTPUTS_WITH_PARTS:
                 allowed = f"with a velocity filter, a hand or another part there are {listing(OUTPUTS_WITH_PARTS)}"

@@ -33,7 +33,7 @@ from zwidth.figures.grid import scale_axis
 from zwidth.figures.motion import draw_motion, draw_positions, draw_step
 from zwidth.figures.stable_set import draw_stable_set, scale_walls, tabulate_sets, tabulate_walls
 from zwidth.figures.table import Parameters, Result, Table, name_as_linear, stack
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.loops.rigid.response import settling_time
 from zwidth.parts.checks import read_texts
 from zwidth.parts.measured import MeasuredDevice
@@ -162,7 +162,7 @@ def recommendation(
         )
     panels = _choose_two_axes(axes, 1, 2, None)
     outlines, walls = tabulate_sets({"": scene})
-    if not find_obstacle(**vars(scene.device)) and scene.device.damping > 0:
+    if not find_unsupported_reason(**vars(scene.device)) and scene.device.damping > 0:
         outlines = stack([outlines, _trace_passive(scene)])
     if verdict is None:
         return draw_stable_set(outlines, walls, panels[:1])

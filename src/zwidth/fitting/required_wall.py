@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.held_mass import Plant, held_plant, split_delay
+from zwidth.arrays.held_mass import Plant, discretize_mass, split_delay
 from zwidth.loops.rigid.ridge import plant_slopes
 from zwidth.parts.circle import CirclePoints, Jet
 from zwidth.words.types import Array
@@ -62,7 +62,7 @@ class CriticalController:
     @cached_property
     def plant(self) -> Plant:
         """The sampled rigid mass."""
-        return held_plant(self.delta, self.fraction)
+        return discretize_mass(self.delta, self.fraction)
 
     def evaluate(self, points: CirclePoints) -> Array:
         """Return q."""

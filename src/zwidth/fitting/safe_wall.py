@@ -21,7 +21,7 @@ import numpy as np
 
 from zwidth.fitting.device_estimate import DeviceEstimate, DimensionlessDevice
 from zwidth.fitting.required_wall import CriticalController, GridLimits, find_highest
-from zwidth.loops.linear.held import Sampled, delay_force
+from zwidth.loops.linear.held import DiscreteChain, add_input_delay
 from zwidth.loops.rigid.normalization import device_status
 from zwidth.parts.chain import Body, Chain, Resonance
 from zwidth.parts.circle import circle
@@ -236,7 +236,7 @@ def _are_stable(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtua
     # Devices with the same integer delay have closed loops of the same order.
     for n in np.unique(n_delay):
         group = n_delay == n
-        plant = delay_force(Sampled(*(part[group] for part in parts)), int(n))
+        plant = add_input_delay(DiscreteChain(*(part[group] for part in parts)), int(n))
         alpha, beta = (
             wall / devices.mass[group, None, None] for wall in (stiffness * fit.period**2, virtual_damping * fit.period)
         )

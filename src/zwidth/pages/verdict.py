@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from math import isfinite, isnan
 from typing import TYPE_CHECKING
 
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.pages.words import (
     diagnosis_lines,
     fold,
@@ -196,7 +196,7 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
     """Return the passivity of a wall in words; with a coupling the condition is sufficient but not necessary."""
     stiffness, margin = scene.wall.stiffness, verdict.passivity_margin
     if verdict.passive is None:
-        return f"not known {find_obstacle(**vars(scene.device)).partition(':')[0]}"
+        return f"not known {find_unsupported_reason(**vars(scene.device)).partition(':')[0]}"
     if stiffness < 0:
         return "no: no damping makes a negative stiffness passive"
     dampings = scene.device.damping + abs(scene.wall.virtual_damping) + stiffness * scene.timing.period

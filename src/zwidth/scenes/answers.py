@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from zwidth.arrays.evaluate import are_numbers, as_float64, broadcast_traced, join_shapes
-from zwidth.loops.linear.held import closed_loop, delayed_device, open_loop
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.held import realize_closed_loop, realize_device, realize_open_loop
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.loops.linear.rows import Island
 from zwidth.loops.rigid.verdict import STABILITY_METHODS, StabilityMethod
 from zwidth.parts.checks import read_texts
@@ -115,11 +115,11 @@ class SceneAnswers(SceneParts):
         Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
         """
         compliance = self.timing.period**2 / float(self.mass)
-        return _realize(self, closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
+        return _realize(self, realize_closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
 
     def open_loop(self, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
         """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
-        return _realize(self, open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
+        return _realize(self, realize_open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
 
     def frequency_response(
         self, stiffness: Walls = None, virtual_damping: Walls = None, frequency: ArrayLike | None = None
@@ -250,7 +250,7 @@ class SceneAnswers(SceneParts):
         actuator and with modes there is no such condition, and InputError says so. A wall that pushes has at most its
         K T.
         """
-        if obstacle := find_obstacle(**vars(self.device)):
+        if obstacle := find_unsupported_reason(**vars(self.device)):
             raise InputError(f"passivity {obstacle}")
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         return self.loop.passivity_margin(alpha, beta) * self.units.virtual_damping
@@ -306,7 +306,7 @@ def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, a
     loop = build(chain, *one_wall(alpha, beta))
     force = mass / period**2
     own = np.array(chain.state_units(1.0 / period, force))
-    waiting = delayed_device(chain).A.shape[0] - own.size
+    waiting = realize_device(chain).A.shape[0] - own.size
     filtered = loop.A.shape[0] - own.size - waiting
     scale = np.concatenate([np.ones(filtered), own, np.full(waiting, force)])
     A, B = loop.A * scale[:, None] / scale, loop.B * scale[:, None] * unit

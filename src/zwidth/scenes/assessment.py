@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.parts.checks import Span
 from zwidth.parts.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
 from zwidth.scenes.answers import allows_negative
@@ -114,7 +114,7 @@ def assess(scene: SceneOptima) -> Assessment:
     """
     # Compute the dominant pole first, because this raises an error if the loop has too many poles.
     slowest, period = scene.loop.slowest(float(scene.alpha), float(scene.beta)), scene.timing.period
-    stands, best, known = scene.margins(), scene.max_stiffness(), not find_obstacle(**vars(scene.device))
+    stands, best, known = scene.margins(), scene.max_stiffness(), not find_unsupported_reason(**vars(scene.device))
     margin = float(scene.passivity_margin()) if known else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
     row, column = (tuple(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))

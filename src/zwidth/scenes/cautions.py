@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.parts.device import Device
 from zwidth.parts.grasps import list_grasps
 from zwidth.scenes.assessment import Assessment, assess, round_margin
@@ -49,7 +49,7 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
         cautions.append(f"{', '.join(thin)}{after}; {advice}")
     if unstable := [name for name, stable in recommendation.grasps.items() if not stable]:
         options = {"--grasps all": wanted._replace(grasps="all")}
-        if float(scene.device.damping) > 0 and not find_obstacle(**vars(scene.device)):
+        if float(scene.device.damping) > 0 and not find_unsupported_reason(**vars(scene.device)):
             options["--passive"] = Wanted(passive=True, beyond_safe=wanted.beyond_safe)
         advice = _advise(
             recommendation,

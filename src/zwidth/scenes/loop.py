@@ -17,17 +17,23 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, check_scalars, evaluate
 from zwidth.arrays.held_mass import classify_delays
-from zwidth.loops.linear.border import Border, Outline
+from zwidth.loops.linear.border import Outline, StableSet
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.curve import curve_at
+from zwidth.loops.linear.curve import evaluate_curve
 from zwidth.loops.linear.held import find_roots
-from zwidth.loops.linear.margins import linear_margins, open_loop_response
-from zwidth.loops.linear.passivity import PassivityCondition, passivity_margins
-from zwidth.loops.linear.poles import is_marginal, log_size, poles_less_one
+from zwidth.loops.linear.margins import compute_margins, open_loop_response
+from zwidth.loops.linear.passivity import PassivityCondition, compute_passivity_margins
+from zwidth.loops.linear.poles import compute_poles_minus_one, is_marginal, log_modulus
 from zwidth.loops.linear.poles import spectral_radius as linear_radius
-from zwidth.loops.linear.ridge import BoundRidge, SceneSensitivities, differentiate, find_ridge, find_slope
+from zwidth.loops.linear.ridge import (
+    RidgeSolution,
+    SceneSensitivities,
+    compute_sensitivities,
+    differentiate_stiffness,
+    find_ridge,
+)
 from zwidth.loops.linear.roots import LoopRoots
-from zwidth.loops.linear.rows import Island, bound_intervals, label_walls, stable_dampings
+from zwidth.loops.linear.rows import Island, find_stable_dampings, find_stable_intervals, label_walls
 from zwidth.loops.rigid.boundary import boundary, boundary_point, stable_region
 from zwidth.loops.rigid.margins import margins, margins_kernel
 from zwidth.loops.rigid.normalization import wall_status
@@ -68,7 +74,7 @@ class LinearLoop:
 
     scene: Any
     # Cache of the stiffest walls, by "negative damping allowed".
-    _ridges: dict[bool, BoundRidge | None] = field(default_factory=dict, init=False, repr=False)
+    _ridges: dict[bool, RidgeSolution | None] = field(default_factory=dict, init=False, repr=False)
 
     # Number of random devices in an interactive computation; one maximum stiffness takes some 10 to 50 ms.
     draws: ClassVar[int] = 200
@@ -98,13 +104,13 @@ class LinearLoop:
     @cached_property
     def _in_powers(self) -> tuple[LoopRoots, int]:
         """The loop of which its own has the k-th roots as poles, and k: they come k at a time, and so would edges."""
-        return self.roots.take_root()
+        return self.roots.contract_powers()
 
     @cached_property
-    def border(self) -> Border:
+    def border(self) -> StableSet:
         """The edge of its stable set."""
         roots, k = self._in_powers
-        return Border(self.boundary if k == 1 else Boundary.trace(roots))
+        return StableSet(self.boundary if k == 1 else Boundary.trace(roots))
 
     @cached_property
     def poles_sought(self) -> int:
@@ -132,7 +138,7 @@ class LinearLoop:
             used = Method.CERTIFIED
         elif method == "companion":
             with np.errstate(invalid="ignore"):
-                stable = log_size(poles_less_one(self.roots, *np.broadcast_arrays(alpha, beta))).max(-1) < 0
+                stable = log_modulus(compute_poles_minus_one(self.roots, *np.broadcast_arrays(alpha, beta))).max(-1) < 0
             stable &= ~self.boundary.are_lossless(beta)
             used = Method.COMPANION
         else:
@@ -141,7 +147,7 @@ class LinearLoop:
 
     def poles(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
         """All poles, along a new last axis."""
-        return 1.0 + poles_less_one(self.roots, alpha, beta)
+        return 1.0 + compute_poles_minus_one(self.roots, alpha, beta)
 
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """The spectral radius, below 1 exactly where a wall is stable; NaN where one is out of range."""
@@ -155,27 +161,27 @@ class LinearLoop:
         if is_marginal(self.roots, alpha, beta):
             return SlowestMotion(True, 1.0, 0.0, 0.0)
         wall = np.array([alpha]), np.array([beta])
-        zeta = poles_less_one(self.roots, *wall)[0]
-        slowest = zeta[np.argmax(log_size(zeta))]
+        zeta = compute_poles_minus_one(self.roots, *wall)[0]
+        slowest = zeta[np.argmax(log_modulus(zeta))]
         turn = abs(np.arctan2(slowest.imag, 1.0 + slowest.real))
-        if self.boundary.are_lossless(wall[1])[0] and log_size(slowest) <= _ON_CIRCLE:
+        if self.boundary.are_lossless(wall[1])[0] and log_modulus(slowest) <= _ON_CIRCLE:
             return SlowestMotion(True, 1.0, 0.0, float(turn))
-        return SlowestMotion(False, float(self.radius(*wall)[0]), -float(log_size(slowest)), float(turn))
+        return SlowestMotion(False, float(self.radius(*wall)[0]), -float(log_modulus(slowest)), float(turn))
 
     def row(self, beta: np.ndarray) -> np.ndarray:
         """The stable intervals of alpha at each damping: shape (rows, intervals, 2), NaN where a row has fewer."""
-        return np.stack(bound_intervals(self.boundary, *nan_beyond(WALL_RANGE, beta))[:2], -1)
+        return np.stack(find_stable_intervals(self.boundary, *nan_beyond(WALL_RANGE, beta))[:2], -1)
 
     def column(self, alpha: float) -> np.ndarray:
         """The stable intervals of beta at a stiffness: shape (intervals, 2)."""
-        return stable_dampings(self.boundary, float(*nan_beyond(WALL_RANGE, alpha)))
+        return find_stable_dampings(self.boundary, float(*nan_beyond(WALL_RANGE, alpha)))
 
     def dampers(self) -> np.ndarray:
         """Return the beta intervals, shape (n, 2), in which all poles of a damper but z = 1 lie inside the circle."""
         damper = self.roots.as_damper()
         if damper is None:
             return LinearLoop.column(self, 0.0)
-        intervals = bound_intervals(Boundary.trace(damper), np.zeros(1))
+        intervals = find_stable_intervals(Boundary.trace(damper), np.zeros(1))
         return np.stack([intervals.low[0], intervals.high[0]], -1)
 
     def explain(self, alpha: float, beta: float) -> list[str]:
@@ -193,7 +199,7 @@ class LinearLoop:
 
     def holds_softly(self, alpha: float, beta: float) -> bool:
         """Whether a path of stable walls leads from soft ones to a stable wall."""
-        return self.border.holds_softly(alpha, beta)
+        return self.border.is_in_main(alpha, beta)
 
     def islands(self, least: float) -> list[Island]:
         """The pieces of the stable set without soft walls, with dampings above ``least``."""
@@ -201,7 +207,7 @@ class LinearLoop:
 
     def critical_walls(self, w: Array) -> tuple[Array, Array]:
         """Return alpha and beta of the walls that have a pole pair on the unit circle at the angles w in (0, pi)."""
-        curve = curve_at(self.roots, w)
+        curve = evaluate_curve(self.roots, w)
         return curve.alpha, curve.beta
 
     def least_stiffness(self, least: float) -> float | None:
@@ -226,7 +232,7 @@ class LinearLoop:
         alpha, beta, omega = map(np.float64, (found.alpha, found.beta, found.omega))
         return RidgePoint(alpha, beta, omega, np.int32(found.kind), np.int32(status))
 
-    def ridge(self, negative: bool) -> tuple[BoundRidge | None, Status]:
+    def ridge(self, negative: bool) -> tuple[RidgeSolution | None, Status]:
         """Return the stiffest wall with its active constraints, None if there is none, and a status; not traceable."""
         border = self.border
         if negative not in self._ridges:
@@ -240,7 +246,7 @@ class LinearLoop:
 
     def sensitivities(self, negative: bool) -> SceneSensitivities:
         """What a little more of each parameter of the scene buys of the stiffest wall, in SI units."""
-        return differentiate(self.scene, *self.ridge(negative))
+        return compute_sensitivities(self.scene, *self.ridge(negative))
 
     def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> Array:
         """``L = (alpha + beta F) G`` at angles."""
@@ -248,13 +254,13 @@ class LinearLoop:
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
         """Margins, in periods and radians a period; those that are not wanted may be NaN."""
-        return linear_margins(self.chain, self.boundary, alpha, beta, wanted)
+        return compute_margins(self.chain, self.boundary, alpha, beta, wanted)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """The device's own damping in excess of what passive walls need."""
         condition = PassivityCondition.derive(self.chain.estimate, self.scene.d)
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
-        return passivity_margins(condition, alpha, beta, self.scene.own_delta)[()]
+        return compute_passivity_margins(condition, alpha, beta, self.scene.own_delta)[()]
 
     def vary(self, drawn: dict[str, np.ndarray]) -> Variants:
         """The scene with each of the values drawn of some of its parameters."""
@@ -371,6 +377,8 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
         # The derivative with respect to the stiffness of the operator has no closed form.
         ridge = scene.loop.ridge(negative)[0]
-        per["operator.stiffness"] = math.nan if ridge is None else find_slope(scene, ridge, "operator.stiffness")
+        per["operator.stiffness"] = (
+            math.nan if ridge is None else differentiate_stiffness(scene, ridge, "operator.stiffness")
+        )
     per = {path: float(slope) for path, slope in per.items()}
     return SceneSensitivities(np.float64(stiffness), per, found.point.status)

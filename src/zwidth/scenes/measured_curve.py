@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.rows import lay_lines, side_by_side
+from zwidth.loops.linear.rows import arrange_by_line, collect_by_line
 from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
@@ -213,7 +213,7 @@ class DecidedWalls:
     def _intervals(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> Decided:
         """Of rows or columns, so many at a time."""
         together = max(1, _BLOCK // self.curve.w.size)
-        low, high, stable = lay_lines(partial(self._some, free), together, fixed, least, most)
+        low, high, stable = collect_by_line(partial(self._some, free), together, fixed, least, most)
         return Decided(low, high, stable == 1)
 
     def _some(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -237,7 +237,7 @@ class DecidedWalls:
         np.maximum.at(least := least.copy(), line[outer], low[outer])
         np.minimum.at(most := most.copy(), line[outer], high[outer])
         order = np.lexsort((low[~outer], line[~outer]))
-        both = side_by_side(fixed.size, line[~outer][order], np.stack([low, high], -1)[~outer][order])
+        both = arrange_by_line(fixed.size, line[~outer][order], np.stack([low, high], -1)[~outer][order])
         low, high = np.moveaxis(both, -1, 0)
         reached = np.fmax.accumulate(np.column_stack([least, high]), 1)
         low = np.minimum(np.where(np.isnan(low), -np.inf, low), most[:, None])

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.roots import narrow_dips
+from zwidth.arrays.roots import minimize_golden_section
 from zwidth.loops.linear.border import Outline
-from zwidth.loops.linear.margins import nearest_gain_crossover, nearest_phase_crossover
-from zwidth.loops.linear.rows import Island, side_by_side
+from zwidth.loops.linear.margins import select_gain_margin, select_phase_margin
+from zwidth.loops.linear.rows import Island, arrange_by_line
 from zwidth.loops.rigid.verdict import StabilityMethod
 from zwidth.parts.chain import AnyChain
 from zwidth.scenes.loop import LinearLoop, SlowestMotion
@@ -162,7 +162,7 @@ class MeasuredLoop(LinearLoop):
         low, middle, high, cost = (
             np.array([end]) for end in (low if negative else max(low, 0.0), middle, high, -top[best])
         )
-        found = narrow_dips(lambda beta: -self._find_tops(beta), low, middle, high, cost, _STEPS)
+        found = minimize_golden_section(lambda beta: -self._find_tops(beta), low, middle, high, cost, _STEPS)
         middle, value = float(found[0][0]), -float(found[1][0])
         # Just inside: the end itself is not decided.
         value *= 1.0 - _INSIDE
@@ -235,8 +235,8 @@ class MeasuredLoop(LinearLoop):
             k, share = _zeros(np.log(np.abs(L)))
             at = c.w[k] + share * np.diff(c.w)[k]
             turns: Any = np.angle(-L[k]) + share * np.angle(L[k + 1] / L[k])
-            gain, phase_at = nearest_phase_crossover(stable, places, sizes)
-            phase, gain_at = nearest_gain_crossover(stable, at, turns)
+            gain, phase_at = select_gain_margin(stable, places, sizes)
+            phase, gain_at = select_phase_margin(stable, at, turns)
             delay = float(np.min(np.mod(turns, 2.0 * np.pi) / at, initial=np.inf)) if stable else 0.0
         closest = int(np.argmin(np.abs(1.0 + L)))
         return Margins(gain, phase, delay, float(abs(1.0 + L[closest])), phase_at, gain_at, float(c.w[closest]))
@@ -245,7 +245,7 @@ class MeasuredLoop(LinearLoop):
 def _only(found: Decided, held: np.ndarray | bool) -> np.ndarray:
     """Stable intervals of each line of the plane, of those some: (lines, intervals, 2), NaN where one has fewer."""
     line, k = np.nonzero(found.stable & held)
-    return side_by_side(len(found.low), line, np.stack([found.low[line, k], found.high[line, k]], -1))
+    return arrange_by_line(len(found.low), line, np.stack([found.low[line, k], found.high[line, k]], -1))
 
 
 def _zeros(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.checks import check_limit
 from zwidth.parts.device import Device
@@ -239,7 +239,7 @@ class Recommendation:
         passive = None if self.verdict is None else self.verdict.passive
         if passive and self.verdict is not None and self.verdict.passivity_margin < reserve_damping(self.scene):
             return "uncertain, because the fitted damping is"
-        obstacle = find_obstacle(**vars(self.scene.device)).partition(":")[0]
+        obstacle = find_unsupported_reason(**vars(self.scene.device)).partition(":")[0]
         return {True: "yes", False: "no", None: f"not known {obstacle}".rstrip()}[passive]
 
     def as_dict(self) -> dict[str, Any]:
@@ -344,7 +344,7 @@ class SceneAdvice(SceneOptima):
             'phase_margin'
         """
         wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe, grasps)
-        if wanted.passive and (obstacle := find_obstacle(**vars(self.device))):
+        if wanted.passive and (obstacle := find_unsupported_reason(**vars(self.device))):
             raise InputError(f"passive: got True {obstacle}")
         if not isinstance(self.device, Device) and wanted.grasps != "none" and grasps is not None:
             raise InputError(f"grasps: got {grasps!r}, but the device is no Device with a mass; only 'none' is allowed")

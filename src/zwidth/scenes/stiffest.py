@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
-from zwidth.arrays.roots import find_lowest
+from zwidth.arrays.roots import find_global_minimum
 from zwidth.loops.linear.margins import OpenLoop
 from zwidth.loops.linear.ridge import SceneSensitivities
 from zwidth.parts.checks import read_texts
@@ -388,12 +388,12 @@ class SceneOptima(SceneAnswers):
         @np.vectorize
         def margin(beta: float) -> float:
             loop = self.loop
-            wall = OpenLoop.lay_out(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
-            return wall.least_distance()[0]
+            wall = OpenLoop.tabulate(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
+            return wall.find_least_distance()[0]
 
         cost: Callable[[Any], np.ndarray] = radius if goal == "fast" else lambda beta: -margin(beta)
         columns = soft_dampings(self, stiffness, negative_damping)
         if not columns:
             return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
-        _, best = min(find_lowest(cost, *ends, _SAMPLES) for ends in columns)
+        _, best = min(find_global_minimum(cost, *ends, _SAMPLES) for ends in columns)
         return BestDamping(best * units.virtual_damping, float(radius(best)), float(margin(best)), Status.OK)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.evaluate import FEW
-from zwidth.loops.linear.rows import reaches_down
+from zwidth.loops.linear.rows import are_connected
 from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.verdict import is_stable
@@ -45,7 +45,7 @@ class Variants:
         if self.scene.loop.least_stiffness(-np.inf) is not None:
             ends = np.array([np.min(np.where(high > 0, high, np.inf), -1, initial=np.inf) for _, high in rows])
             return np.where(np.isfinite(ends), ends, 0.0)
-        firsts = (np.where(reaches_down(low, high), high, 0.0) for low, high in rows)
+        firsts = (np.where(are_connected(low, high), high, 0.0) for low, high in rows)
         return np.array([first.max(-1, initial=0.0) for first in firsts])
 
     def stiffest(self) -> tuple[np.ndarray, np.ndarray]:

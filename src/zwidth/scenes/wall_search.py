@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.roots import false_position, find_lowest
+from zwidth.arrays.roots import false_position, find_global_minimum
 from zwidth.parts.device import Device
 from zwidth.parts.grasps import list_grasps
 from zwidth.parts.safe_limit import SafeLimit, reserve_damping
@@ -196,7 +196,7 @@ def find_stiffest(
         if safe is not None:
             intervals = _clip(intervals, *(end / unit for end in safe.dampings(stiffness) or (math.inf, -math.inf)))
         dips = [
-            find_lowest(cost, low, high, SAMPLES, NEAR * width) if low < high else (float(cost(low)), low)
+            find_global_minimum(cost, low, high, SAMPLES, NEAR * width) if low < high else (float(cost(low)), low)
             for low, high in intervals
         ]
         lowest, beta = min(dips, default=(1.0, math.nan))

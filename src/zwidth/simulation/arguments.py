@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, join_shapes
-from zwidth.arrays.threads import processors
+from zwidth.arrays.threads import count_processors
 from zwidth.parts.checks import read_texts
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.measured import MeasuredDevice
@@ -199,7 +199,7 @@ def refuse_bodies(scenes: list[Any], which: np.ndarray, numbers: dict[str, np.nd
 def check_memory(numbers: dict[str, np.ndarray], settings: Settings) -> None:
     """Raise `ResourceError` if the simulations need too much memory."""
     count, instants = numbers["seed"].size, settings.periods * settings.substeps
-    together = min(count, GROUP * processors())
+    together = min(count, GROUP * count_processors())
     kept = count * instants * RECORDED_BYTES if settings.record else 0
     jitter = together * instants * JITTER_BYTES if np.any(numbers["jitter"] > 0) else 0
     drawn = (

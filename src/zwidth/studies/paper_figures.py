@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from zwidth import figures
-from zwidth.arrays.held_mass import Plant, held_plant
+from zwidth.arrays.held_mass import Plant, discretize_mass
 from zwidth.arrays.roots import bisect, newton
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
@@ -58,7 +58,7 @@ def maximize_alpha(delta: np.ndarray, d: float) -> tuple[Any, Any, Any]:
     """Return the maximum of alpha with the paper's z^(1+d), and beta and omega there."""
     if d.is_integer():
         return alpha_max(delta, d)[:3]
-    curve, lag = expand_curve(held_plant(delta)), np.full_like(delta, d)
+    curve, lag = expand_curve(discretize_mass(delta)), np.full_like(delta, d)
     at = evaluate_wave(_find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta)), lag, False)
     return *evaluate_wall(at, curve), 2.0 * at.half_omega
 
@@ -76,7 +76,7 @@ def limit_slope(d: float) -> float:
 
 def find_upper_damping(delta: np.ndarray, d: float) -> np.ndarray:
     """Return the largest stable beta for alpha -> 0 with the paper's z^(1+d), for a fractional d."""
-    curve, lag = expand_curve(held_plant(delta)), np.full_like(delta, d)
+    curve, lag = expand_curve(discretize_mass(delta)), np.full_like(delta, d)
     top = _find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta))
     limit = np.full_like(delta, np.sin(0.5 * np.pi / max(1.0, d + 0.5)))  # upper bound of s on the stability lobe
     s = bisect(lambda s: evaluate_wall(evaluate_wave(s, lag, False), curve)[0] > WALL_RANGE[0], top, limit)

@@ -112,8 +112,8 @@ def _with_lag() -> str:
     walls = [scene, scene.replace(velocity=WindowedDifference(round(2 * FILTER_LAG / PERIOD)))]
     before, after = (wall.max_stiffness() for wall in walls)
     return (
-        f"for b = 0 it lowers K_max from {with_unit(before.stiffness, 'N/m')} to "
-        f"{with_unit(after.stiffness, 'N/m')} and its B from {with_unit(before.virtual_damping, 'N s/m')} to "
+        f"for b = 0 it reduces K_max from {with_unit(before.stiffness, 'N/m')} to "
+        f"{with_unit(after.stiffness, 'N/m')}, and B at K_max from {with_unit(before.virtual_damping, 'N s/m')} to "
         f"{with_unit(after.virtual_damping, 'N s/m')}"
     )
 
@@ -245,7 +245,7 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         f"Given in section VIII: m = {MASS:g} kg, T = {PERIOD:g} s, d = {DELAY_FACTOR}, "
         f"b = {', '.join(f'{damping:g}' for damping in DAMPINGS)} N s/m, {100 * STIFFNESS_FRACTION:g} % of alpha_max.",
         "",
-        "## Sharpened",
+        "## More precise values",
         "",
         "| quantity | in the paper | computed | how |",
         "|---|---|---|---|",

@@ -297,7 +297,7 @@ def test_arrays_broadcast_and_bad_members_stay_alone():
 
 def test_blocks_change_nothing():
     rng = np.random.default_rng(88)
-    size = 2 * counting._BLOCK + 3
+    size = 2 * counting.BLOCK_SIZE + 3
     zeros, gain = rng.normal(size=(size, 2)), rng.normal(size=size)
     counts = count_poles(zeros, [1.0, 0.9], gain, 4)
     some = rng.integers(0, size, 40)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from zwidth.arrays.roots import bisect, false_position, follow_root, newton
+from zwidth.arrays.roots import attach_root_derivatives, bisect, false_position, newton
 
 
 def test_a_step_out_of_the_bracket_becomes_a_bisection():
@@ -36,7 +36,7 @@ def test_false_position_and_its_derivative(x64):
     assert found == pytest.approx(-np.log(0.3), rel=1e-15)
 
     def root(shift):
-        return follow_root(function, jax.numpy.asarray(found), lambda x, slope, step: slope < 0, shift)
+        return attach_root_derivatives(function, jax.numpy.asarray(found), lambda x, slope, step: slope < 0, shift)
 
     assert jax.grad(root)(0.3) == pytest.approx(-1 / 0.3, rel=1e-14)
     assert jax.grad(jax.grad(root))(0.3) == pytest.approx(1 / 0.09, rel=1e-13)

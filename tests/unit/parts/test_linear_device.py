@@ -12,7 +12,7 @@ import pytest
 import scipy.signal
 
 import zwidth
-from zwidth.loops.linear.curve import curve_at
+from zwidth.loops.linear.curve import evaluate_curve
 
 # A mass of 0.1 kg with 10 N s/m.
 TIMING = zwidth.Timing(1e-3, 1.5e-3)
@@ -115,7 +115,7 @@ def test_random_systems_are_judged_as_balls_do(seed):
         periods = float(generator.choice(np.array([0.0, 1.0, generator.integers(0, 6), generator.uniform(0, 4)])))
         device = zwidth.LinearDevice(random_system(generator, period))
         scene = zwidth.Scene(device, zwidth.Timing(period, periods * period))
-        units, curve = scene.units, curve_at(scene.loop.roots, generator.choice(scene.loop.boundary.w, 6))
+        units, curve = scene.units, evaluate_curve(scene.loop.roots, generator.choice(scene.loop.boundary.w, 6))
         side = 1.0 + 10 ** generator.uniform(-6, -2, 6) * generator.choice([-1.0, 1.0], 6)
         K = np.append(10 ** generator.uniform(-4, 1, 4), curve.alpha * side) * units.stiffness
         B = np.append(generator.uniform(-0.1, 0.15, 4), curve.beta * side) * units.virtual_damping

@@ -19,7 +19,7 @@ NEAR = 0.02
 
 def response(scene, hertz):
     """The sampled response of a model, delay and hold in it, in m/N."""
-    return scene.loop.roots.response(circle(2 * np.pi * hertz * PERIOD)).value / scene.units.stiffness
+    return scene.loop.roots.evaluate_response(circle(2 * np.pi * hertz * PERIOD)).value / scene.units.stiffness
 
 
 def measured(scene, hertz, deviation=None, error=0.0):

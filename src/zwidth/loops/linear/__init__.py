@@ -1,1 +1,1 @@
-"""Any linear loop of a virtual wall: which walls put poles on the unit circle, and all that follows from it."""
+"""Stability of virtual walls in any linear loop, computed from the walls that put poles on the unit circle."""

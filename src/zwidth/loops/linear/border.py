@@ -1,8 +1,12 @@
-"""The edge of the stable set of any linear loop and the pieces of the set, by rows between which nothing changes.
+"""Find the edges, the connected pieces and the outlines of the stable set of any linear loop.
 
-A row is stable in intervals, each between two columns of its crossings, which are arcs or lines. As beta moves they
-keep their columns, up to where two columns meet: a corner, or an end of arcs (docs/theory/scenes.md, V20). Rows stand
-on both sides of every such damping, so that what they tell holds between them.
+A line of constant B is stable in intervals of alpha, and each end of an interval lies in one *column*, an arc or a
+crossing line of `loops.linear.boundary`. As beta varies, the intervals keep their columns up to a *meeting*, where two
+columns start or stop bounding intervals together: a corner, where they cross, or an extremum of beta, where two arcs
+end (docs/theory/scenes.md, V20). The part of a column between two meetings that bounds stable intervals is an *edge*.
+Lines of constant B are placed on both sides of every meeting, so their intervals determine all edges and *pieces*, the
+connected components. A piece is *connected to K = 0* if a path of stable walls leads from its walls to K = 0; the other
+pieces are *islands*. In arrays, a *row* belongs to a line of constant B.
 """
 
 from __future__ import annotations
@@ -15,210 +19,256 @@ import numpy as np
 
 from zwidth.arrays.roots import false_position
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.curve import curve_at, zeros_of
-from zwidth.loops.linear.rows import Island, bound_intervals, reaches_down
+from zwidth.loops.linear.curve import evaluate_curve, find_field_zeros
+from zwidth.loops.linear.rows import Island, are_connected, find_stable_intervals
 from zwidth.words.showing import shown
 
-# Rows across the whole of the plane, and how far beyond the edge that nodes show the first and the last one are.
-_ACROSS, _BEYOND = 65, 0.05
-# Rows beside a damping at which columns meet, as shares of the way between the rows that enclosed it.
-# The nearest two enclose it.
-_BESIDE, _CLOSE = np.array([-1e-3, -1e-7, 1e-7, 1e-3]), 3e-7
-# How often rows are added, and steps towards a corner, which is told to such a share of its damping.
-_ROUNDS, _STEPS, _TOLD = 60, 60, 1e-13
-# Edges of few nodes get so many points.
-_FEW, _FILLED = 5, 33
-# So near to an edge, as a share of its damping, a row is on it.
-_NEAR = 1e-9
+# Initial lines of constant B
+N_ACROSS = 65  # equidistant lines across the stable set
+BEYOND = 0.05  # distance of the first and last of them from the stable nodes, relative to the range of dampings
+
+# Refinement near meetings
+# Offsets in beta of new lines of constant B near a meeting, relative to the gap between the lines that enclose it.
+MEETING_OFFSETS = np.array([-1e-3, -1e-7, 1e-7, 1e-3])
+# Largest final gap between two lines that enclose a meeting, relative to the gap before refinement.
+ENCLOSED_GAP = 3e-7
+MAX_ROUNDS = 60  # rounds in which lines are added
+MAX_CORNER_STEPS = 60  # steps of false position for a corner
+DAMPING_TOLERANCE = 1e-13  # relative accuracy of the damping of a corner
+
+# Edges
+MIN_NODES = 5  # edges with fewer nodes of the curve
+N_FILLED = 33  # receive this many points
+NEAR_EDGE = 1e-9  # relative distance in beta within which a wall may be on a neighboring edge
 
 
 class Edge(NamedTuple):
-    """A part of one column along which stable intervals end, in ascending damping, from meeting to meeting."""
+    """The part of one column between two meetings along which stable intervals end, in ascending damping."""
 
     column: int
     piece: int
-    rows: slice  # those that it ends intervals of
-    meetings: tuple[int, int]  # the numbers of the first and of the last one
+    rows: slice  # lines of constant B whose intervals it bounds
+    meetings: tuple[int, int]  # indices of the meetings at its first and last damping
     w: np.ndarray  # NaN at both ends
     alpha: np.ndarray
     beta: np.ndarray
 
 
 class _Rows(NamedTuple):
-    """Rows in ascending order, and of each column the stable interval that it ends: (rows, columns), NaN for none."""
+    """Stable intervals of lines of constant B in ascending order: shape (rows, columns), NaN if a column bounds none.
 
-    beta: np.ndarray
+    ``alpha`` and ``w`` locate the end of an interval in each column.
+    """
+
+    beta: np.ndarray  # shape (rows,)
     alpha: np.ndarray
     w: np.ndarray
-    upper: np.ndarray  # of the lower end of an interval the column of the upper one, else -1
+    upper: np.ndarray  # at the lower end of an interval: the column of its upper end; else -1
 
 
 class _Meetings(NamedTuple):
-    """Where two columns cease to end intervals together, or begin to: between which rows, and the wall there."""
+    """The meetings of pairs of columns between neighboring lines of constant B."""
 
-    gap: np.ndarray  # the number of the row above
-    columns: np.ndarray  # (meetings, 2)
-    walls: np.ndarray  # (meetings, 2), alpha and beta
-    known: np.ndarray  # whether that is a wall at which they meet, or one between the rows
+    gap: np.ndarray  # index of the line above
+    columns: np.ndarray  # shape (meetings, 2)
+    walls: np.ndarray  # alpha and beta of each meeting, shape (meetings, 2); a guess if not enclosed
+    enclosed: np.ndarray  # True if the wall of the meeting has been computed and two close lines enclose it
 
 
 @dataclass(frozen=True)
-class Border:
-    """The edge of the stable set of one loop."""
+class StableSet:
+    """The stable walls of one loop, by the edges of the set."""
 
     boundary: Boundary
 
     @cached_property
     def _nodes(self) -> np.ndarray:
-        """Angles, alpha and beta at the nodes of the curve, the extremes of alpha among them."""
-        w = np.union1d(self.boundary.w, self.boundary.tops)
-        return np.stack([w, *curve_at(self.boundary.loop, w)[:2]])
+        """Angles, alpha and beta at the nodes of the curve and the extrema of alpha: shape (3, nodes)."""
+        w = np.union1d(self.boundary.w, self.boundary.alpha_extrema)
+        return np.stack([w, *evaluate_curve(self.boundary.loop, w)[:2]])
 
     @property
-    def _upright(self) -> float:
+    def _triangle_beta(self) -> float:
         """The damping of a lossless loop if exactly two crossing lines bound its stable walls; otherwise NaN."""
         return self.boundary.lossless if len(self.boundary.lines) == 2 else np.nan
 
-    def _first_rows(self) -> np.ndarray:
-        """Rows on both sides of where nodes of the curve cease to be on the edge, and across the set."""
+    def _place_rows(self) -> np.ndarray:
+        """Return the dampings of the initial lines of constant B.
+
+        They are equidistant across the stable set, and close to each point of the curve where an edge starts or ends.
+        """
         b, (w, _, beta) = self.boundary, self._nodes
-        own, held = b.arc_at(w), b.borders(w)
-        parted = np.pad((held[1:] != held[:-1]) | (held[1:] & (own[1:] != own[:-1])), 1, constant_values=True)
-        near = beta[parted[1:] | parted[:-1]]
-        set_at = beta[held] if held.any() else np.array([arc.beta[[0, -1]] for arc in b.arcs]).ravel()
-        set_at = set_at[np.isfinite(set_at)]
-        if not set_at.size:
-            return set_at
-        room = _BEYOND * (np.ptp(set_at) + abs(set_at[0]) + 1e-300)
-        across = np.linspace(set_at.min() - room, set_at.max() + room, _ACROSS)
-        # Soft walls without damping are stable on a device that comes to rest, however few angles its edge has.
-        across = across if held.any() else np.union1d(across, 0.0)
-        # Nodes that are not on the edge may be next to where the curve runs to infinity.
+        arc, is_edge = b.find_arc(w), b.are_stable_edges(w)
+        changes = np.pad((is_edge[1:] != is_edge[:-1]) | (is_edge[1:] & (arc[1:] != arc[:-1])), 1, constant_values=True)
+        near = beta[changes[1:] | changes[:-1]]
+        reached = beta[is_edge] if is_edge.any() else np.array([arc.beta[[0, -1]] for arc in b.arcs]).ravel()
+        reached = reached[np.isfinite(reached)]
+        if not reached.size:
+            return reached
+        margin = BEYOND * (np.ptp(reached) + abs(reached[0]) + 1e-300)
+        across = np.linspace(reached.min() - margin, reached.max() + margin, N_ACROSS)
+        # If no node is on an edge, the set may still contain walls without damping: the softest walls of a device that
+        # comes to rest are stable.
+        across = across if is_edge.any() else np.union1d(across, 0.0)
+        # Drop nodes outside this range, because they may lie next to an asymptote of the curve.
         return np.union1d(across, near[(near > across[0]) & (near < across[-1])])
 
-    def _look(self, beta: np.ndarray) -> _Rows:
-        """The stable intervals of rows; of those alone whose crossings do not contradict each other."""
+    def _scan_rows(self, beta: np.ndarray) -> _Rows:
+        """Return the stable intervals of those lines of constant B whose crossings are consistent."""
         b = self.boundary
-        beta = beta[b.settle(beta)[1]]
-        found, shape = bound_intervals(b, beta), (beta.size, len(b.arcs) + len(b.lines))
+        beta = beta[b.shift_ambiguous(beta)[1]]
+        intervals, shape = find_stable_intervals(b, beta), (beta.size, len(b.arcs) + len(b.lines))
         rows = _Rows(beta, np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
-        row, k = np.nonzero((found.below >= 0) & (found.above >= 0))
-        below, above = found.below[row, k], found.above[row, k]
+        row, k = np.nonzero((intervals.below >= 0) & (intervals.above >= 0))
+        below, above = intervals.below[row, k], intervals.above[row, k]
         rows.upper[row, below] = above
-        for column, alpha, w in ((below, found.low, found.w_below), (above, found.high, found.w_above)):
+        for column, alpha, w in (
+            (below, intervals.low, intervals.w_below),
+            (above, intervals.high, intervals.w_above),
+        ):
             rows.alpha[row, column], rows.w[row, column] = alpha[row, k], w[row, k]
         return rows
 
     @cached_property
-    def _found(self) -> tuple[_Rows, _Meetings]:
-        """Rows on both sides of all dampings at which columns meet, and the meetings."""
-        if np.isfinite(self._upright):
+    def _enclosed(self) -> tuple[_Rows, _Meetings]:
+        """Lines of constant B on both sides of all meetings, and the meetings."""
+        if np.isfinite(self._triangle_beta):
             one, other = self.boundary.lines
             corner = (one.q - other.q) / (one.f - other.f)
-            rows = self._look(np.unique(corner + (self._upright - corner) * np.linspace(0.0, 1.0, _ACROSS + 1)[1:-1]))
+            rows = self._scan_rows(
+                np.unique(corner + (self._triangle_beta - corner) * np.linspace(0.0, 1.0, N_ACROSS + 1)[1:-1])
+            )
             return rows, _pair_ends(rows, np.array([[one.q - corner * one.f, corner, np.inf]]))
-        looked_at, corners = self._first_rows(), np.empty((0, 3))
-        rows = self._look(looked_at)
-        met = _pair_ends(rows, corners)
-        for _ in range(_ROUNDS):
-            left = np.flatnonzero(~met.known)
+        scanned, corners = self._place_rows(), np.empty((0, 3))
+        rows = self._scan_rows(scanned)
+        meetings = _pair_ends(rows, corners)
+        for _ in range(MAX_ROUNDS):
+            left = np.flatnonzero(~meetings.enclosed)
             if not left.size:
                 break
-            new, more = self._enclose(rows, met, left)
-            new, corners = np.setdiff1d(new, looked_at), np.concatenate([corners, more])
-            looked_at = np.append(looked_at, new)
-            parts = [np.concatenate(both) for both in zip(rows, self._look(new), strict=True)]
+            new, more = self._refine_meetings(rows, meetings, left)
+            new, corners = np.setdiff1d(new, scanned), np.concatenate([corners, more])
+            scanned = np.append(scanned, new)
+            parts = [np.concatenate(both) for both in zip(rows, self._scan_rows(new), strict=True)]
             order = np.unique(parts[0], return_index=True)[1]
             rows = _Rows(*(part[order] for part in parts))
-            met = _pair_ends(rows, corners)
+            meetings = _pair_ends(rows, corners)
             if not new.size:
                 break
-        return rows, met
+        return rows, meetings
 
-    def _enclose(self, rows: _Rows, met: _Meetings, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows next to where columns meet, and the walls there as far as they are told: as `_pair_ends` takes them."""
-        b, columns, beta = self.boundary, met.columns[left], rows.beta
-        # The set may go on beyond the first row, or the last one.
+    def _refine_meetings(self, rows: _Rows, meetings: _Meetings, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Locate meetings between lines of constant B.
+
+        Args:
+            rows: all lines.
+            meetings: all meetings.
+            left: indices of the meetings to locate.
+
+        Returns:
+            Dampings of further lines near these meetings, and the located corners as in `_pair_ends`.
+        """
+        b, columns, beta = self.boundary, meetings.columns[left], rows.beta
+        # Extend the range, because the set may extend beyond the first and the last line of constant B.
         size = np.ptp(beta[np.isfinite(rows.alpha).any(1)]) + np.spacing(np.abs(beta).max())
-        low, high = np.concatenate([[beta[0] - size], beta, [beta[-1] + size]])[met.gap[left] + np.array([[0], [1]])]
-        # An arc ends; or two columns cross; else the rows are halved.
+        low, high = np.concatenate([[beta[0] - size], beta, [beta[-1] + size]])[
+            meetings.gap[left] + np.array([[0], [1]])
+        ]
+        # A meeting is the end of an arc or, if none ends in the gap, the corner of two columns whose difference changes
+        # sign. If neither is the case, the gap is halved.
         ends = np.moveaxis(b.ends[..., columns], -1, 1).reshape(2, -1, left.size)
         inside = (ends[1] > low) & (ends[1] < high)
-        alpha, at = np.where(inside.any(0), ends[:, inside.argmax(0), np.arange(left.size)], np.nan)
-        first, last = self._gaps(np.tile(columns, (2, 1)), np.concatenate([low, high])).reshape(2, -1)
-        k = np.flatnonzero(np.isnan(at) & (np.sign(first) * np.sign(last) == -1))
+        alpha, damping = np.where(inside.any(0), ends[:, inside.argmax(0), np.arange(left.size)], np.nan)
+        first, last = self._subtract_columns(np.tile(columns, (2, 1)), np.concatenate([low, high])).reshape(2, -1)
+        k = np.flatnonzero(np.isnan(damping) & (np.sign(first) * np.sign(last) == -1))
         if k.size:
             first, last = first[k], last[k]
             scale = np.sign(first) / (np.abs(first) + np.abs(last))
-            width = _TOLD * np.maximum(np.abs(low[k]), np.abs(high[k]))
+            width = DAMPING_TOLERANCE * np.maximum(np.abs(low[k]), np.abs(high[k]))
             ends = low[k], high[k], first * scale, last * scale
-            at[k] = false_position(lambda at: scale * self._gaps(columns[k], at), *ends, _STEPS, width)
-            alpha[k] = b.cross(columns[k, 0], at[k])
-        told = np.isfinite(at) & np.isfinite(alpha)
-        new = np.concatenate([[0.5 * (low + high)], at + (high - low) * _BESIDE[:, None]])
-        return np.unique(new[(new > low) & (new < high)]), np.stack([alpha, at, _CLOSE * (high - low)], -1)[told]
+            damping[k] = false_position(
+                lambda beta: scale * self._subtract_columns(columns[k], beta), *ends, MAX_CORNER_STEPS, width
+            )
+            alpha[k] = b.find_alpha(columns[k, 0], damping[k])
+        located = np.isfinite(damping) & np.isfinite(alpha)
+        new = np.concatenate([[0.5 * (low + high)], damping + (high - low) * MEETING_OFFSETS[:, None]])
+        return (
+            np.unique(new[(new > low) & (new < high)]),
+            np.stack([alpha, damping, ENCLOSED_GAP * (high - low)], -1)[located],
+        )
 
-    def _gaps(self, columns: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """How far two columns are apart in each row; NaN where one does not meet it."""
-        return np.subtract(*self.boundary.cross(columns.T.ravel(), np.tile(beta, 2)).reshape(2, -1))
+    def _subtract_columns(self, columns: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """Return the difference in alpha of two columns on each line of constant B; NaN if the line misses either."""
+        return np.subtract(*self.boundary.find_alpha(columns.T.ravel(), np.tile(beta, 2)).reshape(2, -1))
 
     @cached_property
     def edges(self) -> list[Edge]:
-        """All of it, and the piece that each edge bounds."""
-        (rows, met), edges = self._found, []
-        if np.isfinite(self._upright):
-            return self._triangle if met.gap.size else []
-        held = np.pad(np.isfinite(rows.alpha.T), ((0, 0), (1, 1)))
-        begins, ends = held[:, 1:-1] & ~held[:, :-2], held[:, 1:-1] & ~held[:, 2:]
-        # Edges that one interval of a row is between bound one piece, and edges that meet.
+        """All edges of the stable set, each with the index of the piece that it bounds."""
+        (rows, meetings), edges = self._enclosed, []
+        if np.isfinite(self._triangle_beta):
+            return self._triangle if meetings.gap.size else []
+        bounds = np.pad(np.isfinite(rows.alpha.T), ((0, 0), (1, 1)))
+        begins, ends = bounds[:, 1:-1] & ~bounds[:, :-2], bounds[:, 1:-1] & ~bounds[:, 2:]
+        # Two edges bound the same piece if they bound the same interval of a line or if they meet.
         number = np.cumsum(begins).reshape(begins.shape).T - 1
         row, below = np.nonzero(rows.upper >= 0)
         pairs = [number[row, below], number[row, rows.upper[row, below]]]
-        gap = met.gap[:, None]
-        meeting = number[gap - ~held[met.columns, gap + 1], met.columns].T
-        pieces = _join(np.concatenate([pairs, meeting], 1), int(begins.sum()))
-        numbers = {(gap, column): k for k, gap in enumerate(met.gap.tolist()) for column in met.columns[k].tolist()}
+        gap = meetings.gap[:, None]
+        meeting = number[gap - ~bounds[meetings.columns, gap + 1], meetings.columns].T
+        pieces = _join_pairs(np.concatenate([pairs, meeting], 1), int(begins.sum()))
+        index = {
+            (gap, column): k for k, gap in enumerate(meetings.gap.tolist()) for column in meetings.columns[k].tolist()
+        }
         (columns, firsts), (_, lasts) = np.nonzero(begins), np.nonzero(ends)
         for piece, column, first, last in np.stack([pieces, columns, firsts, lasts], 1).tolist():
-            own = numbers[first, column], numbers[last + 1, column]
-            path = self._trace(column, rows.w[[first, last], column], met.walls[list(own)])
-            edges.append(Edge(column, piece, slice(first, last + 1), own, *path))
+            both = index[first, column], index[last + 1, column]
+            path = self._trace_edge(column, rows.w[[first, last], column], meetings.walls[list(both)])
+            edges.append(Edge(column, piece, slice(first, last + 1), both, *path))
         return edges
 
     @property
     def _triangle(self) -> list[Edge]:
-        """The edges where all pole pairs are at one damping: two lines, and the curve upright between them."""
+        """The edges if all pole pairs cross at one damping: two crossing lines, and the curve at this damping."""
         b, ends, edges = self.boundary, [], []
-        corner = next(wall[1] for wall in self._found[1].walls[self._found[1].known].tolist())
+        corner = next(wall[1] for wall in self._enclosed[1].walls[self._enclosed[1].enclosed].tolist())
         for k, line in enumerate(b.lines):
-            beta = np.sort([corner, self._upright])
-            ends.append((line.w, float(line.q - self._upright * line.f)))
-            meetings = (0, k + 1) if beta[0] == corner else (k + 1, 0)
-            own = slice(0, self._found[0].beta.size)
-            edges.append(Edge(len(b.arcs) + k, 0, own, meetings, np.full(2, np.nan), line.q - beta * line.f, beta))
+            beta = np.sort([corner, self._triangle_beta])
+            ends.append((line.w, float(line.q - self._triangle_beta * line.f)))
+            both = (0, k + 1) if beta[0] == corner else (k + 1, 0)
+            rows = slice(0, self._enclosed[0].beta.size)
+            edges.append(Edge(len(b.arcs) + k, 0, rows, both, np.full(2, np.nan), line.q - beta * line.f, beta))
         (first, low), (_, high) = ends
         w = b.w if first == 0.0 else b.w[::-1]
-        alpha = np.concatenate([[low], curve_at(b.loop, w).alpha, [high]])
+        alpha = np.concatenate([[low], evaluate_curve(b.loop, w).alpha, [high]])
         w = np.concatenate([[np.nan], w, [np.nan]])
-        return [*edges, Edge(-1, 0, slice(0), (1, 2), w, alpha, np.full(w.size, self._upright))]
+        return [*edges, Edge(-1, 0, slice(0), (1, 2), w, alpha, np.full(w.size, self._triangle_beta))]
 
-    def _trace(self, column: int, within: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Angles, alpha and beta along a column from one wall to another, of few nodes with more of two angles."""
+    def _trace_edge(self, column: int, angles: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Return points along a column between two walls.
+
+        Args:
+            column: the column.
+            angles: angles of the first and last line of constant B. An edge with few nodes gets more points between.
+            ends: alpha and beta of both walls, shape (2, 2).
+
+        Returns:
+            Angle (NaN at both walls), alpha and beta, shape (3, points).
+        """
         b, path = self.boundary, np.empty((3, 0))
         if column < len(b.arcs):
-            path = self._nodes[:, b.arc_at(self._nodes[0]) == column]
+            path = self._nodes[:, b.find_arc(self._nodes[0]) == column]
             path = path[:, (path[2] > ends[0, 1]) & (path[2] < ends[1, 1])]
-            if path.shape[1] < _FEW:
-                more = np.linspace(within.min(), within.max(), _FILLED)
-                tops = zeros_of(b.loop, more, curve_at(b.loop, more).alpha_slope, "alpha_slope")
-                w = np.unique(np.concatenate([path[0], more[1:-1], tops]))
-                path = np.stack([w, *curve_at(b.loop, w)[:2]])
+            if path.shape[1] < MIN_NODES:
+                more = np.linspace(angles.min(), angles.max(), N_FILLED)
+                extrema = find_field_zeros(b.loop, more, evaluate_curve(b.loop, more).alpha_slope, "alpha_slope")
+                w = np.unique(np.concatenate([path[0], more[1:-1], extrema]))
+                path = np.stack([w, *evaluate_curve(b.loop, w)[:2]])
             path = path if b.arcs[column].w[0] < b.arcs[column].w[-1] else path[:, ::-1]
         return np.insert(path, [0, path.shape[1]], np.insert(ends.T, 0, np.nan, 0), 1)
 
     @cached_property
     def width(self) -> float:
-        """Over which dampings its edges reach."""
+        """The difference of the largest and the smallest damping of the edges."""
         return float(np.ptp([edge.beta[[0, -1]] for edge in self.edges]))
 
     @cached_property
@@ -232,80 +282,86 @@ class Border:
         damped = {edge.piece for edge in self.edges if edge.beta[-1] > 0}
         for edge in self.edges:
             ends.setdefault(edge.piece, []).extend([edge.alpha.min(), edge.alpha.max()])
-        soft = frozenset(piece for piece, both in ends.items() if reaches_down(np.min(both), np.max(both)))
+        connected = frozenset(piece for piece, both in ends.items() if are_connected(np.min(both), np.max(both)))
         stiff = [piece for piece, both in ends.items() if np.max(both) > 0]
-        if soft or not stiff or not self.boundary.loop.device_is_unstable:
-            return soft
+        if connected or not stiff or not self.boundary.loop.device_is_unstable:
+            return connected
         return frozenset([min(stiff, key=lambda piece: (piece not in damped, np.min(ends[piece])))])
 
     def find_softest(self, least: float) -> float:
         """Return the lowest alpha on the edges of the `main` pieces at dampings of at least ``least``; NaN if none."""
-        walls = [edge.alpha[edge.beta >= least] for edge in self.soft_edges(least)]
+        walls = [edge.alpha[edge.beta >= least] for edge in self.main_edges(least)]
         return float(min((alpha.min() for alpha in walls if alpha.size), default=np.nan))
 
-    def holds_softly(self, alpha: float, beta: float) -> bool:
-        """Whether a wall is stable in a piece with soft walls."""
-        # The edges above it, on its row or beside: where several meet, that of the row may be another one.
-        rows = beta + _NEAR * (abs(beta) + self.width) * np.array([0.0, -1.0, 1.0])
-        found = bound_intervals(self.boundary, rows)
-        row, k = np.nonzero((found.low < alpha) & (alpha < found.high))
-        above = set(zip(rows[row].tolist(), found.above[row, k].tolist(), strict=True))
-        edges = self.soft_edges(-np.inf)
-        return any(edge.beta[0] <= at <= edge.beta[-1] and edge.column == end for edge in edges for at, end in above)
+    def is_in_main(self, alpha: float, beta: float) -> bool:
+        """Return whether a wall lies in a `main` piece."""
+        # Compare the edge at the upper end of the wall's interval. Near a meeting of several edges it may be any of
+        # them, so use the neighboring lines of constant B as well.
+        rows = beta + NEAR_EDGE * (abs(beta) + self.width) * np.array([0.0, -1.0, 1.0])
+        intervals = find_stable_intervals(self.boundary, rows)
+        row, k = np.nonzero((intervals.low < alpha) & (alpha < intervals.high))
+        above = set(zip(rows[row].tolist(), intervals.above[row, k].tolist(), strict=True))
+        edges = self.main_edges(-np.inf)
+        return any(edge.beta[0] <= row <= edge.beta[-1] and edge.column == end for edge in edges for row, end in above)
 
-    def soft_edges(self, least: float) -> list[Edge]:
-        """The edges of pieces with soft walls that reach beyond a damping: not by rounding of a meeting there."""
+    def main_edges(self, least: float) -> list[Edge]:
+        """Return the edges of `main` pieces that reach above a damping by more than rounding errors."""
         main = [edge for edge in self.edges if edge.piece in self.main]
-        return [edge for edge in main if edge.beta[-1] - least > _TOLD * np.ptp(edge.beta)]
+        return [edge for edge in main if edge.beta[-1] - least > DAMPING_TOLERANCE * np.ptp(edge.beta)]
 
     def find_highest(self, least: float) -> float:
-        """Up to which alpha rows with that much damping or more are stable in pieces with soft walls; else -inf."""
-        rows, highest = self._found[0], -np.inf
-        for edge in self.soft_edges(least):
-            own = rows.alpha[edge.rows, edge.column]
-            highest = np.max(own, where=rows.beta[edge.rows] >= least, initial=highest)
+        """Return the largest alpha on lines of constant B in `main` pieces, for beta >= ``least``; -inf if none."""
+        rows, highest = self._enclosed[0], -np.inf
+        for edge in self.main_edges(least):
+            alpha = rows.alpha[edge.rows, edge.column]
+            highest = np.max(alpha, where=rows.beta[edge.rows] >= least, initial=highest)
         return float(highest)
 
     def islands(self, least: float) -> list[Island]:
-        """The pieces without soft walls, with walls of alpha > 0 and beta > ``least``, the stiffest first."""
-        found = []
+        """Return the islands that contain walls with alpha > 0 and beta > ``least``, the stiffest first."""
+        islands = []
         for piece in {edge.piece for edge in self.edges} - self.main:
             walls = np.concatenate([edge[-2:] for edge in self.edges if edge.piece == piece], 1)
-            found.append(Island(*(tuple(pair) for pair in np.stack([walls.min(1), walls.max(1)], 1).tolist())))
-        # Of one that ends at K = 0 rounding may leave a little above it.
-        found = [one for one in found if one.stiffness[1] > _NEAR * np.ptp(one.stiffness)]
-        found = [one for one in found if one.virtual_damping[1] > least]
-        return sorted(found, key=lambda one: -one.stiffness[1])
+            islands.append(Island(*(tuple(pair) for pair in np.stack([walls.min(1), walls.max(1)], 1).tolist())))
+        # An island with K < 0 that ends at K = 0 may have positive alpha by rounding errors.
+        islands = [one for one in islands if one.stiffness[1] > NEAR_EDGE * np.ptp(one.stiffness)]
+        islands = [one for one in islands if one.virtual_damping[1] > least]
+        return sorted(islands, key=lambda one: -one.stiffness[1])
 
     def outlines(self) -> list[Outline]:
-        """All edges as closed outlines, the largest first."""
+        """Join all edges to closed outlines, the largest first."""
         joined: dict[int, list[tuple[int, int]]] = {}
         for k, edge in enumerate(self.edges):
             for end, meeting in enumerate(edge.meetings):
                 joined.setdefault(meeting, []).append((k, end))
-        follow = {one: other for both in joined.values() for one, other in (both, both[::-1])}
-        found, left = [], dict.fromkeys(range(len(self.edges)))
+        successor = {one: other for both in joined.values() for one, other in (both, both[::-1])}
+        outlines, left = [], dict.fromkeys(range(len(self.edges)))
         while left:
-            at, path = (next(iter(left)), 0), []
-            piece = self.edges[at[0]].piece
-            while at[0] in left:
-                del left[at[0]]
-                walls = np.stack(self.edges[at[0]][-2:])
-                path.append((walls[:, ::-1] if at[1] else walls)[:, :-1])
-                at = follow[at[0], 1 - at[1]]
+            current, path = (next(iter(left)), 0), []
+            piece = self.edges[current[0]].piece
+            while current[0] in left:
+                del left[current[0]]
+                walls = np.stack(self.edges[current[0]][-2:])
+                path.append((walls[:, ::-1] if current[1] else walls)[:, :-1])
+                current = successor[current[0], 1 - current[1]]
             stiffness, damping = np.concatenate(path, 1)
-            found.append((piece, Outline(stiffness, damping, False, piece not in self.main)))
-        # Where the curve has one damping but for rounding, rounding draws outlines of its own.
-        found = [(piece, one) for piece, one in found if np.ptp(one.virtual_damping) > _TOLD * self.width]
-        found.sort(key=lambda each: -each[1].area)
-        # What else bounds a piece than the largest of its outlines are holes.
-        outer = {piece: k for k, (piece, _) in reversed(list(enumerate(found)))}
-        return [outline._replace(hole=outer[piece] != k) for k, (piece, outline) in enumerate(found)]
+            outlines.append((piece, Outline(stiffness, damping, False, piece not in self.main)))
+        # Drop spurious outlines along a part of the curve whose damping is constant up to rounding errors.
+        outlines = [
+            (piece, one) for piece, one in outlines if np.ptp(one.virtual_damping) > DAMPING_TOLERANCE * self.width
+        ]
+        outlines.sort(key=lambda each: -each[1].area)
+        # The largest outline of a piece is its outer one; all others are holes.
+        outer = {piece: k for k, (piece, _) in reversed(list(enumerate(outlines)))}
+        return [outline._replace(hole=outer[piece] != k) for k, (piece, outline) in enumerate(outlines)]
 
 
-def _join(pairs: np.ndarray, count: int) -> np.ndarray:
-    """The least number that each of so many is joined to, directly or not, by pairs (2, pairs)."""
-    # A graph of SciPy's would take a third of a second to load.
+def _join_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Return the connected components of the graph on ``count`` nodes with these edges, shape (2, pairs).
+
+    Each component is denoted by its smallest node.
+    """
+    # `scipy.sparse.csgraph` would do the same, but takes a third of a second to import.
     least, before = np.arange(count), np.full(count, -1)
     while not np.array_equal(least, before):
         before = least.copy()
@@ -316,36 +372,42 @@ def _join(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 def _pair_ends(rows: _Rows, corners: np.ndarray) -> _Meetings:
-    """The meetings between rows, and as their walls the nearest of the corners that these enclose."""
-    # Of each corner (3,) alpha, beta, and how close to each other rows enclose it. Where an interval begins or ends, is
-    # parted, or changes a column, two columns do; in order of alpha they are pairs.
+    """Find the meetings between neighboring lines of constant B.
+
+    Args:
+        rows: the lines.
+        corners: alpha and beta of located meetings, and the largest gap between the lines that may enclose each; shape
+            (corners, 3).
+    """
+    # A column that bounds an interval on one line but not on the next takes part in a meeting, and so does a second
+    # column: an interval begins, ends, splits, or changes a column. In order of alpha, these columns form pairs.
     alpha = np.pad(rows.alpha, ((1, 1), (0, 0)), constant_values=np.nan)
-    held = np.isfinite(alpha)
-    gap, column = np.nonzero(held[1:] != held[:-1])
-    beside = np.where(held[gap, column], alpha[gap, column], alpha[gap + 1, column])
-    order = np.lexsort((beside, gap))
-    gap, columns, beside = gap[order][::2], column[order].reshape(-1, 2), beside[order].reshape(-1, 2).mean(1)
+    bounds = np.isfinite(alpha)
+    gap, column = np.nonzero(bounds[1:] != bounds[:-1])
+    near = np.where(bounds[gap, column], alpha[gap, column], alpha[gap + 1, column])
+    order = np.lexsort((near, gap))
+    gap, columns, near = gap[order][::2], column[order].reshape(-1, 2), near[order].reshape(-1, 2).mean(1)
     ends = np.concatenate([[-np.inf], rows.beta, [np.inf]])
     low, high = ends[gap][:, None], ends[gap + 1][:, None]
     inside = (corners[:, 1] > low) & (corners[:, 1] < high) & (high - low <= corners[:, 2])
-    walls, known = np.stack([beside, 0.5 * (ends[gap] + ends[gap + 1])], -1), np.asarray(inside.any(1))
-    for k in np.flatnonzero(known).tolist():
-        own = corners[inside[k]]
-        walls[k] = own[np.argmin(np.abs(own[:, 0] - beside[k])), :2]
-    return _Meetings(gap, columns, walls, known)
+    walls, enclosed = np.stack([near, 0.5 * (ends[gap] + ends[gap + 1])], -1), np.asarray(inside.any(1))
+    for k in np.flatnonzero(enclosed).tolist():
+        candidates = corners[inside[k]]
+        walls[k] = candidates[np.argmin(np.abs(candidates[:, 0] - near[k])), :2]
+    return _Meetings(gap, columns, walls, enclosed)
 
 
 @shown()
 class Outline(NamedTuple):
-    """One closed outline of the stable set; a hole where unstable walls lie inside, an island where no soft ones do."""
+    """A closed outline of the stable set, as a polygon of walls."""
 
     stiffness: np.ndarray
     virtual_damping: np.ndarray
-    hole: bool
-    island: bool  # of a piece without soft walls
+    hole: bool  # the walls inside are unstable
+    island: bool  # outline of a piece that is not connected to K = 0
 
     @property
     def area(self) -> float:
-        """Inside, of the polygon."""
+        """The area of the polygon."""
         x, y = self.stiffness, self.virtual_damping
         return 0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y)))

@@ -1,12 +1,15 @@
-"""The boundary of any linear loop at constant damping, and the number of poles outside the unit circle of each wall.
+"""Intersect lines of constant B with the stability boundary of any linear loop, and count the unstable poles of walls.
 
-A line of constant damping (a row) crosses each arc of `loops.linear.curve` at most once (docs/theory/scenes.md, V12).
-As alpha increases, poles leave the unit circle at a crossing if ``Im(q' - beta F') > 0``, also at z = 1 and z = -1.
-Hence
+The boundary consists of the arcs and crossing lines of `loops.linear.curve`; a line of constant B crosses each of them
+at most once (docs/theory/scenes.md, V12). As alpha increases along the line, a pole leaves the unit circle where
+``Im(q' - beta F') > 0`` and enters it where this is negative (V11; q and F as in `loops.linear.roots`). Hence
 
-    poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
+    unstable poles(alpha, beta) = base + sum of +-2 (pairs) or +-1 (real poles) over the crossings below alpha
 
-with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide (V13, V14).
+where the same number ``base`` holds for all walls: as alpha -> -inf the poles approach the zeros of G (V13, V14).
+
+In the arrays of this module, a *row* belongs to a line of constant B, and a *column* to an arc or, after all arcs, to a
+crossing line. ``leaving`` is the net number of poles that leave the circle as alpha increases past a crossing.
 """
 
 from __future__ import annotations
@@ -22,288 +25,331 @@ from zwidth.loops.linear.curve import (
     Arc,
     CrossingLine,
     JoinedArcs,
-    circle_zeros,
-    curve_at,
+    build_level_arc,
     cut_arcs,
+    evaluate_curve,
+    find_field_zeros,
+    find_lines,
     find_lossless,
-    level_arc,
-    lines_at,
-    nodes_of,
-    zeros_of,
+    list_circle_zeros,
+    place_nodes,
 )
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.parts.circle import are_on_circle, circle, depths
 
-# Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
-_MOST_STEPS, _ARRIVED = 120, 1e-10
-# By what share a row is moved, at most, that rounding keeps from being counted.
-_SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
-# How near to an angle where the curve has no point of its own it is looked at, as a share of the way to a node.
-_PROBE = 1e-6
-# A pole that leaves a zero on the circle along it, to such a share, goes where that way bends to.
-_ALONG = 1e-9
-_SAME_ROW = 1e-12  # dampings with a smaller relative difference are equal up to rounding errors
-# Pairs of rows and arcs that are looked at in one go: what they need stays in caches.
-_BLOCK = 1 << 17
+# Newton's method for a crossing
+MAX_STEPS = 120
+CONVERGED_STEP = 1e-10  # relative to w; the error after it is of the order of its square
+
+# Relative changes of beta, tried in this order, for lines whose crossings are ambiguous by rounding errors (V15).
+SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
+# Distance of a probe of the curve from an angle at which it is undefined, relative to the distance of the next node.
+PROBE_DISTANCE = 1e-6
+# Relative imaginary part of x below which a pole leaves a zero of G along the unit circle (V14).
+TANGENT_TOLERANCE = 1e-9
+EQUAL_DAMPING = 1e-12  # dampings with a smaller relative difference are equal up to rounding errors
+BLOCK_SIZE = 1 << 17  # pairs of lines and arcs per batch; its arrays fit in the cache
 
 
 class Crossings(NamedTuple):
-    """Where rows cross the boundary: shape (rows, arcs and lines), NaN where one does not."""
+    """Crossings of lines of constant B with the boundary: shape (rows, columns), NaN if a line misses a column."""
 
     alpha: np.ndarray
     w: np.ndarray
-    leaving: np.ndarray  # poles that leave the circle as alpha rises past the crossing; negative for entering ones
-    sound: np.ndarray  # of each row: whether its crossings lead from the count far below to that far above
+    leaving: np.ndarray
+    consistent: np.ndarray  # of each row: its crossings account for the count far below and the count far above (V15)
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """The boundary of one loop, prepared for lines of constant damping."""
+    """The stability boundary of one loop, cut into arcs and crossing lines."""
 
     loop: LoopRoots
-    w: np.ndarray
+    w: np.ndarray  # angles of the nodes
     arcs: tuple[Arc, ...]
     lines: tuple[CrossingLine, ...]
-    infinite: np.ndarray  # angles at which the curve runs to infinity
-    limits: dict[float, tuple[float, float]]  # alpha and beta where it has no point of its own, NaN where it has no end
+    asymptotes: np.ndarray  # angles at which the curve runs to infinity
+    limits: dict[float, tuple[float, float]]  # angle -> limit of alpha and beta where V8 is 0/0; NaN if infinite
     lossless: float  # damping of a lossless loop (`find_lossless`); NaN for all other loops
 
     @classmethod
     def trace(cls, loop: LoopRoots) -> Boundary:
-        """Lay out the curve."""
-        w = nodes_of(loop)
-        here = curve_at(loop, w)
-        vertical = zeros_of(loop, w, here.fall, "fall")
-        touched = [p for p in circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
+        """Compute the boundary of a loop."""
+        w = place_nodes(loop)
+        curve = evaluate_curve(loop, w)
+        vertical = find_field_zeros(loop, w, curve.im_f, "im_f")
+        touched = [p for p in list_circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
         vertical = np.union1d(vertical, touched)
-        lines = lines_at(loop, vertical)
-        poles = np.array([p for p in vertical if all(p != line.w for line in lines)])
-        turns = zeros_of(loop, w, here.turn, "turn")
-        turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
-        lines += lines_at(loop, (0.0, np.pi))
-        limits = dict.fromkeys([0.0, np.pi, *poles.tolist()], (np.nan, np.nan))
-        limits |= {line.w: (line.q - line.meeting * line.f, line.meeting) for line in lines}
-        lossless = find_lossless(loop, w, here, limits[0.0][1])
-        arcs = [level_arc(w, here, lossless)] if np.isfinite(lossless) else cut_arcs(loop, w, here, turns, limits)
-        return cls(loop, w, tuple(arcs), tuple(lines), poles, limits, lossless)
+        lines = find_lines(loop, vertical)
+        asymptotes = np.array([p for p in vertical if all(p != line.w for line in lines)])
+        extrema = find_field_zeros(loop, w, curve.wronskian, "wronskian")
+        extrema = np.array([t for t in extrema if all(abs(t - line.w) > 1e-6 for line in lines)])
+        lines += find_lines(loop, (0.0, np.pi))
+        limits = dict.fromkeys([0.0, np.pi, *asymptotes.tolist()], (np.nan, np.nan))
+        limits |= {line.w: (line.q - line.curve_beta * line.f, line.curve_beta) for line in lines}
+        lossless = find_lossless(loop, w, curve, limits[0.0][1])
+        arcs = (
+            [build_level_arc(w, curve, lossless)]
+            if np.isfinite(lossless)
+            else cut_arcs(loop, w, curve, extrema, limits)
+        )
+        return cls(loop, w, tuple(arcs), tuple(lines), asymptotes, limits, lossless)
 
     def are_lossless(self, beta: np.ndarray) -> np.ndarray:
         """Return whether dampings equal that of a lossless loop, at which no wall is stable (`find_lossless`)."""
         with np.errstate(invalid="ignore"):
-            return np.abs(beta - self.lossless) <= _SAME_ROW * np.abs(self.lossless)
+            return np.abs(beta - self.lossless) <= EQUAL_DAMPING * np.abs(self.lossless)
 
-    def crossings(self, beta: np.ndarray) -> Crossings:
-        """Where the rows of these dampings, shape (rows,), cross the boundary."""
-        beta, sound = self.settle(beta)
-        steps = self._steps
-        place, row, k = steps.meet(beta)
-        w, alpha = self._solve(beta[row], place, k)
+    def find_crossings(self, beta: np.ndarray) -> Crossings:
+        """Return the crossings of the lines of constant B with these dampings, shape (rows,)."""
+        beta, consistent = self.shift_ambiguous(beta)
+        joined = self._joined
+        column, row, k = joined.list_crossings(beta)
+        w, alpha = self._solve_crossings(beta[row], column, k)
         shape = beta.size, len(self.arcs) + len(self.lines)
-        out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape), sound)
-        out.alpha[row, place], out.w[row, place] = alpha, w
-        out.leaving[row, place] = steps.leaving[place]
-        for place, line in enumerate(self.lines, len(self.arcs)):
-            out.alpha[:, place] = line.q - beta * line.f
-            out.w[:, place] = line.w
-            out.leaving[:, place] = line.leaving(beta)
+        out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape), consistent)
+        out.alpha[row, column], out.w[row, column] = alpha, w
+        out.leaving[row, column] = joined.leaving[column]
+        for column, line in enumerate(self.lines, len(self.arcs)):
+            out.alpha[:, column] = line.q - beta * line.f
+            out.w[:, column] = line.w
+            out.leaving[:, column] = line.count_leaving(beta)
         return out
 
-    def cross(self, column: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """The alpha at which rows cross one column of `crossings` each: shape (rows,), NaN where one does not."""
-        steps, alpha = self._steps, np.full(beta.shape, np.nan)
-        for place, line in enumerate(self.lines, len(self.arcs)):
-            alpha = np.where(column == place, line.q - beta * line.f, alpha)
+    def find_alpha(self, column: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """Return the alpha at which each line of constant B crosses its column.
+
+        Args:
+            column: column of each line, shape (rows,).
+            beta: damping of each line, shape (rows,).
+
+        Returns:
+            Array of shape (rows,); NaN if a line misses its column.
+        """
+        joined, alpha = self._joined, np.full(beta.shape, np.nan)
+        for index, line in enumerate(self.lines, len(self.arcs)):
+            alpha = np.where(column == index, line.q - beta * line.f, alpha)
         row = np.flatnonzero(column < len(self.arcs))
-        low, high = steps.ends[:, column[row]]
+        low, high = joined.ends[:, column[row]]
         row = row[(beta[row] >= low) & (beta[row] < high)]
-        k = steps.find(column[row], np.searchsorted(steps.dampings, beta[row]))
-        alpha[row] = self._solve(beta[row], column[row], k)[1]
+        k = joined.find_nodes(column[row], np.searchsorted(joined.dampings, beta[row]))
+        alpha[row] = self._solve_crossings(beta[row], column[row], k)[1]
         return alpha
 
     @cached_property
     def ends(self) -> np.ndarray:
-        """The walls at both ends of each column of `crossings`: (alpha and beta, 2, columns), NaN where none is."""
+        """The walls at both ends of each arc: shape (alpha and beta, 2, columns); NaN for crossing lines."""
         w = np.array([arc.w[[0, -1]] for arc in self.arcs]).T
-        alpha = curve_at(self.loop, w.ravel()).alpha.reshape(w.shape)
+        alpha = evaluate_curve(self.loop, w.ravel()).alpha.reshape(w.shape)
         for angle, (limit, _) in self.limits.items():
             alpha[w == angle] = limit
-        walls = np.stack([alpha, self._steps.ends])
+        walls = np.stack([alpha, self._joined.ends])
         return np.pad(walls, ((0, 0), (0, 0), (0, len(self.lines))), constant_values=np.nan)
 
-    def _solve(self, beta: np.ndarray, place: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The angle before node ``k`` of all arcs' at which each row crosses, and its alpha."""
-        # Newton's method, inside a bracket, on ``Im(q - beta F)``, which rises with w where a pair leaves, over what
-        # vanishes on every row; who has arrived takes no part any more.
-        steps, nodes = self._steps, self._at_nodes
-        lower = np.where(steps.w[k - 1] < steps.w[k], k - 1, k)
+    def _solve_crossings(self, beta: np.ndarray, arc: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the crossings of lines of constant B with arcs by Newton's method within a bracket.
+
+        Args:
+            beta: damping of each line.
+            arc: arc that it crosses.
+            k: first node of the arc after the crossing, as an index of the joined arcs.
+
+        Returns:
+            Angle and alpha of each crossing.
+        """
+        # Solve ``ratio(w) = 0``. Im(q - beta F) increases with w where a pair leaves the circle (V11); ``signs`` are
+        # those of the factors by which ``ratio`` divides it. Converged crossings leave the iteration.
+        joined, nodes = self._joined, self._node_values
+        lower = np.where(joined.w[k - 1] < joined.w[k], k - 1, k)
         upper = 2 * k - 1 - lower
-        below, above = steps.w[lower], steps.w[upper]
+        below, above = joined.w[lower], joined.w[upper]
         middle = np.cos(0.5 * (below + above))
-        signs = [np.sign(middle - np.cos(w)) for w in self._fixed]
-        rising = steps.leaving[place] * np.prod(signs, axis=0) > 0
-        first, last = nodes.pick(lower).of_rows(beta), nodes.pick(upper).of_rows(beta)
-        # A row through an end of its arc meets the line there in one point, with nothing between them.
-        found = np.where(last.ratio == 0, above, np.where(first.ratio == 0, below, _between(below, above, first, last)))
+        signs = [np.sign(middle - np.cos(w)) for w in self._pair_angles]
+        rising = joined.leaving[arc] * np.prod(signs, axis=0) > 0
+        first, last = nodes.select(lower).evaluate_rows(beta), nodes.select(upper).evaluate_rows(beta)
+        # A line of constant B through an end of the arc crosses it there, and no iteration is needed.
+        angle = np.where(
+            last.ratio == 0, above, np.where(first.ratio == 0, below, _estimate_crossing(below, above, first, last))
+        )
         alpha = np.where(last.ratio == 0, last.alpha, first.alpha)
-        here = np.flatnonzero((first.ratio != 0) & (last.ratio != 0))
-        x, before = found[here], (above - below)[here]
-        for _ in range(_MOST_STEPS if here.size else 0):
-            row = self._look(x).of_rows(beta[here])
-            ahead = (row.ratio < 0) == rising[here]
-            below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
+        active = np.flatnonzero((first.ratio != 0) & (last.ratio != 0))
+        x, before = angle[active], (above - below)[active]
+        for _ in range(MAX_STEPS if active.size else 0):
+            row = self._evaluate_loop(x).evaluate_rows(beta[active])
+            ahead = (row.ratio < 0) == rising[active]
+            below[active], above[active] = np.where(ahead, x, below[active]), np.where(ahead, above[active], x)
             with np.errstate(all="ignore"):
                 move = -row.ratio / row.ratio_slope
             new = x + move
-            # Steps that do not become half as short lead nowhere.
-            good = (new >= below[here]) & (new <= above[here]) & (np.abs(move) <= 0.5 * before)
-            # Who has arrived at an end of the bracket may leave it by rounding.
-            good |= np.abs(new - x) <= _ARRIVED * x
-            new = np.where(good, np.clip(new, below[here], above[here]), 0.5 * (below[here] + above[here]))
-            # A step so short leaves rounding: each next one would be its square. Beside an undamped mode that of the
-            # angle is too much for alpha.
+            # Bisect if the step leaves the bracket or is longer than half the previous step.
+            good = (new >= below[active]) & (new <= above[active]) & (np.abs(move) <= 0.5 * before)
+            # Accept a converged step even if rounding errors put it outside the bracket.
+            good |= np.abs(new - x) <= CONVERGED_STEP * x
+            new = np.where(good, np.clip(new, below[active], above[active]), 0.5 * (below[active] + above[active]))
+            # After the last step the error is of the order of its square. Extrapolate alpha by the exact step, because
+            # near an undamped mode the rounding error of the angle alone would change alpha too much.
             move = np.where(new == x + move, move, new - x)
-            found[here], alpha[here] = new, row.alpha + move * row.alpha_slope
-            on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
-            if not on.any():
+            angle[active], alpha[active] = new, row.alpha + move * row.alpha_slope
+            left = (np.abs(new - x) > CONVERGED_STEP * new) & (above[active] - below[active] > CONVERGED_STEP * new)
+            if not left.any():
                 break
-            here, x, before = here[on], new[on], np.abs(new - x)[on]
-        return found, alpha
+            active, x, before = active[left], new[left], np.abs(new - x)[left]
+        return angle, alpha
 
-    def _look(self, w: np.ndarray) -> _LoopAngles:
-        """The loop at angles, for any rows."""
-        at, whole, turn = circle(w), np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
-        for angle in self._fixed:
+    def _evaluate_loop(self, w: np.ndarray) -> _LoopValues:
+        """Evaluate the loop at angles, for lines of any damping."""
+        points, common, slope = circle(w), np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
+        for angle in self._pair_angles:
             factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
-            whole, turn = whole * factor, turn * factor - whole * np.sin(w)
+            common, slope = common * factor, slope * factor - common * np.sin(w)
         with np.errstate(all="ignore"):
-            return _LoopAngles(*self.loop.required_wall(at), *self.loop.estimate.jet(at), whole, turn)
+            return _LoopValues(*self.loop.evaluate_controller(points), *self.loop.estimate.jet(points), common, slope)
 
     @cached_property
-    def _at_nodes(self) -> _LoopAngles:
-        return self._look(self._steps.w)
+    def _node_values(self) -> _LoopValues:
+        """The values of the loop at the nodes of all arcs."""
+        return self._evaluate_loop(self._joined.w)
 
     @cached_property
-    def _steps(self) -> JoinedArcs:
-        """The nodes of all arcs, in one sequence."""
+    def _joined(self) -> JoinedArcs:
+        """The arcs in one sequence of nodes."""
         return JoinedArcs.join(self.arcs)
 
-    def arc_at(self, w: np.ndarray) -> np.ndarray:
+    def find_arc(self, w: np.ndarray) -> np.ndarray:
         """Return the index of the arc that contains each angle."""
-        return np.searchsorted(self._steps.slowest, w, side="right") - 1
+        return np.searchsorted(self._joined.lowest, w, side="right") - 1
 
     @cached_property
-    def tops(self) -> np.ndarray:
+    def alpha_extrema(self) -> np.ndarray:
         """The angles at which alpha is extreme along the curve."""
-        tops = zeros_of(self.loop, self.w, curve_at(self.loop, self.w).alpha_slope, "alpha_slope")
-        return tops[np.isfinite(curve_at(self.loop, tops).alpha)]
+        w = find_field_zeros(self.loop, self.w, evaluate_curve(self.loop, self.w).alpha_slope, "alpha_slope")
+        return w[np.isfinite(evaluate_curve(self.loop, w).alpha)]
 
     @cached_property
-    def heights(self) -> tuple[np.ndarray, np.ndarray]:
-        """Angles between which alpha is monotone along the curve, and alpha there; NaN where it runs to infinity."""
-        nodes = np.union1d(self.w, self.tops)
-        pieces, heights = [], []
+    def alpha_nodes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Angles between which alpha is monotone along the curve, and alpha there; NaN where the curve is infinite."""
+        nodes = np.union1d(self.w, self.alpha_extrema)
+        pieces, values = [], []
         for a, b in pairwise(sorted(self.limits)):
             inner = nodes[(nodes > a) & (nodes < b)]
             inner = inner if inner.size else np.array([0.5 * (a + b)])
-            # Towards an end at infinity the curve is looked at no further than this.
-            probes = a + _PROBE * (inner[0] - a), b - _PROBE * (b - inner[-1])
+            # Bracket intersections near an infinite end of the curve by probes close to it.
+            probes = a + PROBE_DISTANCE * (inner[0] - a), b - PROBE_DISTANCE * (b - inner[-1])
             inner = np.concatenate([probes[:1], inner, probes[1:]])
             pieces.append(np.concatenate([[a], inner, [b]]))
-            heights.append(np.concatenate([self.limits[a][:1], curve_at(self.loop, inner).alpha, self.limits[b][:1]]))
-        return np.concatenate(pieces), np.concatenate(heights)
+            values.append(
+                np.concatenate([self.limits[a][:1], evaluate_curve(self.loop, inner).alpha, self.limits[b][:1]])
+            )
+        return np.concatenate(pieces), np.concatenate(values)
 
     @property
-    def _fixed(self) -> list[float]:
-        """The angles besides 0 and pi at which ``Im(q - beta F)`` vanishes on every row."""
+    def _pair_angles(self) -> list[float]:
+        """The angles inside (0, pi) of crossing lines; ``Im(q - beta F)`` vanishes there for every beta."""
         return [line.w for line in self.lines if line.poles == 2]
 
-    def settle(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows whose crossings lead from the count far below to that far above, and which ones do (V15)."""
-        # A row within rounding of a turn of the curve may miss one of two arcs: a neighbor that does not stands for it.
-        missed = self._missed(beta)
-        for shift in _SHIFTS:
-            row = np.flatnonzero(missed)
+    def shift_ambiguous(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Shift dampings whose lines of constant B have inconsistent crossings (V15).
+
+        A line within rounding errors of an extremum of beta may miss one of the two arcs that meet there. A line with a
+        slightly different damping replaces it.
+
+        Returns:
+            The dampings, and for each line whether its crossings are consistent with the counts far below and above.
+        """
+        mismatch = self._count_mismatch(beta)
+        for shift in SHIFTS:
+            row = np.flatnonzero(mismatch)
             if not row.size:
                 break
             beta = beta.copy()
             beta[row] = beta[row] * (1.0 + shift)
-            missed[row] = self._missed(beta[row])
-        return beta, missed == 0
+            mismatch[row] = self._count_mismatch(beta[row])
+        return beta, mismatch == 0
 
-    def _missed(self, beta: np.ndarray) -> np.ndarray:
-        """By how many poles the crossings of each row fail to lead to the count far above."""
+    def _count_mismatch(self, beta: np.ndarray) -> np.ndarray:
+        """Return, per line, the count far below plus all poles that leave, minus the count far above: 0 if correct."""
         return self.count_below(beta) - self.count_above(beta) + self._sum_leaving(beta)
 
-    def _sum_leaving(self, beta: np.ndarray, most: float = np.inf) -> np.ndarray:
-        """Poles that leave at all crossings of each row, where each counts for no more than ``most``."""
-        steps = self._steps
-        total = steps.sum_met(np.minimum(steps.leaving, most), beta)
-        return total + sum(np.minimum(line.leaving(beta), most) for line in self.lines)
+    def _sum_leaving(self, beta: np.ndarray, limit: float = np.inf) -> np.ndarray:
+        """Return the sum of ``leaving``, each at most ``limit``, over all crossings of each line of constant B."""
+        joined = self._joined
+        total = joined.sum_crossed(np.minimum(joined.leaving, limit), beta)
+        return total + sum(np.minimum(line.count_leaving(beta), limit) for line in self.lines)
 
-    def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """How many poles of each wall lie outside the circle; -1 where the row's crossings contradict each other."""
-        passed, sound = self._passed(alpha, beta)
-        return np.where(sound, self.count_below(beta) + passed, -1)
-
-    def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> tuple[np.ndarray, np.ndarray]:
-        """Poles that have left below each wall, without those of one column of the crossings; and if that is sound."""
-        # Most walls are far above or below where an arc crosses their row, which the nodes beside tell.
-        but = np.broadcast_to(but, beta.shape)
-        beta, sound = self.settle(beta)
-        steps = self._steps
-        place, row, k = steps.meet(beta)
-        counted = but[row] != place
-        place, row, k = place[counted], row[counted], k[counted]
-        with np.errstate(all="ignore"):
-            share = (beta[row] - steps.beta[k - 1]) / (steps.beta[k] - steps.beta[k - 1])
-            share = np.where(steps.straight[k], share, 0.5)
-            away = alpha[row] - (steps.alpha[k - 1] + share * (steps.alpha[k] - steps.alpha[k - 1]))
-            passed, near = away > steps.room[k], ~(np.abs(away) > steps.room[k])
-        if near.any():
-            passed[near] = self._solve(beta[row[near]], place[near], k[near])[1] < alpha[row[near]]
-        total = np.zeros(beta.shape)
-        np.add.at(total, row[passed], steps.leaving[place[passed]])
-        for place, line in enumerate(self.lines, len(self.arcs)):
-            passed = (line.q - beta * line.f < alpha) & (but != place)
-            total += np.where(passed, line.leaving(beta), 0.0)
-        return total.astype(int), sound
-
-    def borders(self, w: np.ndarray) -> np.ndarray:
-        """Whether the stable set lies on one side of the curve at each angle (V18)."""
-        here = curve_at(self.loop, w)
-        held = np.isfinite(here.alpha) & np.isfinite(here.beta)
-        # Of a long delay's rows most hold no stable wall wherever: not enough poles enter on them.
-        rows = self.settle(here.beta[held])[0]
-        held[held] = self.count_below(rows) + self._sum_leaving(rows, 0.0) <= 0
-        own, block = self.arc_at(w), max(1, _BLOCK // max(1, len(self.arcs)))
-        for part in np.array_split(np.flatnonzero(held), 1 + held.sum() // block):
-            passed, sound = self._passed(here.alpha[part], here.beta[part], own[part])
-            # By the arc: next to z = -1 the slope at one angle may be rounding.
-            below = self.count_below(here.beta[part])
-            held[part] = sound & (below + passed == np.where(self._steps.leaving[own[part]] > 0, 0, 2))
-        return held
-
-    def count_below(self, beta: np.ndarray) -> np.ndarray | int:
-        """Return the number of poles outside the circle for alpha below all crossings (docs/theory/scenes.md, V14).
+    def count_outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """Return the number of poles outside the unit circle for each wall.
 
         Args:
-            beta: dampings of lines of constant B.
+            alpha: normalized stiffness, shape (walls,).
+            beta: normalized damping, shape (walls,).
+
+        Returns:
+            Array of shape (walls,); -1 if the crossings of the line of constant B are inconsistent.
         """
+        sums, consistent = self._sum_below(alpha, beta)
+        return np.where(consistent, self.count_below(beta) + sums, -1)
+
+    def _sum_below(
+        self, alpha: np.ndarray, beta: np.ndarray, excluded: np.ndarray | int = -1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Sum ``leaving`` over the crossings below each wall, except in the column ``excluded``.
+
+        Returns:
+            The sums, and whether the crossings of each wall's line of constant B are consistent.
+        """
+        # Most walls are far from the crossing. For these the interpolated alpha and the bound of its error decide, and
+        # only the others need the exact crossing.
+        excluded = np.broadcast_to(excluded, beta.shape)
+        beta, consistent = self.shift_ambiguous(beta)
+        joined = self._joined
+        column, row, k = joined.list_crossings(beta)
+        counted = excluded[row] != column
+        column, row, k = column[counted], row[counted], k[counted]
+        with np.errstate(all="ignore"):
+            share = (beta[row] - joined.beta[k - 1]) / (joined.beta[k] - joined.beta[k - 1])
+            share = np.where(joined.straight[k], share, 0.5)
+            distance = alpha[row] - (joined.alpha[k - 1] + share * (joined.alpha[k] - joined.alpha[k - 1]))
+            passed, near = distance > joined.room[k], ~(np.abs(distance) > joined.room[k])
+        if near.any():
+            passed[near] = self._solve_crossings(beta[row[near]], column[near], k[near])[1] < alpha[row[near]]
+        total = np.zeros(beta.shape)
+        np.add.at(total, row[passed], joined.leaving[column[passed]])
+        for column, line in enumerate(self.lines, len(self.arcs)):
+            passed = (line.q - beta * line.f < alpha) & (excluded != column)
+            total += np.where(passed, line.count_leaving(beta), 0.0)
+        return total.astype(int), consistent
+
+    def are_stable_edges(self, w: np.ndarray) -> np.ndarray:
+        """Return whether the stable set lies on one side of the curve at each angle (V18)."""
+        curve = evaluate_curve(self.loop, w)
+        result = np.isfinite(curve.alpha) & np.isfinite(curve.beta)
+        # With a long delay most lines of constant B contain no stable wall, because fewer poles enter the circle along
+        # them than are outside far below. Exclude these lines before solving for crossings.
+        beta = self.shift_ambiguous(curve.beta[result])[0]
+        result[result] = self.count_below(beta) + self._sum_leaving(beta, 0.0) <= 0
+        arc, block = self.find_arc(w), max(1, BLOCK_SIZE // max(1, len(self.arcs)))
+        for part in np.array_split(np.flatnonzero(result), 1 + result.sum() // block):
+            sums, consistent = self._sum_below(curve.alpha[part], curve.beta[part], arc[part])
+            # Use the direction of the whole arc, because the derivative at one angle may be a rounding error.
+            below = self.count_below(curve.beta[part])
+            result[part] = consistent & (below + sums == np.where(self._joined.leaving[arc[part]] > 0, 0, 2))
+        return result
+
+    def count_below(self, beta: np.ndarray) -> np.ndarray | int:
+        """Return the number of poles outside the circle for alpha below all crossings, for each beta (V14)."""
         return self._count_far(-1.0, beta)
 
     def count_above(self, beta: np.ndarray) -> np.ndarray | int:
-        """Return the number of poles outside the circle for alpha above all crossings.
+        """Return the number of poles outside the circle for alpha above all crossings, for each beta (V14).
 
         On every line of constant B the poles that cross account for the difference from `count_below`.
-
-        Args:
-            beta: dampings of lines of constant B.
         """
         return self._count_far(1.0, beta)
 
     def _count_far(self, side: float, beta: np.ndarray) -> np.ndarray | int:
+        """Return the number of poles outside the circle as alpha -> side * inf."""
         less, more = self._far_counts[side]
-        # Only in a lossless loop does the number of poles depend on the damping.
+        # The number depends on the damping only if the loop is lossless.
         return less if less == more else np.where(beta > self.lossless, more, less)
 
     @cached_property
@@ -311,80 +357,88 @@ class Boundary:
         """Poles outside at alpha -> -inf (key -1) and +inf (key 1): for beta below and above the lossless damping."""
         return {side: (self._far_outside(side, -1.0), self._far_outside(side, 1.0)) for side in (-1.0, 1.0)}
 
-    def _far_outside(self, side: float, more: float) -> int:
+    def _far_outside(self, side: float, excess: float) -> int:
         """Return the number of poles outside the unit circle as |alpha| -> inf.
 
         Poles then approach the zeros of the device; the remaining poles go to infinity.
 
         Args:
             side: sign of alpha.
-            more: sign of beta minus the lossless damping; has no effect if the loop is not lossless.
+            excess: sign of beta minus the lossless damping; has no effect if the loop is not lossless.
         """
         loop = self.loop
-        depth, on = depths(loop.zeros), are_on_circle(loop.zeros)
+        depth, on_circle = depths(loop.zeros), are_on_circle(loop.zeros)
         leaving = 0
-        for zero, times in zip(*np.unique(loop.zeros[on], return_counts=True), strict=True):
-            # Next to such a zero G(w) = c x^times (1 + e x), x = w - w0, is -1/alpha, and |z| > 1 where Im x < 0.
-            at = circle(np.angle(1.0 - zero))
-            rest = replace(loop, zeros=loop.zeros[loop.zeros != zero]).response(at)
-            power = -side / (rest.value * (1j * at.z) ** times)
-            x = power ** (1.0 / times) * np.exp(2j * np.pi * np.arange(times) / times)
+        for zero, order in zip(*np.unique(loop.zeros[on_circle], return_counts=True), strict=True):
+            # Near a zero at w0, G = c x^order (1 + e x) with x = w - w0; poles satisfy G = -1/alpha, and |z| > 1 if and
+            # only if Im x < 0 (V14).
+            points = circle(np.angle(1.0 - zero))
+            rest = replace(loop, zeros=loop.zeros[loop.zeros != zero]).evaluate_response(points)
+            power = -side / (rest.value * (1j * points.z) ** order)
+            x = power ** (1.0 / order) * np.exp(2j * np.pi * np.arange(order) / order)
             if np.isfinite(self.lossless):
                 # alpha moves the pole along the circle. Only excess damping moves it off the circle: x becomes
                 # x (1 - (beta - lossless) F/alpha).
-                leaving += int(np.sum(side * more * loop.estimate.jet(at).value.imag * x.real > 0))
+                leaving += int(np.sum(side * excess * loop.estimate.jet(points).value.imag * x.real > 0))
                 continue
-            bend = -(rest.slope / rest.value + 0.5j * times) * x * x / times
-            leaving += int(np.sum(np.where(np.abs(x.imag) > _ALONG * np.abs(x), x.imag, bend.imag) < 0))
-        return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving
+            # A pole with real x leaves tangentially; the next order, -e x^2/order, then decides.
+            bend = -(rest.slope / rest.value + 0.5j * order) * x * x / order
+            leaving += int(np.sum(np.where(np.abs(x.imag) > TANGENT_TOLERANCE * np.abs(x), x.imag, bend.imag) < 0))
+        return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on_circle] < 0)) + leaving
 
 
-class _Row(NamedTuple):
-    """Of rows at angles: what vanishes at a crossing, ``Re(q - beta F)``, and their slopes in w."""
+class _RowValues(NamedTuple):
+    """Values at one angle per line of constant B; a crossing is a zero of ``ratio``."""
 
-    ratio: np.ndarray
-    ratio_slope: np.ndarray
-    alpha: np.ndarray
-    alpha_slope: np.ndarray
+    ratio: np.ndarray  # Im(q - beta F)/common, with ``common`` of `_LoopValues`
+    ratio_slope: np.ndarray  # its derivative in w
+    alpha: np.ndarray  # Re(q - beta F)
+    alpha_slope: np.ndarray  # its derivative in w
 
 
-class _LoopAngles(NamedTuple):
-    """q and F at angles with their slopes, and ``sin w prod(cos w - cos fixed)`` with its own."""
+class _LoopValues(NamedTuple):
+    """q, F and their derivatives in w at angles, and the factor of ``Im(q - beta F)`` that every beta shares."""
 
     q: np.ndarray
     q_slope: np.ndarray
     f: np.ndarray
     f_slope: np.ndarray
-    whole: np.ndarray
-    turn: np.ndarray
+    common: np.ndarray  # sin w prod(cos w - cos w_k) over the angles w_k of `_pair_angles`
+    common_slope: np.ndarray
 
-    def pick(self, index: np.ndarray) -> _LoopAngles:
-        """Some of them."""
-        return _LoopAngles(*(part[index] for part in self))
+    def select(self, index: np.ndarray) -> _LoopValues:
+        """Return the values at the selected angles."""
+        return _LoopValues(*(part[index] for part in self))
 
-    def of_rows(self, beta: np.ndarray) -> _Row:
-        """``Im(q - beta F)`` over what vanishes on every row, and the alpha of rows that cross there."""
+    def evaluate_rows(self, beta: np.ndarray) -> _RowValues:
+        """Evaluate `_RowValues` for one damping per angle."""
         with np.errstate(all="ignore"):
             value, slope = self.q - beta * self.f, self.q_slope - beta * self.f_slope
-            end = self.whole == 0
-            safe = np.where(end, 1.0, self.whole)
-            ratio = np.where(end, np.imag(slope) / self.turn, np.imag(value) / safe)
-            return _Row(ratio, (np.imag(slope) - ratio * self.turn) / safe, np.real(value), np.real(slope))
+            is_zero = self.common == 0
+            divisor = np.where(is_zero, 1.0, self.common)
+            ratio = np.where(is_zero, np.imag(slope) / self.common_slope, np.imag(value) / divisor)
+            return _RowValues(
+                ratio, (np.imag(slope) - ratio * self.common_slope) / divisor, np.real(value), np.real(slope)
+            )
 
 
 @np.errstate(all="ignore")
-def _between(below: np.ndarray, above: np.ndarray, first: _Row, last: _Row) -> np.ndarray:
-    """Where a crossing between two angles is sought first: by the cubic of the inverse, or by a parabola."""
-    rise, far = last.ratio - first.ratio, above - below
+def _estimate_crossing(below: np.ndarray, above: np.ndarray, first: _RowValues, last: _RowValues) -> np.ndarray:
+    """Estimate a zero of ``ratio`` between two angles from values and derivatives at both.
+
+    The estimate is the cubic interpolation of the inverse function or, if this leaves the interval, the root of a
+    parabola.
+    """
+    rise, width = last.ratio - first.ratio, above - below
     share = -first.ratio / rise
     bends = rise * (1.0 - share) / first.ratio_slope, rise * share / last.ratio_slope
-    cubic = below + share * (share * (3.0 - 2.0 * share) * far + (1.0 - share) * (bends[0] - bends[1]))
-    # Next to an end at which the arc turns, with the slope of the flatter end.
+    cubic = below + share * (share * (3.0 - 2.0 * share) * width + (1.0 - share) * (bends[0] - bends[1]))
+    # The parabola uses the smaller of the two derivatives, because near an extremum of beta it vanishes at one end.
     flat = np.abs(first.ratio_slope) < np.abs(last.ratio_slope)
-    start, slope = np.where(flat, first.ratio, last.ratio), np.where(flat, first.ratio_slope, -last.ratio_slope) * far
+    start, slope = np.where(flat, first.ratio, last.ratio), np.where(flat, first.ratio_slope, -last.ratio_slope) * width
     rise = np.where(flat, rise, -rise)
     root = np.sqrt(np.maximum(slope * slope - 4.0 * (rise - slope) * start, 0.0))
-    away = -2.0 * start / (slope + np.where(rise < 0, -root, root))
-    away = np.clip(np.where(np.isfinite(away), away, 0.5), 1e-9, 1.0 - 1e-9) * far
-    parabola = np.where(flat, below + away, above - away)
+    offset = -2.0 * start / (slope + np.where(rise < 0, -root, root))
+    offset = np.clip(np.where(np.isfinite(offset), offset, 0.5), 1e-9, 1.0 - 1e-9) * width
+    parabola = np.where(flat, below + offset, above - offset)
     return np.where((share > 0) & (share < 1) & (cubic > below) & (cubic < above), cubic, parabola)

@@ -1,13 +1,17 @@
-"""Certified verdicts of any linear loop: its characteristic polynomial in balls, decided by the Schur-Cohn recursion.
+"""Decide the stability of walls in any linear loop with a certificate: Schur-Cohn recursion in ball arithmetic.
 
-All parameters of the scene and of the wall are exact; the delay in periods is the float64 quotient that the scene uses.
-The matrix exponential of the device, its characteristic polynomial and the velocity estimate are balls of python-flint.
-Let P have degree n, and let ``P*(z) = z^n P(1/z)``. All zeros of P lie inside the unit circle if and only if
-``|P(0)| < |lead|`` and all zeros of ``(lead P - P(0) P*)/z`` lie inside it. The precision is doubled until all
-comparisons are certain.
+The characteristic polynomial is ``P = D + K N1 + B N2``, here in SI units; G is the response from force to sampled
+position, F the velocity estimate, T the period. All parameters of the scene and of the wall are taken as exact; the
+delay in periods is the float64 quotient that the scene uses. The matrix exponential of the device, its characteristic
+polynomial and the velocity estimate are computed in balls of python-flint, i.e. with error bounds.
+
+Let P have degree n and leading coefficient ``lead``, and let ``P*(z) = z^n P(1/z)``. All zeros of P lie inside the unit
+circle if and only if ``|P(0)| < |lead|`` and all zeros of ``(lead P - P(0) P*)/z`` lie inside it. The precision is
+doubled until all comparisons are certain.
 
 References:
-    Schur 1917; Cohn 1922; Johansson 2017.
+    Schur 1917, J. reine angew. Math. 147; Cohn 1922, Math. Zeitschrift 14 (recursion). Johansson 2017, IEEE Trans.
+    Computers 66 (ball arithmetic).
 """
 
 from __future__ import annotations
@@ -29,42 +33,55 @@ from zwidth.words.status import Status
 if TYPE_CHECKING:
     import flint
 
+# Placeholder for the velocity estimate of the chain, because the estimate is expanded separately.
 NO_ESTIMATE = Estimate(0, 0.0)
 
 
 def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return labels and statuses of walls of one shape, in SI units."""
+    """Decide the stability of walls.
+
+    Args:
+        scene: the scene.
+        stiffness: K in N/m, any shape.
+        damping: B in N s/m, the same shape.
+
+    Returns:
+        Label (True if stable) and `Status` of each wall.
+
+    Raises:
+        InputError: if python-flint is not installed.
+    """
     if not available():
         raise InputError(f"method: 'certified' needs python-flint for this scene: {how_to_install('certified')}")
-    polynomials = cache(lambda bits: _polynomials(scene))
+    polynomials = cache(lambda bits: _expand_polynomials(scene))
     stable, status = np.zeros(stiffness.shape, bool), np.zeros(stiffness.shape, np.int32)
-    for place in np.ndindex(stiffness.shape):
-        stable[place], status[place] = _decide(polynomials, float(stiffness[place]), float(damping[place]))
+    for index in np.ndindex(stiffness.shape):
+        stable[index], status[index] = _decide(polynomials, float(stiffness[index]), float(damping[index]))
     return stable, status
 
 
 def _decide(polynomials: Callable[[int], Any], stiffness: float, damping: float) -> tuple[bool, Status]:
-    """Return label and status of one wall."""
+    """Return the label and the status of one wall."""
     import flint
 
     if not (np.isfinite(stiffness) and np.isfinite(damping)):
         return False, Status.INVALID_INPUT
     for bits in BITS:
         with flint.ctx.workprec(bits):
-            D, N1, N2, rest = polynomials(bits)
+            D, N1, N2, has_rest = polynomials(bits)
             p = D + N1 * flint.arb(stiffness) + N2 * flint.arb(damping)
-            at_one = stiffness == 0 and rest
+            at_one = stiffness == 0 and has_rest
             if at_one:
-                # z = 1 is a pole; decide on the other poles.
+                # z = 1 is a pole, so the wall is on the boundary if all other poles are inside.
                 p = p // flint.arb_poly([-1, 1])
-            verdict = all_inside(p)
+            verdict = are_zeros_inside(p)
         if verdict is not None:
             return (False, Status.ON_BOUNDARY if verdict else Status.OK) if at_one else (verdict, Status.OK)
     return False, Status.UNDECIDED
 
 
-def all_inside(p: flint.arb_poly) -> bool | None:
-    """Return whether all zeros lie inside the unit circle; None if the balls are too wide."""
+def are_zeros_inside(p: flint.arb_poly) -> bool | None:
+    """Return whether all zeros of p lie inside the unit circle; None if the balls are too wide to decide."""
     import flint
 
     while p.degree() > 0:
@@ -76,78 +93,89 @@ def all_inside(p: flint.arb_poly) -> bool | None:
         if not gap > 0:
             return False if gap < 0 else None
         coefficients = p.coeffs()
-        mirrored = flint.arb_poly(coefficients[::-1])
-        reduced = (p * (1 / last) - mirrored * (first / last / last)).coeffs()
+        reversed_ = flint.arb_poly(coefficients[::-1])
+        reduced = (p * (1 / last) - reversed_ * (first / last / last)).coeffs()
         p = flint.arb_poly(reduced[1 : len(coefficients)])
     return True
 
 
-def _polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly, bool]:
-    """Return D, N1 and N2 of ``P = D + K N1 + B N2`` in SI units, and whether K = 0 puts a pole at exactly z = 1."""
+def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly, bool]:
+    """Return D, N1 and N2 in SI units, and whether K = 0 puts a pole at exactly z = 1."""
     import flint
 
-    exact = _exact(scene)
+    exact = _convert_exactly(scene)
     period = exact.timing.period
     chain = chain_of(exact, (scene.d, int(scene.d)), NO_ESTIMATE)
-    answer, device = _device(chain)
+    numerator, denominator = _expand_response(chain)
     estimate = _exact_estimate(exact, scene.velocity, scene.timing.period)
-    top, bottom = _estimate_polynomials(estimate)
+    f_numerator, f_denominator = _expand_estimate(estimate)
     unit = period * period / exact.mass
-    whole = chain.whole + (1 if chain.d > chain.whole else 0)
-    waiting = flint.arb_poly([0] * whole + device.coeffs())
+    lag = chain.whole + (1 if chain.d > chain.whole else 0)
+    delayed = flint.arb_poly([0] * lag + denominator.coeffs())
     # F(1) is exactly 0 if F is a windowed difference, or if one of its zeros is exactly z = 1.
-    rest = chain.free and (estimate.window > 0 or any(offset == 0 for offset in np.asarray(estimate.zeros).tolist()))
-    return waiting * bottom, answer * bottom * unit, answer * top * (unit / period), rest
+    has_rest = chain.free and (
+        estimate.window > 0 or any(offset == 0 for offset in np.asarray(estimate.zeros).tolist())
+    )
+    return (
+        delayed * f_denominator,
+        numerator * f_denominator * unit,
+        numerator * f_numerator * (unit / period),
+        has_rest,
+    )
 
 
-def _exact(part: Any) -> Any:
-    """Return a scene or part with exact balls for floats; bypass constructors, because their checks need floats."""
+def _convert_exactly(part: Any) -> Any:
+    """Return a scene or one of its parts with exact balls in place of floats.
+
+    Constructors are bypassed, because their checks require floats.
+    """
     import flint
 
     if isinstance(part, tuple):
-        return tuple(map(_exact, part))
+        return tuple(map(_convert_exactly, part))
     if isinstance(part, LinearDevice) or not is_dataclass(part):
         # The coefficients of a linear device are exact fractions.
         return flint.arb(part) if isinstance(part, float) else part
-    # Omit cached values, which are floats.
-    made = object.__new__(type(part))
+    # Copy only fields, because cached values are floats.
+    copy = object.__new__(type(part))
     for item in fields(part):
-        object.__setattr__(made, item.name, _exact(getattr(part, item.name)))
-    return made
+        object.__setattr__(copy, item.name, _convert_exactly(getattr(part, item.name)))
+    return copy
 
 
-def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
-    """Return numerator and denominator of G without its integer delay."""
+def _expand_response(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
+    """Return numerator and denominator of G in normalized units, without the poles at z = 0 that the delay causes."""
     import flint
 
-    rate, push, _ = (array.tolist() for array in chain.realize())
-    size = len(push)
+    A, B, _ = (array.tolist() for array in chain.realize())
+    size = len(B)
 
-    def flow(time: flint.arb) -> tuple[flint.arb_mat, flint.arb_mat]:
-        rows = [[time * value for value in (*row, force)] for row, force in zip(rate, push, strict=True)]
-        whole = flint.arb_mat([*rows, [0] * (size + 1)]).exp()
+    def compute_transition(time: flint.arb) -> tuple[flint.arb_mat, flint.arb_mat]:
+        """Return e^(A t), and the state after a unit force held for time t from rest."""
+        rows = [[time * value for value in (*row, force)] for row, force in zip(A, B, strict=True)]
+        block = flint.arb_mat([*rows, [0] * (size + 1)]).exp()
         return (
-            flint.arb_mat([[whole[i, j] for j in range(size)] for i in range(size)]),
-            flint.arb_mat([[whole[i, size]] for i in range(size)]),
+            flint.arb_mat([[block[i, j] for j in range(size)] for i in range(size)]),
+            flint.arb_mat([[block[i, size]] for i in range(size)]),
         )
 
     if chain.sampled:
-        step, full = flint.arb_mat(rate), flint.arb_mat([[value] for value in push])
+        transition, full = flint.arb_mat(A), flint.arb_mat([[value] for value in B])
     else:
-        step, full = flow(flint.arb(1))
-    device = step.charpoly()
+        transition, full = compute_transition(flint.arb(1))
+    denominator = transition.charpoly()
 
-    def numerator(state: flint.arb_mat) -> flint.arb_poly:
-        """Return ``C adj(z - A) state`` by the matrix determinant lemma; C selects the first state."""
-        changed = flint.arb_mat(step)
+    def expand_numerator(state: flint.arb_mat) -> flint.arb_poly:
+        """Return ``C adj(z - transition) state`` by the matrix determinant lemma; C selects the first state."""
+        changed = flint.arb_mat(transition)
         for k in range(size):
             changed[k, 0] = changed[k, 0] - state[k, 0]
-        return changed.charpoly() - device
+        return changed.charpoly() - denominator
 
     if chain.d == chain.whole:
-        return numerator(full), device
-    late = flow(1 - flint.arb(float(chain.d - chain.whole)))[1]
-    return flint.arb_poly([0, 1]) * numerator(late) + numerator(full - late), device
+        return expand_numerator(full), denominator
+    late = compute_transition(1 - flint.arb(float(chain.d - chain.whole)))[1]
+    return flint.arb_poly([0, 1]) * expand_numerator(late) + expand_numerator(full - late), denominator
 
 
 def _exact_estimate(exact: Any, velocity: Any, period: float) -> Estimate:
@@ -159,23 +187,23 @@ def _exact_estimate(exact: Any, velocity: Any, period: float) -> Estimate:
         return velocity.estimate(period)
 
 
-def _estimate_polynomials(estimate: Estimate) -> tuple[flint.arb_poly, flint.arb_poly]:
+def _expand_estimate(estimate: Estimate) -> tuple[flint.arb_poly, flint.arb_poly]:
     """Return the numerator and the denominator of the velocity estimate F, for T = 1."""
     import flint
 
-    z, turns = flint.arb_poly([0, 1]), estimate.window + estimate.lag
-    top, bottom = (_expand(roots) for roots in (estimate.zeros, estimate.poles))
-    top = top * estimate.gain * z ** max(-turns, 0)
+    z, delay = flint.arb_poly([0, 1]), estimate.window + estimate.lag
+    numerator, denominator = (_expand(roots) for roots in (estimate.zeros, estimate.poles))
+    numerator = numerator * estimate.gain * z ** max(-delay, 0)
     if estimate.window:
-        top = top * (z**estimate.window - 1) * (1 / flint.arb(estimate.window))
-    return top, bottom * z ** max(turns, 0)
+        numerator = numerator * (z**estimate.window - 1) * (1 / flint.arb(estimate.window))
+    return numerator, denominator * z ** max(delay, 0)
 
 
 def _expand(offsets: Any) -> flint.arb_poly:
     """Return the real monic polynomial of roots in conjugate pairs, given as offsets ``1 - z``."""
     import flint
 
-    found = flint.acb_poly([1])
+    product = flint.acb_poly([1])
     for offset in np.asarray(offsets).tolist():
-        found = found * flint.acb_poly([flint.acb(offset) - 1, 1])
-    return flint.arb_poly([coefficient.real for coefficient in found.coeffs()])
+        product = product * flint.acb_poly([flint.acb(offset) - 1, 1])
+    return flint.arb_poly([coefficient.real for coefficient in product.coeffs()])

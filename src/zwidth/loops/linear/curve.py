@@ -1,8 +1,14 @@
-"""The boundary of any linear loop: the curve of pole pairs, its nodes, zeros and arcs, and the lines (V8 to V12).
+"""Compute the walls that put poles on the unit circle in any linear loop: boundary curve and crossing lines.
 
-On ``z = e^(jw)``, 0 < w < pi, a pole pair is where ``beta = Im q/Im F`` and ``alpha = Re q - beta Re F``. On an arc
-beta is monotone, so that a row meets it once. Where F is real, ``alpha + beta F = q`` is a line as soon as q is real as
-well: real poles, and pairs of undamped devices at one frequency.
+On ``z = e^(jw)``, 0 < w < pi, a wall has a pole pair at z if and only if ``alpha + beta F = q`` (`loops.linear.roots`),
+that is (docs/theory/scenes.md, V8)
+
+    beta = Im q/Im F        alpha = Re q - beta Re F
+
+which is the *boundary curve* (alpha(w), beta(w)). A prime denotes d/dw. The curve is cut into *arcs* on which beta is
+monotone, so a line of constant B crosses an arc at most once (V12). If F and q are both real at w, the equation is a
+whole *crossing line* of walls: real poles at w = 0 and w = pi (V9), or pole pairs inside (V10), for example of
+undamped devices. The *nodes* are the angles at which the curve is tabulated (V16).
 """
 
 from __future__ import annotations
@@ -13,57 +19,58 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from zwidth.arrays.roots import zeros_between
+from zwidth.arrays.roots import find_zeros_between
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.parts.circle import are_on_circle, circle
 
-# How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
-_STEP = 0.08
-_ROUNDS = 60
-# How near to z = -1 the last node is, for a loop without roots there.
-_LAST = 1e-4
+# Nodes
+NODE_SPACING = 0.08  # relative change of q and F between neighboring nodes, estimated
+MAX_ROUNDS = 60  # of halving the intervals
+LAST_NODE = 1e-4  # pi - w of the last node, for a loop without delay and without roots near z = -1
 
 
 class CurvePoints(NamedTuple):
-    """Points of the boundary curve, and what decides their order."""
+    """Points of the boundary curve."""
 
     alpha: np.ndarray
     beta: np.ndarray
     alpha_slope: np.ndarray  # d alpha/dw
-    turn: np.ndarray  # Im q' Im F - Im q Im F', of the sign of d beta/dw
-    fall: np.ndarray  # Im F
-    size: np.ndarray  # |q| + |beta F|, of which alpha is a difference
+    wronskian: np.ndarray  # Im q' Im F - Im q Im F'; has the sign of d beta/dw
+    im_f: np.ndarray  # Im F
+    size: np.ndarray  # |q| + |beta F|, the terms whose difference is alpha; scales its rounding error
 
 
-def curve_at(loop: LoopRoots, w: np.ndarray) -> CurvePoints:
-    """The boundary curve at angles in (0, pi)."""
-    at = circle(w)
+def evaluate_curve(loop: LoopRoots, w: np.ndarray) -> CurvePoints:
+    """Evaluate the boundary curve at angles in (0, pi)."""
+    points = circle(w)
     with np.errstate(all="ignore"):
-        q, f = loop.required_wall(at), loop.estimate.jet(at)
+        q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
         beta = q.value.imag / f.value.imag
         alpha = q.value.real - beta * f.value.real
-        turn = q.slope.imag * f.value.imag - q.value.imag * f.slope.imag
-        beta_slope = turn / f.value.imag**2
+        wronskian = q.slope.imag * f.value.imag - q.value.imag * f.slope.imag
+        beta_slope = wronskian / f.value.imag**2
         alpha_slope = q.slope.real - beta_slope * f.value.real - beta * f.slope.real
         size = np.abs(q.value) + np.abs(beta * f.value)
-        return CurvePoints(alpha, beta, alpha_slope, turn, f.value.imag, size)
+        return CurvePoints(alpha, beta, alpha_slope, wronskian, f.value.imag, size)
 
 
-def nodes_of(loop: LoopRoots) -> np.ndarray:
-    """Angles from nearly 0 to nearly pi, so close that the loop hardly changes from one to the next."""
+def place_nodes(loop: LoopRoots) -> np.ndarray:
+    """Return angles from nearly 0 to nearly pi, so dense that q and F change little from one to the next (V16)."""
     roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
-    sizes, far = np.abs(roots), np.abs(roots - 2.0)
-    turn = 1.0 / (loop.lag + loop.estimate.window + 1.0)
-    first = 1e-3 * min([turn, *sizes[sizes > 1e-13]])
-    # Next to z = -1 imaginary parts x = pi - w have lost eps/x of themselves, and beta varies by (x/far)^2: closer than
-    # this its slope is rounding.
-    last = _LAST * min([turn, *far[far > 1e-13]]) ** (2.0 / 3.0)
+    from_one, from_minus_one = np.abs(roots), np.abs(roots - 2.0)
+    delay_angle = 1.0 / (loop.lag + loop.estimate.window + 1.0)
+    first = 1e-3 * min([delay_angle, *from_one[from_one > 1e-13]])
+    # Near z = -1, with x = pi - w, imaginary parts have a relative error of eps/x, and beta varies as
+    # (x/from_minus_one)^2. The last node is as close to pi as the resulting error of d beta/dw allows.
+    last = LAST_NODE * min([delay_angle, *from_minus_one[from_minus_one > 1e-13]]) ** (2.0 / 3.0)
     w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - last, 32)[1:]])
     nodes, low, high = [w], w[:-1], w[1:]
-    for _ in range(_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         half = 0.5 * (high - low)
-        steps = 2.0 * half * loop.turning(low + half, half * np.array([[1.0], [0.0]]))
-        wide = (steps > _STEP * np.array([[16.0], [1.0]])).any(0)
+        # Change over the interval, by the bound within it (first row) and by the value at its middle (second row).
+        # The bound overestimates the change near roots, so a 16 times larger value of it is accepted.
+        change = 2.0 * half * loop.bound_variation(low + half, half * np.array([[1.0], [0.0]]))
+        wide = (change > NODE_SPACING * np.array([[16.0], [1.0]])).any(0)
         if not wide.any():
             break
         middle = (low + half)[wide]
@@ -72,129 +79,157 @@ def nodes_of(loop: LoopRoots) -> np.ndarray:
     return np.sort(np.concatenate(nodes))
 
 
-def zeros_of(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
-    """Zeros of a field of the curve between nodes where its sign changes."""
+def find_field_zeros(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
+    """Return the zeros of a field of `CurvePoints` at sign changes between nodes.
+
+    Args:
+        loop: the loop without a wall.
+        w: angles of the nodes.
+        values: the field at the nodes.
+        field: its name.
+    """
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
-    return zeros_between(lambda at: getattr(curve_at(loop, at), field), w, values, k)
+    return find_zeros_between(lambda angles: getattr(evaluate_curve(loop, angles), field), w, values, k)
 
 
-# Of |q|: less of an imaginary part than that where Im F vanishes is none.
-_NONE = 1e-11
-# A velocity estimate that turns less than this at z = 1, -1 or a line does not answer there.
-_FLAT = 1e-12
+# Crossing lines
+REAL_TOLERANCE = 1e-11  # |Im q| of a real q, relative to |q|; smaller values are rounding errors
+MIN_ESTIMATE_SLOPE = 1e-12  # |Im F'| below which F does not vary to first order at a crossing line
 
 
 class CrossingLine(NamedTuple):
-    """A frequency at which a whole line ``alpha + beta real(F) = q`` puts poles on the circle."""
+    """The line ``alpha + beta F = q`` of walls with poles on the unit circle at w, where F and q are real."""
 
     w: float
     q: float
     f: float
-    q_turn: float  # Im dq/dw
-    f_turn: float
-    poles: int  # 1 at z = 1 and z = -1, else 2
+    im_q_slope: float  # Im q'
+    im_f_slope: float  # Im F'
+    poles: int  # number of poles on the circle: 1 at z = 1 and z = -1, else 2
 
     @property
-    def meeting(self) -> float:
-        """The damping at which the curve meets the line, ``Im q'/Im F'``; NaN where it does not."""
-        return self.q_turn / self.f_turn if abs(self.f_turn) > _FLAT else np.nan
+    def curve_beta(self) -> float:
+        """The damping at which the boundary curve meets the line, ``Im q'/Im F'``; NaN if they do not meet."""
+        return self.im_q_slope / self.im_f_slope if abs(self.im_f_slope) > MIN_ESTIMATE_SLOPE else np.nan
 
-    def leaving(self, beta: np.ndarray) -> np.ndarray:
-        """Poles that leave the circle there as alpha rises; on the row through the meeting, as just above it."""
-        if np.isnan(self.meeting):
-            return np.full(beta.shape, self.poles * np.sign(self.q_turn))
-        return self.poles * np.sign(self.f_turn) * np.where(beta < self.meeting, 1.0, -1.0)
+    def count_leaving(self, beta: np.ndarray) -> np.ndarray:
+        """Return the net number of poles that leave the unit circle as alpha increases past the line (V11).
+
+        A line of constant B through `curve_beta` counts as one just above it.
+        """
+        if np.isnan(self.curve_beta):
+            return np.full(beta.shape, self.poles * np.sign(self.im_q_slope))
+        return self.poles * np.sign(self.im_f_slope) * np.where(beta < self.curve_beta, 1.0, -1.0)
 
 
-def lines_at(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
-    """The lines of zeros of Im F where q is real as well: at z = 1 and -1, inside of undamped devices and windows."""
-    # There is none where q or F is infinite: where the device does not move, say.
+def find_lines(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
+    """Return the crossing lines at those of the angles at which q is real.
+
+    Args:
+        loop: the loop without a wall.
+        angles: zeros of Im F, including 0 and pi.
+    """
+    # There is no line if q or F is infinite, for example at a zero of G.
     w = np.array(angles, float)
-    at, end = circle(w), (w == 0.0) | (w == np.pi)
+    points, is_end = circle(w), (w == 0.0) | (w == np.pi)
     with np.errstate(all="ignore"):
-        q, f = loop.required_wall(at), loop.estimate.jet(at)
-        real = end | (np.abs(q.value.imag) <= _NONE * np.abs(q.value))
-    numbers = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
-    # A slow zero has an offset of its own from z = 1.
-    reach = np.where(w == 0.0, 1e-15, np.where(end, 1e-12, 1e-9))
-    near = np.abs(at.before[:, None] + loop.zeros) <= reach[:, None]
-    found = np.flatnonzero(real & ~near.any(1) & np.isfinite(numbers).all(1))
-    return [CrossingLine(*numbers[k].tolist(), poles=1 if end[k] else 2) for k in found]
+        q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
+        real = is_end | (np.abs(q.value.imag) <= REAL_TOLERANCE * np.abs(q.value))
+    values = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
+    # Zeros of G within this distance count as located at the angle. The distance is smallest at z = 1, because offsets
+    # of zeros near z = 1 have a small relative error.
+    reach = np.where(w == 0.0, 1e-15, np.where(is_end, 1e-12, 1e-9))
+    near = np.abs(points.before[:, None] + loop.zeros) <= reach[:, None]
+    selected = np.flatnonzero(real & ~near.any(1) & np.isfinite(values).all(1))
+    return [CrossingLine(*values[k].tolist(), poles=1 if is_end[k] else 2) for k in selected]
 
 
-def circle_zeros(loop: LoopRoots) -> np.ndarray:
-    """Angles of zeros on the circle: of an undamped device, where q is infinite, or of F, where Im F may touch 0."""
+def list_circle_zeros(loop: LoopRoots) -> np.ndarray:
+    """Return the angles of zeros on the unit circle: of G, where q is infinite, and of F, where Im F may touch 0."""
     zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
     angles = np.angle(1.0 - zeros[are_on_circle(zeros)])
     return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
 
 
-# How far beyond two neighboring nodes the curve may be between them, of what alpha is a difference of.
-_ROOM, _ROUNDING = 0.02, 1e-6
+# Errors of alpha between two nodes, relative to `CurvePoints.size`
+COARSE_TOLERANCE = 0.02  # added to 1.5 times the difference of the nodes if alpha may not be interpolated
+ROUNDING_TOLERANCE = 1e-6  # bound of the rounding errors
 
 
 class Arc(NamedTuple):
-    """A part of the curve on which beta is monotone, by its nodes in ascending beta."""
+    """A part of the boundary curve on which beta is monotone, by its nodes in ascending beta."""
 
     w: np.ndarray
     beta: np.ndarray
     alpha: np.ndarray
-    alpha_slope: np.ndarray  # in w, as beta's
-    beta_slope: np.ndarray
-    size: np.ndarray  # that of `CurvePoints`
-    leaving: float  # poles that leave the circle as alpha rises past it: 2, or -2
+    alpha_slope: np.ndarray  # d alpha/dw
+    beta_slope: np.ndarray  # d beta/dw
+    size: np.ndarray  # as in `CurvePoints`
+    leaving: float  # net number of poles that leave the unit circle as alpha increases past the arc: 2 or -2
 
     @property
     def first(self) -> float:
-        """Its lowest angle."""
+        """The lowest angle of the arc."""
         return float(min(self.w[0], self.w[-1]))
 
 
 def cut_arcs(
-    loop: LoopRoots, w: np.ndarray, here: CurvePoints, turns: np.ndarray, limits: dict[float, tuple[float, float]]
+    loop: LoopRoots, w: np.ndarray, curve: CurvePoints, extrema: np.ndarray, limits: dict[float, tuple[float, float]]
 ) -> list[Arc]:
-    """Cut the curve where beta turns or runs to infinity, and where Im F changes its sign."""
-    ends = np.unique(np.concatenate([list(limits), turns]))
-    betas = dict(zip(turns.tolist(), curve_at(loop, turns).beta.tolist(), strict=True))
+    """Cut the curve at extrema of beta, where it runs to infinity, and where Im F changes its sign.
+
+    Args:
+        loop: the loop without a wall.
+        w: angles of the nodes.
+        curve: the curve at the nodes.
+        extrema: angles at which beta is extreme along the curve.
+        limits: alpha and beta at angles where the formulas of the curve are undefined; NaN if it runs to infinity.
+
+    Returns:
+        The arcs in ascending angle. An arc starts and ends with its two limits; there alpha is NaN.
+    """
+    ends = np.unique(np.concatenate([list(limits), extrema]))
+    betas = dict(zip(extrema.tolist(), evaluate_curve(loop, extrema).beta.tolist(), strict=True))
     betas |= {end: beta for end, (_, beta) in limits.items()}
     arcs, starts, stops = [], np.searchsorted(w, ends, "right").tolist(), np.searchsorted(w, ends, "left").tolist()
     for (a, b), start, stop in zip(pairwise(ends.tolist()), starts[:-1], stops[1:], strict=True):
-        nodes, curve = w[start:stop], CurvePoints(*(values[start:stop] for values in here))
+        nodes, inner = w[start:stop], CurvePoints(*(values[start:stop] for values in curve))
         if not nodes.size:
             nodes = np.array([0.5 * (a + b)])
-            curve = curve_at(loop, nodes)
-        rising = np.sum(np.sign(curve.turn)) > 0
-        # As alpha passes the arc a pair leaves where Im(q - beta F) rises with w: told once, by the nodes.
-        leaving = 2.0 if rising == (np.sum(np.sign(curve.fall)) > 0) else -2.0
+            inner = evaluate_curve(loop, nodes)
+        rising = np.sum(np.sign(inner.wronskian)) > 0
+        # A pair leaves the circle if (d beta/dw) Im F > 0 (V11, V12). Decide by the majority of the nodes, because the
+        # signs at single nodes near the ends of an arc may be rounding errors.
+        leaving = 2.0 if rising == (np.sum(np.sign(inner.im_f)) > 0) else -2.0
         first, last = (
             betas[end] if np.isfinite(betas[end]) else side * np.inf
             for end, side in ((a, -1.0 if rising else 1.0), (b, 1.0 if rising else -1.0))
         )
-        # The ends have no alpha: next to them every wall is compared with the crossing itself.
+        # The ends of an arc have no tabulated alpha, so walls next to them are compared with the exact crossing.
         with np.errstate(all="ignore"):
-            slope = curve.turn / curve.fall**2
-        parts = [nodes, curve.beta, curve.alpha, curve.alpha_slope, slope, curve.size]
+            slope = inner.wronskian / inner.im_f**2
+        parts = [nodes, inner.beta, inner.alpha, inner.alpha_slope, slope, inner.size]
         edges = [(a, b), (first, last), *[(np.nan, np.nan)] * 4]
         parts = [np.concatenate([[end[0]], part, [end[1]]]) for part, end in zip(parts, edges, strict=True)]
         if not rising:
             parts = [part[::-1] for part in parts]
-        # Next to a limit or an extreme rounding may leave a node out of order; without it nothing is lost.
+        # Drop nodes whose beta is out of order by rounding errors, near limits and extrema.
         beta = parts[1]
-        good = np.maximum.accumulate(beta) == beta
-        good &= np.minimum.accumulate(beta[::-1])[::-1] == beta
-        good[[0, -1]] = True
+        ordered = np.maximum.accumulate(beta) == beta
+        ordered &= np.minimum.accumulate(beta[::-1])[::-1] == beta
+        ordered[[0, -1]] = True
         if beta[0] <= beta[-1]:
-            parts = [part[good] for part in parts]
+            parts = [part[ordered] for part in parts]
             arcs.append(Arc(*parts, leaving))
     return arcs
 
 
 # Tests for a lossless loop
-_LOSSLESS_ERROR = 1e-12  # of Im(q - beta F), relative to its terms and their conditioning; smaller values are 0
-_LOSSLESS_ANGLE = 1e-2  # rad; at smaller angles, rounding errors of poles at z = 1 dominate Im(q - beta F)
+LOSSLESS_ERROR = 1e-12  # of Im(q - beta F), relative to its terms and their conditioning; smaller values are 0
+LOSSLESS_ANGLE = 1e-2  # rad; at smaller angles, rounding errors of poles at z = 1 dominate Im(q - beta F)
 
 
-def find_lossless(loop: LoopRoots, w: np.ndarray, here: CurvePoints, damping: float) -> float:
+def find_lossless(loop: LoopRoots, w: np.ndarray, curve: CurvePoints, damping: float) -> float:
     """Return the damping at which the loop is lossless, or NaN.
 
     A loop is lossless if ``q - beta F`` is real on the whole unit circle. Then the reciprocal of every pole is also a
@@ -203,47 +238,56 @@ def find_lossless(loop: LoopRoots, w: np.ndarray, here: CurvePoints, damping: fl
     Args:
         loop: the loop without its wall.
         w: angles of the nodes of the curve.
-        here: points of the curve at the nodes.
+        curve: points of the curve at the nodes.
         damping: beta of the curve at z = 1. The only candidates are this value and 0.
     """
-    shows = w >= _LOSSLESS_ANGLE
-    before, here = circle(w[shows]).before[:, None], CurvePoints(*(values[shows] for values in here))
+    tested = w >= LOSSLESS_ANGLE
+    z_minus_1, curve = circle(w[tested]).before[:, None], CurvePoints(*(values[tested] for values in curve))
     roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
     with np.errstate(all="ignore"):
         # Conditioning: near a root, the relative error is proportional to 1/distance.
-        near = 1.0 + (np.abs(roots) / np.abs(before + roots)).sum(1)
+        condition = 1.0 + (np.abs(roots) / np.abs(z_minus_1 + roots)).sum(1)
         for beta in (0.0, damping):
-            rest = np.abs((here.beta - beta) * here.fall) / (here.size * near)
-            if np.all(np.nan_to_num(rest, nan=0.0) <= _LOSSLESS_ERROR):
+            residual = np.abs((curve.beta - beta) * curve.im_f) / (curve.size * condition)
+            if np.all(np.nan_to_num(residual, nan=0.0) <= LOSSLESS_ERROR):
                 return beta
     return np.nan
 
 
-def level_arc(w: np.ndarray, here: CurvePoints, beta: float) -> Arc:
+def build_level_arc(w: np.ndarray, curve: CurvePoints, beta: float) -> Arc:
     """Return the curve of a lossless loop: one arc of constant damping, which no line of constant B crosses."""
     blank, level = np.full(w.size + 2, np.nan), np.full(w.size + 2, beta)
-    alpha = np.concatenate([[np.nan], here.alpha, [np.nan]])
+    alpha = np.concatenate([[np.nan], curve.alpha, [np.nan]])
     return Arc(np.concatenate([[0.0], w, [np.pi]]), level, alpha, blank, blank, blank, 2.0)
 
 
-def bands(
+def bound_interpolation(
     w: np.ndarray, alpha: np.ndarray, alpha_slope: np.ndarray, beta_slope: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a mask of the steps over which alpha may be interpolated linearly in beta, and bounds of its error.
 
-    The arguments are those of joined arcs; alpha is NaN at their ends. Use the mean alpha of both ends for the other
-    steps.
+    On the other steps alpha is approximated by the mean of both ends, with the returned bound of the error.
+
+    Args:
+        w: angles of the nodes of all arcs, joined, shape (nodes,).
+        alpha: alpha at the nodes; NaN at the ends of the arcs.
+        alpha_slope: d alpha/dw.
+        beta_slope: d beta/dw.
+        size: as in `CurvePoints`.
+
+    Returns:
+        Two arrays of shape (nodes,); an entry describes the step from the previous node.
     """
     # If the slope of beta hardly changes over a step, linear interpolation misses alpha by at most an eighth of the
     # step times the change of alpha's slope, plus the curvature of beta. Allow four times this error. For other steps
     # allow more than the difference of both ends.
     with np.errstate(all="ignore"):
-        bend = beta_slope / np.roll(beta_slope, 1)
-        straight = (bend > 0.5) & (bend < 2.0)
-        step, rise, turn = (np.abs(np.diff(part, prepend=part[0])) for part in (w, alpha, alpha_slope))
+        ratio = beta_slope / np.roll(beta_slope, 1)
+        straight = (ratio > 0.5) & (ratio < 2.0)
+        step, rise, change = (np.abs(np.diff(part, prepend=part[0])) for part in (w, alpha, alpha_slope))
         largest = np.maximum(size, np.roll(size, 1))
-        close = 0.5 * step * turn + np.abs(bend - 1.0) * rise + _ROUNDING * largest
-        return straight, np.where(straight, close, 1.5 * rise + _ROOM * largest)
+        fine = 0.5 * step * change + np.abs(ratio - 1.0) * rise + ROUNDING_TOLERANCE * largest
+        return straight, np.where(straight, fine, 1.5 * rise + COARSE_TOLERANCE * largest)
 
 
 class JoinedArcs(NamedTuple):
@@ -260,32 +304,35 @@ class JoinedArcs(NamedTuple):
     ends: np.ndarray  # (2, arcs): smallest and largest damping
     order: np.ndarray  # order of the flattened ends
     sorted_ends: np.ndarray
-    leaving: np.ndarray  # of each arc: poles that leave the circle as alpha increases
-    slowest: np.ndarray  # of each arc: its lowest angle
+    leaving: np.ndarray  # of each arc: net number of poles that leave the circle as alpha increases
+    lowest: np.ndarray  # of each arc: its lowest angle
 
     @classmethod
     def join(cls, arcs: tuple[Arc, ...]) -> JoinedArcs:
         """Join the arcs of a boundary."""
-        w, beta, *rest = map(np.concatenate, zip(*(arc[:6] for arc in arcs), strict=True))
+        w, beta, *others = map(np.concatenate, zip(*(arc[:6] for arc in arcs), strict=True))
         sizes = [arc.w.size for arc in arcs]
         dampings, keys = np.unique(beta, return_inverse=True)
         keys = keys + np.repeat(np.arange(len(arcs)), sizes) * dampings.size
         ends = np.array([arc.beta[[0, -1]] for arc in arcs]).T
         order = np.argsort(ends, axis=None)
         ends, first = (ends, order, ends.ravel()[order]), np.cumsum([0, *sizes[:-1]])
-        own = np.array([(arc.leaving, arc.first) for arc in arcs]).T
-        return cls(w, beta, rest[0], *bands(w, *rest), keys, dampings, first, *ends, *own)
+        by_arc = np.array([(arc.leaving, arc.first) for arc in arcs]).T
+        return cls(w, beta, others[0], *bound_interpolation(w, *others), keys, dampings, first, *ends, *by_arc)
 
-    def sum_met(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return the sum of the weights of the arcs that contain each beta, without the larger end of each arc."""
+    def sum_crossed(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """Return the sum of the weights of the arcs that each line of constant B crosses.
+
+        A line through an end of an arc counts as one just above it.
+        """
         sums = np.cumsum(np.concatenate([[0.0], np.concatenate([weights, -weights])[self.order]]))
         return sums[np.searchsorted(self.sorted_ends, beta, side="right")]
 
-    def meet(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return for each crossing of an arc with a beta the indices of arc and beta, and the first node after it."""
-        place, row = np.nonzero((beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None]))
-        return place, row, self.find(place, np.searchsorted(self.dampings, beta)[row])
+    def list_crossings(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return all crossings of arcs by lines of constant B: arc, index of the line, and first node after it."""
+        arc, row = np.nonzero((beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None]))
+        return arc, row, self.find_nodes(arc, np.searchsorted(self.dampings, beta)[row])
 
-    def find(self, place: np.ndarray, among: np.ndarray) -> np.ndarray:
-        """Return the first node of each arc after its crossing; ``among``: index of the beta in the sorted dampings."""
-        return np.maximum(np.searchsorted(self.keys, place * self.dampings.size + among), self.first[place] + 1)
+    def find_nodes(self, arc: np.ndarray, rank: np.ndarray) -> np.ndarray:
+        """Return the first node of each arc after its crossing; ``rank``: index of the line's beta in ``dampings``."""
+        return np.maximum(np.searchsorted(self.keys, arc * self.dampings.size + rank), self.first[arc] + 1)

@@ -1,14 +1,18 @@
-"""A device under a force that is held over each period: discretized exactly, and by its roots (any loop).
+"""Discretize a device exactly under a delayed zero-order hold, and factor the resulting open loop.
 
-With ``x' = A x + B u`` and the first number of x what is sensed, the motion between samples is the matrix exponential.
-From held force to sampled position, with zeta = z - 1, Psi = e^A - 1 = A phi1(A) and Gamma(t) the answer to a force
-held for t (docs/theory/scenes.md, V2 to V4):
+Between samples the device obeys ``x' = A x + B u``, with the sensed position as the first state. In normalized units
+(T = 1) and with ``zeta = z - 1``, ``Psi = e^A - 1``, and Gamma(t), the state after a unit force held for time t from
+rest, the response from held force to sampled position is (docs/theory/scenes.md, V2 to V4)
 
     G(z) = C (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1)) / z^(n+1),   d = n + f
 
-As matrices, with the forces on their way, u the wall's force and w one held from outside on the same body, a period is
+with the integer delay n and the fractional delay f; for f = 0 it is ``C (zeta - Psi)^-1 Gamma(1) / z^n``. In state
+space, with the wall's force u of earlier samples and an external force w held on the same body,
 
     x+ = e^A x + Gamma(1 - f) u_(k-n) + (Gamma(1) - Gamma(1 - f)) u_(k-n-1) + Gamma(1) w,    u = -(alpha + beta F) y
+
+A *chain* (`parts.chain`) is a row of masses, springs and dampers; a *system* (`parts.system`) is any linear device. A
+*sampled* system is given in discrete time already. ``q = -1/G`` is the critical controller (`loops.linear.roots`).
 """
 
 from __future__ import annotations
@@ -17,8 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.held_mass import Plant, factor_numerator, held_plant
-from zwidth.loops.linear.roots import LoopRoots, step_apart
+from zwidth.arrays.held_mass import Plant, discretize_mass, factor_numerator
+from zwidth.loops.linear.roots import LoopRoots, compute_aberth_step
 from zwidth.loops.linear.sampled_zeros import find_sampled_zeros
 from zwidth.parts.chain import AnyChain, Chain, is_zero
 from zwidth.parts.circle import CirclePoints, circle, lag_jet
@@ -26,91 +30,95 @@ from zwidth.parts.state_space import StateSpace, estimate_matrices, in_series
 from zwidth.parts.system import System
 from zwidth.words.xp import frozen, namespace, repeat
 
-# Continuous zeros slower than this a period lead to sampled ones; Aberth's steps at most, and the last one's share.
-_SLOW, _MOST_STEPS, _ARRIVED = 0.1, 30, 1e-13
-# Zeros so near to z = 0 are taken together where G by its roots differs by more from G by its matrices, at one angle.
-_FORGOTTEN, _AGREES, _LOOK = 1e-2, 1e-11, 0.5
-# The inverse of how far a zero is at most that is kept.
-_FAR = 1e-17
-# Terms of a series; twice a rate that `Chain.check` allows is below 2^36.
-_TERMS, _DOUBLINGS = 15, 36
+# Zeros of G
+SLOW_ZERO = 0.1  # |zeta| below which a zero starts from its continuous-time counterpart
+MAX_STEPS = 30  # Aberth steps
+CONVERGED_STEP = 1e-13  # last Aberth step, relative to |zeta|
+CLUSTER_RADIUS = 1e-2  # |z| of zeros near z = 0 that rounding errors may make inseparable
+RESPONSE_TOLERANCE = 1e-11  # relative difference of q by roots and by matrices, above which the cluster is not refined
+TEST_ANGLE = 0.5  # rad per sample at which the two are compared
+FAR_ZERO = 1e-17  # inverse |zeta| beyond which a zero is dropped
+
+# Matrix exponential
+SERIES_TERMS = 15
+MAX_DOUBLINGS = 36  # 2^36 exceeds twice the largest rate that `Chain.check` allows
 
 
-def flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
-    """``y = e^(A t) - 1`` and the answer ``Gamma(t)`` to a unit force held for t."""
-    # The series of a time that is smaller by a power of 2, then y(2 t) = y(t) (2 + y(t)), Gamma(2 t) likewise: neither
-    # slow motions nor those that strong damping stops at once lose digits. In two loops, because a program that is
-    # differentiated costs by its length: with JAX's own exponential derivatives of `zwidth.Scene.max_stiffness` took
-    # 1.2 to 1.7 times as long to compile.
-    xp = namespace(rate)
-    size = frozen(xp.abs(rate * time).sum(0).max(), xp)
-    doublings = xp.ceil(xp.log2(xp.maximum(2.0 * size, 1.0)))
-    small, one = rate * (time / 2.0**doublings), xp.eye(rate.shape[0], dtype=rate.dtype)
+def compute_transition(A: Any, B: Any, time: Any) -> tuple[Any, Any]:
+    """Return ``e^(A t) - 1`` and Gamma(t), the state after a unit force held for time t from rest."""
+    # Evaluate the series for the time divided by a power of 2, then double: y(2 t) = y(t) (2 + y(t)) for y = e^(A t) -
+    # 1, and similarly Gamma. This keeps the relative accuracy of slow and of strongly damped modes. Two separate loops
+    # keep the program short, because compiling its derivatives takes time proportional to its length: with JAX's own
+    # exponential, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to compile.
+    xp = namespace(A)
+    norm = frozen(xp.abs(A * time).sum(0).max(), xp)
+    doublings = xp.ceil(xp.log2(xp.maximum(2.0 * norm, 1.0)))
+    small, identity = A * (time / 2.0**doublings), xp.eye(A.shape[0], dtype=A.dtype)
 
     def add(state: tuple[Any, Any]) -> tuple[Any, Any]:
         k, total = state
-        return k - 1.0, one + small @ total / k
+        return k - 1.0, identity + small @ total / k
 
     def double(state: tuple[Any, Any]) -> tuple[Any, Any]:
-        k, moved = state
-        return k + 1.0, xp.where(k < doublings, 2.0 * moved + moved[:, :-1] @ moved, moved)
+        k, both = state
+        return k + 1.0, xp.where(k < doublings, 2.0 * both + both[:, :-1] @ both, both)
 
-    _, phi1 = repeat(_TERMS, add, (doublings * 0.0 + _TERMS + 1.0, one), xp)
-    moved = phi1 @ xp.concatenate([small, push[:, None] * (time / 2.0**doublings)], 1)
-    moved = repeat(_DOUBLINGS, double, (doublings * 0.0, moved), xp, lambda old, new: bool(new[0] >= doublings))[1]
-    return moved[:, :-1], moved[:, -1]
-
-
-def hold(chain: AnyChain, rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
-    """The `flow` of a chain's matrices; those of a sampled one are it, whatever the time."""
-    return (rate - np.eye(len(push)), push) if chain.sampled else flow(rate, push, time)
+    _, phi1 = repeat(SERIES_TERMS, add, (doublings * 0.0 + SERIES_TERMS + 1.0, identity), xp)
+    both = phi1 @ xp.concatenate([small, B[:, None] * (time / 2.0**doublings)], 1)
+    both = repeat(MAX_DOUBLINGS, double, (doublings * 0.0, both), xp, lambda old, new: bool(new[0] >= doublings))[1]
+    return both[:, :-1], both[:, -1]
 
 
-class Sampled(NamedTuple):
-    """The chain between two samples; what the sensor sees is the first number of the state."""
-
-    psi: Any
-    full: Any
-    late: Any | None  # Gamma(1 - f), None for whole delays
+def compute_chain_transition(chain: AnyChain, A: Any, B: Any, time: Any) -> tuple[Any, Any]:
+    """Return `compute_transition` for the matrices of a chain; for a sampled system, A - 1 and B at any time."""
+    return (A - np.eye(len(B)), B) if chain.sampled else compute_transition(A, B, time)
 
 
-def respond(chain: AnyChain) -> Sampled | Plant:
-    """The chain between two samples, what `required_wall` is computed from at every angle."""
+class DiscreteChain(NamedTuple):
+    """A chain discretized over one period; the first state is the sensed position."""
+
+    psi: Any  # e^A - 1
+    full: Any  # Gamma(1)
+    late: Any | None  # Gamma(1 - f); None for integer delays
+
+
+def discretize_chain(chain: AnyChain) -> DiscreteChain | Plant:
+    """Discretize a chain: a rigid one in closed form, all others by the matrix exponential."""
     if not (isinstance(chain, Chain) and chain.rigid):
-        return sampled(chain)
+        return discretize_states(chain)
     fraction = chain.d - chain.whole
-    return held_plant(chain.bodies[0].damping, None if is_zero(fraction) else fraction)
+    return discretize_mass(chain.bodies[0].damping, None if is_zero(fraction) else fraction)
 
 
-def sampled(chain: AnyChain) -> Sampled:
-    """Discretize exactly."""
+def discretize_states(chain: AnyChain) -> DiscreteChain:
+    """Discretize a chain by the matrix exponential."""
     A, B, _ = chain.realize()
-    psi, full = hold(chain, A, B, 1.0)
+    psi, full = compute_chain_transition(chain, A, B, 1.0)
     fraction = chain.d - chain.whole
-    late = None if is_zero(fraction) else hold(chain, A, B, 1.0 - fraction)[1]
-    return Sampled(psi, full, late)
+    late = None if is_zero(fraction) else compute_chain_transition(chain, A, B, 1.0 - fraction)[1]
+    return DiscreteChain(psi, full, late)
 
 
-def required_wall(chain: AnyChain, w: Any, parts: Sampled | Plant) -> Any:
-    """``q = -1/G`` at ``e^(jw)``, one angle, without any root: what derivatives are taken of."""
-    at: CirclePoints = circle(w)
-    if isinstance(parts, Plant):
-        # N(z)/z = a2 z + a1 + a0/z, around z = 1.
-        answer = parts.a2 * at.z + parts.a1 + parts.a0 / at.z
-        return -lag_jet(at, chain.whole).value * at.before * (at.before + parts.em) / answer
-    xp = namespace(parts.psi, w)
-    force = parts.full + 0j if parts.late is None else at.before * parts.late + parts.full
-    turns = chain.whole if parts.late is None else chain.whole + 1
-    moved = xp.linalg.solve(at.before * xp.eye(parts.psi.shape[0]) - parts.psi, force)
-    return -lag_jet(at, turns).value / moved[0]
+def evaluate_controller(chain: AnyChain, w: Any, discretized: DiscreteChain | Plant) -> Any:
+    """Evaluate ``q = -1/G`` at ``e^(jw)`` for one angle w, differentiably, because no root is computed."""
+    points: CirclePoints = circle(w)
+    if isinstance(discretized, Plant):
+        # N(z)/z = a2 z + a1 + a0/z, the numerator of G.
+        numerator = discretized.a2 * points.z + discretized.a1 + discretized.a0 / points.z
+        return -lag_jet(points, chain.whole).value * points.before * (points.before + discretized.em) / numerator
+    xp = namespace(discretized.psi, w)
+    force = discretized.full + 0j if discretized.late is None else points.before * discretized.late + discretized.full
+    lag = chain.whole if discretized.late is None else chain.whole + 1
+    state = xp.linalg.solve(points.before * xp.eye(discretized.psi.shape[0]) - discretized.psi, force)
+    return -lag_jet(points, lag).value / state[0]
 
 
 def find_roots(chain: AnyChain) -> LoopRoots:
-    """Return the zeros, poles, gain and delay of the loop of a chain."""
+    """Return the open loop of a chain, without a wall, by its zeros, poles and gain."""
     if isinstance(chain, Chain) and chain.rigid:
-        return _rigid_loop(chain)
+        return _factor_rigid_loop(chain)
     chain.check()
-    parts = sampled(chain)
+    discretized = discretize_states(chain)
     if isinstance(chain, System):
         lag, (zeros, poles) = chain.whole + (chain.d != chain.whole), chain.device.offsets
         gain = chain.device.gain * float(chain.mass) / float(chain.period) ** 2
@@ -118,126 +126,144 @@ def find_roots(chain: AnyChain) -> LoopRoots:
             lead, zeros = find_sampled_zeros(chain.device, float(chain.period), float(chain.d) - chain.whole)
             gain = lead * float(chain.mass) / float(chain.period) ** 2
             poles = -np.expm1(chain.device.poles * float(chain.period))
-        # Each pole at z = 0 is a delay of one period; zeros at z = 0 cancel such poles.
-        lag, still = int(lag + np.sum(poles == 1)), int(np.sum(zeros == 1))
-        zeros = np.append(zeros[zeros != 1], np.ones(max(still - lag, 0)))
-        return LoopRoots(gain, max(lag - still, 0), zeros, poles[poles != 1], chain.estimate)
-    seen, poles = chain.continuous
+        # Poles at z = 0 are periods of delay, and zeros at z = 0 cancel them.
+        lag, at_origin = int(lag + np.sum(poles == 1)), int(np.sum(zeros == 1))
+        zeros = np.append(zeros[zeros != 1], np.ones(max(at_origin - lag, 0)))
+        return LoopRoots(gain, max(lag - at_origin, 0), zeros, poles[poles != 1], chain.estimate)
+    continuous_zeros, poles = chain.continuous
     poles = -np.expm1(poles)
-    den = np.atleast_1d(np.poly(-poles)).real
-    top = _numerator(parts, parts.full, den)
+    denominator = np.atleast_1d(np.poly(-poles)).real
+    numerator = _expand_numerator(discretized, discretized.full, denominator)
     lag = chain.whole
-    if parts.late is not None:
-        top = np.polyadd(np.append(_numerator(parts, parts.late, den), 0.0), top)
+    if discretized.late is not None:
+        numerator = np.polyadd(np.append(_expand_numerator(discretized, discretized.late, denominator), 0.0), numerator)
         lag += 1
-    top = np.trim_zeros(top, "f")
-    if top.size > 1 and abs(top[0]) < _FAR * abs(top[1]):
-        # Just before a whole delay: a zero so far off moves nothing on the circle, and no step would find it.
-        top = top[1:]
-    # Zeros beside a soft mode's poles are lost in ``top``; they are nearly those of the continuous motion.
+    numerator = np.trim_zeros(numerator, "f")
+    if numerator.size > 1 and abs(numerator[0]) < FAR_ZERO * abs(numerator[1]):
+        # For a delay just below an integer, one zero is so far from the unit circle that it has no effect there, and
+        # Aberth's method would not find it.
+        numerator = numerator[1:]
+    # The coefficients do not resolve zeros near the poles of a soft mode. Start these zeros from those of the
+    # continuous-time response, which they approximate.
     with np.errstate(all="ignore"):
-        slow = np.expm1(seen)
-    slow = slow[np.abs(slow) < _SLOW]
-    zeros = np.roots(top).astype(complex)
+        slow = np.expm1(continuous_zeros)
+    slow = slow[np.abs(slow) < SLOW_ZERO]
+    zeros = np.roots(numerator).astype(complex)
     zeros[np.argsort(np.abs(zeros))[: slow.size]] = slow
-    found = []
-    # What a period forgets leaves zeros next to z = 0, of which no determinant may tell one from another; of ``top``
-    # they are right together.
-    for moves in (np.full(zeros.shape, True), np.abs(1.0 + zeros) > _FORGOTTEN):
-        # Off the real line, which steps cannot leave: two real ones may have become a pair.
-        off = 1.0 + 1e-6j * (1.0 - 2.0 * (np.arange(zeros.size) % 2)) * moves
-        polished = -_polished_zeros(parts, zeros * off, moves)
-        loop = LoopRoots(float(top[0]), lag, polished, poles, chain.estimate)
-        error = np.abs(loop.required_wall(circle(_LOOK)).value / required_wall(chain, _LOOK, parts) - 1.0)
-        if error < _AGREES:
+    candidates = []
+    # Modes that decay within a period leave a cluster of zeros near z = 0. If the determinant does not separate them,
+    # keep the roots of ``numerator`` there, which are accurate as a group.
+    for is_refined in (np.full(zeros.shape, True), np.abs(1.0 + zeros) > CLUSTER_RADIUS):
+        # Start off the real axis, because Aberth's steps keep real approximations real, but two real zeros of the
+        # coefficients may be a complex pair of the determinant.
+        off_axis = 1.0 + 1e-6j * (1.0 - 2.0 * (np.arange(zeros.size) % 2)) * is_refined
+        refined = -_refine_zeros(discretized, zeros * off_axis, is_refined)
+        loop = LoopRoots(float(numerator[0]), lag, refined, poles, chain.estimate)
+        error = np.abs(
+            loop.evaluate_controller(circle(TEST_ANGLE)).value / evaluate_controller(chain, TEST_ANGLE, discretized)
+            - 1.0
+        )
+        if error < RESPONSE_TOLERANCE:
             return loop
-        found.append((error, loop))
-    return min(found, key=lambda each: each[0])[1]
+        candidates.append((error, loop))
+    return min(candidates, key=lambda each: each[0])[1]
 
 
-def _numerator(parts: Sampled, push: np.ndarray, den: np.ndarray) -> np.ndarray:
-    """The numerator in zeta of ``C (zeta - Psi)^-1 push``, by its Markov parameters."""
-    markov, state = [], push
-    for _ in range(den.size - 1):
+def _expand_numerator(discretized: DiscreteChain, force: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+    """Return the numerator of ``C (zeta - Psi)^-1 force`` in zeta, computed from its Markov parameters."""
+    markov, state = [], force
+    for _ in range(denominator.size - 1):
         markov.append(state[0])
-        state = parts.psi @ state
-    return np.convolve(den, markov)[: den.size - 1]
+        state = discretized.psi @ state
+    return np.convolve(denominator, markov)[: denominator.size - 1]
 
 
-def _polished_zeros(parts: Sampled, zeros: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    """Aberth's steps on the determinant of ``[[zeta - Psi, push], [C, 0]]``, where no pole cancels a zero."""
-    size = parts.full.size
-    at_rest = np.zeros((size + 1, size + 1))
-    at_rest[:size, :size], at_rest[:size, size], at_rest[size, 0] = -parts.psi, parts.full, 1.0
-    growing = np.eye(size + 1)
-    growing[:, size] = np.append(np.zeros(size) if parts.late is None else parts.late, 0.0)
-    for _ in range(_MOST_STEPS):
+def _refine_zeros(discretized: DiscreteChain, zeros: np.ndarray, is_refined: np.ndarray) -> np.ndarray:
+    """Refine zeros of G by Aberth's method on ``det [[zeta - Psi, zeta Gamma(1 - f) + Gamma(1)], [C, 0]]``.
+
+    No pole of G makes this determinant small, so zeros near poles are resolved (V4).
+
+    Args:
+        discretized: the chain.
+        zeros: approximations of zeta.
+        is_refined: False for zeros that stay fixed.
+
+    Returns:
+        The refined zeta, in the same order.
+    """
+    size = discretized.full.size
+    constant = np.zeros((size + 1, size + 1))
+    constant[:size, :size], constant[:size, size], constant[size, 0] = -discretized.psi, discretized.full, 1.0
+    linear = np.eye(size + 1)
+    linear[:, size] = np.append(np.zeros(size) if discretized.late is None else discretized.late, 0.0)
+    for _ in range(MAX_STEPS):
         with np.errstate(all="ignore"):
-            slope = np.array([_relative_slope(at_rest + zeta * growing, growing) for zeta in zeros])
-            step = step_apart(zeros, slope)
-        step = np.where(np.isfinite(step) & moves, step, 0.0)
+            rate = np.array([_log_derivative(constant + zeta * linear, linear) for zeta in zeros])
+            step = compute_aberth_step(zeros, rate)
+        step = np.where(np.isfinite(step) & is_refined, step, 0.0)
         zeros = zeros - step
-        if np.all(np.abs(step) <= _ARRIVED * np.abs(zeros)):
+        if np.all(np.abs(step) <= CONVERGED_STEP * np.abs(zeros)):
             break
     return zeros
 
 
-def _relative_slope(matrix: np.ndarray, growing: np.ndarray) -> complex:
-    """The derivative of the determinant over itself; infinite on a zero."""
+def _log_derivative(matrix: np.ndarray, change: np.ndarray) -> complex:
+    """Return the derivative of log det(matrix) for a given derivative of the matrix; infinite if it is singular."""
     try:
-        return np.trace(np.linalg.solve(matrix, growing))
+        return np.trace(np.linalg.solve(matrix, change))
     except np.linalg.LinAlgError:
         return complex(np.inf)
 
 
-def _rigid_loop(chain: Chain) -> LoopRoots:
+def _factor_rigid_loop(chain: Chain) -> LoopRoots:
+    """Return the open loop of a rigid device in closed form."""
     delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.whole)
-    plant = held_plant(delta, fraction if fraction else None)
+    plant = discretize_mass(delta, fraction if fraction else None)
     if fraction:
         h, q = factor_numerator(plant)
         zeros = [1.0 + h / plant.a2, 1.0 + q]
     else:
-        # At delta = 0 it is at -1 exactly.
+        # For delta = 0 the gap is 0, so the zero is at exactly z = -1.
         zeros = [2.0 - plant.gap / plant.a2]
     roots = (np.array(offsets, complex) for offsets in (zeros, [0.0, plant.em]))
     return LoopRoots(float(plant.a2), chain.whole + len(zeros) - 1, *roots, estimate=chain.estimate)
 
 
-def delayed_device(chain: AnyChain) -> StateSpace:
-    """G: from the wall's force to the sampled position, with the forces that are on their way."""
-    return delay_force(sampled(chain), chain.whole)
+def realize_device(chain: AnyChain) -> StateSpace:
+    """Return G in state space; its last states are the delayed forces."""
+    return add_input_delay(discretize_states(chain), chain.whole)
 
 
-def delay_force(parts: Sampled, whole: int) -> StateSpace:
-    """The same of a device between two samples, or of many along leading axes, and so many whole periods of delay."""
-    size, held = parts.psi.shape[-1], parts.late is not None
-    now = parts.late if held else parts.full
-    count = whole + held
-    A = np.zeros((*parts.psi.shape[:-2], size + count, size + count))
+def add_input_delay(discretized: DiscreteChain, n: int) -> StateSpace:
+    """Return G in state space for a discretized device, or for several along leading axes, with integer delay n."""
+    size, is_fractional = discretized.psi.shape[-1], discretized.late is not None
+    newer = discretized.late if is_fractional else discretized.full
+    count = n + is_fractional
+    A = np.zeros((*discretized.psi.shape[:-2], size + count, size + count))
     B = np.zeros((*A.shape[:-1], 1))
-    A[..., :size, :size] = np.eye(size) + parts.psi
+    A[..., :size, :size] = np.eye(size) + discretized.psi
     A[..., size:, size:] = np.eye(count, k=-1)
     B[..., size : size + 1, :] = 1.0
-    if whole:
-        A[..., :size, size + whole - 1] = now
+    if n:
+        A[..., :size, size + n - 1] = newer
     else:
-        B[..., :size, 0] = now
-    if held:
-        A[..., :size, size + whole] += parts.full - now
+        B[..., :size, 0] = newer
+    if is_fractional:
+        A[..., :size, size + n] += discretized.full - newer
     C = np.broadcast_to(np.eye(1, size + count), (*A.shape[:-2], 1, size + count))
     return StateSpace(A, B, C, np.zeros((*A.shape[:-2], 1, 1)))
 
 
-def open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
-    """``L = (alpha + beta F) G``, from the position that the wall is given to the one that its force answers."""
+def realize_open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
+    """Return ``L = (alpha + beta F) G`` in state space, from the input position of the wall to the sampled position."""
     f = estimate_matrices(chain.estimate)
-    return in_series(StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D), delayed_device(chain))
+    return in_series(StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D), realize_device(chain))
 
 
-def closed_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
-    """From a force held on the device to the sampled position, in contact with the wall."""
-    loop, filtered = open_loop(chain, alpha, beta), len(estimate_matrices(chain.estimate).A)
-    A, _, held = chain.realize()
-    push = np.zeros((len(loop.A), 1))
-    push[filtered : filtered + len(held), 0] = hold(chain, A, held, 1.0)[1]
-    return StateSpace(loop.A - loop.B @ loop.C, push, loop.C, np.zeros((1, 1)))
+def realize_closed_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
+    """Return the closed loop with a wall, from an external force held on the device to the sampled position."""
+    loop, filter_order = realize_open_loop(chain, alpha, beta), len(estimate_matrices(chain.estimate).A)
+    A, _, external = chain.realize()
+    B = np.zeros((len(loop.A), 1))
+    B[filter_order : filter_order + len(external), 0] = compute_chain_transition(chain, A, external, 1.0)[1]
+    return StateSpace(loop.A - loop.B @ loop.C, B, loop.C, np.zeros((1, 1)))

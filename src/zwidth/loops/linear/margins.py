@@ -1,14 +1,15 @@
-"""Gain, phase, modulus and delay margin of walls in any linear loop, and every crossover they are taken from.
+"""Compute gain, phase, modulus and delay margin of walls in any linear loop, from all crossovers of the open loop.
 
-``L = -(alpha + beta F)/q`` on the circle. The nodes of `loops.linear.boundary` resolve q and F; where the wall itself
-nearly vanishes they are halved. Between neighbors |L| and its phase then hardly change: a root shows by a change of
-sign, or as a dip that the tangents at both ends announce, and is polished from there.
+On the unit circle the open loop is ``L = -(alpha + beta F)/q`` (q and F as in `loops.linear.roots`). It is tabulated at
+the nodes of `loops.linear.curve`, which resolve q and F; intervals in which the controller ``alpha + beta F`` is nearly
+0 are halved. Between neighboring nodes |L| and its phase hardly change. Crossovers are found at sign changes between
+nodes, and next to a minimum of the magnitude from which tangents at both nodes reach zero.
 
-One period more of delay changes nothing but the phase of L, by the angle w itself: at a gain crossover of phase
-``p = arg(-L)`` a pole is on the circle m periods later if ``p - m w`` is a multiple of 2 pi. So the loops of delays
-within one period serve all longer ones: where m passes a whole number from one of them to the next, the delay is found
-by Newton's method, each step with the exact loop of its own. Real poles come to z = -1 where ``|L(-1)|`` passes 1.
-Poles counted before and beyond must confirm the first of these delays.
+Delay margin: one more period of delay changes the phase of L by the angle w and nothing else. At a gain crossover with
+the phase ``p = arg(-L)``, a pole is therefore on the unit circle after m more periods if ``p - m w`` is a multiple of
+2 pi. Therefore loops with delays within one period suffice for all longer delays: if m passes an integer between two of
+them, Newton's method solves for the delay, with the exact loop of each iterate. A real pole reaches z = -1 where
+``|L(-1)|`` passes 1. Counts of the unstable poles below and above must confirm the smallest of these delays.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.roots import zeros_between
+from zwidth.arrays.roots import find_zeros_between
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.curve import nodes_of
+from zwidth.loops.linear.curve import place_nodes
 from zwidth.loops.linear.held import find_roots
-from zwidth.loops.linear.poles import log_radius
+from zwidth.loops.linear.poles import compute_log_radius
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import label_walls
 from zwidth.parts.chain import AnyChain
@@ -34,16 +35,16 @@ from zwidth.words.results import Margins
 from zwidth.words.types import Array
 from zwidth.words.xp import within
 
-# Halvings beside a zero of the wall, and how much of itself the wall may change from node to node.
-_HALVINGS, _SHARE = 40, 0.25
-# The offset from z = 1 of a pole there.
-_AT_ONE = 1e-13
-# An L so small, as a share of what it changes by over w, is a zero of it.
-_NOTHING = 1e-10
+# Refinement of the nodes near a zero of the controller
+MAX_HALVINGS = 40
+MAX_CONTROLLER_CHANGE = 0.25  # of the controller between nodes, relative to its magnitude
+
+POLE_AT_ONE = 1e-13  # |offset| of a pole at z = 1
+ZERO_OF_L = 1e-10  # |L| of a zero of L, relative to w |dL/dw|
 
 
 class OpenLoop(NamedTuple):
-    """One wall in one loop, on angles that resolve it."""
+    """The open loop L with one wall, tabulated at angles that resolve it."""
 
     loop: LoopRoots
     alpha: float
@@ -52,277 +53,359 @@ class OpenLoop(NamedTuple):
     L: Jet
 
     @classmethod
-    def lay_out(cls, loop: LoopRoots, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
-        """Refine the nodes of a loop for a wall."""
+    def tabulate(cls, loop: LoopRoots, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
+        """Tabulate L at the nodes of a loop, refined for a wall."""
         w = np.append(nodes[nodes < np.pi], np.pi)
-        free = int(np.count_nonzero(np.abs(loop.poles) <= _AT_ONE))
-        soft = abs(alpha * loop.response(circle(w[:1])).value[0])
-        if free and 0.0 < soft < 1.0:
-            # To a free device L has no end towards w = 0: that of a soft wall passes 1 below all nodes.
-            most = 1.0 - np.log2(soft) / free
-            w = np.concatenate([w[0] * np.exp2(-np.linspace(most, 1.0, int(np.ceil(most)))), w])
-        for _ in range(_HALVINGS):
+        n_integrators = int(np.count_nonzero(np.abs(loop.poles) <= POLE_AT_ONE))
+        first_gain = abs(alpha * loop.evaluate_response(circle(w[:1])).value[0])
+        if n_integrators and 0.0 < first_gain < 1.0:
+            # For a device with poles at z = 1, |L| grows without limit as w -> 0. With a soft wall its crossover may be
+            # below all nodes, so add lower ones.
+            octaves = 1.0 - np.log2(first_gain) / n_integrators
+            w = np.concatenate([w[0] * np.exp2(-np.linspace(octaves, 1.0, int(np.ceil(octaves)))), w])
+        for _ in range(MAX_HALVINGS):
             f = loop.estimate.jet(circle(w))
-            wall = np.abs(alpha + beta * f.value)
+            controller = np.abs(alpha + beta * f.value)
             step = np.diff(w)
             change = np.abs(beta * np.diff(f.value))
-            wide = (change > _SHARE * np.maximum(wall[:-1], wall[1:])) & (step > 1e-9 * w[1:])
+            wide = (change > MAX_CONTROLLER_CHANGE * np.maximum(controller[:-1], controller[1:])) & (
+                step > 1e-9 * w[1:]
+            )
             if not wide.any():
                 break
             w = np.sort(np.concatenate([w, w[:-1][wide] + 0.5 * step[wide]]))
         return cls(loop, alpha, beta, w, open_loop_response(loop, alpha, beta, circle(w)))
 
-    def at(self, w: np.ndarray) -> Jet:
-        """L and its derivative."""
+    def evaluate(self, w: np.ndarray) -> Jet:
+        """Return L and its derivative in w."""
         return open_loop_response(self.loop, self.alpha, self.beta, circle(w))
 
-    def at_rest(self) -> float | None:
-        """``L(1)`` where it is finite and not 0."""
-        value = self.at(np.zeros(1)).value[0]
+    def evaluate_at_one(self) -> float | None:
+        """Return ``L(1)``; None if it is infinite or 0."""
+        value = self.evaluate(np.zeros(1)).value[0]
         return float(value.real) if np.isfinite(value) and value.real != 0 else None
 
-    def gain_crossovers(self) -> np.ndarray:
-        """Angles at which ``|L| = 1``, ascending."""
+    def find_gain_crossovers(self) -> np.ndarray:
+        """Return the angles at which ``|L| = 1``, ascending."""
 
-        def size(jet: Jet) -> tuple[np.ndarray, np.ndarray]:
+        def log_gain(jet: Jet) -> tuple[np.ndarray, np.ndarray]:
+            """Return ``log|L|`` and its derivative."""
             with np.errstate(all="ignore"):
                 return np.log(np.abs(jet.value)), (jet.slope / jet.value).real
 
-        return self._roots(size)
+        return self._find_zeros(log_gain)
 
-    def phase_crossovers(self) -> np.ndarray:
-        """Angles in (0, pi] at which L is real and negative, ascending."""
+    def find_phase_crossovers(self) -> np.ndarray:
+        """Return the angles in (0, pi] at which L is real and negative, ascending."""
 
-        def turn(jet: Jet) -> tuple[np.ndarray, np.ndarray]:
+        def phase_sine(jet: Jet) -> tuple[np.ndarray, np.ndarray]:
+            """Return the sine of arg L and its derivative."""
             with np.errstate(all="ignore"):
                 unit = jet.value / np.abs(jet.value)
                 return unit.imag, unit.real * (jet.slope / jet.value).imag
 
-        # At pi L is real in any case.
-        found = np.append(self._roots(turn, until=-1), np.pi)
-        L = self.at(found)
-        # Where L passes through 0 its phase jumps, and no factor brings a pole there.
-        return found[(L.value.real < 0) & (np.abs(L.value) > _NOTHING * found * np.abs(L.slope))]
+        # At pi, L is always real.
+        w = np.append(self._find_zeros(phase_sine, stop=-1), np.pi)
+        L = self.evaluate(w)
+        # Exclude zeros of L, where the phase jumps: no factor of the gain puts a pole there.
+        return w[(L.value.real < 0) & (np.abs(L.value) > ZERO_OF_L * w * np.abs(L.slope))]
 
-    def _roots(self, read: Callable[[Jet], tuple[np.ndarray, np.ndarray]], until: int | None = None) -> np.ndarray:
-        w, L = self.w[:until], Jet(*(part[:until] for part in self.L))
-        value, slope = read(L)
-        dips = self._dips(read, w, value, slope)
-        if dips.size:
-            w = np.sort(np.concatenate([w, dips]))
-            value, slope = read(self.at(w))
-        k = np.flatnonzero((value[:-1] > 0) != (value[1:] > 0))
-        return zeros_between(lambda at: read(self.at(at))[0], w, value, k)
-
-    def _dips(
-        self, read: Callable[[Jet], tuple[np.ndarray, np.ndarray]], w: np.ndarray, value: np.ndarray, slope: np.ndarray
+    def _find_zeros(
+        self, function: Callable[[Jet], tuple[np.ndarray, np.ndarray]], stop: int | None = None
     ) -> np.ndarray:
-        """Lowest points between nodes of one sign from which the tangents lead to the other sign."""
-        step, sign = np.diff(w), np.sign(value[:-1])
-        toward = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
-        size, fall = np.abs(value), np.abs(slope)
-        # At half the rate L may be 0: no tangent of its logarithm leads anywhere from there.
-        with np.errstate(invalid="ignore"):
-            lowest = np.minimum(size[:-1] - fall[:-1] * step, size[1:] - fall[1:] * step)
-        k = np.flatnonzero(toward & (lowest < 0))
-        return zeros_between(lambda at: read(self.at(at))[1], w, slope, k)
+        """Return all zeros of a real function of L.
 
-    def least_distance(self) -> tuple[float, float]:
-        """The least ``|1 + L|`` and its angle."""
+        Args:
+            function: maps L to values and derivatives in w.
+            stop: index of the node before which the search stops.
+        """
+        w, L = self.w[:stop], Jet(*(part[:stop] for part in self.L))
+        value, slope = function(L)
+        minima = self._find_minima(function, w, value, slope)
+        if minima.size:
+            w = np.sort(np.concatenate([w, minima]))
+            value, slope = function(self.evaluate(w))
+        k = np.flatnonzero((value[:-1] > 0) != (value[1:] > 0))
+        return find_zeros_between(lambda angles: function(self.evaluate(angles))[0], w, value, k)
+
+    def _find_minima(
+        self,
+        function: Callable[[Jet], tuple[np.ndarray, np.ndarray]],
+        w: np.ndarray,
+        value: np.ndarray,
+        slope: np.ndarray,
+    ) -> np.ndarray:
+        """Return minima of |function| between nodes of equal sign whose tangents reach the other sign."""
+        step, sign = np.diff(w), np.sign(value[:-1])
+        approaching = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
+        size, descent = np.abs(value), np.abs(slope)
+        # At the Nyquist frequency L may be 0; the tangent of its logarithm is then NaN.
+        with np.errstate(invalid="ignore"):
+            lowest = np.minimum(size[:-1] - descent[:-1] * step, size[1:] - descent[1:] * step)
+        k = np.flatnonzero(approaching & (lowest < 0))
+        return find_zeros_between(lambda angles: function(self.evaluate(angles))[1], w, slope, k)
+
+    def find_least_distance(self) -> tuple[float, float]:
+        """Return the minimum of ``|1 + L|`` and its angle."""
 
         def slope(jet: Jet) -> np.ndarray:
+            """Return half the derivative of ``|1 + L|^2``."""
             return ((1.0 + jet.value).conj() * jet.slope).real
 
         distance, rising = np.abs(1.0 + self.L.value), np.nan_to_num(slope(self.L))
         k = np.flatnonzero((rising[:-1] <= 0) & (rising[1:] > 0))
         k = k[np.minimum(distance[k], distance[k + 1]) < 2.0 * np.nanmin(distance)]
-        places = np.concatenate([self.w, zeros_between(lambda at: slope(self.at(at)), self.w, rising, k)])
-        distances = np.concatenate([distance, np.abs(1.0 + self.at(places[self.w.size :]).value)])
-        rest = self.at_rest()
-        if rest is not None:
-            places, distances = np.append(places, 0.0), np.append(distances, abs(1.0 + rest))
+        angles = np.concatenate([self.w, find_zeros_between(lambda w: slope(self.evaluate(w)), self.w, rising, k)])
+        distances = np.concatenate([distance, np.abs(1.0 + self.evaluate(angles[self.w.size :]).value)])
+        at_one = self.evaluate_at_one()
+        if at_one is not None:
+            angles, distances = np.append(angles, 0.0), np.append(distances, abs(1.0 + at_one))
         best = int(np.nanargmin(distances))
-        return float(distances[best]), float(places[best])
+        return float(distances[best]), float(angles[best])
 
 
-def open_loop_response(loop: LoopRoots, alpha: Array, beta: Array, at: CirclePoints) -> Jet:
-    """L and its derivative in w."""
+def open_loop_response(loop: LoopRoots, alpha: Array, beta: Array, points: CirclePoints) -> Jet:
+    """Return L and its derivative in w, for arrays that broadcast."""
     with np.errstate(all="ignore"):
-        f = loop.estimate.jet(at)
-        found = Jet(alpha + beta * f.value, beta * f.slope).times(loop.response(at))
-        # At pi it is real.
-        real = at.w >= np.pi
-        return Jet(np.where(real, found.value.real + 0j, found.value), found.slope)
+        f = loop.estimate.jet(points)
+        L = Jet(alpha + beta * f.value, beta * f.slope).times(loop.evaluate_response(points))
+        # At pi, L is real; drop rounding errors of the imaginary part.
+        is_nyquist = points.w >= np.pi
+        return Jet(np.where(is_nyquist, L.value.real + 0j, L.value), L.slope)
 
 
-def margins_of(wall: OpenLoop, stable: bool, wanted: Container[str]) -> Margins:
-    """The nearest crossovers, and the least distance from -1, of one wall; NaN for what nobody asks for.
+def compute_wall_margins(wall: OpenLoop, stable: bool, wanted: Container[str]) -> Margins:
+    """Return the margins of one wall except the delay margin, which needs loops with other delays.
 
-    That of the delay needs more than this loop.
+    Args:
+        wall: the open loop.
+        stable: True if the closed loop is stable.
+        wanted: names of the margins; the others are NaN.
     """
-    found = Margins(*[np.nan] * len(Margins._fields))
+    result = Margins(*[np.nan] * len(Margins._fields))
     if "gain_margin" in wanted:
-        w = wall.phase_crossovers()
-        sizes, rest = np.abs(wall.at(w).value), wall.at_rest()
-        if rest is not None and rest < 0:
-            w, sizes = np.append(w, 0.0), np.append(sizes, -rest)
-        gain, at = nearest_phase_crossover(stable, w, sizes)
-        found = found._replace(gain_margin=gain, phase_crossover=at)
+        w = wall.find_phase_crossovers()
+        gains, at_one = np.abs(wall.evaluate(w).value), wall.evaluate_at_one()
+        if at_one is not None and at_one < 0:
+            w, gains = np.append(w, 0.0), np.append(gains, -at_one)
+        margin, angle = select_gain_margin(stable, w, gains)
+        result = result._replace(gain_margin=margin, phase_crossover=angle)
     if "phase_margin" in wanted:
-        w = wall.gain_crossovers()
-        phase, at = nearest_gain_crossover(stable, w, np.angle(-wall.at(w).value))
-        found = found._replace(phase_margin=phase, gain_crossover=at)
+        w = wall.find_gain_crossovers()
+        margin, angle = select_phase_margin(stable, w, np.angle(-wall.evaluate(w).value))
+        result = result._replace(phase_margin=margin, gain_crossover=angle)
     if "modulus_margin" in wanted:
-        distance, at = wall.least_distance()
-        found = found._replace(modulus_margin=distance, modulus_frequency=at)
-    return found
+        distance, angle = wall.find_least_distance()
+        result = result._replace(modulus_margin=distance, modulus_frequency=angle)
+    return result
 
 
-def nearest_phase_crossover(stable: bool, w: np.ndarray, sizes: np.ndarray) -> tuple[float, float]:
-    """The gain margin and where it is taken, of places where L is negative and of some size."""
+def select_gain_margin(stable: bool, w: np.ndarray, gains: np.ndarray) -> tuple[float, float]:
+    """Return the gain margin and its phase crossover: the gain closest to 1, on a logarithmic scale.
+
+    Args:
+        stable: True if the closed loop is stable.
+        w: phase crossovers, shape (crossovers,).
+        gains: |L| at the phase crossovers, shape (crossovers,).
+
+    Returns:
+        The factor of the gain that puts a pole on the unit circle, and the angle of this pole. Without crossovers the
+        margin is inf for a stable loop and 0 for an unstable one, and the angle is NaN.
+    """
     if not w.size:
         return np.inf if stable else 0.0, np.nan
-    nearest = int(np.argmin(np.abs(np.log(sizes))))
-    return float(1.0 / sizes[nearest]), float(w[nearest])
+    nearest = int(np.argmin(np.abs(np.log(gains))))
+    return float(1.0 / gains[nearest]), float(w[nearest])
 
 
-def nearest_gain_crossover(stable: bool, w: np.ndarray, turns: Array) -> tuple[float, float]:
-    """The phase margin and where it is taken, of places where L is of size 1 and so far turned from -1."""
+def select_phase_margin(stable: bool, w: np.ndarray, phases: Array) -> tuple[float, float]:
+    """Return the phase margin in degrees, negative for an unstable loop, and its gain crossover.
+
+    Args:
+        stable: True if the closed loop is stable.
+        w: gain crossovers, shape (crossovers,).
+        phases: arg(-L) at the gain crossovers in rad, shape (crossovers,).
+
+    Returns:
+        The margin and the angle of the crossover. Without crossovers the margin is inf for a stable loop and NaN for an
+        unstable one, and the angle is NaN.
+    """
     if not w.size:
         return np.inf if stable else np.nan, np.nan
-    phases = np.degrees(np.abs(turns))
-    nearest = int(np.argmin(phases))
-    return float(phases[nearest] * (1.0 if stable else -1.0)), float(w[nearest])
+    degrees = np.degrees(np.abs(phases))
+    nearest = int(np.argmin(degrees))
+    return float(degrees[nearest] * (1.0 if stable else -1.0)), float(w[nearest])
 
 
-# Parts of a period at whose ends crossovers are looked for, and by how many of them a start may miss its own.
-_PARTS, _SPARE = 8, 1.5
-# And how long before a whole delay, in time constants of the fastest pole: within ln 2 of them a strongly damped device
-# bears less than at it. Slower ones than this the parts resolve.
-_EARLY, _FAST = np.array([1.0, 0.5, 0.25, 0.1]), 2.0
-# The step of a derivative in a delay, with a share of it; Newton steps at most, and a logarithm of L that is rounding.
-_STEP, _PART, _TRIALS, _ROUNDED = 1e-5, 1e-9, 30, 1e-9
-# Shares of the margin at which the wall must still be stable, and one at which it must not be.
-_WITNESSES, _BEYOND = (0.25, 0.5, 0.75, 1.0 - 1e-5), 1.0 + 1e-5
+# Delays at which crossovers are computed
+N_PARTS = 8  # per period
+# Largest error in the delay of a starting value, in parts of a period, if the number of crossovers changes there.
+START_ERROR = 1.5
+# Further delays below an integer, in time constants of the fastest pole: a strongly damped device tolerates less delay
+# within ln 2 time constants below the integer than at it.
+EARLY_DELAYS = np.array([1.0, 0.5, 0.25, 0.1])
+FAST_RATE = 2.0  # per period; the parts resolve slower poles
+
+# Newton's method for the delay, in periods
+DIFFERENCE_STEP = 1e-5  # step of the finite difference in the delay
+RELATIVE_STEP = 1e-9  # additional step, relative to the delay
+MAX_STEPS = 30
+LOG_TOLERANCE = 1e-9  # largest |log(-L)| at a solution
+
+# Additional delays that confirm a delay margin by pole counts, relative to the margin
+STABLE_MULTIPLES = (0.25, 0.5, 0.75, 1.0 - 1e-5)  # the wall must be stable
+UNSTABLE_MULTIPLE = 1.0 + 1e-5  # the wall must be unstable
 
 
-def lay_delays(chain: AnyChain) -> dict[float, tuple[LoopRoots, np.ndarray]]:
-    """Loops and nodes at delays up to a period longer than the own one: that, every eighth, just before a whole one."""
-    own = float(chain.d)
+def build_delayed_loops(chain: AnyChain) -> dict[float, tuple[LoopRoots, np.ndarray]]:
+    """Return loops and their nodes for delays up to one period longer than that of the chain, ascending."""
+    d = float(chain.d)
     fastest = -float(np.linalg.eigvals(chain.realize().A).real.min())
-    early = 1.0 - _EARLY / fastest if fastest > _FAST else np.empty(0)
-    grid = np.floor(own) + np.union1d(np.arange(_PARTS) / _PARTS, early)
+    early = 1.0 - EARLY_DELAYS / fastest if fastest > FAST_RATE else np.empty(0)
+    grid = np.floor(d) + np.union1d(np.arange(N_PARTS) / N_PARTS, early)
     grid = np.concatenate([grid, grid + 1.0])
-    delays = np.concatenate([[own], grid[(grid > own + 1e-9) & (grid < own + 1.0 - 1e-9)], [own + 1.0]])
-    return {delay: (loop := loop_at(chain, delay), nodes_of(loop)) for delay in delays.tolist()}
+    delays = np.concatenate([[d], grid[(grid > d + 1e-9) & (grid < d + 1.0 - 1e-9)], [d + 1.0]])
+    return {delay: (loop := change_delay(chain, delay), place_nodes(loop)) for delay in delays.tolist()}
 
 
-def loop_at(chain: AnyChain, delay: float) -> LoopRoots:
-    """The loop of a chain at another delay."""
+def change_delay(chain: AnyChain, delay: float) -> LoopRoots:
+    """Return the loop of a chain with another delay, in periods."""
     return find_roots(replace(chain, d=float(delay), whole=int(np.floor(delay))))
 
 
-def delay_margin(
+def find_delay_margin(
     chain: AnyChain, delayed: dict[float, tuple[LoopRoots, np.ndarray]], alpha: float, beta: float
 ) -> float:
-    """Periods of delay that a stable wall bears; infinite where no delay is too long, NaN where that is in doubt."""
+    """Return the delay margin of a stable wall in periods.
+
+    Args:
+        chain: the chain.
+        delayed: its `build_delayed_loops`.
+        alpha: normalized stiffness.
+        beta: normalized damping.
+
+    Returns:
+        The margin; inf if the wall is stable with any delay, NaN if pole counts do not confirm the result.
+    """
     wall, delays = (alpha, beta), list(delayed)
-    laid = [OpenLoop.lay_out(loop, *wall, nodes) for loop, nodes in delayed.values()]
-    crossed = [each.gain_crossovers() for each in laid]
-    turns = [np.mod(np.angle(-each.at(w).value), 2.0 * np.pi) for each, w in zip(laid, crossed, strict=True)]
-    ends = [_follow(chain, wall, w, delay) for w, delay in _find_starts(delays, crossed, turns)]
+    loops = [OpenLoop.tabulate(loop, *wall, nodes) for loop, nodes in delayed.values()]
+    crossovers = [each.find_gain_crossovers() for each in loops]
+    phases = [np.mod(np.angle(-each.evaluate(w).value), 2.0 * np.pi) for each, w in zip(loops, crossovers, strict=True)]
+    limits = [_solve_delay(chain, wall, w, delay) for w, delay in _list_starts(delays, crossovers, phases)]
 
-    def at_half_rate(delay: float) -> float:
-        return open_loop_response(loop_at(chain, delay), *wall, circle(np.array([np.pi]))).value[0].real
+    def evaluate_at_nyquist(delay: float) -> float:
+        """Return L(-1) with a delay."""
+        return open_loop_response(change_delay(chain, delay), *wall, circle(np.array([np.pi]))).value[0].real
 
-    last = np.array([each.L.value[-1].real for each in laid])
-    above = np.abs(last) - 1.0
+    at_nyquist = np.array([each.L.value[-1].real for each in loops])
+    above = np.abs(at_nyquist) - 1.0
     k = np.flatnonzero((above[1:] > 0) != (above[:-1] > 0))
-    met = zeros_between(lambda at: np.abs([*map(at_half_rate, at)]) - 1.0, np.array(delays), above, k)
-    ends += (met + np.where(last[k] < 0, 0.0, 1.0)).tolist()
-    ends = [end - float(chain.d) for end in ends if end > chain.d]
-    if not ends:
-        return np.nan if any(w.size for w in crossed) else np.inf
-    return min(ends) if _is_first_loss(chain, alpha, beta, min(ends)) else np.nan
+    real = find_zeros_between(lambda each: np.abs([*map(evaluate_at_nyquist, each)]) - 1.0, np.array(delays), above, k)
+    # If L(-1) = 1, one more period of delay makes it -1.
+    limits += (real + np.where(at_nyquist[k] < 0, 0.0, 1.0)).tolist()
+    limits = [limit - float(chain.d) for limit in limits if limit > chain.d]
+    if not limits:
+        return np.nan if any(w.size for w in crossovers) else np.inf
+    return min(limits) if _is_first_loss(chain, alpha, beta, min(limits)) else np.nan
 
 
-def _find_starts(
-    delays: list[float], crossed: list[np.ndarray], turns: list[np.ndarray]
+def _list_starts(
+    delays: list[float], crossovers: list[np.ndarray], phases: list[np.ndarray]
 ) -> Iterator[tuple[float, float]]:
-    """Angles and delays next to which a pole is on the circle, by gain crossovers of laid delays and their phases."""
-    # So many periods more as the phase is of the angle turn L to -1, and whole ones leave its size as it is: between
-    # two delays each whole number is looked for that this passes, and beside a lowest one that below it.
-    more = [phases / w for phases, w in zip(turns, crossed, strict=True)]
-    for k, (w, after) in enumerate(pairwise(crossed)):
+    """Yield angles and delays near which a pole is on the unit circle.
+
+    Args:
+        delays: delays of the loops.
+        crossovers: gain crossovers of each loop.
+        phases: arg(-L) at these crossovers, in [0, 2 pi).
+    """
+    # After m = phase/w more periods L is -1 at the crossover, and integer m do not change |L|. So look between two
+    # delays for each integer that m passes, and next to a local minimum of m for the integer below it.
+    more = [phase / w for phase, w in zip(phases, crossovers, strict=True)]
+    for k, (w, after) in enumerate(pairwise(crossovers)):
         if w.size != after.size:
-            # Two crossovers have met in between; one may have turned past L = -1 meanwhile.
+            # Two crossovers have merged between these delays, and one may have passed L = -1 before. Take all
+            # crossovers of both loops whose m is nearly an integer.
             for i, turn in product((k, k + 1), (0.0, 2.0 * np.pi)):
-                left = (turns[i] - turn) / crossed[i]
-                whole = np.round(left)
-                near = (np.abs(left - whole) <= _SPARE / _PARTS) & (whole >= 0.0)
-                yield from zip(crossed[i][near].tolist(), (delays[i] + left[near]).tolist(), strict=True)
+                m = (phases[i] - turn) / crossovers[i]
+                integer = np.round(m)
+                near = (np.abs(m - integer) <= START_ERROR / N_PARTS) & (integer >= 0.0)
+                yield from zip(crossovers[i][near].tolist(), (delays[i] + m[near]).tolist(), strict=True)
             continue
-        rise = np.mod(turns[k + 1] - turns[k] + np.pi, 2.0 * np.pi) - np.pi
+        rise = np.mod(phases[k + 1] - phases[k] + np.pi, 2.0 * np.pi) - np.pi
         for turn in (0.0, 2.0 * np.pi):
-            first, last = (turns[k] - turn) / w, (turns[k] + rise - turn) / after
-            whole = np.maximum(np.ceil(np.minimum(first, last)), 0.0)
-            for j in np.flatnonzero(whole <= np.maximum(first, last)):
-                share = (whole[j] - first[j]) / (last[j] - first[j]) if first[j] != last[j] else 0.0
-                at = delays[k] + share * (delays[k + 1] - delays[k])
-                yield float(w[j] + share * (after[j] - w[j])), float(at + whole[j])
-    for k, (before, here, after) in enumerate(zip(more, more[1:], more[2:], strict=False), 1):
-        if before.size == here.size == after.size:
-            lowest = (here <= before) & (here <= after)
-            for j in np.flatnonzero(lowest & (here - np.floor(here) <= np.maximum(before, after) - here)):
-                yield float(crossed[k][j]), float(delays[k] + here[j])
+            first, last = (phases[k] - turn) / w, (phases[k] + rise - turn) / after
+            integer = np.maximum(np.ceil(np.minimum(first, last)), 0.0)
+            for j in np.flatnonzero(integer <= np.maximum(first, last)):
+                share = (integer[j] - first[j]) / (last[j] - first[j]) if first[j] != last[j] else 0.0
+                delay = delays[k] + share * (delays[k + 1] - delays[k])
+                yield float(w[j] + share * (after[j] - w[j])), float(delay + integer[j])
+    for k, (before, middle, after) in enumerate(zip(more, more[1:], more[2:], strict=False), 1):
+        if before.size == middle.size == after.size:
+            lowest = (middle <= before) & (middle <= after)
+            for j in np.flatnonzero(lowest & (middle - np.floor(middle) <= np.maximum(before, after) - middle)):
+                yield float(crossovers[k][j]), float(delays[k] + middle[j])
 
 
-def _follow(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) -> float:
-    """The delay near a start with which a pole is on the circle, by Newton's method on ``log(-L)``; else NaN."""
-    rest = np.inf
-    for _ in range(_TRIALS):
+def _solve_delay(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) -> float:
+    """Return the delay near a start at which a pole is on the unit circle, by Newton's method on log(-L); else NaN."""
+    residual = np.inf
+    for _ in range(MAX_STEPS):
         if not (0.0 < w < np.pi and delay >= 0.0):
             return np.nan
-        at, step = circle(np.array([w])), _STEP + _PART * delay
-        here, beside = (open_loop_response(loop_at(chain, delay + h), *wall, at) for h in (0.0, step))
-        rest, turn = np.log(-here.value[0]), here.slope[0] / here.value[0]
-        slope = np.log(beside.value[0] / here.value[0]) / step
-        # Where L is the same for a while, as of a device that has come to rest before, this leads to no angle.
+        points, step = circle(np.array([w])), DIFFERENCE_STEP + RELATIVE_STEP * delay
+        L, shifted = (open_loop_response(change_delay(chain, delay + h), *wall, points) for h in (0.0, step))
+        residual, d_w = np.log(-L.value[0]), L.slope[0] / L.value[0]
+        d_delay = np.log(shifted.value[0] / L.value[0]) / step
+        # If L does not depend on the delay in some range, because the device has come to rest before, the step is NaN.
         with np.errstate(all="ignore"):
-            by_w, by_delay = np.imag([slope * rest.conj(), rest * turn.conj()]) / np.imag(slope * turn.conj())
-        w, delay = w - by_w, delay - by_delay
-        # On the flank of a narrow resonance the rounding of w alone moves the delay by more.
-        if abs(by_delay) <= 1e-14 * (1.0 + delay):
+            w_step, delay_step = np.imag([d_delay * residual.conj(), residual * d_w.conj()]) / np.imag(
+                d_delay * d_w.conj()
+            )
+        w, delay = w - w_step, delay - delay_step
+        # Check the delay only, because on the flank of a narrow resonance the rounding error of w keeps w changing.
+        if abs(delay_step) <= 1e-14 * (1.0 + delay):
             break
-    return delay if abs(rest) < _ROUNDED else np.nan
+    return delay if abs(residual) < LOG_TOLERANCE else np.nan
 
 
 def _is_first_loss(chain: AnyChain, alpha: float, beta: float, margin: float) -> bool:
-    """Whether the wall is stable at some delays before, and no longer beyond: poles counted, not followed."""
+    """Return whether the wall is stable with several delays below the margin and unstable just above, by its poles."""
     wall = np.array([alpha]), np.array([beta])
-    delays = [float(chain.d) + share * margin for share in (*_WITNESSES, _BEYOND)]
-    logs = [log_radius(loop_at(chain, delay), *wall)[0] for delay in delays]
+    delays = [float(chain.d) + multiple * margin for multiple in (*STABLE_MULTIPLES, UNSTABLE_MULTIPLE)]
+    logs = [compute_log_radius(change_delay(chain, delay), *wall)[0] for delay in delays]
     return all(log < 0 for log in logs[:-1]) and logs[-1] > 0
 
 
-def linear_margins(
+def compute_margins(
     chain: AnyChain, boundary: Boundary, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str]
 ) -> Margins:
-    """Margins of walls of one shape, periods and radians a period; NaN where a wall is out of range."""
+    """Return the margins of walls, with delays in periods and angles in rad per sample.
+
+    Args:
+        chain: the chain.
+        boundary: the stability boundary of its loop.
+        alpha: normalized stiffness, any shape.
+        beta: normalized damping, the same shape.
+        wanted: names of the margins; the others are NaN.
+
+    Returns:
+        Margins of that shape; NaN for walls out of range.
+    """
     stable = label_walls(boundary, alpha, beta)
-    inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
+    in_range = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
     delayed: dict[float, tuple[LoopRoots, np.ndarray]] = {}
-    # What a sampled device does between its samples is not known.
+    # A sampled system does not define its response between samples, so fractional delays are impossible.
     with_delay = "delay_margin" in wanted and not chain.sampled
     out = np.full((len(Margins._fields), *alpha.shape), np.nan)
-    for place in np.ndindex(alpha.shape):
-        a, b, good = float(alpha[place]), float(beta[place]), bool(stable[place])
-        if not inside[place]:
+    for index in np.ndindex(alpha.shape):
+        a, b, is_stable = float(alpha[index]), float(beta[index]), bool(stable[index])
+        if not in_range[index]:
             continue
-        found = margins_of(OpenLoop.lay_out(boundary.loop, a, b, boundary.w), good, wanted)
+        margins = compute_wall_margins(OpenLoop.tabulate(boundary.loop, a, b, boundary.w), is_stable, wanted)
         delay = 0.0 if with_delay else np.nan
-        if good and with_delay:
-            delayed = delayed or lay_delays(chain)
-            delay = delay_margin(chain, delayed, a, b)
-        out[(slice(None), *place)] = found._replace(delay_margin=delay)
+        if is_stable and with_delay:
+            delayed = delayed or build_delayed_loops(chain)
+            delay = find_delay_margin(chain, delayed, a, b)
+        out[(slice(None), *index)] = margins._replace(delay_margin=delay)
     return Margins(*(part[()] for part in out))

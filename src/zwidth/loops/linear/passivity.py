@@ -1,14 +1,16 @@
-"""Passivity of a wall with any velocity estimate, on a device that moves as one mass where force and sensor are.
+"""Compute the passivity margin of walls with any velocity estimate, on a device that is a single mass.
 
-Colgate's condition (docs: `loops.rigid.passivity`) with the wall C = alpha + beta F, d = n + f. Per frequency the
-physical damping must exceed, with s = sin(w/2),
+Colgate's condition (docs/theory/passivity.md, P4) is a lower bound on the physical damping at every frequency. For the
+wall ``C = alpha + beta F``, the velocity estimate ``F = (z - 1) E``, and the delay d = n + f (n integer, 0 <= f < 1),
+the required damping at ``z = e^(jw)``, with s = sin(w/2), is
 
-    needed = (-a + sqrt(a^2 + 4 f (1 - f) |C|^2))/4
-    a = -alpha sin((n + 1/2) w)/s + 2 beta Re(z^-n E) - 2 f Re(z^-(n+1) C),     F = (z - 1) E
+    N(w) = (-a + sqrt(a^2 + 4 f (1 - f) |C|^2))/4
+    a = -alpha sin((n + 1/2) w)/s + 2 beta Re(z^-n E) - 2 f Re(z^-(n+1) C)
 
-Its maximum is proved by bounds of a'' and C'' (docs/theory/passivity.md, P4): intervals that cannot hold it are left,
-the others halved. An estimate that answers a position at rest with F(1) != 0 adds ``beta F(1)`` to the stiffness; E is
-then that of F - F(1).
+the larger eigenvalue of a 2x2 matrix M(w). Its maximum is computed with a certificate: between two angles that are h
+apart, N exceeds its chord by at most h^2/8 times a bound of |M''|, so intervals that cannot contain the maximum are
+discarded and the others divided. An estimate with F(1) != 0 adds ``beta F(1)`` to the stiffness; E is then that of
+F - F(1).
 """
 
 from __future__ import annotations
@@ -22,76 +24,88 @@ from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 
-_NODES, _MOST = 129, 1 << 18
-# Into how many parts an interval is cut that may hold the maximum, and how often.
-_PARTS, _ROUNDS = 16, 20
-_SHARES = np.arange(1, _PARTS)[:, None] / _PARTS
-# By how much more, relatively, no frequency may need for the search to end.
-_PROVED = 1e-13
+# Search for the maximum
+N_NODES = 129  # initial angles
+MAX_INTERVALS = 1 << 18  # intervals that are still undecided in one round
+N_PARTS = 16  # parts into which an interval is divided
+MAX_ROUNDS = 20  # rounds of division
+SHARES = np.arange(1, N_PARTS)[:, None] / N_PARTS  # inner points of a divided interval, relative to its width
+CERTIFIED_ERROR = 1e-13  # relative error of the maximum
 
 
-# What of a device has no such condition: with what, and where none is known.
-_OBSTACLES = {
-    "response": ("a measured response", "without a model; measure the device with the hands it meets"),
+# Fields of a device for which the condition is unknown: description, and reason with remedy.
+UNSUPPORTED = {
+    "response": (
+        "a measured response",
+        "without a model; measure the device together with the hand",
+    ),
     "system": (
         "a linear device",
-        "where damping is not that of one body; ask is_stable of devices with the hands they meet",
+        "in general; use is_stable on devices that include the hand",
     ),
     "actuator": (
         "an actuator",
-        "where the force lags behind the command; ask is_stable with the hand as operator, or leave the actuator out",
+        "because the force lags; use is_stable with the hand as operator, or omit the actuator",
     ),
     "modes": (
         "modes",
-        "where the sensor sees more than the body that the hand holds; ask is_stable with the hand as operator, or "
-        "leave the modes out",
+        "because the sensor moves relative to the hand; use is_stable with the hand as operator, or omit the modes",
     ),
 }
 
 
-def find_obstacle(*, coupling: Any = None, **parts: Any) -> str:
-    """Why parts of a device have no such condition; nothing where force and sensed motion are those of one point."""
-    for name, (what, where) in _OBSTACLES.items():
+def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
+    """Return the reason why no passivity condition is available for a device; "" if one is.
+
+    The condition requires that the force acts on the point whose position is sensed.
+
+    Args:
+        coupling: coupling of the device.
+        **parts: its other fields.
+    """
+    for name, (description, reason) in UNSUPPORTED.items():
         part = parts.get(name)
         if part if isinstance(part, tuple | list) else part is not None:
-            return f"with {what}: no passivity condition of this kind is known {where}"
+            return f"with {description}: no passivity condition is known {reason}"
     if coupling is not None and coupling.sensor == "tip":
         return (
-            "with the sensor at the tip: there is no passivity condition of this kind, for force and sensed motion are "
-            "not those of one point and no damping of the motor bounds the energy; ask is_stable with the hand as "
-            "operator"
+            "with the sensor at the tip: there is no passivity condition, because motor damping does not bound the "
+            "energy; use is_stable with the hand as operator"
         )
     return ""
 
 
 @dataclass(frozen=True)
 class PassivityCondition:
-    """What a velocity estimate and a delay ask of the damping."""
+    """The condition for a velocity estimate and a delay."""
 
     quotient: Estimate  # E
     spring: float  # F(1)
-    whole: int
-    fraction: float
+    integer_delay: int  # n
+    fractional_delay: float  # f
 
     @classmethod
     def derive(cls, estimate: Estimate, d: float) -> PassivityCondition:
-        """The condition of an estimate and a delay in periods."""
-        whole = int(np.floor(d))
+        """Return the condition for an estimate and a delay in periods."""
+        n = int(np.floor(d))
         if estimate.window:
-            return cls(estimate, 0.0, whole, float(d - whole))
-        zeta = np.polynomial.polynomial
+            return cls(estimate, 0.0, n, float(d - n))
+        # Polynomials in zeta = z - 1, lowest power first.
+        polynomial = np.polynomial.polynomial
         lag = max(estimate.lag, 0)
-        top = float(estimate.gain) * zeta.polyfromroots([*-estimate.zeros, *[-1.0] * max(-estimate.lag, 0)]).real
-        bottom = zeta.polyfromroots([*-estimate.poles, *[-1.0] * lag]).real
-        rest = top[0] / bottom[0]
-        # (F - F(1))/(z - 1): without the constant coefficient, which the subtraction takes away; 0 of a constant F.
-        over = np.trim_zeros(zeta.polysub(top, rest * bottom)[1:], "b")
-        over = over if over.size else np.zeros(1)
-        quotient = Estimate(0, over[-1], lag, -zeta.polyroots(over) + 0j, estimate.poles)
-        return cls(quotient, float(rest), whole, float(d - whole))
+        numerator = (
+            float(estimate.gain) * polynomial.polyfromroots([*-estimate.zeros, *[-1.0] * max(-estimate.lag, 0)]).real
+        )
+        denominator = polynomial.polyfromroots([*-estimate.poles, *[-1.0] * lag]).real
+        spring = numerator[0] / denominator[0]
+        # The numerator of E = (F - F(1))/(z - 1): drop the constant coefficient, which is 0; a constant F leaves none.
+        quotient = np.trim_zeros(polynomial.polysub(numerator, spring * denominator)[1:], "b")
+        quotient = quotient if quotient.size else np.zeros(1)
+        E = Estimate(0, quotient[-1], lag, -polynomial.polyroots(quotient) + 0j, estimate.poles)
+        return cls(E, float(spring), n, float(d - n))
 
-    def _quotient(self, w: np.ndarray) -> np.ndarray:
-        """E; of a window's difference the mean of z^-1 to z^-window."""
+    def _evaluate_quotient(self, w: np.ndarray) -> np.ndarray:
+        """Return E; for a windowed difference it contains the mean of z^-1 to z^-window."""
         n, value = self.quotient.window, replace(self.quotient, window=0).jet(circle(w)).value
         if n:
             s = np.sin(0.5 * w)
@@ -99,51 +113,54 @@ class PassivityCondition:
             value = value * (mean * np.exp(-0.5j * (n + 1) * w))
         return value
 
-    def needed(self, alpha: float, beta: float, w: np.ndarray) -> np.ndarray:
-        """The damping that each angle in [0, pi] asks for; alpha with the estimate's own spring, >= 0."""
-        n, f = self.whole, self.fraction
+    def require_damping(self, alpha: float, beta: float, w: np.ndarray) -> np.ndarray:
+        """Return the required damping N at angles in [0, pi], for alpha >= 0 that includes ``beta F(1)``."""
+        n, f = self.integer_delay, self.fractional_delay
         s = np.sin(0.5 * w)
         kernel = np.where(s == 0, 2.0 * n + 1.0, np.sin((n + 0.5) * w) / np.where(s == 0, 1.0, s))
-        over = beta * self._quotient(w)
-        wall: Array = alpha + over * circle(w).before
-        a = -alpha * kernel + 2.0 * (np.exp(-1j * n * w) * over).real
+        damper = beta * self._evaluate_quotient(w)
+        wall: Array = alpha + damper * circle(w).before
+        a = -alpha * kernel + 2.0 * (np.exp(-1j * n * w) * damper).real
         if f == 0:
             return np.maximum(-0.5 * a, 0.0)
         a = a - 2.0 * f * (np.exp(-1j * (n + 1) * w) * wall).real
         return 0.25 * (-a + np.sqrt(a * a + 4.0 * f * (1.0 - f) * np.abs(wall) ** 2))
 
-    def curvature(self, alpha: float, beta: float, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """A bound of ``|M''|`` from low to high."""
-        n, f = self.whole, self.fraction
-        step = _enclose_difference(low, high, 0.0)
-        over = _times(self._enclose_quotient(low, high), _turns(n, low))
-        wall = _times(over, step)[2]
-        bound = alpha * n * (n + 1) * (2 * n + 1) / 3.0 + 2.0 * abs(beta) * over[2]
-        late = _times(_times(over, step), _turns(1, low))[2]
+    def bound_curvature(self, alpha: float, beta: float, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Return a bound of ``|M''|`` on each interval of angles [low, high]."""
+        n, f = self.integer_delay, self.fractional_delay
+        difference = _bound_difference(low, high, 0.0)
+        damper = _multiply_bounds(self._bound_quotient(low, high), _bound_power(n, low))
+        wall = _multiply_bounds(damper, difference)[2]
+        bound = alpha * n * (n + 1) * (2 * n + 1) / 3.0 + 2.0 * abs(beta) * damper[2]
+        late = _multiply_bounds(_multiply_bounds(damper, difference), _bound_power(1, low))[2]
         bound = bound + 2.0 * f * (alpha * (n + 1) ** 2 + abs(beta) * late)
-        # C itself turns no more than z^-n C does.
+        # The factor z^-n in ``wall`` only increases it, so beta ``wall`` also bounds |C''|.
         return 0.5 * (bound + np.sqrt(f * (1.0 - f)) * abs(beta) * wall)
 
-    def _enclose_quotient(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _bound_quotient(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return bounds of E and its first two derivatives."""
         f = self.quotient
-        value = _times((abs(f.gain) + 0.0 * low, 0.0 * low, 0.0 * low), _turns(abs(f.lag), low))
+        value = _multiply_bounds((abs(f.gain) + 0.0 * low, 0.0 * low, 0.0 * low), _bound_power(abs(f.lag), low))
         if f.window:
             n = f.window
-            value = _times(value, (1.0 + 0.0 * low, 0.5 * (n + 1) + 0.0 * low, (n + 1) * (2 * n + 1) / 6.0 + 0.0 * low))
+            value = _multiply_bounds(
+                value, (1.0 + 0.0 * low, 0.5 * (n + 1) + 0.0 * low, (n + 1) * (2 * n + 1) / 6.0 + 0.0 * low)
+            )
         for zero in f.zeros:
-            value = _times(value, _enclose_difference(low, high, zero))
+            value = _multiply_bounds(value, _bound_difference(low, high, zero))
         for pole in f.poles:
             middle = 0.5 * (low + high)
-            far = np.abs(circle(middle).before + pole) - 0.5 * (high - low)
-            # No point of the circle is closer than its own distance from the pole.
+            distance = np.abs(circle(middle).before + pole) - 0.5 * (high - low)
+            # No point of the unit circle is closer to the pole than 1 - |pole|.
             depth = 1.0 - abs(1.0 - pole)
-            far = np.maximum(far, depth)
-            value = _times(value, (1.0 / far, 1.0 / far**2, 2.0 / far**3 + 1.0 / far**2))
+            distance = np.maximum(distance, depth)
+            value = _multiply_bounds(value, (1.0 / distance, 1.0 / distance**2, 2.0 / distance**3 + 1.0 / distance**2))
         return value
 
 
-def _times(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """Bounds of a product and of its first two derivatives."""
+def _multiply_bounds(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """Return bounds of a product and its first two derivatives, from those of its factors."""
     return (
         one[0] * other[0],
         one[1] * other[0] + one[0] * other[1],
@@ -151,12 +168,13 @@ def _times(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> tuple[
     )
 
 
-def _turns(count: int, like: np.ndarray) -> tuple[np.ndarray, ...]:
-    return 1.0 + 0.0 * like, count + 0.0 * like, float(count) ** 2 + 0.0 * like
+def _bound_power(exponent: int, like: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return bounds of ``z^exponent`` or its inverse and the first two derivatives, in the shape of ``like``."""
+    return 1.0 + 0.0 * like, exponent + 0.0 * like, float(exponent) ** 2 + 0.0 * like
 
 
-def _enclose_difference(low: np.ndarray, high: np.ndarray, offset: complex) -> tuple[np.ndarray, ...]:
-    """``z - root``, the root by its offset from 1."""
+def _bound_difference(low: np.ndarray, high: np.ndarray, offset: complex) -> tuple[np.ndarray, ...]:
+    """Return bounds of ``z - root`` and its first two derivatives; ``offset`` is 1 - root."""
     middle, one = 0.5 * (low + high), 1.0 + 0.0 * low
     return np.abs(circle(middle).before + offset) + 0.5 * (high - low), one, one
 
@@ -165,34 +183,46 @@ def find_needed_damping(condition: PassivityCondition, alpha: float, beta: float
     """Return the largest damping required at any frequency, certified to a relative 1e-13; NaN for non-finite input."""
     if not (np.isfinite(alpha) and np.isfinite(beta)):
         return np.nan
-    stiff = max(alpha + beta * condition.spring, 0.0)
-    w = np.concatenate([[0.0], np.geomspace(1e-6, 1e-2, 24), np.linspace(1e-2, np.pi, _NODES)[1:]])
-    values = condition.needed(stiff, beta, w)
+    stiffness = max(alpha + beta * condition.spring, 0.0)
+    w = np.concatenate([[0.0], np.geomspace(1e-6, 1e-2, 24), np.linspace(1e-2, np.pi, N_NODES)[1:]])
+    values = condition.require_damping(stiffness, beta, w)
     # Both ends of each interval of angles, and the damping required at each end.
     ends, needs = np.stack([w[:-1], w[1:]]), np.stack([values[:-1], values[1:]])
-    best, most = float(values.max()), values
-    for _ in range(_ROUNDS):
-        most = needs.max(0) + condition.curvature(stiff, beta, *ends) * np.diff(ends, axis=0)[0] ** 2 / 8.0
-        open_ = most > best + _PROVED * (abs(best) + 1e-300)
-        if not open_.any():
+    best, upper = float(values.max()), values
+    for _ in range(MAX_ROUNDS):
+        upper = needs.max(0) + condition.bound_curvature(stiffness, beta, *ends) * np.diff(ends, axis=0)[0] ** 2 / 8.0
+        undecided = upper > best + CERTIFIED_ERROR * (abs(best) + 1e-300)
+        if not undecided.any():
             return best
-        if open_.sum() > _MOST:
-            # Flat all over: what is left open is a bound, on the side of caution.
+        if undecided.sum() > MAX_INTERVALS:
+            # The function is flat on too many intervals, so return their upper bound, which is conservative.
             break
-        (low, high), needs = ends[:, open_], needs[:, open_]
-        places = low + (high - low) * _SHARES
-        inner = condition.needed(stiff, beta, places.ravel())
+        (low, high), needs = ends[:, undecided], needs[:, undecided]
+        angles = low + (high - low) * SHARES
+        inner = condition.require_damping(stiffness, beta, angles.ravel())
         best = max(best, float(inner.max()))
-        places = np.concatenate([[low], places, [high]])
-        values = np.concatenate([needs[:1], inner.reshape(_PARTS - 1, -1), needs[1:]])
-        ends, needs = (np.stack([part[:-1].ravel(), part[1:].ravel()]) for part in (places, values))
-    return float(most.max())
+        angles = np.concatenate([[low], angles, [high]])
+        values = np.concatenate([needs[:1], inner.reshape(N_PARTS - 1, -1), needs[1:]])
+        ends, needs = (np.stack([part[:-1].ravel(), part[1:].ravel()]) for part in (angles, values))
+    return float(upper.max())
 
 
-def passivity_margins(condition: PassivityCondition, alpha: np.ndarray, beta: np.ndarray, delta: float) -> np.ndarray:
-    """By how much delta exceeds what walls of one shape need; at most their stiffness where that is negative."""
+def compute_passivity_margins(
+    condition: PassivityCondition, alpha: np.ndarray, beta: np.ndarray, delta: float
+) -> np.ndarray:
+    """Return the passivity margins of walls: delta minus the required damping.
+
+    The margin of a wall with negative stiffness is at most its stiffness, because such a wall supplies unlimited
+    energy, which the condition at w > 0 does not detect.
+
+    Args:
+        condition: the condition for velocity estimate and delay.
+        alpha: normalized stiffness, any shape.
+        beta: normalized damping, the same shape.
+        delta: normalized physical damping.
+    """
     pairs = zip(alpha.ravel().tolist(), beta.ravel().tolist(), strict=True)
     needed = [find_needed_damping(condition, *wall) for wall in pairs]
     margin = delta - np.array(needed).reshape(alpha.shape)
-    stiff = alpha + beta * condition.spring
-    return np.where(stiff < 0, np.minimum(margin, stiff), margin)
+    stiffness = alpha + beta * condition.spring
+    return np.where(stiffness < 0, np.minimum(margin, stiffness), margin)

@@ -1,11 +1,14 @@
-"""Poles of a linear loop with walls: companion eigenvalues, then Aberth's steps on the factored polynomial; its radius.
+"""Compute all closed-loop poles and the spectral radius of walls in any linear loop.
 
-With zeta = z - 1 and every root t of the loop by its offset 1 - t,
+With ``zeta = z - 1`` and the offsets t = 1 - root of the poles and b = 1 - root of the zeros of the open loop, the
+characteristic polynomial is
 
-    P = z^lag prod(zeta + t) Q + g prod(zeta + b) (alpha Q + beta R),     F = R/Q
+    P = z^lag prod(zeta + t) Q + gain prod(zeta + b) (alpha Q + beta R),     F = R/Q
 
-keeps the digits of poles next to z = 1, which the coefficients lose; a pole is kept as its zeta as well. For long
-delays the spectral radius comes from counting poles in circles.
+with numerator R and denominator Q of the velocity estimate. Companion eigenvalues are the starting values of Aberth's
+method (Aberth 1973, Math. Comp. 27) on this factored form, which keeps the significant digits of poles near z = 1; the
+coefficients of P lose them. For the same reason poles are returned as zeta. For long delays the spectral radius is
+found by counting the poles in circles (`arrays.counting`), at a cost that does not depend on the delay.
 """
 
 from __future__ import annotations
@@ -16,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.counting import count_poles
-from zwidth.arrays.polynomials import companion, square
-from zwidth.loops.linear.roots import LoopRoots, affine_polynomial, closed_loop_roots, step_apart
+from zwidth.arrays.polynomials import abs2, companion
+from zwidth.loops.linear.roots import LoopRoots, affine_polynomial, compute_aberth_step, factor_open_loop
 from zwidth.parts.circle import Jet
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
@@ -25,20 +28,22 @@ from zwidth.words.quantities import MOST_POLES, WALL_RANGE
 from zwidth.words.types import Array
 from zwidth.words.xp import within
 
-# Aberth's steps at most, and the step, in units of the pole's own distance from z = 1, that ends them.
-_STEPS, _ARRIVED = 60, 4e-16
-_LONGEST_STEP = 0.5
-# Nearer to z = 1 than this a pole's distance from it has digits of its own, that eigenvalues do not know. A pole that
-# would go farther, as a share of that distance, has not arrived; and how often such are moved.
-_NEAR_ONE, _STRAY, _STIRS = 1e-6, 1e-3, 4
-# Imaginary parts that are none, as a share.
-_REAL = 1e-13
-# Numbers that a block of walls holds: eigenvalues and the distances between poles take order^2 each.
-_NUMBERS = 1 << 20
+# Aberth's method
+MAX_STEPS = 60
+CONVERGED_STEP = 4e-16  # relative to |zeta|
+LONGEST_STEP = 0.5
+
+# Restart of poles that did not converge
+NEAR_ONE = 1e-6  # |zeta| below which eigenvalues have no significant digits
+UNCONVERGED_STEP = 1e-3  # relative to |zeta|
+MAX_RESTARTS = 4
+
+REAL_TOLERANCE = 1e-13  # imaginary part of a real pole, relative to |zeta|; smaller ones are rounding errors
+BLOCK_SIZE = 1 << 20  # values per block of walls; eigenvalues and pole differences take order^2 values per wall
 
 
 class PolynomialValue(NamedTuple):
-    """P, its derivative, and the size of what it is the sum of."""
+    """P, its derivative, and the sum of the magnitudes of its terms, which scales the rounding error of P."""
 
     value: Array
     slope: Array
@@ -46,181 +51,223 @@ class PolynomialValue(NamedTuple):
 
 
 def _product(zeta: Array, offsets: Array, factor: float = 1.0) -> Jet:
-    found = Jet(np.full_like(zeta, factor), np.zeros_like(zeta))
+    """Return ``factor prod(zeta + offset)`` and its derivative."""
+    product = Jet(np.full_like(zeta, factor), np.zeros_like(zeta))
     for offset in offsets:
-        found = found.times(Jet(zeta + offset, 1.0))
-    return found
+        product = product.times(Jet(zeta + offset, 1.0))
+    return product
 
 
-def _power(zeta: Array, turns: int) -> Jet:
-    """``z^turns``."""
-    below = (1.0 + zeta) ** (turns - 1) if turns else np.ones_like(zeta)
-    return Jet(below * (1.0 + zeta) if turns else below, turns * below)
+def _power(zeta: Array, exponent: int) -> Jet:
+    """Return ``z^exponent`` and its derivative."""
+    lower = (1.0 + zeta) ** (exponent - 1) if exponent else np.ones_like(zeta)
+    return Jet(lower * (1.0 + zeta) if exponent else lower, exponent * lower)
 
 
 def _difference(zeta: Array, window: int) -> Jet:
-    """``(z^window - 1)/window``: next to z = 1 by the binomial's product, where the subtraction has no digit left."""
+    """Return ``(z^window - 1)/window`` and its derivative."""
     power, slope = _power(zeta, window)
-    size = 0.5 * np.log1p(np.maximum(2.0 * zeta.real + square(zeta), -0.999))
-    turned = window * (size + 1j * np.arctan2(zeta.imag, 1.0 + zeta.real))
-    near = np.abs(turned) < 1.0
-    small = np.where(near, turned, 0.0)
+    log_z = 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -0.999))
+    exponent = window * (log_z + 1j * np.arctan2(zeta.imag, 1.0 + zeta.real))
+    # Near z = 1 the subtraction of 1 would cancel, so use expm1 of window log(z).
+    near = np.abs(exponent) < 1.0
+    small = np.where(near, exponent, 0.0)
     return Jet(np.where(near, np.expm1(small), power - 1.0) / window, slope / window)
 
 
-def log_size(zeta: Array) -> Array:
-    """``log|z|``, with the digits of a slow pole."""
+def log_modulus(zeta: Array) -> Array:
+    """Return ``log|z|`` with full relative accuracy for poles near z = 1."""
     with np.errstate(divide="ignore"):
-        return 0.5 * np.log1p(np.maximum(2.0 * zeta.real + square(zeta), -1.0))
+        return 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -1.0))
 
 
-def evaluate(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> PolynomialValue:
-    """The factored polynomial; arrays that broadcast with zeta."""
+def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> PolynomialValue:
+    """Evaluate P and its derivative in the factored form, for arrays that broadcast."""
     f = loop.estimate
-    turns = f.window + f.lag
-    device = _product(zeta, loop.poles).times(_power(zeta, loop.lag))
-    answer = _product(zeta, loop.zeros, loop.gain)
-    bottom = _product(zeta, f.poles).times(_power(zeta, max(turns, 0)))
-    top = _product(zeta, f.zeros, float(f.gain))
+    delay = f.window + f.lag
+    g_denominator = _product(zeta, loop.poles).times(_power(zeta, loop.lag))
+    g_numerator = _product(zeta, loop.zeros, loop.gain)
+    Q = _product(zeta, f.poles).times(_power(zeta, max(delay, 0)))
+    R = _product(zeta, f.zeros, float(f.gain))
     if f.window:
-        top = top.times(_difference(zeta, f.window))
-    top = top.times(_power(zeta, max(-turns, 0)))
-    wall = Jet(alpha * bottom.value + beta * top.value, alpha * bottom.slope + beta * top.slope)
-    own, pushed = device.times(bottom), answer.times(wall)
-    largest = np.abs(own.value) + np.abs(answer.value) * (np.abs(alpha * bottom.value) + np.abs(beta * top.value))
-    return PolynomialValue(own.value + pushed.value, own.slope + pushed.slope, largest)
+        R = R.times(_difference(zeta, f.window))
+    R = R.times(_power(zeta, max(-delay, 0)))
+    wall = Jet(alpha * Q.value + beta * R.value, alpha * Q.slope + beta * R.slope)
+    first, second = g_denominator.times(Q), g_numerator.times(wall)
+    size = np.abs(first.value) + np.abs(g_numerator.value) * (np.abs(alpha * Q.value) + np.abs(beta * R.value))
+    return PolynomialValue(first.value + second.value, first.slope + second.slope, size)
 
 
 def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
-    """Eigenvalues of the companion matrices, less 1, moved by Aberth's steps: Newton's, each pole off the others."""
+    """Return zeta of all poles of walls of shape (walls,), as an array of shape (walls, order)."""
     D, N1, N2 = affine_polynomial(loop)
     monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
     zeta = np.linalg.eigvals(companion(monic)) - 1.0 + 0j
-    _take_steps(loop, alpha, beta, zeta, np.arange(len(zeta)))
-    # Steps keep a real pair real and a conjugate one conjugate. Of two poles that are almost one eigenvalues may have
-    # made the other kind, from which no step leads to them.
-    for turn in range(_STIRS):
-        at = evaluate(loop, alpha[:, None], beta[:, None], zeta)
+    _refine_poles(loop, alpha, beta, zeta, np.arange(len(zeta)))
+    # Aberth's steps keep real approximations real and complex pairs complex. If the eigenvalues of a nearly double pole
+    # are of the wrong kind, the steps do not converge. Move these approximations off their line and repeat.
+    for restart in range(MAX_RESTARTS):
+        P = evaluate_polynomial(loop, alpha[:, None], beta[:, None], zeta)
         with np.errstate(all="ignore"):
-            step = step_apart(zeta, at.slope / at.value)
-        far = (np.abs(step) > _STRAY * np.abs(zeta)) | (np.abs(zeta) < _NEAR_ONE)
-        stray = (np.abs(at.value) > 1e-10 * at.size) & far
-        if not stray.any():
+            step = compute_aberth_step(zeta, P.slope / P.value)
+        is_far = (np.abs(step) > UNCONVERGED_STEP * np.abs(zeta)) | (np.abs(zeta) < NEAR_ONE)
+        unconverged = (np.abs(P.value) > 1e-10 * P.size) & is_far
+        if not unconverged.any():
             break
-        zeta *= np.where(stray, 1.0 + 0.3 * np.exp(2.4j * (np.arange(zeta.shape[1]) + turn)), 1.0)
-        _take_steps(loop, alpha, beta, zeta, np.flatnonzero(stray.any(1)))
+        zeta *= np.where(unconverged, 1.0 + 0.3 * np.exp(2.4j * (np.arange(zeta.shape[1]) + restart)), 1.0)
+        _refine_poles(loop, alpha, beta, zeta, np.flatnonzero(unconverged.any(1)))
     return zeta
 
 
-def _take_steps(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array, rows: Array) -> None:
-    """Move some walls' poles until they stay."""
-    for _ in range(_STEPS):
-        if not rows.size:
+def _refine_poles(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array, walls: Array) -> None:
+    """Apply Aberth's steps, in place, to the poles of the walls with these indices until all have converged."""
+    for _ in range(MAX_STEPS):
+        if not walls.size:
             break
-        now = zeta[rows]
-        at = evaluate(loop, alpha[rows, None], beta[rows, None], now)
+        current = zeta[walls]
+        P = evaluate_polynomial(loop, alpha[walls, None], beta[walls, None], current)
         with np.errstate(all="ignore"):
-            step = step_apart(now, at.slope / at.value)
-        # Below the rounding of P a step moves nothing but noise.
-        good = np.isfinite(step) & (np.abs(at.value) > 1e-16 * at.size)
-        step = np.where(good, step, 0.0)
-        step *= _LONGEST_STEP / np.maximum(np.abs(step), _LONGEST_STEP)
-        zeta[rows] = now - step
-        rows = rows[(np.abs(step) > _ARRIVED * np.abs(now)).any(1)]
+            step = compute_aberth_step(current, P.slope / P.value)
+        # If |P| is below its own rounding error, the step would be noise.
+        is_significant = np.isfinite(step) & (np.abs(P.value) > 1e-16 * P.size)
+        step = np.where(is_significant, step, 0.0)
+        step *= LONGEST_STEP / np.maximum(np.abs(step), LONGEST_STEP)
+        zeta[walls] = current - step
+        walls = walls[(np.abs(step) > CONVERGED_STEP * np.abs(current)).any(1)]
 
 
-def poles_less_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
-    """``z - 1`` for all poles of walls of one shape, along a new last axis; NaN where a wall is out of range."""
+def compute_poles_minus_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
+    """Return ``zeta = z - 1`` of all poles of walls.
+
+    Args:
+        loop: the loop without a wall.
+        alpha: normalized stiffness, any shape.
+        beta: normalized damping, the same shape.
+
+    Returns:
+        Array of shape ``(*alpha.shape, order)``; NaN for walls out of range.
+
+    Raises:
+        InputError: if the loop has more than `MOST_POLES` poles.
+    """
     order, shape = loop.order, alpha.shape
     if order > MOST_POLES:
         raise InputError(
-            f"scene: its {order} poles would take minutes a wall, and at most {MOST_POLES} are computed; "
-            "spectral_radius and is_stable answer for every delay at once"
+            f"scene: got {order} poles, at most {MOST_POLES} are computed because more take minutes per wall; "
+            "use spectral_radius or is_stable"
         )
     alpha, beta = alpha.reshape(-1), beta.reshape(-1)
     out = np.full((alpha.size, order), complex(np.nan, np.nan))
-    known = np.flatnonzero(within(alpha, WALL_RANGE) & within(beta, WALL_RANGE))
-    block = max(1, _NUMBERS // order**2)
+    in_range = np.flatnonzero(within(alpha, WALL_RANGE) & within(beta, WALL_RANGE))
+    block = max(1, BLOCK_SIZE // order**2)
     for damped in (True, False):
-        walls = known[(beta[known] != 0) == damped]
+        walls = in_range[(beta[in_range] != 0) == damped]
         for k in range(0, walls.size, block):
-            some = walls[k : k + block]
-            out[some] = _find_poles(loop, alpha[some], beta[some]) if damped else _springs(loop, alpha[some])
-    # Steps leave rounding on real poles; those of a pair that meets there are 1e-8 apart.
-    out = np.where(np.abs(np.imag(out)) <= _REAL * np.abs(out), np.real(out) + 0j, out)
+            part = walls[k : k + block]
+            out[part] = _find_poles(loop, alpha[part], beta[part]) if damped else _find_spring_poles(loop, alpha[part])
+    # Aberth's steps leave rounding errors in the imaginary parts of real poles. A complex pair that has just left the
+    # real axis has larger ones, about 1e-8.
+    out = np.where(np.abs(np.imag(out)) <= REAL_TOLERANCE * np.abs(out), np.real(out) + 0j, out)
     return out.reshape(*shape, order)
 
 
-def _springs(loop: LoopRoots, alpha: Array) -> Array:
-    """Walls without damping: the poles of the estimate are in nobody's loop, and known."""
+def _find_spring_poles(loop: LoopRoots, alpha: Array) -> Array:
+    """Return the poles of walls without damping.
+
+    The velocity estimate then has no effect on the force, and its own poles are poles of the closed loop.
+    """
     f = loop.estimate
-    idle = np.concatenate([-f.poles, -np.ones(max(f.window + f.lag, 0))])
-    found = _find_poles(replace(loop, estimate=Estimate(0)), alpha, np.zeros_like(alpha))
-    return np.concatenate([found, np.broadcast_to(idle, (alpha.size, idle.size))], 1)
+    filter_poles = np.concatenate([-f.poles, -np.ones(max(f.window + f.lag, 0))])
+    zeta = _find_poles(replace(loop, estimate=Estimate(0)), alpha, np.zeros_like(alpha))
+    return np.concatenate([zeta, np.broadcast_to(filter_poles, (alpha.size, filter_poles.size))], 1)
 
 
-# In a difference of two numbers: what the rounding of either may leave of it.
-_CANCELLED = 1e-14
+# Relative size of a difference of two float64 values below which it is only their rounding error.
+CANCELLATION = 1e-14
 
 
 def is_marginal(loop: LoopRoots, alpha: float, beta: float) -> bool:
-    """Whether a wall has one pole exactly at z = 1 and all others strictly inside: it neither pulls back nor grows."""
+    """Return whether a wall has a simple pole at exactly z = 1 and all other poles strictly inside the unit circle.
+
+    The device then comes to rest, but at any position.
+    """
     wall = np.array([alpha]), np.array([beta])
-    at = evaluate(loop, *wall, np.zeros(1, complex))
-    undamped = evaluate(loop, wall[0], 0.0 * wall[1], np.zeros(1, complex))
-    # Where the wall's damping takes away all that the device has, the difference is rounding: two poles at z = 1.
-    parts = np.abs(undamped.slope[0]) + np.abs(at.slope[0] - undamped.slope[0])
-    if at.value[0] != 0 or np.abs(at.slope[0]) <= _CANCELLED * parts:
+    P = evaluate_polynomial(loop, *wall, np.zeros(1, complex))
+    undamped = evaluate_polynomial(loop, wall[0], 0.0 * wall[1], np.zeros(1, complex))
+    # If the negative damping of the wall cancels the damping of the device, P'(1) is a rounding error of 0, and the
+    # pole at z = 1 is double.
+    terms = np.abs(undamped.slope[0]) + np.abs(P.slope[0] - undamped.slope[0])
+    if P.value[0] != 0 or np.abs(P.slope[0]) <= CANCELLATION * terms:
         return False
-    found = poles_less_one(loop, *wall)[0]
-    return bool(np.all(log_size(np.delete(found, np.argmin(np.abs(found)))) < 0))
+    zeta = compute_poles_minus_one(loop, *wall)[0]
+    return bool(np.all(log_modulus(np.delete(zeta, np.argmin(np.abs(zeta)))) < 0))
 
 
-# Beyond so many poles a count, whose cost no delay changes, is faster than all of them; but the window's zeros count.
-_MOST_POLES, _LONGEST_WINDOW = 150, 40
-# Circles looked at in one call, which narrow the bracket by one more; and where the bracket ends.
-_CIRCLES, _ROUNDS, _WIDTH = 16, 24, 4e-16
-# A bracket that stays wider holds poles that the count cannot tell apart from the circle.
-_UNKNOWN = 1e-6
-# Where label and radius contradict each other by more than that, one of the two is wrong: neither is given.
-_CONTRADICTION = 1e-7
+# Loops with more poles are counted in circles, which is then faster than computing all poles. A long window adds so
+# many zeros that counting is slower.
+MAX_COMPUTED_POLES = 150
+MAX_COUNTED_WINDOW = 40
+
+# Bracket of the log radius
+N_CIRCLES = 16  # circles per call
+MAX_ROUNDS = 24
+BRACKET_WIDTH = 4e-16  # target width, relative to max(1, |log radius|)
+MAX_BRACKET_WIDTH = 1e-6  # a wider final bracket, caused by inconclusive counts, means NaN
+
+# Largest |log radius| that may contradict the verdict on stability; for a larger one either may be wrong.
+VERDICT_TOLERANCE = 1e-7
 
 
-def log_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """``log max|z|`` of walls of shape (walls,); NaN where it is not known."""
-    if loop.order <= _MOST_POLES or loop.estimate.window > _LONGEST_WINDOW:
-        return log_size(poles_less_one(loop, alpha, beta)).max(-1)
-    return np.array([_by_circles(loop, a, b) for a, b in zip(alpha.tolist(), beta.tolist(), strict=True)])
+def compute_log_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+    """Return ``log max|z|`` over the poles of walls of shape (walls,); NaN if it cannot be computed."""
+    if loop.order <= MAX_COMPUTED_POLES or loop.estimate.window > MAX_COUNTED_WINDOW:
+        return log_modulus(compute_poles_minus_one(loop, alpha, beta)).max(-1)
+    return np.array([_bracket_log_radius(loop, a, b) for a, b in zip(alpha.tolist(), beta.tolist(), strict=True)])
 
 
 def spectral_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, stable: np.ndarray) -> np.ndarray:
-    """``max|z|`` on the verdict's side of 1: within rounding of the boundary the two would contradict each other."""
-    log = log_radius(loop, alpha, beta)
-    log = np.where((log < 0) != stable, np.where(np.abs(log) < _CONTRADICTION, 0.0, np.nan), log)
+    """Return ``max|z|`` over the poles of walls, below 1 if and only if ``stable``.
+
+    Within rounding errors of the stability boundary the computed radius may contradict the verdict; it is then 1, or
+    the next smaller float64 for a stable wall.
+
+    Args:
+        loop: the loop without a wall.
+        alpha: normalized stiffness, shape (walls,).
+        beta: normalized damping, shape (walls,).
+        stable: verdict on each wall, shape (walls,).
+
+    Returns:
+        Array of shape (walls,); NaN for a contradiction larger than `VERDICT_TOLERANCE`.
+    """
+    log = compute_log_radius(loop, alpha, beta)
+    log = np.where((log < 0) != stable, np.where(np.abs(log) < VERDICT_TOLERANCE, 0.0, np.nan), log)
     radius = np.exp(log)
     return np.where(stable, np.minimum(radius, np.nextafter(1.0, 0.0)), radius)
 
 
-def _by_circles(loop: LoopRoots, alpha: float, beta: float) -> float:
+def _bracket_log_radius(loop: LoopRoots, alpha: float, beta: float) -> float:
+    """Return the log radius of one wall by narrowing a bracket with pole counts."""
     if not (np.isfinite(alpha) and np.isfinite(beta)):
         return np.nan
-    zeros, poles, gain, lag = closed_loop_roots(loop, alpha, beta)
-    full = poles.size + lag
+    zeros, poles, gain, lag = factor_open_loop(loop, alpha, beta)
+    order = poles.size + lag
     low, high = -1.0, 1.0
-    for round_ in range(_ROUNDS):
-        logs = np.linspace(low, high, _CIRCLES + 2)[0 if round_ < 3 else 1 : None if round_ < 3 else -1]
+    for round_ in range(MAX_ROUNDS):
+        # The first rounds include both ends, because the bracket may have to be enlarged.
+        logs = np.linspace(low, high, N_CIRCLES + 2)[0 if round_ < 3 else 1 : None if round_ < 3 else -1]
         with np.errstate(all="ignore"):
             counts = count_poles(zeros, poles, gain, lag, np.exp(logs))
-        holds, lacks = logs[counts == full], logs[(counts >= 0) & (counts < full)]
-        if not holds.size and round_ < 3 and lacks.size:
+        above, below = logs[counts == order], logs[(counts >= 0) & (counts < order)]
+        if not above.size and round_ < 3 and below.size:
             low, high = high, 8.0 * high
             continue
-        if not lacks.size and round_ < 3 and holds.size:
+        if not below.size and round_ < 3 and above.size:
             low, high = 8.0 * low, low
             continue
-        if not holds.size and not lacks.size:
+        if not above.size and not below.size:
             break
-        low, high = max([low, *lacks]), min([high, *holds])
-        if high - low <= _WIDTH * max(1.0, abs(high)):
+        low, high = max([low, *below]), min([high, *above])
+        if high - low <= BRACKET_WIDTH * max(1.0, abs(high)):
             break
-    return 0.5 * (low + high) if high - low <= _UNKNOWN else np.nan
+    return 0.5 * (low + high) if high - low <= MAX_BRACKET_WIDTH else np.nan

@@ -1,11 +1,15 @@
-"""The stiffest stable wall of any linear loop, and what binds it.
+"""Find the stiffest stable wall of any linear loop, its active constraints, and its derivatives in the parameters.
 
-The top of the stable set is a smooth maximum of its edge, a corner where two conditions meet, or, where only
-dampings beta >= 0 are allowed, the end of the row beta = 0. Each is the solution of two conditions of two equations
-each, with ``r(z) = alpha + beta F(z) - q(z)``:
+The maximum of alpha over the stable set is a smooth maximum of an edge, a corner where two crossings with the boundary
+coincide, or, if only beta >= 0 is allowed, a crossing on the line beta = 0. It solves two conditions on
+``r(z) = alpha + beta F(z) - q(z)`` (q and F as in `loops.linear.roots`; docs/theory/scenes.md, V19):
 
-    first     r(e^(j w1)) = 0 of a pole pair, or of a real pole at z = -1 or z = 1
-    second    the same at w2; or the curve of the first is stationary in alpha; or beta = 0
+    first     r(e^(j w1)) = 0 for a pole pair, or for a real pole at z = -1 or z = 1
+    second    the same at w2; or alpha is stationary along the curve of the first condition; or beta = 0
+
+As a parameter changes, the same conditions remain active, so their implicit derivatives are those of alpha (V21). In
+arrays of crossings, a *row* belongs to a line of constant B and a *column* to an arc or crossing line, as in
+`loops.linear.boundary`. A *main* piece of the stable set is one that is connected to K = 0 (`loops.linear.border`).
 """
 
 from __future__ import annotations
@@ -17,12 +21,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.border import Border
+from zwidth.loops.linear.border import StableSet
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.curve import curve_at
-from zwidth.loops.linear.held import hold
+from zwidth.loops.linear.curve import evaluate_curve
+from zwidth.loops.linear.held import compute_chain_transition
 from zwidth.loops.linear.roots import LoopRoots
-from zwidth.loops.linear.rows import bound_intervals
+from zwidth.loops.linear.rows import find_stable_intervals
 from zwidth.parts.chain import chain_of
 from zwidth.parts.circle import CirclePoints, circle, lag_jet
 from zwidth.words.errors import InputError
@@ -31,29 +35,33 @@ from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 
-# How far apart, as shares of alpha, two crossings of a corner are, and from a corner where the curve ends at z = -1.
-_MEETS, _NEAR = 1e-8, 1e-5
-# Steps to a corner at most, and the one, as a share of beta, after which it is reached.
-_STEPS, _ARRIVED = 4, 1e-15
-_ON_ROW = 1e-9  # tolerance of the lossless damping, relative to the width of the stable set in beta
-# By what share rounding may make a row's wall stiffer.
-_ABOVE = 1e-7
-# Rows next to a ridge, as shares of the plane, one of which must reach nearly as high.
-_BESIDE, _NEARLY = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3]), 0.99
+# Corners
+CORNER_TOLERANCE = 1e-8  # difference of the two crossings in alpha at a corner, relative to alpha
+NEAR_CORNER = 1e-5  # largest distance of a first guess, relative to beta; or to alpha for an end of the curve
+MAX_STEPS = 4  # Newton steps
+CONVERGED_STEP = 1e-15  # relative to beta
+
+ON_LOSSLESS = 1e-9  # tolerance of the lossless damping, relative to the width of the stable set in beta
+# Relative excess of alpha on a line of constant B over the ridge, above which the two contradict each other.
+CONTRADICTION = 1e-7
+
+# Test of a maximum on neighboring lines of constant B
+NEIGHBOR_OFFSETS = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3])  # in beta, relative to its scale
+REACHED_FRACTION = 0.99  # of alpha, up to which one of these lines must be stable
 
 
 class Condition(IntEnum):
-    """What holds at the stiffest wall."""
+    """An active constraint of the stiffest wall."""
 
-    PAIR = 0
-    MINUS_ONE = 1
-    PLUS_ONE = 2
-    STATIONARY = 3
-    NO_DAMPING = 4
+    PAIR = 0  # a pole pair on the unit circle
+    MINUS_ONE = 1  # a pole at z = -1
+    PLUS_ONE = 2  # a pole at z = 1
+    STATIONARY = 3  # d alpha/dw = 0 along the curve
+    NO_DAMPING = 4  # beta = 0
 
 
-class BoundRidge(NamedTuple):
-    """The stiffest stable wall and the two conditions that make it so; ``w2`` is w1 where the second has no angle."""
+class RidgeSolution(NamedTuple):
+    """The stiffest stable wall and its two active constraints; ``w2`` equals w1 if the second one has no angle."""
 
     alpha: float
     beta: float
@@ -64,164 +72,197 @@ class BoundRidge(NamedTuple):
 
     @property
     def omega(self) -> float:
-        """The angle at which the loop oscillates there, the higher one at a corner."""
+        """The angle at which the loop oscillates with this wall; at a corner, the higher of the two."""
         return max(self.w1, self.w2) if self.second <= Condition.PLUS_ONE else self.w1
 
     @property
     def kind(self) -> RidgeKind:
-        """Smooth, a corner, or the end of the allowed damping."""
+        """The kind of maximum: smooth, a corner, or at the limit beta = 0."""
         if self.second == Condition.NO_DAMPING:
             return RidgeKind.NO_DAMPING
         smooth = self.first == Condition.PAIR and self.second == Condition.STATIONARY
         return RidgeKind.SMOOTH if smooth else RidgeKind.CORNER
 
 
-def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
-    """The stiffest stable wall with alpha > 0 or None; ArithmeticError where the rows contradict what was found."""
+def find_ridge(stable_set: StableSet, negative_damping: bool) -> RidgeSolution | None:
+    """Return the stiffest stable wall with alpha > 0.
+
+    Args:
+        stable_set: the stable walls of the loop.
+        negative_damping: if False, require beta >= 0.
+
+    Returns:
+        The wall and its active constraints; None if no wall with alpha > 0 is stable.
+
+    Raises:
+        ArithmeticError: if lines of constant B contradict the result, or a corner was not resolved.
+    """
     least = -np.inf if negative_damping else 0.0
     # On an edge that does not depend on B, corners differ in alpha only by rounding errors: prefer the largest beta,
     # then the crossing on a line of constant B, because the end of an edge has no angle.
-    tops = sorted(_tops(border, least), key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta, math.isnan(top.w)))
-    # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
-    top = next((top for top in tops if _is_reached(border, top, least)), None)
-    found = None if top is None else _describe(border, top, least)
-    lossless = border.boundary.lossless
-    if found is not None and abs(found.beta - lossless) <= _ON_ROW * border.width:
-        # At exactly this damping no wall decays. With the rounding error of the corner some would appear to decay.
-        found = found._replace(beta=lossless)
-    highest = border.find_highest(least)
-    if highest > (0.0 if found is None else found.alpha) * (1.0 + _ABOVE):
-        raise ArithmeticError(f"rows reach {highest!r}, the ridge {found!r}")
-    return found
+    maxima = sorted(
+        _list_maxima(stable_set, least), key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta, math.isnan(top.w))
+    )
+    # Near an asymptote of the curve, rounding errors may turn a part of it into a spurious edge. Such an edge bounds no
+    # interval of a line of constant B.
+    top = next((top for top in maxima if _is_reached(stable_set, top, least)), None)
+    ridge = None if top is None else _identify_conditions(stable_set, top, least)
+    lossless = stable_set.boundary.lossless
+    if ridge is not None and abs(ridge.beta - lossless) <= ON_LOSSLESS * stable_set.width:
+        # No wall is asymptotically stable at exactly this damping. Remove the rounding error of the corner, with which
+        # some walls would appear to be.
+        ridge = ridge._replace(beta=lossless)
+    highest = stable_set.find_highest(least)
+    if highest > (0.0 if ridge is None else ridge.alpha) * (1.0 + CONTRADICTION):
+        raise ArithmeticError(f"lines of constant B reach alpha = {highest!r}, above the maximum {ridge!r}")
+    return ridge
 
 
-class _Top(NamedTuple):
-    """A local maximum of the edges: which column of a row's crossings it is on, and whether it lies inside its edge."""
+class _Maximum(NamedTuple):
+    """A local maximum of alpha along the edges."""
 
     alpha: float
     beta: float
     w: float
     column: int
-    inner: bool
+    inner: bool  # inside its edge, not at an end
 
 
-def _tops(border: Border, least: float) -> Iterator[_Top]:
-    """Local maxima of the edges of pieces with soft walls, with beta of ``least`` or more."""
-    edges = border.soft_edges(least)
+def _list_maxima(stable_set: StableSet, least: float) -> Iterator[_Maximum]:
+    """Yield the local maxima of alpha along the edges of main pieces, for beta >= ``least``."""
+    edges = stable_set.main_edges(least)
     for edge in edges:
         padded = np.pad(np.where(edge.beta >= least, edge.alpha, -np.inf), 1, constant_values=-np.inf)
         alpha, last = padded[1:-1], edge.w.size - 1
         for k in np.flatnonzero((alpha >= padded[:-2]) & (alpha >= padded[2:]) & (alpha > 0)):
-            yield _Top(float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), edge.column, bool(0 < k < last))
+            yield _Maximum(float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), edge.column, bool(0 < k < last))
     if np.isfinite(least):
-        # Where edges pass the least damping.
-        row = border.boundary.crossings(np.array([least]))
+        # The crossings of the edges with the line beta = least.
+        row = stable_set.boundary.find_crossings(np.array([least]))
         for edge in edges:
             high, w = float(row.alpha[0, edge.column]), float(row.w[0, edge.column])
             if edge.beta[0] <= least and high > 0:
-                yield _Top(high, least, w, edge.column, False)
+                yield _Maximum(high, least, w, edge.column, False)
 
 
-def _is_reached(border: Border, top: _Top, least: float) -> bool:
-    """Whether a row next to a top is stable nearly up to it."""
-    size = border.width + abs(top.beta)
-    found = bound_intervals(border.boundary, np.maximum(top.beta + size * _BESIDE, least))
-    own = (found.above == top.column) | (found.below == top.column)
-    return bool(np.any(own & (found.high >= _NEARLY * top.alpha)))
+def _is_reached(stable_set: StableSet, top: _Maximum, least: float) -> bool:
+    """Return whether a line of constant B next to a maximum is stable nearly up to it."""
+    scale = stable_set.width + abs(top.beta)
+    intervals = find_stable_intervals(stable_set.boundary, np.maximum(top.beta + scale * NEIGHBOR_OFFSETS, least))
+    bounded = (intervals.above == top.column) | (intervals.below == top.column)
+    return bool(np.any(bounded & (intervals.high >= REACHED_FRACTION * top.alpha)))
 
 
-def _describe(border: Border, top: _Top, least: float) -> BoundRidge:
+def _identify_conditions(stable_set: StableSet, top: _Maximum, least: float) -> RidgeSolution:
+    """Return a maximum with its active constraints."""
     alpha, beta, w = top[:3]
     if beta == least:
-        return BoundRidge(alpha, beta, w, w, _condition(w), Condition.NO_DAMPING)
+        return RidgeSolution(alpha, beta, w, w, _classify_angle(w), Condition.NO_DAMPING)
     if top.inner:
-        return BoundRidge(alpha, beta, w, w, Condition.PAIR, Condition.STATIONARY)
-    return _corner(border, alpha, beta)
+        return RidgeSolution(alpha, beta, w, w, Condition.PAIR, Condition.STATIONARY)
+    return _solve_corner(stable_set, alpha, beta)
 
 
-def _condition(w: float) -> Condition:
+def _classify_angle(w: float) -> Condition:
+    """Return the condition of a pole at an angle."""
     if w == 0.0:
         return Condition.PLUS_ONE
     return Condition.MINUS_ONE if w == np.pi else Condition.PAIR
 
 
-def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
-    """The two conditions that meet at a corner."""
-    # By Newton's method on rows: an edge's end is as far off, beside an undamped mode, as a digit of its angle tells.
-    (w, other), heights, slopes, step = _nearest_two(border.boundary, alpha, beta)
-    for _ in range(_STEPS):
-        if not _ARRIVED * abs(beta) < abs(step) <= _NEAR * abs(beta):
+def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> RidgeSolution:
+    """Compute the corner next to a wall, and its two active constraints."""
+    # Newton's method on the difference of two crossings of a line of constant B, because near an undamped mode the end
+    # of an edge is only as accurate as the last digit of its angle.
+    (w, other), heights, slopes, step = _find_nearest_two(stable_set.boundary, alpha, beta)
+    for _ in range(MAX_STEPS):
+        if not CONVERGED_STEP * abs(beta) < abs(step) <= NEAR_CORNER * abs(beta):
             break
         alpha, beta = heights[0] + slopes[0] * step, beta + step
-        (w, other), heights, slopes, step = _nearest_two(border.boundary, alpha, beta)
+        (w, other), heights, slopes, step = _find_nearest_two(stable_set.boundary, alpha, beta)
     w, other = sorted((w, other))
-    # Of the place in beta the flatter one makes the less of alpha.
-    apart, missed = abs(slopes[0] - slopes[1]), abs(heights[1] - heights[0]) / abs(alpha)
-    flat = min(1.0, min(map(abs, slopes)) / apart) if apart > 0 else 1.0
-    if abs(step) <= _NEAR * (border.width + abs(beta)) and flat * missed <= _MEETS and other - w > 1e-6:
-        return BoundRidge(alpha, beta, w, other, _condition(w), _condition(other))
-    # A double pole at z = -1, or at z = 1 of a device that moves against its force: the curve ends on the line there.
+    # An error in beta changes alpha of the corner only by the smaller of the two derivatives.
+    difference, gap = abs(slopes[0] - slopes[1]), abs(heights[1] - heights[0]) / abs(alpha)
+    flatness = min(1.0, min(map(abs, slopes)) / difference) if difference > 0 else 1.0
+    if (
+        abs(step) <= NEAR_CORNER * (stable_set.width + abs(beta))
+        and flatness * gap <= CORNER_TOLERANCE
+        and other - w > 1e-6
+    ):
+        return RidgeSolution(alpha, beta, w, other, _classify_angle(w), _classify_angle(other))
+    # A double pole at z = -1, or at z = 1 for a device that moves against its force: the curve ends there, on the
+    # crossing line.
     for w in (np.pi, 0.0):
-        top, damping = border.boundary.limits[w]
-        if abs(top - alpha) <= _NEAR * abs(alpha):
-            return BoundRidge(top, damping, w, w, _condition(w), Condition.STATIONARY)
+        limit, damping = stable_set.boundary.limits[w]
+        if abs(limit - alpha) <= NEAR_CORNER * abs(alpha):
+            return RidgeSolution(limit, damping, w, w, _classify_angle(w), Condition.STATIONARY)
     raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
 
 
-def _nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[float], list[float], list[float], float]:
-    """Angles of a row's two crossings nearest to a wall, their alphas, these' slopes in beta, and how far they meet."""
-    found = b.crossings(np.array([beta]))
-    away = np.abs(found.alpha[0] - alpha)
-    near = np.resize(np.argsort(np.where(np.isnan(away), np.inf, away))[:2], 2)
-    here = curve_at(b.loop, found.w[0, near])
+def _find_nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[float], list[float], list[float], float]:
+    """Return the two crossings of the line of constant B that are nearest to a wall.
+
+    Returns:
+        Their angles, alphas, and derivatives d alpha/d beta; and the Newton step in beta to where their alphas agree.
+    """
+    row = b.find_crossings(np.array([beta]))
+    distance = np.abs(row.alpha[0] - alpha)
+    near = np.resize(np.argsort(np.where(np.isnan(distance), np.inf, distance))[:2], 2)
+    curve = evaluate_curve(b.loop, row.w[0, near])
     with np.errstate(all="ignore"):
-        slopes = here.alpha_slope * here.fall**2 / here.turn
+        slopes = curve.alpha_slope * curve.im_f**2 / curve.wronskian
     for k in np.flatnonzero(near >= len(b.arcs)):
         slopes[k] = -b.lines[near[k] - len(b.arcs)].f
-    heights = found.alpha[0, near]
+    heights = row.alpha[0, near]
     step = (heights[1] - heights[0]) / ((slopes[0] - slopes[1]) or np.inf)
-    return found.w[0, near].tolist(), heights.tolist(), slopes.tolist(), float(step)
+    return row.w[0, near].tolist(), heights.tolist(), slopes.tolist(), float(step)
 
 
-def _conditions(loop: LoopRoots, wall: BoundRidge) -> tuple[np.ndarray, list[int]]:
-    """How what binds a wall moves with what may of alpha, beta, w1 and w2, and which of five conditions that is."""
-    # Of ``r = alpha + beta F - q``: Re and Im at w1, the same at w2, and Im dr/dw at w1, where w stays. At a smooth
-    # optimum the angle may stay where it is: to first order it does not matter.
-    at = circle(np.array([wall.w1, wall.w2]))
+def _differentiate_conditions(loop: LoopRoots, ridge: RidgeSolution) -> tuple[np.ndarray, list[int]]:
+    """Return the Jacobian of the active constraints in the free unknowns.
+
+    The five possible equations are Re r and Im r at w1, the same at w2, and Im dr/dw at w1; the unknowns are alpha,
+    beta, w1 and w2. An angle is free only if it belongs to a pole pair. At a smooth maximum w1 may stay fixed, because
+    it changes alpha only to second order (envelope theorem).
+
+    Returns:
+        The square Jacobian, and the indices of its equations.
+    """
+    points = circle(np.array([ridge.w1, ridge.w2]))
     with np.errstate(all="ignore"):
-        q, f = loop.required_wall(at), loop.estimate.jet(at)
-        slope = wall.beta * f.slope - q.slope
+        q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
+        slope = ridge.beta * f.slope - q.slope
     matrix = np.zeros((5, 4))
     matrix[[0, 2], 0] = 1.0
-    matrix[:, 1] = _list_conditions(f.value, f.slope)
-    matrix[:2, 2], matrix[2:4, 3] = _list_conditions(slope, slope)[:4].reshape(2, 2)
-    pair = wall.first == Condition.PAIR, wall.second == Condition.PAIR
-    rows, columns = [0, 1] if pair[0] else [0], [0]
-    if wall.second != Condition.NO_DAMPING:
-        columns.append(1)
-    if wall.second <= Condition.PLUS_ONE:
-        rows += [2, 3] if pair[1] else [2]
-    elif wall.second == Condition.STATIONARY and not pair[0]:
-        rows.append(4)
-    if wall.second != Condition.STATIONARY:
-        columns += [2 + k for k in range(2) if pair[k]]
-    return matrix[np.ix_(rows, columns)], rows
+    matrix[:, 1] = _stack_equations(f.value, f.slope)
+    matrix[:2, 2], matrix[2:4, 3] = _stack_equations(slope, slope)[:4].reshape(2, 2)
+    is_pair = ridge.first == Condition.PAIR, ridge.second == Condition.PAIR
+    equations, unknowns = [0, 1] if is_pair[0] else [0], [0]
+    if ridge.second != Condition.NO_DAMPING:
+        unknowns.append(1)
+    if ridge.second <= Condition.PLUS_ONE:
+        equations += [2, 3] if is_pair[1] else [2]
+    elif ridge.second == Condition.STATIONARY and not is_pair[0]:
+        equations.append(4)
+    if ridge.second != Condition.STATIONARY:
+        unknowns += [2 + k for k in range(2) if is_pair[k]]
+    return matrix[np.ix_(equations, unknowns)], equations
 
 
-def _list_conditions(rest: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """The five parts of r and dr/dw, or of what moves them, at two angles."""
-    return np.array([rest[0].real, rest[0].imag, rest[1].real, rest[1].imag, slope[0].imag])
+def _stack_equations(value: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return the five equations for r and dr/dw at two angles, or their derivatives for those of r and dr/dw."""
+    return np.array([value[0].real, value[0].imag, value[1].real, value[1].imag, slope[0].imag])
 
 
-# The step of a difference, as a share of the parameter; its sixth power is rounding. And that of an imaginary step.
-_STEP, _TINY = 1e-3, 1e-30
-# A parameter below this share of its unit is next to 0: in steps of its own size rounding ate up to 3e-6 of a slope.
-_NEXT_TO_NOTHING = 1e-5
-# Weights of the differences: around a value, and from it on.
-_CENTRAL = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
-_ONE_SIDED = [-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6]
-# By what share G may differ by its matrices and by its roots.
-_AGREES = 1e-8
+DIFFERENCE_STEP = 1e-3  # relative to the parameter; its sixth power is the truncation error
+COMPLEX_STEP = 1e-30  # imaginary step; its square is negligible
+# A parameter below this fraction of its unit takes steps relative to the unit instead. Steps relative to such a small
+# value caused errors of the derivative of up to 3e-6, by rounding.
+SMALL_PARAMETER = 1e-5
+# Sixth-order finite differences: offsets in steps and weights of a central difference, weights of a one-sided one.
+CENTRAL_DIFFERENCE = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
+ONE_SIDED_DIFFERENCE = [-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6]
+RESPONSE_TOLERANCE = 1e-8  # largest relative difference of G by the matrices of the chain and by its roots
 
 
 @shown()
@@ -233,100 +274,124 @@ class SceneSensitivities(NamedTuple):
     status: Array
 
 
-def differentiate(scene: Any, found: BoundRidge | None, status: Status) -> SceneSensitivities:
-    """The derivatives of a ridge by the conditions that bind it."""
-    paths = moving_paths(scene)
-    if found is None:
+def compute_sensitivities(scene: Any, ridge: RidgeSolution | None, status: Status) -> SceneSensitivities:
+    """Return the derivatives of the maximum stiffness in all parameters; NaN if ``ridge`` is None."""
+    paths = list_ridge_parameters(scene)
+    if ridge is None:
         return SceneSensitivities(np.float64(math.nan), dict.fromkeys(paths, math.nan), np.int32(status))
-    per = {path: find_slope(scene, found, path) for path in paths}
+    per = {path: differentiate_stiffness(scene, ridge, path) for path in paths}
     status = Status.NOT_CONVERGED if any(math.isnan(slope) for slope in per.values()) else status
-    return SceneSensitivities(np.float64(found.alpha * scene.units.stiffness), per, np.int32(status))
+    return SceneSensitivities(np.float64(ridge.alpha * scene.units.stiffness), per, np.int32(status))
 
 
-def moving_paths(scene: Any) -> tuple[str, ...]:
-    """The parameters of a scene, without the wall's, that K_max can be differentiated in."""
+def list_ridge_parameters(scene: Any) -> tuple[str, ...]:
+    """Return the dotted paths of the real parameters of a scene that K_max depends on."""
     paths = [path for path, value in scene.parameters().items() if not isinstance(value, int | np.integer)]
     rigid = scene.operator is not None and scene.operator.rigid
-    without = (*WALL, "operator.coupling_damping") if rigid else WALL
-    return tuple(path for path in paths if path not in without)
+    excluded = (*WALL, "operator.coupling_damping") if rigid else WALL
+    return tuple(path for path in paths if path not in excluded)
 
 
-def find_slope(scene: Any, found: BoundRidge, path: str) -> float:
-    """The derivative of K_max in one parameter: as it moves, the conditions that bind go on to hold (V21)."""
-    matrix, rows = _conditions(scene.loop.roots, found)
-    at = circle(np.array([found.w1, found.w2]))
-    # Longer periods are fewer in a delay: from a whole number of them on, a fraction of one less.
-    whole = scene.whole_delay - (path == "period" and scene.d == scene.whole_delay > 0)
-    for weights in _stencils(scene, path):
+def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> float:
+    """Return the derivative of K_max in one parameter, with the same active constraints (V21); NaN if inaccurate."""
+    matrix, equations = _differentiate_conditions(scene.loop.roots, ridge)
+    points = circle(np.array([ridge.w1, ridge.w2]))
+    # A longer period shortens a delay measured in periods. If the delay is an integer, it becomes a fractional delay
+    # with an integer part that is smaller by one.
+    n = scene.whole_delay - (path == "period" and scene.d == scene.whole_delay > 0)
+    for weights in _list_differences(scene, path):
         try:
             states = [
-                [weight * part for part in _inputs(scene.replace(**{path: value}), whole, at)]
+                [weight * part for part in _collect_dependencies(scene.replace(**{path: value}), n, points)]
                 for value, weight in weights
             ]
         except InputError:
-            # The parameter is at the end of its range: from the other side.
+            # The parameter is at the end of its range: try a difference toward the other side.
             continue
-        by_unit, by_delay, by_rate, by_push, by_f, by_f_slope = (
-            np.sum(part, axis=0) for part in zip(*states, strict=True)
-        )
-        q, q_slope = _needed_slopes(scene, whole, at, by_rate, by_push, by_delay)
-        rest, slope = found.beta * by_f - q, found.beta * by_f_slope - q_slope
+        d_unit, d_delay, d_A, d_B, d_f, d_f_slope = (np.sum(part, axis=0) for part in zip(*states, strict=True))
+        q, q_slope = _differentiate_controller(scene, n, points, d_A, d_B, d_delay)
+        residual, slope = ridge.beta * d_f - q, ridge.beta * d_f_slope - q_slope
         try:
-            by_alpha = -np.linalg.solve(matrix, _list_conditions(rest, slope)[rows])[0]
+            d_alpha = -np.linalg.solve(matrix, _stack_equations(residual, slope)[equations])[0]
         except np.linalg.LinAlgError:
             break
-        return float(scene.units.stiffness * by_alpha + found.alpha * by_unit)
+        return float(scene.units.stiffness * d_alpha + ridge.alpha * d_unit)
     return math.nan
 
 
-def _inputs(scene: Any, whole: int, at: CirclePoints) -> tuple[Any, ...]:
-    """What K_max depends on a parameter through: the unit of stiffness, the delay, the rates of the chain, F and F'."""
+def _collect_dependencies(scene: Any, n: int, points: CirclePoints) -> tuple[Any, ...]:
+    """Return the quantities that determine K_max: unit of stiffness, delay, A, B, F and dF/dw."""
     delay = scene.timing.delay / scene.timing.period
-    chain = chain_of(scene, (delay, whole))
+    chain = chain_of(scene, (delay, n))
     if chain.sampled:
-        # Its period is that of the loop.
+        # Refuse a period that differs from that of the sampled system.
         chain.check()
-    return (scene.units.stiffness, delay, *chain.realize()[:2], *chain.estimate.jet(at))
+    return (scene.units.stiffness, delay, *chain.realize()[:2], *chain.estimate.jet(points))
 
 
-def _needed_slopes(
-    scene: Any, whole: int, at: CirclePoints, by_rate: np.ndarray, by_push: np.ndarray, by_delay: float
+def _differentiate_controller(
+    scene: Any, n: int, points: CirclePoints, d_A: np.ndarray, d_B: np.ndarray, d_delay: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The derivatives of ``q = -1/G`` and of dq/dw in a parameter, by those of the chain's rates and of the delay."""
-    # NaN where G by the matrices of the chain is not G by its roots: then rounding has eaten what they tell.
+    """Return the derivatives of ``q = -1/G`` and of dq/dw in a parameter, by the chain rule.
+
+    Args:
+        scene: the scene.
+        n: integer delay.
+        points: the two angles of the ridge.
+        d_A: derivative of the matrix A of the chain in the parameter.
+        d_B: derivative of its matrix B.
+        d_delay: derivative of the delay in periods.
+
+    Returns:
+        Both derivatives at the angles; NaN where G by the matrices of the chain differs from G by its roots, because
+        rounding errors then dominate.
+    """
     chain = scene.loop.chain
-    # An imaginary step so short that its square is nothing is a derivative without a difference, here of e^A.
-    rate, push = (value + 1j * _TINY * by for value, by in zip(chain.realize(), (by_rate, by_push), strict=False))
-    fraction = chain.d - whole + 1j * _TINY * by_delay
-    steps = (*hold(chain, rate, push, 1.0), hold(chain, rate, push, 1.0 - fraction)[1])
-    (psi, full, late), (by_psi, by_full, by_late) = ([f(x) for x in steps] for f in (np.real, lambda x: x.imag / _TINY))
-    turns, slopes = whole + 1, np.full((2, at.w.size), complex(np.nan, np.nan))
-    exact, lag = scene.loop.roots.required_wall(at).value, lag_jet(at, turns)
-    for k, (zeta, turn) in enumerate(zip(at.before, 1j * at.z, strict=True)):
+    # The discretization is differentiated by the complex-step method, which has no cancellation.
+    A, B = (value + 1j * COMPLEX_STEP * d for value, d in zip(chain.realize(), (d_A, d_B), strict=False))
+    fraction = chain.d - n + 1j * COMPLEX_STEP * d_delay
+    steps = (
+        *compute_chain_transition(chain, A, B, 1.0),
+        compute_chain_transition(chain, A, B, 1.0 - fraction)[1],
+    )
+    (psi, full, late), (d_psi, d_full, d_late) = (
+        [f(x) for x in steps] for f in (np.real, lambda x: x.imag / COMPLEX_STEP)
+    )
+    lag, slopes = n + 1, np.full((2, points.w.size), complex(np.nan, np.nan))
+    exact, z_power = scene.loop.roots.evaluate_controller(points).value, lag_jet(points, lag)
+    for k, (zeta, zeta_slope) in enumerate(zip(points.before, 1j * points.z, strict=True)):
         with np.errstate(all="ignore"):
             try:
-                back = np.linalg.inv(zeta * np.eye(len(psi)) - psi)
+                inverse = np.linalg.inv(zeta * np.eye(len(psi)) - psi)
             except np.linalg.LinAlgError:
                 continue
-            moved = back @ (zeta * late + full)
-            by_w = back @ (turn * late - turn * moved)
-            by_p = back @ (by_psi @ moved + zeta * by_late + by_full)
-            by_both = back @ (by_psi @ by_w + turn * by_late - turn * by_p)
-            value, slope = lag.value[k] / moved[0] ** 2, lag.slope[k] / moved[0] ** 2
-            if abs(lag.value[k] / moved[0] + exact[k]) <= _AGREES * abs(exact[k]):
-                slopes[0, k] = value * by_p[0]
-                slopes[1, k] = slope * by_p[0] + value * (by_both[0] - 2.0 * by_p[0] * by_w[0] / moved[0])
+            # The state x = (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1)), with derivatives in w, in the parameter p,
+            # and in both.
+            x = inverse @ (zeta * late + full)
+            x_w = inverse @ (zeta_slope * late - zeta_slope * x)
+            x_p = inverse @ (d_psi @ x + zeta * d_late + d_full)
+            x_wp = inverse @ (d_psi @ x_w + zeta_slope * d_late - zeta_slope * x_p)
+            value, slope = z_power.value[k] / x[0] ** 2, z_power.slope[k] / x[0] ** 2
+            if abs(z_power.value[k] / x[0] + exact[k]) <= RESPONSE_TOLERANCE * abs(exact[k]):
+                slopes[0, k] = value * x_p[0]
+                slopes[1, k] = slope * x_p[0] + value * (x_wp[0] - 2.0 * x_p[0] * x_w[0] / x[0])
     return slopes[0], slopes[1]
 
 
-def _stencils(scene: Any, path: str) -> Iterator[list[tuple[float, float]]]:
-    """Values of a parameter with their weights in its derivative, of sixth order: around it, above it, below it."""
+def _list_differences(scene: Any, path: str) -> Iterator[list[tuple[float, float]]]:
+    """Yield sixth-order finite differences in a parameter: a central one, one above its value, and one below.
+
+    Each is a list of values of the parameter and their weights.
+    """
     value = float(scene.parameters()[path])
     period = float(scene.timing.period)
     units = {"mass": scene.mass, "damping": scene.mass / period, "stiffness": scene.mass / period**2, "delay": period}
     unit = float(next((unit for name, unit in units.items() if path.endswith(name)), 0.0))
-    # Rates are linear in dampings and springs, and smooth in the delay, over all of the unit; a light mass has its own.
-    least = 0.0 if path.endswith("mass") else _NEXT_TO_NOTHING * unit
-    step = _STEP * (abs(value) if abs(value) > least else unit)
-    yield from ([[(value + k * step, weight / step) for k, weight in _CENTRAL]] if value > 3.0 * step else [])
-    yield from ([(value + side * k * step, side * w / step) for k, w in enumerate(_ONE_SIDED)] for side in (1, -1))
+    # A and B are linear in dampings and stiffnesses, and smooth in the delay, over the scale of the unit; but a light
+    # mass has its own scale.
+    least = 0.0 if path.endswith("mass") else SMALL_PARAMETER * unit
+    step = DIFFERENCE_STEP * (abs(value) if abs(value) > least else unit)
+    yield from ([[(value + k * step, weight / step) for k, weight in CENTRAL_DIFFERENCE]] if value > 3.0 * step else [])
+    yield from (
+        [(value + side * k * step, side * w / step) for k, w in enumerate(ONE_SIDED_DIFFERENCE)] for side in (1, -1)
+    )

@@ -1,7 +1,9 @@
-"""The stiffest wall of any linear loop under JAX: found on the host, finished by optimistix, differentiable.
+"""Compute the stiffest stable wall of any linear loop under JAX, differentiably, for traced parameters of the scene.
 
-The unknowns are alpha, beta, w1 and w2; the equations are the two conditions of `loops.linear.ridge`. The search for
-which conditions those are has no derivative and needs none: as a parameter moves, the same conditions hold.
+A host callback runs the search of `loops.linear.ridge` in NumPy, which needs no derivative: it only determines which
+two conditions are active. Newton's method (optimistix) then solves these conditions for alpha, beta, w1 and w2 in JAX.
+The implicit derivatives of this solution are those of the ridge, because the same conditions remain active when the
+parameters change. Symbols are those of `loops.linear.ridge`.
 """
 
 from __future__ import annotations
@@ -17,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth.arrays.evaluate import broadcast_traced
-from zwidth.arrays.roots import polish
-from zwidth.loops.linear.held import required_wall, respond
-from zwidth.loops.linear.ridge import Condition, moving_paths
+from zwidth.arrays.roots import polish_root
+from zwidth.loops.linear.held import discretize_chain, evaluate_controller
+from zwidth.loops.linear.ridge import Condition, list_ridge_parameters
 from zwidth.parts.chain import AnyChain, chain_of
 from zwidth.parts.circle import circle
 from zwidth.parts.paths import replace_parameters
@@ -30,130 +32,161 @@ from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.xp import is_traced, nan_with_nan_slopes
 
-# Finite starting values for a batch entry without a ridge.
-_NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.NONE))
+# Finite placeholder for batch entries without a ridge: alpha, beta, w1, w2, both conditions and the kind of ridge.
+PLACEHOLDER = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.NONE))
 
 
 class Structure(NamedTuple):
-    """What is compiled once: a scene whose moving parameters are placeholders, their paths, and its delay."""
+    """The static part of a scene with traced parameters; one program is compiled per structure."""
 
-    template: Any
-    paths: tuple[str, ...]
-    d: float
-    negative: bool
+    template: Any  # the scene, with placeholders for the traced parameters
+    paths: tuple[str, ...]  # of the traced parameters
+    d: float  # delay in periods
+    negative: bool  # True if beta < 0 is allowed
 
 
-def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
-    """What is static of a scene when these parameters move; the delay in periods must be."""
+def build_structure(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
+    """Return the static part of a scene.
+
+    Args:
+        scene: the scene.
+        paths: dotted paths of its traced parameters.
+        negative: True if beta < 0 is allowed.
+
+    Raises:
+        TracedDelayError: if the delay or the period is traced, unless the delay is a plain 0.
+    """
     delay, period = scene.timing.delay, scene.timing.period
     undelayed = isinstance(delay, float) and delay == 0.0
     if is_traced(delay, period) and not undelayed:
         raise TracedDelayError(
-            "timing: got a traced delay or period, but the number of poles depends on the whole periods of the delay; "
-            "pass both as plain numbers, or ask scene.sensitivities() for the derivatives in them"
+            "timing: got a traced delay or period, but the number of poles depends on the integer delay; pass both as "
+            "plain numbers, or use scene.sensitivities() for their derivatives"
         )
     template = replace_parameters(scene, {"wall": VirtualWall(0.0), **dict.fromkeys(paths, 1.0)})
     return Structure(template, paths, 0.0 if undelayed else float(scene.d), negative)
 
 
 def trace_stiffest(scene: Any, negative: bool) -> RidgePoint:
-    """The stiffest wall of a scene with traced parameters."""
+    """Return the stiffest stable wall of a scene with traced parameters, with beta >= 0 unless ``negative``."""
     values = scene.parameters()
-    paths = tuple(path for path in moving_paths(scene) if is_traced(values[path]))
+    paths = tuple(path for path in list_ridge_parameters(scene) if is_traced(values[path]))
     if not paths:
-        # Only the wall is traced, and the ridge does not depend on it.
+        # Only the wall is traced, and the ridge does not depend on it. Pass any parameter, because the compiled
+        # function needs one.
         paths = ("mass",)
-    structure = structure_of(scene, paths, negative)
-    return compiled_ridge(structure, *broadcast_traced({path: values[path] for path in paths}))
+    structure = build_structure(scene, paths, negative)
+    return compute_ridge(structure, *broadcast_traced({path: values[path] for path in paths}))
 
 
 @partial(jax.jit, static_argnums=0)
-def compiled_ridge(structure: Structure, *values: Array) -> RidgePoint:
-    """Return the point of maximum stiffness for values of the traced parameters."""
+def compute_ridge(structure: Structure, *values: Array) -> RidgePoint:
+    """Return the stiffest wall for values of the traced parameters."""
     dtype = values[0].dtype
-    # As bits: the thread of a callback may have JAX's default precision, which would halve the digits on the way.
+    # Pass values to the callback and back as bits, because the thread of the callback may use JAX's default precision,
+    # which would round them to float32.
     bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(jnp.stack(values)), jnp.int32)
-    shape = jax.ShapeDtypeStruct((len(_NOWHERE) + 1, *bits.shape[1:]), jnp.int32)
-    search_there = partial(_search, structure, np.dtype(dtype))
-    told = jax.pure_callback(search_there, shape, bits, vmap_method="sequential")
-    told = jax.lax.bitcast_convert_type(told, dtype)
-    status = told[-1].astype(jnp.int32)
-    found = status == Status.OK
-    nowhere = jnp.asarray(_NOWHERE, dtype).reshape(-1, *(1 for _ in found.shape))
-    told = jnp.where(found, told[:-1], nowhere)
-    codes = told[4:6].astype(jnp.int32)
-    alpha, beta, w1, w2, close = _solve(structure, _fill(structure, values), told[:4], codes, found)
-    status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
-    spoiled = nan_with_nan_slopes(status == Status.OK, *values)
-    omega = jnp.where(told[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
-    kind = jnp.where(status == Status.OK, told[6].astype(jnp.int32), int(RidgeKind.NONE))
-    return RidgePoint(alpha + spoiled, beta + spoiled, omega + spoiled, kind, status)
+    shape = jax.ShapeDtypeStruct((len(PLACEHOLDER) + 1, *bits.shape[1:]), jnp.int32)
+    search = partial(_search_on_host, structure, np.dtype(dtype))
+    result = jax.pure_callback(search, shape, bits, vmap_method="sequential")
+    result = jax.lax.bitcast_convert_type(result, dtype)
+    status = result[-1].astype(jnp.int32)
+    exists = status == Status.OK
+    placeholder = jnp.asarray(PLACEHOLDER, dtype).reshape(-1, *(1 for _ in exists.shape))
+    result = jnp.where(exists, result[:-1], placeholder)
+    conditions = result[4:6].astype(jnp.int32)
+    alpha, beta, w1, w2, close = _solve_conditions(
+        structure, _fill_template(structure, values), result[:4], conditions, exists
+    )
+    status = jnp.where(exists & ~close, int(Status.NOT_CONVERGED), status)
+    invalid = nan_with_nan_slopes(status == Status.OK, *values)
+    omega = jnp.where(result[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
+    kind = jnp.where(status == Status.OK, result[6].astype(jnp.int32), int(RidgeKind.NONE))
+    return RidgePoint(alpha + invalid, beta + invalid, omega + invalid, kind, status)
 
 
-def _search(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> np.ndarray:
-    """The ridge on the host, and its status behind it; numbers come and go as their bits."""
+def _search_on_host(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> np.ndarray:
+    """Search the ridge in NumPy; return the fields of `PLACEHOLDER` and the status, as bits."""
     values = np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()
     try:
-        found, status = _fill(structure, values).loop.ridge(structure.negative)
+        ridge, status = _fill_template(structure, values).loop.ridge(structure.negative)
     except InputError:
-        found, status = None, Status.INVALID_INPUT
-    ridge = (math.nan,) * len(_NOWHERE) if found is None else (*found, found.kind)
-    told = np.array([*ridge, status], dtype)
-    return told.view(np.int32).reshape(told.size, *np.shape(bits)[1:])
+        ridge, status = None, Status.INVALID_INPUT
+    fields = (math.nan,) * len(PLACEHOLDER) if ridge is None else (*ridge, ridge.kind)
+    result = np.array([*fields, status], dtype)
+    return result.view(np.int32).reshape(result.size, *np.shape(bits)[1:])
 
 
-def _fill(structure: Structure, values: Iterable[Any]) -> Any:
-    """The scene with these values in place of the placeholders."""
+def _fill_template(structure: Structure, values: Iterable[Any]) -> Any:
+    """Return the scene with these values in place of the placeholders."""
     return replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
 
 
-def _solve(
-    structure: Structure, scene: Any, start: Array, codes: Array, found: Array
+def _solve_conditions(
+    structure: Structure, scene: Any, start: Array, conditions: Array, exists: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
+    """Solve the two active conditions by Newton's method.
+
+    Args:
+        structure: the static part of the scene.
+        scene: the scene with traced parameters.
+        start: alpha, beta, w1 and w2 from the search.
+        conditions: codes of the two active conditions.
+        exists: False if there is no ridge.
+
+    Returns:
+        alpha, beta, w1, w2, and whether they agree with ``start``.
+    """
     chain = chain_of(scene, (structure.d, int(structure.d)))
-    estimate, complexes = chain.estimate, jnp.result_type(start.dtype, jnp.complex64)
-    # The size of the unknowns.
+    estimate, complex_dtype = chain.estimate, jnp.result_type(start.dtype, jnp.complex64)
+    # Scale the unknowns to order one.
     scales = jnp.stack([start[0], jnp.abs(start[0]) + jnp.abs(start[1]), start[2], start[3]])
     scales = jnp.where(scales > 0, scales, 1.0)
-    moving = {
+    traced = {
         "gain": jnp.asarray(estimate.gain, start.dtype),
-        "zeros": jnp.asarray(estimate.zeros, complexes),
-        "poles": jnp.asarray(estimate.poles, complexes),
+        "zeros": jnp.asarray(estimate.zeros, complex_dtype),
+        "poles": jnp.asarray(estimate.poles, complex_dtype),
     }
     begin = start / scales
-    args = (jax.tree.map(jnp.asarray, respond(chain)), moving, start, codes, scales)
-    end = polish(partial(_residual, chain), begin, args, found)
-    # Newton must stay where the search put it; a double root is met to half of the digits.
+    args = (jax.tree.map(jnp.asarray, discretize_chain(chain)), traced, start, conditions, scales)
+    end = polish_root(partial(_residual, chain), begin, args, exists)
+    # Newton's method must not converge to a different solution. A double root is accurate to half of the digits.
     close = jnp.all(jnp.abs(end - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
     return *(end * scales), close
 
 
 def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
-    """The four equations, of order one; ``args`` is what they depend on beside the unknowns."""
-    parts, moving, start, codes, scales = args
-    alpha, beta, w1, w2 = unknowns * scales
-    estimate = replace(chain.estimate, **moving)
+    """Return the four equations, scaled to order one.
 
-    def distance(w: Array) -> tuple[Array, Array]:
-        """``r = alpha + beta F - q`` over the size of q, and F."""
-        q, f = required_wall(chain, w, parts), estimate.jet(circle(w)).value
+    Args:
+        chain: the chain, for its static fields.
+        unknowns: alpha, beta, w1 and w2, divided by their scales.
+        args: traced values: discretized chain, velocity estimate, start, conditions and scales.
+    """
+    discretized, traced, start, conditions, scales = args
+    alpha, beta, w1, w2 = unknowns * scales
+    estimate = replace(chain.estimate, **traced)
+
+    def evaluate_r(w: Array) -> tuple[Array, Array]:
+        """Return ``r = alpha + beta F - q``, relative to the magnitude of q, and F."""
+        q, f = evaluate_controller(chain, w, discretized), estimate.jet(circle(w)).value
         size = jax.lax.stop_gradient(jnp.abs(q))
         return (alpha + beta * f - q) / jnp.where(size > 0, size, 1.0), f
 
-    def both(w: Array) -> tuple[Array, Array]:
-        (r, f), (slope, _) = jax.jvp(distance, (w,), (jnp.ones_like(w),))
-        across = (jnp.conj(f) * slope).imag
+    def evaluate_both(w: Array) -> tuple[Array, Array]:
+        """Return r, and the quantity that is 0 if alpha is stationary along the curve."""
+        (r, f), (slope, _) = jax.jvp(evaluate_r, (w,), (jnp.ones_like(w),))
+        stationary = (jnp.conj(f) * slope).imag
         size = jax.lax.stop_gradient(jnp.abs(f) * jnp.abs(slope))
-        across = across / jnp.where(size > 0, size, 1.0)
-        # At z = -1 F is real, and may be 0.
-        return r, jnp.where(codes[0] == Condition.PAIR, across, slope.imag)
+        stationary = stationary / jnp.where(size > 0, size, 1.0)
+        # At z = -1, F is real and may be 0, so use Im dr/dw itself.
+        return r, jnp.where(conditions[0] == Condition.PAIR, stationary, slope.imag)
 
-    # One text for both angles, so that the compiler reads it once.
-    r, across = jax.vmap(both)(jnp.stack([w1, w2]))
-    stays = unknowns[2:] - start[2:] / scales[2:]
-    # A pole pair at w, or a real pole where w stays.
-    meet = jnp.stack([r.real, jnp.where(codes == Condition.PAIR, r.imag, stays)], -1)
-    which = jnp.maximum(codes[1] - Condition.PLUS_ONE, 0)
-    second = jnp.stack([meet[1], jnp.stack([across[0], stays[1]]), jnp.stack([unknowns[1], stays[1]])])[which]
-    return jnp.concatenate([meet[0], second])
+    # Evaluate both angles in one vmap, so that the function is compiled only once.
+    r, stationary = jax.vmap(evaluate_both)(jnp.stack([w1, w2]))
+    fixed = unknowns[2:] - start[2:] / scales[2:]
+    # A pole pair at w has r = 0; a real pole has Re r = 0 and a fixed w.
+    poles = jnp.stack([r.real, jnp.where(conditions == Condition.PAIR, r.imag, fixed)], -1)
+    index = jnp.maximum(conditions[1] - Condition.PLUS_ONE, 0)
+    second = jnp.stack([poles[1], jnp.stack([stationary[0], fixed[1]]), jnp.stack([unknowns[1], fixed[1]])])[index]
+    return jnp.concatenate([poles[0], second])

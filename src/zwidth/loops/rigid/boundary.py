@@ -13,8 +13,8 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth.arrays.evaluate import as_number, check_scalars, evaluate
-from zwidth.arrays.held_mass import DelayClasses, classify_delays, valid_device
-from zwidth.arrays.roots import follow_root, integrate
+from zwidth.arrays.held_mass import DelayClasses, classify_delays, is_valid_device
+from zwidth.arrays.roots import attach_root_derivatives, integrate
 from zwidth.loops.rigid.curve import (
     build_lobe,
     compute_corner_line,
@@ -73,7 +73,7 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Wall:
 def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
     """Return `boundary`, elementwise."""
     xp = namespace(omega, delta, d)
-    ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
+    ok = is_valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
     nan_if_invalid = nan_with_nan_slopes(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
     curve = find_boundary_wall(omega, build_frequency_loop(delta, d))
@@ -161,7 +161,9 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
     if is_row:
         limit = store_once(find_row_end(frozen_number, frozen_curve), delta)
         x, on_lobe, exists = limit.x, limit.meets_lobe, (limit.meets_lobe | limit.beyond) & (limit.alpha > 0)
-        x = follow_root(lambda x, curve, b: evaluate_lobe(x, curve).b - b, x, lambda *_: True, curve, number + delta)
+        x = attach_root_derivatives(
+            lambda x, curve, b: evaluate_lobe(x, curve).b - b, x, lambda *_: True, curve, number + delta
+        )
         point = evaluate_lobe(x, curve)
         # Return the value that `zwidth.is_stable` compares alpha with, with the derivatives of the curve.
         alpha = limit.alpha if xp is np else frozen(limit.alpha, xp) + (point.alpha - frozen(point.alpha, xp))
@@ -172,7 +174,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
         target = xp.where(exists, frozen_number, 0.5 * top.alpha)
         x, on_line = store_once(find_column_end(target, top, frozen_curve, line == "upper"), delta)
         on_lobe = ~on_line
-        x = follow_root(
+        x = attach_root_derivatives(
             lambda x, curve, alpha: evaluate_lobe(x, curve).alpha - alpha, x, lambda *_: True, curve, number
         )
         point = evaluate_lobe(x, curve)
@@ -326,4 +328,4 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
         return point.alpha * point.d_b
 
     under_lobe = integrate(integrand, (0.0 * end, end), (LOBE_NODES,))
-    return under_lobe + 0.25 * corner_alpha * corner_alpha + nan_with_nan_slopes(valid_device(delta, d), delta, d)
+    return under_lobe + 0.25 * corner_alpha * corner_alpha + nan_with_nan_slopes(is_valid_device(delta, d), delta, d)

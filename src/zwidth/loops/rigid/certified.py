@@ -23,8 +23,8 @@ import numpy as np
 
 from zwidth.arrays.balls import BITS, available
 from zwidth.arrays.evaluate import evaluate_columns
-from zwidth.arrays.held_mass import DelayClasses, DeviceTerms, PhiFunctions, classify_delays, held_plant
-from zwidth.arrays.held_mass import device as discretize
+from zwidth.arrays.held_mass import DelayClasses, DiscretePlant, PhiFunctions, classify_delays, discretize_mass
+from zwidth.arrays.held_mass import discretize_plant as discretize
 from zwidth.loops.rigid.crossover import (
     DelayPhase,
     Verdict,
@@ -131,12 +131,12 @@ def compute_wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: 
     return code.astype(xp.uint8)
 
 
-def size_device(delta: Array, d: Array, kind: DelayClasses) -> DeviceTerms:
-    """Return the `DeviceTerms` of exact delta and d, NaN if out of range."""
+def size_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
+    """Return the `DiscretePlant` of exact delta and d, NaN if out of range."""
     plant = discretize(delta, d, kind)
     if kind.fractional and kind.long:
         plant = store_once(plant, delta)  # because several loops of the compiled program use it
-    sized = DeviceTerms(*(Sized(value, abs(value) + TINY) for value in plant))
+    sized = DiscretePlant(*(Sized(value, abs(value) + TINY) for value in plant))
     sized = sized._replace(delta=Sized(plant.delta), f=Sized(plant.f), whole=plant.whole, a0=None)
     if kind.fractional:
         # The rounding error of f changes a0 by up to 2^-52 a1.
@@ -226,17 +226,17 @@ def compute_verdict(alpha: float, beta: float, delta: float, d: float, bits: int
 
 
 @lru_cache(maxsize=64)
-def device(delta: float, d: float, bits: int) -> DeviceTerms:
+def device(delta: float, d: float, bits: int) -> DiscretePlant:
     """Return the device of exact delta and d in balls, cached because all walls of a grid share it."""
     import flint
 
     # Use 64 more bits, because the phi-functions amplify the rounding error of delta (1 - f).
     with flint.ctx.workprec(bits + 64):
         x, f = flint.arb(delta), flint.arb(d - int(d))
-        phis_delta, phis_late, plant = _phi(x), _phi(x * (1 - f)), held_plant(x, f if f != 0 else None, _phi)
+        phis_delta, phis_late, plant = _phi(x), _phi(x * (1 - f)), discretize_mass(x, f if f != 0 else None, _phi)
         phis = phis_delta.phi1, phis_delta.phi2, phis_delta.psi, phis_late.phi1, phis_late.psi
         a0 = plant.a0 if f != 0 else None
-        return DeviceTerms(x, None, f, plant.c, plant.em, *phis, plant.a2, plant.a1, a0, plant.gap, None)
+        return DiscretePlant(x, None, f, plant.c, plant.em, *phis, plant.a2, plant.a1, a0, plant.gap, None)
 
 
 def _phi(x: flint.arb) -> PhiFunctions:

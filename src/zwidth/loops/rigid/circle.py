@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.held_mass import factor_numerator, held_plant, split_delay
+from zwidth.arrays.held_mass import discretize_mass, factor_numerator, split_delay
 from zwidth.loops.rigid.crossover import find_first_root
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.words.types import Array
@@ -59,7 +59,7 @@ def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: b
     valid = valid_wall(alpha, beta, delta, d)
     delta, d = xp.where(valid, delta, 1.0), xp.where(valid, d, 0.0)
     n, f = split_delay(d)
-    plant = held_plant(delta, f if fractional else None)
+    plant = discretize_mass(delta, f if fractional else None)
     h, q = factor_numerator(plant) if fractional else (plant.a1, 0.0 * plant.a1)
     alpha, beta, s = nan_unless(valid, alpha, beta, alpha + beta)
     return LoopFactors(alpha, beta, s, n + 1.0, d + 1.0, plant.c, plant.em, plant.a2, h, q)

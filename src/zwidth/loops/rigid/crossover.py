@@ -39,8 +39,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.held_mass import ANY, DelayClasses, DeviceTerms, device
-from zwidth.arrays.roots import follow_root
+from zwidth.arrays.held_mass import ANY, DelayClasses, DiscretePlant, discretize_plant
+from zwidth.arrays.roots import attach_root_derivatives
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
 from zwidth.words.xp import ARCSINE, COSINE, SINE, find_turn, frozen, horner, namespace, roots, within
@@ -198,7 +198,7 @@ def decide_long_delay(
         alpha: Normalized stiffness of the wall.
         beta: Normalized damping of the wall.
         n: Integer part of the delay in periods.
-        plant: `DeviceTerms` in the arithmetic of alpha and beta.
+        plant: `DiscretePlant` in the arithmetic of alpha and beta.
         find_root: Finds the crossover in this arithmetic.
         evaluate_phase: Evaluates the phase lag in this arithmetic.
 
@@ -293,7 +293,7 @@ def evaluate_phase(u: Array, n: Array) -> DelayPhase:
     )
 
 
-def find_gain_crossover(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
+def find_gain_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
     """Find the gain crossover frequency of a wall with alpha > 0, for stability margins.
 
     Args:
@@ -323,7 +323,7 @@ def find_gain_crossover(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[
     # Positive at u = 1: the crossover, if it exists, lies above w = pi/2.
     above_half = sum(in_u[1:], in_u[0]) > 0
     coefficients = tuple(xp.where(above_half, *pair) for pair in zip(in_v, in_u, strict=True))
-    root = follow_root(
+    root = attach_root_derivatives(
         lambda x, *powers: horner(x, powers),
         find_first_root(frozen(coefficients, xp)),
         lambda x, slope, _: slope != 0,
@@ -336,10 +336,10 @@ def find_gain_crossover(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[
 
 def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
     """Return whether each wall is stable, elementwise; False if an argument is NaN or out of range."""
-    return decide_in_floats(alpha, beta, device(delta, d, kind), kind)
+    return decide_in_floats(alpha, beta, discretize_plant(delta, d, kind), kind)
 
 
-def decide_in_floats(alpha: Array, beta: Array, plant: DeviceTerms, kind: DelayClasses) -> Array:
+def decide_in_floats(alpha: Array, beta: Array, plant: DiscretePlant, kind: DelayClasses) -> Array:
     """Return whether each wall is stable on a discretized plant, elementwise, in floating point."""
     integer_plant = plant._replace(a0=None)
     if not kind.fractional:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.held_mass import DelayClasses, DeviceTerms, device
+from zwidth.arrays.held_mass import DelayClasses, DiscretePlant, discretize_plant
 from zwidth.loops.rigid.crossover import expand_short_delay_curve
 from zwidth.loops.rigid.ridge_newton import guess_start, solve_ridge
 from zwidth.loops.rigid.row_limit import (
@@ -40,7 +40,7 @@ COLUMN_STEPS = 3  # Newton steps for n >= 1; the start is within 0.3 % of x
 class Lobe(NamedTuple):
     """The stability lobe of one device; fields for delays that do not occur are None."""
 
-    plant: DeviceTerms
+    plant: DiscretePlant
     d: Array
     is_short: Array | None  # d < 1; None unless both forms occur
     short_curve: Any  # `expand_short_delay_curve`
@@ -68,7 +68,7 @@ class Peak(NamedTuple):
 def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
     """Return the lobe of one device, or of arrays of one shape, for the delays that `DelayClasses` allows."""
     xp = namespace(delta, d)
-    plant = store_once(device(delta, d, kind), delta)
+    plant = store_once(discretize_plant(delta, d, kind), delta)
     is_short = plant.whole < 1
     short_curve, long_lobe, ends = None, None, []
     to_corner = plant.delta < 0
@@ -147,7 +147,7 @@ def compute_frequency(x: Array, lobe: Lobe) -> Array:
 
 def compute_corner_line(lobe: Lobe) -> Array:
     """Return ``alpha + 2 beta`` on the line of poles at z = -1; arbitrary if the lobe does not end in the corner."""
-    return 1.0 / namespace(lobe.d).where(lobe.to_corner, lobe.plant.tilt, 1.0)
+    return 1.0 / namespace(lobe.d).where(lobe.to_corner, lobe.plant.minus_one_coefficient, 1.0)
 
 
 class RowLimit(NamedTuple):

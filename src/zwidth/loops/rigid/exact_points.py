@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from zwidth.arrays.roots import polish
+from zwidth.arrays.roots import polish_root
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.normalization import device_status, wall_status
 from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, build_frequency_loop, find_boundary_wall
@@ -104,7 +104,7 @@ def _solve_conditions(
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
     scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
     unknowns = jnp.stack([*wall, start]) / scales
-    omega = polish(
+    omega = polish_root(
         lambda *values: _evaluate_conditions(condition, *values), unknowns, (loop, number, scales), bracketed
     )[2]
     omega = store_once(omega, start)

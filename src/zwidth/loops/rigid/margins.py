@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.held_mass import ANY, DeviceTerms, device, split_delay
-from zwidth.arrays.roots import false_position, follow_root, narrow_dips
+from zwidth.arrays.held_mass import ANY, DiscretePlant, discretize_plant, split_delay
+from zwidth.arrays.roots import attach_root_derivatives, false_position, minimize_golden_section
 from zwidth.loops.rigid.crossover import decide_in_floats, expand_short_delay_curve
 from zwidth.loops.rigid.modulus import (
     SAMPLES_WEIGHT,
@@ -111,7 +111,7 @@ def margins_kernel(
     d = xp.where(ok, d, 0.0)
     # A damping whose square or inverse under- or overflows has no effect on the margins.
     delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), NEGLIGIBLE_DAMPING)), 0.0, delta)
-    plant = store_once(device(delta, d), delta)
+    plant = store_once(discretize_plant(delta, d), delta)
     w, phase, crosses = evaluate_at_crossover(alpha, beta, plant)
     stable = store_once(decide_in_floats(*frozen((alpha, beta, plant), xp), ANY), delta)
     gain, phase_crossover = _find_gain_margin(alpha, beta, plant, xp)
@@ -146,12 +146,12 @@ def _place_by_verdict(margin: Array, edge: float, least: float, stable: Array, x
     return xp.where((margin < nearest) == stable, nearest + (margin - frozen(margin, xp)), margin)
 
 
-def _find_gain_margin(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) -> tuple[Array, Array]:
+def _find_gain_margin(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> tuple[Array, Array]:
     """Return the factor on the wall at which it becomes unstable, and the frequency there."""
     # The phase of L does not depend on the factor, and the gain crossover increases with the factor. So the wall is
     # stable up to the first zero of the phase; if there is none below z = -1, up to ``|L(-1)| = 1``.
 
-    def evaluate_phase(log_w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> Array:
+    def evaluate_phase(log_w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Array:
         # Multiply the phase by a positive factor that makes it of order 1 on both sides of w = sqrt(em), because for
         # light damping the phase itself is below its rounding error long before its sign changes.
         w, n, em = xp.exp(log_w), plant.whole, plant.em
@@ -179,7 +179,7 @@ def _find_gain_margin(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) ->
     never_stable = ~(start > 0)
     bracket = low, high, xp.where(never_stable, 1.0, start), -1.0 + 0.0 * low
     log_w = false_position(lambda x: evaluate_phase(x, *wall), *bracket, FALSE_POSITION_STEPS, 1e-15)
-    w = xp.minimum(xp.exp(follow_root(evaluate_phase, log_w, _is_falling, alpha, beta, plant)), np.pi)
+    w = xp.minimum(xp.exp(attach_root_derivatives(evaluate_phase, log_w, _is_falling, alpha, beta, plant)), np.pi)
     gain_at_zero = 1.0 / evaluate_gain_and_phase(w, alpha, beta, plant)[0]
     wall_at_nyquist = xp.abs(plant.gap * (alpha + 2.0 * beta))
     gain_at_nyquist = 2.0 * (1.0 + plant.c) / xp.where(wall_at_nyquist > 0, wall_at_nyquist, 1.0)
@@ -212,7 +212,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
     if xp is not np or dips.any():
         index = xp.argmax(dips, axis=-1)[..., None] + 1
         left, middle, right = (sample(grid, index + k) for k in (-1, 0, 1))
-        f, least = narrow_dips(
+        f, least = minimize_golden_section(
             lambda f: _limit_delay(*_evaluate_fraction(f, *frozen_wall)),
             left,
             middle,
@@ -246,7 +246,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
     f = false_position(
         lambda f: excess(f, n_lost, *frozen_wall), low, high, excess_low, excess_high, FALSE_POSITION_STEPS, width
     )
-    return n_lost + follow_root(excess, f, _is_falling, n_lost, *wall) - d
+    return n_lost + attach_root_derivatives(excess, f, _is_falling, n_lost, *wall) - d
 
 
 def _grade_fractions(delta: Array, xp: Any) -> Array:
@@ -265,4 +265,4 @@ def _limit_delay(w: Array, phase: Array, exists: Array) -> Array:
 
 def _evaluate_fraction(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
     """Return the gain crossover, the phase there, and whether it exists, for a delay f < 1."""
-    return evaluate_at_crossover(alpha, beta, store_once(device(delta, f), f))
+    return evaluate_at_crossover(alpha, beta, store_once(discretize_plant(delta, f), f))

@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.held_mass import DeviceTerms
-from zwidth.arrays.roots import follow_root, newton
+from zwidth.arrays.held_mass import DiscretePlant
+from zwidth.arrays.roots import attach_root_derivatives, newton
 from zwidth.loops.rigid.crossover import find_gain_crossover
 from zwidth.words.types import Array
 from zwidth.words.xp import along, apply_each, frozen, namespace, store_once
 
 
-def evaluate_gain_and_phase(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
+def evaluate_gain_and_phase(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
     """Return the gain ``|L|`` and the phase of L plus pi, at w in (0, pi].
 
     With ``u = 1 - cos w``, ``s = sin w``, ``W = alpha + beta u + j beta s``, M at e^(j w) and ``Z = s + j (em - u)``,
@@ -43,7 +43,7 @@ def evaluate_gain_and_phase(w: Array, alpha: Array, beta: Array, plant: DeviceTe
     return gain, phase - (plant.whole + 0.5) * w
 
 
-def _evaluate_factors(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Any, ...]:
+def _evaluate_factors(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Any, ...]:
     """Return sin(w/2), cos(w/2), u, s, and the real and imaginary parts of W and of M."""
     xp = namespace(w, alpha)
     sine, cosine = xp.sin(0.5 * w), xp.cos(0.5 * w)
@@ -52,7 +52,7 @@ def _evaluate_factors(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -
     return sine, cosine, u, s, (alpha + beta * u, beta * s), (m_re, (plant.a2 - plant.a0) * s)
 
 
-def evaluate_at_crossover(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array, Array]:
+def evaluate_at_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array, Array]:
     """Return the gain crossover, the phase there, and whether the crossover exists; otherwise both are arbitrary."""
     xp = namespace(alpha, plant.delta)
     w, exists = find_gain_crossover(alpha, beta, plant)
@@ -72,7 +72,7 @@ MAX_DIPS = 5
 NEWTON_STEPS = 8
 
 
-def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> Array:
+def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Array:
     """Return ``|1 + L|^2`` at w in (0, pi]: ``L = -W M Z e^(-j (n + 1/2) w)/(2 h |Z|^2)`` with h = sin(w/2)."""
     xp = namespace(w, alpha)
     delay_phase = (2.0 * plant.whole + 1.0) * (0.5 * w)
@@ -89,7 +89,7 @@ def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DeviceT
     return (1.0 - minus_re_loop) ** 2 + im_part * im_part
 
 
-def _differentiate_distance(w: Array, alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
+def _differentiate_distance(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
     """Return half the first and half the second derivative of the squared distance, from the derivatives of log L."""
     xp = namespace(w, alpha)
     n_plus_half, c = plant.whole + 0.5, xp.cos(w)
@@ -110,7 +110,7 @@ def _differentiate_distance(w: Array, alpha: Array, beta: Array, plant: DeviceTe
     )
 
 
-def find_modulus_margin(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[Array, Array]:
+def find_modulus_margin(alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
     """Return the least ``|1 + L|`` over (0, pi] and its frequency w, for alpha > 0, elementwise."""
     xp = namespace(alpha, plant.c)
     wall = alpha, beta, plant
@@ -119,7 +119,7 @@ def find_modulus_margin(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[
         return (w < np.pi) & (curvature > 0)
 
     lowest = _find_lowest(*frozen(wall, xp), xp)
-    w = follow_root(
+    w = attach_root_derivatives(
         lambda *point: _differentiate_distance(*point)[0],
         lowest,
         is_dip,
@@ -129,7 +129,7 @@ def find_modulus_margin(alpha: Array, beta: Array, plant: DeviceTerms) -> tuple[
     return xp.sqrt(xp.maximum(compute_squared_distance(w, *wall), 0.0)), w
 
 
-def _find_lowest(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) -> Array:
+def _find_lowest(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> Array:
     """Return the frequency w at which |1 + L| is smallest."""
 
     def find_frequency_of_gain(level: Array) -> Array:
@@ -139,8 +139,8 @@ def _find_lowest(alpha: Array, beta: Array, plant: DeviceTerms, xp: Any) -> Arra
         return store_once(w, w)
 
     alpha, beta = xp.asarray(alpha), xp.asarray(beta)
-    plant = DeviceTerms(*(xp.asarray(field) for field in plant))
-    wall = alpha[..., None], beta[..., None], DeviceTerms(*(field[..., None] for field in plant))
+    plant = DiscretePlant(*(xp.asarray(field) for field in plant))
+    wall = alpha[..., None], beta[..., None], DiscretePlant(*(field[..., None] for field in plant))
     center = find_frequency_of_gain(xp.ones_like(alpha))
     # Increase the distance slightly, because rounding errors matter if both bounds nearly coincide.
     distance = 1.0001 * xp.sqrt(compute_squared_distance(center, alpha, beta, plant))

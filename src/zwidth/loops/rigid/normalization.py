@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, evaluate, join_shapes
-from zwidth.arrays.held_mass import valid_device
+from zwidth.arrays.held_mass import is_valid_device
 from zwidth.parts.checks import accept_units, in_periods
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS, SI_RANGE, SIZES, WALL_RANGE
@@ -87,7 +87,7 @@ def quantity_status(**values: Array) -> Array:
 
 def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
     """Return whether a wall and its device are valid and in the range of the model."""
-    return valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
+    return is_valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
 
 
 def device_status(delta: Array, d: Array) -> Array:
@@ -115,7 +115,7 @@ def status_of_results(
     for values in results:
         status[np.isnan(values)] = Status.NOT_CONVERGED
     # Check each argument separately first, because usually all are in range.
-    if not (valid_device(*device).all() and all(within(part, WALL_RANGE).all() for part in walls)):
+    if not (is_valid_device(*device).all() and all(within(part, WALL_RANGE).all() for part in walls)):
         input_status = wall_status(*walls, *device)
         np.copyto(status, input_status, where=input_status != Status.OK, casting="unsafe")
     return status

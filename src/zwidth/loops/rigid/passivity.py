@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.evaluate import FEW, as_number, check_scalars, evaluate, evaluate_columns, to_caller
-from zwidth.arrays.held_mass import ANY, DelayClasses, classify_delays, valid_device
+from zwidth.arrays.held_mass import ANY, DelayClasses, classify_delays, is_valid_device
 from zwidth.arrays.roots import integrate
 from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments, group_by_value, restore_shape
 from zwidth.loops.rigid.needed_damping import compute_needed_damping, find_directions, solve_larger_root
@@ -272,7 +272,7 @@ def _passive_area_kernel(delta: Array, d: Array) -> Array:
     (d < 2/9 only) at pi, and in between at a frequency that increases with theta continuously.
     """
     xp = namespace(delta, d)
-    valid = valid_device(delta, d)
+    valid = is_valid_device(delta, d)
     safe_d = xp.where(valid, d, 1.0)
     unit = 1.0 / (safe_d + 0.5)
     # Errors of the limits of the parts have no effect of first order.

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.roots import follow_root
+from zwidth.arrays.roots import attach_root_derivatives
 from zwidth.loops.rigid.circle import LoopFactors, count_poles, factor_loop
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.loops.rigid.pole_step import evaluate_polynomial, halley_step, make_complex, newton_step, shift_pole
@@ -409,7 +409,7 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
             for part in evaluate_polynomial(log_pole.real, log_pole.imag, loop, fractional)[:2]
         ]
 
-    log_pole = follow_root(
+    log_pole = attach_root_derivatives(
         lambda *x: evaluate(*x)[0], make_complex(re, im), lambda *_: True, loop, slope=lambda *x: evaluate(*x)[1]
     )
     (log_radius,) = nan_unless(certified, log_pole.real)

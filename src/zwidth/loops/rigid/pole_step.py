@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.polynomials import square
+from zwidth.arrays.polynomials import abs2
 from zwidth.loops.rigid.circle import LoopFactors
 from zwidth.words.types import Array
 from zwidth.words.xp import COSINE, SINE, epsilon, horner, namespace, store_once
@@ -50,7 +50,7 @@ class Pair:
 
     def over(self, other: Pair) -> Pair:
         """Return the quotient."""
-        size = square(other)
+        size = abs2(other)
         real = (self.real * other.real + self.imag * other.imag) / size
         return Pair(real, (self.imag * other.real - self.real * other.imag) / size)
 
@@ -161,17 +161,17 @@ def newton_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> Ne
     """Compute one Newton step from ``e^(re + j im)``, |im| <= pi."""
     xp = namespace(re, loop.alpha)
     value = evaluate_polynomial(re, im, loop, fractional)
-    norm = square(value.first)
+    norm = abs2(value.first)
     step = value.p * value.first.conjugate() * (-1.0 / norm)
     # A polynomial of degree N has a zero within N |P/P'| of every point.
     degree, slope = loop.n_plus_1 + (3.0 if fractional else 2.0), xp.sqrt(norm)
     rounding_error = value.rounding / slope
     # The second derivative leaves an error after the step; near a double pole it is half the step.
-    curvature_error = square(step) * xp.sqrt(square(value.second)) / slope
+    curvature_error = abs2(step) * xp.sqrt(abs2(value.second)) / slope
     return NewtonStep(
         step.real,
         step.imag,
-        degree * (xp.sqrt(square(value.p)) / slope + rounding_error),
+        degree * (xp.sqrt(abs2(value.p)) / slope + rounding_error),
         rounding_error + curvature_error,
     )
 
@@ -180,11 +180,11 @@ def halley_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> tu
     """Take one Halley step, limited to `MAX_STEP`; return the new point, in the upper half plane."""
     xp = namespace(re, loop.alpha)
     value = evaluate_polynomial(re, im, loop, fractional)
-    inverse_first = value.first.conjugate() * (1.0 / square(value.first))
+    inverse_first = value.first.conjugate() * (1.0 / abs2(value.first))
     step = value.p * inverse_first
     denominator = step * (value.second * inverse_first) * -0.5 + 1.0
-    step = step * denominator.conjugate() * (-1.0 / square(denominator))
-    size = xp.sqrt(square(step)) * (loop.n_plus_1 + 1.0)
+    step = step * denominator.conjugate() * (-1.0 / abs2(denominator))
+    size = xp.sqrt(abs2(step)) * (loop.n_plus_1 + 1.0)
     factor = MAX_STEP / xp.maximum(size, MAX_STEP)
     return shift_pole(re, im, step.real * factor, step.imag * factor)
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from zwidth.arrays.blocks import map_blocks
 from zwidth.arrays.evaluate import as_float64, to_caller
-from zwidth.arrays.polynomials import companion, square
+from zwidth.arrays.polynomials import abs2, companion
 from zwidth.loops.rigid.circle import LoopFactors, factor_loop
 from zwidth.loops.rigid.folding import Degree, count_uncompiled_points, find_degree, map_by_degree
 from zwidth.loops.rigid.normalization import valid_wall, wall_status
@@ -213,14 +213,14 @@ def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, d
         value, slope = evaluate(z)
         stationary = (slope.real == 0) & (slope.imag == 0)
         correction = value.over(Pair(xp.where(stationary, 1.0, slope.real), slope.imag))
-        accepted = ~stationary & (square(correction) < 1e-6 * xp.maximum(square(pair), 1e-6))
+        accepted = ~stationary & (abs2(correction) < 1e-6 * xp.maximum(abs2(pair), 1e-6))
         return make_complex(
             pair.real - xp.where(accepted, correction.real, 0.0), pair.imag - xp.where(accepted, correction.imag, 0.0)
         )
 
     first = xp.moveaxis(z, -1, 0)
     last = repeat(POLISHING_STEPS, step, first, xp)
-    better = square(evaluate(last)[0]) < square(evaluate(first)[0])
+    better = abs2(evaluate(last)[0]) < abs2(evaluate(first)[0])
     return xp.moveaxis(xp.where(better, last, first), 0, -1) + nan_if_invalid[..., None]
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from zwidth.arrays.held_mass import Plant, held_plant, split_delay
+from zwidth.arrays.held_mass import Plant, discretize_mass, split_delay
 from zwidth.arrays.polynomials import Affine
 from zwidth.loops.rigid.folding import Degree, map_by_degree
 from zwidth.loops.rigid.normalization import valid_wall
@@ -25,7 +25,7 @@ from zwidth.words.xp import namespace, nan_with_nan_slopes
 
 def expand_affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
     """Return the coefficient vectors D, N1, N2 of devices of one degree, along a new last axis of degree.poles + 1."""
-    plant = held_plant(delta, d - degree.n if degree.fractional else None)
+    plant = discretize_mass(delta, d - degree.n if degree.fractional else None)
     xp = namespace(plant.a2)
     zero, one = 0.0 * plant.a2, 0.0 * plant.a2 + 1.0
     head = [one, -(1.0 + plant.c), plant.c]
@@ -72,7 +72,7 @@ class FrequencyLoop(NamedTuple):
 def build_frequency_loop(delta: Array, d: Array) -> FrequencyLoop:
     """Return the discretized plant and the integer delay of one (delta, d)."""
     n, fraction = split_delay(d)
-    return FrequencyLoop(held_plant(delta, fraction), n)
+    return FrequencyLoop(discretize_mass(delta, fraction), n)
 
 
 def find_boundary_wall(omega: Reals, loop: FrequencyLoop) -> Wall:

@@ -20,10 +20,10 @@ from zwidth.arrays.held_mass import (
     DelayClasses,
     Plant,
     classify_delays,
-    held_plant,
+    discretize_mass,
+    is_valid_device,
     phi_functions,
     split_delay,
-    valid_device,
 )
 from zwidth.loops.rigid.normalization import device_status
 from zwidth.loops.rigid.ridge_newton import (
@@ -52,7 +52,7 @@ def _compute_chi(x: Array, gap: Array) -> Array:
 
 
 def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
-    """Return the derivatives of `arrays.held_mass.held_plant` in delta and in the fraction of the delay."""
+    """Return the derivatives of `arrays.held_mass.discretize_mass` in delta and in the fraction of the delay."""
     f, t = fraction, 1.0 - fraction
     c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
     phi_t, phi_f = phi_functions(delta * t), phi_functions(delta * f)
@@ -96,10 +96,10 @@ def differentiable_ridge(plant: Plant, n: Array, start: Start, kind: DelayClasse
 
 @cache
 def _jax_plant() -> Any:
-    """Return `arrays.held_mass.held_plant` as a JAX function with derivatives in closed form."""
+    """Return `arrays.held_mass.discretize_mass` as a JAX function with derivatives in closed form."""
     import jax
 
-    function = jax.custom_jvp(lambda delta, fraction: held_plant(delta, fraction))
+    function = jax.custom_jvp(lambda delta, fraction: discretize_mass(delta, fraction))
 
     @function.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple[Plant, Plant]:
@@ -243,9 +243,9 @@ def _solve_point(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Arr
     n, f = split_delay(d)
     start = guess_start(delta, d, f, kind)
     if kind.fractional:
-        plant = held_plant(delta, f) if namespace(delta, f) is np else _jax_plant()(delta, f)
+        plant = discretize_mass(delta, f) if namespace(delta, f) is np else _jax_plant()(delta, f)
     else:
-        plant = held_plant(delta)
+        plant = discretize_mass(delta)
     ridge = store_once(differentiable_ridge(plant, n, start, kind), delta)
     return ridge, status, plant, n, (delta, f)
 
@@ -303,7 +303,7 @@ def stiffness_slope(d: ArrayLike) -> Array:
 
 def slope_kernel(d: Array, kind: DelayClasses = ANY) -> Array:
     """Return `stiffness_slope`, elementwise."""
-    (d,) = nan_unless(valid_device(0.0 * d, d), d)
+    (d,) = nan_unless(is_valid_device(0.0 * d, d), d)
     zero = 0.0 * d
     n, f = split_delay(d)
     # The limit of delta N(z) for delta -> infinity: the velocity is proportional to the force, and e^-delta vanishes.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.held_mass import ANY, DelayClasses, DeviceTerms, Plant
+from zwidth.arrays.held_mass import ANY, DelayClasses, DiscretePlant, Plant
 from zwidth.words.types import Array
 from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
 
@@ -31,7 +31,7 @@ class Curve(NamedTuple):
     gap: Array  # N(-1)
 
 
-def expand_curve(plant: Plant | DeviceTerms) -> Curve:
+def expand_curve(plant: Plant | DiscretePlant) -> Curve:
     """Expand the curve of one plant; no coefficient has cancellation in the range of the ridge."""
     c, em, a2, a1, a0, gap = plant.c, plant.em, plant.a2, plant.a1, plant.a0, plant.gap
     sigma = a2 + a0
@@ -239,7 +239,7 @@ def _find_stationary(curve: Curve, n: Array, start: Start, undelayed: bool) -> t
     return s, s - before
 
 
-def solve_ridge(plant: Plant | DeviceTerms, n: Array, start: Start, kind: DelayClasses) -> Ridge:
+def solve_ridge(plant: Plant | DiscretePlant, n: Array, start: Start, kind: DelayClasses) -> Ridge:
     """Return the ridge of one plant with a delay of n periods."""
     xp = namespace(plant.a2, n)
     undelayed = not kind.long

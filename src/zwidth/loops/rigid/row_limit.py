@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.evaluate import FEW, Route, evaluate_columns
-from zwidth.arrays.held_mass import DeviceTerms, device
+from zwidth.arrays.held_mass import DiscretePlant, discretize_plant
 from zwidth.loops.rigid.crossover import expand_long_delay_curve, expand_short_delay_curve
 from zwidth.loops.rigid.folding import Points, group_by_value
 from zwidth.words.quantities import WALL_RANGE
@@ -69,12 +69,12 @@ def find_on_short_lobe(b: Array, curve: Any) -> tuple[Array, Array]:
     return 2.0 * b * v0 / (linear + xp.sqrt(xp.maximum(discriminant, 0.0))), discriminant >= 0
 
 
-def limit_short_delay(beta: Array, plant: DeviceTerms) -> Array:
+def limit_short_delay(beta: Array, plant: DiscretePlant) -> Array:
     """Return the limit for d < 1: on the lobe, or beyond the corner on the line of poles at z = -1.
 
     It is 0 if no alpha is stable, and NaN for invalid input.
     """
-    p1, psi, tilt = plant.p1, plant.psi, plant.tilt
+    p1, psi, minus_one_coefficient = plant.p1, plant.psi, plant.minus_one_coefficient
     xp = namespace(beta, plant.delta)
     b = beta + plant.delta
     # For d = 0 the limit is phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)).
@@ -83,14 +83,14 @@ def limit_short_delay(beta: Array, plant: DeviceTerms) -> Array:
     y, meets_curve = find_on_short_lobe(b, curve)
     # V = |N|^2 is 0 where the curve goes to infinity; rounding errors must not change its sign there.
     limit = 4.0 * y * horner(y, stiffness_terms) / xp.abs(horner(y, modulus_terms))
-    corner_reached = (tilt > 0) & (stiffness_terms[0] + stiffness_terms[1] + stiffness_terms[2] > 0)
+    corner_reached = (minus_one_coefficient > 0) & (stiffness_terms[0] + stiffness_terms[1] + stiffness_terms[2] > 0)
     beyond = xp.where(corner_reached, xp.inf, 0.0)
     # Beyond the lobe the curve returns from infinity, with b < 0 at first. A line above the whole lobe may meet that
     # part, but it is no stability limit.
     fractional = xp.where(meets_curve & (y <= 1) & (u0 + u1 * y > 0), limit, beyond)
     limit = xp.where(plant.f == 0, integer_limit, fractional)
-    line_limit = 1.0 / xp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
-    limit = xp.where(tilt > 0, xp.minimum(limit, line_limit), limit)
+    line_limit = 1.0 / xp.where(minus_one_coefficient > 0, minus_one_coefficient, 1.0) - 2.0 * beta
+    limit = xp.where(minus_one_coefficient > 0, xp.minimum(limit, line_limit), limit)
     return _mask_limit(limit, b)
 
 
@@ -100,13 +100,13 @@ def _mask_limit(limit: Array, b: Array) -> Array:
     return xp.where(xp.isfinite(b), xp.where((b > 0) & (limit > 0), limit, 0.0), xp.nan)
 
 
-def expand_long_lobe(plant: DeviceTerms) -> LongLobe:
+def expand_long_lobe(plant: DiscretePlant) -> LongLobe:
     """Expand the curve of one device, without the end of the lobe."""
     E, H, V, excess = expand_long_delay_curve(plant)
     return LongLobe(plant.delta, plant.whole + 0.5, *E, *H, *V, *excess)
 
 
-def build_long_lobe(plant: DeviceTerms) -> LongLobe:
+def build_long_lobe(plant: DiscretePlant) -> LongLobe:
     """Expand the curve of one device, and find the end of its lobe and the starting values."""
     lobe = expand_long_lobe(plant)
     em, p1, n, f = plant.em, plant.p1, plant.whole, plant.f
@@ -309,12 +309,12 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, route: Route 
 
 def _short_limit(beta: Array, delta: Array, d: Array) -> Array:
     """Return the limits for d < 1."""
-    return limit_short_delay(beta, device(delta, d))
+    return limit_short_delay(beta, discretize_plant(delta, d))
 
 
 def _long_limit(beta: Array, delta: Array, d: Array) -> Array:
     """Return the limits for d >= 1."""
-    return find_limit_long_delay(beta, build_long_lobe(device(delta, d)))[0]
+    return find_limit_long_delay(beta, build_long_lobe(discretize_plant(delta, d)))[0]
 
 
 def _compare_with_limits(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.pages.verdict import write_check
 from zwidth.pages.words import list_slopes, pole_words, row, spell_radius, word_of
 from zwidth.parts.device import Device
@@ -115,7 +115,7 @@ def step_motion(scene: Scene, periods: int) -> Curve:
 
 def passive_set(scene: Scene) -> Curve | None:
     """The edge of the passive walls, None where no condition is known; empty where no wall is passive."""
-    if find_obstacle(**vars(scene.device)):
+    if find_unsupported_reason(**vars(scene.device)):
         return None
     return passive_edge(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
 

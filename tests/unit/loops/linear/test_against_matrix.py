@@ -11,8 +11,8 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 import zwidth
-from zwidth.loops.linear.curve import curve_at
-from zwidth.loops.linear.poles import poles_less_one
+from zwidth.loops.linear.curve import evaluate_curve
+from zwidth.loops.linear.poles import compute_poles_minus_one
 
 SCENES = 6
 # Poles against balls: their distance, or how far from this loop one is that has them.
@@ -30,7 +30,7 @@ def scenes(kind: str, seed: int, count: int = SCENES) -> list[zwidth.Scene]:
 
 def walls_of(scene: zwidth.Scene, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Normalized walls anywhere, and beside the curve at a relative distance of 1e-9 to 1e-2."""
-    curve = curve_at(scene.loop.roots, generator.choice(scene.loop.boundary.w, 15))
+    curve = evaluate_curve(scene.loop.roots, generator.choice(scene.loop.boundary.w, 15))
     side = 10 ** generator.uniform(-9, -2, 15) * generator.choice([-1.0, 1.0], 15)
     fine = (np.abs(curve.alpha) < 1e6) & (np.abs(curve.beta) < 1e6) & (np.abs(curve.alpha) > 1e-6)
     alpha = 10 ** generator.uniform(-4, 1, 10) * generator.choice([1.0, 1.0, -0.1], 10)
@@ -44,7 +44,7 @@ def test_poles_outside_are_those_of_the_matrix(kind):
     for scene in scenes(kind, 10):
         units = scene.units
         walls = walls_of(scene, generator)
-        for alpha, beta, outside in zip(*walls, scene.loop.boundary.outside(*walls), strict=True):
+        for alpha, beta, outside in zip(*walls, scene.loop.boundary.count_outside(*walls), strict=True):
             wall = alpha * units.stiffness, beta * units.virtual_damping
             sizes = np.abs(np.linalg.eigvals(any_loop.closed_loop_matrix(scene, *wall)))
             expected: int | None = int(np.sum(sizes > 1))
@@ -63,7 +63,7 @@ def test_poles_are_proved_ones(kind):
     for scene in scenes(kind, 20, 40):
         alpha, beta = 10 ** generator.uniform(-3, 0), 10 ** generator.uniform(-2, 0) * generator.choice([0.0, 1.0, 1.0])
         wall = alpha * scene.units.stiffness, beta * scene.units.virtual_damping
-        found = poles_less_one(scene.loop.roots, np.array([alpha]), np.array([beta]))[0]
+        found = compute_poles_minus_one(scene.loop.roots, np.array([alpha]), np.array([beta]))[0]
         try:
             expected, missed = proved_loop.proved_poles(scene, *wall, found)
         except ValueError:

@@ -6,13 +6,13 @@ import proved_loop
 import pytest
 
 import zwidth
-from zwidth.loops.linear.rows import stable_dampings
+from zwidth.loops.linear.rows import find_stable_dampings
 
 
 @pytest.mark.parametrize("alpha", [0.3, 5.0, np.nan, np.inf])
 def test_a_column_beyond_the_stable_set_is_empty(alpha):
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
-    assert stable_dampings(scene.loop.boundary, alpha).shape == (0, 2)
+    assert find_stable_dampings(scene.loop.boundary, alpha).shape == (0, 2)
 
 
 # Columns that a curve crosses next to its ends, beyond its first or last node, or between two narrow turns.
@@ -56,7 +56,7 @@ def check_column(scene, stiffness):
     exact = proved_loop.proved_column(scene, stiffness)
     if exact is None:
         return None
-    found = stable_dampings(scene.loop.boundary, stiffness / scene.units.stiffness) * scene.units.virtual_damping
+    found = find_stable_dampings(scene.loop.boundary, stiffness / scene.units.stiffness) * scene.units.virtual_damping
     assert found.shape == exact.shape, (scene, stiffness, found, exact)
     if exact.size:
         np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-12 * np.abs(exact).max())

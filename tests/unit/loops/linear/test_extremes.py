@@ -10,8 +10,8 @@ import proved_loop
 import pytest
 
 import zwidth
-from zwidth.loops.linear.curve import curve_at
-from zwidth.loops.linear.held import required_wall, sampled
+from zwidth.loops.linear.curve import evaluate_curve
+from zwidth.loops.linear.held import discretize_states, evaluate_controller
 from zwidth.parts.circle import circle
 
 T = 1e-3
@@ -81,14 +81,14 @@ SCENES = {
 def test_counts_are_those_of_proved_poles(name):
     loop, generator = SCENES[name], np.random.default_rng(5)
     boundary, units = loop.loop.boundary, loop.units
-    curve = curve_at(loop.loop.roots, generator.choice(boundary.w, 10))
+    curve = evaluate_curve(loop.loop.roots, generator.choice(boundary.w, 10))
     side = 10 ** generator.uniform(-7, -2, 10) * generator.choice([-1.0, 1.0], 10)
     # Next to w = 0 and to undamped modes, alpha is what rounding leaves of larger numbers.
     fine = (np.abs(curve.alpha) < 1e5) & (np.abs(curve.alpha) > 1e-7) & (np.abs(curve.beta) < 1e5)
     alpha = np.concatenate([10 ** generator.uniform(-3, 0, 6), (curve.alpha * (1 + side))[fine]])
     beta = np.concatenate([generator.uniform(-0.1, 0.5, 6), curve.beta[fine]])
     decided = 0
-    for a, b, outside in zip(alpha, beta, boundary.outside(alpha, beta), strict=True):
+    for a, b, outside in zip(alpha, beta, boundary.count_outside(alpha, beta), strict=True):
         wall = a * units.stiffness, b * units.virtual_damping
         expected = proved_loop.count_outside(loop, *wall)
         decided += expected is not None
@@ -104,8 +104,8 @@ def test_every_row_s_crossings_lead_from_the_count_below_to_the_one_above(name):
     through_nodes = generator.choice(np.concatenate([arc.beta for arc in boundary.arcs]), 300)
     rows = np.concatenate([generator.uniform(-1, 1.5, 300) * 10 ** generator.uniform(-6, 1, 300), through_nodes, [0.0]])
     rows = rows[np.isfinite(rows)]
-    found = boundary.crossings(rows)
-    assert found.sound.all()
+    found = boundary.find_crossings(rows)
+    assert found.consistent.all()
     crossed = np.where(np.isfinite(found.alpha), found.leaving, 0.0).sum(1)
     np.testing.assert_array_equal(boundary.count_below(rows) + crossed, boundary.count_above(rows))
 
@@ -116,10 +116,10 @@ def test_roots_just_before_a_whole_delay_are_those_of_the_exact_response(before,
     tip = tied(0.02, 0.02, "tip", 0.5) if parts != "lag" else None
     driven = zwidth.Device(1.0, 5.0 / T, tip, zwidth.Actuator(cutoff=30.0, order=2))
     loop = scene(driven, 2.0 - before).loop
-    response = sampled(loop.chain)
+    response = discretize_states(loop.chain)
     for w in (1e-3, 0.1, 1.0, 3.0):
-        exact = required_wall(loop.chain, w, response)
-        np.testing.assert_allclose(loop.roots.required_wall(circle(w)).value, exact, rtol=1e-11)
+        exact = evaluate_controller(loop.chain, w, response)
+        np.testing.assert_allclose(loop.roots.evaluate_controller(circle(w)).value, exact, rtol=1e-11)
 
 
 def test_zeros_that_a_period_forgets_are_right_together():
@@ -128,10 +128,10 @@ def test_zeros_that_a_period_forgets_are_right_together():
     damped = zwidth.Device(1.0, 240.0 / T, tied(5.3, 0.37, "motor", 1.5e-3), actuator=slow)
     hand = zwidth.Operator(2.4e-6, 718.0 / T, 2.7 / T**2, 0.042 / T**2, 0.048 / T)
     loop = scene(damped, 3.0, hand=hand).loop
-    response = sampled(loop.chain)
+    response = discretize_states(loop.chain)
     for w in (1e-3, 0.1, 1.0, 3.0):
-        exact = required_wall(loop.chain, w, response)
-        np.testing.assert_allclose(loop.roots.required_wall(circle(w)).value, exact, rtol=1e-10)
+        exact = evaluate_controller(loop.chain, w, response)
+        np.testing.assert_allclose(loop.roots.evaluate_controller(circle(w)).value, exact, rtol=1e-10)
 
 
 def test_a_device_without_any_damping_is_not_stable_behind_a_spring_alone():
@@ -153,7 +153,9 @@ def test_walls_of_a_row_that_contradicts_itself_are_told_by_their_poles(monkeypa
     stiffness, damping = np.linspace(1e3, 3e5, 12), np.array([[0.0], [50.0], [300.0]])
     expected = loop.is_stable(stiffness, damping)
     assert 0 < expected.sum() < expected.size
-    monkeypatch.setattr(type(loop.loop.boundary), "settle", lambda self, beta: (beta, np.zeros(beta.shape, bool)))
+    monkeypatch.setattr(
+        type(loop.loop.boundary), "shift_ambiguous", lambda self, beta: (beta, np.zeros(beta.shape, bool))
+    )
     np.testing.assert_array_equal(loop.is_stable(stiffness, damping), expected)
 
 

@@ -12,8 +12,8 @@ from waiting import LONGEST
 
 import zwidth
 from zwidth import Actuator, Butterworth, Coupling, Device, LowPass, Operator, Scene, Status, Timing, WindowedDifference
-from zwidth.loops.linear.curve import curve_at
-from zwidth.loops.linear.ridge import BoundRidge, Condition, find_ridge, moving_paths
+from zwidth.loops.linear.curve import evaluate_curve
+from zwidth.loops.linear.ridge import Condition, RidgeSolution, find_ridge, list_ridge_parameters
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import RidgeKind
 
@@ -33,7 +33,7 @@ PAPER = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3))
 WINDOW = PAPER.replace(velocity=WindowedDifference(15))
 
 
-def wanted(scene: Scene, negative: bool) -> BoundRidge:
+def wanted(scene: Scene, negative: bool) -> RidgeSolution:
     found = find_ridge(scene.loop.border, negative)
     assert found is not None
     return found
@@ -57,11 +57,11 @@ def test_the_table_of_filters(velocity, undamped, damped):
 def test_the_curve_borders_the_stable_walls_beside_it(delay, damping, velocity):
     scene = PAPER.replace(delay=delay, damping=damping, velocity=velocity)
     boundary = scene.loop.boundary
-    curve = curve_at(boundary.loop, boundary.w)
+    curve = evaluate_curve(boundary.loop, boundary.w)
     # Next to other crossings, and where the curve's own angle is rounding, the two differ in which side they look at.
-    sides = [boundary.outside(curve.alpha * (1.0 + side), curve.beta) for side in (-1e-9, 1e-9)]
+    sides = [boundary.count_outside(curve.alpha * (1.0 + side), curve.beta) for side in (-1e-9, 1e-9)]
     clear = (np.abs(sides[0] - sides[1]) == 2) & (np.minimum(*sides) >= 0)
-    borders = boundary.borders(boundary.w)
+    borders = boundary.are_stable_edges(boundary.w)
     assert clear.mean() > 0.95
     assert 50 < borders.sum() < 0.5 * borders.size
     np.testing.assert_array_equal(borders[clear], np.minimum(*sides)[clear] == 0)
@@ -161,7 +161,7 @@ def test_derivatives_are_those_of_the_search(name):
     got = scene.sensitivities(negative_damping=negative)
     assert got.status == Status.OK
     assert got.stiffness == pytest.approx(wall.stiffness, rel=1e-11)
-    assert set(got.per) == set(moving_paths(scene))
+    assert set(got.per) == set(list_ridge_parameters(scene))
     for path, slope in got.per.items():
         value = scene.parameters()[path]
         if value:
@@ -319,7 +319,9 @@ def test_no_stable_wall_is_no_number():
 def test_a_ridge_without_its_rows_is_refused(monkeypatch):
     scene = PAPER.replace(velocity=LowPass(cutoff=100.0))
     low = wanted(scene, False)
-    monkeypatch.setattr("zwidth.loops.linear.ridge._describe", lambda *_: low._replace(alpha=0.9 * low.alpha))
+    monkeypatch.setattr(
+        "zwidth.loops.linear.ridge._identify_conditions", lambda *_: low._replace(alpha=0.9 * low.alpha)
+    )
     wall = scene.max_stiffness()
     assert np.isnan(wall.stiffness)
     assert wall.status == Status.NOT_CONVERGED

@@ -16,7 +16,7 @@ from mpmath import mpf
 
 import oracles
 import zwidth
-from zwidth.arrays.held_mass import device
+from zwidth.arrays.held_mass import discretize_plant
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -76,7 +76,7 @@ def test_the_limit_at_pi(d):
 
 def test_the_line_of_a_pole_at_minus_one():
     points = np.array(list(itertools.product([0.1, 2.0, 2.31, 4.0, 1e3], [0.0, 0.125, 0.5, 0.9, 1.0, 2.0, 3.3])))
-    for limit, (delta, d) in zip(1.0 / device(*points.T).tilt, points, strict=True):
+    for limit, (delta, d) in zip(1.0 / discretize_plant(*points.T).minus_one_coefficient, points, strict=True):
         with mp.workdps(60):
             # P(-1) is affine in alpha + 2 beta, which is put into alpha alone.
             at_zero, at_one = (oracles.evaluate(oracles.polynomial(a, 0, delta, d), -1) for a in (0, 1))

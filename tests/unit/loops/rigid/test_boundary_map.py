@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zwidth.arrays.held_mass import device
+from zwidth.arrays.held_mass import discretize_plant
 from zwidth.loops.rigid import row_limit as maps
 from zwidth.loops.rigid.row_limit import build_long_lobe, find_limit_long_delay, row_limits
 from zwidth.loops.rigid.verdict import is_stable
@@ -79,7 +79,7 @@ def test_a_map_and_its_points_one_by_one_agree(d):
 @pytest.mark.parametrize("d", [1.0, 2.5, 8.0, 60.0, 500.0])
 @pytest.mark.parametrize("delta", [0.0, 1e-8, 0.3, 4.0, 1e3, 1e6])
 def test_rows_are_solved_to_the_last_digits(d, delta, monkeypatch):
-    fields = build_long_lobe(device(np.float64(delta), np.float64(d)))
+    fields = build_long_lobe(discretize_plant(np.float64(delta), np.float64(d)))
     beta = np.linspace(0.0, 0.999, 500)[1:] * fields.end_b - delta
     limit = row_limits(beta, np.array([delta]), np.array([d]))
     monkeypatch.setattr("zwidth.loops.rigid.row_limit.ROW_STEPS", 6)

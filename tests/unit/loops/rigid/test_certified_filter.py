@@ -44,7 +44,11 @@ def errors(computed, exact, index, precision=BITS):
 
 def numbers(plant, exact):
     """Return the terms of a device and the coefficients of its curve, with their exact values."""
-    names = [name for name, value in plant._asdict().items() if isinstance(value, Sized) and name not in ("p2", "tilt")]
+    names = [
+        name
+        for name, value in plant._asdict().items()
+        if isinstance(value, Sized) and name not in ("p2", "minus_one_coefficient")
+    ]
     pairs = [(getattr(plant, name), getattr(exact, name)) for name in names]
     for curve in (
         (expand_long_delay_curve, expand_short_delay_curve) if exact.a0 is not None else (expand_long_delay_curve,)

@@ -8,7 +8,7 @@ import pytest
 from compiling import QUICKLY, compile_bends
 
 import zwidth
-from zwidth.arrays.held_mass import device
+from zwidth.arrays.held_mass import discretize_plant
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.modulus import compute_squared_distance, find_modulus_margin
 from zwidth.words.errors import InputError
@@ -236,11 +236,15 @@ def test_no_frequency_comes_closer():
             beta = (delta + 0.1) * 10 ** random.uniform(-3, 0.3) * random.choice([-1, 1, 1])
             alpha = 10 ** random.uniform(-8, 1) / (d + 1) * (1 + delta)
         w = np.concatenate([np.linspace(0, np.pi, 200 * (int(d) + 2))[1:], np.geomspace(1e-12, np.pi, 8000)])
-        scanned = np.sqrt(compute_squared_distance(w, alpha, beta, device(np.float64(delta), np.float64(d))).min())
+        scanned = np.sqrt(
+            compute_squared_distance(w, alpha, beta, discretize_plant(np.float64(delta), np.float64(d))).min()
+        )
         found = zwidth.margins(alpha, beta, delta, d)
         assert found.modulus_margin <= scanned * (1 + 1e-12), (alpha, beta, delta, d)
         # And the distance is attained.
-        at = compute_squared_distance(found.modulus_frequency, alpha, beta, device(np.float64(delta), np.float64(d)))
+        at = compute_squared_distance(
+            found.modulus_frequency, alpha, beta, discretize_plant(np.float64(delta), np.float64(d))
+        )
         assert found.modulus_margin == pytest.approx(np.sqrt(at), rel=1e-12)
 
 
@@ -329,7 +333,7 @@ def test_second_derivatives_of_the_modulus_margin_and_of_its_frequency(x64):
 
     def nearest(wall):
         alpha, beta, delta, d = wall
-        return jax.numpy.stack(find_modulus_margin(alpha, beta, device(delta, d)))
+        return jax.numpy.stack(find_modulus_margin(alpha, beta, discretize_plant(delta, d)))
 
     differentiate = compile_bends(jax.jacfwd(nearest))
     for side, bend in zip(np.eye(4), np.moveaxis(differentiate([wall, wall])[1][0], -1, 0), strict=True):

@@ -8,7 +8,7 @@ import tolerances as tol
 from mpmath import mp, mpf
 
 import oracles
-from zwidth.arrays.held_mass import held_plant, phi_functions, split_delay
+from zwidth.arrays.held_mass import discretize_mass, phi_functions, split_delay
 
 FRACTIONS = [0.0, 1e-300, 1e-16, 1e-8, 0.125, 0.25, 0.37, 0.5, 0.75, 0.9, 1 - 2.0**-30, 1 - 2.0**-53]
 DAMPINGS = [0.0, 1e-300, 1e-16, 1e-8, 1e-3, 0.1, 1.0, 2.31, 2.5, 3.0, 8.0, 30.0, 700.0, 1e4, 1e6]
@@ -23,7 +23,7 @@ def digits(delta, fraction):
 @pytest.fixture(scope="module")
 def plants():
     with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, jax.jit(jax.vmap(held_plant))(*jnp.asarray(GRID).T))
+        return jax.tree.map(np.asarray, jax.jit(jax.vmap(discretize_mass))(*jnp.asarray(GRID).T))
 
 
 def test_gap_is_the_numerator_at_minus_one(plants):
@@ -64,7 +64,7 @@ PHYSICAL = [(0.1, 10.0, 1e-3), (0.1, 100.0, 1e-3), (2.0, 1e-9, 5e-4), (0.045, 30
 def transfers(mass, damping, period):
     """Numerator and denominator of the paper's H_v and H_x, from held force in N to sampled velocity and position."""
     delta = np.float64(damping * period / mass)
-    plant = held_plant(delta)
+    plant = discretize_mass(delta)
     gain = period * period / mass
     velocity = [period / mass * phi_functions(delta).phi1], [1.0, -plant.c]
     return velocity, ([gain * plant.a2, gain * plant.a1], [1.0, -(1.0 + plant.c), plant.c])

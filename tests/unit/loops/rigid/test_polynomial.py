@@ -10,7 +10,7 @@ from mpmath import mp, mpf
 
 import oracles
 import zwidth
-from zwidth.arrays.held_mass import held_plant
+from zwidth.arrays.held_mass import discretize_mass
 from zwidth.loops.rigid.folding import find_degree
 from zwidth.loops.rigid.polynomial import expand_affine
 
@@ -137,7 +137,7 @@ def test_si_polynomial_without_damping_is_the_limit():
 @pytest.mark.parametrize("scene", PHYSICAL)
 def test_the_closed_loop_s_numerator_is_that_of_eq_10(scene, d):
     mass, damping, period, *_ = scene
-    plant = held_plant(np.float64(damping * period / mass))
+    plant = discretize_mass(np.float64(damping * period / mass))
     got = period * period / mass * np.array([plant.a2, plant.a1])
     with mp.workdps(80):
         m, b, T = mpf(mass), mpf(damping), mpf(period)
