@@ -148,10 +148,9 @@ def _integrate_with_friction(
         for each in (acceleration, np.full(acceleration.shape, friction))
     )
     acceleration = acceleration.T.ravel()
-    able, gained = (
-        np.flatnonzero(np.abs(acceleration) > friction),
-        {s: s * by_forces - by_friction for s in (1.0, -1.0)},
-    )
+    gained = {s: s * by_forces - by_friction for s in (1.0, -1.0)}
+    # Parts in which the forces can move a mass that sticks.
+    able = np.flatnonzero(np.abs(acceleration) > friction)
     decay = np.exp(-delta * np.arange(count // 2 + 1))
     # Decay since the start of a first or of a second part.
     decays = [np.outer(decay, [1.0, each]).ravel() for each in slow]
@@ -169,7 +168,7 @@ def _integrate_with_friction(
             changes.append((m, s))
         # Find the next part at whose end s v <= 0, in windows of increasing size.
         gain, decay, first, size = gained[s], decays[m % 2], m + 1, 128
-        ahead = s * v - gain.item(m)
+        ahead = s * v - gain.item(m)  # s v_m - G_m
         while first <= count:
             last = min(first + size, count + 1)
             stopped = gain[first:last] + ahead * decay[first - m : last - m] <= 0.0
@@ -185,19 +184,20 @@ def _integrate_with_friction(
             # The sign of s v at the end of the part is a rounding error: the mass does not decelerate.
             v = slow[part] * v + rates[part] * a
             continue
+        # The time from the start of the part to the stop, first without and then with damping.
         before = -v / a
         before = min(log1p(delta * before) / delta if delta else before, h)
         rest, s = h - before, -s if abs(forced) > friction else 0.0
+        # The velocity at the end of the part, from rest at the stop.
         v = (-expm1(-delta * rest) / delta if delta else rest) * (forced - s * friction) if s else 0.0
         stops.append((k, before, s, v))
         changes.append((k + 1, s))
     starts, directions = np.array(changes).T
     direction = np.repeat(directions, np.diff(np.append(starts, count)).astype(int))
     sticks = direction == 0
-    factors, added = (
-        np.where(sticks, 0.0, np.tile(slow, count // 2)),
-        np.tile(rates, count // 2) * (acceleration - direction * friction),
-    )
+    # With known directions and stops, the velocities obey a linear recursion.
+    factors = np.where(sticks, 0.0, np.tile(slow, count // 2))
+    added = np.tile(rates, count // 2) * (acceleration - direction * friction)
     added[sticks] = 0.0
     k, before, after, velocities = np.reshape(stops, (-1, 4)).T
     k = k.astype(int)
@@ -256,10 +256,8 @@ def _integrate_positions(
             rate[k] = a_after - delta * end[k]
             # A change of the velocity just before the stop shifts the stop by -1/a times this change.
             velocity_shift, shift = rate[k] / a[k], end[k] / a[k]
-            moved_by_v[k], velocity_by_v[k] = (
-                t * phi_before.phi1 + shift * phi_before.c,
-                velocity_shift * phi_before.c,
-            )
+            moved_by_v[k] = t * phi_before.phi1 + shift * phi_before.c
+            velocity_by_v[k] = velocity_shift * phi_before.c
             before = _differentiate_segment(phi_before, delta, t, v[k], a[k], force[k], direction[k], sticks[k])
             after = _differentiate_segment(
                 phi_after, delta, r, 0.0 * r, a_after, force[k], direction_after, sticks_after
@@ -295,10 +293,8 @@ def _differentiate_segment(phi: PhiFunctions, delta: float, t: np.ndarray, *segm
     v, a, force, direction, sticks = segment
     minus_phi2_slope = np.where(delta * t == 0, 1.0 / 6.0, phi.gap / np.where(delta * t == 0, 1.0, delta * t))
     by = np.zeros((2, N_COLUMNS, *v.shape))
-    by[0, DELTA], by[1, DELTA] = (
-        -(t**2) * phi.psi * v - t**3 * minus_phi2_slope * a,
-        -t * phi.c * v - t**2 * phi.psi * a,
-    )
+    by[0, DELTA] = -(t**2) * phi.psi * v - t**3 * minus_phi2_slope * a
+    by[1, DELTA] = -t * phi.c * v - t**2 * phi.psi * a
     by[0, OFFSET], by[1, OFFSET] = np.where(sticks, 0.0, t**2 * phi.phi2), np.where(sticks, 0.0, t * phi.phi1)
     by[:, G], by[:, FRICTION] = force * by[:, OFFSET], -direction * by[:, OFFSET]
     return by

@@ -210,11 +210,11 @@ def fit_model(model: Recordings) -> FittedModel:
     direction = float(np.sign(steps.sum()))
     if -np.sum(steps, where=direction * steps < 0) * direction < _BACK * np.abs(steps).sum():
         g, total = best.theta[0], best.theta[-2] - direction * best.theta[-1]
-        parts, omitted = (
-            ((total, LEAST * abs(g) * model.largest_force), -1)
-            if direction * total > 0
-            else ((0.0, -direction * total), -2)
-        )
+        # A total in the direction of motion is a constant force, one against it friction.
+        if direction * total > 0:
+            parts, omitted = (total, LEAST * abs(g) * model.largest_force), -1
+        else:
+            parts, omitted = (0.0, -direction * total), -2
         start = np.append(best.theta[:-2], parts)
         rival = _fit(model, start, (omitted,))
         if rival.inverse.undetermined[-2:].all() and rival.fits_as_well_as(best):
