@@ -106,13 +106,13 @@ def compute_reach(freedom: int | None, upper: float = UPPER) -> float:
 class DeviceEstimate:
     """An estimate of a device with its uncertainty; the attributes are described in `zwidth.DeviceFit`."""
 
-    nominal: Scene
-    covariance: np.ndarray
-    noise: float | tuple[float, float]
-    freedom: int | None = None
-    response: MeasuredDevice | None = None
-    damping_tried: float | None = None
-    stiffness_tried: float | None = None
+    nominal: Scene  # the fitted loop
+    covariance: np.ndarray  # of the parameters, in SI units
+    noise: float | tuple[float, float]  # of the position in m; for walls the relative noise of K and f
+    freedom: int | None = None  # degrees of freedom with which the noise was estimated; None if it is given
+    response: MeasuredDevice | None = None  # of the device, with a radius for an undetected resonance
+    damping_tried: float | None = None  # largest B of the measured walls, N s/m
+    stiffness_tried: float | None = None  # K measured at this B, N/m
 
     # Attributes of the fitted scene.
     mass = property(attrgetter("nominal.device.mass"))
