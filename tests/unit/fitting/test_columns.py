@@ -158,5 +158,5 @@ def test_logs_of_different_axes_are_not_fitted_together(tmp_path):
     coarse = read_log(write(tmp_path, "t,x,F\n0,7,1\n"), {}, resolution="1 mm")
     with pytest.raises(InputError, match="fit them separately"):
         fit_motions([linear, turning])
-    with pytest.raises(InputError, match="resolution: the logs have several"):
+    with pytest.raises(InputError, match="resolution: the logs have different ones"):
         fit_motions([linear, coarse])
