@@ -59,9 +59,8 @@ class FittedMotion(NamedTuple):
     time: np.ndarray  # s
     force: np.ndarray  # N
     position: np.ndarray  # measured, m
-    modelled: (
-        np.ndarray
-    )  # fitted, m; NaN if past forces are unknown (at the start, after gaps), or after 200,000 samples
+    # Fitted positions in m; NaN if past forces are unknown, at the start and after gaps, and after 200,000 samples.
+    modelled: np.ndarray
 
 
 class RivalDevice(NamedTuple):

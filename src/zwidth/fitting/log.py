@@ -19,7 +19,7 @@ from zwidth.fitting.encoder import fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_response, sample_resonances
 from zwidth.fitting.hidden_lag import bound_lag
 from zwidth.fitting.moving import Recording
-from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
+from zwidth.fitting.output_error import MIN_FRICTION, FittedModel, fit_model
 from zwidth.fitting.recordings import ReadLogs, find_even, find_stretches, read_logs
 from zwidth.fitting.structure import Recordings
 from zwidth.parts.checks import check_number
@@ -228,7 +228,7 @@ def _convert_force(best: FittedModel, k: int) -> tuple[float, float]:
     slope = np.array([-value / g, 1.0 / g])
     error = float(np.sqrt(slope @ best.covariance[np.ix_(indices, indices)] @ slope))
     # A friction at the lower bound of the search means no friction.
-    is_zero = k == -1 and value <= 2.0 * LEAST * best.model.largest_force
+    is_zero = k == -1 and value <= 2.0 * MIN_FRICTION * best.model.largest_force
     return 0.0 if is_zero else float(value), error
 
 

@@ -30,12 +30,12 @@ from zwidth.fitting.structure import Recordings
 # Initial values.
 _DELTAS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0)  # damping b T/m
 _FRICTIONS = np.array([0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.35])  # friction, relative to the largest force
-LEAST = 1e-12  # least friction of the search, relative to the largest force, because the derivative vanishes at 0
-_GLIMPSE = 600  # leading positions of each log that determine the initial values
-_AT_ONCE = 32  # delays per batch; bounds the memory
+MIN_FRICTION = 1e-12  # least friction of the search, relative to the largest force; at 0 the derivative vanishes
+_N_LEADING = 600  # leading positions of each log that determine the initial values
+_BATCH_SIZE = 32  # delays per batch; bounds the memory
 # Selection of an initial value.
 _ROUNDS = ((300, 4), (600, 3), (1200, 2), (2500, 1))  # leading positions, and number of initial values that are kept
-_FOLLOWED = 12  # largest number of steps from each initial value per round
+_STEPS_PER_ROUND = 12  # largest number of steps from each initial value per round
 
 # Tolerances of the search: predicted reduction of the sum of squares by the next step, relative to this sum.
 _NEAR = 1e-3  # in the selection of an initial value
@@ -43,20 +43,20 @@ CLOSELY = 2e-5  # in the comparison of device structures
 _CONVERGED = 1e-14  # of the final fit
 NEARLY = 1e-6  # if only the noise is estimated; also accepted as converged if no step decreases the sum of squares
 # Levenberg-Marquardt steps.
-_STEPS = 100  # largest number of steps
-_EASY = 1e-4  # initial damping of the steps
-_LIGHT = 1e-6  # a decreasing damping below this value is set to 0
-_STUBBORN = 1e12  # largest damping, at which the search ends
+_MAX_STEPS = 100  # largest number of steps
+_INITIAL_DAMPING = 1e-4  # initial damping of the steps
+_NEGLIGIBLE_DAMPING = 1e-6  # a decreasing damping below this value is set to 0
+_MAX_DAMPING = 1e12  # largest damping, at which the search ends
 
 # Ambiguity of friction.
-_BACK = 0.1  # a motion is in one direction if its way back is shorter than this share of all motion
-_CLOSE_BY = 900.0  # squared standard errors of the friction, below which a fit without friction is tried
+_BACKWARD_SHARE = 0.1  # a motion is in one direction if its way back is shorter than this share of all motion
+_NEARLY_FRICTIONLESS = 900.0  # squared standard errors of the friction, below which a fit without friction is tried
 _EXCLUDED = 25.0  # squared standard errors from which on a rival does not enlarge the covariance
-_WITHIN = 3.0  # an initial motion shorter than this many standard deviations of the noise is not visible
+_INVISIBLE_DISTANCE = 3.0  # an initial motion shorter than this many standard deviations of the noise is not visible
 # Numerical limits.
-_BLIND = 1e7  # condition number of the columns above which parameters are not determined
+_MAX_CONDITION = 1e7  # condition number of the columns above which parameters are not determined
 _ROUNDING = 1e-13  # relative rounding error of a sum of squares, and of the positions
-_CHANCE = 1e-3  # significance level of the excess of sums of residuals
+_SIGNIFICANCE = 1e-3  # significance level of the excess of sums of residuals
 _Fixed = tuple[int, ...]  # indices of the parameters in theta that keep their initial values
 
 
@@ -127,9 +127,9 @@ class FittedModel:
     def inverse(self) -> ColumnsInverse:
         """The pseudo-inverse of ``columns``, by singular values."""
         left, values, right = np.linalg.svd(self.columns[0], full_matrices=False)
-        blind = values * _BLIND < values[0]
+        blind = values * _MAX_CONDITION < values[0]
         inverse = right[~blind].T / values[~blind] @ left[:, ~blind].T
-        return ColumnsInverse(inverse, np.any(np.abs(right[blind]) > _BLIND**-0.5, axis=0), left[:, ~blind])
+        return ColumnsInverse(inverse, np.any(np.abs(right[blind]) > _MAX_CONDITION**-0.5, axis=0), left[:, ~blind])
 
     def estimate_step(self, k: int) -> float:
         """Return the step to the unconstrained minimum of a parameter fixed at its bound, in standard errors.
@@ -165,7 +165,7 @@ class FittedModel:
         if not expected > 0:
             return 1.0
         ratio = float(np.mean(sums**2)) / expected
-        return ratio if ratio * starts.size > chdtri(starts.size, _CHANCE) else 1.0
+        return ratio if ratio * starts.size > chdtri(starts.size, _SIGNIFICANCE) else 1.0
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -208,11 +208,11 @@ def fit_model(model: Recordings) -> FittedModel:
     # little, because noise can cause that.
     steps = np.diff(best.response.position)
     direction = float(np.sign(steps.sum()))
-    if -np.sum(steps, where=direction * steps < 0) * direction < _BACK * np.abs(steps).sum():
+    if -np.sum(steps, where=direction * steps < 0) * direction < _BACKWARD_SHARE * np.abs(steps).sum():
         g, total = best.theta[0], best.theta[-2] - direction * best.theta[-1]
         # A total in the direction of motion is a constant force, one against it friction.
         if direction * total > 0:
-            parts, omitted = (total, LEAST * abs(g) * model.largest_force), -1
+            parts, omitted = (total, MIN_FRICTION * abs(g) * model.largest_force), -1
         else:
             parts, omitted = (0.0, -direction * total), -2
         start = np.append(best.theta[:-2], parts)
@@ -221,9 +221,9 @@ def fit_model(model: Recordings) -> FittedModel:
             return rival
     # Without friction the mass never rests. There the sum of squares has a kink, beyond which it may increase less than
     # the derivatives predict; therefore compare with a fit without friction.
-    if best.theta[-1] ** 2 < _CLOSE_BY * best.covariance[-1, -1]:
+    if best.theta[-1] ** 2 < _NEARLY_FRICTIONLESS * best.covariance[-1, -1]:
         start = best.theta - np.nan_to_num(best.covariance[:, -1]) * best.theta[-1] / best.covariance[-1, -1]
-        start[-1] = LEAST * abs(start[0]) * model.largest_force
+        start[-1] = MIN_FRICTION * abs(start[0]) * model.largest_force
         frictionless = fit_nonnegative(model, start, (-1,))
         if best.fits_as_well_as(frictionless):
             return replace(best, rivals=(frictionless,))
@@ -234,11 +234,11 @@ def fit_model(model: Recordings) -> FittedModel:
 def _list_starts(model: Recordings) -> list[np.ndarray]:
     """Return initial values of theta: one without friction, and the best one for each friction of a grid.
 
-    For each friction, damping and delay are those of least squares on a grid, for the first `_GLIMPSE` positions.
+    For each friction, damping and delay are those of least squares on a grid, for the first `_N_LEADING` positions.
     """
     # At fixed damping, delay, and velocities and accelerations relative to g, the positions are linear in all other
     # parameters. One response per damping serves all integer delays: it begins earlier and is shifted.
-    model = model.truncate(_GLIMPSE)
+    model = model.truncate(_N_LEADING)
     base, most = np.zeros(model.size), int(model.longest)
     early = Recordings(
         tuple(Recording(log.force, np.zeros(log.position.size + most), log.skip - most) for log in model.logs)
@@ -251,7 +251,7 @@ def _list_starts(model: Recordings) -> list[np.ndarray]:
     def search(deltas: tuple[float, ...]) -> tuple[float, int]:
         """Return the damping and the delay of the least sum of squares."""
         tried = []
-        for delta, some in product(deltas, np.array_split(np.arange(most + 1), 1 + most // _AT_ONCE)):
+        for delta, some in product(deltas, np.array_split(np.arange(most + 1), 1 + most // _BATCH_SIZE)):
             rows = np.swapaxes(_simulate_rows(early, delta, 0.0, base)[:, samples - some[:, None]], 0, 1)
             squares = _combine_rows(rows, model.measured)[1]
             tried += [(float(each), delta, d) for each, d in zip(squares, some.tolist(), strict=True)]
@@ -308,7 +308,7 @@ def _select_start(model: Recordings, starts: list[np.ndarray]) -> np.ndarray:
     """
     for count, kept in _ROUNDS:
         part = model.truncate(count)
-        refined = [minimize_squares(part, start, (), _FOLLOWED, _NEAR) for start in starts]
+        refined = [minimize_squares(part, start, (), _STEPS_PER_ROUND, _NEAR) for start in starts]
         starts = [theta for theta, *_ in sorted(refined, key=lambda result: result[1])[:kept]]
     return starts[0]
 
@@ -321,7 +321,7 @@ def _fit(model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: fl
     speed, (_, delta, *_, friction) = np.abs(best.theta[model.velocity_indices]), best.theta
     # The distance to the stop, interpolated: v^2/(2 c) without damping, v/delta without friction.
     distance = speed**2 / (2.0 * friction + delta * speed)
-    invisible = (distance > 0) & (distance < _WITHIN * np.sqrt(best.variance))
+    invisible = (distance > 0) & (distance < _INVISIBLE_DISTANCE * np.sqrt(best.variance))
     if invisible.any():
         still = best.theta.copy()
         still[model.velocity_indices[invisible]] = 0.0
@@ -344,7 +344,7 @@ def fit_nonnegative(
 
 
 def minimize_squares(
-    model: Recordings, start: np.ndarray, fixed: _Fixed, most: int = _STEPS, tolerance: float = _CONVERGED
+    model: Recordings, start: np.ndarray, fixed: _Fixed, most: int = _MAX_STEPS, tolerance: float = _CONVERGED
 ) -> tuple[np.ndarray, float, bool]:
     """Minimize the weighted sum of squares by Levenberg-Marquardt steps within the bounds of theta.
 
@@ -359,9 +359,9 @@ def minimize_squares(
         theta, the sum of squares, and whether the search converged.
     """
     low, high = model.bounds()
-    low[-1] = LEAST * abs(start[0]) * model.largest_force
+    low[-1] = MIN_FRICTION * abs(start[0]) * model.largest_force
     low[list(fixed)] = high[list(fixed)] = start[list(fixed)]
-    theta, measured, damping = np.clip(start, low, high), model.measured, _EASY
+    theta, measured, damping = np.clip(start, low, high), model.measured, _INITIAL_DAMPING
 
     def evaluate(theta: np.ndarray) -> tuple[ModelResponse, np.ndarray, float]:
         response = model.simulate(theta)
@@ -388,11 +388,11 @@ def minimize_squares(
             trial_response, trial_residuals, trial_squares = evaluate(trial)
             # Accept steps whose effect is below the rounding error of the sum of squares, as the last ones are.
             better = trial_squares < squares or max(predicted, trial_squares - squares) <= _ROUNDING * squares
-            if better or damping > _STUBBORN:
+            if better or damping > _MAX_DAMPING:
                 break
             if predicted <= tolerance * squares:
                 return theta, squares, True
-            damping = max(10.0 * damping, _EASY)
+            damping = max(10.0 * damping, _INITIAL_DAMPING)
         if not better:
             # No step along the derivatives decreases the sum of squares, because of a kink or rounding errors.
             break
@@ -400,7 +400,7 @@ def minimize_squares(
         # Decrease the damping if the reduction was about as predicted; increase it below half of that (Nielsen 1999).
         ratio = (before - squares) / predicted if predicted > 0 else 0.0
         factor = max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
-        damping = 0.0 if damping < _LIGHT and factor < 1.0 else factor * damping
+        damping = 0.0 if damping < _NEGLIGIBLE_DAMPING and factor < 1.0 else factor * damping
         if before - squares <= tolerance * before and predicted <= tolerance * before:
             return theta, squares, True
     return theta, squares, predicted <= NEARLY * squares

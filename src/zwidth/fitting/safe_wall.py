@@ -37,8 +37,8 @@ from zwidth.words.status import Status
 _SAMPLES = 8000  # largest number of random devices
 _SEARCHED = 5  # number of random devices for a search, in multiples of ``LinearLoop.draws``
 _CONFIRMED = 2  # the same to confirm a wall
-_CLOSE = 1e-3  # relative accuracy of K
-_NOTHING = 1e-4  # K below this ratio to K_max of the devices counts as 0
+_ACCURACY = 1e-3  # relative accuracy of K
+_NEGLIGIBLE = 1e-4  # K below this ratio to K_max of the devices counts as 0
 _BELOW = 1e-9  # relative distance of K below the limit of the active device
 # Frequency grid, in rad per sample.
 _SLOWEST = 1e-4  # lowest frequency
@@ -48,7 +48,7 @@ _EVEN_PER_PERIOD = 40  # further frequencies on this grid per period of delay
 _FARTHEST = (20.0, 1.5)  # largest delay of a device in periods: a constant, and a factor of the estimated delay
 # Confirmation of a wall by eigenvalues.
 _SOFTER = (1.0, 0.5, 0.1)  # checked stiffnesses, relative to K
-_ASTRAY = 2e-3  # largest share of devices for which eigenvalues may contradict the grid of frequencies
+_MAX_CONTRADICTED = 2e-3  # largest share of devices for which eigenvalues may contradict the grid of frequencies
 
 
 @shown(resonance="Hz")
@@ -93,7 +93,7 @@ def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> Safe
         return SafeWall(0.0, 0.0, 1.0, int(Status.OK), resonance)
     stiffness *= 1.0 - _BELOW
     share = devices.share(stiffness, virtual_damping)
-    if share < reliability - max(_ASTRAY, 1.0 / count):
+    if share < reliability - max(_MAX_CONTRADICTED, 1.0 / count):
         return _UNDECIDED
     return SafeWall(stiffness, virtual_damping, share, int(Status.OK), resonance)
 
@@ -140,8 +140,8 @@ class _RigidDevices(RigidVariants):
     def find(self, reliability: float, most: float) -> tuple[float, float]:
         """Return K and B of the stiffest wall with B <= ``most``; both 0 if no wall is stable on enough devices."""
         low, high, damping = 0.0, borne_by(self.stiffest()[0], reliability), 0.0
-        least = _NOTHING * high
-        while high > max((1.0 + _CLOSE) * low, least):
+        least = _NEGLIGIBLE * high
+        while high > max((1.0 + _ACCURACY) * low, least):
             stiffness = 0.5 * (low + high)
             trial = self._find_best_damping(stiffness)
             limit = self.limit(trial, reliability)
