@@ -156,7 +156,7 @@ def bound_errors(made: Made) -> dict[str, float]:
     by_truth[[0, 1], 0] = -theta[:2] / mass
     by_truth[1, 1], by_truth[2, 2] = PERIOD / mass, 1 / PERIOD
     by_truth[[5, 6], 0], by_truth[5, 5], by_truth[6, 6] = -theta[5:] / mass, g, g
-    slopes = model.follow(theta).slopes @ by_truth
+    slopes = model.simulate(theta).derivatives @ by_truth
     sizes = np.linalg.norm(slopes, axis=0)
     seen = sizes > 0
     slopes = slopes[:, seen] / sizes[seen]

@@ -1,4 +1,8 @@
-"""Fit of a rigid device to walls at the onset of instability: their stiffness, damping and frequency."""
+"""Fit a rigid device to walls at the onset of instability, given by their stiffness, damping and frequency.
+
+`fitting.buzz_search` finds the device by least squares; this module checks the walls and the fit, and proposes the most
+informative next measurement. ``theta = (ln m, delta, d)`` are the unknowns of `fitting.buzzing`.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +19,21 @@ from zwidth.fitting.buzz_search import (
     RigidFit,
     are_on_boundary,
     find_device,
-    is_blind,
-    weigh,
+    is_rank_deficient,
+    weight_derivatives,
 )
 from zwidth.fitting.buzzing import Onsets
-from zwidth.fitting.device_estimate import differentiate, find_stiffest
-from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, VAGUE, DeviceFit, FurtherExperiment, RivalDevice, doubt_period
-from zwidth.fitting.words import spell_rival
+from zwidth.fitting.device_estimate import differentiate, differentiate_stiffness_max
+from zwidth.fitting.device_fit import (
+    BEYOND,
+    MASS_OPEN,
+    VAGUE,
+    DeviceFit,
+    FurtherExperiment,
+    RivalDevice,
+    check_period_unit,
+)
+from zwidth.fitting.words import format_rival
 from zwidth.parts.checks import check_number, find_kind, read_texts
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.scenes.scene import Scene
@@ -31,7 +43,7 @@ from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 from zwidth.words.units import read_share
 
-CHANCE = 0.003  # probability of refusing the walls of a rigid device
+CHANCE = 0.003  # probability that the walls of a rigid device are refused because of their noise
 ROUGH = 0.1  # largest standard deviation of K and f if the noise is not given
 ANGLES = 240  # frequencies on the boundary that are candidates for the next experiment
 SAME = 1e-6  # dampings with a smaller relative difference count as one
@@ -99,8 +111,8 @@ def fit_buzz(
 
     Example:
         >>> import zwidth
-        >>> heard = [(6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)]
-        >>> fit = zwidth.fit_buzz(heard, period="1 ms", noise=0.02)
+        >>> walls = [(6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)]
+        >>> fit = zwidth.fit_buzz(walls, period="1 ms", noise=0.02)
         >>> print(f"{fit.mass * 1e3:.0f} g")
         100 g
     """
@@ -119,68 +131,68 @@ def fit_buzz(
     velocity = BackwardDifference() if velocity is None else velocity
     if not isinstance(velocity, Velocity):
         raise InputError(f"velocity: got {velocity!r}; give an estimate, as zwidth.LowPass(cutoff=100)")
-    share = _read_noise(noise)
-    table, doubts = _read_points(points, period, share is None, system)
-    kappa, rub, w = (table * [period**2, period, 2 * np.pi * period]).T
-    onsets = Onsets(kappa, rub, w, velocity, period, system=system)
-    weights = 1.0 / np.array(share or (1.0, 1.0))
-    chosen = find_device(onsets, weights, share is not None)
-    best, equals = chosen.best, chosen.equals
-    scale = chosen.scale
-    against = None
-    if share and best.squares > chdtri(chosen.freedom, CHANCE):
-        far = plain(np.sqrt(best.squares / chosen.freedom), 2)
-        against = (
-            f"no rigid device has these walls: residuals are {far} times the noise; check K, B and f, or fit a log for "
-            "lags and resonances"
+    noise_pair = _read_noise(noise)
+    table, warnings = _read_points(points, period, noise_pair is None, system)
+    kappa, scaled_damping, w = (table * [period**2, period, 2 * np.pi * period]).T
+    onsets = Onsets(kappa, scaled_damping, w, velocity, period, system=system)
+    weights = 1.0 / np.array(noise_pair or (1.0, 1.0))
+    rigid_fit = find_device(onsets, weights, noise_pair is not None)
+    best, equals = rigid_fit.best, rigid_fit.equals
+    scale = rigid_fit.scale
+    refusal = None
+    if noise_pair and best.squares > chdtri(rigid_fit.freedom, CHANCE):
+        ratio = plain(np.sqrt(best.squares / rigid_fit.freedom), 2)
+        refusal = (
+            f"no rigid device has these walls: residuals are {ratio} times the noise; check K, B and f, or fit a log "
+            "for lags and resonances"
         )
-    elif not share and scale > ROUGH**2:
-        against = (
+    elif not noise_pair and scale > ROUGH**2:
+        refusal = (
             f"no rigid device has these walls: residuals are {plain(100 * np.sqrt(scale), 2)} %; check K, B, f "
             "and the period, fit a log, or give a larger noise"
         )
     elif not equals:
-        against = "these walls are not on the stability boundary of the fitted device; check K, B, f and the period"
-    status = Status.NO_BOUNDARY if against else Status.OK
-    slopes = weigh(onsets.follow(best.theta).slopes(), weights)
-    _refuse_blind(slopes, best.theta, table, bool(equals), system)
-    information = slopes.T @ slopes / scale
-    scene = chosen.scene(best.theta)
-    by_theta = differentiate(lambda theta: onsets.normalize(theta).to_numbers(period), best.theta)
-    stiffest, slope = find_stiffest(scene)
+        refusal = "these walls are not on the stability boundary of the fitted device; check K, B, f and the period"
+    status = Status.NO_BOUNDARY if refusal else Status.OK
+    derivatives = weight_derivatives(onsets.predict_walls(best.theta).differentiate(), weights)
+    _require_identifiability(derivatives, best.theta, table, bool(equals), system)
+    information = derivatives.T @ derivatives / scale
+    scene = rigid_fit.scene(best.theta)
+    by_theta = differentiate(lambda theta: onsets.normalize(theta).to_parameters(period), best.theta)
+    stiffness_max, gradient = differentiate_stiffness_max(scene)
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
-    apart = [best.theta]
+    distinct = [best.theta]
     for other in equals[1:] if status == Status.OK else ():
         # Skip devices that differ from a listed one only along poorly determined directions.
-        if all((away := other.theta - one) @ information @ away > AS_GOOD for one in apart):
-            apart.append(other.theta)
-    rivals = tuple(_describe_rival(chosen.scene(theta)) for theta in apart[1:])
+        if all((step := other.theta - one) @ information @ step > AS_GOOD for one in distinct):
+            distinct.append(other.theta)
+    rivals = tuple(_describe_rival(rigid_fit.scene(theta)) for theta in distinct[1:])
     if rivals:
         status = Status.UNDECIDED
-        doubts.append(
-            f"another device fits equally well: {spell_rival(rivals[0], system)}; add the experiment named next"
+        warnings.append(
+            f"another device fits equally well: {format_rival(rivals[0], system)}; add the measurement proposed as next"
         )
-    if against:
-        doubts.append(against)
+    if refusal:
+        warnings.append(refusal)
     else:
         if covariance[0, 0] > (VAGUE * scene.device.mass) ** 2:
-            doubts.append(MASS_OPEN)
+            warnings.append(MASS_OPEN)
         if best.squares > EXACT:
-            doubts += [
-                f"the {name} is 0 at best: a negative one would fit better"
-                for name in best.held
-                if name != "delay" or _delay_beyond(slopes, best) < -BEYOND * np.sqrt(scale)
+            warnings += [
+                f"the {name} is at its lower bound, 0: a negative one would fit better; check K, B, f and the period"
+                for name in best.fixed
+                if name != "delay" or _estimate_delay_step(derivatives, best) < -BEYOND * np.sqrt(scale)
             ]
-    further = _further(chosen, stiffest, information, slope @ by_theta, weights**2 / scale)
+    further = _propose_measurement(rigid_fit, stiffness_max, information, gradient @ by_theta, weights**2 / scale)
     stiffness, damping, _ = table[np.argmax(table[:, 1])].tolist()
     fit = DeviceFit(
         nominal=scene,
         covariance=covariance,
-        noise=share or (float(np.sqrt(scale)), float(np.sqrt(scale))),
+        noise=noise_pair or (float(np.sqrt(scale)), float(np.sqrt(scale))),
         residuals=best.residuals / np.sqrt(scale),
-        doubts=(*doubts, *doubt_period(period)),
+        doubts=(*warnings, *check_period_unit(period)),
         status=int(status),
-        freedom=None if share else chosen.freedom,
+        freedom=None if noise_pair else rigid_fit.freedom,
         rivals=rivals,
         damping_tried=damping,
         stiffness_tried=stiffness,
@@ -212,7 +224,7 @@ def _read_points(
                 f"points[{k}]: got {point!r}; give K in {units[0]}, B in {units[1]} and f in Hz, as (6e3, 0, 37.6)"
             )
         if not row[0] > 0:
-            raise InputError(f"points[{k}].stiffness: got {row[0]:g} {units[0]}; it must be greater than 0 to buzz")
+            raise InputError(f"points[{k}].stiffness: got {row[0]:g} {units[0]}; it must be greater than 0")
         if not 0 < row[2] < 0.5 / period:
             raise InputError(
                 f"points[{k}].frequency: got {row[2]:g} Hz; it must be greater than 0 and less than half the sampling "
@@ -220,10 +232,10 @@ def _read_points(
             )
         rows.append(row)
     if not rows:
-        raise InputError("points: got none; raise K at B = 0 until the wall buzzes, and again at another B")
-    doubts = []
+        raise InputError("points: got none; raise K at B = 0 until the wall becomes unstable, and again at another B")
+    warnings = []
     if copies_count_once and len(kept := list(dict.fromkeys(map(tuple, rows)))) < len(rows):
-        doubts.append(
+        warnings.append(
             f"{len(rows) - len(kept)} of the walls repeat others to the last digit and count once; give the noise if "
             "they were measured again"
         )
@@ -237,10 +249,11 @@ def _read_points(
             f"points: {count} not determine m, b and t_d; add another damping: raise K at B = "
             f"{with_unit(table[0, 1] + 0.4 * unit, units[1], 2)}"
         )
-    return table, doubts
+    return table, warnings
 
 
 def _read_noise(noise: Any) -> tuple[float, float] | None:
+    """Return the relative noise of K and of f, None if it is not given; raise `InputError` if it is invalid."""
     if noise is None:
         return None
     try:
@@ -254,28 +267,29 @@ def _read_noise(noise: Any) -> tuple[float, float] | None:
 
 
 def _describe_rival(scene: Scene) -> RivalDevice:
+    """Return the parameters and K_max of another device that fits equally well."""
     return RivalDevice(scene.mass, scene.damping, scene.timing.delay, float(scene.max_stiffness().stiffness))
 
 
-def _delay_beyond(slopes: np.ndarray, best: Candidate) -> float:
+def _estimate_delay_step(derivatives: np.ndarray, best: Candidate) -> float:
     """Return the least-squares delay of a fit whose delay is fixed at 0, in standard errors for unit noise."""
-    inverse = np.linalg.pinv(slopes)[2]
+    inverse = np.linalg.pinv(derivatives)[2]
     return float(inverse @ best.residuals.ravel() / np.linalg.norm(inverse))
 
 
-def _refuse_blind(
-    slopes: np.ndarray, theta: np.ndarray, table: np.ndarray, on_boundary: bool, system: UnitSystem
+def _require_identifiability(
+    derivatives: np.ndarray, theta: np.ndarray, table: np.ndarray, on_boundary: bool, system: UnitSystem
 ) -> None:
     """Raise `InputError` if the walls do not determine mass, damping and delay.
 
     Args:
-        slopes: weighted derivatives of the residuals in theta.
+        derivatives: weighted derivatives of the residuals in theta.
         theta: parameters of the best device.
         table: walls, shape (walls, 3).
         on_boundary: the walls are on the stability boundary of that device.
         system: units of the walls.
     """
-    if is_blind(slopes):
+    if is_rank_deficient(derivatives):
         dampings = ", ".join(f"{value:g}" for value in np.unique(table[:, 1]))
         if not on_boundary:
             raise InputError(
@@ -289,34 +303,34 @@ def _refuse_blind(
         )
 
 
-def _further(
-    chosen: RigidFit, stiffest: float, information: np.ndarray, wanted: np.ndarray, precision: np.ndarray
+def _propose_measurement(
+    rigid_fit: RigidFit, stiffness_max: float, information: np.ndarray, wanted: np.ndarray, precision: np.ndarray
 ) -> FurtherExperiment | None:
     """Return the wall with B >= 0 on the boundary of the device that reduces the error of K_max most; None without one.
 
     Args:
-        chosen: the fit.
-        stiffest: K_max.
+        rigid_fit: the fit.
+        stiffness_max: K_max.
         information: information matrix of theta from the measured walls.
         wanted: derivatives of K_max in theta.
         precision: inverse variances of ln K and ln f.
     """
-    onsets, theta = chosen.onsets, chosen.best.theta
-    scene, period = chosen.scene(theta), onsets.period
+    onsets, theta = rigid_fit.onsets, rigid_fit.best.theta
+    scene, period = rigid_fit.scene(theta), onsets.period
     w = np.linspace(0.0, np.pi, ANGLES + 2)[1:-1]
     # The boundary of slow loops is at low frequencies.
     w = np.concatenate([np.geomspace(1e-4, w[0], 60)[:-1], w])
     stiffness, damping = scene.boundary(w / period)
     # Walls softer than a tenth of K_max are hard to measure.
-    real = (damping >= 0) & (stiffness > 0.1 * stiffest)
-    real[real] = are_on_boundary(scene, stiffness[real], damping[real])
-    if not real.any():
+    valid = (damping >= 0) & (stiffness > 0.1 * stiffness_max)
+    valid[valid] = are_on_boundary(scene, stiffness[valid], damping[valid])
+    if not valid.any():
         return None
-    stiffness, damping, w = stiffness[real], damping[real], w[real]
-    walls = replace(onsets, kappa=stiffness * period**2, rub=damping * period, w=w)
-    rows = walls.follow(theta).slopes()
-    more = np.einsum("nki,k,nkj->nij", rows, precision, rows)
-    after = np.linalg.solve(information + more, wanted[:, None])[..., 0] @ wanted
+    stiffness, damping, w = stiffness[valid], damping[valid], w[valid]
+    walls = replace(onsets, kappa=stiffness * period**2, scaled_damping=damping * period, w=w)
+    rows = walls.predict_walls(theta).differentiate()
+    added = np.einsum("nki,k,nkj->nij", rows, precision, rows)
+    after = np.linalg.solve(information + added, wanted[:, None])[..., 0] @ wanted
     best = int(np.argmin(after))
     return FurtherExperiment(
         float(damping[best]),

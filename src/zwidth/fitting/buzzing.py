@@ -4,8 +4,9 @@ With z = e^(jw), w = 2 pi f T, a pole pair is on the unit circle if and only if
 
     K T^2 + B T F(z) = m q(z),     q = -1/G,
 
-two real equations per wall (docs/theory/scenes.md). For a given B they determine w and K. The unknowns are
-``theta = (ln m, delta, d)``.
+two real equations per wall (docs/theory/scenes.md), with the response G of the device and the velocity estimate F. For
+a given B they determine w and K. The unknowns are ``theta = (ln m, delta, d)``: the mass m, the damping delta = b T/m
+and the delay d in sampling periods.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.fitting.device_estimate import DimensionlessDevice
-from zwidth.fitting.required_wall import RequiredWall
+from zwidth.fitting.required_wall import CriticalController
 from zwidth.parts.circle import circle
 from zwidth.parts.velocity import Estimate, Velocity
 from zwidth.words.unit_system import LINEAR, UnitSystem
@@ -27,16 +28,18 @@ from zwidth.words.unit_system import LINEAR, UnitSystem
 STEPS = 25  # largest number of iterations
 LONGEST = 0.15  # largest step, relative to w, so that the iteration stays close to the measured frequency
 CONVERGED = 1e-9  # relative step at which the iteration ends; because convergence is quadratic, w is then exact
-FOUND = 1e-6  # largest relative last step of a solution
+SOLVED = 1e-6  # largest relative last step of a solution
 
 
-class Followed(NamedTuple):
+class PredictedWalls(NamedTuple):
     """Walls of a device at the measured dampings."""
 
     kappa: np.ndarray  # K T^2, kg
     w: np.ndarray  # rad per sample
-    found: np.ndarray  # mask of the walls for which the iteration converged
-    slopes: Callable[[], np.ndarray]  # returns the derivatives of ln kappa and ln w in theta, shape (walls, 2, 3)
+    converged: np.ndarray  # mask of the walls for which the iteration converged
+    differentiate: Callable[
+        [], np.ndarray
+    ]  # returns the derivatives of ln kappa and ln w in theta, shape (walls, 2, 3)
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class Onsets:
     """Measured walls, and the velocity estimate and period of their loop."""
 
     kappa: np.ndarray  # K T^2, kg
-    rub: np.ndarray  # B T, kg
+    scaled_damping: np.ndarray  # B T, kg
     w: np.ndarray  # rad per sample
     velocity: Velocity
     period: float  # s
@@ -52,39 +55,43 @@ class Onsets:
 
     @cached_property
     def _estimate(self) -> Estimate:
+        """The velocity estimate at this period."""
         return self.velocity.estimate(self.period)
 
     def normalize(self, theta: np.ndarray) -> DimensionlessDevice:
         """Return the device with the parameters theta."""
         return DimensionlessDevice(np.exp(theta[0]), *theta[1:3])
 
-    def follow(self, theta: np.ndarray) -> Followed:
+    def predict_walls(self, theta: np.ndarray) -> PredictedWalls:
         """Return the walls of the device theta at the measured dampings, with w nearest to the measured one."""
-        mass, required, estimate, w = np.exp(theta[0]), RequiredWall(*theta[1:3]), self._estimate, self.w
+        mass, controller, estimate, w = np.exp(theta[0]), CriticalController(*theta[1:3]), self._estimate, self.w
         step = np.full(w.shape, np.inf)
         for _ in range(STEPS):
-            at = circle(w)
-            f, q = estimate.jet(at), required.jet(at)
-            rest, slope = (self.rub * f.value - mass * q.value).imag, (self.rub * f.slope - mass * q.slope).imag
-            step = np.clip(-rest / slope, -LONGEST * w, LONGEST * w)
+            points = circle(w)
+            f, q = estimate.jet(points), controller.evaluate_rigid(points)
+            residual, slope = (
+                (self.scaled_damping * f.value - mass * q.value).imag,
+                (self.scaled_damping * f.slope - mass * q.slope).imag,
+            )
+            step = np.clip(-residual / slope, -LONGEST * w, LONGEST * w)
             w = np.minimum(w + step, 0.5 * (w + np.pi))
             # Do not iterate on walls whose step is NaN, because it stays NaN.
             if not np.any(np.abs(step) > CONVERGED * w):
                 break
-        at = circle(w)
-        f, q = estimate.jet(at), required.jet(at)
-        kappa = (mass * q.value - self.rub * f.value).real
+        points = circle(w)
+        f, q = estimate.jet(points), controller.evaluate_rigid(points)
+        kappa = (mass * q.value - self.scaled_damping * f.value).real
 
         def differentiate() -> np.ndarray:
-            # d kappa + e_w dw = m dq - rub dF, with e_w = rub F' - m q'.
-            moved = mass * np.stack([q.value, *required.moves(at, q.value)], -1)
-            by_w = (self.rub * f.slope - mass * q.slope)[:, None]
+            # d kappa + e_w dw = m dq - B T dF, with e_w = B T F' - m q'.
+            moved = mass * np.stack([q.value, *controller.differentiate(points, q.value)], -1)
+            by_w = (self.scaled_damping * f.slope - mass * q.slope)[:, None]
             dw = moved.imag / by_w.imag
             return np.stack([(moved.real - by_w.real * dw) / kappa[:, None], dw / w[:, None]], 1)
 
-        return Followed(kappa, w, np.abs(step) <= FOUND * w, differentiate)
+        return PredictedWalls(kappa, w, np.abs(step) <= SOLVED * w, differentiate)
 
-    def starts(self, deltas: np.ndarray, longest: float, count: int) -> list[np.ndarray]:
+    def list_starts(self, deltas: np.ndarray, longest: float, count: int) -> list[np.ndarray]:
         """Return initial values of theta: the lowest local minima of the squared errors of the complex equation.
 
         Args:
@@ -96,11 +103,11 @@ class Onsets:
         from scipy.ndimage import minimum_filter
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)
-        at = circle(self.w)
-        q = RequiredWall(deltas[:, None, None], delays[:, None]).jet(at).value
-        away = np.log((self.kappa + self.rub * self._estimate.jet(at).value) / q)
-        log_mass = away.real.mean(-1)
-        cost = (away.imag**2).sum(-1) + ((away.real - log_mass[..., None]) ** 2).sum(-1)
+        points = circle(self.w)
+        q = CriticalController(deltas[:, None, None], delays[:, None]).evaluate_rigid(points).value
+        errors = np.log((self.kappa + self.scaled_damping * self._estimate.jet(points).value) / q)
+        log_mass = errors.real.mean(-1)
+        cost = (errors.imag**2).sum(-1) + ((errors.real - log_mass[..., None]) ** 2).sum(-1)
         lowest = np.argwhere(cost == minimum_filter(cost, 3, mode="constant", cval=np.inf))
-        dips = sorted(lowest.tolist(), key=lambda place: cost[tuple(place)])[:count]
-        return [np.array([log_mass[i, j], deltas[i], delays[j]]) for i, j in dips]
+        minima = sorted(lowest.tolist(), key=lambda index: cost[tuple(index)])[:count]
+        return [np.array([log_mass[i, j], deltas[i], delays[j]]) for i, j in minima]

@@ -28,7 +28,8 @@ _EXPLAINED = 0.25  # a further force is the cause if it leaves less than this sh
 
 # Test of the residuals.
 _SHARE = 0.5  # a force is the cause if it explains more than this share of the residual sum of squares
-# The same share for rounding errors of the force: lower, because their size is computed and not fitted.
+# Least share that rounding errors of the force must explain: lower than `_SHARE`, because the size of these errors is
+# computed and not fitted.
 _ROUNDING_SHARE = 0.2
 _TRIALS = 4  # random draws of the rounding errors
 _MIN_LEVELS = 8  # least number of distinct forces for which a common step is attributed to rounding
@@ -38,12 +39,12 @@ _MIN_STEP = 2e-4  # least rounding step, relative to the largest force
 class Cause(NamedTuple):
     """A cause of motion that the logged force does not explain."""
 
-    words: str  # clause for a message; "" if no cause was identified
+    text: str  # clause for a message; "" if no cause was identified
     reversed: bool = False  # the force, or the position, has the wrong sign
 
 
 def explain_motion(logs: tuple[Recording, ...], period: float, system: UnitSystem) -> Cause:
-    """Return the cause of a motion that the force does not explain; ``words`` is empty if no cause is identified.
+    """Return the cause of a motion that the force does not explain; ``text`` is empty if no cause is identified.
 
     The equation of motion ``x'' = g F - delta x' + o + e(x)``, in sampling periods, is multiplied by smooth test
     functions and integrated by parts. The result is linear in the coefficients g, delta and o and in those of e, the
@@ -58,12 +59,12 @@ def explain_motion(logs: tuple[Recording, ...], period: float, system: UnitSyste
             continue
         acceleration, force, speed, constant, position, sine, cosine = np.concatenate(rows, axis=1)
         total = float(acceleration @ acceleration)
-        free, rest = _solve(acceleration, [force, speed, constant])
-        spring, with_spring = _solve(acceleration, [force, speed, constant, position])
+        free, squares = _fit_columns(acceleration, [force, speed, constant])
+        spring, with_spring = _fit_columns(acceleration, [force, speed, constant, position])
         gravity, with_gravity = (
-            _solve(acceleration, [force, speed, constant, sine, cosine]) if system.rotary else (None, np.inf)
+            _fit_columns(acceleration, [force, speed, constant, sine, cosine]) if system.rotary else (None, np.inf)
         )
-        if min(with_spring, with_gravity) < min(lowest, _EXPLAINED * rest):
+        if min(with_spring, with_gravity) < min(lowest, _EXPLAINED * squares):
             lowest = min(with_spring, with_gravity)
             if gravity is not None and gravity[0] > 0 and with_gravity < 0.5 * with_spring:
                 size = float(np.hypot(*gravity[3:])) / gravity[0]
@@ -72,7 +73,7 @@ def explain_motion(logs: tuple[Recording, ...], period: float, system: UnitSyste
                 stiffness = -spring[3] / spring[0]
                 size = f"{'-' if stiffness < 0 else ''}{with_unit(abs(stiffness), system['N/m'], 3)}"
                 best = Cause(f"a spring or gravity of about {size} also moves the device")
-        if not best.words and free[0] < 0 and rest < _SIGN * total:
+        if not best.text and free[0] < 0 and squares < _SIGN * total:
             best = Cause("", reversed=True)
     return best
 
@@ -90,44 +91,46 @@ def _integrate(log: Recording, window: int) -> np.ndarray | None:
     phase = np.pi * (np.arange(window + 1) / window)
     # sin^4 and its first derivative vanish at the ends, so that the integration by parts has no boundary terms.
     function = np.sin(phase) ** 4
-    slope = 4.0 * np.sin(phase) ** 3 * np.cos(phase) * np.pi / window
-    bend = (12.0 * np.sin(phase) ** 2 * np.cos(phase) ** 2 - 4.0 * np.sin(phase) ** 4) * (np.pi / window) ** 2
+    derivative = 4.0 * np.sin(phase) ** 3 * np.cos(phase) * np.pi / window
+    second_derivative = (12.0 * np.sin(phase) ** 2 * np.cos(phase) ** 2 - 4.0 * np.sin(phase) ** 4) * (
+        np.pi / window
+    ) ** 2
     x, force = log.position - log.position.mean(), log.force[log.skip :][:count]
-    columns = [(bend, x), (function, force), (-slope, x), (function, np.ones(count)), (function, x)]
+    columns = [(second_derivative, x), (function, force), (-derivative, x), (function, np.ones(count)), (function, x)]
     columns += [(function, np.sin(log.position)), (function, np.cos(log.position))]
     return np.array([np.convolve(values, weight[::-1], "valid")[:: window // 4] for weight, values in columns])
 
 
-def _solve(wanted: np.ndarray, columns: list[np.ndarray]) -> tuple[np.ndarray, float]:
+def _fit_columns(wanted: np.ndarray, columns: list[np.ndarray]) -> tuple[np.ndarray, float]:
     """Return the least-squares coefficients and the residual sum of squares."""
     matrix = np.array(columns).T
     sizes = np.linalg.norm(matrix, axis=0)
     sizes = np.where(sizes > 0, sizes, 1.0)
     values = np.linalg.lstsq(matrix / sizes, wanted, rcond=None)[0]
-    rest = wanted - matrix / sizes @ values
-    return values / sizes, float(rest @ rest)
+    residuals = wanted - matrix / sizes @ values
+    return values / sizes, float(residuals @ residuals)
 
 
 def explain_residuals(best: FittedModel, system: UnitSystem) -> str:
     """Return the cause of residuals that are not white noise as a clause; "" if no cause is identified."""
-    slopes = best.motion.slopes
-    basis = np.linalg.qr(slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300))[0]
+    derivatives = best.response.derivatives
+    basis = np.linalg.qr(derivatives / np.maximum(np.linalg.norm(derivatives, axis=0), 1e-300))[0]
     left = best.residuals - basis @ (basis.T @ best.residuals)
     squares = float(left @ left)
     # Test for rounding first, because the response to rounding errors drifts and resembles that of a weak spring.
     if rounded := _explain_rounding(best, basis, squares, system):
         return rounded
 
-    def explain(*pushes: list[np.ndarray]) -> float:
+    def explain(*accelerations: list[np.ndarray]) -> float:
         """Return the share of the residual sum of squares that the responses to further accelerations explain."""
-        columns = np.array([_respond(best, push) for push in pushes]).T
+        columns = np.array([_simulate_accelerations(best, each) for each in accelerations]).T
         columns = columns - basis @ (basis.T @ columns)
-        return 1.0 - _solve(left, list(columns.T))[1] / squares
+        return 1.0 - _fit_columns(left, list(columns.T))[1] / squares
 
     places = [log.position - log.position.mean() for log in best.model.logs]
     spring = explain([-each for each in places])
     if system.rotary and max(map(np.ptp, places)) > 0.5:
-        gravity = explain(*([turn(log.position) for log in best.model.logs] for turn in (np.sin, np.cos)))
+        gravity = explain(*([function(log.position) for log in best.model.logs] for function in (np.sin, np.cos)))
         if gravity > _SHARE and gravity > spring + 0.1:
             return "they depend on the angle, as gravity would cause"
     # The stiffness is not estimated, because the fitted friction absorbs a part of the spring force.
@@ -136,17 +139,17 @@ def explain_residuals(best: FittedModel, system: UnitSystem) -> str:
     return ""
 
 
-def _respond(best: FittedModel, pushes: list[np.ndarray]) -> np.ndarray:
+def _simulate_accelerations(best: FittedModel, accelerations: list[np.ndarray]) -> np.ndarray:
     """Return the position response to further accelerations, without friction, of all logs in one array.
 
     Args:
         best: fitted model, which supplies the damping.
-        pushes: accelerations of each log in m per squared sampling period, one per position.
+        accelerations: accelerations of each log in m per squared sampling period, one per position.
     """
     delta = float(best.theta[1])
     moved = []
-    for log, push in zip(best.model.logs, pushes, strict=True):
-        force = np.concatenate([np.full(log.skip, push[0]), push])
+    for log, acceleration in zip(best.model.logs, accelerations, strict=True):
+        force = np.concatenate([np.full(log.skip, acceleration[0]), acceleration])
         moved.append(Recording(force, log.position, log.skip).move(1.0, delta, 0.0).position)
     return np.concatenate(moved)
 
@@ -160,18 +163,18 @@ def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float, syst
         squares: residual sum of squares.
     """
     forces = np.concatenate([log.force for log in best.model.logs])
-    step, largest = find_steps(forces)[1], best.model.largest
+    step, largest = find_steps(forces)[1], best.model.largest_force
     if step < _MIN_STEP * largest or np.unique(forces).size < _MIN_LEVELS:
         return ""
     rng, expected = np.random.default_rng(0), []
     for _ in range(_TRIALS):
-        pushes = []
+        accelerations = []
         for log in best.model.logs:
             force = log.force[log.skip :][: log.position.size]
             # Samples of equal force have the same rounding error.
             run = np.append(0, np.cumsum(np.diff(force) != 0))
-            pushes.append(best.theta[0] * rng.uniform(-0.5 * step, 0.5 * step, run[-1] + 1)[run])
-        moved = _respond(best, pushes)
+            accelerations.append(best.theta[0] * rng.uniform(-0.5 * step, 0.5 * step, run[-1] + 1)[run])
+        moved = _simulate_accelerations(best, accelerations)
         moved = moved - basis @ (basis.T @ moved)
         expected.append(float(moved @ moved))
     if np.mean(expected) < _ROUNDING_SHARE * squares:

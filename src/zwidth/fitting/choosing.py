@@ -1,4 +1,11 @@
-"""Selection of the structure of a device by Schwarz's criterion: rigid, or with an actuator lag and resonances."""
+"""Select the structure of a device by Schwarz's criterion: a rigid mass, or one with an actuator lag and resonances.
+
+The model is extended step by step. As long as a score test of the residuals (`zwidth.fitting.hidden`, `hidden_lag`)
+detects a missing pole or lag, every model with one *part* more is fitted: a lag of the next order, or a resonance at
+the frequencies of the highest scores. Schwarz's criterion (BIC, Schwarz 1978) prefers the model of the lowest sum of
+the *misfit*, -2 log(likelihood), and log(N) per parameter for N positions. ``theta`` is the parameter vector of
+`zwidth.fitting.structure.Recordings`.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +17,22 @@ import numpy as np
 
 from zwidth.fitting.hidden import HiddenPole, PoleBank, detect_missing_pole, rank_poles
 from zwidth.fitting.hidden_lag import LagTest, score_lags
-from zwidth.fitting.output_error import CLOSELY, NEARLY, FittedModel, refine, settle
+from zwidth.fitting.output_error import CLOSELY, NEARLY, FittedModel, fit_nonnegative, minimize_squares
 from zwidth.fitting.structure import Recordings
 
-_MOST = 4  # largest number of parts that are added: orders of the actuator lag, and resonances
-_TOLD = 2500  # positions of each log with which the candidates are compared
-_BEGUN = 20  # iterations from each initial value
-_COMPARED = 40  # further iterations of the best candidate of each structure
+_MAX_PARTS = 4  # largest number of parts that are added: orders of the actuator lag, and resonances
+_N_COMPARED = 2500  # positions of each log with which the candidates are compared
+_FIRST_STEPS = 20  # iterations from each initial value
+_FURTHER_STEPS = 40  # further iterations of the best candidate of each structure
 ALIKE = 1.5  # largest excess (`FittedModel.excess`) of residuals that count as white noise
 EXACT = 1e-9  # residuals below this size, relative to the range of positions, are rounding errors
-_BY_CHANCE = 5.99  # reduction of -2 log(likelihood) by two superfluous parameters, exceeded with probability 5 %
+_BY_CHANCE = 5.99  # reduction of the misfit by two superfluous parameters, exceeded with probability 5 %
 # Initial values of actuator lags.
-_LAGS = (0.3, 1.5)  # time constants, in periods
-_RATIO = 0.7  # damping ratio of a second-order lag
+_TIME_CONSTANTS = (0.3, 1.5)  # time constants, in periods
+_DAMPING_RATIO = 0.7  # damping ratio of a second-order lag
 # Initial values of resonances.
-_PARTED = 2  # number of initial frequencies
-_APART = float(np.exp(0.2))  # least ratio of two initial frequencies
+_N_FREQUENCIES = 2  # number of initial frequencies
+_FREQUENCY_SPACING = float(np.exp(0.2))  # least ratio of two initial frequencies
 
 Choice = tuple[FittedModel, HiddenPole | None, PoleBank | None, LagTest | None]
 
@@ -36,82 +43,83 @@ def choose_structure(best: FittedModel) -> Choice:
     If the residuals of the final model are not white noise, the rigid device is returned.
 
     Returns:
-        The selected model, the pole that it still lacks or that it may have instead of its lag, the scores of all
-        poles, and the test for lags; None for what was not found or not tested.
+        The selected model; a pole that it still lacks, or a resonance that it may have instead of its lag, or None; the
+        scores of all poles; and the test for lags. The scores are None if the residuals are rounding errors, the test
+        for lags also if a pole is missing or the model has a lag.
     """
-    way = max(float(np.ptp(log.position)) for log in best.model.logs)
-    if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * way**2:
+    span = max(float(np.ptp(log.position)) for log in best.model.logs)
+    if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * span**2:
         return best, None, None, None
-    rigid = best, pole, bank, lags = _look(best)
+    rigid = best, pole, bank, lags = _test_residuals(best)
     rival = None
-    for _ in range(_MOST):
+    for _ in range(_MAX_PARTS):
         # The signature of a lag has a known amplitude, so its test can detect a lag that the score of a pole does not.
-        late = lags is not None and lags.projection.max() ** 2 > 2.0 * np.log(best.count)
-        if bank is None or rival or (pole is None and not late):
+        has_lag = lags is not None and lags.projection.max() ** 2 > 2.0 * np.log(best.count)
+        if bank is None or rival or (pole is None and not has_lag):
             break
-        richer, rival = _grow(best, bank)
-        if richer is None:
+        larger, rival = _add_part(best, bank)
+        if larger is None:
             break
-        best, pole, bank, lags = _look(richer)
+        best, pole, bank, lags = _test_residuals(larger)
     if best is rigid[0] or not (rival or (pole is None and best.excess <= ALIKE)):
         return rigid
-    best = settle(best.model, best.theta)
-    known = best.arrived and not best.inverse.open[: best.model.parts.stop].any()
-    return (best, rival or pole, bank, lags) if known else rigid
+    best = fit_nonnegative(best.model, best.theta)
+    is_determined = best.converged and not best.inverse.undetermined[: best.model.parts.stop].any()
+    return (best, rival or pole, bank, lags) if is_determined else rigid
 
 
-def _look(best: FittedModel) -> Choice:
-    """Test the residuals for missing poles; without any, and if the model has no lag, also for lags."""
+def _test_residuals(best: FittedModel) -> Choice:
+    """Test the residuals for a missing pole; if none is missing and the model has no lag, test for lags, too."""
     pole, bank = detect_missing_pole(best)
     return best, pole, bank, None if pole or best.model.lag else score_lags(best)
 
 
-def _grow(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, HiddenPole | None]:
+def _add_part(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, HiddenPole | None]:
     """Return the best model with one part more, and a resonance that may replace its lag.
 
     The model is None if Schwarz's criterion prefers the present one. A weak resonance resembles a lag, which has fewer
     parameters, but a very different K_max. Therefore the resonance is returned if it fits significantly better.
     """
-    begun: dict[tuple[int, int], tuple[float, Recordings, np.ndarray]] = {}
-    for lag, modes, start in _start(best, bank):
-        model = replace(best.model, lag=lag, modes=modes).begin(_TOLD)
-        theta, squares, _ = refine(model, start, (), _BEGUN, CLOSELY)
-        if squares < begun.get((lag, modes), (np.inf,))[0]:
-            begun[lag, modes] = squares, model, theta
+    first_fits: dict[tuple[int, int], tuple[float, Recordings, np.ndarray]] = {}
+    for lag, modes, start in _list_starts(best, bank):
+        model = replace(best.model, lag=lag, modes=modes).truncate(_N_COMPARED)
+        theta, squares, _ = minimize_squares(model, start, (), _FIRST_STEPS, CLOSELY)
+        if squares < first_fits.get((lag, modes), (np.inf,))[0]:
+            first_fits[lag, modes] = squares, model, theta
     tried = []
-    for _, model, start in begun.values():
-        theta, squares, _ = refine(model, start, (), _COMPARED, CLOSELY)
-        # Schwarz's criterion: -2 log(likelihood) plus log(count) per parameter.
+    for _, model, start in first_fits.values():
+        theta, squares, _ = minimize_squares(model, start, (), _FURTHER_STEPS, CLOSELY)
         misfit = model.measured.size * np.log(squares)
         tried.append((misfit + theta.size * np.log(model.measured.size), misfit, model, theta))
     _, least, model, theta = min(tried, key=lambda trial: trial[0])
     model = replace(model, logs=best.model.logs)
-    found = settle(model, theta, (), NEARLY)
+    selected = fit_nonnegative(model, theta, (), NEARLY)
     if model.resolution:
-        found = settle(replace(model, noise=found.noise), found.theta, (), NEARLY)
-    if best.lag_behind(found) <= (found.theta.size - best.theta.size) * np.log(best.count):
+        selected = fit_nonnegative(replace(model, noise=selected.noise), selected.theta, (), NEARLY)
+    if best.compare_misfit(selected) <= (selected.theta.size - best.theta.size) * np.log(best.count):
         return None, None
     for _, misfit, other, theta in tried:
         if other.modes > model.modes and misfit < least - _BY_CHANCE:
-            return found, HiddenPole(float(theta[other.parts.stop - 3]) / (2.0 * np.pi), True, instead=True)
-    return found, None
+            return selected, HiddenPole(float(theta[other.parts.stop - 3]) / (2.0 * np.pi), True, replaces_lag=True)
+    return selected, None
 
 
-def _start(best: FittedModel, bank: PoleBank) -> Iterator[tuple[int, int, np.ndarray]]:
+def _list_starts(best: FittedModel, bank: PoleBank) -> Iterator[tuple[int, int, np.ndarray]]:
     """Yield models with one part more: the order of the lag, the number of modes, and the initial theta."""
     model, theta = best.model, best.theta
     lag, modes, logs, first = model.lag, model.modes, len(model.logs), model.parts.stop
     if lag == 0:
-        for late in _LAGS:
-            if late <= theta[2] + 0.5:
-                start = [theta[0], theta[1], max(theta[2] - late, 0.0), late]
+        for delay in _TIME_CONSTANTS:
+            if delay <= theta[2] + 0.5:
+                start = [theta[0], theta[1], max(theta[2] - delay, 0.0), delay]
                 yield 1, modes, np.r_[start, theta[3:]]
-                yield 2, modes, np.r_[start, _RATIO, theta[3:]]
+                yield 2, modes, np.r_[start, _DAMPING_RATIO, theta[3:]]
     elif lag == 1:
-        yield 2, modes, np.r_[theta[:4], _RATIO, theta[4:]]
-    speeds, states = np.split(theta[first:-2], [2 * logs])
+        yield 2, modes, np.r_[theta[:4], _DAMPING_RATIO, theta[4:]]
+    # A further mode starts with mass ratio 0 and without a free response.
+    rigid_states, states = np.split(theta[first:-2], [2 * logs])
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
     complex_poles = bank.select(bank.ratio < 1.0)
-    for _, frequency, ratio in islice(rank_poles(complex_poles, _APART), _PARTED):
+    for _, frequency, ratio in islice(rank_poles(complex_poles, _FREQUENCY_SPACING), _N_FREQUENCIES):
         mode = [2.0 * np.pi * frequency, ratio, 0.0]
-        yield lag, modes + 1, np.r_[theta[:first], mode, speeds, states, theta[-2:]]
+        yield lag, modes + 1, np.r_[theta[:first], mode, rigid_states, states, theta[-2:]]

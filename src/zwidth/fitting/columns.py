@@ -51,10 +51,10 @@ class LoggedMotion:
     """Columns of one log in SI units.
 
     Attributes:
-        time: in s; None where none was read.
+        time: in s; None if no times were read.
         position: in m, or in rad of a rotary axis.
         force: in N, or in N m of a rotary axis.
-        resolution: step of the encoder in m or rad; None where it is not known.
+        resolution: step of the encoder in m or rad; None if it is unknown.
         rotary: whether the axis turns.
         notes: interpretations of the columns that the user should check, one clause each.
 
@@ -118,19 +118,20 @@ def read_log(
             f"{table.nameless}; add a header such as 'time [s],position [m],force [N]', or specify each column by its "
             "number and unit, as 1:ms, 2:mm and 3:N for time, position and force (1:s+2:ns for a time in two columns)"
         )
-    places = find_columns(file, heads, columns, wanted)
-    taken = [place for column in places.values() for place in column.places]
+    sources = find_columns(file, heads, columns, wanted)
+    taken = [index for column in sources.values() for index in column.indices]
     if len(set(taken)) < len(taken):
-        words = ", ".join(f"{name} {heads[column.places[0]]!r}" for name, column in places.items())
-        raise InputError(f"{file}: the same column is used twice: {words}; specify another one")
+        names = ", ".join(f"{name} {heads[column.indices[0]]!r}" for name, column in sources.items())
+        raise InputError(f"{file}: the same column is used twice: {names}; specify another one")
     cells = dict(zip(taken, table.numbers(taken, gaps=True), strict=True))
-    for place, column in cells.items():
+    for index, column in cells.items():
         if not np.isfinite(column).any():
-            raise InputError(f"{file}: column {heads[place]!r} contains no number; specify another column")
-    whole = _look_like_counts(cells[places["position"].places[0]])
-    given, notes = _name_units(heads, places, resolution, whole)
-    moves = _without_rate(given["position"])
-    units = {**given, "position": moves or given["position"]}
+            raise InputError(f"{file}: column {heads[index]!r} contains no number; specify another column")
+    is_counts = _look_like_counts(cells[sources["position"].indices[0]])
+    given, notes = _name_units(heads, sources, resolution, is_counts)
+    # The unit of the position if the column is a velocity.
+    integrated = _integrate_unit(given["position"])
+    units = {**given, "position": integrated or given["position"]}
     constant = 1.0
     if given["force"] in _AMPERES:
         constant, units["force"] = _read_constant(motor_constant, given["force"])
@@ -146,14 +147,14 @@ def read_log(
             )
         factors["position"] = step
     factors["force"] *= constant
-    numbers = {name: cells[places[name].places[0]] * factors[name] for name in factors}
-    time = None if period is not None else _join_times(places["time"], cells, notes)
+    numbers = {name: cells[sources[name].indices[0]] * factors[name] for name in factors}
+    time = None if period is not None else _join_times(sources["time"], cells, notes)
     if period is not None:
         _compare_period(file, table, period)
-    if moves is not None:
+    if integrated is not None:
         timed = np.zeros(1) if time is None else time[np.isfinite(time)]
-        apart = float(timed[-1] - timed[0]) / max(1, timed.size - 1) if period is None else period
-        speed = numbers["position"] * apart * (1 / 60 if given["position"] == "rpm" else 1.0)
+        interval = float(timed[-1] - timed[0]) / max(1, timed.size - 1) if period is None else period
+        speed = numbers["position"] * interval * (1 / 60 if given["position"] == "rpm" else 1.0)
         numbers["position"] = np.where(np.isnan(speed), np.nan, np.cumsum(np.nan_to_num(speed)))
     return LoggedMotion(time, numbers["position"], numbers["force"], step, rotary, tuple(notes))
 
@@ -165,52 +166,52 @@ def _look_like_counts(position: np.ndarray) -> bool:
 
 
 def _name_units(
-    heads: Sequence[str], places: Mapping[str, Column], resolution: Any, whole: bool
+    heads: Sequence[str], sources: Mapping[str, Column], resolution: Any, is_counts: bool
 ) -> tuple[dict[str, str], list[str]]:
     """Return the unit of each quantity, and notes on the interpretations that the user should check.
 
     Args:
         heads: headers of the table.
-        places: column of each quantity.
+        sources: column of each quantity.
         resolution: encoder resolution as specified; an angle implies a rotary axis.
-        whole: whether the positions look like encoder counts; if so, positions without a unit are read in counts.
+        is_counts: whether the positions look like encoder counts; if so, positions without a unit are read in counts.
     """
-    units = {name: column.units[0] for name, column in places.items()}
+    units = {name: column.units[0] for name, column in sources.items()}
     notes = []
-    if any(column.guessed for column in places.values()):
-        names = [f"{name} {' + '.join(repr(heads[k]) for k in column.places)}" for name, column in places.items()]
+    if any(column.guessed for column in sources.values()):
+        names = [f"{name} {' + '.join(repr(heads[k]) for k in column.indices)}" for name, column in sources.items()]
         notes.append(f"columns identified by their headers: {', '.join(names)}")
     for name in ("position", "force"):
-        header_unit, asked = places[name].header_unit, places[name].units[0]
-        sizes = [size for unit in (header_unit, asked) if (size := _measure(name, unit)) is not None]
-        if header_unit != asked and len(sizes) == 2 and abs(sizes[0] / sizes[1] - 1) > _ROUNDING:
-            notes.append(f"the {name} is read in {asked}, as specified, although its header has {header_unit}")
+        header_unit, specified = sources[name].header_unit, sources[name].units[0]
+        sizes = [size for unit in (header_unit, specified) if (size := _measure(name, unit)) is not None]
+        if header_unit != specified and len(sizes) == 2 and abs(sizes[0] / sizes[1] - 1) > _ROUNDING:
+            notes.append(f"the {name} is read in {specified}, as specified, although its header has {header_unit}")
     if units["force"] in _WEIGHTS:
         mass, units["force"] = units["force"], _WEIGHTS[units["force"]]
         weight = FORCE.in_base("1", 0, units["force"])
         notes.append(f"the force in {mass} is read as a weight: 1 {mass} = {plain(weight or 0)} N")
-    if whole and not units["position"]:
+    if is_counts and not units["position"]:
         units["position"] = COUNTS[0]
-        notes.append(f"the position {heads[places['position'].places[0]]!r} has no unit and is read in counts")
-    if _turns(units, places, resolution):
+        notes.append(f"the position {heads[sources['position'].indices[0]]!r} has no unit and is read in counts")
+    if _is_rotary(units, sources, resolution):
         for name, unit in (("position", "rad"), ("force", "N m")):
-            if not units[name] and places[name].turns is not False:
+            if not units[name] and sources[name].is_rotary is not False:
                 units[name] = unit
-                notes.append(f"the {name} {heads[places[name].places[0]]!r} has no unit and is read in {unit}")
+                notes.append(f"the {name} {heads[sources[name].indices[0]]!r} has no unit and is read in {unit}")
     return units, notes
 
 
-def _turns(units: Mapping[str, str], places: Mapping[str, Column], resolution: Any) -> bool:
+def _is_rotary(units: Mapping[str, str], sources: Mapping[str, Column], resolution: Any) -> bool:
     """Return whether the axis is rotary: by the units, by the resolution, or by the headers, in this order."""
     for name in ("force", "position"):
         linear, angular = DIMENSIONS[name]
-        base = _without_rate(units[name]) or units[name]
+        base = _integrate_unit(units[name]) or units[name]
         for dimension in (linear, angular):
             if base and dimension.in_base("1", 0, base) is not None:
                 return dimension is angular
     if resolution is not None and read_step(resolution)[1] is not None:
         return bool(read_step(resolution)[1])
-    return any(places[name].turns for name in ("force", "position"))
+    return any(sources[name].is_rotary for name in ("force", "position"))
 
 
 def _measure(name: str, unit: str) -> float | None:
@@ -234,8 +235,8 @@ def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[s
         notes: receives a note if the unit is assumed.
     """
     total: Any = 0.0
-    for place, unit in zip(column.places, column.units, strict=True):
-        values = numbers[place]
+    for index, unit in zip(column.indices, column.units, strict=True):
+        values = numbers[index]
         size = _read_unit("time", unit)[0]
         first = float(values[np.isfinite(values)][0])
         if not unit:
@@ -245,12 +246,12 @@ def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[s
                 notes.append(f"the time has no unit and is read in {name} since 1970, according to its magnitude")
         # Subtract the first of the whole seconds, because the rounding error of seconds since 1970 would exceed the
         # resolution of the other column.
-        total = total + (values - first if len(column.places) > 1 and size == 1.0 else values) * size
+        total = total + (values - first if len(column.indices) > 1 and size == 1.0 else values) * size
     return total
 
 
-def _without_rate(unit: str) -> str | None:
-    """The length, angle or counts that a velocity sums up to; None of no velocity."""
+def _integrate_unit(unit: str) -> str | None:
+    """Return the unit of length, angle or counts of a unit of velocity; None if the unit is not one of velocity."""
     if unit == "rpm":
         return "turns"
     base, per, second = unit.rpartition("/")
@@ -258,7 +259,12 @@ def _without_rate(unit: str) -> str | None:
 
 
 def _read_constant(constant: str | None, unit: str) -> tuple[float, str]:
-    """N or N m that one of a unit of current makes, and which of them."""
+    """Return the force or torque of one unit of current in SI units, and its unit, "N" or "N m".
+
+    Args:
+        constant: the motor constant as specified, such as "5 N/A"; None if it is not specified.
+        unit: unit of the current.
+    """
     match = _PER_AMPERE.fullmatch(constant or "")
     for dimension in (FORCE, TORQUE):
         try:
@@ -268,60 +274,69 @@ def _read_constant(constant: str | None, unit: str) -> tuple[float, str]:
             continue
     got = "nothing" if constant is None else describe(constant)
     raise InputError(
-        f"motor_constant: got {got} for a force in {unit}; write what an ampere makes, as 5 N/A or 0.03 N m/A"
+        f"motor_constant: got {got} for a force in {unit}; give the force per ampere, as 5 N/A or 0.03 N m/A"
     )
 
 
 def _compare_period(file: str | Path, table: NamedColumns, period: float) -> None:
-    """Raise `InputError` where a column of times, in a unit that it says, is of another period than the one given."""
+    """Raise `InputError` if a column of times, with a unit, contradicts the specified period by more than `_OTHER`."""
     try:
         column = find_columns(file, table.heads, {}, ["time"])["time"]
         if not all(column.units):
             return
-        values = table.numbers(column.places, gaps=True)
-        time = _join_times(column, dict(zip(column.places, values, strict=True)), [])
+        values = table.numbers(column.indices, gaps=True)
+        time = _join_times(column, dict(zip(column.indices, values, strict=True)), [])
         time = time[np.isfinite(time)]
     except InputError:
-        # The period may be given for the times' sake.
+        # Ignore times that cannot be read, because they may be the reason why the period is specified.
         return
     step = float(time[-1] - time[0]) / max(1, time.size - 1)
     if not abs(step - period) <= _OTHER * period:
         raise InputError(
-            f"period: got {with_unit(period, 's')}, but the times in {file} are {with_unit(step, 's')} apart; leave "
-            "the period out, or correct one of them"
+            f"period: got {with_unit(period, 's')}, but the times in {file} are {with_unit(step, 's')} apart; omit the "
+            "period, or correct one of them"
         )
 
 
 def _read_unit(name: str, unit: str) -> tuple[float, Dimension | None]:
-    """What one of a unit is in SI units, the base unit of a linear axis without one; its dimension, None of counts."""
+    """Return the factor that converts a unit of a quantity to SI, and its dimension, None for counts.
+
+    Without a unit, the factor is 1 and the dimension that of a linear axis.
+    """
     if name == "position" and unit.lower() in COUNTS:
         return 1.0, None
     for dimension in DIMENSIONS[name]:
         size = dimension.in_base("1", 0, unit) if unit else 1.0
         if size is not None:
             return size, dimension
-    known = [each for dimension in DIMENSIONS[name] for each in dimension.units]
-    known += [COUNTS[0]] if name == "position" else []
+    allowed = [each for dimension in DIMENSIONS[name] for each in dimension.units]
+    allowed += [COUNTS[0]] if name == "position" else []
     raise InputError(
-        f"{name}: got the unit {unit!r}; allowed are {', '.join(known)}; "
-        + suggestion(unit, known, "write COLUMN:unit with one of them")
+        f"{name}: got the unit {unit!r}; allowed are {', '.join(allowed)}; "
+        + suggestion(unit, allowed, "write COLUMN:unit with one of them")
     )
 
 
 def _check_pairs(units: Mapping[str, str], dimensions: Mapping[str, Dimension | None], resolution: Any) -> float | None:
-    """The encoder's step in its SI unit; `InputError` where it, or the position, is of another axis than the force."""
-    turns = dimensions["force"] is TORQUE
-    force = f"a {'torque' if turns else 'force'} in {units['force'] or 'N (no unit is given)'}"
+    """Return the encoder step in SI units; raise `InputError` if linear and rotary quantities are combined.
+
+    Args:
+        units: unit of each quantity, "" for none.
+        dimensions: dimension of position and force, None for counts.
+        resolution: encoder resolution as specified.
+    """
+    is_rotary = dimensions["force"] is TORQUE
+    force = f"a {'torque' if is_rotary else 'force'} in {units['force'] or 'N (no unit)'}"
     step, angular = (None, None) if resolution is None else read_step(resolution)
-    if angular is not None and angular != turns:
+    if angular is not None and angular != is_rotary:
         raise InputError(
             f"resolution: got {describe(resolution)} with {force}; "
             + ("an angle belongs to a torque, as in N m" if angular else "a length belongs to a force, as in N")
         )
-    if dimensions["position"] not in (None, ANGLE if turns else LENGTH):
+    if dimensions["position"] not in (None, ANGLE if is_rotary else LENGTH):
         raise InputError(
-            f"position, force: got a position in {units['position'] or 'm (no unit is given)'} with {force}; a length "
-            "goes with a force, an angle with a torque: say the units, as COLUMN:deg and COLUMN:mN m"
+            f"position, force: got a position in {units['position'] or 'm (no unit)'} with {force}; a length "
+            "belongs to a force, an angle to a torque: specify units, as COLUMN:deg and COLUMN:mN m"
         )
     return step
 
@@ -341,29 +356,29 @@ def read_step(resolution: Any) -> tuple[float, bool | None]:
         try:
             return read_quantity(value, ANGLE, POSITIVE, counts=True)[0], True
         except UnusableValueError:
-            what, allowed = error.parts[:2]
+            problem, allowed = error.parts[:2]
             raise InputError(
-                f"resolution: {what}; {allowed}, or with one of {', '.join(ANGLE.units)}: as 0.03 mm or 0.09 deg"
+                f"resolution: {problem}; {allowed}, or with one of {', '.join(ANGLE.units)}: as 0.03 mm or 0.09 deg"
             ) from None
 
 
 def join_logs(motions: Sequence[LoggedMotion], period: float | None) -> dict[str, Any]:
-    """Arguments of `zwidth.fit_log`: one axis and one encoder, and the period where no times were read."""
+    """Return the arguments of `zwidth.fit_log` for several logs of one axis; the period replaces missing times."""
     if len({motion.rotary for motion in motions}) > 1:
-        raise InputError("logs: some are of an angle, others of a length; fit them apart")
+        raise InputError("logs: some have angles, others lengths; fit them separately")
     steps = {motion.resolution for motion in motions}
     if len(steps) > 1:
-        raise InputError("resolution: the logs have several; give all of them the same, or fit them apart")
+        raise InputError("resolution: the logs have different ones; give all the same, or fit them separately")
     columns = {name: [getattr(motion, name) for motion in motions] for name in QUANTITIES}
     columns["time"] = [period if time is None else time for time in columns["time"]]
     return {**columns, "resolution": steps.pop(), "rotary": motions[0].rotary}
 
 
-def check_period(period: float | None, found: float) -> None:
+def check_period(period: float | None, logged: float) -> None:
     """Raise `InputError` if the sampling period found in the times of logs differs from the specified one."""
-    if period is not None and abs(found - period) > _SAME_PERIOD * period:
+    if period is not None and abs(logged - period) > _SAME_PERIOD * period:
         raise InputError(
-            f"period: got {with_unit(period, 's')}, but the samples of the log are {with_unit(found, 's')} apart; "
+            f"period: got {with_unit(period, 's')}, but the samples of the log are {with_unit(logged, 's')} apart; "
             "correct the period, or leave it out"
         )
 

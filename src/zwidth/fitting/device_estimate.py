@@ -1,4 +1,9 @@
-"""A device as records leave it: its scene, the covariance of its numbers, and what the records say of other devices."""
+"""Estimate of a device from records: its parameters with their covariance, as a scene, and random devices around it.
+
+The parameters are mass, damping and delay, those of an actuator lag, and those of resonances (*modes*), in SI units. A
+fit with d degrees of freedom has parameters with Student's t distribution; with known noise they are normal. The
+response of the estimated device with a radius around it describes all devices that agree with the records.
+"""
 
 from __future__ import annotations
 
@@ -19,78 +24,79 @@ from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
-# Of the upper ends of intervals of 95 %.
-UPPER = 0.975
-# Of standard errors, for differences; of complex numbers, whose square is lost beside 1.
-_STEP, _TINY = 0.1, 1e-40
-# Of the usual safe wall.
-RELIABILITY = 0.99
-# Rounds of draws; where most are impossible, the estimate says nothing.
-_ROUNDS = 50
+UPPER = 0.975  # probability below the upper end of a 95 % interval
+_STEP = 0.1  # step of central differences, in standard deviations
+_TINY = 1e-40  # complex step of derivatives; its square is below the rounding error
+RELIABILITY = 0.99  # default of the proportion of devices on which a safe wall is stable
+_ROUNDS = 50  # rounds of random draws, after which an estimate with mostly impossible devices is given up
 
 
 class DimensionlessDevice(NamedTuple):
-    """A device in units of its mass and of the sampling period, arrays that broadcast.
+    """A device in units of its mass and of the sampling period; the fields are numbers or arrays that broadcast."""
 
-    ``mass`` in kg, ``delta = b T/m``, the delay in periods, of an amplifier its time constant in periods (and of second
-    order its damping ratio), of each mode its frequency in radians a period, damping ratio and ``m/m_i``.
-    """
+    mass: Any  # m, kg
+    delta: Any  # b T/m
+    d: Any  # delay, in periods
+    lag: Any = ()  # time constant of the actuator in periods and, for second order, its damping ratio
+    modes: Any = ()  # for each mode the frequency in rad per sample, the damping ratio and the mass ratio m/m_i
 
-    mass: Any
-    delta: Any
-    d: Any
-    lag: Any = ()
-    modes: Any = ()
-
-    def to_numbers(self, period: Any) -> np.ndarray:
-        """Its numbers in SI units, as `name_numbers` names them."""
+    def to_parameters(self, period: Any) -> np.ndarray:
+        """Return the parameters in SI units, in the order of `name_parameters`, along the first axis."""
         mass, units = self.mass, [period, 1.0]
         values = [mass, self.delta * mass / period, self.d * period]
         values += [part * unit for part, unit in zip(self.lag, units, strict=False)]
-        for turns, ratio, share in self.modes:
-            values += [turns * 0.5 / (np.pi * period), ratio, mass / share]
+        for frequency, ratio, mass_ratio in self.modes:
+            values += [frequency * 0.5 / (np.pi * period), ratio, mass / mass_ratio]
         return np.array(values)
 
     @classmethod
-    def of_numbers(cls, values: np.ndarray, period: float, lag: int) -> DimensionlessDevice:
+    def from_parameters(cls, values: np.ndarray, period: float, lag: int) -> DimensionlessDevice:
         """Return the device with the parameters along the first axis of ``values``; ``lag`` is the order of its lag."""
         mass, modes = values[0], values[3 + lag :].reshape(-1, 3, *values.shape[1:])
-        ringing = [(2.0 * np.pi * period * hertz, ratio, mass / own) for hertz, ratio, own in modes]
+        scaled = [(2.0 * np.pi * period * hertz, ratio, mass / modal_mass) for hertz, ratio, modal_mass in modes]
         delays = [part / unit for part, unit in zip(values[3 : 3 + lag], [period, 1.0], strict=False)]
-        return cls(mass, values[1] / (mass / period), values[2] / period, delays, ringing)
+        return cls(mass, values[1] / (mass / period), values[2] / period, delays, scaled)
 
     def to_scene(self, period: float, velocity: Velocity, system: UnitSystem = LINEAR) -> Scene:
         """Return the loop of the device, without a wall."""
-        lag, (mass, damping, delay, *beside) = len(self.lag), map(float, self.to_numbers(period))
-        constant, *ratio = beside[:lag] or [None]
+        lag, (mass, damping, delay, *parts) = len(self.lag), map(float, self.to_parameters(period))
+        constant, *ratio = parts[:lag] or [None]
         actuator = Actuator(None, constant, lag, *ratio) if lag else None
-        modes = [Mode(*beside[k : k + 3]) for k in range(lag, len(beside), 3)]
+        modes = [Mode(*parts[k : k + 3]) for k in range(lag, len(parts), 3)]
         device = Device(mass, damping, actuator=actuator, modes=modes, rotary=system.rotary)
         return Scene(device, Timing(period=period, delay=delay), velocity=velocity)
 
 
 def differentiate(function: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
-    """The derivatives of a smooth formula, a column each, by complex steps: exact to rounding (Squire, Trapp 1998)."""
+    """Return the derivatives of an analytic function, one column per argument, exact to rounding error.
+
+    Complex steps have no cancellation (Squire, Trapp 1998).
+    """
     return np.stack([np.imag(function(values + 1j * _TINY * unit)) / _TINY for unit in np.eye(values.size)], -1)
 
 
-def name_numbers(scene: Scene) -> tuple[str, ...]:
-    """Paths of what is fitted: mass, damping, delay, and what stands beside the rigid mass."""
+def name_parameters(scene: Scene) -> tuple[str, ...]:
+    """Return the paths of the fitted parameters: mass, damping, delay, and those of actuator lag and modes."""
     actuator, modes = scene.device.actuator, range(len(scene.device.modes))
     lag = () if actuator is None else ("time_constant", *(["damping_ratio"] if actuator.order == 2 else []))
     of_mode = ("frequency", "damping_ratio", "mass")
-    beside = [f"actuator.{name}" for name in lag] + [f"modes.{k}.{name}" for k in modes for name in of_mode]
-    return ("mass", "damping", "delay", *beside)
+    parts = [f"actuator.{name}" for name in lag] + [f"modes.{k}.{name}" for k in modes for name in of_mode]
+    return ("mass", "damping", "delay", *parts)
 
 
-def find_stiffest(scene: Scene) -> tuple[float, np.ndarray]:
-    """K_max of a scene, and its derivatives in what `name_numbers` names."""
-    slopes = scene.sensitivities()
-    return float(slopes.stiffness), np.array([slopes.per[path] for path in name_numbers(scene)])
+def differentiate_stiffness_max(scene: Scene) -> tuple[float, np.ndarray]:
+    """Return K_max of a scene and its derivatives in the parameters of `name_parameters`."""
+    sensitivities = scene.sensitivities()
+    return float(sensitivities.stiffness), np.array([sensitivities.per[path] for path in name_parameters(scene)])
 
 
-def reach_of(freedom: int | None, upper: float = UPPER) -> float:
-    """Standard errors to a side: of a known noise, or of one estimated with so many degrees of freedom."""
+def compute_reach(freedom: int | None, upper: float = UPPER) -> float:
+    """Return the half-width of a confidence interval, in standard errors.
+
+    Args:
+        freedom: degrees of freedom with which the noise was estimated; None if it is known.
+        upper: probability below the upper end of the interval.
+    """
     from scipy.special import ndtri, stdtrit
 
     return float(ndtri(upper) if freedom is None else stdtrit(freedom, upper))
@@ -98,17 +104,17 @@ def reach_of(freedom: int | None, upper: float = UPPER) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceEstimate:
-    """What is known of a device; the attributes are those of `zwidth.DeviceFit`."""
+    """An estimate of a device with its uncertainty; the attributes are described in `zwidth.DeviceFit`."""
 
-    nominal: Scene
-    covariance: np.ndarray
-    noise: float | tuple[float, float]
-    freedom: int | None = None
-    response: MeasuredDevice | None = None
-    damping_tried: float | None = None
-    stiffness_tried: float | None = None
+    nominal: Scene  # the fitted loop
+    covariance: np.ndarray  # of the parameters, in SI units
+    noise: float | tuple[float, float]  # of the position in m; for walls the relative noise of K and f
+    freedom: int | None = None  # degrees of freedom with which the noise was estimated; None if it is given
+    response: MeasuredDevice | None = None  # of the device, with a radius for an undetected resonance
+    damping_tried: float | None = None  # largest B of the measured walls, N s/m
+    stiffness_tried: float | None = None  # K measured at this B, N/m
 
-    # Of its scene: kg, N s/m, s, the period in s, and the parts that the records ask for.
+    # Attributes of the fitted scene.
     mass = property(attrgetter("nominal.device.mass"))
     damping = property(attrgetter("nominal.device.damping"))
     delay = property(attrgetter("nominal.timing.delay"))
@@ -125,34 +131,41 @@ class DeviceEstimate:
 
     @property
     def numbers(self) -> tuple[str, ...]:
-        """Paths of what was fitted, in the order of the covariance: mass, damping, delay, and what more there is."""
-        return name_numbers(self.nominal)
+        """The paths of the fitted parameters, in the order of the covariance."""
+        return name_parameters(self.nominal)
 
     @cached_property
     def estimates(self) -> np.ndarray:
-        """The values of ``numbers``."""
-        own = self.nominal.parameters()
-        return np.array([own[name] for name in self.numbers])
+        """The values of the fitted parameters, in the order of ``numbers``."""
+        parameters = self.nominal.parameters()
+        return np.array([parameters[name] for name in self.numbers])
 
     @property
     def reach(self) -> float:
-        """How many standard errors the intervals reach."""
-        return reach_of(self.freedom)
+        """The half-width of the 95 % confidence intervals, in standard errors."""
+        return compute_reach(self.freedom)
 
     def normalize(self, drawn: np.ndarray) -> DimensionlessDevice:
-        """Devices of other values of ``numbers``, a row each."""
+        """Return devices with other parameters, given in the order of ``numbers``, one row per device."""
         lag = 0 if self.actuator is None else self.actuator.order
-        return DimensionlessDevice.of_numbers(np.moveaxis(drawn, 1, 0), self.period, lag)
+        return DimensionlessDevice.from_parameters(np.moveaxis(drawn, 1, 0), self.period, lag)
 
-    def differ(self, ask: Callable[[Scene], Any]) -> np.ndarray:
-        """By how much an answer changes along each axis of the covariance, one standard deviation far: a row each."""
-        values, middle, rows = self.estimates, ask(self.nominal), []
+    def propagate_errors(self, evaluate: Callable[[Scene], Any]) -> np.ndarray:
+        """Return the linearized change of a quantity by one standard deviation along each axis of the covariance.
+
+        Args:
+            evaluate: function that computes the quantity, a number or an array, from a scene.
+
+        Returns:
+            One row per axis. The sum of their squares is the variance of the quantity.
+        """
+        values, middle, rows = self.estimates, evaluate(self.nominal), []
         for axis in _find_axes(self.covariance).T:
             step = _STEP * axis
-            # Where damping or delay would be negative, to one side.
+            # Use a one-sided difference if a parameter would change its sign on the other side.
             sides = [side for side in (-1.0, 1.0) if np.all((values + side * step) * np.where(values < 0, -1, 1) >= 0)]
             moved = [dict(zip(self.numbers, (values + side * step).tolist(), strict=True)) for side in sides]
-            ends = [ask(self.nominal.replace(**each)) for each in moved]
+            ends = [evaluate(self.nominal.replace(**each)) for each in moved]
             if len(sides) == 1:
                 sides, ends = [0.0, *sides], [middle, *ends]
             change = (ends[-1] - ends[0]) / (_STEP * (sides[-1] - sides[0])) if sides else np.nan * middle
@@ -160,14 +173,22 @@ class DeviceEstimate:
         return np.array(rows)
 
     def draw(self, count: int) -> np.ndarray | None:
-        """What ``numbers`` has of possible devices around the estimate, a row each; None if few are possible.
+        """Draw parameters of random devices around the estimate, in the order of ``numbers``, one row per device.
 
-        The mass is drawn by its logarithm, for what walls and logs tell of it is a share, and of a mode what it moves.
+        The logarithm of the mass and the reciprocals of modal masses are drawn, because measurements determine the mass
+        to a relative error and the response of a mode is proportional to the reciprocal of its modal mass. Devices with
+        negative damping, delay or other parameters are drawn again.
+
+        Args:
+            count: number of devices.
+
+        Returns:
+            The parameters; None if the covariance is not finite or almost all devices are impossible.
         """
         values = self.estimates
         if not np.all(np.isfinite(self.covariance)):
             return None
-        # By their reciprocals, and of any sign.
+        # Modal masses may have any sign.
         inverse = np.array([name.endswith(".mass") for name in self.numbers])
         center, slopes = values.copy(), np.ones(values.size)
         center[inverse], slopes[inverse] = 1.0 / values[inverse], -1.0 / values[inverse] ** 2
@@ -179,56 +200,66 @@ class DeviceEstimate:
             spread = generator.standard_normal((count, values.size))
             if self.freedom is not None:
                 spread /= np.sqrt(generator.chisquare(self.freedom, count) / self.freedom)[:, None]
-            some = center + spread @ root.T
-            some = some[np.all((some >= 0) | inverse | (np.arange(values.size) == 0), 1)]
+            devices = center + spread @ root.T
+            devices = devices[np.all((devices >= 0) | inverse | (np.arange(values.size) == 0), 1)]
             with np.errstate(over="ignore", divide="ignore"):
-                some[:, 0] = np.exp(some[:, 0])
-                some[:, inverse] = 1.0 / some[:, inverse]
-            kept = np.concatenate([kept, some])
+                devices[:, 0] = np.exp(devices[:, 0])
+                devices[:, inverse] = 1.0 / devices[:, inverse]
+            kept = np.concatenate([kept, devices])
             if len(kept) >= count:
                 return kept[:count]
         return None
 
-    def bear_tried(self, confidence: float) -> float:
-        """What the K that buzzed at the largest damping tried is at least, by its noise."""
+    def bound_measured_stiffness(self, confidence: float) -> float:
+        """Return the lower confidence limit of the K measured at the largest B, in N/m; 0 for a log.
+
+        Args:
+            confidence: probability that the true K is above the limit.
+        """
         noise = self.noise[0] if isinstance(self.noise, tuple) else 0.0
-        return max(0.0, (self.stiffness_tried or 0.0) * (1.0 - reach_of(self.freedom, confidence) * noise))
+        return max(0.0, (self.stiffness_tried or 0.0) * (1.0 - compute_reach(self.freedom, confidence) * noise))
 
     @cached_property
-    def responding(self) -> Scene | None:
-        """The same loop with the response in place of the device: what holds for every resonance within its radius.
+    def response_scene(self) -> Scene | None:
+        """The scene of `build_response_scene` with undetected resonances, at the default reliability."""
+        return self.build_response_scene(RELIABILITY, True)
 
-        Of a device with an amplifier or resonances, the radius has what their numbers may be, too.
-        """
-        return self.respond(RELIABILITY, True)
+    def build_response_scene(self, reliability: float, hidden: bool) -> Scene | None:
+        """Build the loop with the response of the device and its radius, in place of the fitted parameters.
 
-    def respond(self, reliability: float, hidden: bool) -> Scene | None:
-        """The loop of the response; within its radius are so many devices that the log allows, and what it may hide.
+        A wall that is stable for all responses within the radius is stable on all devices that these describe.
 
-        None without a response, and where the numbers are too open for a radius.
+        Args:
+            reliability: proportion of devices whose response the radius covers, for a device with a lag or modes; the
+                parameters of a rigid device do not enter the radius.
+            hidden: include one undetected resonance in the radius.
+
+        Returns:
+            The scene; None without a response, or if the parameters are too uncertain for a finite radius.
         """
         from scipy.special import fdtri
 
-        known = self.response
-        if known is None:
+        fitted = self.response
+        if fitted is None:
             return None
-        radius = known.deviation if hidden else 0.0 * known.deviation
+        radius = fitted.deviation if hidden else 0.0 * fitted.deviation
         if self.is_structured:
-            changes = self.differ(lambda scene: scene.frequency_response(1.0, 0.0, known.frequency))
-            # The longer axis of the ellipse in which the response lies with the numbers.
+            changes = self.propagate_errors(lambda scene: scene.frequency_response(1.0, 0.0, fitted.frequency))
+            # To first order, the confidence region of the response at a frequency is an ellipse in the complex plane;
+            # add its longer half-axis.
             square, across = np.sum(np.abs(changes) ** 2, 0), np.abs(np.sum(changes**2, 0))
             count = len(self.numbers)
             reach = count * fdtri(count, self.freedom, reliability)
             radius = radius + np.sqrt(0.5 * (square + across) * reach)
         if not np.all(np.isfinite(radius)):
             return None
-        device = MeasuredDevice(known.frequency, known.response, radius, known.rotary)
+        device = MeasuredDevice(fitted.frequency, fitted.response, radius, fitted.rotary)
         return Scene(device, Timing(self.period), velocity=self.velocity)
 
 
 def _find_axes(covariance: np.ndarray) -> np.ndarray:
-    """One standard deviation along each axis of a covariance, a column each."""
-    # Of very different units: by correlations. What is known exactly has none.
+    """Return one standard deviation along each axis of a covariance, one column per axis."""
+    # Use the correlations, because the parameters have very different units. Exact parameters have no error.
     errors = np.sqrt(np.diag(covariance))
     errors = np.where(errors > 0, errors, 1.0)
     sizes, axes = np.linalg.eigh(covariance / np.outer(errors, errors))

@@ -1,4 +1,9 @@
-"""What a fit says of a device: estimates, how far they may be off, and the stiffest wall that follows."""
+"""Result of a fit: the estimated device, confidence intervals, and the maximum stiffness and walls that follow.
+
+Confidence intervals have 95 %. The interval of K_max is computed for its logarithm, to first order in the parameters.
+For a log it also covers undetected resonances, by Bayesian model averaging, and an undetected actuator lag
+(`zwidth.fitting.hidden`, docs/theory/hidden.md).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.device_estimate import RELIABILITY, UPPER, DeviceEstimate, find_stiffest
+from zwidth.fitting.device_estimate import RELIABILITY, UPPER, DeviceEstimate, differentiate_stiffness_max
 from zwidth.fitting.hidden import HiddenResonances
 from zwidth.fitting.hidden_lag import HiddenLag
 from zwidth.fitting.safe_scene import limit_walls, round_scene
@@ -20,17 +25,16 @@ from zwidth.words.formatting import to_json, with_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
-# Standard errors within which everything lies.
-_FAR = 1e3
-# A standard error beyond this share leaves a value open.
-VAGUE = 0.5
-# Standard errors below 0 that nobody takes for a delay of 0 anymore; half of a true 0's errors go below.
-BEYOND = 3.0
-# Sampling periods of loops, in s: outside a unit is suspected.
-_QUICKEST, _SLOWEST = 5e-6, 0.02
-# About a device that may be more than the model.
-SEE_MORE = "play a record of zwidth.excite, push harder, or read a finer encoder"
-MASS_OPEN = "the mass is hardly determined: its standard error is more than half of it"
+_FAR = 1e3  # half-width, in standard errors, of the bracket in which quantiles are searched
+VAGUE = 0.5  # relative standard error above which a parameter causes a warning
+BEYOND = 3.0  # standard errors below 0 from which on a negative delay causes a warning; small ones are noise
+
+# Range of sampling periods in s; a period outside causes a warning about its unit.
+_SHORTEST_PERIOD = 5e-6
+_LONGEST_PERIOD = 0.02
+# Remedy if the log does not decide between two structures of the device.
+SEE_MORE = "record a force of zwidth.excite, use a larger force, or a finer encoder"
+MASS_OPEN = "the mass is hardly determined: its standard error is more than half of its value"
 
 
 class ErrorBar(NamedTuple):
@@ -41,27 +45,21 @@ class ErrorBar(NamedTuple):
 
 
 class FurtherExperiment(NamedTuple):
-    """Raise K at this damping until the wall buzzes: N s/m, the N/m and Hz expected, and K_max's error afterwards.
+    """The most informative next measurement: raise K at this B until the wall becomes unstable."""
 
-    That error is NaN where K_max is.
-    """
-
-    virtual_damping: float
-    stiffness: float
-    frequency: float
-    error_afterwards: float
+    virtual_damping: float  # B, N s/m
+    stiffness: float  # expected K at the onset of instability, N/m
+    frequency: float  # expected frequency of the oscillation, Hz
+    error_afterwards: float  # expected standard error of K_max with the further wall, N/m; NaN if K_max is
 
 
 class FittedMotion(NamedTuple):
-    """One log beside its fit, a number a sample: times in s, forces in N, positions in m.
+    """A log and its fitted positions, arrays with one entry per sample."""
 
-    ``modelled`` is NaN at the first samples and behind a gap, where past forces are unknown, and behind the first
-    200,000.
-    """
-
-    time: np.ndarray
-    force: np.ndarray
-    position: np.ndarray
+    time: np.ndarray  # s
+    force: np.ndarray  # N
+    position: np.ndarray  # measured, m
+    # Fitted positions in m; NaN if past forces are unknown, at the start and after gaps, and after 200,000 samples.
     modelled: np.ndarray
 
 
@@ -86,47 +84,52 @@ class RivalDevice(NamedTuple):
 )
 @dataclass(frozen=True, kw_only=True)
 class DeviceFit(DeviceEstimate):
-    """A device found from records of it.
+    """The result of a fit of a device to measurements: a log, or walls at the onset of instability.
+
+    For a rotary device the units are rad, N m and kg m² in place of m, N and kg.
 
     Attributes:
         mass, damping, delay: estimates in kg, N s/m, s.
-        actuator, modes: the amplifier's lag and the resonances that the records ask for, a `zwidth.Actuator` or None
-            and `zwidth.Mode`; the sensor of a positive modal mass is at the motor, of a negative one beyond a node.
-        errors: standard errors of the three, by name, and of the parts by their paths, as "actuator.time_constant" and
-            "modes.0.frequency".
-        covariance: of ``numbers``, in that order, SI units.
-        stiffness_max: K_max in N/m of the estimated device, `zwidth.Scene.max_stiffness`; NaN where the status is not
-            OK, unless it is UNDECIDED and the rivals have the same within the error.
-        stiffness_error: its standard error, by K_max's gradient.
-        noise: relative (K and f) of buzzing walls, of the position in m of a log; given, or estimated from residuals.
-        residuals: measured less fitted, of buzzing walls an array (n, 2) in units of the noise of K and f, of a log in
-            m, NaN where samples are left out.
-        doubts: what is odd about the records or about the estimate, a sentence each; then there is no safe wall.
+        actuator, modes: the actuator lag and the resonances that the measurements require: a `zwidth.Actuator` or None,
+            and `zwidth.Mode`. A negative modal mass means that actuator and sensor are on opposite sides of a node.
+        errors: standard errors of the three, by name, and of the other parameters by their paths, such as
+            "actuator.time_constant" and "modes.0.frequency".
+        numbers: paths of the fitted parameters.
+        covariance: covariance of the parameters in the order of ``numbers``, in SI units.
+        stiffness_max: K_max in N/m of the estimated device, `zwidth.Scene.max_stiffness`; NaN if the status is not OK,
+            except for UNDECIDED if the rivals have the same K_max within its error.
+        stiffness_error: standard error of K_max, from its gradient.
+        noise: for walls, the relative noise of K and f; for a log, the noise of the position in m. Given, or estimated
+            from the residuals.
+        residuals: measured minus fitted values: for walls an array (n, 2) in units of the noise of K and f; for a log
+            in m, NaN for samples that are not fitted.
+        doubts: warnings about the measurements or the estimate, one sentence each. With a warning there is no safe
+            wall.
         notes: interpretations of the columns of a log and repairs of its rows, one clause each.
-        status: of `zwidth.Status`: UNDECIDED where another device fits as well, or where a log shows more than the
-            model has.
-        rivals: those devices, a `zwidth.RivalDevice` each.
-        next: the further experiment that reduces the error of K_max most; None for a log.
-        offset, friction: constant force beside the commanded one and Coulomb friction, in N, of a log; their errors in
-            ``errors_of_log`` and ``errors``, NaN where the log leaves open how much is of which.
-        resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
-        motions: of a log, each with its fit, a `zwidth.FittedMotion`.
+        status: code of `zwidth.Status`; UNDECIDED if another device fits equally well, or if the residuals of a log are
+            not white noise.
+        rivals: those devices, `zwidth.RivalDevice`.
+        next: for walls, the further measurement that reduces the error of K_max most; otherwise None.
+        offset, friction: for a log, constant force in addition to the commanded one, and Coulomb friction, in N. Their
+            errors, in ``errors_of_log`` and ``errors``, are NaN if the log does not distinguish them.
+        resolution: encoder step in m with which a log was fitted; 0 for none, and for walls.
+        motions: for a log, the measured and fitted positions, `zwidth.FittedMotion`.
         scene: the fitted loop, a `zwidth.Scene` with the safe limit of its walls. Its parameters are rounded to a
             thousandth of their standard errors, as `zwidth fit --yaml` writes them.
         nominal, period, velocity: the fitted loop before rounding and without the safe limit, its sampling period in s
             and its velocity estimate.
-        response: of a log, a `zwidth.MeasuredDevice`: the response of the estimated device, with the radius by which a
-            resonance of a damping ratio of 0.005 or more may move it and not show in the log. None of buzzing walls, of
-            a log without noise, and under a doubt of what the fit leaves.
-        lag: of a log, ``(time_constant, delay, stiffness_max)`` of the longest lag of an amplifier that it does not
-            tell from a delay, in s and N/m; the interval of K_max reaches there. None as ``response``, and where none
-            is so.
-        hidden: of a log, ``(odds, stiffness_max)``: how likely the device has a resonance more than the log asks for
-            against none, and K_max with such ones over that without, all equally likely; the interval of K_max is that
-            of all these devices. None as ``response``.
-        damping_tried, stiffness_tried: of walls that buzzed, the largest B among them, in N s/m, and the K in N/m that
-            buzzed there; None of a log.
-        freedom: degrees of freedom that the noise was estimated with; None where it is known.
+        response: for a log, a `zwidth.MeasuredDevice`: the response of the estimated device. Its deviation covers every
+            resonance with a damping ratio of at least 0.005 that may be undetected in the log. None for walls, for a
+            log without noise, and if the residuals cause a warning.
+        lag: for a log, ``(time_constant, delay, stiffness_max)`` in s and N/m for the longest actuator lag that the log
+            does not distinguish from a delay. The interval of K_max extends to that K_max. None as for ``response``,
+            and if the log excludes every lag.
+        hidden: for a log, ``(odds, stiffness_max)``: the posterior odds of one undetected resonance against none, and
+            equally likely values of K_max with such a resonance, relative to K_max without. The interval of K_max
+            averages over them. None as for ``response``.
+        damping_tried, stiffness_tried: for walls, the largest measured B in N s/m, and the K in N/m measured there;
+            None for a log.
+        freedom: degrees of freedom with which the noise was estimated; None if the noise is given.
     """
 
     residuals: np.ndarray
@@ -145,34 +148,35 @@ class DeviceFit(DeviceEstimate):
 
     @cached_property
     def errors(self) -> dict[str, float]:
-        """Standard errors by name."""
-        own = np.sqrt(np.diag(self.covariance)).tolist()
-        return dict(zip(self.numbers, own, strict=True)) | self.errors_of_log
+        """The standard errors by name."""
+        errors = np.sqrt(np.diag(self.covariance)).tolist()
+        return dict(zip(self.numbers, errors, strict=True)) | self.errors_of_log
 
     @cached_property
     def _stiffest(self) -> tuple[float, float]:
-        """K_max and its standard error; NaN where the device that bears it is another one, or may be."""
-        value, gradient = find_stiffest(self.nominal)
+        """K_max and its standard error; NaN if another device with another K_max fits equally well."""
+        value, gradient = differentiate_stiffness_max(self.nominal)
         error = float(np.sqrt(gradient @ self.covariance @ gradient))
-        agreed = bool(self.rivals) and all(abs(one.stiffness_max - value) <= error for one in self.rivals)
-        known = self.status == Status.OK or (self.status == Status.UNDECIDED and agreed)
-        return (value, error) if known else (np.nan, np.nan)
+        agreed = bool(self.rivals) and all(abs(rival.stiffness_max - value) <= error for rival in self.rivals)
+        is_determined = self.status == Status.OK or (self.status == Status.UNDECIDED and agreed)
+        return (value, error) if is_determined else (np.nan, np.nan)
 
     @property
     def stiffness_max(self) -> float:
-        """In N/m."""
+        """K_max of the estimated device, in N/m; NaN if it is not determined."""
         return self._stiffest[0]
 
     @property
     def stiffness_error(self) -> float:
-        """In N/m."""
+        """The standard error of K_max, in N/m."""
         return self._stiffest[1]
 
     @property
     def is_doubted(self) -> bool:
-        """Whether there is a doubt or a status: then no safe wall and no wall to set is given.
+        """True if the fit has a warning or its status is not OK: then no wall is recommended.
 
-        What a record shows beyond the model moved K_max up to 2.8 times, and most often where something was doubted.
+        In simulations, dynamics that the model lacks changed K_max by a factor of up to 2.8, mostly in fits with
+        warnings.
         """
         return self.status != Status.OK or bool(self.doubts)
 
@@ -188,51 +192,59 @@ class DeviceFit(DeviceEstimate):
 
     @cached_property
     def virtual_damping(self) -> float:
-        """B in N s/m of the stiffest stable wall; NaN where ``stiffness_max`` is."""
+        """B in N s/m of the stiffest stable wall; NaN if ``stiffness_max`` is."""
         return float(self.nominal.max_stiffness().virtual_damping) if self.stiffness_max > 0 else np.nan
 
     @cached_property
     def virtual_damping_error(self) -> float:
-        """Standard error of that B, by differences along the axes of the covariance."""
+        """The standard error of ``virtual_damping``, by differences along the axes of the covariance."""
         if not np.isfinite(self.virtual_damping + self.covariance.sum()):
             return np.nan
-        return float(np.sqrt(np.sum(self.differ(lambda scene: scene.max_stiffness().virtual_damping) ** 2)))
+        return float(np.sqrt(np.sum(self.propagate_errors(lambda scene: scene.max_stiffness().virtual_damping) ** 2)))
 
     def value_of(self, name: str) -> float:
-        """What ``errors`` names: an attribute of the fit, or a parameter of a part by its path."""
+        """Return a value that ``errors`` names: an attribute of the fit, or a parameter of a part by its path."""
         return float(self.nominal.parameters()[name] if "." in name else getattr(self, name))
 
     @cached_property
     def intervals(self) -> dict[str, ErrorBar]:
-        """95 % intervals by name: of what ``errors`` has, and of "stiffness_max", with ``hidden`` and up to ``lag``.
+        """The 95 % intervals by name, of all values in ``errors`` and of "stiffness_max".
 
-        Where K_max has more damping than the walls that buzzed, it reaches down to what buzzed at the most of them.
+        The interval of K_max includes ``hidden`` and ``lag``. If K_max has a larger B than all measured walls, the
+        interval also includes the K measured at the largest B.
         """
-        reaches = {name: (self.value_of(name), self.reach * error) for name, error in self.errors.items()}
-        signed = [name for name in reaches if name == "offset" or (name.startswith("modes") and name.endswith("mass"))]
-        # A NaN stays one; a constant force and the mass of a mode may be negative.
+        widths = {name: (self.value_of(name), self.reach * error) for name, error in self.errors.items()}
+        # A constant force and a modal mass may be negative.
+        signed = [name for name in widths if name == "offset" or (name.startswith("modes") and name.endswith("mass"))]
+        # np.maximum keeps NaN.
         bars = {
-            name: ErrorBar(float(value - far if name in signed else np.maximum(0.0, value - far)), value + far)
-            for name, (value, far) in reaches.items()
+            name: ErrorBar(float(value - width if name in signed else np.maximum(0.0, value - width)), value + width)
+            for name, (value, width) in widths.items()
         }
         stiffness = self.stiffness_max
         with np.errstate(all="ignore"):
-            # By its logarithm: K_max falls ever less as the delay grows, and near a delay of 0 it is many times more.
+            # Compute the interval of ln K_max, because K_max is a strongly nonlinear function of the delay near 0.
             error = np.divide(self.stiffness_error, stiffness)
             ends = np.array([-self.reach, self.reach]) * error
             if self.hidden is not None and error > 0:
-                ends = self._average(error, *self.hidden)
-            # What is printed beside the interval lies in it, also where most devices have another K_max.
+                ends = self._average_models(error, *self.hidden)
+            # Include the estimate itself, even if most devices with an undetected resonance have another K_max.
             low, high = (stiffness * np.exp([min(ends[0], 0.0), max(ends[1], 0.0)])).tolist()
         if self.damping_tried is not None and self.virtual_damping > self.damping_tried:
-            # Beyond the dampings tried K_max is what the model says; it is at least what buzzed there.
-            low = min(low, self.bear_tried(UPPER))
+            # K_max is extrapolated beyond the measured B, but it is at least the measured K.
+            low = min(low, self.bound_measured_stiffness(UPPER))
         if self.lag is not None:
             high += max(self.lag.stiffness_max - stiffness, 0.0)
         return bars | {"stiffness_max": ErrorBar(low, high)}
 
-    def _average(self, error: float, odds: float, ratios: np.ndarray) -> list[float]:
-        """The interval of ln K_max, from that of the device, with a hidden resonance or none."""
+    def _average_models(self, error: float, odds: float, ratios: np.ndarray) -> list[float]:
+        """Return the interval of ln K_max relative to the estimate, averaged over devices with and without a resonance.
+
+        Args:
+            error: standard error of ln K_max of each device.
+            odds: posterior odds of an undetected resonance.
+            ratios: K_max with a resonance, relative to K_max without.
+        """
         from scipy.optimize import brentq
         from scipy.special import stdtr
 
@@ -240,11 +252,11 @@ class DeviceFit(DeviceEstimate):
         weights = np.append(np.full(ratios.size, odds / ratios.size), 1.0) / (1.0 + odds)
         far = np.abs(middles).max() + _FAR * error
 
-        def exceed(away: float, share: float) -> float:
-            return float(weights @ stdtr(self.freedom, (away - middles) / error)) - share
+        def exceed(value: float, probability: float) -> float:
+            return float(weights @ stdtr(self.freedom, (value - middles) / error)) - probability
 
         return [
-            float(brentq(exceed, -far, far, args=(0.5 + side * (UPPER - 0.5),)))  # pyright: ignore[reportArgumentType]  (a number unless asked)
+            float(brentq(exceed, -far, far, args=(0.5 + side * (UPPER - 0.5),)))  # pyright: ignore[reportArgumentType]  (a number by default)
             for side in (-1.0, 1.0)
         ]
 
@@ -262,7 +274,7 @@ class DeviceFit(DeviceEstimate):
                 and a wall that such a resonance makes unstable may be far softer than K_max of the rigid mass.
 
         Returns:
-            SafeWall: ``stiffness`` K in N/m and ``virtual_damping`` B in N s/m, both 0 if no wall is stable on so many
+            SafeWall: ``stiffness`` K in N/m and ``virtual_damping`` B in N s/m, both 0 if no wall is stable on enough
             devices; ``share``, the proportion of the random devices on which the wall is stable by their poles;
             ``status``: that of the fit, or UNDECIDED if the fit has warnings, the poles do not confirm the wall, or
             almost no random device is possible; all numbers are NaN unless it is OK; ``resonance``, the frequency in Hz
@@ -286,28 +298,28 @@ class DeviceFit(DeviceEstimate):
 
         Example:
             >>> import zwidth
-            >>> heard = [(6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)]
-            >>> fit = zwidth.fit_buzz(heard, period="1 ms", noise=0.02)
+            >>> walls = [(6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)]
+            >>> fit = zwidth.fit_buzz(walls, period="1 ms", noise=0.02)
             >>> wall = fit.safe_wall()
             >>> print(f"{wall.stiffness / 1e3:.1f} of {fit.stiffness_max / 1e3:.1f} kN/m")
             18.8 of 19.9 kN/m
         """
         if isinstance(reliability, bool | str) or not 0.5 <= reliability < 1:
-            raise InputError(f"reliability: got {reliability!r}; a share from 0.5 to below 1 is needed, as 0.99")
-        asked = reliability, rigid
-        if asked not in self._safe_walls:
-            open_status = self.status if self.status != Status.OK else int(Status.UNDECIDED)
-            none = SafeWall(np.nan, np.nan, np.nan, open_status)
-            self._safe_walls[asked] = none if self.is_doubted else find_safe_wall(self, *asked)
-        return self._safe_walls[asked]
+            raise InputError(f"reliability: got {reliability!r}; give a share of at least 0.5 and below 1, as 0.99")
+        options = reliability, rigid
+        if options not in self._safe_walls:
+            status = self.status if self.status != Status.OK else int(Status.UNDECIDED)
+            none = SafeWall(np.nan, np.nan, np.nan, status)
+            self._safe_walls[options] = none if self.is_doubted else find_safe_wall(self, *options)
+        return self._safe_walls[options]
 
     @cached_property
     def _safe_walls(self) -> dict[tuple[float, bool], SafeWall]:
-        """Those that were asked for."""
+        """The computed safe walls by reliability and ``rigid``."""
         return {}
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON; None for what is NaN."""
+        """Return the result as plain numbers and texts for JSON; NaN becomes None."""
         numbers = {
             **dict(zip(self.numbers, self.estimates.tolist(), strict=True)),
             "stiffness_max": self.stiffness_max,
@@ -340,10 +352,9 @@ class DeviceFit(DeviceEstimate):
         }
 
 
-def doubt_period(period: float) -> list[str]:
-    if _QUICKEST <= period <= _SLOWEST:
+def check_period_unit(period: float) -> list[str]:
+    """Return a warning about the unit of the sampling period if it is unusual."""
+    if _SHORTEST_PERIOD <= period <= _LONGEST_PERIOD:
         return []
-    slip = "in ms or us" if period > _SLOWEST else "in s"
-    return [
-        f"a sampling period of {with_unit(period, 's')} is far from any loop; the time may be {slip}: check its unit"
-    ]
+    unit = "in ms or us" if period > _LONGEST_PERIOD else "in s"
+    return [f"a sampling period of {with_unit(period, 's')} is unusual; the time may be {unit}: check its unit"]

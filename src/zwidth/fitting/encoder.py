@@ -22,12 +22,12 @@ import numpy as np
 
 # Fourier series of the covariance.
 _WAVES = 40  # terms h that are computed; the rest, about 1.5 % of q^2/12, counts as white noise
-_LEAST = 1e-6  # smallest weight w_h, relative to the variance of a sample; the series ends there
+_MIN_WEIGHT = 1e-6  # smallest weight w_h, relative to the variance of a sample; the series ends there
 # Detection of the step, of which all positions are integer multiples except for a common offset.
-_OFF = 0.02  # largest distance of a position from a multiple, in steps
-_EXACT = 1e-4  # the same for the rounding step of a column, with rounding errors of float64 only
+_MAX_OFFSET = 0.02  # largest distance of a position from a multiple, in steps
+_MAX_ROUNDING_OFFSET = 1e-4  # the same for the rounding step of a column, with rounding errors of float64 only
 _ROUNDINGS = 5.0  # least encoder step, in rounding steps of the column; finer ones are not distinguished from these
-_MOST = 1e7  # largest range of positions, in steps
+_MAX_STEPS = 1e7  # largest range of positions, in steps
 _CHANCE = 1e-6  # largest probability that random positions are as close to multiples
 _PICKS = 100  # positions that refine the estimate of a step
 
@@ -41,8 +41,8 @@ def find_steps(position: np.ndarray) -> tuple[float, float]:
     values = np.unique(position)
     # Subtracting a common offset leaves errors of the size of the spacing of float64.
     error = 16.0 * float(np.spacing(np.abs(values).max()))
-    column = _find_lattice(values, _EXACT, error)
-    return _find_lattice(values, _OFF, max(column, error)) or column, column
+    column = _find_lattice(values, _MAX_ROUNDING_OFFSET, error)
+    return _find_lattice(values, _MAX_OFFSET, max(column, error)) or column, column
 
 
 def find_resolution(position: np.ndarray) -> float:
@@ -67,12 +67,12 @@ def _find_lattice(values: np.ndarray, off: float, slack: float) -> float:
     gaps = gaps[gaps > 2.0 * slack]  # smaller gaps are rounding errors of equal positions
     span, rest = float(np.ptp(values)), gaps
     picks = (values - values[0])[np.unique(np.geomspace(1, values.size - 1, _PICKS).astype(int))]
-    while rest.size and span <= _MOST * (least := float(rest.min())) and least >= (_ROUNDINGS - 1.0) * slack:
+    while rest.size and span <= _MAX_STEPS * (least := float(rest.min())) and least >= (_ROUNDINGS - 1.0) * slack:
         step = smallest = float(np.mean(rest[rest <= least + 2.0 * slack]))
         # Refine the step from distances of n steps in ascending order: their rounding error is divided by n, but n is
         # known only if the step is accurate enough.
-        for way in picks.tolist():
-            step = way / max(1.0, np.round(way / step))
+        for distance in picks.tolist():
+            step = distance / max(1.0, np.round(distance / step))
         chance = (2.0 * max(off, slack / step)) ** (values.size - 1)
         if step >= _ROUNDINGS * slack and chance < _CHANCE and fits_steps(values, step, off, slack):
             return step
@@ -81,7 +81,7 @@ def _find_lattice(values: np.ndarray, off: float, slack: float) -> float:
     return 0.0
 
 
-def fits_steps(position: np.ndarray, step: float, off: float = _OFF, slack: float = 0.0) -> bool:
+def fits_steps(position: np.ndarray, step: float, off: float = _MAX_OFFSET, slack: float = 0.0) -> bool:
     """Return whether positions are integer multiples of a step, except for a common offset."""
     ratios = (position - position[0]) / step
     return bool(np.all(np.abs(ratios - np.round(ratios)) <= max(off, slack / step)))
@@ -108,11 +108,16 @@ class MeasurementNoise:
                 starts.append(k)
                 first = place
         sizes = np.diff([*starts, self.position.size])
-        alike = np.ones(sizes.size)
+        inflation = np.ones(sizes.size)
         for wave, weight in self._waves():
-            alike += weight / self.variance * (np.abs(np.add.reduceat(wave, starts)) ** 2 / sizes - 1.0)
-        few = sizes[alike > 1.0]
-        return np.flatnonzero(np.repeat(alike > 1.0, sizes)), np.cumsum(few) - few, few, alike[alike > 1.0]
+            inflation += weight / self.variance * (np.abs(np.add.reduceat(wave, starts)) ** 2 / sizes - 1.0)
+        kept = sizes[inflation > 1.0]
+        return (
+            np.flatnonzero(np.repeat(inflation > 1.0, sizes)),
+            np.cumsum(kept) - kept,
+            kept,
+            inflation[inflation > 1.0],
+        )
 
     @property
     def count(self) -> int:
@@ -121,29 +126,29 @@ class MeasurementNoise:
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
         """Return columns over samples, with the mean of each stretch of `_rests` scaled to white noise."""
-        rows, starts, sizes, alike = self._rests
+        rows, starts, sizes, inflation = self._rests
         if not rows.size:
             return columns
-        weighed, beyond = columns.copy(), (1.0 - alike**-0.5) / sizes
-        weighed[rows] -= np.repeat((np.add.reduceat(columns[rows], starts).T * beyond).T, sizes, axis=0)
+        weighed, removed = columns.copy(), (1.0 - inflation**-0.5) / sizes
+        weighed[rows] -= np.repeat((np.add.reduceat(columns[rows], starts).T * removed).T, sizes, axis=0)
         return weighed
 
-    def spread(self, slopes: np.ndarray) -> np.ndarray:
+    def spread(self, columns: np.ndarray) -> np.ndarray:
         """Return ``J^T C J`` for columns J, with the covariance C of the samples."""
-        plain = slopes.T @ slopes
-        total = self.variance * plain
+        white = columns.T @ columns
+        total = self.variance * white
         for wave, weight in self._waves():
-            along = slopes.T @ wave
-            total = total + weight * (np.real(np.outer(along, along.conj())) - plain)
+            projection = columns.T @ wave
+            total = total + weight * (np.real(np.outer(projection, projection.conj())) - white)
         return total
 
     def spread_each(self, columns: np.ndarray) -> np.ndarray:
         """Return the diagonal of `spread`."""
-        plain = np.sum(columns**2, 0)
-        total = self.variance * plain
+        white = np.sum(columns**2, 0)
+        total = self.variance * white
         for wave, weight in self._waves():
             # Use real and imaginary parts, because a complex product would convert the columns to complex numbers.
-            total = total + weight * (np.sum((columns.T @ wave.view(float).reshape(-1, 2)) ** 2, 1) - plain)
+            total = total + weight * (np.sum((columns.T @ wave.view(float).reshape(-1, 2)) ** 2, 1) - white)
         return total
 
     def spread_of_sums(self, count: int, weights: MeasurementNoise) -> float:
@@ -160,11 +165,11 @@ class MeasurementNoise:
         if not self.resolution:
             return
         sigma = np.sqrt(max(0.0, self.variance / self.resolution**2 - 1.0 / 12.0))
-        turn = np.exp(2j * np.pi * (self.position / self.resolution))
-        wave = np.ones_like(turn)
+        fundamental = np.exp(2j * np.pi * (self.position / self.resolution))
+        wave = np.ones_like(fundamental)
         for h in range(1, _WAVES + 1):
-            wave = wave * turn
+            wave = wave * fundamental
             weight = self.resolution**2 / (2.0 * (np.pi * h) ** 2) * np.exp(-((2.0 * np.pi * h * sigma) ** 2))
-            if weight < _LEAST * self.variance:
+            if weight < _MIN_WEIGHT * self.variance:
                 return
             yield wave, float(weight)

@@ -1,4 +1,8 @@
-"""What a fit rests on, as tables to draw and to keep: motions and residuals, and the boundary with its band."""
+"""Tabulate the evidence for a fit, to draw and to save.
+
+For a log: measured and fitted positions, residuals and their autocorrelation. For every fit: the stability boundary of
+the device with its confidence band, and the stiffest, recommended and measured walls.
+"""
 
 from __future__ import annotations
 
@@ -8,28 +12,30 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.buzz import BuzzPoint
-from zwidth.fitting.device_estimate import reach_of
+from zwidth.fitting.device_estimate import compute_reach
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.words import unit_of
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import header
 from zwidth.words.status import Status
 
-# Devices drawn around the estimate, dampings of the boundary, and how far beyond its end.
-_DRAWS, _ROWS, _BEYOND = 1000, 121, 1.1
-# Lags of the autocorrelation, at most, and at most as a share of the samples.
-_LAGS, _SHARE = 60, 0.25
+_DRAWS = 1000  # largest number of random devices for the confidence band
+_ROWS = 121  # number of dampings from 0 to the largest stable one; a tenth more lie above it
+_BEYOND = 1.1  # end of the dampings, relative to the largest stable one
+# Number of lags of the autocorrelation: the smaller of both limits.
+_LAGS = 60
+_SHARE = 0.25  # relative to the number of samples
 
 
 def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = ()) -> dict[str, dict[str, Any]]:
     """Return all tables of a fit, in the form that `zwidth.figures.draw_device_fit` requires."""
-    found: dict[str, dict[str, Any]] = {}
+    tables: dict[str, dict[str, Any]] = {}
     for name, table in (("boundary", trace_boundary(fit)), ("walls", tabulate_walls(fit, points))):
         rows = next(iter(table.values())).size
-        found[name] = {"fitted_to": np.full(rows, source), **table}
+        tables[name] = {"fitted_to": np.full(rows, source), **table}
     if fit.motions:
-        found |= {"motion": tabulate_motions(fit), "correlation": correlate_residuals(fit)}
-    return found
+        tables |= {"motion": tabulate_motions(fit), "correlation": correlate_residuals(fit)}
+    return tables
 
 
 def tabulate_motions(fit: DeviceFit) -> dict[str, np.ndarray]:
@@ -39,22 +45,22 @@ def tabulate_motions(fit: DeviceFit) -> dict[str, np.ndarray]:
     units = {"time": "s"} | {name: unit_of(quantity, fit.unit_system) for name, quantity in names.items()}
     columns = {name: np.concatenate([getattr(motion, name) for motion in fit.motions]) for name in units}
     table = {header(name, unit): columns[name] for name, unit in units.items()}
-    rest = columns["position"] - columns["modelled"]
-    return {"log": np.concatenate(logs), **table, header("residual", units["position"]): rest}
+    residual = columns["position"] - columns["modelled"]
+    return {"log": np.concatenate(logs), **table, header("residual", units["position"]): residual}
 
 
 def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
     """Return the autocorrelation of the residuals of all logs over the lag, with the 95 % band of white noise."""
-    rests = [motion.position - motion.modelled for motion in fit.motions]
-    rests = [rest[np.isfinite(rest)] for rest in rests]
-    most = int(min(_LAGS, *(_SHARE * rest.size for rest in rests)))
+    residuals = [motion.position - motion.modelled for motion in fit.motions]
+    residuals = [each[np.isfinite(each)] for each in residuals]
+    most = int(min(_LAGS, *(_SHARE * each.size for each in residuals)))
     lags = np.arange(1, most + 1)
-    products = np.array([sum(float(rest[k:] @ rest[: rest.size - k]) for rest in rests) for k in lags])
-    size, count = sum(float(rest @ rest) for rest in rests), sum(rest.size for rest in rests)
+    products = np.array([sum(float(each[k:] @ each[: each.size - k]) for each in residuals) for k in lags])
+    size, count = sum(float(each @ each) for each in residuals), sum(each.size for each in residuals)
     return {
         header("lag", "s"): lags * fit.period,
         "autocorrelation": products / size if size > 0 else np.full(most, np.nan),
-        "band": np.full(most, reach_of(None) / np.sqrt(count)),
+        "band": np.full(most, compute_reach(None) / np.sqrt(count)),
     }
 
 
@@ -69,7 +75,7 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
         raise InputError("scene: no wall of the fitted device is stable; measure again")
     end = max(float(each.virtual_damping.max()) for each in outlines)
     damping = np.concatenate([np.linspace(0.0, end, _ROWS), np.linspace(end, _BEYOND * end, _ROWS // 10)[1:]])
-    own = fit.estimates[None]
+    estimate = fit.estimates[None]
     low = high = np.full(damping.size, np.nan)
     drawn = fit.draw(min(_DRAWS, fit.nominal.loop.draws))
     if drawn is not None:
@@ -77,7 +83,7 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
     unit = unit_of("stiffness", fit.unit_system)
     return {
         header("virtual_damping", unit_of("damping", fit.unit_system)): damping,
-        header("stiffness", unit): _limit_rows(fit, own, damping)[0],
+        header("stiffness", unit): _limit_rows(fit, estimate, damping)[0],
         header("stiffness_low", unit): low,
         header("stiffness_high", unit): high,
     }
@@ -93,12 +99,18 @@ def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str
 
     The residuals of stiffness and frequency are in units of their noise.
     """
-    top, choice, lost = fit.nominal.max_stiffness(), fit.recommended, (np.nan,) * 4
-    rows: list[tuple[Any, ...]] = [("stiffest", float(top.stiffness), float(top.virtual_damping), *lost)]
-    rows += [] if choice.status != Status.OK else [("set", choice.stiffness, choice.virtual_damping, *lost)]
-    share = fit.noise[0] if isinstance(fit.noise, tuple) else np.nan
-    for each, rest in zip(points, fit.residuals if points else (), strict=True):
-        rows.append(("buzzing", each.stiffness, each.virtual_damping, share * each.stiffness, each.frequency, *rest))
+    top, recommended, missing = fit.nominal.max_stiffness(), fit.recommended, (np.nan,) * 4
+    rows: list[tuple[Any, ...]] = [("stiffest", float(top.stiffness), float(top.virtual_damping), *missing)]
+    rows += (
+        []
+        if recommended.status != Status.OK
+        else [("set", recommended.stiffness, recommended.virtual_damping, *missing)]
+    )
+    noise = fit.noise[0] if isinstance(fit.noise, tuple) else np.nan
+    for each, residual in zip(points, fit.residuals if points else (), strict=True):
+        rows.append(
+            ("buzzing", each.stiffness, each.virtual_damping, noise * each.stiffness, each.frequency, *residual)
+        )
     kinds, *numbers = zip(*rows, strict=True)
     stiffness, damping = (unit_of(name, fit.unit_system) for name in ("stiffness", "damping"))
     heads = {"stiffness": stiffness, "virtual_damping": damping, "stiffness_error": stiffness, "frequency": "Hz"}

@@ -160,7 +160,7 @@ def _design(
     count = int(length / period / (_STRETCHES * _PERIODS)) // 2 * 2
     if count < _FEWEST_SAMPLES:
         needed = _FEWEST_SAMPLES * _STRETCHES * _PERIODS * period
-        raise InputError(f"duration: got {length:g} s, too short at this rate; at least {needed:.3g} s are needed")
+        raise InputError(f"duration: got {length:g} s, too short at this sampling rate; give at least {needed:.3g} s")
     velocity = BackwardDifference() if velocity is None else velocity
     scene = None if response is None else Scene(response, Timing(period), velocity=velocity)
     limit = None if scene is None else find_nominal_limit(scene)
@@ -171,17 +171,18 @@ def _design(
         lines, shape = _design_second(scene, limit, count)
     rng = np.random.default_rng(seed)
     stretches = [_make_period(lines, shape, count, rng) for _ in range(_STRETCHES)]
-    scale = most / max(float(np.abs(one).max()) for one in stretches)
-    played = scale * np.concatenate([np.tile(one, _PERIODS) for one in stretches])
+    scale = most / max(float(np.abs(stretch).max()) for stretch in stretches)
+    commanded = scale * np.concatenate([np.tile(stretch, _PERIODS) for stretch in stretches])
     amplitude = scale * shape
-    # A mean of n samples has noise of 2 sigma/sqrt(n) at a line; equal periods meet the same steps of the encoder.
+    # In n samples, white noise of standard deviation sigma has amplitudes of 2 sigma/sqrt(n) at a line. The equal
+    # periods of a stretch count as one, because their quantization errors are equal.
     deviation = SURE * step / np.sqrt(12.0) * 2.0 / np.sqrt(_STRETCHES * count) / amplitude
     hertz, expected = lines / (count * period), None
     if scene is not None and response is not None:
-        answer = _answer_at(scene, 2.0 * np.pi * lines / count)[0]
-        predicted = MeasuredDevice(hertz, answer, deviation, system.rotary)
+        curve = _interpolate_response(scene, 2.0 * np.pi * lines / count)[0]
+        predicted = MeasuredDevice(hertz, curve, deviation, system.rotary)
         expected = Scene(predicted, scene.timing, velocity=velocity).max_stiffness()
-    return Excitation(played, period, count * period, hertz, amplitude, deviation, expected, limit, system.rotary)
+    return Excitation(commanded, period, count * period, hertz, amplitude, deviation, expected, limit, system.rotary)
 
 
 def _build_frequency_grid(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
@@ -193,7 +194,7 @@ def _build_frequency_grid(count: int, period: float, spacing: np.ndarray) -> np.
     return np.array(lines)
 
 
-def _answer_at(scene: Scene, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _interpolate_response(scene: Scene, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the interpolated response in m/N, the velocity estimate and the interpolation error in m/N."""
     c = cast("MeasuredLoop", scene.loop).walls.curve
     S, F = c.evaluate(np.clip(w, c.w[0], c.w[-1]))
@@ -205,9 +206,9 @@ def _design_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.nd
     """Return frequencies and relative amplitudes of a second record, for walls close to the stiffest one."""
     period, units = scene.timing.period, scene.units
     all_lines = np.arange(1, count // 2)
-    answer, F, gap = _answer_at(scene, 2.0 * np.pi * all_lines / count)
+    response, F, gap = _interpolate_response(scene, 2.0 * np.pi * all_lines / count)
     wall = limit.stiffness + limit.virtual_damping * units.stiffness / units.virtual_damping * F
-    distance = np.min([np.abs(1.0 / (share * wall) + answer) for share in _SHARES], axis=0)
+    distance = np.min([np.abs(1.0 / (share * wall) + response) for share in _SHARES], axis=0)
     spacing = _SPACING * np.minimum(1.0, np.sqrt(_GAP * distance / np.maximum(gap, 1e-300)))
     # Limit the ratio of neighboring spacings to 2.
     spacing = np.minimum(spacing, np.minimum(np.roll(spacing, 1), np.roll(spacing, -1)) * 2.0)

@@ -37,8 +37,8 @@ _MEASURED = ("meas", "measured", "actual", "sensed", "sensor", "est", "estimated
 # Words for derivatives, errors and temperatures. Columns with these words are neither positions nor forces.
 _DERIVED = ("error", "err", "vel", "velocity", "speed", "dot", "acc", "rate", "temp")
 # Words that imply a rotary axis, and words that imply a linear axis.
-_TURNS = ("angle", "phi", "theta", "winkel", "torque", "tau", "moment", "drehmoment", "sollmoment")
-_MOVES = ("force", "f", "kraft", "sollkraft", "weg")
+_ROTARY_WORDS = ("angle", "phi", "theta", "winkel", "torque", "tau", "moment", "drehmoment", "sollmoment")
+_LINEAR_WORDS = ("force", "f", "kraft", "sollkraft", "weg")
 # Headers of columns that replace a missing position or force, and their unit if the header has none.
 _INSTEAD = {
     "position": (("velocity", "vel", "speed"), "m/s"),
@@ -56,22 +56,22 @@ _WHOLE = ("sec", "secs", "seconds", "s")
 class Column(NamedTuple):
     """The column of a table that contains a quantity, or the two columns of a time split into seconds and fractions."""
 
-    places: tuple[int, ...]  # column indices, counted from 0
+    indices: tuple[int, ...]  # column indices, counted from 0
     units: tuple[str, ...]  # unit of each column, "" if none is specified
-    turns: bool | None  # True: the header implies a rotary axis; False: a linear axis; None: neither
+    is_rotary: bool | None  # True: the header implies a rotary axis; False: a linear axis; None: neither
     guessed: bool = False  # True if the header contains more than the name of the quantity, or only a unit
     header_unit: str = ""  # unit in the header if the user specified a unit as well
 
 
 def find_columns(
-    file: object, heads: Sequence[str], asked: Mapping[str, str | None], wanted: Sequence[str]
+    file: object, heads: Sequence[str], specified: Mapping[str, str | None], wanted: Sequence[str]
 ) -> dict[str, Column]:
     """Return the column of each quantity.
 
     Args:
         file: path of the table, for messages.
         heads: headers of the table.
-        asked: user-specified columns by quantity, as "NAME" or "NAME:unit"; None to identify the column by its header.
+        specified: columns specified by the user, by quantity, as "NAME" or "NAME:unit"; None to use the headers.
         wanted: the quantities to return.
 
     Raises:
@@ -80,16 +80,16 @@ def find_columns(
     columns: dict[str, Column] = {}
     missing, several = [], []
     for name in wanted:
-        text = asked.get(name)
+        text = specified.get(name)
         if text is not None:
             columns[name] = _find_asked(file, heads, name, text)
             continue
-        column, places = _find_by_name(heads, name)
+        column, indices = _find_by_name(heads, name)
         if column is not None:
             columns[name] = column
-        elif places:
+        elif indices:
             several.append(
-                f"{name}: may be any of the columns {list_heads(heads[k] for k in places)} in {file}; specify one"
+                f"{name}: may be any of the columns {list_heads(heads[k] for k in indices)} in {file}; specify one"
             )
         else:
             missing.append(name)
@@ -102,8 +102,8 @@ def find_columns(
 
 def has_column(heads: Sequence[str], name: str) -> bool:
     """Return whether the headers of a table identify at least one column of a quantity."""
-    column, places = _find_by_name(heads, name)
-    return column is not None or bool(places)
+    column, indices = _find_by_name(heads, name)
+    return column is not None or bool(indices)
 
 
 def _refuse_missing(file: object, heads: Sequence[str], missing: list[str]) -> None:
@@ -130,10 +130,10 @@ def _find_by_name(heads: Sequence[str], name: str) -> tuple[Column | None, list[
         if rank is not None:
             ranks.setdefault(rank, []).append(k)
     if not ranks:
-        places = [k for k, (title, _) in enumerate(titles) if title.lower() in others]
-        if len(places) != 1:
-            return None, places
-        return Column((places[0],), (titles[places[0]][1] or usual,), None), []
+        indices = [k for k, (title, _) in enumerate(titles) if title.lower() in others]
+        if len(indices) != 1:
+            return None, indices
+        return Column((indices[0],), (titles[indices[0]][1] or usual,), None), []
     best = min(ranks)
     if len(ranks[best]) > 1:
         return None, ranks[best]
@@ -141,7 +141,9 @@ def _find_by_name(heads: Sequence[str], name: str) -> tuple[Column | None, list[
     title, unit = titles[k]
     words = _split_words(title)
     unit = unit or next((_UNIT_WORDS[word] for word in words if word in _UNIT_WORDS), "")
-    return Column((k,), (unit or (heads[k].strip() if best == _UNIT_ONLY else ""),), _is_turning(words), best > 0), []
+    return Column(
+        (k,), (unit or (heads[k].strip() if best == _UNIT_ONLY else ""),), _classify_axis(words), best > 0
+    ), []
 
 
 _UNIT_ONLY = 3  # rank of a header that is only a unit
@@ -186,11 +188,11 @@ def _split_words(title: str) -> list[str]:
     return [re.sub(r"[0-9]+$", "", word).lower() for word in re.split(r"[\W_]+", spaced) if word]
 
 
-def _is_turning(words: Sequence[str]) -> bool | None:
+def _classify_axis(words: Sequence[str]) -> bool | None:
     """Return True if words of a header imply a rotary axis, False if they imply a linear axis, None otherwise."""
-    if any(word in _TURNS for word in words):
+    if any(word in _ROTARY_WORDS for word in words):
         return True
-    return False if any(word in _MOVES for word in words) else None
+    return False if any(word in _LINEAR_WORDS for word in words) else None
 
 
 def _find_parts(heads: Sequence[str]) -> Column | None:
@@ -224,7 +226,7 @@ def _find_asked(file: object, heads: Sequence[str], name: str, wanted: str) -> C
     if name == "time" and "+" in title and not _match_title(heads, title):
         parts = [_find_asked(file, heads, name, part) for part in title.split("+")]
         units = tuple(unit for part in parts for unit in part.units)
-        return Column(tuple(place for part in parts for place in part.places), units, None)
+        return Column(tuple(index for part in parts for index in part.indices), units, None)
     unit = None
     matches = _match_title(heads, title)
     if not matches:
@@ -242,8 +244,8 @@ def _find_asked(file: object, heads: Sequence[str], name: str, wanted: str) -> C
     words = _split_words(base)
     unit_word = next((_UNIT_WORDS[word] for word in words if word in _UNIT_WORDS), "") if name == "time" else ""
     if unit is not None:
-        return Column((k,), (unit,), _is_turning(words), header_unit=header_unit)
-    return Column((k,), (header_unit or unit_word,), _is_turning(words))
+        return Column((k,), (unit,), _classify_axis(words), header_unit=header_unit)
+    return Column((k,), (header_unit or unit_word,), _classify_axis(words))
 
 
 def _match_title(heads: Sequence[str], title: str) -> list[int]:

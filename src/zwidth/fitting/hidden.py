@@ -41,7 +41,7 @@ import numpy as np
 
 from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
-from zwidth.fitting.required_wall import DeviceRows, RequiredWall
+from zwidth.fitting.required_wall import CriticalController, GridLimits
 from zwidth.parts.circle import circle
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.measured_curve import LEAST_DAMPING_RATIO
@@ -92,8 +92,8 @@ class HiddenPole(NamedTuple):
     """A pole that the model lacks, or a resonance that explains the log as well as the model's actuator lag."""
 
     frequency: float  # relative to the sampling rate
-    rings: bool  # complex pole (resonance); otherwise real (lag)
-    instead: bool = False  # alternative to the actuator lag of the model, which explains the log equally well
+    is_resonance: bool  # complex pole; otherwise a real pole, i.e. a lag
+    replaces_lag: bool = False  # alternative to the actuator lag of the model, which explains the log equally well
 
 
 class PoleBank(NamedTuple):
@@ -104,9 +104,7 @@ class PoleBank(NamedTuple):
     score: np.ndarray  # reduction of the sum of squares, in noise variances; chi-square for white noise alone
     signature_size: np.ndarray  # norm of the signature of the unit mode, in standard errors
     projection: np.ndarray  # residuals projected onto that signature, in standard errors
-    error_inflation: (
-        np.ndarray
-    )  # standard error with autocorrelated encoder errors, divided by that with white noise; >= 1
+    error_inflation: np.ndarray  # standard error with autocorrelated encoder errors, relative to white noise; >= 1
     absorbed: np.ndarray  # bias of theta if the unit mode is omitted from the model; one column per parameter
 
     def select(self, mask: np.ndarray) -> PoleBank:
@@ -214,7 +212,7 @@ def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenR
     order = np.argsort(grid, -1)
     grid, response = (np.take_along_axis(each, order, -1) for each in (grid, np.concatenate(responses, -1)))
     velocity = scene.velocity.estimate(period).jet(circle(2.0 * np.pi * grid)).value
-    reference, *stiffness = DeviceRows(-1.0 / response, velocity / period).stiffest()
+    reference, *stiffness = GridLimits(-1.0 / response, velocity / period).find_stiffness_max()
     return HiddenResonances(odds, np.array(stiffness) / reference) if reference > 0 else None
 
 
@@ -265,7 +263,7 @@ def _build_frequency_grid(scene: Scene, phase_step: float) -> np.ndarray:
 def _evaluate_unit_modes(fit: FittedModel, grid: np.ndarray, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
     """Return the contribution of unit modes to the frequency response."""
     (g, delta, d), mode = fit.theta[:3], (2.0 * np.pi * frequency, ratio, np.sqrt(1.0 - ratio**2))
-    return g * RequiredWall(delta, d, (), [mode]).add(circle(2.0 * np.pi * grid))
+    return g * CriticalController(delta, d, (), [mode]).evaluate_parts(circle(2.0 * np.pi * grid))
 
 
 def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -273,8 +271,8 @@ def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tup
     points = circle(2.0 * np.pi * grid.ravel())
 
     def evaluate(theta: np.ndarray) -> np.ndarray:
-        wall = RequiredWall(*fit.model.normalize(theta, period)[1:])
-        return (-theta[0] / wall.value(points)).reshape(grid.shape)
+        controller = CriticalController(*fit.model.normalize(theta, period)[1:])
+        return (-theta[0] / controller.evaluate(points)).reshape(grid.shape)
 
     count, response = fit.model.parts.stop, evaluate(fit.theta)
     steps = np.abs(fit.theta[:count])
@@ -286,10 +284,10 @@ def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tup
 
 
 def truncate_logs(fit: FittedModel) -> FittedModel:
-    """Return the fit restricted to the first `MAX_SAMPLES` positions of each log."""
+    """Return the fit, restricted to the first `MAX_SAMPLES` positions of each log."""
     if max(log.position.size for log in fit.model.logs) <= MAX_SAMPLES:
         return fit
-    part = replace(fit, model=fit.model.begin(MAX_SAMPLES), rivals=())
+    part = replace(fit, model=fit.model.truncate(MAX_SAMPLES), rivals=())
     part = replace(part, squares=float(part.residuals @ part.residuals))
     return replace(part, model=replace(part.model, noise=part.noise)) if fit.model.noise is not None else part
 
@@ -341,7 +339,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
 def _expand_unit_modes(fit: FittedModel, poles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Expand the position of each unit mode in the filtered forces of `_filter_forces`.
 
-    A held force that has acted for a whole period contributes ``(e^p - 1) e^(-f p)/p`` times the filtered force, with f
+    A force that was held for a whole period contributes ``(e^p - 1) e^(-f p)/p`` times the filtered force, with f
     the fractional part of the delay. The latest force has acted for 1 - f periods only, which subtracts
     ``(1 - e^(-f p))/p`` times that force. The position is the imaginary part, multiplied by g/|p|.
 
@@ -349,10 +347,10 @@ def _expand_unit_modes(fit: FittedModel, poles: np.ndarray) -> tuple[np.ndarray,
         The gains of the real and the imaginary part of the filtered force, one row each; and the gain of the latest
         force, to be subtracted. They are 0 for real poles, of which only the score is used.
     """
-    unit, held = fit.theta[0] / np.abs(poles) / poles, np.exp(-(fit.theta[2] % 1.0) * poles)
-    gain = unit * np.expm1(poles) * held
+    unit, delayed = fit.theta[0] / np.abs(poles) / poles, np.exp(-(fit.theta[2] % 1.0) * poles)
+    gain = unit * np.expm1(poles) * delayed
     # Im(gain (x + j y)) = Im(gain) x + Re(gain) y.
-    return np.array([gain.imag, gain.real] if np.iscomplexobj(poles) else [gain.imag]), (unit * (1.0 - held)).imag
+    return np.array([gain.imag, gain.real] if np.iscomplexobj(poles) else [gain.imag]), (unit * (1.0 - delayed)).imag
 
 
 def _build_poles(ratio: float, frequency: np.ndarray) -> Any:

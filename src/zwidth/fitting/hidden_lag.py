@@ -51,7 +51,9 @@ def score_lags(fit: FittedModel) -> LagTest:
     # resonances.
     (g, delta, d), model = fit.theta[:3], Recordings(fit.model.logs, lag=1)
     thetas = [np.pad([g, delta, d - lag, lag], (0, model.size - 4)) for lag in lags]
-    changes = [np.concatenate([model.add_parts(theta, k).position for k in range(len(model.logs))]) for theta in thetas]
+    changes = [
+        np.concatenate([model.simulate_parts(theta, k).position for k in range(len(model.logs))]) for theta in thetas
+    ]
     changes = fit.model.weigh(np.stack(changes, -1))
     absorbed = fit.inverse.matrix @ changes
     signatures, residuals = changes - fit.columns[0] @ absorbed, fit.model.weigh(fit.residuals)

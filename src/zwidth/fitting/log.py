@@ -1,4 +1,9 @@
-"""A device from a log of its free motion under a commanded force."""
+"""Fit a device to a log of its free motion under a commanded force.
+
+The steps: read and repair the logs (`fitting.recordings`); fit the positions by least squares (`fitting.output_error`)
+with the structure that Schwarz's criterion selects (`fitting.choosing`); refuse fits that the force does not explain;
+test the residuals for white noise; and bound undetected resonances and lags (`fitting.hidden`, `fitting.hidden_lag`).
+"""
 
 from __future__ import annotations
 
@@ -8,13 +13,13 @@ import numpy as np
 
 from zwidth.fitting.causes import Cause, explain_motion, explain_residuals
 from zwidth.fitting.choosing import ALIKE, EXACT, Choice, choose_structure
-from zwidth.fitting.device_estimate import differentiate, reach_of
-from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, doubt_period
+from zwidth.fitting.device_estimate import compute_reach, differentiate
+from zwidth.fitting.device_fit import BEYOND, MASS_OPEN, SEE_MORE, VAGUE, DeviceFit, FittedMotion, check_period_unit
 from zwidth.fitting.encoder import fits_steps
 from zwidth.fitting.hidden import HiddenPole, bound_response, sample_resonances
 from zwidth.fitting.hidden_lag import bound_lag
 from zwidth.fitting.moving import Recording
-from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
+from zwidth.fitting.output_error import MIN_FRICTION, FittedModel, fit_model
 from zwidth.fitting.recordings import ReadLogs, find_even, find_stretches, read_logs
 from zwidth.fitting.structure import Recordings
 from zwidth.parts.checks import check_number
@@ -34,16 +39,13 @@ _USUAL = {False: (2e-3, 10.0, 3.0, 1e3), True: (1e-8, 10.0, 100.0, 300.0)}
 _FEWEST = 20  # least number of fitted positions per stretch; the positions before them only provide past forces
 _FEW = 60  # fewer fitted positions cause a warning, because very different devices may fit equally well
 _MOST = 200_000  # largest number of fitted positions of all logs; more need gigabytes and only reduce the errors
-_FINER = 0.3  # residuals below this share of the quantization noise of an encoder exclude its step
+_FINER = 0.3  # an encoder step is excluded if the residuals are below this share of its quantization noise
 _SEEN = 5.0  # least effect of the force on the positions, in standard errors
 # A fit is refused if both limits are exceeded.
 _UNEXPLAINED = 0.01  # residual sum of squares, relative to that of the motion without a force
 _SMOOTH = 5.0  # excess of the residuals over white noise (`FittedModel.excess`)
 # Remedy for residuals with dynamics that the model lacks.
-_RECORD_NEXT = (
-    "the device has dynamics that the model lacks, so K_max stays open; play a force of zwidth.excite and use "
-    "zwidth.respond, which needs no model"
-)
+_RECORD_NEXT = "measure the response instead (zwidth.excite, zwidth.respond), which needs no model"
 
 
 def fit_log(
@@ -59,7 +61,7 @@ def fit_log(
 ) -> DeviceFit:
     """Fit mass, damping and delay of a device to a log of its free motion under commanded forces.
 
-    The model is ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, with the force held between samples; the positions
+    The model is ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, with zero-order hold of the force; the positions
     are fitted by least squares. The constant force f0 and the friction F_c are always fitted, which increases the
     errors of the other parameters. Omitting them if the log hardly shows them would bias the others by many standard
     errors. An actuator lag of first or second order and resonances are added if Schwarz's criterion requires them.
@@ -129,55 +131,57 @@ def _fit(
     system: UnitSystem,
 ) -> DeviceFit:
     """Return the fit of logs that were read and repaired."""
-    logs, places, period, wavers, notes, _ = read
+    logs, places, period, period_error, notes, _ = read
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
     stretches = [find_even(place, skip + _FEWEST) for place in places]
-    for k, own in enumerate(stretches):
-        if not own:
+    for k, parts in enumerate(stretches):
+        if not parts:
             most = max((each.stop - each.start for each in find_even(places[k], 1)), default=1)
             raise InputError(
-                f"time: log {k + 1} has {most} samples without a gap, and the first {skip} serve as past force; at "
-                f"least {skip + _FEWEST} are needed: record longer, or give a shorter max_delay"
+                f"time: log {k + 1} has {most} samples without a gap, of which the first {skip} only provide past "
+                f"forces; at least {skip + _FEWEST} are needed: record longer, or give a shorter max_delay"
             )
     count = sum(map(len, stretches))
     recordings = tuple(
-        Recording(log.force[each], log.position[each][skip:], skip).begin(_MOST // count)
-        for log, own in zip(logs, stretches, strict=True)
-        for each in own
+        Recording(log.force[each], log.position[each][skip:], skip).truncate(_MOST // count)
+        for log, parts in zip(logs, stretches, strict=True)
+        for each in parts
     )
-    doubts = [doubt for log in logs for doubt in find_stretches(log, system)]
-    steps, odd = _list_steps(resolution, read, system)
+    warnings = [warning for log in logs for warning in find_stretches(log, system)]
+    steps, step_warnings = _list_steps(resolution, read, system)
     step, (best, pole, bank, lags) = _choose_step(recordings, longest, steps)
     model, theta = best.model, best.theta
     _refuse_unmoved(best, period, system)
-    if best.inverse.open[:3].any():
+    if best.inverse.undetermined[:3].any():
         raise InputError(
-            "force: mass, damping and delay cannot be told apart by this log; record longer, with a force that changes "
-            "its sign at different times, as steps to and fro"
+            "force: this log does not determine mass, damping and delay; record longer, with a force that changes its "
+            "sign at irregular times"
         )
-    scene, known = model.normalize(theta, period).to_scene(period, velocity, system), slice(0, model.parts.stop)
-    by_theta = differentiate(lambda theta: model.normalize(theta, period).to_numbers(period), theta)[:, known]
-    (by_period,) = differentiate(lambda time: model.normalize(theta, time[0]).to_numbers(time[0]), np.array([period])).T
-    late = wavers * period * by_period
-    covariance = by_theta @ best.covariance[known, known] @ by_theta.T + np.outer(late, late)
+    scene, of_device = model.normalize(theta, period).to_scene(period, velocity, system), slice(0, model.parts.stop)
+    by_theta = differentiate(lambda theta: model.normalize(theta, period).to_parameters(period), theta)[:, of_device]
+    (by_period,) = differentiate(
+        lambda time: model.normalize(theta, time[0]).to_parameters(time[0]), np.array([period])
+    ).T
+    from_period = period_error * period * by_period
+    covariance = by_theta @ best.covariance[of_device, of_device] @ by_theta.T + np.outer(from_period, from_period)
     freedom = max(1, best.count - theta.size)
     unexplained = _find_unexplained(best, pole, period, system) if bank else []
-    doubts = odd + doubts + _doubt(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
-    status = Status.OK if best.arrived else Status.NOT_CONVERGED
-    # The true device has another K_max then.
+    warnings = step_warnings + warnings + _list_warnings(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
+    status = Status.OK if best.converged else Status.NOT_CONVERGED
+    # If the residuals are not white noise, the true device may have quite another K_max.
     status = Status.UNDECIDED if status == Status.OK and unexplained else status
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
-        doubts.append(
+        warnings.append(
             f"the delay is at the end of the search range, {with_unit(longest * period, 's')}; give a longer max_delay"
         )
-    motions = _place(best, logs, places, stretches, skip, period)
-    offset, friction = (_in_newton(best, k) for k in (-2, -1))
-    shown: dict[str, Any] = {}
+    motions = _build_motions(best, logs, places, stretches, skip, period)
+    offset, friction = (_convert_force(best, k) for k in (-2, -1))
+    analyses: dict[str, Any] = {}
     if bank and not unexplained:
-        shown = {"response": bound_response(best, scene, bank), "hidden": sample_resonances(best, scene, bank)}
-        shown |= {"lag": bound_lag(best, lags, scene, reach_of(freedom))}
+        analyses = {"response": bound_response(best, scene, bank), "hidden": sample_resonances(best, scene, bank)}
+        analyses |= {"lag": bound_lag(best, lags, scene, compute_reach(freedom))}
     return DeviceFit(
         nominal=scene,
         covariance=covariance,
@@ -188,11 +192,11 @@ def _fit(
         motions=motions,
         noise=float(np.sqrt(best.variance)),
         residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
-        doubts=(*doubts, *doubt_period(period)),
+        doubts=(*warnings, *check_period_unit(period)),
         status=int(status),
         freedom=freedom,
         notes=notes,
-        **shown,
+        **analyses,
     )
 
 
@@ -202,29 +206,30 @@ def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float,
     if cause:
         remedy = "log the force with more digits" if "rounded" in cause else _RECORD_NEXT
         return [f"the residuals are not white noise: {cause}; {remedy}"]
-    if pole is not None and pole.instead:
+    if pole is not None and pole.replaces_lag:
         near = with_unit(pole.frequency / period, "Hz", 3)
-        what = f"an actuator lag and a resonance near {near}, with another K_max, fit equally well"
-        return [f"{what}: {SEE_MORE}"]
+        cause = f"an actuator lag and a resonance near {near}, with another K_max, fit equally well"
+        return [f"{cause}: {SEE_MORE}"]
     if pole is not None:
-        kind = "a resonance near" if pole.rings else "an actuator lag with a corner frequency near"
-        what = f"they indicate {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
+        kind = "a resonance near" if pole.is_resonance else "an actuator lag with a corner frequency near"
+        cause = f"they indicate {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
     elif best.excess > ALIKE:
-        what = f"their sums are {plain(np.sqrt(best.excess), 2)} times as large, as with a hand or a compliance"
+        ratio = plain(np.sqrt(best.excess), 2)
+        cause = f"their sums are {ratio} times too large, as with a hand or a compliance"
     else:
         return []
-    return [f"the residuals are not white noise: {what}; {_RECORD_NEXT}"]
+    return [f"the residuals are not white noise: {cause}; {_RECORD_NEXT}"]
 
 
-def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
-    """Return a force with its standard error; ``k`` is the index of the force, divided by the mass, in theta."""
+def _convert_force(best: FittedModel, k: int) -> tuple[float, float]:
+    """Return a constant force or friction in N, with its standard error; ``k`` is its index in theta."""
     g = best.theta[0]
-    value, those = best.theta[k] / g, [0, k]
+    value, indices = best.theta[k] / g, [0, k]
     slope = np.array([-value / g, 1.0 / g])
-    error = float(np.sqrt(slope @ best.covariance[np.ix_(those, those)] @ slope))
-    # The lower bound of the friction in the search means no friction.
-    none = k == -1 and value <= 2.0 * LEAST * best.model.largest
-    return 0.0 if none else float(value), error
+    error = float(np.sqrt(slope @ best.covariance[np.ix_(indices, indices)] @ slope))
+    # A friction at the lower bound of the search means no friction.
+    is_zero = k == -1 and value <= 2.0 * MIN_FRICTION * best.model.largest_force
+    return 0.0 if is_zero else float(value), error
 
 
 def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[list[float], list[str]]:
@@ -258,27 +263,27 @@ def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> Non
     """Raise `InputError` if the force explains too little of the motion, or if the fitted mass is negative."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
     # Residuals of the motion without any force, friction included.
-    alone = model.follow(np.append(theta[:-2], [0.0, 0.0])).slopes[:, model.parts.stop : -2]
+    alone = model.simulate(np.append(theta[:-2], [0.0, 0.0])).derivatives[:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
     if float(rest @ rest) - squares <= _SEEN**2 * squares / model.measured.size:
         raise InputError(
-            "force: the position does not follow it; check that both columns are of the same axis, and that nothing "
-            "holds the device"
+            "force: the position does not follow it; check that both columns belong to the same axis, and that "
+            "nothing blocks the device"
         )
     left = squares / float(rest @ rest)
     unexplained = left > _UNEXPLAINED and best.excess > _SMOOTH
     cause = explain_motion(model.logs, period, system) if theta[0] <= 0 or unexplained else Cause("")
-    if cause.words:
+    if cause.text:
         raise InputError(
-            f"force: {cause.words}; support the device, or measure its frequency response, which needs no model "
+            f"force: {cause.text}; support the device, or measure its frequency response, which needs no model "
             "(zwidth.excite, zwidth.respond)"
         )
     if theta[0] <= 0 and (cause.reversed or left < _UNEXPLAINED):
         raise InputError(
             "force: the device accelerates against it, as with a mass of "
-            f"{with_unit(period**2 / theta[0], system['kg'])}; turn the sign of the "
-            "force, or of the position; a velocity given as a position looks so too"
+            f"{with_unit(period**2 / theta[0], system['kg'])}; reverse the sign of force or position; a velocity in "
+            "place of the position has the same effect"
         )
     if theta[0] <= 0:
         raise InputError(
@@ -288,58 +293,60 @@ def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> Non
         )
     if unexplained:
         raise InputError(
-            f"force: {plain(100 * np.sqrt(left), 2)} % of the motion is unexplained and no noise: another force, a "
-            "saturated motor, a wrong column or missing samples; record every sample of the free device"
+            f"force: {plain(100 * np.sqrt(left), 2)} % of the motion is unexplained and not white noise: another "
+            "force, a saturated motor, a wrong column or missing samples; record every sample of the free device"
         )
 
 
-def _doubt(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Recording, ...]) -> list[str]:
+def _list_warnings(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Recording, ...]) -> list[str]:
     """Return warnings about units, and about parameters that the log hardly determines."""
     mass, damping, delay = scene.device.mass, scene.device.damping, scene.timing.delay
-    doubts, residuals, units = [], best.residuals, scene.unit_system
+    warnings, residuals, units = [], best.residuals, scene.unit_system
     lightest, heaviest, farthest, strongest = _USUAL[units.rotary]
-    place, newton, fine = units["m"], units["N"], "degrees or counts" if units.rotary else "mm"
+    length, newton, fine = units["m"], units["N"], "degrees or counts" if units.rotary else "mm"
     if not lightest <= mass <= heaviest:
         light = f"the position may be in {fine}, or the force in k{newton}"
-        heavy = f"the force may be in m{newton}, the time in ms, or the position in a larger unit than is said"
-        slip = light if mass < lightest else heavy
-        what = f"a mass of {with_unit(mass, units['kg'])} is far from any device"
-        doubts.append(f"{what}; {slip}: {place}, {newton} and s are meant")
-    way, push = max(float(np.ptp(log.position)) for log in logs), best.model.largest
-    if way > farthest:
-        what = f"a way of {with_unit(way, place)} is far from any device"
-        doubts.append(f"{what}; the position may be in {fine}: {place} is meant")
-    if push > strongest:
-        what = f"a force of {with_unit(push, newton)} is far from any device"
-        doubts.append(f"{what}; it may be in m{newton}: {newton} is meant")
+        heavy = f"the force may be in m{newton}, the time in ms, or the position in a larger unit"
+        unit = light if mass < lightest else heavy
+        value = f"a mass of {with_unit(mass, units['kg'])} is far from any device"
+        warnings.append(f"{value}; {unit}: check that they are in {length}, {newton} and s")
+    span, force = max(float(np.ptp(log.position)) for log in logs), best.model.largest_force
+    if span > farthest:
+        value = f"a travel of {with_unit(span, length)} is far from any device"
+        warnings.append(f"{value}; the position may be in {fine}: check that it is in {length}")
+    if force > strongest:
+        value = f"a force of {with_unit(force, newton)} is far from any device"
+        warnings.append(f"{value}; it may be in m{newton}: check that it is in {newton}")
     if errors[0] > VAGUE * mass:
-        doubts.append(MASS_OPEN)
+        warnings.append(MASS_OPEN)
     if residuals.size < _FEW:
-        doubts.append(
+        warnings.append(
             f"only {residuals.size} positions are fitted, because earlier ones only provide past forces: the errors "
             "may be larger; record longer, or give a shorter max_delay"
         )
     size = float(residuals @ residuals)
-    if size <= EXACT**2 * residuals.size * way**2:
+    if size <= EXACT**2 * residuals.size * span**2:
         # The residuals are rounding errors.
-        return doubts
+        return warnings
     if damping == 0:
-        doubts.append("the damping is 0 at best: a negative damping would fit better")
+        warnings.append(
+            "the damping is at its lower bound, 0: a negative one would fit better; record longer, or a faster motion"
+        )
     elif errors[1] > VAGUE * damping:
-        span = max(log.force.size for log in logs)
-        doubts.append(
-            f"the damping is hardly seen, its standard error is {with_unit(errors[1], units['N s/m'], 2)}; record "
-            f"more than {span} samples, or a faster motion"
+        longest = max(log.force.size for log in logs)
+        warnings.append(
+            f"the damping is hardly determined: its standard error is {with_unit(errors[1], units['N s/m'], 2)}; "
+            f"record more than {longest} samples, or a faster motion"
         )
-    if delay == 0 and (away := best.step_beyond(2)) < -BEYOND:
-        doubts.append(
-            f"the delay is 0 at best: a negative delay would fit better, by {plain(-away, 2)} standard errors; check "
-            "for a shifted column"
+    if delay == 0 and (step := best.estimate_step(2)) < -BEYOND:
+        warnings.append(
+            f"the delay is at its lower bound, 0: a negative delay would fit better, by {plain(-step, 2)} standard "
+            "errors; check for a shifted column"
         )
-    return doubts
+    return warnings
 
 
-def _place(
+def _build_motions(
     best: FittedModel,
     logs: tuple[Recording, ...],
     places: tuple[np.ndarray, ...],
@@ -348,10 +355,10 @@ def _place(
     period: float,
 ) -> tuple[FittedMotion, ...]:
     """Return each log with its fitted positions, NaN for samples that are not fitted (first ones, and after gaps)."""
-    motions, parts = [], iter(best.model.split(best.motion.position))
-    for log, place, own in zip(logs, places, stretches, strict=True):
+    motions, parts = [], iter(best.model.split(best.response.position))
+    for log, place, slices in zip(logs, places, stretches, strict=True):
         modelled = np.full(log.force.size, np.nan)
-        for each in own:
+        for each in slices:
             part = next(parts)
             modelled[each.start + skip : each.start + skip + part.size] = part
         motions.append(FittedMotion(period * place, log.force, log.position, modelled))

@@ -1,4 +1,8 @@
-"""Logs as they are given: read, and refused where nothing can be found from them."""
+"""Read logs from arrays, repair them, and refuse those to which no device can be fitted.
+
+Samples are assigned to whole sampling periods by a line through all times, with the slope of the period. Times may
+differ from this line by timestamp jitter within limits, or by the ticks of a coarse clock (`fitting.repair`).
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from zwidth.words.unit_system import UnitSystem
 
 # Largest distance of a time from an evenly spaced one, in periods.
 _UNEVEN = 0.05  # without timestamp jitter
-_WAVERING = 0.25  # with timestamp jitter; less than the distance that a missing sample causes
+_JITTER = 0.25  # with timestamp jitter; less than the distance that a missing sample causes
 _SAME = 1e-5  # largest relative difference of the periods of two logs, in addition to their errors
 _SURE = 5.0  # standard errors of a period that its difference from another may have
 _STUCK = 25  # least duration in samples of a constant maximum or minimum that causes a warning
@@ -31,7 +35,7 @@ class ReadLogs(NamedTuple):
     logs: tuple[Recording, ...]
     places: tuple[np.ndarray, ...]  # for each log, the times of its samples in whole periods after the first
     period: float  # s
-    wavers: float  # relative standard error of the period
+    period_error: float  # relative standard error of the period
     notes: tuple[str, ...]  # the repairs, one clause each
     steps: tuple[tuple[float, float], ...]  # encoder step and column step of each log, from `find_steps`
 
@@ -73,15 +77,16 @@ def read_logs(
 def _read(
     time: Any, position: Any, force: Any, resample: bool, step: float, system: UnitSystem
 ) -> tuple[Recording, np.ndarray, float, float, list[str], tuple[float, float]]:
+    """Read one log; return its part of each field of `ReadLogs`. ``step`` is the encoder step, 0 if unknown."""
     x, f = as_float64("position", position), as_float64("force", force)
     clock = None if isinstance(time, str) or np.ndim(time) == 0 else as_float64("time", time)
     given = {"position": x, "force": f} | ({} if clock is None else {"time": clock})
     shapes = {array.shape for array in given.values()}
     if len(shapes) == 1 and x.shape == (1,):
-        raise InputError("got a single sample; a motion is fitted to many: record some seconds of it")
+        raise InputError("got a single sample; a fit needs many: record some seconds of motion")
     if len(shapes) > 1 or x.ndim != 1 or x.size < 2:
         text = ", ".join(f"{name} {array.shape}" for name, array in given.items())
-        raise InputError(f"shapes differ or are no single columns: {text}; give one number a sample in each")
+        raise InputError(f"shapes differ or are not single columns: {text}; give one number per sample in each")
     for name, array in given.items():
         finite = array[np.isfinite(array)]
         if not finite.size:
@@ -97,57 +102,57 @@ def _read(
     if clock is None:
         place, period, error = row - row[0], check_number("time", time, "s", POSITIVE), 0.0
     else:
-        place, period, error = _place(clock, resample, notes)
+        place, period, error = _assign_periods(clock, resample, notes)
     if np.ptp(f) == 0:
         raise InputError(
-            f"force: it is {plain(f[0])} {system['N']} all the time; command a force that changes, as steps to and fro"
+            f"force: it is {plain(f[0])} {system['N']} all the time; command a force that changes, such as steps of "
+            "both signs"
         )
     if np.ptp(x) == 0:
-        raise InputError("position: it never changes; check the column, and that nothing holds the device")
+        raise InputError("position: it never changes; check the column, and that nothing blocks the device")
     return Recording(f, x, 0), place, period, error, notes, steps
 
 
-def _place(clock: np.ndarray, wavering: bool, notes: list[str]) -> tuple[np.ndarray, float, float]:
+def _assign_periods(clock: np.ndarray, jitter: bool, notes: list[str]) -> tuple[np.ndarray, float, float]:
     """Return the index of each sample in periods, the period in s and its relative standard error.
 
     Args:
         clock: times in s.
-        wavering: allow timestamp jitter up to ``_WAVERING`` periods.
+        jitter: allow timestamp jitter up to ``_JITTER`` periods.
         notes: receives a note on times that are rounded to ticks.
     """
-    # The line through all times: nothing between the samples is guessed, they are taken as they are.
     steps = np.diff(clock)
     usual = float(np.median(steps))
     uneven = np.ptp(steps) > _UNEVEN * usual
-    coarse = even_coarse_times(clock) if uneven and not wavering else None
+    coarse = even_coarse_times(clock) if uneven and not jitter else None
     if coarse is not None:
         notes.append(coarse.note)
     elif steps.min() <= 0:
         refuse_repeated(clock)
-    # By a clock that wavers it cannot be told how many samples are missing.
-    passed = np.where((steps > _MISSING * usual) & (not wavering), np.round(steps / usual), 1.0)
+    # Do not search for missing samples with timestamp jitter, because their number would be ambiguous.
+    passed = np.where((steps > _MISSING * usual) & (not jitter), np.round(steps / usual), 1.0)
     place = np.concatenate([[0.0], np.cumsum(passed)]) if coarse is None else coarse.place
     count = place - place.mean()
     square = float(count @ count)
-    # Times to 12 digits have a period of as many.
+    # The slope of the line through all times, with as many digits as times usually have.
     period = float(f"{count @ clock / square:.12g}")
     late = clock - clock.mean() - period * count
     error = float(np.sqrt(late @ late / max(1, clock.size - 2) / square))
-    # Against the middle of them, for the first sample may be the late one.
+    # Measure deviations from the middle of their range, because the first sample may be the one that is late.
     late = late - 0.5 * (late.max() + late.min())
     worst = int(np.argmax(np.abs(late)))
-    if coarse is None and abs(late[worst]) > (_WAVERING if wavering else _UNEVEN) * period:
-        if abs(late[worst]) > _WAVERING * period:
-            remedy = "which sample is whose cannot be told; record at even times"
+    if coarse is None and abs(late[worst]) > (_JITTER if jitter else _UNEVEN) * period:
+        if abs(late[worst]) > _JITTER * period:
+            remedy = "the samples cannot be assigned to periods; record with a constant period"
         else:
             remedy = (
-                "record at even times; if only the clock that read them wavers, give the period in place of the times, "
-                "or ask to resample"
+                "record with a constant period; if only the timestamps have jitter, give the period in place of the "
+                "times, or use resample"
             )
         raise InputError(
-            f"time: samples are not even: steps from {with_unit(float(steps.min()), 's')} to "
-            f"{with_unit(float(steps.max()), 's')}, sample {worst} is {plain(100 * abs(late[worst]) / period, 2)} % of "
-            f"a period off; {remedy}"
+            f"time: samples are not evenly spaced: steps from {with_unit(float(steps.min()), 's')} to "
+            f"{with_unit(float(steps.max()), 's')}, sample {worst} is off by "
+            f"{plain(100 * abs(late[worst]) / period, 2)} % of a period; {remedy}"
         )
     return place.astype(int), period, error / period
 
@@ -160,31 +165,32 @@ def find_even(place: np.ndarray, least: int) -> list[slice]:
 
 def find_stretches(log: Recording, system: UnitSystem) -> list[str]:
     """Return warnings about an end stop, a saturated sensor or a saturated motor."""
-    doubts = []
-    for end, way in ((log.position.max(), 1.0), (log.position.min(), -1.0)):
-        first, last = _longest_run((log.position == end) & (log.force * way > 0))
+    warnings = []
+    for end, direction in ((log.position.max(), 1.0), (log.position.min(), -1.0)):
+        first, last = _find_longest_run((log.position == end) & (log.force * direction > 0))
         if last - first >= _STUCK:
-            doubts.append(
+            warnings.append(
                 f"the position stays at {with_unit(end, system['m'], 4)} from sample {first} to {last - 1} despite a "
                 "force: end stop, saturated sensor or static friction; omit such stretches"
             )
     for end in (log.force.max(), log.force.min()):
         at_end = log.force == end
-        first, last = _longest_run(at_end)
+        first, last = _find_longest_run(at_end)
         inside = np.unique(log.force[~at_end]).size
         if inside > _MANY * at_end.size and last - first >= _STUCK:
-            doubts.append(
+            warnings.append(
                 f"the force stays at {with_unit(end, system['N'], 4)} from sample {first} to {last - 1} and varies "
                 "elsewhere: if the motor saturates, log the force after saturation"
             )
-    return doubts
+    return warnings
 
 
 def find_runs(marked: np.ndarray) -> np.ndarray:
-    """First and one past the last of each run of marked samples, a row each."""
+    """Return the first index and one past the last index of each run of marked samples, one row per run."""
     return np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]]))).reshape(-1, 2)
 
 
-def _longest_run(marked: np.ndarray) -> tuple[int, int]:
+def _find_longest_run(marked: np.ndarray) -> tuple[int, int]:
+    """Return the longest of the runs of `find_runs`, (0, 0) if no sample is marked."""
     first, last = max(find_runs(marked).tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
     return first, last

@@ -1,12 +1,16 @@
-"""The critical controller of a device, which puts a pole on the unit circle: ``K + B F(z)/T = q(z)``, ``q = -1/G``.
+"""Compute the critical controller of a device, and from it the stability limits of walls on a grid of frequencies.
 
-The lag and the modes add to the response of the mass a sum over their poles p of ``r h(p; z)``: the response of
-``E' = p E + F`` to a held force with the delay d = n + f. With zeta = z - 1:
+The critical controller is ``q(z) = -1/G(z)``, with the response G of the sampled device. A wall (K, B) puts a pole at z
+on the unit circle if and only if ``K + B F(z)/T = q(z)``, with the velocity estimate F.
+
+An actuator lag and modes add to the response of the rigid mass a sum over their poles p of ``r h(p; z)`` with the
+residue r. h is the response of ``E' = p E + F`` to a force with zero-order hold and the delay d = n + f, 0 <= f < 1, in
+sampling periods. With zeta = z - 1:
 
     h = (zeta (e^((1 - f) p) - 1) + e^p - 1)/(p (zeta + 1 - e^p) z^(n + 1))
 
-A row of walls of one damping ends at its first crossing: the smallest K > 0 at which a pole reaches the unit circle,
-from K -> 0+, where it is stable for all B below the first that puts a pole on the circle there.
+A line of constant B ends at its first crossing: the smallest K > 0 that puts a pole on the unit circle, if the walls
+with K -> 0+ are stable. These are stable for all B > 0 below the smallest B that puts a pole on the circle at K = 0.
 """
 
 from __future__ import annotations
@@ -23,129 +27,152 @@ from zwidth.loops.rigid.ridge import plant_slopes
 from zwidth.parts.circle import CirclePoints, Jet
 from zwidth.words.types import Array
 
-# Poles closer than this are moved apart, because partial fractions require distinct poles.
-_DOUBLE = 1e-5
-# Dampings of a column, as shares of its end, then refined so often.
-_DAMPINGS, _REFINED, _TIMES = 33, 9, 3
+_DOUBLE = 1e-5  # least |zeta^2 - 1| of a pole pair; closer poles are moved apart, because partial fractions need that
+# Search over B: a grid that is refined around its best point.
+_DAMPINGS = 33  # points of the first grid
+_REFINED = 9  # points of a refined grid
+_TIMES = 3  # number of refinements
 
 
-class RequiredWall:
+class CriticalController:
     """``q = -1/G`` of devices; the arguments are arrays that broadcast with the frequencies.
 
-    A rigid device has ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``. ``lag`` contains the time constant of the
-    actuator in periods and, for second order, its damping ratio; ``modes`` frequencies in rad per sample, damping
-    ratios and mass ratios ``m/m_i``.
+    A rigid device has ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``, with the coefficients of `arrays.held_mass`.
+
+    Args:
+        delta: damping b T/m.
+        d: delay in periods.
+        lag: time constant of the actuator in periods and, for second order, its damping ratio; empty without a lag.
+        modes: for each mode the frequency in rad per sample, the damping ratio and the mass ratio ``m/m_i``.
     """
 
     def __init__(self, delta: Any, d: Any, lag: Sequence[Any] = (), modes: Sequence[Sequence[Any]] = ()) -> None:
         """Compute the quantities that do not depend on the frequency."""
-        self.whole, fraction = split_delay(np.asarray(d, float))
+        self.n_delay, fraction = split_delay(np.asarray(d, float))
         self.delta, self.fraction = delta, fraction
-        poles, residues = list_poles(delta, lag, modes)
-        self.beside = len(poles) > 0
+        poles, residues = expand_partial_fractions(delta, lag, modes)
+        self.has_parts = len(poles) > 0
         if poles:
             both = np.array(np.broadcast_arrays(fraction + np.zeros(1), *poles, *residues)[1:], complex)
             poles, self.residues = np.where(both[: len(poles)] == 0, 1e-300, both[: len(poles)]), both[len(poles) :]
-            self.turns, self.full = np.expm1(poles), np.expm1(poles) / poles
-            self.late = np.expm1((1.0 - fraction) * poles) / poles
+            # e^p - 1, the gain (e^p - 1)/p of a whole period, and the gain of its part after the fractional delay.
+            self.growth, self.gain = np.expm1(poles), np.expm1(poles) / poles
+            self.late_gain = np.expm1((1.0 - fraction) * poles) / poles
 
     @cached_property
     def plant(self) -> Plant:
-        """The rigid mass."""
+        """The sampled rigid mass."""
         return discretize_mass(self.delta, self.fraction)
 
-    def value(self, at: CirclePoints) -> Array:
+    def evaluate(self, points: CirclePoints) -> Array:
         """Return q."""
-        rigid = self.jet(at).value
-        return rigid / (1.0 - rigid * self.add(at)) if self.beside else rigid
+        rigid = self.evaluate_rigid(points).value
+        return rigid / (1.0 - rigid * self.evaluate_parts(points)) if self.has_parts else rigid
 
-    def jet(self, at: CirclePoints) -> Jet:
-        """Return q of the rigid mass and its derivative in w."""
-        plant, turn = self.plant, 1j * at.z
-        total, below = _answer(plant, at), at.before + plant.em
-        q = -np.exp(1j * self.whole * at.w) * at.before * below / total
-        slopes = turn / at.before + turn / below - 1j * (plant.a2 * at.z - plant.a0 / at.z) / total
-        return Jet(q, q * (1j * self.whole + slopes))
+    def evaluate_rigid(self, points: CirclePoints) -> Jet:
+        """Return q of the rigid mass and its derivative in the frequency w."""
+        plant, turn = self.plant, 1j * points.z
+        numerator, z_minus_c = _evaluate_numerator(plant, points), points.before + plant.em
+        q = -np.exp(1j * self.n_delay * points.w) * points.before * z_minus_c / numerator
+        slopes = turn / points.before + turn / z_minus_c - 1j * (plant.a2 * points.z - plant.a0 / points.z) / numerator
+        return Jet(q, q * (1j * self.n_delay + slopes))
 
-    def add(self, at: CirclePoints) -> Array:
-        """Return the part of the frequency response that is due to lag and modes."""
-        above, below = at.before * self.late + self.full, at.before - self.turns
-        return (self.residues * (np.exp(-1j * (self.whole + 1.0) * at.w) * above / below)).sum(0)
+    def evaluate_parts(self, points: CirclePoints) -> Array:
+        """Return the part of the response G that is due to lag and modes."""
+        above, below = points.before * self.late_gain + self.gain, points.before - self.growth
+        return (self.residues * (np.exp(-1j * (self.n_delay + 1.0) * points.w) * above / below)).sum(0)
 
-    def moves(self, at: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives of q of the rigid mass with respect to delta and d."""
+    def differentiate(self, points: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of q of the rigid mass in delta and d; ``q`` is its value."""
         by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
-        total = _answer(self.plant, at)
+        numerator = _evaluate_numerator(self.plant, points)
         return (
-            q * (by_delta.em / (at.before + self.plant.em) - _answer(by_delta, at) / total),
-            -q * _answer(by_fraction, at) / total,
+            q * (by_delta.em / (points.before + self.plant.em) - _evaluate_numerator(by_delta, points) / numerator),
+            -q * _evaluate_numerator(by_fraction, points) / numerator,
         )
 
 
-def _answer(plant: Any, at: CirclePoints) -> Any:
-    return plant.a2 * at.z + plant.a1 + plant.a0 / at.z
+def _evaluate_numerator(plant: Plant, points: CirclePoints) -> Any:
+    """Return the numerator of the rigid plant divided by z, ``a2 z + a1 + a0/z``."""
+    return plant.a2 * points.z + plant.a1 + plant.a0 / points.z
 
 
-def list_poles(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:
-    """Poles and residues of ``A(s) (1/(s (s + delta)) + sum of modes)`` but for ``1/(s (s + delta))``."""
-    # Those of the amplifier, -delta behind one, and two of each mode: frequency, damping ratio and ``m/m_i``.
-    late, gains = (list(each) for each in _amplify(lag))
-    poles, weights = list(late), [gain / pole / (pole + delta) for pole, gain in zip(late, gains, strict=True)]
-    if late:
+def expand_partial_fractions(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:
+    """Return the partial fractions of a lag and modes, in addition to ``1/(s (s + delta))`` of the rigid mass.
+
+    The expanded function is ``A(s) (1/(s (s + delta)) + sum_i r_i/(s^2 + 2 zeta_i w_i s + w_i^2)) - 1/(s (s + delta))``
+    with the lag A and the mass ratios r_i.
+
+    Args:
+        delta: damping b T/m.
+        lag: time constant and, for second order, damping ratio; empty without a lag.
+        modes: for each mode the frequency, the damping ratio and the mass ratio.
+
+    Returns:
+        The poles and their residues: the poles of the lag, -delta if there is a lag, and two poles per mode.
+    """
+    lag_poles, gains = (list(each) for each in _expand_lag(lag))
+    poles, weights = list(lag_poles), [gain / p / (p + delta) for p, gain in zip(lag_poles, gains, strict=True)]
+    if lag_poles:
         poles, weights = [*poles, -delta + 0j], [*weights, -sum(weights)]
-    for turns, ratio, share in modes:
-        own = _find_roots(turns, ratio)
-        for k, (pole, gain) in enumerate(zip(late, gains, strict=True)):
-            weights[k] = weights[k] + share * gain / (pole - own[0]) / (pole - own[1])
-        for pole, other in (own, own[::-1]):
+    for frequency, ratio, mass_ratio in modes:
+        pair = _solve_quadratic(frequency, ratio)
+        for k, (pole, gain) in enumerate(zip(lag_poles, gains, strict=True)):
+            weights[k] = weights[k] + mass_ratio * gain / (pole - pair[0]) / (pole - pair[1])
+        for pole, other in (pair, pair[::-1]):
             poles.append(pole)
-            behind = sum(gain / (pole - each) for each, gain in zip(late, gains, strict=True)) if late else 1.0
-            weights.append(share * behind / (pole - other))
+            lagged = sum(gain / (pole - p) for p, gain in zip(lag_poles, gains, strict=True)) if lag_poles else 1.0
+            weights.append(mass_ratio * lagged / (pole - other))
     return poles, weights
 
 
-def _amplify(lag: Sequence[Any] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poles and residues of A, along the first axis, by its time constant and damping ratio; none without them."""
+def _expand_lag(lag: Sequence[Any] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the poles and residues of A(s) along the first axis; none if ``lag`` is empty."""
     if len(lag) == 0:
         return np.zeros(0), np.zeros(0)
-    poles = _find_roots(1.0 / lag[0], lag[1]) if len(lag) == 2 else np.array([-1.0 / lag[0] + 0j])
+    poles = _solve_quadratic(1.0 / lag[0], lag[1]) if len(lag) == 2 else np.array([-1.0 / lag[0] + 0j])
     return poles, np.prod(-poles, 0) / (poles - poles[::-1] if len(lag) == 2 else np.ones_like(poles))
 
 
-def _find_roots(w: Any, ratio: Any) -> np.ndarray:
-    """Of ``s^2 + 2 zeta w s + w^2``, along the first axis; a double one is parted a little."""
-    inside = ratio**2 - 1.0
-    root = np.sqrt(np.where(np.abs(inside) > _DOUBLE, inside, _DOUBLE) + 0j)
+def _solve_quadratic(w: Any, ratio: Any) -> np.ndarray:
+    """Return the roots of ``s^2 + 2 zeta w s + w^2`` along the first axis; a double root is split by a little."""
+    discriminant = ratio**2 - 1.0
+    root = np.sqrt(np.where(np.abs(discriminant) > _DOUBLE, discriminant, _DOUBLE) + 0j)
     return np.array([w * (-ratio + root), w * (-ratio - root)])
 
 
 @dataclass(frozen=True)
-class DeviceRows:
-    """Devices with ``needed`` q in N/m, a row each over frequencies, and F/T in 1/s, a row for all or for each."""
+class GridLimits:
+    """Stability limits of devices for B >= 0, computed on a grid of frequencies in ascending order."""
 
-    needed: Array
-    velocity: Array
+    critical: Array  # q in N/m, a row per device and a column per frequency
+    velocity: Array  # F/T in 1/s, one row for all devices or one for each
 
     @cached_property
-    def ends(self) -> np.ndarray:
-        """Up to which damping soft walls are stable; inf where that is nowhere."""
-        return _cross_first(self.needed * self.velocity.conj(), self.needed / self.velocity)
+    def damping_limits(self) -> np.ndarray:
+        """The B below which walls with K -> 0+ are stable, one per device; inf if no B puts a pole on the circle."""
+        return _cross_first(self.critical * self.velocity.conj(), self.critical / self.velocity)
 
-    def row_ends(self, virtual_damping: np.ndarray) -> np.ndarray:
-        """Up to which stiffness every softer wall is stable, at one damping or at one for each device."""
-        wall = self.needed - np.reshape(virtual_damping, (-1, 1)) * self.velocity
-        ends = _cross_first(wall, wall)
-        # A slower crossing than the grid's slowest, or no end at all, is not believed.
-        real = (wall.imag[:, 0] < 0) & (virtual_damping < self.ends) & np.isfinite(ends)
-        return np.where(real, ends, 0.0)
+    def limit_stiffness(self, virtual_damping: np.ndarray) -> np.ndarray:
+        """Return the stiffness up to which all walls of one B are stable, for each device; 0 if none is.
 
-    def stiffest(self) -> np.ndarray:
-        """K_max of each device, of walls with B >= 0 alone."""
-        return find_highest(self.row_ends, np.where(np.isfinite(self.ends), self.ends, 0.0))[0]
+        Args:
+            virtual_damping: B, one for all devices or one for each.
+        """
+        stiffness = self.critical - np.reshape(virtual_damping, (-1, 1)) * self.velocity
+        limits = _cross_first(stiffness, stiffness)
+        # Reject limits that are infinite, or if the first crossing may be below the lowest frequency of the grid.
+        valid = (stiffness.imag[:, 0] < 0) & (virtual_damping < self.damping_limits) & np.isfinite(limits)
+        return np.where(valid, limits, 0.0)
+
+    def find_stiffness_max(self) -> np.ndarray:
+        """Return K_max of each device, for B >= 0."""
+        limits = self.damping_limits
+        return find_highest(self.limit_stiffness, np.where(np.isfinite(limits), limits, 0.0))[0]
 
 
 def find_highest(limit: Callable[[np.ndarray], np.ndarray], top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The highest limits over dampings from 0 to ``top``, and these dampings, all elementwise."""
+    """Return the maxima of a function of B over 0 <= B <= ``top``, and their B, elementwise."""
     middle = width = limits = 0.5 * top
     for count in (_DAMPINGS, *_TIMES * [_REFINED]):
         tried = np.clip(middle + width * np.linspace(-1.0, 1.0, count)[:, None], 0.0, top)
@@ -156,9 +183,13 @@ def find_highest(limit: Callable[[np.ndarray], np.ndarray], top: np.ndarray) -> 
 
 
 @np.errstate(all="ignore")
-def _cross_first(turning: Array, value: Array) -> np.ndarray:
-    """The smallest real part > 0 of ``value`` where ``turning`` is real; inf where there is none."""
-    left, right = turning.imag[:, :-1], turning.imag[:, 1:]
+def _cross_first(criterion: Array, value: Array) -> np.ndarray:
+    """Return the smallest positive real part of ``value`` among the frequencies at which ``criterion`` is real.
+
+    Both are interpolated linearly between the columns, which are frequencies; the result is inf if there is none. The
+    last frequency counts as one at which ``criterion`` is real, because it is at or near z = -1.
+    """
+    left, right = criterion.imag[:, :-1], criterion.imag[:, 1:]
     share = np.where(left == right, 0.0, left / (left - right))
     between = value.real[:, :-1] + share * (value.real[:, 1:] - value.real[:, :-1])
     crossed = (left * right <= 0) & (between > 0)

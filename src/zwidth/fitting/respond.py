@@ -1,8 +1,11 @@
-"""A frequency response with its deviation from records of commanded force and sampled position.
+"""Estimate a frequency response with its deviation from records of commanded force and sampled position.
 
-A periodic force tells it best: periods are averaged, what their differences drift by is taken out, and what cycles of
-other phases leave of one another is the error of each line, that of encoder, friction and noise alike. Any other force
-that is rich enough is answered by averaged spectra of overlapping pieces (Welch).
+For a periodic force with spectra U, the response is ``G = sum Y conj(U)/sum |U|^2`` at each frequency of the force (a
+*line*). The sums are over records with equal or different phases; Y are the spectra of the positions, without drift.
+The residuals Y - G U of the records give the standard error, which contains the errors of encoder, friction and noise
+(Pintelon, Schoukens 2012). A record is one *stretch*, two or more periods of the same force, averaged; or, if there is
+only one stretch, each of its periods. Any other force is analyzed by spectra averaged over overlapping segments (Welch
+1967).
 """
 
 from __future__ import annotations
@@ -27,21 +30,23 @@ from zwidth.words.quantities import POSITIVE
 from zwidth.words.types import ArrayLike
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
-# The radius that holds for some thousand lines at once: 4.5 standard errors of real and imaginary part, each of which
-# has half of the variance.
+# Deviation in standard errors of the complex response. It is 4.5 standard errors of the real and of the imaginary part,
+# each of which has half of the variance; all of some thousand lines are within it.
 SURE = 4.5 / np.sqrt(2.0)
-# What of a force is the same from period to period, of its range; a line with so little of the largest is none.
-_SAME, _EXCITED = 1e-5, 1e-3
-# Least samples of a period, and what share of a record must repeat.
-_SHORTEST, _REPEATED = 16, 0.3
-# Neighboring lines over which the error is averaged, to each side: few and many.
-_NARROW, _WIDE = 4, 24
-# Pieces of a record that does not repeat, at least, and their longest; below this coherence a line tells nothing.
-_PIECES, _LONGEST, _COHERENT = 8, 1 << 13, 0.1
-# Overlapping by half, pieces of Hann's window count so much less.
-_OVERLAP = 1.06
-# A motion of fewer steps of the encoder is not seen as it is.
-_STEPS = 20
+# Periodic forces.
+_SAME = 1e-5  # largest difference of the force between two periods, relative to its range
+_EXCITED = 1e-3  # least amplitude of a line, relative to the largest
+_SHORTEST = 16  # least number of samples per period, and of usable lines of a force that does not repeat
+_REPEATED = 0.3  # least share of a record that must repeat for a period to be accepted
+# Half-widths, in lines, of the two running means of the squared error; the larger mean is used.
+_NARROW = 4
+_WIDE = 24
+# Forces that do not repeat.
+_PIECES = 8  # least number of segments
+_LONGEST = 1 << 13  # largest number of samples per segment
+_COHERENT = 0.1  # least coherence of the first and last usable line
+_OVERLAP = 1.06  # variance with half-overlapping Hann windows, relative to that of as many independent segments
+_STEPS = 20  # a motion over fewer encoder steps causes a warning
 _FILLED = 0.002  # largest share of missing samples that are interpolated
 _LONGEST_GAP = 4  # longest step across missing samples, in samples
 
@@ -114,8 +119,8 @@ def respond(
         >>> record = zwidth.excite(period=1e-3, force=2.0, resolution=1e-5, duration=15)
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 5), zwidth.Timing(period=1e-3))
         >>> motion = zwidth.simulate(scene, 0.0, 0.0, push_history=record.force, periods=record.force.size)
-        >>> found = zwidth.respond(1e-3, motion.position[: record.force.size], record.force)
-        >>> f"{found.device.frequency.size} lines from {found.records} stretches"
+        >>> estimate = zwidth.respond(1e-3, motion.position[: record.force.size], record.force)
+        >>> f"{estimate.device.frequency.size} lines from {estimate.records} stretches"
         '409 lines from 5 stretches'
     """
     estimate = _respond(time, position, force, cycle, resolution, SYSTEMS[rotary])
@@ -125,29 +130,29 @@ def respond(
 def _respond(
     time: ArrayLike, position: ArrayLike, force: ArrayLike, cycle: Any, resolution: Any, system: UnitSystem
 ) -> ResponseEstimate:
-    """Estimate the response as in `respond`, in a unit system."""
+    """Estimate the response as in `respond`, with a unit system."""
     read = read_logs(time, position, force, system, resolution=resolution)
     period, notes = read.period, list(read.notes)
     logs = tuple(_fill(log, place, k, notes) for k, (log, place) in enumerate(zip(*read[:2], strict=True), start=1))
     step = min(encoder for encoder, _ in read.steps)
     step = step if resolution is None else check_number("resolution", resolution, system["m"])
     given = None if cycle is None else int(np.round(check_number("cycle", cycle, "s", POSITIVE) / period))
-    doubts = []
+    warnings = []
     if step and all(np.ptp(log.position) < _STEPS * step for log in logs):
-        doubts.append(
+        warnings.append(
             f"the position moves by less than {_STEPS} encoder steps of {with_unit(step, system['m'])}; record with a "
             "larger force"
         )
     count = given or _find_period(logs[0].force)
     if count is None:
-        return replace(_average_pieces(logs, period, doubts), notes=tuple(notes))
-    stretches = [part for log in logs for part in _split(log, count, given is not None)]
+        return replace(_average_segments(logs, period, warnings), notes=tuple(notes))
+    stretches = [part for log in logs for part in _split_stretches(log, count, given is not None)]
     if not stretches:
         raise InputError(
             f"cycle: no stretch of the force repeats after {count} samples; leave the cycle out, or record two periods "
             "or more of each force"
         )
-    return replace(_average_periods(stretches, count, period, step, doubts), notes=tuple(notes))
+    return replace(_average_periods(stretches, count, period, step, warnings), notes=tuple(notes))
 
 
 def _fill(log: Recording, place: np.ndarray, number: int, notes: list[str]) -> Recording:
@@ -189,52 +194,61 @@ def respond_to_logs(motions: Sequence[LoggedMotion], period: float | None, cycle
 
 
 def find_nominal_limit(scene: Scene) -> StiffestWall:
-    """The stiffest wall by the measured curve itself, without its deviation, which max_stiffness keeps clear of."""
+    """Return the stiffest wall for the measured response without its deviation."""
     nominal, loop = replace(scene), cast("MeasuredLoop", scene.loop)
     vars(nominal)["loop"] = loop.nominal
     return nominal.max_stiffness()
 
 
 def _find_period(force: np.ndarray) -> int | None:
-    """After how many samples the force repeats itself; None where it does not."""
+    """Return the period of the force in samples, from the peaks of its autocorrelation; None if it does not repeat."""
     centered, size = force - force.mean(), 1 << int(np.ceil(np.log2(2 * force.size)))
     spectrum = np.fft.rfft(centered, size)
-    alike = np.fft.irfft(np.abs(spectrum) ** 2, size)[: force.size // 2 + 1]
-    lags = np.flatnonzero((alike[1:-1] > alike[:-2]) & (alike[1:-1] >= alike[2:])) + 1
+    correlation = np.fft.irfft(np.abs(spectrum) ** 2, size)[: force.size // 2 + 1]
+    lags = np.flatnonzero((correlation[1:-1] > correlation[:-2]) & (correlation[1:-1] >= correlation[2:])) + 1
     lags = lags[lags >= _SHORTEST]
-    tall = np.sort(lags[np.argsort(-alike[lags])][:20])
-    for lag in tall.tolist():
+    highest = np.sort(lags[np.argsort(-correlation[lags])][:20])
+    for lag in highest.tolist():
         if sum(last - first for first, last in _find_repeats(force, lag)) > _REPEATED * force.size:
             return lag
     return None
 
 
 def _find_repeats(force: np.ndarray, count: int) -> list[tuple[int, int]]:
-    """First and one past the last sample of each stretch of two periods of so many samples or more."""
+    """Return first and one past the last sample of each stretch of at least two periods of ``count`` samples."""
     runs = find_runs(np.abs(force[count:] - force[:-count]) <= _SAME * np.ptp(force)).tolist()
     return [(first, last + count) for first, last in runs if last - first >= count]
 
 
-def _split(log: Recording, count: int, trusted: bool) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Stretches of two periods or more that repeat one force, as force and position, shape (periods, count)."""
+def _split_stretches(log: Recording, count: int, trusted: bool) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return force and position of all stretches with at least two periods of one force, of shape (periods, count).
+
+    Args:
+        log: a log without gaps.
+        count: samples per period.
+        trusted: the user specified the period. If no stretch repeats exactly, the whole log is then one stretch.
+    """
     runs = _find_repeats(log.force, count)
     if trusted and not runs and log.force.size >= 2 * count:
-        # A loop that holds the device adds to the force: it repeats on average only.
+        # A loop that holds the device in place adds to the force, which then repeats only on average.
         runs = [(0, log.force.size)]
-    found = []
+    stretches = []
     for first, last in runs:
         first = last - (last - first) // count * count
         shape = (last - first) // count, count
-        found.append((log.force[first:last].reshape(shape), log.position[first:last].reshape(shape)))
-    return found
+        stretches.append((log.force[first:last].reshape(shape), log.position[first:last].reshape(shape)))
+    return stretches
 
 
-def _without_drift(position: np.ndarray) -> np.ndarray:
-    """Periods of a position without the parabola that carries each into the next one."""
+def _remove_drift(position: np.ndarray) -> np.ndarray:
+    """Subtract a parabola over time from positions of shape (periods, count), so that they become periodic.
+
+    The parabola is fitted to the differences between the last three periods.
+    """
     count = position.shape[1]
     steps = np.diff(position[-3:], axis=0).ravel()
     slope, start = np.polyfit(np.arange(steps.size), steps, 1).tolist()
-    # Of a t + b t^2 a period makes a P + b (2 t P + P^2).
+    # The parabola a t + b t^2 increases by a P + b (2 t P + P^2) within a period P.
     bend = 0.5 * slope / count
     rise = (start - bend * count**2) / count
     t = np.arange(position.size) - (position.size - min(3, position.shape[0]) * count)
@@ -242,44 +256,62 @@ def _without_drift(position: np.ndarray) -> np.ndarray:
 
 
 def _average_periods(
-    stretches: list[tuple[np.ndarray, np.ndarray]], count: int, period: float, step: float, doubts: list[str]
+    stretches: list[tuple[np.ndarray, np.ndarray]], count: int, period: float, step: float, warnings: list[str]
 ) -> ResponseEstimate:
-    kept = [(force[1:], _without_drift(position)[1:]) for force, position in stretches]
+    """Estimate the response to a periodic force.
+
+    Args:
+        stretches: force and position of each stretch, shape (periods, count).
+        count: samples per period.
+        period: sampling period in s.
+        step: encoder step, 0 for none.
+        warnings: receives a warning if there is only one record.
+    """
+    # The first period of each stretch contains the transient.
+    kept = [(force[1:], _remove_drift(position)[1:]) for force, position in stretches]
     several = len(kept) > 1
-    # Each stretch one record, or the periods of a single one.
+    # The records: the mean of each stretch, or the periods of a single stretch.
     parts = [(f.mean(0), x.mean(0)) for f, x in kept] if several else list(zip(*kept[0], strict=True))
     U, Y = (np.fft.rfft(np.array([part[k] for part in parts]))[:, 1 : (count + 1) // 2] for k in (0, 1))
     power = (np.abs(U) ** 2).sum(0)
     lines = np.flatnonzero(power > _EXCITED**2 * power.max())
     U, Y, power = U[:, lines], Y[:, lines], power[lines]
     G = (Y * U.conj()).sum(0) / power
-    records, rest = len(parts), Y - G * U
-    error = (np.abs(rest) ** 2).sum(0) / max(1, records - 1)
+    records, residuals = len(parts), Y - G * U
+    error = (np.abs(residuals) ** 2).sum(0) / max(1, records - 1)
     error = np.maximum(*(_smooth(error, size) for size in (_NARROW, _WIDE)))
     if records == 1:
-        doubts.append("there is one period only behind the first, so that errors are not seen; record more of them")
+        warnings.append("only one period follows the first one, so the errors cannot be estimated; record more periods")
     if not several:
-        # The same steps of the encoder every time: their error is not seen, and no average takes it away.
+        # Equal periods have equal quantization errors, which neither the residuals show nor averaging reduces.
         error = error + records * count * step**2 / 12.0
     deviation = SURE * np.sqrt(error / power)
     total = (np.abs(Y) ** 2).sum(0)
-    coherence = 1.0 - np.minimum(1.0, (np.abs(rest) ** 2).sum(0) / np.maximum(total, 1e-300))
+    coherence = 1.0 - np.minimum(1.0, (np.abs(residuals) ** 2).sum(0) / np.maximum(total, 1e-300))
     device = MeasuredDevice((lines + 1) / (count * period), G, deviation)
     each = float(np.mean([len(f) for f, _ in kept])) if several else 1.0
     noise = float(np.sqrt(np.median(error) * each / count))
     _refuse_unmoved(device)
-    return ResponseEstimate(device, period, coherence, count * period, len(kept), noise, tuple(doubts))
+    return ResponseEstimate(device, period, coherence, count * period, len(kept), noise, tuple(warnings))
 
 
 def _smooth(values: np.ndarray, reach: int) -> np.ndarray:
-    """Means over lines to both sides, fewer at the ends."""
-    near = np.ones(2 * reach + 1)
-    total, count = (np.convolve(each, near)[reach : reach + values.size] for each in (values, np.ones(values.size)))
+    """Return the running mean over ``reach`` values on each side, fewer at the ends."""
+    window = np.ones(2 * reach + 1)
+    total, count = (np.convolve(each, window)[reach : reach + values.size] for each in (values, np.ones(values.size)))
     return total / count
 
 
-def _average_pieces(logs: tuple[Recording, ...], period: float, doubts: list[str]) -> ResponseEstimate:
-    """Averaged spectra of a force that does not repeat; of the position's steps, for positions wander."""
+def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list[str]) -> ResponseEstimate:
+    """Estimate the response to a force that does not repeat, from spectra averaged over segments.
+
+    The spectra of the differences of successive positions are used, because positions drift.
+
+    Args:
+        logs: logs without gaps.
+        period: sampling period in s.
+        warnings: receives a warning about the frequency resolution.
+    """
     from scipy.signal import csd, welch
 
     least = min(log.force.size for log in logs)
@@ -290,38 +322,40 @@ def _average_pieces(logs: tuple[Recording, ...], period: float, doubts: list[str
     sums = [np.zeros(size // 2 + 1, complex) for _ in range(3)]
     pieces = 0
     for log in logs:
-        # One sample in front has no step.
+        # The first sample has no difference.
         f, x = log.force[1:], np.diff(log.position)
-        own = 2 * f.size // size - 1
-        pieces += own
-        sums[0] += own * welch(f, **options)[1]
-        sums[1] += own * welch(x, **options)[1]
-        sums[2] += own * csd(f, x, **options)[1]
+        segments = 2 * f.size // size - 1
+        pieces += segments
+        sums[0] += segments * welch(f, **options)[1]
+        sums[1] += segments * welch(x, **options)[1]
+        sums[2] += segments * csd(f, x, **options)[1]
     forces, steps, both = (values[2:-1] for values in sums)
     coherence = np.abs(both) ** 2 / np.maximum(np.real(forces * steps), 1e-300)
     w = 2.0 * np.pi * np.arange(2, size // 2) / size
     G = both / forces / (1.0 - np.exp(-1j * w))
     error = np.abs(G) * np.sqrt((1.0 - np.minimum(coherence, 1.0)) / np.maximum(coherence, 1e-300) * _OVERLAP / pieces)
-    # The window mixes each line with its neighbors.
+    # The window averages over neighboring lines, with an error proportional to the second difference of the response
+    # of the acceleration, u G.
     u = 4.0 * np.sin(0.5 * w) ** 2
     bend = np.abs(np.diff(u * G, 2))
     deviation = SURE * error + np.pad(bend, 1, mode="edge") / u
-    seen = np.flatnonzero(np.real(coherence) > _COHERENT)
-    if seen.size < _SHORTEST:
-        raise InputError("force: nothing of the motion follows it; check that both columns are of one axis")
-    seen = slice(seen[0], seen[-1] + 1)
-    doubts.append(
-        f"the force does not repeat: {pieces} pieces of {with_unit(size * period, 's')} were averaged, which blurs "
-        f"what turns within {plain(2.0 / (size * period), 2)} Hz; play a record of zwidth.excite for a sharper one"
+    usable = np.flatnonzero(np.real(coherence) > _COHERENT)
+    if usable.size < _SHORTEST:
+        raise InputError("force: the position does not follow it; check that both columns belong to one axis")
+    usable = slice(usable[0], usable[-1] + 1)
+    warnings.append(
+        f"the force does not repeat, so {pieces} segments of {with_unit(size * period, 's')} are averaged, with a "
+        f"resolution of {plain(2.0 / (size * period), 2)} Hz; record a force of zwidth.excite for a finer one"
     )
-    device = MeasuredDevice(w[seen] / (2.0 * np.pi * period), G[seen], deviation[seen])
+    device = MeasuredDevice(w[usable] / (2.0 * np.pi * period), G[usable], deviation[usable])
     _refuse_unmoved(device)
-    return ResponseEstimate(device, period, np.real(coherence[seen]), None, pieces, float("nan"), tuple(doubts))
+    return ResponseEstimate(device, period, np.real(coherence[usable]), None, pieces, float("nan"), tuple(warnings))
 
 
 def _refuse_unmoved(device: MeasuredDevice) -> None:
+    """Raise `InputError` if the response is within its deviation of 0 at all frequencies."""
     if np.all(np.abs(device.response) <= device.deviation):
         raise InputError(
-            "force: at no frequency the motion follows it beyond its errors; check that both columns are of one axis, "
-            "push harder, or record longer"
+            "force: its effect on the position is below the errors at all frequencies; check that both columns belong "
+            "to one axis, use a larger force, or record longer"
         )

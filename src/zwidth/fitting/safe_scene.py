@@ -22,7 +22,7 @@ EXACT_DIGITS = 12  # parameters without a standard error
 PERIOD_DIGITS = 7  # periods derived from timestamps; more than the accuracy of any clock
 LIMIT_DIGITS = 4  # the safe limit; as many as are printed for a wall
 # Descriptions of the status of a fit. The warnings of the fit contain the details.
-_TROUBLES = {
+_STATUS_TEXTS = {
     Status.NOT_CONVERGED: "the search did not converge",
     Status.NO_BOUNDARY: "no device has all of these walls on its stability boundary",
     Status.UNDECIDED: "another device fits equally well",
@@ -30,8 +30,8 @@ _TROUBLES = {
 }
 
 
-def round_number(fit: DeviceFit, name: str) -> float:
-    """Return a parameter rounded to a thousandth of its standard error, because further digits differ per machine."""
+def round_parameter(fit: DeviceFit, name: str) -> float:
+    """Return a parameter rounded to a thousandth of its standard error; further digits depend on the machine."""
     value, error = fit.value_of(name), fit.errors[name]
     if not (error > 0 and value):
         return float(f"{value:.{EXACT_DIGITS}g}")
@@ -49,15 +49,15 @@ def round_scene(fit: DeviceFit) -> Scene:
     nominal = fit.nominal
     # Replace the period before the delay, because a delay in periods changes with the period.
     nominal = replace(nominal, timing=replace(nominal.timing, period=round_period(fit)))
-    return nominal.replace(**{name: round_number(fit, name) for name in fit.numbers})
+    return nominal.replace(**{name: round_parameter(fit, name) for name in fit.numbers})
 
 
-def name_trouble(fit: DeviceFit) -> str:
+def describe_status(fit: DeviceFit) -> str:
     """Return a description of the status of a fit, "" if the status is OK."""
     status = Status(fit.status)
     if status == Status.UNDECIDED and not fit.rivals:
         return "the residuals are not white noise"
-    return "" if status == Status.OK else _TROUBLES.get(status, status.message)
+    return "" if status == Status.OK else _STATUS_TEXTS.get(status, status.message)
 
 
 def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
@@ -68,21 +68,21 @@ def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
         rigid: assume that the device has no resonances other than the fitted ones, as in `DeviceFit.safe_wall`.
     """
     if fit.is_doubted:
-        trouble = name_trouble(fit)
-        return SafeLimit(0.0, reason=trouble or "resolve the warnings first", warnings=fit.doubts)
+        text = describe_status(fit)
+        return SafeLimit(0.0, reason=text or "resolve the warnings first", warnings=fit.doubts)
     wall = fit.safe_wall(rigid=rigid)
     if wall.status != Status.OK or not wall.stiffness > 0:
         return SafeLimit(0.0, reason="the fitted parameters are too uncertain for any wall; record longer")
     stiffness = round_safely(wall.stiffness, "below", LIMIT_DIGITS)
     # Round B toward 0, because at larger |B| the stiffness limit often decreases steeply.
     damping = math.copysign(round_safely(abs(wall.virtual_damping), "below", LIMIT_DIGITS), wall.virtual_damping)
-    limit = SafeLimit(float(f"{stiffness:.12g}"), float(f"{damping:.12g}"), _explain(fit, wall))
-    estimate, low = round_number(fit, "damping"), fit.intervals["damping"].low
+    limit = SafeLimit(float(f"{stiffness:.12g}"), float(f"{damping:.12g}"), _explain_limit(fit, wall))
+    estimate, low = round_parameter(fit, "damping"), fit.intervals["damping"].low
     reserve = estimate - low if low > 0 else estimate
     return replace(limit, damping_reserve=float(f"{round_safely(max(reserve, 0.0), 'above', LIMIT_DIGITS):.12g}"))
 
 
-def _explain(fit: DeviceFit, wall: SafeWall) -> str:
+def _explain_limit(fit: DeviceFit, wall: SafeWall) -> str:
     """Return the reason of the safe limit, with the measurement that can raise it."""
     if math.isfinite(wall.resonance):
         near = with_unit(wall.resonance, "Hz", 3)
@@ -90,11 +90,11 @@ def _explain(fit: DeviceFit, wall: SafeWall) -> str:
         return f"{hidden}; {advise_record(fit)}"
     if fit.damping_tried is not None and wall.virtual_damping >= fit.damping_tried:
         unit = fit.unit_system["N s/m"]
-        tried = with_unit(fit.damping_tried, unit)
+        measured = with_unit(fit.damping_tried, unit)
         remedy = "" if fit.next is None else f", such as B = {with_unit(fit.next.virtual_damping, unit, 3)}"
         return (
-            f"no wall with B > {tried} was measured, and an undetected resonance may make such walls unstable; measure "
-            f"one{remedy}"
+            f"no wall with B > {measured} was measured, and an undetected resonance may make such walls unstable; "
+            f"measure one{remedy}"
         )
     return "stable for 99 % of the devices that are consistent with the measurements"
 

@@ -1,14 +1,16 @@
-"""The motion of a rubbing mass with an amplifier before it and resonances beside it, under a recorded force; exact.
+"""Exact response of a mass with friction, an actuator lag and resonances to a logged force with zero-order hold.
 
-The amplifier and the resonances are linear, so that what they add to the motion of `zwidth.fitting.moving` is a sum
-over their poles p of ``r E_p``, ``E_p' = p E_p + F(t - d)``, the force held. For an amplifier ``A = sum r_j/(s - p_j)``
+The actuator lag A(s) and the resonances (*modes*) are linear. They therefore add to the response of the rigid mass
+(`zwidth.fitting.moving`) a sum over their poles p of ``r E_p``, with ``E_p' = p E_p + F(t - d)`` and the residue r of
+the pole, called its weight. For a lag ``A = sum r_j/(s - p_j)`` partial fractions give, with delta = b T/m,
 
     A(s)/(s (s + delta)) = 1/(s (s + delta)) + sum_j (r_j/p_j)/(p_j + delta) (1/(s - p_j) - 1/(s + delta)).
 
-So are the derivatives: in the pole E_p is filtered once more, and a force that comes later moves it by ``-E_p'``.
+The derivative of E_p in p is E_p filtered once more by the same pole; the derivative in the delay d is ``-E_p'``.
 
-Friction alone is not linear: its turns are those of the mass whose force comes later by the amplifier's delay at low
-frequencies, -A'(0), which is the same but for the bends of the force within a turn.
+Friction is not linear. The stops of the mass are those of a rigid mass whose delay is increased by the delay of the lag
+at low frequencies, -A'(0). The only error is that the lag also smooths the force within a stop. Times are in sampling
+periods; ``theta`` is the parameter vector defined by `Recordings`.
 """
 
 from __future__ import annotations
@@ -21,27 +23,39 @@ import numpy as np
 from zwidth.arrays.held_mass import phi_functions
 from zwidth.fitting.device_estimate import DimensionlessDevice
 from zwidth.fitting.encoder import MeasurementNoise
-from zwidth.fitting.moving import ModelledMotion, Recording, recur
-from zwidth.fitting.required_wall import list_poles
+from zwidth.fitting.moving import ModelResponse, Recording, recur
+from zwidth.fitting.required_wall import expand_partial_fractions
 
-# Of differences to both sides: of delta and of a followed pole absolute, of all else relative.
+# Step of central differences: absolute in delta and in the pole of a filter, relative in all other parameters.
 _STEP = 1e-6
-# Time constants of amplifiers in periods, frequencies in radians a period, damping ratios.
-LAGS, TURNS, RATIOS = (0.02, 5.0), (0.0125, 3.11), (1e-6, 4.0)
-# The delays at low frequencies of those of second order.
-_SLOW = 2.0 * RATIOS[0] * LAGS[0], 2.0 * LAGS[1]
+# Bounds of the parameters.
+LAG_RANGE = (0.02, 5.0)  # time constant of the actuator, in periods
+FREQUENCY_RANGE = (0.0125, 3.11)  # frequency of a mode, in rad per sample
+RATIO_RANGE = (1e-6, 4.0)  # damping ratio of a mode or of a second-order lag
+_DELAY_RANGE = 2.0 * RATIO_RANGE[0] * LAG_RANGE[0], 2.0 * LAG_RANGE[1]  # 2 zeta tau of a second-order lag, in periods
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """Several logs of one device with an amplifier of order ``lag``, 0 for none, and so many ``modes``.
+    """Several logs of one device, with the structure of its model.
 
-    theta is ``(g, delta, d)``, the amplifier's delay at low frequencies in periods (and damping ratio), of each mode
-    the frequency in radians a period, the damping ratio and ``T^2/m``, then for each log x0 and v0, and two numbers of
-    how each mode was moving before; o and c come last. The delay of second order, ``2 zeta tau``, stands in place of
-    tau: a log tells its sum with d far better than either, and along a straight valley steps are long.
+    The parameter vector theta contains, in this order:
 
-    ``longest`` is the longest delay that is looked for, in periods, ``resolution`` the encoder's step, 0 for none.
+    - g = T^2/m, delta = b T/m and the delay d;
+    - for a lag: its delay at low frequencies, which is tau for order 1 and 2 zeta tau for order 2, and for order 2 the
+      damping ratio zeta. The delay replaces tau because a log determines its sum with d much better than either of
+      them; in this form the optimizer can take long steps;
+    - for each mode: the frequency in rad per sample, the damping ratio, and T^2/m_i with the modal mass m_i;
+    - for each log: x0 and v0 of the mass; then, for each log and mode, two amplitudes of its free response;
+    - o and c, the accelerations by the constant force and by the friction.
+
+    Attributes:
+        logs: the logs.
+        noise: noise of the positions, which weights them; None for equal weights.
+        lag: order of the actuator lag, 0 for none.
+        modes: number of modes.
+        longest: largest delay of the search, in periods.
+        resolution: encoder step, 0 for none.
     """
 
     logs: tuple[Recording, ...]
@@ -52,191 +66,222 @@ class Recordings:
     resolution: float = 0.0
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
-        """Columns over samples, as `MeasurementNoise.weigh` where the noise is known."""
+        """Return columns over samples weighted by `MeasurementNoise.weigh`, or unchanged if the noise is unknown."""
         return columns if self.noise is None else self.noise.weigh(columns)
 
-    def begin(self, count: int) -> Recordings:
-        """Of each log so many first positions."""
-        return replace(self, logs=tuple(log.begin(count) for log in self.logs), noise=None)
+    def truncate(self, count: int) -> Recordings:
+        """Return the logs cut by `Recording.truncate`, with equal weights."""
+        return replace(self, logs=tuple(log.truncate(count) for log in self.logs), noise=None)
 
     @property
     def measured(self) -> np.ndarray:
-        """All positions that count."""
+        """The measured positions of all logs in one array."""
         return np.concatenate([log.position for log in self.logs])
 
     def split(self, column: np.ndarray) -> list[np.ndarray]:
-        """What of a column over samples belongs to each log."""
+        """Split an array over the samples of all logs into one array per log."""
         return np.split(column, np.cumsum([log.position.size for log in self.logs])[:-1])
 
     @property
     def size(self) -> int:
-        """How many numbers theta has."""
+        """The number of parameters in theta."""
         return self.parts.stop + 2 + 2 * (1 + self.modes) * len(self.logs)
 
     @property
     def parts(self) -> slice:
-        """Where in theta the numbers of amplifier and modes are."""
+        """The slice of theta with the parameters of the lag and the modes; the device's parameters end with it."""
         return slice(3, 3 + self.lag + 3 * self.modes)
 
     @property
-    def speeds(self) -> np.ndarray:
-        """Where in theta the first speeds are."""
+    def velocity_indices(self) -> np.ndarray:
+        """The indices of the initial velocities v0 in theta, one per log."""
         return self.parts.stop + 1 + 2 * np.arange(len(self.logs))
 
     @property
-    def largest(self) -> float:
-        """The largest force commanded."""
+    def largest_force(self) -> float:
+        """The largest magnitude of a commanded force."""
         return max(float(np.abs(log.force).max()) for log in self.logs)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """The least and the largest that each number of theta may be."""
+        """Return the lower and upper bounds of theta."""
         low, high = np.full((2, self.size), [[-np.inf], [np.inf]])
-        ends = [LAGS if self.lag == 1 else _SLOW, RATIOS][: self.lag] + self.modes * [TURNS, RATIOS, (-np.inf, np.inf)]
+        lag = [LAG_RANGE if self.lag == 1 else _DELAY_RANGE, RATIO_RANGE][: self.lag]
+        ends = lag + self.modes * [FREQUENCY_RANGE, RATIO_RANGE, (-np.inf, np.inf)]
         low[self.parts], high[self.parts] = np.reshape(ends, (-1, 2)).T
-        # A little beyond 0 the model goes on, so that an optimum at 0 is no corner.
+        # Allow slightly negative dampings and delays, so that an optimum at 0 is not at a bound. The damping stays
+        # below the rate of the fastest lag, because the partial fractions require distinct poles.
         count = max(log.force.size for log in self.logs)
-        # No faster than the fastest lag, whose pole it would meet there.
-        low[1:3], high[1:3] = (-5.0 / count, -1.0), (0.99 / LAGS[0], self.longest)
+        low[1:3], high[1:3] = (-5.0 / count, -1.0), (0.99 / LAG_RANGE[0], self.longest)
         return low, high
 
     def normalize(self, theta: np.ndarray, period: Any) -> DimensionlessDevice:
-        """The device of theta, or those of thetas along the first axis."""
+        """Return the device with parameters theta; further axes of theta become axes of the device."""
         modes = theta[self.parts][self.lag :].reshape(self.modes, 3, *theta.shape[1:]).copy()
         modes[:, 2] /= theta[0]
         lag = theta[3 : 3 + self.lag].copy()
         lag[:1] /= 2.0 * lag[1] if self.lag == 2 else 1.0
         return DimensionlessDevice(period**2 / theta[0], theta[1], theta[2], lag, modes)
 
-    def follow(self, theta: np.ndarray) -> ModelledMotion:
-        """The motion of theta in all logs."""
-        each = [self.follow_log(theta, k) for k in range(len(self.logs))]
-        place = np.concatenate([motion.position for motion in each])
-        return ModelledMotion(place, lambda: np.concatenate([motion.slopes for motion in each]))
+    def simulate(self, theta: np.ndarray) -> ModelResponse:
+        """Return the positions in all logs, in one array, and their derivatives in theta."""
+        each = [self.simulate_log(theta, k) for k in range(len(self.logs))]
+        place = np.concatenate([response.position for response in each])
+        return ModelResponse(place, lambda: np.concatenate([response.derivatives for response in each]))
 
-    def follow_log(self, theta: np.ndarray, which: int) -> ModelledMotion:
-        """The motion in one of them."""
-        late, by_late = _delay(theta, self.lag, self.logs[which])
-        speed = self.speeds[which]
-        into = np.array([0, 1, 2, speed - 1, speed, -2, -1])
-        rigid = self.logs[which].move(*(theta[into] + late * np.eye(7)[2]).tolist())
-        beside = self.add_parts(theta, which) if self.lag or self.modes else None
+    def simulate_log(self, theta: np.ndarray, k: int) -> ModelResponse:
+        """Return the positions in log ``k``, and their derivatives in theta."""
+        late, by_late = _limit_lag_delay(theta, self.lag, self.logs[k])
+        v0 = self.velocity_indices[k]
+        # Indices in theta of the parameters of `Recording.move`.
+        rigid_indices = np.array([0, 1, 2, v0 - 1, v0, -2, -1])
+        rigid = self.logs[k].move(*(theta[rigid_indices] + late * np.eye(7)[2]).tolist())
+        parts = self.simulate_parts(theta, k) if self.lag or self.modes else None
 
         def differentiate() -> np.ndarray:
-            slopes = np.zeros((theta.size, rigid.position.size)).T
-            slopes[:, into] = rigid.slopes
-            if beside is not None:
-                slopes += beside.slopes
-                slopes[:, 3 : 3 + self.lag] += np.outer(rigid.slopes[:, 2], by_late)
-            return slopes
+            derivatives = np.zeros((theta.size, rigid.position.size)).T
+            derivatives[:, rigid_indices] = rigid.derivatives
+            if parts is not None:
+                derivatives += parts.derivatives
+                derivatives[:, 3 : 3 + self.lag] += np.outer(rigid.derivatives[:, 2], by_late)
+            return derivatives
 
-        return ModelledMotion(rigid.position if beside is None else rigid.position + beside.position, differentiate)
+        return ModelResponse(rigid.position if parts is None else rigid.position + parts.position, differentiate)
 
-    def add_parts(self, theta: np.ndarray, which: int) -> ModelledMotion:
-        """What amplifier and modes add in one log to the mass whose force comes later."""
-        log, (g, delta, d) = self.logs[which], theta[:3].tolist()
-        own, now, place = np.eye(theta.size), np.arange(log.position.size), np.zeros(log.position.size)
+    def simulate_parts(self, theta: np.ndarray, k: int) -> ModelResponse:
+        """Return the contribution of lag and modes to the positions in log ``k``.
+
+        The contribution is relative to the rigid mass of `simulate_log`, whose delay includes that of the lag.
+        """
+        log, (g, delta, d) = self.logs[k], theta[:3].tolist()
+        unit, samples, place = np.eye(theta.size), np.arange(log.position.size), np.zeros(log.position.size)
         poles, weights, states = self._find_poles(theta[:, None])
-        first, ways, ringing, slides = self.parts.stop + 2 * (len(self.logs) + self.modes * which), {}, [], []
+        first = self.parts.stop + 2 * (len(self.logs) + self.modes * k)
+        filtered, free_responses, exchanged = {}, [], []
         poles, weights = poles[:, 0].tolist(), weights[:, 0]
-        for own_pole, (pole, weight, k) in enumerate(zip(poles, weights, states, strict=True)):
-            ways[pole] = _follow(log, pole, d)
-            place += (weight * ways[pole].position).real
-            if k >= 0:
-                # How a mode moves that did so before: by two real poles, or the real and imaginary part of one.
-                free = own[first + k] - 1j * own[first + k + 1] if pole.imag else own[first + k]
-                motion, size = np.exp(pole * now), free @ theta
-                place += (motion * size).real
-                ringing.append((own_pole, motion, free, size))
+        for j, (pole, weight, state) in enumerate(zip(poles, weights, states, strict=True)):
+            filtered[pole] = _filter_force(log, pole, d)
+            place += (weight * filtered[pole].position).real
+            if state >= 0:
+                # Free response of a mode: one amplitude for each of two real poles, or the real and the imaginary part
+                # of the amplitude of a complex one.
+                by_theta = unit[first + state] - 1j * unit[first + state + 1] if pole.imag else unit[first + state]
+                decay, amplitude = np.exp(pole * samples), by_theta @ theta
+                place += (decay * amplitude).real
+                free_responses.append((j, decay, by_theta, amplitude))
         if self.lag:
-            late, by_late = _delay(theta, self.lag, log)
-            turn = own[2] + by_late @ own[3 : 3 + self.lag]
-            for sign, by, there in ((g, own[2], d), (-g, turn, d + late)):
-                speed = ways[-delta] if there == d else _follow(log, -delta, there)
-                slide = _slide(log, delta, there, speed)
-                place += sign * slide.position
-                slides.append((sign, by, speed.position, slide))
+            # The rigid mass has the delay d + late, as required for the friction. Exchange its linear response for that
+            # with the delay d, to which the partial fractions refer.
+            late, by_late = _limit_lag_delay(theta, self.lag, log)
+            by_total = unit[2] + by_late @ unit[3 : 3 + self.lag]
+            for gain, by_delay, delay in ((g, unit[2], d), (-g, by_total, d + late)):
+                velocity = filtered[-delta] if delay == d else _filter_force(log, -delta, delay)
+                displacement = _integrate_velocity(log, delta, delay, velocity)
+                place += gain * displacement.position
+                exchanged.append((gain, by_delay, velocity.position, displacement))
 
         def differentiate() -> np.ndarray:
-            # Rows, and how their real parts count in the slopes. A delay moves E by -E' = -p E - F.
-            moved = log.pushes[0, log.skip - int(np.floor(d)) + now]
-            parts: list[tuple[Any, Any]] = [(moved, -own[2] * weights.sum())]
-            by_theta, slopes = self._differ_poles(theta)
-            for pole, weight, by, slope in zip(poles, weights, by_theta, slopes, strict=True):
-                way = ways[pole]
-                parts += [(way.position, slope - pole * weight * own[2]), (way.slopes, weight * by)]
-            for k, motion, free, size in ringing:
-                parts += [(motion, free), (now * motion, size * by_theta[k])]
-            for sign, by, speed, slide in slides:
-                parts += [(slide.position, sign / g * own[0]), (slide.slopes, sign * own[1])]
-                parts += [(speed[0] - speed, sign * by)]
-            rows = [(row.real, factor.real) for row, factor in parts]
-            rows += [(row.imag, -factor.imag) for row, factor in parts if np.iscomplexobj(row)]
+            # The derivatives are the real part of a sum of products: a row over samples times a factor over theta.
+            # The derivative of E_p in the delay is -E_p' = -p E_p - F.
+            force = log.recent_forces[0, log.skip - int(np.floor(d)) + samples]
+            terms: list[tuple[Any, Any]] = [(force, -unit[2] * weights.sum())]
+            poles_by_theta, weights_by_theta = self._differentiate_poles(theta)
+            for pole, weight, pole_by, weight_by in zip(poles, weights, poles_by_theta, weights_by_theta, strict=True):
+                state = filtered[pole]
+                terms += [(state.position, weight_by - pole * weight * unit[2]), (state.derivatives, weight * pole_by)]
+            for j, decay, by_theta, amplitude in free_responses:
+                terms += [(decay, by_theta), (samples * decay, amplitude * poles_by_theta[j])]
+            for gain, by_delay, velocity, displacement in exchanged:
+                terms += [(displacement.position, gain / g * unit[0]), (displacement.derivatives, gain * unit[1])]
+                terms += [(velocity[0] - velocity, gain * by_delay)]
+            rows = [(row.real, factor.real) for row, factor in terms]
+            rows += [(row.imag, -factor.imag) for row, factor in terms if np.iscomplexobj(row)]
             columns, factors = map(np.array, zip(*rows, strict=True))
             return columns.T @ factors
 
-        return ModelledMotion(place, differentiate)
+        return ModelResponse(place, differentiate)
 
-    def _find_poles(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of thetas by the first axis: poles on and above the real axis, weights, and which state of modes, or -1."""
-        device = self.normalize(at, 1.0)
-        poles, weights = (np.array(each) for each in list_poles(device.delta, device.lag, device.modes))
+    def _find_poles(self, thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the poles of lag and modes on and above the real axis.
+
+        Args:
+            thetas: parameter vectors along the first axis, shape (size, count).
+
+        Returns:
+            The poles and their weights, shape (poles, count); and for each pole the index of its amplitude among those
+            of the free responses of the modes, -1 for the poles of the lag.
+        """
+        device = self.normalize(thetas, 1.0)
+        poles, weights = (np.array(each) for each in expand_partial_fractions(device.delta, device.lag, device.modes))
         states, height = np.maximum(np.arange(-len(poles), 0) + 2 * self.modes, -1), np.imag(poles[:, 0])
-        # Of a pair half is followed, which counts twice.
-        weights = weights * at[0] * (1.0 + (height > 0))[:, None]
+        # The upper pole of a complex pair represents both, with twice the weight, because only real parts are used.
+        weights = weights * thetas[0] * (1.0 + (height > 0))[:, None]
         return poles[height >= 0], weights[height >= 0], states[height >= 0]
 
-    def _differ_poles(self, theta: np.ndarray) -> np.ndarray:
-        """The slopes of these poles, and of their weights."""
+    def _differentiate_poles(self, theta: np.ndarray) -> np.ndarray:
+        """Return the derivatives in theta of the poles and of their weights, shape (2, poles, size)."""
         moving = np.r_[0, 1, self.parts]
         steps, count = _STEP * np.abs(theta[moving]), moving.size
+        # delta and T^2/m_i may be 0: use a least absolute step, and the step of T^2/m.
         steps[1], steps[4 + self.lag :: 3] = max(_STEP, steps[1]), steps[0]
-        at = np.tile(theta[:, None], 1 + 2 * count)
-        at[moving, 1 + np.arange(count)] += steps
-        at[moving, 1 + count + np.arange(count)] -= steps
-        both = np.array(self._find_poles(at)[:2])
+        thetas = np.tile(theta[:, None], 1 + 2 * count)
+        thetas[moving, 1 + np.arange(count)] += steps
+        thetas[moving, 1 + count + np.arange(count)] -= steps
+        both = np.array(self._find_poles(thetas)[:2])
         by_theta = np.zeros((*both.shape[:2], theta.size), complex)
         by_theta[..., moving] = (both[..., 1 : 1 + count] - both[..., 1 + count :]) / (2.0 * steps)
         return by_theta
 
 
-def _delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.ndarray]:
-    """By how much an amplifier delays slow forces, and its derivatives; no more than forces are known."""
+def _limit_lag_delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.ndarray]:
+    """Return the delay of the lag at low frequencies and its derivatives in the parameters of the lag.
+
+    The delay is limited so that the past forces of the log suffice.
+    """
     late, by = theta[3:4].sum() if order else 0.0, np.eye(2)[0, :order]
     most = log.skip - 1.5 - theta[2]
     return (float(late), by) if late < most else (float(most), 0.0 * by)
 
 
-def _follow(log: Recording, pole: complex, d: float) -> ModelledMotion:
-    """``E_p`` at the positions, from rest at the log's first sample; its slope is that in p."""
-    whole = int(np.floor(d))
-    f, pole, first = d - whole, pole if pole.imag else pole.real, log.skip - whole
-    seen = slice(first, first + log.position.size)
-    # What a new force and the older one move until a sample, and a little beside the pole.
-    at = pole + _STEP * np.array([[0.0], [1.0], [-1.0]])
-    at = np.where(at == 0, 1e-300, at)
-    held = np.expm1(np.array([1.0 - f, f]) * at) / at * np.exp([0.0, 1.0 - f] * at)
-    turn = np.exp(pole)
-    ways = recur(turn, held[0] @ log.pushes)
+def _filter_force(log: Recording, pole: complex, d: float) -> ModelResponse:
+    """Return E_p at the samples with positions, and its derivative in p; E_p is 0 at the first sample of the log."""
+    n_delay = int(np.floor(d))
+    f, pole, first = d - n_delay, pole if pole.imag else pole.real, log.skip - n_delay
+    with_positions = slice(first, first + log.position.size)
+    # Effects of the newer and of the older force of a period on the next sample, at p and, for the derivative, at p
+    # plus and minus a step.
+    near = pole + _STEP * np.array([[0.0], [1.0], [-1.0]])
+    near = np.where(near == 0, 1e-300, near)
+    gains = np.expm1(np.array([1.0 - f, f]) * near) / near * np.exp([0.0, 1.0 - f] * near)
+    decay = np.exp(pole)
+    states = recur(decay, gains[0] @ log.recent_forces)
 
     def differentiate() -> np.ndarray:
-        moves = (held[1] - held[2]) * 0.5 / _STEP @ log.pushes
-        moves[1:] += turn * ways[:-1]
-        return recur(turn, moves)[seen]
+        added = (gains[1] - gains[2]) * 0.5 / _STEP @ log.recent_forces
+        added[1:] += decay * states[:-1]
+        return recur(decay, added)[with_positions]
 
-    return ModelledMotion(ways[seen], differentiate)
+    return ModelResponse(states[with_positions], differentiate)
 
 
-def _slide(log: Recording, delta: float, d: float, speed: ModelledMotion) -> ModelledMotion:
-    """The way of a mass with g = 1 and no friction from the first position on; its slope is that in delta."""
-    whole = int(np.floor(d))
-    spans, now = np.array([d - whole, 1.0 - d + whole, 1.0]), log.skip - whole
-    at = phi_functions((delta + _STEP * np.array([[0.0], [1.0], [-1.0]])) * spans)
-    reach, way = (at.phi1 * spans).T, (at.phi2 * spans**2).T
-    factors = np.array([reach[2], way[0] + reach[0] * reach[1], way[1]])
-    terms = np.vstack([speed.position[:-1], log.pushes[::-1, now + 1 : now + log.position.size]])
+def _integrate_velocity(log: Recording, delta: float, d: float, velocity: ModelResponse) -> ModelResponse:
+    """Return the displacement of a mass without friction and with g = 1, and its derivative in delta.
+
+    Args:
+        log: the log; the displacement is relative to the first sample with a position.
+        delta: damping b T/m.
+        d: delay.
+        velocity: velocity of the mass, E_p for p = -delta.
+    """
+    n_delay = int(np.floor(d))
+    spans, now = np.array([d - n_delay, 1.0 - d + n_delay, 1.0]), log.skip - n_delay
+    phi = phi_functions((delta + _STEP * np.array([[0.0], [1.0], [-1.0]])) * spans)
+    by_velocity, by_force = (phi.phi1 * spans).T, (phi.phi2 * spans**2).T
+    # Displacement per period by the velocity at its start, the older force and the newer force.
+    factors = np.array([by_velocity[2], by_force[0] + by_velocity[0] * by_velocity[1], by_force[1]])
+    terms = np.vstack([velocity.position[:-1], log.recent_forces[::-1, now + 1 : now + log.position.size]])
 
     def differentiate() -> np.ndarray:
-        steps = 0.5 / _STEP * (factors[:, 1] - factors[:, 2]) @ terms - factors[0, 0] * speed.slopes[:-1]
+        steps = 0.5 / _STEP * (factors[:, 1] - factors[:, 2]) @ terms - factors[0, 0] * velocity.derivatives[:-1]
         return np.append(0.0, np.cumsum(steps))
 
-    return ModelledMotion(np.append(0.0, np.cumsum(factors[:, 0] @ terms)), differentiate)
+    return ModelResponse(np.append(0.0, np.cumsum(factors[:, 0] @ terms)), differentiate)

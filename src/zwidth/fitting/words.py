@@ -1,4 +1,8 @@
-"""Print a fit: as a summary with details, and as a configuration in YAML."""
+"""Format a fit as text: a summary with details for the terminal, and a configuration in YAML.
+
+A summary is a list of pairs of label and text. Values have units and as many digits as their confidence intervals
+require.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit, RivalDevice
-from zwidth.fitting.safe_scene import advise_record, limit_walls, name_trouble, round_number, round_period
+from zwidth.fitting.safe_scene import advise_record, describe_status, limit_walls, round_parameter, round_period
 from zwidth.parts.paths import spell_estimate
 from zwidth.scenes.recommendation import Recommendation
 from zwidth.words.formatting import plain, with_unit
@@ -24,8 +28,8 @@ NEAR_ROUNDING = (0.5, 1.1)  # range of residuals as expected, in units of the en
 
 STIFFER = 1.005  # least ratio of the stiffnesses of two walls that are printed as different
 _SYMBOLS = {"mass": "m", "damping": "b", "delay": "t_d", "stiffness_max": "K_max"}
-# SI units of a linear device by the last part of a path: of parameters, and of what a fit has beside them.
-_UNITS = {path.rpartition(".")[2]: known.unit.removeprefix("1") for path, known in FIELDS.items()}
+# SI units for a linear device, by the last part of the path of a parameter, and of further values of a fit.
+_UNITS = {path.rpartition(".")[2]: field.unit.removeprefix("1") for path, field in FIELDS.items()}
 _UNITS |= {"stiffness_max": "N/m", "friction": "N", "offset": "N", "force": "N", "position": "m"}
 
 
@@ -44,7 +48,7 @@ def symbol_of(name: str, system: UnitSystem) -> str:
     return "J" if name == "mass" and system.rotary else _SYMBOLS[name]
 
 
-def spell(name: str, value: float, system: UnitSystem, digits: int = 4) -> str:
+def format_value(name: str, value: float, system: UnitSystem, digits: int = 4) -> str:
     """Return a value of a fit with its unit."""
     return with_unit(value, unit_of(name, system), digits)
 
@@ -67,19 +71,19 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
         rows = [("SET", recommended.spell_wall()), ("", reason)]
     rows += [("", ""), *_describe_device(fit)]
     determined = math.isfinite(fit.stiffness_max)
-    rows.append(("K_max", _spell_estimate(fit, "stiffness_max") if determined else "open: see the warnings"))
+    rows.append(("K_max", _format_estimate(fit, "stiffness_max") if determined else "not determined: see the warnings"))
     rows.append(("fit", _describe_residuals(fit)))
     if recommended.status == Status.OK:
         rows.append(("margins", f"{recommended.spell_margins()}; passive: {recommended.spell_passive()}"))
         rows += [*checks, *(("CAUTION", caution) for caution in recommended.cautions)]
     # The warnings of the fit describe every other status.
-    trouble = [f"NOT_CONVERGED: {name_trouble(fit)}"] if fit.status == Status.NOT_CONVERGED else []
-    rows += [("WARNING", text) for text in (*trouble, *fit.doubts)] or [("warnings", "none")]
+    unconverged = [f"NOT_CONVERGED: {describe_status(fit)}"] if fit.status == Status.NOT_CONVERGED else []
+    rows += [("WARNING", text) for text in (*unconverged, *fit.doubts)] or [("warnings", "none")]
     rows += [("note", note) for note in fit.notes]
     if fit.next is not None:
         rows.append(("next", _describe_next(fit)))
     elif fit.motions and recommended.is_at_safe_limit and (rigid := _assume_rigid(fit)) is not None:
-        stiffest = spell("stiffness", rigid.stiffness, fit.unit_system)
+        stiffest = format_value("stiffness", rigid.stiffness, fit.unit_system)
         rows.append(("next", f"for a stiffer wall (up to {stiffest} without hidden resonances) {advise_record(fit)}"))
     return rows
 
@@ -92,32 +96,32 @@ def _assume_rigid(fit: DeviceFit) -> Recommendation | None:
 
 def _describe_device(fit: DeviceFit) -> list[tuple[str, str]]:
     """Return pairs of label and text for the fitted parameters, with their 95 % confidence intervals."""
-    texts = [f"{symbol_of(name, fit.unit_system)} = {_spell_estimate(fit, name)}" for name in fit.numbers[:2]]
-    texts.append(f"delay {_spell_estimate(fit, 'delay')}")
+    texts = [f"{symbol_of(name, fit.unit_system)} = {_format_estimate(fit, name)}" for name in fit.numbers[:2]]
+    texts.append(f"delay {_format_estimate(fit, 'delay')}")
     if "friction" in fit.errors:
         certain = math.isfinite(fit.errors["friction"])
-        friction = f"friction {_spell_estimate(fit, 'friction')}" if fit.friction else "no friction"
-        texts.append(friction if certain else "friction open")
+        friction = f"friction {_format_estimate(fit, 'friction')}" if fit.friction else "no friction"
+        texts.append(friction if certain else "friction not determined")
     rows = [("device", ", ".join(texts))]
     for name in fit.numbers[3:]:
         *owner, last = name.split(".")
         label = "actuator" if owner[0] == "actuator" else "resonance"
-        text = f"{last.replace('_', ' ')} {_spell_estimate(fit, name)}"
+        text = f"{last.replace('_', ' ')} {_format_estimate(fit, name)}"
         # Join the parameters of one part into one line. Each resonance starts with its frequency.
         new = rows[-1][0] != label or last == "frequency"
         rows = [*rows, (label, text)] if new else [*rows[:-1], (label, f"{rows[-1][1]}, {text}")]
     return rows
 
 
-def _spell_estimate(fit: DeviceFit, name: str) -> str:
+def _format_estimate(fit: DeviceFit, name: str) -> str:
     """Return a fitted value with its 95 % confidence interval."""
     if not math.isfinite(fit.value_of(name)):
-        return "open"
+        return "not determined"
     interval = fit.intervals[name]
     if not math.isfinite(sum(interval)):
-        return f"{_spell(fit, name)} (uncertain)"
-    value = _spell(fit, name)
-    low, high = (spell(name, end, fit.unit_system, _count_digits(fit, name)) for end in interval)
+        return f"{_format(fit, name)} (uncertain)"
+    value = _format(fit, name)
+    low, high = (format_value(name, end, fit.unit_system, _count_digits(fit, name)) for end in interval)
     unit = f" {high.partition(' ')[2]}"
     if low.endswith(unit):
         low, high = low.removesuffix(unit), high.removesuffix(unit) if value.endswith(unit) else high
@@ -128,11 +132,11 @@ def _describe_residuals(fit: DeviceFit) -> str:
     """Return the size of the residuals, compared with the quantization noise of the encoder."""
     if isinstance(fit.noise, tuple):
         return f"noise of K and f {' and '.join(f'{plain(100 * share, 2)} %' for share in fit.noise)}"
-    size = f"residuals of {spell('position', fit.noise, fit.unit_system, 3)}"
+    size = f"residuals of {format_value('position', fit.noise, fit.unit_system, 3)}"
     if not fit.resolution:
         return size
     expected = NEAR_ROUNDING[0] < fit.noise / fit.resolution * math.sqrt(12.0) < NEAR_ROUNDING[1]
-    step = spell("position", fit.resolution, fit.unit_system, 3)
+    step = format_value("position", fit.resolution, fit.unit_system, 3)
     return f"{size}, {'as expected for an encoder step of' if expected else 'with an encoder step of'} {step}"
 
 
@@ -140,10 +144,10 @@ def _describe_next(fit: DeviceFit) -> str:
     """Return the most informative next experiment with walls, and the expected standard error of K_max after it."""
     step, units = fit.next, fit.unit_system
     assert step is not None, "only fits to walls at the onset of instability propose a next experiment"
-    B, K = spell("damping", step.virtual_damping, units, 3), spell("stiffness", step.stiffness, units, 3)
+    B, K = format_value("damping", step.virtual_damping, units, 3), format_value("stiffness", step.stiffness, units, 3)
     text = f"raise K at B = {B}, to about {K} and {with_unit(step.frequency, 'Hz', 3)}"
     if math.isfinite(fit.stiffness_error + step.error_afterwards):
-        errors = [spell("stiffness", error, units, 2) for error in (fit.stiffness_error, step.error_afterwards)]
+        errors = [format_value("stiffness", error, units, 2) for error in (fit.stiffness_error, step.error_afterwards)]
         text += f": decreases the standard error of K_max from {' to '.join(errors)}"
     return text
 
@@ -169,21 +173,21 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     elif any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
         rows.append(("used", f"{count:,} of {total:,} samples, from the start; more would only reduce the errors"))
     if math.isfinite(fit.virtual_damping):
-        B, error = (spell("damping", value, units) for value in (fit.virtual_damping, fit.virtual_damping_error))
+        B, error = (format_value("damping", value, units) for value in (fit.virtual_damping, fit.virtual_damping_error))
         rows.append(("at K_max", f"B = {B} (standard error {error})"))
     for name in ("friction", "offset"):
         if name in fit.errors and not math.isfinite(fit.errors[name]):
             rows.append(
-                (name, f"{_spell(fit, name)}, uncertain: the log does not distinguish friction from a constant force")
+                (name, f"{_format(fit, name)}, uncertain: the log does not distinguish friction from a constant force")
             )
         elif name == "offset" and name in fit.errors:
-            rows.append((name, f"{_spell_estimate(fit, name)}, a constant force"))
-    rows += [("or as well", spell_rival(rival, units)) for rival in fit.rivals]
+            rows.append((name, f"{_format_estimate(fit, name)}, a constant force"))
+    rows += [("alternative", format_rival(rival, units)) for rival in fit.rivals]
     if fit.lag is not None:
         names = ("time_constant", "delay", "stiffness_max")
-        lag, delay, K = (spell(name, value, units, 3) for name, value in zip(names, fit.lag, strict=True))
+        lag, delay, K = (format_value(name, value, units, 3) for name, value in zip(names, fit.lag, strict=True))
         rows.append(
-            ("or as well", f"an actuator lag of up to {lag}; at this lag the fitted delay is {delay} and K_max is {K}")
+            ("alternative", f"an actuator lag of up to {lag}; at this lag the fitted delay is {delay} and K_max is {K}")
         )
     if fit.is_doubted or fit.scene.safe_limit is None:
         return rows
@@ -194,40 +198,42 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
     return rows
 
 
-def spell_rival(rival: RivalDevice, system: UnitSystem) -> str:
-    """Return the parameters of a rival device in one line."""
+def format_rival(rival: RivalDevice, system: UnitSystem) -> str:
+    """Return the parameters of another device that fits equally well, in one line."""
     names = ("mass", "damping", "delay")
-    parts = {symbol_of(name, system): spell(name, getattr(rival, name), system) for name in names}
-    parts[symbol_of("stiffness_max", system)] = spell("stiffness", rival.stiffness_max, system)
+    parts = {symbol_of(name, system): format_value(name, getattr(rival, name), system) for name in names}
+    parts[symbol_of("stiffness_max", system)] = format_value("stiffness", rival.stiffness_max, system)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 
 
-def _spell(fit: DeviceFit, name: str) -> str:
+def _format(fit: DeviceFit, name: str) -> str:
     """Return a value with as many digits as its confidence interval requires."""
-    return spell(name, fit.value_of(name), fit.unit_system, _count_digits(fit, name))
+    return format_value(name, fit.value_of(name), fit.unit_system, _count_digits(fit, name))
 
 
-def _between(fit: DeviceFit, name: str) -> str:
+def _format_interval(fit: DeviceFit, name: str) -> str:
+    """Return the 95 % confidence interval of a value as text."""
     if not math.isfinite(sum(fit.intervals[name])):
-        return "open"
-    low, high = (spell(name, end, fit.unit_system, _count_digits(fit, name)) for end in fit.intervals[name])
+        return "not determined"
+    low, high = (format_value(name, end, fit.unit_system, _count_digits(fit, name)) for end in fit.intervals[name])
     return f"95 % between {low} and {high}"
 
 
 def _count_digits(fit: DeviceFit, name: str) -> int:
+    """Return the number of digits of a value: two more than the interval confirms, but 4 to 9."""
     value, bar = abs(fit.value_of(name)), fit.intervals[name]
-    known = value / (bar.high - bar.low) if bar.high > bar.low else 1.0
-    return min(max(4, 2 + math.ceil(math.log10(known))), 9) if known > 0 and math.isfinite(known) else 4
+    ratio = value / (bar.high - bar.low) if bar.high > bar.low else 1.0
+    return min(max(4, 2 + math.ceil(math.log10(ratio))), 9) if ratio > 0 and math.isfinite(ratio) else 4
 
 
 def _write_number(fit: DeviceFit, name: str) -> str:
     """Return a parameter of the scene as a line of YAML."""
-    return f"{name.rpartition('.')[2]}: {round_number(fit, name)!r} {unit_of(name, fit.unit_system)}".rstrip()
+    return f"{name.rpartition('.')[2]}: {round_parameter(fit, name)!r} {unit_of(name, fit.unit_system)}".rstrip()
 
 
 def _write_part(fit: DeviceFit, name: str) -> str:
     """Return a parameter of the scene as a line of YAML, with its interval as a comment."""
-    return f"{_write_number(fit, name)} # fitted, {_between(fit, name)}"
+    return f"{_write_number(fit, name)} # fitted, {_format_interval(fit, name)}"
 
 
 def _write_limit(fit: DeviceFit) -> list[str]:
@@ -261,7 +267,7 @@ def write_scene(
     units = fit.unit_system
     origin = "as given" if period_given or not fit.motions else "from the times of the log"
     lines = [
-        f"# Fitted to {source}: {_between(fit, 'stiffness_max')} for K_max.",
+        f"# Fitted to {source}: {_format_interval(fit, 'stiffness_max')} for K_max.",
         *(f"# Note: {note}" for note in fit.notes),
         *("version: 1", f"name: {_name_file(source)}", "scene:"),
         *(f"  {_write_part(fit, key)}" for key in fit.numbers[:3]),
@@ -279,7 +285,7 @@ def write_scene(
         lines.append(f"  {key}: {{{inside}}} # as given")
     hardware = list_hardware(fit)
     if "coulomb" in hardware:
-        lines.append(f"  coulomb: {hardware['coulomb']!r} {units['N']} # fitted, {_between(fit, 'friction')}")
+        lines.append(f"  coulomb: {hardware['coulomb']!r} {units['N']} # fitted, {_format_interval(fit, 'friction')}")
     if "resolution" in hardware:
         lines.append(f"  resolution: {hardware['resolution']!r} {units['m']} # encoder step of the log")
     lines += [] if max_force is None else [f"  max_force: {max_force!r} {units['N']} # as given"]
@@ -289,9 +295,9 @@ def write_scene(
 
 def list_hardware(fit: DeviceFit) -> dict[str, float]:
     """Return friction and encoder step as far as a fit determines them, as arguments of `zwidth.diagnose`."""
-    friction = math.isfinite(fit.errors.get("friction", math.nan)) and round_number(fit, "friction")
-    known = {"coulomb": friction, "resolution": float(f"{fit.resolution:.12g}")}
-    return {name: value for name, value in known.items() if value}
+    friction = math.isfinite(fit.errors.get("friction", math.nan)) and round_parameter(fit, "friction")
+    values = {"coulomb": friction, "resolution": float(f"{fit.resolution:.12g}")}
+    return {name: value for name, value in values.items() if value}
 
 
 def _name_file(source: str) -> str:

@@ -11,7 +11,7 @@ from loop_logs import make_knob
 import zwidth
 from zwidth.cli import cli
 from zwidth.fitting.device_fit import RivalDevice
-from zwidth.fitting.words import spell_rival
+from zwidth.fitting.words import format_rival
 from zwidth.studies.document import load_config
 from zwidth.words.unit_system import LINEAR, ROTARY
 
@@ -167,5 +167,5 @@ def test_a_normalized_scene_has_no_hardware(tmp_path):
 
 def test_the_inertia_of_a_rotary_device_has_the_symbol_j():
     rival = RivalDevice(1e-5, 1e-4, 1e-3, 1.0)
-    assert spell_rival(rival, ROTARY).startswith("J = 100.0 g cm^2")
-    assert spell_rival(rival, LINEAR).startswith("m = ")
+    assert format_rival(rival, ROTARY).startswith("J = 100.0 g cm^2")
+    assert format_rival(rival, LINEAR).startswith("m = ")

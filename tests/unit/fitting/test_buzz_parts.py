@@ -6,8 +6,8 @@ from measured_devices import OTHERS, PERIOD, OtherDevice, TrueDevice
 
 import zwidth
 from zwidth.fitting.buzzing import Onsets
-from zwidth.fitting.device_estimate import DimensionlessDevice, differentiate, name_numbers
-from zwidth.fitting.required_wall import RequiredWall
+from zwidth.fitting.device_estimate import DimensionlessDevice, differentiate, name_parameters
+from zwidth.fitting.required_wall import CriticalController
 from zwidth.parts.circle import circle
 from zwidth.words.status import Status
 
@@ -35,18 +35,21 @@ def differ(function, theta):
 def test_the_critical_controller_is_that_of_the_sampled_device(lag, modes):
     device = describe_device(lag, modes)
     at = circle(np.array([1e-3, 0.05, 0.3, 0.72, 1.9, 3.0]))
-    found, wanted = RequiredWall(*device[1:]), device.to_scene(PERIOD, VELOCITY).loop.roots.evaluate_controller(at)
-    np.testing.assert_allclose(found.value(at), wanted.value, rtol=1e-12)
+    found, wanted = (
+        CriticalController(*device[1:]),
+        device.to_scene(PERIOD, VELOCITY).loop.roots.evaluate_controller(at),
+    )
+    np.testing.assert_allclose(found.evaluate(at), wanted.value, rtol=1e-12)
     if not lag + modes:
-        np.testing.assert_allclose(found.jet(at).slope, wanted.slope, rtol=1e-12)
+        np.testing.assert_allclose(found.evaluate_rigid(at).slope, wanted.slope, rtol=1e-12)
 
 
 @pytest.mark.parametrize("lag, modes", KINDS)
 def test_the_parameters_of_a_device_are_those_of_its_scene(lag, modes):
-    values = describe_device(lag, modes).to_numbers(PERIOD)
-    scene = DimensionlessDevice.of_numbers(values, PERIOD, lag).to_scene(PERIOD, VELOCITY)
+    values = describe_device(lag, modes).to_parameters(PERIOD)
+    scene = DimensionlessDevice.from_parameters(values, PERIOD, lag).to_scene(PERIOD, VELOCITY)
     own = scene.parameters()
-    np.testing.assert_allclose([own[name] for name in name_numbers(scene)], values, rtol=1e-15)
+    np.testing.assert_allclose([own[name] for name in name_parameters(scene)], values, rtol=1e-15)
 
 
 def test_walls_and_parameters_have_the_derivatives_of_differences():
@@ -54,15 +57,15 @@ def test_walls_and_parameters_have_the_derivatives_of_differences():
     onsets, theta = Onsets(kappa, rub, w, VELOCITY, PERIOD), np.array([np.log(0.1), 0.03, 1.3])
 
     def follow(theta):
-        walls = onsets.follow(theta)
+        walls = onsets.predict_walls(theta)
         return np.log(np.stack([walls.kappa, walls.w], 1))
 
-    def to_numbers(theta):
-        return onsets.normalize(theta).to_numbers(PERIOD)
+    def to_parameters(theta):
+        return onsets.normalize(theta).to_parameters(PERIOD)
 
-    slopes = onsets.follow(theta).slopes()
+    slopes = onsets.predict_walls(theta).differentiate()
     np.testing.assert_allclose(slopes, differ(follow, theta), rtol=1e-6, atol=1e-8 * np.abs(slopes).max())
-    np.testing.assert_allclose(differentiate(to_numbers, theta), differ(to_numbers, theta), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(differentiate(to_parameters, theta), differ(to_parameters, theta), rtol=1e-7, atol=1e-9)
 
 
 def begin_to_buzz(true, shares, noise=0.0, seed=0):
@@ -142,4 +145,4 @@ def test_the_interval_at_an_unmeasured_damping_includes_the_measured_stiffness()
     bar, spread = fit.intervals["stiffness_max"], np.exp(fit.reach * fit.stiffness_error / fit.stiffness_max)
     assert bar == (pytest.approx(8703 * (1 - 0.02 * fit.reach)), pytest.approx(fit.stiffness_max * spread))
     assert bar.low < true.limit_of_walls() < bar.high
-    assert fit.safe_wall().stiffness <= fit.bear_tried(0.99)
+    assert fit.safe_wall().stiffness <= fit.bound_measured_stiffness(0.99)

@@ -123,8 +123,8 @@ REFUSED = {
     "unit in the option": ("t,x,F\n0,1,2\n", {"time": "t:N"}, "time: got the unit 'N'; allowed are s, ms"),
     "counts alone": ("t,x [counts],F\n0,1,2\n", {}, "specify the resolution, as 0.03 mm"),
     "length and torque": ("t,x [mm],tau [N m]\n0,1,2\n", {}, "got a position in mm with a torque in N m"),
-    "angle and force": ("t,phi [deg],F\n0,1,2\n", {}, "a position in deg with a force in N (no unit is given)"),
-    "length without unit": ("t,weg,tau [N m]\n0,1,2\n", {}, "in m (no unit is given) with a torque in N m"),
+    "angle and force": ("t,phi [deg],F\n0,1,2\n", {}, "a position in deg with a force in N (no unit)"),
+    "length without unit": ("t,weg,tau [N m]\n0,1,2\n", {}, "in m (no unit) with a torque in N m"),
     "all at once": ("a,b,c\n0,1,2\n1,2,3\n", {}, "no column for time, position and force recognized in"),
     "two of three": ("t,b,c\n0,1,2\n1,2,3\n", {}, "among 't', 'b', 'c'; specify position 'COLUMN:unit', force"),
 }  # fmt: skip
@@ -156,7 +156,7 @@ def test_logs_of_different_axes_are_not_fitted_together(tmp_path):
     linear = read_log(write(tmp_path, "t,x,F\n0,7,1\n"), {})
     turning = read_log(write(tmp_path, "t,phi [deg],tau [N m]\n0,7,1\n"), {})
     coarse = read_log(write(tmp_path, "t,x,F\n0,7,1\n"), {}, resolution="1 mm")
-    with pytest.raises(InputError, match="fit them apart"):
+    with pytest.raises(InputError, match="fit them separately"):
         fit_motions([linear, turning])
-    with pytest.raises(InputError, match="resolution: the logs have several"):
+    with pytest.raises(InputError, match="resolution: the logs have different ones"):
         fit_motions([linear, coarse])

@@ -82,7 +82,7 @@ def test_a_resonance_whose_numbers_are_open_has_no_safe_wall():
     force, position = record(OTHERS["compliance of 50 Hz, encoder at the motor"], 0, step=2e-4)
     fit = zwidth.fit_log(PERIOD, position, force)
     safe = fit.safe_wall()
-    assert fit.is_doubted or fit.respond(0.99, True) is None
+    assert fit.is_doubted or fit.build_response_scene(0.99, True) is None
     assert safe.status == Status.UNDECIDED
     assert np.isnan(safe.stiffness)
     assert fit.recommended.status == Status.UNREACHABLE
@@ -106,7 +106,7 @@ def test_the_interval_of_the_stiffest_wall_reaches_to_a_lag_that_does_not_show()
     assert fit.intervals["stiffness_max"].high >= fit.lag.stiffness_max
     assert fit.lag.delay < fit.delay
     assert fit.as_dict()["lag"]["time_constant"] == fit.lag.time_constant
-    assert any("lag" in text for label, text in detail_fit(fit, "a log") if label == "or as well")
+    assert any("lag" in text for label, text in detail_fit(fit, "a log") if label == "alternative")
 
 
 @pytest.mark.parametrize("top, bottom", [([0.2], [1.0, -0.8]), ([0.2] * 5, [1.0])])

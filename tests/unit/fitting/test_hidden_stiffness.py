@@ -11,7 +11,7 @@ from zwidth.fitting.choosing import choose_structure
 from zwidth.fitting.hidden import HiddenResonances, sample_resonances
 from zwidth.fitting.moving import Recording
 from zwidth.fitting.output_error import fit_model
-from zwidth.fitting.required_wall import DeviceRows
+from zwidth.fitting.required_wall import GridLimits
 from zwidth.fitting.structure import Recordings
 from zwidth.words.status import Status
 
@@ -30,7 +30,7 @@ def test_rows_on_a_grid_have_the_stiffest_walls_of_scenes(velocity):
     lines, timing = np.unique(lines), zwidth.Timing(period=PERIOD, delay=DELAY)
     scenes = [zwidth.Scene(zwidth.Device(0.1, 3.0, **parts), timing, velocity=velocity) for parts in SCENES.values()]
     answers = np.array([[scene.frequency_response(*wall, lines) for scene in scenes] for wall in ((1, 0), (0, 1))])
-    found = DeviceRows(-1.0 / answers[0], answers[1] / answers[0]).stiffest()
+    found = GridLimits(-1.0 / answers[0], answers[1] / answers[0]).find_stiffness_max()
     exact = [float(scene.max_stiffness(negative_damping=False).stiffness) for scene in scenes]
     np.testing.assert_allclose(found, exact, rtol=5e-3)
 

@@ -171,7 +171,7 @@ def test_a_lag_that_swings_is_modelled_and_a_hand_refused():
     fit = zwidth.fit_log(PERIOD, move(0.1, 2.0, 1e-3, swinging) + 1e-6 * rng.standard_normal(600), force)
     assert (fit.status, fit.is_structured) == (Status.OK, True)
     rigid = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=PERIOD, delay=1e-3))
-    loop: Any = fit.respond(0.99, True)
+    loop: Any = fit.build_response_scene(0.99, True)
     device = loop.device
     hertz = device.frequency
     turn = np.exp(-2j * np.pi * hertz * PERIOD)
@@ -179,7 +179,7 @@ def test_a_lag_that_swings_is_modelled_and_a_hand_refused():
     # In its band, though it is no continuous lag.
     assert np.all(np.abs(device.response - exact) < device.deviation)
     hand = np.cumsum(0.2 * rng.standard_normal(600))
-    with pytest.raises(InputError, match="unexplained and no noise: another force"):
+    with pytest.raises(InputError, match="unexplained and not white noise: another force"):
         zwidth.fit_log(PERIOD, move(0.1, 2.0, 1e-3, force + hand), force)
 
 
@@ -200,7 +200,7 @@ TIMES = PERIOD * np.arange(200)
 @pytest.mark.parametrize(
     "time, position, force, words",
     [
-        (TIMES + 0.5e-3 * (TIMES > 0.0905), PLACES, FORCE, "not even: steps from 1.000 ms to 1.500 ms"),
+        (TIMES + 0.5e-3 * (TIMES > 0.0905), PLACES, FORCE, "not evenly spaced: steps from 1.000 ms to 1.500 ms"),
         (
             TIMES[np.arange(200) % 40 > 0],
             PLACES[:195],
@@ -278,7 +278,7 @@ def test_a_clock_that_wavers_changes_nothing_but_the_period(share):
     assert fit.stiffness_max == pytest.approx(even.stiffness_max, rel=1e-3)
     assert abs(fit.mass - 0.1) < 4 * fit.errors["mass"]
     if share == 0.05:
-        with pytest.raises(InputError, match="ask to resample"):
+        with pytest.raises(InputError, match="use resample"):
             zwidth.fit_log(stamps, position, force)
     stamps[200:] += 0.6 * PERIOD
     with pytest.raises(InputError, match="not even"):

@@ -110,9 +110,9 @@ def test_few_positions_are_doubted():
     rng = np.random.default_rng(0)
     force = push_to_and_fro(rng, 120)
     position = record(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.0)
-    assert not any("positions count" in doubt for doubt in zwidth.fit_log(PERIOD, position, force).doubts)
+    assert not any("positions are fitted" in doubt for doubt in zwidth.fit_log(PERIOD, position, force).doubts)
     fit = zwidth.fit_log(PERIOD, position[:70], force[:70])
-    assert any("only 48 positions count" in doubt for doubt in fit.doubts)
+    assert any("only 48 positions are fitted" in doubt for doubt in fit.doubts)
 
 
 def test_what_lies_before_and_behind_a_gap_is_fitted_as_two_logs():
@@ -153,5 +153,5 @@ def test_a_delay_of_0_is_doubted_only_where_the_force_comes_late(seed):
     assert 0 < fit.safe_wall().stiffness < fit.stiffness_max
     late = zwidth.fit_log(PERIOD, position[1:], force[:-1], resolution=STEP)
     assert late.delay == 0
-    assert any("precede the force" in doubt for doubt in late.doubts)
+    assert any("a negative delay would fit better" in warning for warning in late.doubts)
     assert np.isnan(late.safe_wall().stiffness)

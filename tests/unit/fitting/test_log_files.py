@@ -201,5 +201,5 @@ def test_a_file_of_matlab_7_3_says_how_to_save_it(tmp_path):
 def test_a_motor_constant_that_is_none_is_told(tmp_path):
     file = tmp_path / "log.csv"
     file.write_text("t,x,i_A\n" + ROWS)
-    with pytest.raises(InputError, match="motor_constant: got '5 kg/A' for a force in A; write what an ampere makes"):
+    with pytest.raises(InputError, match="motor_constant: got '5 kg/A' for a force in A; give the force per ampere"):
         read_log(file, {"force": "i_A"}, motor_constant="5 kg/A")

@@ -41,7 +41,7 @@ def test_slopes_are_those_of_differences(friction, delta, d):
     recording = Recording(random_force(5), np.zeros(294), SKIP)
     at = {"g": 1e-5, "delta": delta, "d": d, "x0": 0.1, "v0": 3e-4, "offset": 2e-7, "friction": friction}
     steps = {"g": 1e-10, "delta": 1e-6, "d": 1e-6, "x0": 1e-6, "v0": 1e-8, "offset": 1e-12, "friction": 1e-11}
-    slopes = recording.move(**at).slopes
+    slopes = recording.move(**at).derivatives
     for k, (name, step) in enumerate(steps.items()):
         if name == "friction" and not friction:
             continue
@@ -54,18 +54,18 @@ def test_a_mass_that_sticks_stays_and_forgets_its_speed():
     recording = Recording(np.full(60, 0.5), np.zeros(54), SKIP)
     moved = recording.move(1e-5, 0.01, 1.3, 0.2, 0.0, 0.0, 6e-6)
     np.testing.assert_array_equal(moved.position, 0.2)
-    np.testing.assert_array_equal(moved.slopes[:, [0, 1, 2, 4, 5, 6]], 0.0)
+    np.testing.assert_array_equal(moved.derivatives[:, [0, 1, 2, 4, 5, 6]], 0.0)
 
 
 def test_several_logs_share_the_device_alone():
     logs = tuple(Recording(random_force(seed), np.zeros(294), SKIP) for seed in (1, 2))
     model = Recordings(logs)
     theta = np.array([1e-5, 0.02, 1.3, 0.1, 1e-4, -0.2, -3e-4, 1e-7, 1e-6])
-    motion = model.follow(theta)
-    places, slopes = motion.position, motion.slopes
+    motion = model.simulate(theta)
+    places, slopes = motion.position, motion.derivatives
     for k, log in enumerate(logs):
         alone = log.move(*theta[:3], *theta[3 + 2 * k : 5 + 2 * k], *theta[7:])
         rows = slice(294 * k, 294 * (k + 1))
         np.testing.assert_array_equal(places[rows], alone.position)
-        np.testing.assert_array_equal(slopes[rows][:, [0, 1, 2, 3 + 2 * k, 4 + 2 * k, 7, 8]], alone.slopes)
+        np.testing.assert_array_equal(slopes[rows][:, [0, 1, 2, 3 + 2 * k, 4 + 2 * k, 7, 8]], alone.derivatives)
         np.testing.assert_array_equal(slopes[rows][:, [5 - 2 * k, 6 - 2 * k]], 0.0)

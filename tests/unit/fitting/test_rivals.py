@@ -120,9 +120,9 @@ def test_a_rival_is_as_many_errors_away_as_its_squares_say(lag, expected):
     force = np.concatenate([np.zeros(SKIP), np.repeat(random.choice([-1.0, 1.0], 20), 20)])
     theta = np.array([1e-5, 0.02, 2.3, 0.0, 1e-5, 1e-7, 1e-6])
     model = Recordings((Recording(force, np.zeros(400), SKIP),))
-    noisy = model.follow(theta).position + 1e-6 * random.standard_normal(400)
+    noisy = model.simulate(theta).position + 1e-6 * random.standard_normal(400)
     model = Recordings((Recording(force, noisy, SKIP),))
-    squares = float(np.sum((noisy - model.follow(theta).position) ** 2))
+    squares = float(np.sum((noisy - model.simulate(theta).position) ** 2))
     alone = FittedModel(model, theta, squares, True)
     # By slopes it is 50 errors away in each of two numbers.
     away = np.zeros(7)

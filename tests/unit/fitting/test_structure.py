@@ -38,7 +38,7 @@ def lay_out(delay, lag, modes, *, friction=1e-15, order=1):
 @pytest.mark.parametrize("case", CASES)
 def test_motions_are_those_of_matrix_exponentials(case):
     model, theta = lay_out(*CASES[case])
-    place = model.follow(theta).position
+    place = model.simulate(theta).position
     np.testing.assert_allclose(place, model.measured, atol=1e-9 * np.ptp(place))
 
 
@@ -49,10 +49,10 @@ def test_derivatives_are_those_of_differences(case, friction, order):
     model, theta = lay_out(*CASES[case], friction=friction, order=order)
     # As of a device that moved before.
     theta[model.parts.stop : -2] += 1e-4 * np.random.default_rng(1).standard_normal(theta[model.parts.stop : -2].size)
-    slopes = model.follow(theta).slopes
+    slopes = model.simulate(theta).derivatives
     for k in range(theta.size - 1):
         step = np.eye(theta.size)[k] * 1e-5 * max(abs(theta[k]), 1e-6)
-        ends = [model.follow(theta + side * step).position for side in (1, -1)]
+        ends = [model.simulate(theta + side * step).position for side in (1, -1)]
         found = (ends[0] - ends[1]) / (2 * step[k])
         np.testing.assert_allclose(slopes[:, k], found, atol=3e-6 * np.abs(found).max())
 
@@ -62,7 +62,7 @@ def test_a_motion_is_one_where_damping_and_lag_end_their_ranges():
     model, theta = lay_out(*CASES["lag"])
     low, high = model.bounds()
     theta[1], theta[3] = high[1], low[3]
-    assert np.isfinite(model.follow(theta).position).all()
+    assert np.isfinite(model.simulate(theta).position).all()
 
 
 def test_the_numbers_of_the_scene_move_with_theta_as_their_derivatives_say():
@@ -75,13 +75,13 @@ def test_the_numbers_of_the_scene_move_with_theta_as_their_derivatives_say():
         own = model.normalize(theta, period).to_scene(period, velocity).parameters()
         return np.array([own[name] for name in names])
 
-    slopes = differentiate(lambda theta: model.normalize(theta, PERIOD).to_numbers(PERIOD), theta)
+    slopes = differentiate(lambda theta: model.normalize(theta, PERIOD).to_parameters(PERIOD), theta)
     for k in range(len(names)):
         step = np.eye(theta.size)[k] * 1e-6 * theta[k]
         found = (numbers(theta + step) - numbers(theta - step)) / (2 * step[k])
         np.testing.assert_allclose(slopes[:, k], found, rtol=1e-7, atol=1e-7 * np.abs(found).max())
     device = model.normalize(theta, PERIOD)
-    again = type(device).of_numbers(numbers(theta), PERIOD, model.lag)
+    again = type(device).from_parameters(numbers(theta), PERIOD, model.lag)
     for found, wanted in zip(again, device, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-14)
 
