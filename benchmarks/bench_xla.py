@@ -115,20 +115,20 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     def top(a: Any, b: Any) -> Any:
         return ridge.ridge_kernel(a, b, ANY)
 
-    wide = xp.known_options(xp.WIDE)
+    wide = xp.filter_options(xp.WIDE)
     yield "WIDE, radius", compiled(quick, wide), compiled(quick), columns
     yield "WIDE, verdict", compiled(stable, wide), compiled(stable), columns
     few = (delta[:8192], d[:8192])
     yield (
-        "store_once, ridge kkt",
+        "materialize, ridge kkt",
         compiled(point),
         compiled(point, kkt__store_once=same, newton__store_once=same),
         few,
     )
-    yield "store_once, ridge", compiled(top), compiled(top, newton__store_once=same), (delta, d)
+    yield "materialize, ridge", compiled(top), compiled(top, newton__store_once=same), (delta, d)
     yield "angle, alone", compiled(xp.angle), compiled(their_angle), (alpha - 1.0, beta)
     other = {"circle__angle": their_angle, "circle__find_turn": their_turn, "radius__angle": their_angle}
-    yield "angle and find_turn, radius", compiled(quick, wide), compiled(quick, wide, **other), columns
+    yield "angle and invert_haversine, radius", compiled(quick, wide), compiled(quick, wide, **other), columns
     by_rule, alone = slopes()
     yield "custom_jvp, gradient of ridge", lambda: by_rule, lambda: alone, (delta, d)
     million = tuple(np.tile(np.asarray(column), 16) for column in (delta, d))

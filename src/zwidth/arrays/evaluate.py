@@ -23,7 +23,7 @@ from zwidth.arrays.blocks import count_points, map_blocks
 from zwidth.words.errors import InputError, PrecisionWarning
 from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
-from zwidth.words.xp import WIDE, compute_concretely, is_jax, is_traced, known_options, store_once, tree_map
+from zwidth.words.xp import WIDE, compute_concretely, filter_options, is_jax, is_traced, materialize, tree_map
 
 # Types whose conversion needs no check; bool and 0-d arrays are checked.
 _PLAIN = frozenset({float, int, np.float64})
@@ -279,7 +279,9 @@ def compile_traced(
         )
         # The values are computed once for all sides, and a side once for all that is made of it.
         value, slopes = jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
-        return value, tree_map(lambda leaf: leaf if leaf.dtype == jax.dtypes.float0 else store_once(leaf, leaf), slopes)
+        return value, tree_map(
+            lambda leaf: leaf if leaf.dtype == jax.dtypes.float0 else materialize(leaf, leaf), slopes
+        )
 
     function = jax.custom_jvp(jax.jit(plain))
 
@@ -349,4 +351,4 @@ def compile_columns(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Call
         count = count_points(columns)
         return kernel(*(column[0] if column.size == 1 < count else column for column in columns), *static)
 
-    return jax.jit(whole, compiler_options=known_options(WIDE))
+    return jax.jit(whole, compiler_options=filter_options(WIDE))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.words.types import Array
-from zwidth.words.xp import along, frozen, namespace, repeat
+from zwidth.words.xp import expand_along, iterate, namespace, stop_gradient
 
 # Maps points to values; or to values and derivatives.
 Function = Callable[[Array], Array]
@@ -33,7 +33,7 @@ def bisect(holds: Function, low: Array, high: Array) -> Array:
         is_true = holds(middle)
         return xp.where(is_true, middle, ends[0]), xp.where(is_true, ends[1], middle)
 
-    low, high = repeat(HALVINGS, halve, (low, high), xp)
+    low, high = iterate(HALVINGS, halve, (low, high), xp)
     return 0.5 * (low + high)
 
 
@@ -64,7 +64,7 @@ def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) 
     def is_done(_: tuple[Array, ...], new: tuple[Array, ...]) -> bool:
         return bool(np.all(new[3] <= CONVERGED_STEP * np.abs(new[0])))
 
-    x, _, _, last = repeat(steps, step, (start, low, high, xp.full_like(start, xp.inf)[()]), xp, is_done)
+    x, _, _, last = iterate(steps, step, (start, low, high, xp.full_like(start, xp.inf)[()]), xp, is_done)
     return x, last
 
 
@@ -104,7 +104,7 @@ def minimize_golden_section(
     def is_done(_: tuple[Array, ...], new: tuple[Array, ...]) -> bool:
         return bool(np.all(new[2] - new[0] <= close * np.abs(new[1])))
 
-    _, middle, _, value = repeat(steps, step, (left, middle, right, value), xp, is_done)
+    _, middle, _, value = iterate(steps, step, (left, middle, right, value), xp, is_done)
     return middle, value
 
 
@@ -300,11 +300,11 @@ def attach_root_derivatives(
 
         value, change = jax.jvp(evaluate_varied, tuple(leaves[k] for k in varied), tuple(changes[k] for k in varied))
         rate = (slope or differentiate)(x, *parameters)
-        valid = usable(*frozen((x, rate, value / xp.where(rate == 0, 1.0, rate)), xp))
+        valid = usable(*stop_gradient((x, rate, value / xp.where(rate == 0, 1.0, rate)), xp))
         return x, xp.where(valid, -change / xp.where(valid, rate, 1.0), 0.0)
 
     attach.defjvp(rule, symbolic_zeros=True)
-    return attach(frozen(root, xp), *parameters)
+    return attach(stop_gradient(root, xp), *parameters)
 
 
 def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes: Sequence[int]) -> Array:
@@ -320,7 +320,7 @@ def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes:
     """
     xp, pieces = namespace(*edges), []
     for low, high, count in zip(edges[:-1], edges[1:], nodes, strict=True):
-        node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(count))
+        node, weight = (expand_along(values, low) for values in np.polynomial.legendre.leggauss(count))
         half = 0.5 * (high - low)[..., None]
         pieces.append((low[..., None] + half * (node + 1.0), half * weight))
     points, weights = (xp.concatenate(parts, axis=-1) for parts in zip(*pieces, strict=True))

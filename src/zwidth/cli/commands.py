@@ -37,8 +37,8 @@ from zwidth.parts.device import Device
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
 from zwidth.parts.wall import VirtualWall
-from zwidth.words.errors import InputError, ZwidthError, check_choice, how_to_install
-from zwidth.words.formatting import plain, spell_stiffness, with_unit
+from zwidth.words.errors import InputError, ZwidthError, check_choice, format_install_command
+from zwidth.words.formatting import format_stiffness, plain, with_unit
 from zwidth.words.quantities import SIZES, Range
 from zwidth.words.status import Status
 
@@ -159,7 +159,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
             "cautions": cautions,
         }
         B, f = with_unit(wall_values[1], scene.unit_system["N s/m"]), with_unit(named["frequency"], "Hz")
-        K = spell_stiffness(named["stiffness_max"], scene.unit_system)
+        K = format_stiffness(named["stiffness_max"], scene.unit_system)
         top = f"{K} at B = {B}, {f} ({kind.replace('_', ' ')} optimum)"
         lines = [
             words.format_line("K_max", top),
@@ -183,7 +183,7 @@ def _list_obstacles(scene: Any) -> list[str]:
 
     top = find_nominal_limit(scene)
     said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
-    K_max = spell_stiffness(float(top.stiffness), scene.unit_system)
+    K_max = format_stiffness(float(top.stiffness), scene.unit_system)
     return [f"K_max = {K_max} for the measured curve without its error band; {text}" for text in said]
 
 
@@ -300,7 +300,7 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
         if (error.name or "").partition(".")[0] not in ("bokeh", "tornado"):
             raise
         raise InputError(
-            f"explore: requires bokeh, which is not installed; install it: {how_to_install('explore')}"
+            f"explore: requires bokeh, which is not installed; install it: {format_install_command('explore')}"
         ) from error
     from zwidth.pages.explorer.controls import read_controls
     from zwidth.runs.record import find_config

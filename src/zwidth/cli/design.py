@@ -28,11 +28,11 @@ from zwidth.pages.words import LABEL, format_line, format_notes, format_parts, p
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import (
     count_digits,
-    name_wall,
+    format_stiffness,
+    format_sufficient,
+    format_wall,
     plain,
-    round_safely,
-    spell_enough,
-    spell_stiffness,
+    round_conservatively,
     with_unit,
 )
 from zwidth.words.quantities import PARAMETERS
@@ -132,12 +132,12 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     if path in ("period", "rate"):
         result["rate"] = needed.value if path == "rate" else 1.0 / needed.value
     low, high = (with_unit(end, unit) for end in needed.range)
-    goal = f"for K_max = {spell_stiffness(wanted, units)}"
+    goal = f"for K_max = {format_stiffness(wanted, units)}"
     kept = f" (the delay stays {scene.timing.kept_delay})" if path in ("period", "rate") and scene.timing.delay else ""
     if needed.status == Status.UNREACHABLE:
         best = _find_best(scene, path, needed.range)
         result["best"] = best
-        reached = f"the largest is {spell_stiffness(best['stiffness'], units)} at {with_unit(best['value'], unit)}"
+        reached = f"the largest is {format_stiffness(best['stiffness'], units)} at {with_unit(best['value'], unit)}"
         text = f"none {goal} from {low} to {high}{kept}; {reached}" if best["stiffness"] else f"none {goal}"
     elif needed.status != Status.OK:
         text = f"not found from {low} to {high}{kept}: {Status(needed.status).message}"
@@ -145,7 +145,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         text = f"any from {low} to {high} {goal}{kept}"
     else:
         values = [crossing.value for crossing in needed.crossings]
-        text = f"{spell_enough(needed.value, needed.enough, values, unit)}"
+        text = f"{format_sufficient(needed.value, needed.enough, values, unit)}"
         # Subtract the one or two crossings that the text already contains.
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"
@@ -202,7 +202,7 @@ def _tolerate(
     percent = f"{100 * simulation.reliability:g} %"
     unit = scene.unit_system["N/m"]
     stiffness, stiffness_best = (
-        with_unit(round_safely(end, "below"), unit) for end in (simulation.stiffness, simulation.stiffness_max)
+        with_unit(round_conservatively(end, "below"), unit) for end in (simulation.stiffness, simulation.stiffness_max)
     )
     # Round towards the safe side, so that 100 % means all devices.
     ends = (
@@ -210,11 +210,11 @@ def _tolerate(
         (simulation.stable_low, "below"),
         (simulation.stable_high, "above"),
     )
-    stable, low, high = (plain(round_safely(100 * each, side)) for each, side in ends)
+    stable, low, high = (plain(round_conservatively(100 * each, side)) for each, side in ends)
     share = f"{stable} % of {simulation.samples} devices drawn"
     interval = f"{low} to {high} % of all, with 95 % confidence"
     lines = [
-        format_line("wall", name_wall(scene.wall.stiffness, scene.wall.virtual_damping, scene.unit_system)),
+        format_line("wall", format_wall(scene.wall.stiffness, scene.wall.virtual_damping, scene.unit_system)),
         format_line("stable", f"{share} ({interval})"),
         format_line(percent, f"of them are stable for K up to {stiffness} at this B"),
     ]
@@ -243,7 +243,7 @@ def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], l
     }
     # Round the stiffness down: softer walls of the same damping are stable too.
     units, names = scene.unit_system, ("stiffness", "stiffness_max")
-    stiffness, stiffness_best = (with_unit(round_safely(result[name], "below"), units["N/m"]) for name in names)
+    stiffness, stiffness_best = (with_unit(round_conservatively(result[name], "below"), units["N/m"]) for name in names)
     damping = with_unit(result["virtual_damping"], units["N s/m"], DIGITS)
     text = f"of all devices within the tolerances are stable for K up to {stiffness} at B = {damping} (by search), "
     text += f"or up to {stiffness_best}, each device with its best B"

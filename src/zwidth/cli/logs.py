@@ -37,11 +37,11 @@ from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.words.errors import UnusableValueError
-from zwidth.words.formatting import name_wall, round_safely, with_unit
+from zwidth.words.formatting import format_wall, round_conservatively, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
-from zwidth.words.units import tell_kind
+from zwidth.words.units import detect_kind
 
 # Entry such as "K=3.2kN/m": a letter, "=", and the text up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
@@ -59,7 +59,7 @@ def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
             numbers[letter] = quantity_type({"K": "N/m", "B": "N s/m", "f": "Hz"}[letter]).read(amount)
         except UnusableValueError as error:
             raise ValueError(f"{letter}: {error}") from None
-        kinds |= {tell_kind(amount)} - {None}
+        kinds |= {detect_kind(amount)} - {None}
     if len(kinds) > 1:
         raise ValueError(f"got {text!r}; write K in N/m and B in N s/m, or K in N m/rad and B in N m s/rad")
     return (numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None
@@ -281,7 +281,7 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
     if made.expected is not None and made.limit is not None:
         share = float(made.expected.stiffness / made.limit.stiffness)
         result |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
-        expected = name_wall(made.expected.stiffness, made.expected.virtual_damping, units)
+        expected = format_wall(made.expected.stiffness, made.expected.virtual_damping, units)
         lines += [format_row("expected", f"safe wall {expected}, {100 * share:.0f} % of the present K_max")]
     print_result(result, [*lines, format_row("wrote", str(out))], as_json)
 
@@ -337,7 +337,7 @@ def _print_response(
         scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
     )
     words = (
-        f"{name_wall(*top[:2], device.unit_system)}, for the measured curve without its error band"
+        f"{format_wall(*top[:2], device.unit_system)}, for the measured curve without its error band"
         if top.status == Status.OK
         else "undecided"
     )
@@ -363,9 +363,9 @@ def spell_safe_wall(scene: Any, wall: Any) -> str:
     """Return a safe wall in words, with K reduced until the rounded wall is stable for the whole error band."""
     stiffness, damping = float(wall.stiffness), float(f"{float(wall.virtual_damping):.4g}")
     for _ in range(_SOFTER):
-        stiffness = round_safely(stiffness, "below")
+        stiffness = round_conservatively(stiffness, "below")
         if scene.is_stable(stiffness, damping):
-            return name_wall(stiffness, damping, scene.unit_system)
+            return format_wall(stiffness, damping, scene.unit_system)
         stiffness *= 1.0 - 1e-4
     units = scene.unit_system
     return f"K = {float(wall.stiffness)!r} {units['N/m']}, B = {float(wall.virtual_damping)!r} {units['N s/m']}"

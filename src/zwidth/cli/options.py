@@ -28,10 +28,10 @@ from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import ESTIMATES, name_estimate
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.words.errors import InputError
-from zwidth.words.plausible import list_doubts
+from zwidth.words.plausible import list_implausible
 from zwidth.words.quantities import ANY, CHOICES, HARDWARE, OF_PARTS, PARAMETERS, Range
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
-from zwidth.words.units import DIMENSIONS, read_quantity, read_share, tell_kind
+from zwidth.words.units import DIMENSIONS, detect_kind, read_quantity, read_share
 
 if TYPE_CHECKING:
     from zwidth.parts.devices import KnownDevice
@@ -63,7 +63,7 @@ class Parsed(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Parse one option."""
-        if self.name == "quantity" and ctx is not None and param is not None and tell_kind(value) is not None:
+        if self.name == "quantity" and ctx is not None and param is not None and detect_kind(value) is not None:
             ctx.meta.setdefault(_WITH_KIND, {})[param.opts[0]] = value
         try:
             return self.read(value)
@@ -98,7 +98,7 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
         if periods:
             return read_span(number, allowed)
         # Read each option in the system of its own unit; the options are compared when the scene is built.
-        dimension = DIMENSIONS[SYSTEMS[bool(tell_kind(number))][unit]]
+        dimension = DIMENSIONS[SYSTEMS[bool(detect_kind(number))][unit]]
         return read_quantity(number, dimension, allowed, counts=counts)[0]
 
     return Parsed("quantity", read)
@@ -208,7 +208,7 @@ def take_options(
 
 def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
     """Write a warning to the error stream for each implausible value of ``given``, a dict of SI values by path."""
-    for line in list_doubts(
+    for line in list_implausible(
         given, lambda path, value: f"{name_option(path)} '{value}'" if value else name_option(path), system
     ):
         click.echo(f"zwidth: {line}", err=True)

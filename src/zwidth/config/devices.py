@@ -22,7 +22,7 @@ from zwidth.config.parts import PART_NAMES, PartSection, parse_message
 from zwidth.config.values import Delay, Quantity, get_system, quantity_of
 from zwidth.parts.checks import Span
 from zwidth.parts.devices import DEVICES
-from zwidth.parts.linear_device import LinearDevice, split_fraction
+from zwidth.parts.linear_device import LinearDevice, parse_fraction
 from zwidth.parts.measured import SUFFIXES, MeasuredDevice
 from zwidth.parts.paths import PARTS
 from zwidth.words.errors import InputError
@@ -167,7 +167,7 @@ def _read_form(raw: Any) -> SystemSection | ResponseSection:
         if isinstance(raw, str) and raw.endswith(SUFFIXES):
             return ResponseSection.read(raw)
         if isinstance(raw, str) and "/" in raw:
-            raw = dict(zip(_SYSTEM_FORMS[0], split_fraction(raw), strict=True))
+            raw = dict(zip(_SYSTEM_FORMS[0], parse_fraction(raw), strict=True))
     except InputError as error:
         # Remove the prefix "device: ", because the location is reported separately.
         raise parse_message(str(error).removeprefix("device: ")) from None

@@ -45,7 +45,7 @@ from zwidth.words.formatting import describe
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.tables import read_columns
 from zwidth.words.unit_system import SYSTEMS
-from zwidth.words.units import split_head, tell_kind
+from zwidth.words.units import detect_kind, split_head
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
@@ -108,9 +108,9 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
         # Coordinates in degrees do not make a device rotary, so only parameters count.
         with suppress(InputError):
             heads = map(split_head, read_columns(find_file(data)).heads)
-            return any(tell_kind(f"1 {unit}") is True for name, unit in heads if name in PARAMETERS)
+            return any(detect_kind(f"1 {unit}") is True for name, unit in heads if name in PARAMETERS)
         return False
-    return data is True if key == "rotary" else key not in _KEYS_WITHOUT_UNIT and tell_kind(data) is True
+    return data is True if key == "rotary" else key not in _KEYS_WITHOUT_UNIT and detect_kind(data) is True
 
 
 def _simplify(value: Any, path: FieldPath, problems: list[LocatedProblem]) -> Any:

@@ -34,7 +34,7 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, short
-from zwidth.words.plausible import list_doubts
+from zwidth.words.plausible import list_implausible
 from zwidth.words.quantities import HARDWARE, LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
 from zwidth.words.xp import within
 
@@ -212,7 +212,9 @@ class PhysicalScene(_PhysicalPlant, noun="a scene"):
         }
         parameters |= {"period": self.period} if self.rate is None else {"rate": self.rate}
         system = self.to_scene().unit_system
-        return list_doubts(parameters, lambda path, value: f"'{path}: {value}'" if value else f"scene.{path}", system)
+        return list_implausible(
+            parameters, lambda path, value: f"'{path}: {value}'" if value else f"scene.{path}", system
+        )
 
     @property
     def wall(self) -> PhysicalWall | None:

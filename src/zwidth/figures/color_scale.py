@@ -34,14 +34,14 @@ def choose_scale(output: Output, finite: np.ndarray) -> ColorScale:
     finite = finite[finite >= LEAST_POSITIVE] if output.logarithmic else finite
     usual = (1.0, 10.0) if output.logarithmic else (0.0, 1.0)
     least, most = (float(finite.min()), float(finite.max())) if finite.size else usual
-    if output.look == "diverging":
+    if output.color_scale == "diverging":
         # Both sides get the range of the favorable side, if it has values; values beyond it share one color.
         sides = [output.center - least, most - output.center]
         good, bad = sides if output.below else reversed(sides)
         span = max(good if good > 0 else bad, 1e-6)
         low, high = output.center - span, output.center + span
     elif output.logarithmic:
-        low, high = least, min(most, _STEEP * least) if output.look == "steep" else most
+        low, high = least, min(most, _STEEP * least) if output.color_scale == "steep" else most
         high = max(high, 1.001 * low)
     else:
         low, high = least, most if most > least else least + 1.0
@@ -51,9 +51,9 @@ def choose_scale(output: Output, finite: np.ndarray) -> ColorScale:
 
 def _name_colormap(output: Output) -> str:
     """Return the name of the colormap of an output in matplotlib."""
-    if output.look == "diverging":
+    if output.color_scale == "diverging":
         return "PuOr_r" if output.below else "PuOr"
-    return "viridis_r" if output.look == "steep" else "viridis"
+    return "viridis_r" if output.color_scale == "steep" else "viridis"
 
 
 def find_colormap(output: Output) -> Any:
@@ -63,7 +63,7 @@ def find_colormap(output: Output) -> Any:
 
 def make_norm(output: Output, scale: ColorScale) -> Any:
     """Return matplotlib's normalization of a color scale."""
-    if output.look == "diverging":
+    if output.color_scale == "diverging":
         return TwoSlopeNorm(output.center, scale.low, scale.high)
     return (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
 
@@ -73,10 +73,10 @@ def choose_levels(values: Any, output: Output, norm: Any) -> np.ndarray:
     low, high = float(values.min()), float(values.max())
     if output.logarithmic:
         # Omit levels where a steep output grows without bound, unless all values are close together.
-        end = min(high, max(norm.vmax / 2.0, (low * high) ** 0.5)) if output.look == "steep" else high
+        end = min(high, max(norm.vmax / 2.0, (low * high) ** 0.5)) if output.color_scale == "steep" else high
         levels = np.asarray(LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, end))
         levels = levels[levels <= end]
-    elif output.look == "diverging":
+    elif output.color_scale == "diverging":
         ends = (low, output.center) if output.below else (output.center, high)
         levels = np.asarray(MaxNLocator(6).tick_values(*ends)) if ends[0] < ends[1] else np.empty(0)
         levels = levels[levels != output.center]

@@ -77,7 +77,7 @@ def draw_curves(
         if output.logarithmic:
             # Choose the ticks by the values of all panels, because the panels share the axis.
             style.use_logarithmic(ax, "y", whole)
-        if output.look == "diverging":
+        if output.color_scale == "diverging":
             ax.axhline(output.center, color=style.GRAY, linewidth=0.7, linestyle=style.DASHED, zorder=0.5)
     values = data[x].values
     if few and not grid.logarithmic(values):

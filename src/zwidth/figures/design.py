@@ -16,7 +16,14 @@ from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, in_order, select
-from zwidth.words.formatting import ENOUGH, count_digits_apart, header, round_safely, spell_enough, with_unit
+from zwidth.words.formatting import (
+    ENOUGH,
+    count_digits_apart,
+    format_sufficient,
+    header,
+    round_conservatively,
+    with_unit,
+)
 from zwidth.words.quantities import PARAMETERS
 
 _STIFFNESS = SI_COLUMNS[0]  # name of the column of K_max
@@ -127,7 +134,7 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) 
         which = f"n = {samples:g}" if np.isfinite(samples) else rf"f_c = {cutoff:.3g}\,\mathrm{{Hz}}"
         look = {"marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgecolor": color, "zorder": 5}
         ax.plot(noise * factors[0], stiffness * factors[1], linestyle="", label="best", **look)
-        text = f":  ${which}$,  {with_unit(round_safely(stiffness, 'below', 3), style.units()['N/m'], 3)}"
+        text = f":  ${which}$,  {with_unit(round_conservatively(stiffness, 'below', 3), style.units()['N/m'], 3)}"
     return text
 
 
@@ -170,7 +177,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
         _mark_required(ax, curve_drawn, target * factor, value * scale if all_known else np.nan, colors[target])
         # Split the column other_crossings, in which quantities are separated by semicolons.
         crossings = [float(each.split()[0]) for each in str(others).split("; ") if each]
-        name = spell_enough(float(value), enough, crossings, style.units()[parameter.unit], 3) if all_known else ""
+        name = format_sufficient(float(value), enough, crossings, style.units()[parameter.unit], 3) if all_known else ""
         names.append(name.replace("g cm^2", style.write_unit("g cm^2")))
     heights = np.append(stiffness, targets)
     for name, scaled in (("x", values * scale), ("y", heights * factor)):
@@ -207,7 +214,7 @@ def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[f
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
         words = f"{wanted * factor:.{digits}g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
         # Round down, because 100 % must not be printed if even one device is unstable.
-        percent = f"{round_safely(100.0 * share, 'below', 3):.3g}"
+        percent = f"{round_conservatively(100.0 * share, 'below', 3):.3g}"
         yield wanted * reserve, words + (f": stable on {percent} % of devices" if np.isfinite(share) else "")
 
 

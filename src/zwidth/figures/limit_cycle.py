@@ -22,7 +22,7 @@ from matplotlib.ticker import FuncFormatter
 from zwidth.figures import grid, style
 from zwidth.figures.table import Table, curves, draws_tables, grid_in_order
 from zwidth.simulation.result import MotionKind
-from zwidth.words.formatting import count_digits_apart, header, spell_short
+from zwidth.words.formatting import count_digits_apart, format_short, header
 from zwidth.words.quantities import FIELDS
 
 # Parameters that may be an axis of the figures, by the name of their array.
@@ -87,7 +87,7 @@ def draw_limit_cycles(
     edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.6}
     handles: list[Any] = [
         Patch(facecolor="white", label="at rest", **edge),
-        Patch(**_BEYOND, label=f"larger than {spell_short(bounds[1], style.units()['m'])}"),
+        Patch(**_BEYOND, label=f"larger than {format_short(bounds[1], style.units()['m'])}"),
     ]
     handles += [style.line("boundary of the linear theory", width=1.2, color=style.VERMILION)] if edges else []
     style.legend(panels, handles, outside=axes is None, ncols=3)
@@ -137,7 +137,7 @@ def draw_limit_cycle_curves(
     looks = _list_looks(arrays, family, cycles["linearly_stable"])
     # Draw dots in addition to lines, because a single limit cycle between two walls at rest has no line.
     dots = {"marker": "o", "markersize": 3.5 if arrays[over].size <= _MAX_DOTS else 1.25, "clip_on": False}
-    largest = spell_short(bounds[1], style.units()["m"])
+    largest = format_short(bounds[1], style.units()["m"])
     for row, (name, scaling, words) in enumerate(quantities):
         for column, ax in enumerate(panels[row * len(labels) : (row + 1) * len(labels)]):
             for curve, is_cycle, look in zip(cycles[name][column], oscillating[column], looks, strict=True):

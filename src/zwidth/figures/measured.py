@@ -17,7 +17,7 @@ from matplotlib.collections import EllipseCollection
 from zwidth.figures import style
 from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select
-from zwidth.words.formatting import round_safely
+from zwidth.words.formatting import round_conservatively
 
 _MAX_SAMPLES = 4000  # largest number of samples drawn per panel; longer logs are thinned evenly
 _TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder": 6}  # properties of texts at walls
@@ -212,7 +212,7 @@ def _mark_walls(
             color = colors.get(fit, style.BLACK)
             mark_wall(ax, (K, B), kind, kind=mark, color=color)
             # Round K down, because the printed wall must be stable, too.
-            numbers = f"$K = {round_safely(K, 'below'):.4g}$ {stiffness[1]}, $B = {B:.4g}$ {damping[1]}"
+            numbers = f"$K = {round_conservatively(K, 'below'):.4g}$ {stiffness[1]}, $B = {B:.4g}$ {damping[1]}"
             handles.append(style.line(f"{words}: {numbers}", "", color=color, **MARKS[mark]))
     if not kinds["set"][1].size:
         handles.append(style.line("no wall recommended: warnings, or no safe wall", ""))

@@ -25,7 +25,7 @@ from zwidth.figures.plane import Panel, draw_panels, panel_grid
 from zwidth.figures.stable_set import Outlines, draw_zeros, mark_wall, shade_region
 from zwidth.figures.table import Table, curves, draws_tables, grid_in_order, select, si_scale
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import round_safely
+from zwidth.words.formatting import round_conservatively
 from zwidth.words.quantities import OUTPUTS
 from zwidth.words.status import Status
 
@@ -366,10 +366,10 @@ def _mark_maximum(ax: Axes, edge: Any, scale: tuple[float, float] | None) -> Non
     """
     top = int(np.argmax(edge.alpha))
     place = (edge.alpha[top], edge.beta[top])
-    text = rf"$\alpha_{{\max}} = {round_safely(place[0], 'below'):.4g}$"
+    text = rf"$\alpha_{{\max}} = {round_conservatively(place[0], 'below'):.4g}$"
     if scale is not None:
         factor, unit = style.si_unit(place[0] * scale[0], "N/m")
-        text += "\n" + rf"$K_{{\max}} = {round_safely(place[0] * scale[0] * factor, 'below'):.4g}$ {unit}"
+        text += "\n" + rf"$K_{{\max}} = {round_conservatively(place[0] * scale[0] * factor, 'below'):.4g}$ {unit}"
     mark_wall(ax, place, "alpha_max", kind="stiffest", text=text)
 
 

@@ -140,7 +140,7 @@ def _add_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> xa
 
 def boundary_level(name: str) -> float:
     """Return the level of an output whose contour is the boundary of the stable or passive walls."""
-    return OUTPUTS[name].center if OUTPUTS[name].look == "diverging" else 0.5
+    return OUTPUTS[name].center if OUTPUTS[name].color_scale == "diverging" else 0.5
 
 
 def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndarray:
@@ -159,7 +159,7 @@ def draw_panels(axes: np.ndarray, panels: Sequence[Panel], name: str, label: str
         ax.set_facecolor(MISSING)
         grid.scale_axis(ax, "x", panel.x)
         grid.scale_axis(ax, "y", panel.y)
-        if output.look == "truth":
+        if output.color_scale == "truth":
             image = _draw_regions(ax, panel, name)
         else:
             shown = panel.variables[name]
@@ -227,7 +227,7 @@ def draw_contours(
     luminance = shades[:, :3] @ np.array([0.299, 0.587, 0.114])
     colors = [("white" if dark < 0.5 else "#303030") for dark in luminance]
     drawn = ax.contour(x, y, values, levels=levels, colors=colors, linewidths=0.7)
-    within = (values < levels.max()) if output.below or output.look == "steep" else (values > levels.min())
+    within = (values < levels.max()) if output.below or output.color_scale == "steep" else (values > levels.min())
     if np.ma.filled(within, False).mean() > _LABELLED:
         label_contours(ax, drawn, colors, shades, others)
 
@@ -235,7 +235,7 @@ def draw_contours(
 def draw_edge(ax: Axes, panel: Panel, name: str, **look: Any) -> list[np.ndarray]:
     """Draw the boundary of the stable or passive walls, exactly or as a contour; return its lines."""
     output, values, level = OUTPUTS[name], panel.variables[name], boundary_level(name)
-    crossed = output.look in ("diverging", "truth")
+    crossed = output.color_scale in ("diverging", "truth")
     if not crossed and name not in _FINITE_IF_STABLE:
         return []
     outlines = panel.outlines.get("passive" if name == "passivity_margin" else "stable")
@@ -266,7 +266,7 @@ def _add_legend(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any
     """
     handles: list[Any] = []
     output, finite = OUTPUTS[name], _collect_finite(panels, name)
-    if output.look == "truth":
+    if output.color_scale == "truth":
         for each, dash in (("stable", "-"), ("passive", "-.")):
             if each == name or each in panels[0].variables:
                 edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.8, "linestyle": dash}
@@ -279,7 +279,7 @@ def _add_legend(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any
         bar.ax.tick_params(labelsize=8)
     exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
     crossed = finite.size and finite.min() < output.center < finite.max()
-    if crossed if output.look == "diverging" else (exact and output.look != "truth"):
+    if crossed if output.color_scale == "diverging" else (exact and output.color_scale != "truth"):
         walls = "passive" if name == "passivity_margin" else "stable"
         handles.append(style.line(f"edge of what is {walls}", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):

@@ -44,7 +44,7 @@ from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import name_wall
+from zwidth.words.formatting import format_wall
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.types import ArrayLike
 
@@ -274,7 +274,7 @@ def step(
 
 def _tabulate_step(scene: Scene, stiffness: float, virtual_damping: float, periods: int) -> dict[str, Any]:
     """Return the response of a scene with a wall (K, B) to a step of 1 N at the samples, as columns of a step study."""
-    label = name_wall(stiffness, virtual_damping, scene.unit_system)
+    label = format_wall(stiffness, virtual_damping, scene.unit_system)
     columns = {**tabulate_walls(scene, stiffness, virtual_damping), "label": label}
     columns["time_s"] = np.arange(periods) * scene.timing.period
     columns["position_m"] = scene.state_space(stiffness, virtual_damping).step(periods)

@@ -19,7 +19,7 @@ from matplotlib.path import Path
 
 from zwidth.figures import style
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select, stack
-from zwidth.words.formatting import round_safely, with_unit
+from zwidth.words.formatting import round_conservatively, with_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -277,7 +277,7 @@ def draw_stable_set(
     rows = {"digits": np.full(len(rows["wall"]), 4), **rows}
     for kind, label, digits, *wall in zip(*(rows[name] for name in ("wall", "label", "digits", *names)), strict=True):
         # Round K down, because the printed wall must be stable.
-        read = round_safely(wall[0], "below", digits), wall[1]
+        read = round_conservatively(wall[0], "below", digits), wall[1]
         wall = [value * factor for value, factor in zip(wall, factors, strict=True)]
         which = kind.split()[0]
         symbols = zip((r"\alpha", r"\beta") if normalized else "KB", read, ("N/m", "N s/m"), strict=True)

@@ -25,7 +25,7 @@ from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocato
 
 from zwidth.words.contexts import set_temporarily
 from zwidth.words.errors import InputError
-from zwidth.words.files import write_whole
+from zwidth.words.files import write_atomically
 from zwidth.words.formatting import PREFIXES
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.unit_system import LINEAR, UnitSystem
@@ -361,7 +361,7 @@ def save(
             usual = PNG_DPI if file.suffix == ".png" else "figure"
             kind = {"format": file.suffix[1:], "metadata": _METADATA[file.suffix]}
             figure.savefig(drawing := BytesIO(), dpi=dpi or _settings.get().dpi or usual, **kind)
-            write_whole(file, drawing.getvalue())
+            write_atomically(file, drawing.getvalue())
             # Keep the layout of the first format for the others, because computing it takes half the run time.
             figure.set_layout_engine(None)
     figure.set_layout_engine(engine)

@@ -20,7 +20,7 @@ import numpy as np
 
 from zwidth.fitting.device_estimate import DimensionlessDevice
 from zwidth.fitting.required_wall import CriticalController
-from zwidth.parts.circle import circle
+from zwidth.parts.circle import circle_points
 from zwidth.parts.velocity import Estimate, Velocity
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
@@ -67,7 +67,7 @@ class Onsets:
         mass, controller, estimate, w = np.exp(theta[0]), CriticalController(*theta[1:3]), self._estimate, self.w
         step = np.full(w.shape, np.inf)
         for _ in range(STEPS):
-            points = circle(w)
+            points = circle_points(w)
             f, q = estimate.jet(points), controller.evaluate_rigid(points)
             residual, slope = (
                 (self.scaled_damping * f.value - mass * q.value).imag,
@@ -78,7 +78,7 @@ class Onsets:
             # Do not iterate on walls whose step is NaN, because it stays NaN.
             if not np.any(np.abs(step) > CONVERGED * w):
                 break
-        points = circle(w)
+        points = circle_points(w)
         f, q = estimate.jet(points), controller.evaluate_rigid(points)
         kappa = (mass * q.value - self.scaled_damping * f.value).real
 
@@ -103,7 +103,7 @@ class Onsets:
         from scipy.ndimage import minimum_filter
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)
-        points = circle(self.w)
+        points = circle_points(self.w)
         q = CriticalController(deltas[:, None, None], delays[:, None]).evaluate_rigid(points).value
         errors = np.log((self.kappa + self.scaled_damping * self._estimate.jet(points).value) / q)
         log_mass = errors.real.mean(-1)

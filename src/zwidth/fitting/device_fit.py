@@ -22,7 +22,7 @@ from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import to_json, with_unit
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.status import Status
 
 _FAR = 1e3  # half-width, in standard errors, of the bracket in which quantiles are searched
@@ -72,7 +72,7 @@ class RivalDevice(NamedTuple):
     stiffness_max: float
 
 
-@shown(
+@compact_repr(
     ("mass", "damping", "delay", "stiffness_max", "stiffness_error", "friction", "status", "doubts"),
     missing=dict.fromkeys(("stiffness_max", "stiffness_error"), "see status and doubts"),
     mass="kg",

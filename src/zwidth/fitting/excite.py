@@ -22,7 +22,7 @@ from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
-from zwidth.words.files import write_whole
+from zwidth.words.files import write_atomically
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
@@ -79,7 +79,7 @@ class Excitation:
     def save(self, file: str | Path) -> None:
         """Write a CSV file with a row per sample: the time in s, and the force in N or the torque in N m."""
         rows = [f"{k * self.period:.9g},{value:.7g}" for k, value in enumerate(self.force.tolist())]
-        write_whole(
+        write_atomically(
             Path(file),
             ("\n".join([f"time [s],{'torque [N m]' if self.rotary else 'force [N]'}", *rows]) + "\n").encode(),
         )

@@ -42,7 +42,7 @@ import numpy as np
 from zwidth.fitting.moving import recur
 from zwidth.fitting.output_error import FittedModel
 from zwidth.fitting.required_wall import CriticalController, GridLimits
-from zwidth.parts.circle import circle
+from zwidth.parts.circle import circle_points
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.measured_curve import LEAST_DAMPING_RATIO
 from zwidth.scenes.scene import Scene
@@ -211,7 +211,7 @@ def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenR
     grid = np.concatenate([np.broadcast_to(common, (len(local), common.size)), local], -1)
     order = np.argsort(grid, -1)
     grid, response = (np.take_along_axis(each, order, -1) for each in (grid, np.concatenate(responses, -1)))
-    velocity = scene.velocity.estimate(period).jet(circle(2.0 * np.pi * grid)).value
+    velocity = scene.velocity.estimate(period).jet(circle_points(2.0 * np.pi * grid)).value
     reference, *stiffness = GridLimits(-1.0 / response, velocity / period).find_stiffness_max()
     return HiddenResonances(odds, np.array(stiffness) / reference) if reference > 0 else None
 
@@ -263,12 +263,12 @@ def _build_frequency_grid(scene: Scene, phase_step: float) -> np.ndarray:
 def _evaluate_unit_modes(fit: FittedModel, grid: np.ndarray, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
     """Return the contribution of unit modes to the frequency response."""
     (g, delta, d), mode = fit.theta[:3], (2.0 * np.pi * frequency, ratio, np.sqrt(1.0 - ratio**2))
-    return g * CriticalController(delta, d, (), [mode]).evaluate_parts(circle(2.0 * np.pi * grid))
+    return g * CriticalController(delta, d, (), [mode]).evaluate_parts(circle_points(2.0 * np.pi * grid))
 
 
 def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the response of the fitted device, and along a last axis its derivatives in the device parameters."""
-    points = circle(2.0 * np.pi * grid.ravel())
+    points = circle_points(2.0 * np.pi * grid.ravel())
 
     def evaluate(theta: np.ndarray) -> np.ndarray:
         controller = CriticalController(*fit.model.normalize(theta, period)[1:])

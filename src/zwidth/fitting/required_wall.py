@@ -72,14 +72,16 @@ class CriticalController:
     def evaluate_rigid(self, points: CirclePoints) -> Jet:
         """Return q of the rigid mass and its derivative in the frequency w."""
         plant, turn = self.plant, 1j * points.z
-        numerator, z_minus_c = _evaluate_numerator(plant, points), points.before + plant.em
-        q = -np.exp(1j * self.n_delay * points.w) * points.before * z_minus_c / numerator
-        slopes = turn / points.before + turn / z_minus_c - 1j * (plant.a2 * points.z - plant.a0 / points.z) / numerator
+        numerator, z_minus_c = _evaluate_numerator(plant, points), points.z_minus_1 + plant.em
+        q = -np.exp(1j * self.n_delay * points.w) * points.z_minus_1 * z_minus_c / numerator
+        slopes = (
+            turn / points.z_minus_1 + turn / z_minus_c - 1j * (plant.a2 * points.z - plant.a0 / points.z) / numerator
+        )
         return Jet(q, q * (1j * self.n_delay + slopes))
 
     def evaluate_parts(self, points: CirclePoints) -> Array:
         """Return the part of the response G that is due to lag and modes."""
-        above, below = points.before * self.late_gain + self.gain, points.before - self.growth
+        above, below = points.z_minus_1 * self.late_gain + self.gain, points.z_minus_1 - self.growth
         return (self.residues * (np.exp(-1j * (self.n_delay + 1.0) * points.w) * above / below)).sum(0)
 
     def differentiate(self, points: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +89,7 @@ class CriticalController:
         by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
         numerator = _evaluate_numerator(self.plant, points)
         return (
-            q * (by_delta.em / (points.before + self.plant.em) - _evaluate_numerator(by_delta, points) / numerator),
+            q * (by_delta.em / (points.z_minus_1 + self.plant.em) - _evaluate_numerator(by_delta, points) / numerator),
             -q * _evaluate_numerator(by_fraction, points) / numerator,
         )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from zwidth.parts.safe_limit import SafeLimit
 from zwidth.scenes.scene import Scene
-from zwidth.words.formatting import round_safely, with_unit
+from zwidth.words.formatting import round_conservatively, with_unit
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -73,13 +73,17 @@ def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
     wall = fit.safe_wall(rigid=rigid)
     if wall.status != Status.OK or not wall.stiffness > 0:
         return SafeLimit(0.0, reason="the fitted parameters are too uncertain for any wall; record longer")
-    stiffness = round_safely(wall.stiffness, "below", LIMIT_DIGITS)
+    stiffness = round_conservatively(wall.stiffness, "below", LIMIT_DIGITS)
     # Round B toward 0, because at larger |B| the stiffness limit often decreases steeply.
-    damping = math.copysign(round_safely(abs(wall.virtual_damping), "below", LIMIT_DIGITS), wall.virtual_damping)
+    damping = math.copysign(
+        round_conservatively(abs(wall.virtual_damping), "below", LIMIT_DIGITS), wall.virtual_damping
+    )
     limit = SafeLimit(float(f"{stiffness:.12g}"), float(f"{damping:.12g}"), _explain_limit(fit, wall))
     estimate, low = round_parameter(fit, "damping"), fit.intervals["damping"].low
     reserve = estimate - low if low > 0 else estimate
-    return replace(limit, damping_reserve=float(f"{round_safely(max(reserve, 0.0), 'above', LIMIT_DIGITS):.12g}"))
+    return replace(
+        limit, damping_reserve=float(f"{round_conservatively(max(reserve, 0.0), 'above', LIMIT_DIGITS):.12g}")
+    )
 
 
 def _explain_limit(fit: DeviceFit, wall: SafeWall) -> str:

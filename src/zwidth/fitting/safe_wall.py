@@ -24,14 +24,14 @@ from zwidth.fitting.required_wall import CriticalController, GridLimits, find_hi
 from zwidth.loops.linear.held import DiscreteChain, add_input_delay
 from zwidth.loops.rigid.normalization import device_status
 from zwidth.parts.chain import Body, Chain, Resonance
-from zwidth.parts.circle import circle
-from zwidth.parts.state_space import StateSpace, estimate_matrices, in_series
+from zwidth.parts.circle import circle_points
+from zwidth.parts.state_space import StateSpace, connect_in_series, realize_estimate
 from zwidth.parts.velocity import BackwardDifference, Estimate
 from zwidth.scenes.tolerances import compute_stiffness_quantile
 from zwidth.scenes.variants import RigidVariants
 from zwidth.simulation.flow import flow
 from zwidth.words.quantities import SI_RANGE
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.status import Status
 
 _SAMPLES = 8000  # largest number of random devices
@@ -51,7 +51,7 @@ _SOFTER = (1.0, 0.5, 0.1)  # checked stiffnesses, relative to K
 _MAX_CONTRADICTED = 2e-3  # largest share of devices for which eigenvalues may contradict the grid of frequencies
 
 
-@shown(resonance="Hz")
+@compact_repr(resonance="Hz")
 class SafeWall(NamedTuple):
     """A wall that is stable on nearly all devices that agree with the records; NaN if the status is not OK."""
 
@@ -190,7 +190,7 @@ class _SearchedDevices:
         drawn, d, rate = drawn[valid], d[valid], rate[valid]
         self.fit, self.drawn = fit, drawn
         even = np.linspace(0.0, np.pi, int(_EVEN + _EVEN_PER_PERIOD * d.max(initial=0.0)))[1:]
-        points = circle(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
+        points = circle_points(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
         with np.errstate(all="ignore"):
             velocity = scene.velocity.estimate(period).jet(points).value[None] / period
             controller = CriticalController(*fit.normalize(drawn[..., None])[1:3])
@@ -227,7 +227,7 @@ def _are_stable(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtua
     """Return a mask of the devices on which a wall, and softer ones with the same B, are stable, by eigenvalues."""
     estimate, devices = fit.velocity.estimate(fit.period), fit.normalize(drawn)
     A, B, _ = (np.moveaxis(part, -1, 0) for part in _build_chain(devices, estimate).realize())
-    n_delay, f = np.floor(devices.d).astype(int), estimate_matrices(estimate)
+    n_delay, f = np.floor(devices.d).astype(int), realize_estimate(estimate)
     rate, size = np.concatenate([A, B[..., None]], -1), B.shape[-1]
     times = np.stack([np.ones_like(devices.d), n_delay + 1.0 - devices.d], -1)
     moved = flow(rate, np.zeros((len(A), size + 1, size + 1)), times).change
@@ -240,7 +240,10 @@ def _are_stable(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtua
         alpha, beta = (
             wall / devices.mass[group, None, None] for wall in (stiffness * fit.period**2, virtual_damping * fit.period)
         )
-        loops = (in_series(StateSpace(f.A, f.B, beta * f.C, softer * alpha + beta * f.D), plant) for softer in _SOFTER)
+        loops = (
+            connect_in_series(StateSpace(f.A, f.B, beta * f.C, softer * alpha + beta * f.D), plant)
+            for softer in _SOFTER
+        )
         radii = [np.abs(np.linalg.eigvals(loop.A - loop.B @ loop.C)).max(-1) for loop in loops]
         stable[group] = np.max(radii, 0) < 1.0
     return stable

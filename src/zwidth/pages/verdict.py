@@ -30,7 +30,14 @@ from zwidth.parts.safe_limit import reserve_damping
 from zwidth.scenes.assessment import round_margin
 from zwidth.scenes.cautions import find_thin
 from zwidth.scenes.stabilization import stabilize
-from zwidth.words.formatting import plain, round_safely, spell_periods, spell_stiffness, tell_apart, with_unit
+from zwidth.words.formatting import (
+    format_interval,
+    format_periods,
+    format_stiffness,
+    plain,
+    round_conservatively,
+    with_unit,
+)
 from zwidth.words.showing import find_unit
 
 if TYPE_CHECKING:
@@ -68,7 +75,7 @@ def spell_device(scene: Scene, omitted: frozenset[str] = frozenset()) -> str:
         body = f"{with_unit(device.mass, units['kg'])}, {damping}"
     else:
         body = device.spell()
-    delay = spell_periods(float(scene.d)) if scene.d else ""
+    delay = format_periods(float(scene.d)) if scene.d else ""
     if delay and not timing.in_periods:
         delay = f"{with_unit(timing.delay, 's')} ({delay})"
     delay = f"delay {delay}" if delay else name_default("delay")
@@ -91,7 +98,7 @@ def format_check(
     file in words.
     """
     wall, word, units = scene.wall, name_verdict(verdict).upper(), scene.unit_system
-    K, B = spell_stiffness(wall.stiffness, units), with_unit(wall.virtual_damping, units["N s/m"])
+    K, B = format_stiffness(wall.stiffness, units), with_unit(wall.virtual_damping, units["N s/m"])
     wall_words, device_words = f"K = {K}, B = {B}", spell_device(scene, omitted)
     if isinstance(scene.device, Device):
         wall_words += f" (alpha {plain(verdict.alpha)}, beta {plain(verdict.beta)})"
@@ -143,7 +150,7 @@ def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> 
         return f"no stable {name} at this {other}"
     spelled = []
     for ends in intervals:
-        low, high = tell_apart(*ends, unit)
+        low, high = format_interval(*ends, unit)
         shared = f" {high.partition(' ')[2]}"
         low = "0" if not ends[0] else low.removesuffix(shared)
         spelled.append(f"{low} to {high}")
@@ -156,7 +163,7 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
         none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
         return [format_line("K_max", none)]
     damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
-    top = f"{spell_stiffness(verdict.stiffness_max, scene.unit_system)} at B = {damping}"
+    top = f"{format_stiffness(verdict.stiffness_max, scene.unit_system)} at B = {damping}"
     used = f"; this wall uses {plain(100.0 * scene.wall.stiffness / verdict.stiffness_max, 3)} %"
     lines = [format_line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]
     if verbose:
@@ -208,7 +215,7 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
     dampings = scene.device.damping + abs(scene.wall.virtual_damping) + stiffness * scene.timing.period
     if abs(margin) <= ROUNDED * dampings:
         return "on the limit: no physical damping to spare"
-    size = with_unit(abs(round_safely(margin, "below")), scene.unit_system["N s/m"])
+    size = with_unit(abs(round_conservatively(margin, "below")), scene.unit_system["N s/m"])
     if verdict.passive and margin < (reserve := reserve_damping(scene)):
         spread = with_unit(reserve, scene.unit_system["N s/m"])
         return f"uncertain: {size} of physical damping to spare, but the fitted damping may be lower by {spread}"
@@ -224,7 +231,7 @@ def format_gains(heading: str, limits: Iterable[Limit], verbose: bool = False) -
         return []
     width, rows = max(len(limit.words) for limit in shown), []
     for limit in shown:
-        stiffness = with_unit(round_safely(limit.stiffness, "below"), find_unit(limit, "N/m"))
+        stiffness = with_unit(round_conservatively(limit.stiffness, "below"), find_unit(limit, "N/m"))
         kept = f"; {limit.note}" if limit.note else ""
         rows.append(f"{limit.words:<{width}}  {stiffness}  (x {plain(limit.gain, 3)}{kept})")
     if len(heading) > LONG:

@@ -70,7 +70,7 @@ class Chain:
     actuator: Resonance | Any | None  # of first order: only the corner frequency, in rad per period
     sensor: int  # index of the body whose position is measured
     d: Any  # delay in periods
-    whole: int  # integer part of d
+    n_delay: int  # integer part of d
     estimate: Estimate
 
     sampled: ClassVar[bool] = False
@@ -78,15 +78,15 @@ class Chain:
     @property
     def rigid(self) -> bool:
         """True for a single mass with a damper, without spring, modes and actuator."""
-        return len(self.bodies) == 1 and self.plain and is_zero(self.bodies[0].stiffness)
+        return len(self.bodies) == 1 and self.drives_body_only and is_zero(self.bodies[0].stiffness)
 
     @property
-    def plain(self) -> bool:
+    def drives_body_only(self) -> bool:
         """True if a commanded force has the same effect as an external force: without modes and actuator."""
         return not self.modes and self.actuator is None
 
     @property
-    def free(self) -> bool:
+    def has_integrator(self) -> bool:
         """True if the device has a pole at s = 0, because no spring connects it to ground."""
         return all(body.stiffness == 0 for body in self.bodies)
 
@@ -122,7 +122,7 @@ class Chain:
         forces = [zero, *forces, zero]
         accelerations = []
         for k, body in enumerate(self.bodies):
-            terms = body_position(k, self.sensor, bodies, modes)
+            terms = express_body_position(k, self.sensor, bodies, modes)
             position, speed = (sum(sign * axes[start + j] for j, sign in terms) for start in (0, count))
             force = forces[k + 1] - forces[k] - body.stiffness * position - body.damping * speed
             accelerations.append((force if k else force + actuator_force + external) / body.mass)
@@ -145,7 +145,7 @@ class Chain:
     @cached_property
     def continuous(self) -> tuple[np.ndarray, np.ndarray]:
         """The finite zeros and the poles in s of the response from command to measured position."""
-        numerator, denominator = compliance(self)
+        numerator, denominator = expand_compliance(self)
         poles = [_find_roots(denominator), *(mode.poles for mode in self.modes)]
         factors = [np.array([1.0, 2.0 * m.damping_ratio * m.rate, m.rate * m.rate], float) for m in self.modes]
         numerator = reduce(np.convolve, factors, numerator)
@@ -188,7 +188,7 @@ AnyChain: TypeAlias = Chain | System
 """The plant of a loop: bodies with known parameters, or a linear system."""
 
 
-def chain_of(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Estimate | None = None) -> AnyChain:
+def build_chain(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Estimate | None = None) -> AnyChain:
     """Build the plant of a scene, normalized by the sampling period and the mass of the first body.
 
     Args:
@@ -198,12 +198,12 @@ def chain_of(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Estim
     """
     device, timing, hand = scene.device, scene.timing, scene.operator
     period = timing.period
-    d, whole = delay or (timing.d, int(np.floor(timing.d)))
+    d, n_delay = delay or (timing.d, int(np.floor(timing.d)))
     estimate = estimate or scene.velocity.estimate(period)
     if isinstance(device, LinearDevice):
         # If the period is a ball, convert the mass to an exact ball, too.
         mass = type(period)(device.mass) if hasattr(period, "mid") else device.mass
-        return System(device, period, mass, d, whole, estimate)
+        return System(device, period, mass, d, n_delay, estimate)
     masses = [(device.mass, device.damping, 0.0)]
     links = []
     if device.coupling is not None:
@@ -229,7 +229,7 @@ def chain_of(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Estim
     actuator: Any = None if lag is None else lag.rate * period
     if lag is not None and lag.order == 2:
         actuator = Resonance(actuator, lag.damping_ratio, 1.0 / (actuator * actuator))
-    return Chain(bodies, normalized_links, modes, actuator, sensor, d, whole, estimate)
+    return Chain(bodies, normalized_links, modes, actuator, sensor, d, n_delay, estimate)
 
 
 def is_zero(value: Any) -> bool:
@@ -237,7 +237,7 @@ def is_zero(value: Any) -> bool:
     return isinstance(value, float | np.floating) and value == 0.0
 
 
-def body_position(body: int, sensor: int, bodies: int, modes: int) -> list[tuple[int, float]]:
+def express_body_position(body: int, sensor: int, bodies: int, modes: int) -> list[tuple[int, float]]:
     """Return the indices and signs of the states whose sum is the position of a body.
 
     Args:
@@ -250,7 +250,7 @@ def body_position(body: int, sensor: int, bodies: int, modes: int) -> list[tuple
     return [(0, 1.0), *extensions, *((j, -1.0) for j in range(bodies, bodies + modes))]
 
 
-def compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
+def expand_compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Return numerator and denominator in s of the response from actuator force to the position of the sensor body.
 
     The highest power is first. Modes are not included.

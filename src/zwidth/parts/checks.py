@@ -23,11 +23,11 @@ from zwidth.words.quantities import ANY, CHOICES, FIELDS, NOT_NEGATIVE, PARAMETE
 from zwidth.words.showing import with_units
 from zwidth.words.types import Array
 from zwidth.words.unit_system import LINEAR, SYSTEMS, UnitSystem
-from zwidth.words.units import DIMENSIONS, TIME, read_quantity, tell_kind, to_float
-from zwidth.words.xp import frozen, is_jax, is_traced, namespace
+from zwidth.words.units import DIMENSIONS, TIME, detect_kind, read_quantity, to_float
+from zwidth.words.xp import is_jax, is_traced, namespace, stop_gradient
 
 
-def in_periods(delay: Array, period: Array) -> Array:
+def to_periods(delay: Array, period: Array) -> Array:
     """Return ``delay/period``; a quotient within 4 rounding errors of an integer becomes this integer."""
     # Without this correction, 1.1 ms over 0.1 ms would be 11.000000000000002 periods in float64, a fractional delay.
     xp = namespace(delay, period)
@@ -35,7 +35,7 @@ def in_periods(delay: Array, period: Array) -> Array:
     nearest = xp.round(quotient)
     near = xp.abs(quotient - nearest) <= 4 * np.finfo(quotient.dtype).eps * xp.maximum(nearest, 1.0)
     # Subtract the rounding error as a constant, so that the derivatives remain those of the quotient.
-    return quotient - frozen(xp.where(near & (nearest > 0), quotient - nearest, 0.0), xp)
+    return quotient - stop_gradient(xp.where(near & (nearest > 0), quotient - nearest, 0.0), xp)
 
 
 class Span(NamedTuple):
@@ -52,7 +52,7 @@ class Span(NamedTuple):
         """Return the duration in sampling periods; an exact integer if it differs from one only by rounding errors."""
         if self.unit == "periods":
             return self.value
-        return float(in_periods(np.float64(self.value), np.float64(period)))
+        return float(to_periods(np.float64(self.value), np.float64(period)))
 
     def __str__(self) -> str:
         return f"{short(self.value)} {self.unit}"
@@ -158,7 +158,7 @@ class Part:
             elif path in FIELDS and not (value is None and item.default is None):
                 quantity, allowed = FIELDS[path], find_range(item, path)
                 if quantity.whole:
-                    value = check_whole(path, value, int(allowed.low), int(allowed.high))
+                    value = check_integer(path, value, int(allowed.low), int(allowed.high))
                 else:
                     value = check_number(path, value, self.unit_system[quantity.unit], allowed)
                 object.__setattr__(self, item.name, value)
@@ -192,7 +192,7 @@ def _flatten(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def _kind_of(value: Any) -> bool | None:
     """Return the kind of device that a text with a unit or a part belongs to; None if it determines none."""
-    return tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
+    return detect_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
 
 
 def find_kind(given: dict[str, Any]) -> bool | None:
@@ -286,7 +286,7 @@ def _read(field: str, value: Any, read: Callable[[Any], Any]) -> Any:
         raise InputError(f"{field}: {message}") from None
 
 
-def check_whole(field: str, value: Any, low: int, high: int) -> int:
+def check_integer(field: str, value: Any, low: int, high: int) -> int:
     """Convert a value to an integer; raise `InputError` if it is not an integer from ``low`` to ``high``."""
     number = value if isinstance(value, int | np.integer) and not isinstance(value, bool) else None
     if number is None and isinstance(value, float | np.floating) and float(value).is_integer():

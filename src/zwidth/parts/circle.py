@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.words.types import Array
-from zwidth.words.xp import frozen, namespace
+from zwidth.words.xp import namespace, stop_gradient
 
 # A root is on the unit circle, as that of an undamped mode, if its distance from the circle is at most
 # _ON_CIRCLE (_AT_ONE + |offset|). The limit decreases with the offset, because the distance of a root near z = 1
@@ -45,27 +45,27 @@ class CirclePoints(NamedTuple):
 
     w: Array
     z: Array
-    before: Array  # z - 1
-    after: Array  # z + 1
+    z_minus_1: Array
+    z_plus_1: Array
 
 
-def circle(w: Array) -> CirclePoints:
+def circle_points(w: Array) -> CirclePoints:
     """Return the points of the unit circle at the angles ``w``; the point at pi is exactly -1."""
     xp = namespace(w)
     half = 0.5 * w
     s, c = xp.sin(half), _exactly_at_pi(w, 0.0, xp.cos(half), xp)
-    before = -2.0 * s * s + 2j * s * c
-    return CirclePoints(w, 1.0 + before, before, 2.0 * c * (c + 1j * s))
+    z_minus_1 = -2.0 * s * s + 2j * s * c
+    return CirclePoints(w, 1.0 + z_minus_1, z_minus_1, 2.0 * c * (c + 1j * s))
 
 
-def depths(offsets: np.ndarray) -> np.ndarray:
+def distances_inside(offsets: np.ndarray) -> np.ndarray:
     """Return ``1 - |root|`` for roots given by their offsets, without cancellation for roots near 1."""
     return (2.0 * np.real(offsets) - np.abs(offsets) ** 2) / (1.0 + np.abs(1.0 - offsets))
 
 
 def are_on_circle(offsets: np.ndarray) -> np.ndarray:
     """Return whether roots, given by their offsets, are on the unit circle except for rounding errors."""
-    return np.abs(depths(offsets)) <= _ON_CIRCLE * (_AT_ONE + np.abs(offsets))
+    return np.abs(distances_inside(offsets)) <= _ON_CIRCLE * (_AT_ONE + np.abs(offsets))
 
 
 def _exactly_at_pi(w: Array, exact: complex, value: Array, xp: Any) -> Array:
@@ -73,10 +73,10 @@ def _exactly_at_pi(w: Array, exact: complex, value: Array, xp: Any) -> Array:
     if xp is np:
         return np.where(w >= np.pi, exact, value)
     # Subtract the rounding error as a constant, so that the derivative at pi remains that of ``value``.
-    return value - frozen(xp.where(w >= np.pi, value - exact, 0.0), xp)
+    return value - stop_gradient(xp.where(w >= np.pi, value - exact, 0.0), xp)
 
 
-def lag_jet(points: CirclePoints, power: float) -> Jet:
+def power_jet(points: CirclePoints, power: float) -> Jet:
     """Return ``z^power`` and its derivative, for an integer power."""
     # z^power is 1 at w = pi for even powers and -1 for odd ones.
     at_pi = 1.0 - 2.0 * (power % 2)
@@ -99,6 +99,8 @@ def product_jet(points: CirclePoints, offsets: Any, factor: Any) -> Jet:
         else:
             # Expand about z = -1 for roots in the left half-plane, otherwise about z = 1: the difference is accurate
             # near the root.
-            difference = points.after + (offset - 2.0) if is_number and offset.real > 1.0 else points.before + offset
+            difference = (
+                points.z_plus_1 + (offset - 2.0) if is_number and offset.real > 1.0 else points.z_minus_1 + offset
+            )
         value, slope = value * difference, slope * difference + value * dz_dw
     return Jet(value, slope)

@@ -170,7 +170,7 @@ def _simple_roots(polynomial: Polynomial) -> list[complex]:
             exact = [Decimal(value.numerator) / Decimal(value.denominator) for value in polynomial]
             roots, errors = iterate_roots(exact)
             # Require small errors, because otherwise a close pair of roots may be either real or complex.
-            if all(error <= ACCURATE * size(root) for root, error in zip(roots, errors, strict=True)):
+            if all(error <= ACCURATE * magnitude(root) for root, error in zip(roots, errors, strict=True)):
                 return _pair_up(roots, errors)
     raise InputError("device: some poles or zeros are too close together; remove modes that hardly affect the output")
 
@@ -190,7 +190,7 @@ def _pair_up(roots: list[Complex], errors: list[Decimal]) -> list[complex]:
     return pairs
 
 
-def size(value: Complex) -> Decimal:
+def magnitude(value: Complex) -> Decimal:
     """Return the magnitude of a complex number."""
     return (value.real * value.real + value.imag * value.imag).sqrt()
 
@@ -241,7 +241,7 @@ def iterate_roots(coefficients: list[Decimal]) -> tuple[list[Complex], list[Deci
             product = _times(ratio, total)
             step = _times(ratio, _inverse(Complex(1 - product.real, -product.imag)))
             roots[k] = Complex(roots[k].real - step.real, roots[k].imag - step.imag)
-            moving[k] = size(step) > tolerance * size(roots[k])
+            moving[k] = magnitude(step) > tolerance * magnitude(roots[k])
         if not any(moving):
             break
     errors = [_newton(scaled, root)[1] * order * unit for root in roots]
@@ -252,7 +252,7 @@ def _newton(coefficients: list[Decimal], x: Complex) -> tuple[Complex, Decimal]:
     """Return the Newton step p/p' at x, and a bound on its magnitude that includes the rounding error of p."""
     # Horner's scheme for p and p'. ``total`` is the sum of the magnitudes of all terms; it bounds the rounding error.
     value, derivative, total = Complex(Decimal(0), Decimal(0)), Complex(Decimal(0), Decimal(0)), Decimal(0)
-    radius = size(x)
+    radius = magnitude(x)
     for coefficient in coefficients:
         derivative_x, value_x = _times(derivative, x), _times(value, x)
         derivative = Complex(derivative_x.real + value.real, derivative_x.imag + value.imag)
@@ -261,4 +261,4 @@ def _newton(coefficients: list[Decimal], x: Complex) -> tuple[Complex, Decimal]:
     if not (derivative.real or derivative.imag):
         return Complex(Decimal(0), Decimal(0)), Decimal("Infinity")
     rounding_error = total * 4 * len(coefficients) * Decimal(10) ** (1 - getcontext().prec)
-    return _times(value, _inverse(derivative)), (size(value) + rounding_error) / size(derivative)
+    return _times(value, _inverse(derivative)), (magnitude(value) + rounding_error) / magnitude(derivative)

@@ -42,7 +42,7 @@ class RationalResponse(NamedTuple):
     dt: float | None  # sampling period in s; None for a continuous-time system
 
 
-class WholeDevice:
+class ResponseDevice:
     """Base class of devices that are defined by their response only, without masses, coupling, actuator and modes."""
 
     coupling: ClassVar[None] = None
@@ -59,7 +59,7 @@ class WholeDevice:
 
 
 @dataclass(frozen=True, repr=False)
-class LinearDevice(WholeDevice):
+class LinearDevice(ResponseDevice):
     """A device defined by any strictly proper linear system from commanded force (N) to measured position (m).
 
     The coefficients are taken as exact. All functions for walls accept such a device. An operator, friction, initial
@@ -146,7 +146,7 @@ class LinearDevice(WholeDevice):
         return float(1.0 / (size * unit * unit))
 
 
-def split_fraction(text: str) -> tuple[list[float], list[float]]:
+def parse_fraction(text: str) -> tuple[list[float], list[float]]:
     """Parse a text "NUMERATOR / DENOMINATOR" whose coefficients, highest power first, have blanks or commas between."""
     try:
         numerator, denominator = ([float(c) for c in side.replace(",", " ").split()] for side in text.split("/"))
@@ -160,7 +160,7 @@ def split_fraction(text: str) -> tuple[list[float], list[float]]:
 
 def _read(given: Any) -> RationalResponse:
     """Return the exact response of a system in any accepted form; raise `InputError` for other values."""
-    given = split_fraction(given) if isinstance(given, str) else given
+    given = parse_fraction(given) if isinstance(given, str) else given
     dt = getattr(given, "dt", None)
     if dt is True:
         raise InputError("device: got a sampled system without its period; set dt to the period of the loop in s")

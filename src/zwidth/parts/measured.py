@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.parts.linear_device import WholeDevice
+from zwidth.parts.linear_device import ResponseDevice
 from zwidth.words.errors import InputError
-from zwidth.words.files import write_whole
+from zwidth.words.files import write_atomically
 from zwidth.words.formatting import suggestion
 from zwidth.words.tables import read_columns
 from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, Dimension, split_head
@@ -45,7 +45,7 @@ _DECIBELS = re.compile(r"dB(?:\s*(?:\(?re\.?\s*)?(?:1\s*)?(m\s*/\s*N|mm\s*/\s*N|
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredDevice(WholeDevice):
+class MeasuredDevice(ResponseDevice):
     """A device defined by its frequency response from commanded force to sampled position.
 
     The response is the ratio X/U of the position that the control program reads to the force that it commands, at the
@@ -163,7 +163,7 @@ class MeasuredDevice(WholeDevice):
             heads, columns = [*heads, f"deviation [{unit}]"], [*columns, self.deviation]
         lines = [f"# {remark}" for remark in remarks] + [",".join(heads)]
         lines += [",".join(repr(float(value)) for value in line) for line in zip(*columns, strict=True)]
-        write_whole(Path(file), ("\n".join(lines) + "\n").encode())
+        write_atomically(Path(file), ("\n".join(lines) + "\n").encode())
 
 
 def _as_line(name: str, values: Any, kind: type) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.parts.state_space import estimate_matrices
+from zwidth.parts.state_space import realize_estimate
 from zwidth.parts.velocity import Estimate, Velocity
 
 DOUBLINGS = 60  # doublings of the number of summed terms; 2^60 terms cover time constants of 1e15 periods
@@ -33,7 +33,7 @@ def _sum_squared_response(estimate: Estimate) -> float:
     """Return the sum of the squared impulse response of a velocity estimate that is normalized to T = 1."""
     if estimate.window and not estimate.zeros.size and not estimate.poles.size:
         return 2.0 * (float(estimate.gain) / estimate.window) ** 2
-    A, B, C, D, _ = estimate_matrices(estimate)
+    A, B, C, D, _ = realize_estimate(estimate)
     # The sum is C G C' + D^2 with the controllability Gramian G, the sum of A^k B B' A'^k. Smith's method (1968)
     # doubles the number of summed terms in each step.
     gramian, power = B @ B.T, A

@@ -8,7 +8,7 @@ from typing import Any
 
 from zwidth.parts.checks import Part, check_number
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import name_wall
+from zwidth.words.formatting import format_wall
 from zwidth.words.unit_system import UnitSystem
 
 ROUNDING = 5e-4  # relative tolerance of `allows`, so that the limit allows a wall that is rounded to four digits
@@ -79,7 +79,7 @@ class SafeLimit(Part):
 
     def describe(self, system: UnitSystem) -> str:
         """Return a one-line description of the limit and its reason, in the given units."""
-        wall = "no wall is supported" if self.forbids_all else name_wall(self.stiffness, self.virtual_damping, system)
+        wall = "no wall is supported" if self.forbids_all else format_wall(self.stiffness, self.virtual_damping, system)
         return f"{wall}: {self.reason}" if self.reason else wall
 
 

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.parts.velocity import Estimate
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 
 
-@shown(dt="s")
+@compact_repr(dt="s")
 class StateSpace(NamedTuple):
     """``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``, with a step every ``dt`` seconds."""
 
@@ -52,7 +52,7 @@ def _realize_filter(estimate: Estimate) -> StateSpace:
     return StateSpace(A, B, (numerator[1:] - numerator[0] * denominator[1:])[None, :], numerator[:1, None])
 
 
-def in_series(first: StateSpace, second: StateSpace) -> StateSpace:
+def connect_in_series(first: StateSpace, second: StateSpace) -> StateSpace:
     """Return the series connection of two systems.
 
     Args:
@@ -67,7 +67,7 @@ def in_series(first: StateSpace, second: StateSpace) -> StateSpace:
     return StateSpace(A, B, np.concatenate([second.D @ first.C, second.C], -1), second.D @ first.D)
 
 
-def estimate_matrices(estimate: Estimate) -> StateSpace:
+def realize_estimate(estimate: Estimate) -> StateSpace:
     """Return the state-space model of a velocity estimate, from measured position to velocity."""
     filtered, count = _realize_filter(estimate), estimate.window
     if not count:
@@ -76,4 +76,4 @@ def estimate_matrices(estimate: Estimate) -> StateSpace:
     weights[0, [0, -1]] = 1.0 / count, -1.0 / count
     # The states are the last ``count`` positions, the newest first.
     difference = StateSpace(np.eye(count, k=-1), np.eye(count, 1), weights[:, 1:], weights[:, :1])
-    return in_series(difference, filtered)
+    return connect_in_series(difference, filtered)

@@ -23,11 +23,11 @@ STRONGEST = 1e10  # largest rate of decay by a damper, per period
 
 
 class Realization(NamedTuple):
-    """``x' = A x + B u + push f``: u is the commanded force, f an external force, and the first state the output."""
+    """``x' = A x + B u + external f``; u: commanded force, f: external force; the first state is the output."""
 
     A: Any
     B: Any
-    push: Any
+    external: Any
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class System:
     period: Any  # T in s
     mass: Any  # unit of mass in kg
     d: Any  # delay in periods
-    whole: int  # integer part of d
+    n_delay: int  # integer part of d
     estimate: Estimate
 
     @property
@@ -47,7 +47,7 @@ class System:
         return self.device.dt is not None
 
     @property
-    def free(self) -> bool:
+    def has_integrator(self) -> bool:
         """True if the device has an integrator, a pole at s = 0 or z = 1."""
         denominator = self.device.system.denominator
         return sum(denominator) == 0 if self.sampled else denominator[-1] == 0
@@ -74,7 +74,7 @@ class System:
                     f"device: got a system sampled at {dt:g} s in a loop of {period:g} s; use a system sampled at the "
                     "loop's period"
                 )
-            if self.d != self.whole:
+            if self.d != self.n_delay:
                 raise InputError(
                     f"delay: got {float(self.d):g} periods; a sampled device allows only whole periods; include the "
                     "fraction in the device"

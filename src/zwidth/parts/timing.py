@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from zwidth.parts.checks import Part, Span, check_number, check_span, in_periods
+from zwidth.parts.checks import Part, Span, check_number, check_span, to_periods
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import spell_periods, with_unit
+from zwidth.words.formatting import format_periods, with_unit
 from zwidth.words.xp import is_jax
 
 
@@ -69,11 +69,11 @@ class Timing(Part):
         """The delay as text in its original unit, in which it is constant if the period changes: "1 period", "1 ms"."""
         if self._periods is None:
             return with_unit(float(self.delay), "s")
-        return spell_periods(self._periods)
+        return format_periods(self._periods)
 
     @property
     def d(self) -> Any:
         """The delay in periods; an exact integer if it differs from one only by rounding errors."""
         if self._periods is not None:
             return np.float64(self._periods)
-        return in_periods(*(value if is_jax(value) else np.float64(value) for value in (self.delay, self.period)))
+        return to_periods(*(value if is_jax(value) else np.float64(value) for value in (self.delay, self.period)))

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from zwidth.parts.checks import Part
-from zwidth.parts.circle import CirclePoints, Jet, lag_jet, product_jet
+from zwidth.parts.circle import CirclePoints, Jet, power_jet, product_jet
 from zwidth.parts.filter_sections import (
     NEXT_TO_ONE,
     ball_offsets,
@@ -53,9 +53,9 @@ class Estimate:
         if self.poles.size:
             product = product.over(product_jet(points, self.poles, 1.0))
         if self.lag:
-            product = product.times(lag_jet(points, -self.lag))
+            product = product.times(power_jet(points, -self.lag))
         if self.window:
-            delayed = lag_jet(points, -self.window)
+            delayed = power_jet(points, -self.window)
             n = self.window
             s = xp.sin(0.5 * n * points.w)
             # 1 - cos(n w) = 2 sin^2(n w/2) avoids cancellation at low frequencies.

@@ -33,7 +33,7 @@ from zwidth.sweep.files import (
 )
 from zwidth.sweep.store import SUFFIX
 from zwidth.words.errors import InputError, StoreError, StoreExistsError
-from zwidth.words.files import remove_quietly, write_whole
+from zwidth.words.files import remove_quietly, write_atomically
 from zwidth.words.formatting import describe
 
 RUN_FILE = "run.json"  # name of the file with the record
@@ -43,7 +43,9 @@ RUN_FORMAT = 2  # format version of the record
 _CHECKSUM = "record_sha256"  # key of the checksum in the record
 _MOVE = f"move it away, or {ELSEWHERE}"  # remedy in messages about files of the user
 _PACKAGES = ("scipy", "matplotlib", "optimistix", "jaxopt")  # further packages whose versions are recorded
-_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}\.partial")  # names of unfinished files and folders, from `hidden_beside`
+_TEMPORARY = re.compile(
+    r"\..+\.[0-9a-f]{8}\.partial"
+)  # names of unfinished files and folders, from `temporary_sibling`
 _KEYS = ("csv", "device")  # keys of the configuration whose value may be the name of a file
 
 
@@ -182,10 +184,10 @@ class Record:
         lost = not written and self._contains_config(text)
         self._update(({"inputs": {**recorded, **digests}} if digests else {}) | ({"lost": True} if lost else {}))
         for name, data in missing.items():
-            write_whole(input_dir / name, data)
+            write_atomically(input_dir / name, data)
         if written or lost or not path.exists():
             self._update({"config_file": CONFIG_FILE})
-            write_whole(path, text.encode("utf-8"))
+            write_atomically(path, text.encode("utf-8"))
 
     def note(self, entry: dict[str, Any]) -> None:
         """Record the entry of a study in place of its earlier entry."""
@@ -203,7 +205,7 @@ class Record:
         content["studies"] = [*studies, *([] if entry is None else [entry])]
         self.content = content
         text = json.dumps(content | {_CHECKSUM: hash_json(content)}, indent=2) + "\n"
-        write_whole(self.folder / RUN_FILE, text.encode())
+        write_atomically(self.folder / RUN_FILE, text.encode())
 
     def faults(self, name: str) -> list[str]:
         """Return the damaged and missing files of a study, each with its fault."""

@@ -29,7 +29,7 @@ from zwidth.sweep.files import is_fatal, lock_folder
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.words.errors import InputError
-from zwidth.words.files import hidden_beside
+from zwidth.words.files import temporary_sibling
 from zwidth.words.status import note_failures
 
 AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
@@ -273,7 +273,7 @@ class _Run:
             seconds = round(time.perf_counter() - clock, 3)
             return {**entry, "seconds": seconds, "notes": [*outcome.notes], "answer": [*outcome.answer], **ended}
 
-        with hidden_beside(self.record.folder / study.name) as stage:
+        with temporary_sibling(self.record.folder / study.name) as stage:
             stage.mkdir()
             try:
                 look = self.config.figure or FigureLook()

@@ -19,13 +19,13 @@ from zwidth.loops.linear.passivity import find_unsupported_reason
 from zwidth.loops.linear.rows import Island
 from zwidth.loops.rigid.verdict import STABILITY_METHODS, StabilityMethod
 from zwidth.parts.checks import read_texts
-from zwidth.parts.linear_device import WholeDevice
+from zwidth.parts.linear_device import ResponseDevice
 from zwidth.parts.state_space import StateSpace
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.base import SceneParts
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.results import Margins, Stability
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import is_traced, namespace
 
@@ -37,7 +37,9 @@ Walls: TypeAlias = ArrayLike | None
 Wall: TypeAlias = float | str | None
 
 
-@shown(phase_margin="degrees", delay_margin="s", phase_crossover="Hz", gain_crossover="Hz", modulus_frequency="Hz")
+@compact_repr(
+    phase_margin="degrees", delay_margin="s", phase_crossover="Hz", gain_crossover="Hz", modulus_frequency="Hz"
+)
 class SceneMargins(Margins):
     """`zwidth.Margins` of walls of a scene, with the delay margin in s and the frequencies in Hz."""
 
@@ -299,7 +301,7 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     They do not count for a device given as a whole system: its true damping is unknown, so a wall with B < 0 would
     cancel modeled damping that may not exist.
     """
-    if negative_damping is None and isinstance(scene.device, WholeDevice):
+    if negative_damping is None and isinstance(scene.device, ResponseDevice):
         return False
     if negative_damping is None:
         estimate = scene.velocity.estimate(scene.timing.period)

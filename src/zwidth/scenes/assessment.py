@@ -22,9 +22,9 @@ from zwidth.scenes.answers import allows_negative
 from zwidth.scenes.base import wrap_function
 from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import plain, round_safely, tell_apart, to_json, with_unit
+from zwidth.words.formatting import format_interval, plain, round_conservatively, to_json, with_unit
 from zwidth.words.results import Margins
-from zwidth.words.showing import ResultList, find_unit, shown, with_units
+from zwidth.words.showing import ResultList, compact_repr, find_unit, with_units
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
@@ -50,7 +50,7 @@ _MISSING = {
 Intervals: TypeAlias = tuple[tuple[float, float], ...]
 
 
-@shown(missing=_MISSING, **_UNITS)
+@compact_repr(missing=_MISSING, **_UNITS)
 @dataclass(frozen=True)
 class Assessment:
     """Results of `assess` for any scene, in SI units except for alpha, beta, delta and d; NaN if undefined."""
@@ -180,7 +180,7 @@ def round_margin(
     value = float(getattr(margins, name))
     # A stable wall may also have a gain margin below 1, if a reduction of the gain makes it unstable.
     outward = name == "gain_margin" and (value > 1.0) != bool(stable)
-    return round_safely(20.0 * math.log10(value) if decibel else value, "above" if outward else "below", digits)
+    return round_conservatively(20.0 * math.log10(value) if decibel else value, "above" if outward else "below", digits)
 
 
 def find_nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
@@ -244,7 +244,7 @@ IMPROVEMENTS = {
 }
 
 
-@shown()
+@compact_repr()
 class Limit(NamedTuple):
     """An improvement of a scene and the stiffness gained by it."""
 
@@ -256,7 +256,7 @@ class Limit(NamedTuple):
 
     def spell(self) -> str:
         """Describe the improvement and the increase of the stiffness that it brings."""
-        K = with_unit(round_safely(self.stiffness, "below"), find_unit(self, "N/m"))
+        K = with_unit(round_conservatively(self.stiffness, "below"), find_unit(self, "N/m"))
         note = f"; {self.note}" if self.note else ""
         return f"{self.words}: {K} (x {plain(self.gain, 3)}{note})"
 
@@ -316,11 +316,11 @@ def describe_islands(scene: SceneOptima) -> list[str]:
     lines, system = [], scene.unit_system
     least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
     if least is not None:
-        softest = with_unit(round_safely(least * scene.units.stiffness, "above"), system["N/m"])
+        softest = with_unit(round_conservatively(least * scene.units.stiffness, "above"), system["N/m"])
         lines.append(f"the device is unstable without a wall: no wall softer than K = {softest} is stable")
     for island in scene.islands():
         units = {"K": (island.stiffness, system["N/m"]), "B": (island.virtual_damping, system["N s/m"])}
-        ends = (f"{name} from {' to '.join(tell_apart(*ends, u))}" for name, (ends, u) in units.items())
+        ends = (f"{name} from {' to '.join(format_interval(*ends, u))}" for name, (ends, u) in units.items())
         lines.append(f"an island of stable walls, {', '.join(ends)}, is not connected to K = 0 and excluded from K_max")
     return lines
 

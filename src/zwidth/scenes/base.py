@@ -35,7 +35,7 @@ from zwidth.scenes.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.scenes.measured_loop import MeasuredLoop
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import WALL
-from zwidth.words.showing import shown, with_units
+from zwidth.words.showing import compact_repr, with_units
 from zwidth.words.types import Array, ArrayLike
 from zwidth.words.unit_system import UnitSystem
 from zwidth.words.xp import is_traced
@@ -55,7 +55,7 @@ _KINDS = {
 }
 
 
-@shown()
+@compact_repr()
 class WallSI(NamedTuple):
     """Walls by stiffness in N/m and damping in N s/m."""
 

@@ -15,7 +15,7 @@ from zwidth.parts.device import Device
 from zwidth.parts.grasps import list_grasps
 from zwidth.scenes.assessment import Assessment, assess, round_margin
 from zwidth.scenes.wall_search import COARSE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN, Wanted, choose_wall
-from zwidth.words.formatting import name_wall, plain, with_unit
+from zwidth.words.formatting import format_wall, plain, with_unit
 from zwidth.words.status import Status
 
 # Limits of acceptable walls; a wall that violates one of them gets a caution.
@@ -87,7 +87,7 @@ def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[
             ratio = wall.stiffness / recommendation.stiffness
             cost = f"costs {max(100.0 * (1.0 - ratio), 0.1):.2g} % of the stiffness"
             cost = cost if ratio <= 1.0 else f"{plain(ratio, 3)} times the stiffness"
-            return f"use recommend {words}: {name_wall(wall.stiffness, wall.damping, scene.unit_system)} ({cost})"
+            return f"use recommend {words}: {format_wall(wall.stiffness, wall.damping, scene.unit_system)} ({cost})"
     return otherwise
 
 

@@ -18,7 +18,7 @@ from zwidth.scenes.stiffest import SceneOptima
 from zwidth.scenes.trials import LONG_DELAY, Experiment, Hardware, SustainedMotion, list_starts
 from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import plain, to_json, with_unit
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
 Cause: TypeAlias = Literal["none", "instability", "quantization", "saturation", "undecided"]
@@ -33,7 +33,7 @@ WITHOUT_MARGINS = "these are limits of stability, without margins: for a wall to
 FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in proportion to its steps"
 
 
-@shown(
+@compact_repr(
     ("cause", "amplitude", "frequency", "linearly_stable", "phase_margin", "remedies"),
     missing={"frequency": "no oscillation", "phase_margin": "no gain crossover determines it"},
     amplitude="m",

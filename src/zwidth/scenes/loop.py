@@ -49,8 +49,8 @@ from zwidth.loops.rigid.poles import poles
 from zwidth.loops.rigid.ridge import alpha_max, slopes_kernel, stiffness_slopes
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import StabilityMethod, decide_stability, is_stable
-from zwidth.parts.chain import AnyChain, chain_of
-from zwidth.parts.circle import circle
+from zwidth.parts.chain import AnyChain, build_chain
+from zwidth.parts.circle import circle_points
 from zwidth.parts.paths import AnyScene, list_parameters, replace_parameters
 from zwidth.scenes.variants import RIGID_PARAMETERS, RigidVariants, Variants
 from zwidth.words.errors import ZwidthError
@@ -95,7 +95,7 @@ class LinearLoop:
         # Raise an error with the name of a traced parameter, because the analyses need plain numbers.
         for path, value in list_parameters(self.scene).items():
             as_float64(path, value)
-        return chain_of(self.scene)
+        return build_chain(self.scene)
 
     @cached_property
     def roots(self) -> LoopRoots:
@@ -264,7 +264,7 @@ class LinearLoop:
 
     def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> Array:
         """Return the open loop ``L = (alpha + beta F) G`` at angles w; F is the velocity estimate, G the plant."""
-        return open_loop_response(self.roots, alpha, beta, circle(w)).value
+        return open_loop_response(self.roots, alpha, beta, circle_points(w)).value
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
         """Return the margins, with times in periods and angles in rad per period; unwanted ones may be NaN."""

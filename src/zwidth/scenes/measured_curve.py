@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.loops.linear.rows import arrange_by_line, collect_by_line
-from zwidth.parts.circle import circle
+from zwidth.parts.circle import circle_points
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 
@@ -123,14 +123,14 @@ class ResponseCurve:
         t = share
         inner = (1 + 2 * t) * (1 - t) ** 2 * S[line] + t * (1 - t) ** 2 * step * slope[line]
         inner += t * t * (3 - 2 * t) * S[line + 1] + t * t * (t - 1) * step * slope[line + 1]
-        F = estimate.jet(circle(angles)).value
+        F = estimate.jet(circle_points(angles)).value
         band, gap = np.append(np.maximum(R[:-1], R[1:])[line], R[-1]), np.append(E[line], E[-1])
         starts = np.flatnonzero(share == 0)[1:]
         # At a line itself the larger bound of both adjacent intervals applies.
         for values in (band, gap):
             values[starts] = np.maximum(values[starts], values[starts - 1])
         below, above = np.linspace(0.0, w[0], N_EXTRAPOLATED), np.linspace(w[-1], np.pi, N_EXTRAPOLATED)
-        max_below, max_above = (float(np.abs(estimate.jet(circle(part)).value).max()) for part in (below, above))
+        max_below, max_above = (float(np.abs(estimate.jet(circle_points(part)).value).max()) for part in (below, above))
         return cls(
             angles, _compute_u(angles), np.append(inner, S[-1]), F, band, gap,
             float(abs(G[0]) - r[0]), _bound_above(w, np.abs(G), r), max_below, max_above,

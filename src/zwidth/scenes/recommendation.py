@@ -37,9 +37,17 @@ from zwidth.scenes.stiffest import SceneOptima, StiffestWall
 from zwidth.scenes.wall_code import write_wall
 from zwidth.scenes.wall_search import COARSE, Grasps, Wanted, choose_wall, list_grasped_scenes, measure_slack
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import count_digits, plain, round_safely, spell_stiffness, tell_apart, to_json, with_unit
+from zwidth.words.formatting import (
+    count_digits,
+    format_interval,
+    format_stiffness,
+    plain,
+    round_conservatively,
+    to_json,
+    with_unit,
+)
 from zwidth.words.quantities import WALL
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.status import Status
 from zwidth.words.unit_system import UnitSystem
 
@@ -52,7 +60,7 @@ _JUDGED = (
 )
 
 
-@shown(("stiffness", "virtual_damping", "limited_by", "status", "reason", "notes"))
+@compact_repr(("stiffness", "virtual_damping", "limited_by", "status", "reason", "notes"))
 @dataclass(frozen=True)
 class Recommendation:
     """Wall recommended for a device, from `zwidth.Scene.recommend`.
@@ -106,7 +114,7 @@ class Recommendation:
 
         def rounded(digits: int) -> tuple[float, float]:
             """Return K rounded down and B rounded."""
-            return round_safely(self.stiffness, "below", digits), float(f"{self.virtual_damping:.{digits}g}")
+            return round_conservatively(self.stiffness, "below", digits), float(f"{self.virtual_damping:.{digits}g}")
 
         def holds(digits: int) -> bool:
             """Return whether the wall with this number of digits is stable and satisfies the requirements."""
@@ -115,7 +123,9 @@ class Recommendation:
                 return False
             # The printed B must lie in the printed range of stable B, whose ends are rounded inwards.
             low, high = ends
-            inside = round_safely(low, "above", digits) <= wall[1] <= round_safely(high, "below", digits)
+            inside = (
+                round_conservatively(low, "above", digits) <= wall[1] <= round_conservatively(high, "below", digits)
+            )
             return inside or not low <= self.virtual_damping <= high
 
         digits = count_digits(holds)
@@ -190,7 +200,7 @@ class Recommendation:
             return (f"no wall: {self.reason}",)
         # Compute the range for the printed K, because a negative lower end is sensitive to the rounding of K.
         intervals = tuple(map(tuple, self.scene.stable_damping(self.read[0]).tolist()))
-        lower, upper = tell_apart(
+        lower, upper = format_interval(
             *find_nearest_interval(intervals, self.virtual_damping), self.unit_system["N s/m"], self.read[2]
         )
         room = f"B from {lower} to {upper} is stable at this K"
@@ -202,12 +212,12 @@ class Recommendation:
     def spell_wall(self) -> str:
         """Return the recommended wall in words."""
         (K, B, digits), units = self.read, self.unit_system
-        return f"K = {spell_stiffness(K, units, digits)}, B = {with_unit(B, units['N s/m'], digits)}"
+        return f"K = {format_stiffness(K, units, digits)}, B = {with_unit(B, units['N s/m'], digits)}"
 
     def spell_limit(self) -> str:
         """Return, in words, the stiffness as a share of K_max and the active requirement."""
         largest = float(self.stiffest.stiffness)
-        share = f"{100.0 * self.stiffness / largest:.3g} % of K_max = {spell_stiffness(largest, self.unit_system)}"
+        share = f"{100.0 * self.stiffness / largest:.3g} % of K_max = {format_stiffness(largest, self.unit_system)}"
         return share if self.limited_by == "stiffness_fraction" else f"{share}; {self.spell_requirement()}"
 
     def spell_requirement(self) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.scenes.stabilization import Remedy, count_steps
 from zwidth.scenes.trials import Experiment
-from zwidth.words.formatting import round_safely
+from zwidth.words.formatting import round_conservatively
 from zwidth.words.showing import with_units
 from zwidth.words.unit_system import UnitSystem
 
@@ -43,9 +43,13 @@ class _Candidates(NamedTuple):
 
     def round(self, system: UnitSystem) -> _Candidates:
         """Return the values to three significant digits, each rounded away from the parameter's current value."""
-        values = [round_safely(value, "above" if self.increasing else "below", 3) for value in self.values.tolist()]
+        values = [
+            round_conservatively(value, "above" if self.increasing else "below", 3) for value in self.values.tolist()
+        ]
         if self.parameter == "resolution" and system.rotary:
-            values = [2.0 * math.pi / round_safely(count_steps(value), "above", 3) for value in self.values.tolist()]
+            values = [
+                2.0 * math.pi / round_conservatively(count_steps(value), "above", 3) for value in self.values.tolist()
+            ]
         return self._replace(values=np.array(values))
 
 

@@ -21,7 +21,7 @@ from zwidth.loops.rigid.normalization import normalize, quantity_status
 from zwidth.parts.checks import accept_units
 from zwidth.scenes.stiffness import max_stiffness
 from zwidth.words.errors import InputError
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import is_traced
@@ -45,7 +45,7 @@ class Interval(NamedTuple):
 Uncertain: TypeAlias = Interval | ArrayLike
 
 
-@shown(attained="N/m", mass="kg", damping="N s/m", period="s", delay="s")
+@compact_repr(attained="N/m", mass="kg", damping="N s/m", period="s", delay="s")
 class RobustStiffness(NamedTuple):
     """The stiffness that every device of a box can render, and the weakest device found."""
 
@@ -59,7 +59,7 @@ class RobustStiffness(NamedTuple):
     status: Array
 
 
-@shown(limit="N/m")
+@compact_repr(limit="N/m")
 class RobustWall(NamedTuple):
     """One wall for all devices of a box, in N/m and N s/m, and the limit of such walls."""
 

@@ -18,9 +18,9 @@ from zwidth.scenes.assessment import find_nearest_interval
 from zwidth.scenes.base import wrap_function
 from zwidth.scenes.stiffest import SceneOptima
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import count_digits, round_safely, tell_apart, with_unit
+from zwidth.words.formatting import count_digits, format_interval, round_conservatively, with_unit
 from zwidth.words.quantities import FIELDS
-from zwidth.words.showing import find_unit, shown
+from zwidth.words.showing import compact_repr, find_unit
 
 # Parameters with their direction of search, 1 (increase) or -1 (decrease), and the largest factor of the change.
 DIRECTIONS = {
@@ -52,7 +52,7 @@ NAMES = {
 }
 
 
-@shown()
+@compact_repr()
 class Remedy(NamedTuple):
     """A range of one parameter in which an oscillation stops, all other parameters unchanged.
 
@@ -74,10 +74,10 @@ class Remedy(NamedTuple):
         if self.parameter == "resolution" and unit == "rad":
             note = f" (at least {count_steps(self.high):,} counts per turn)"
         if self.high == math.inf:
-            return f"{name} at least {with_unit(round_safely(self.low, 'above', digits), unit, digits)}{note}"
+            return f"{name} at least {with_unit(round_conservatively(self.low, 'above', digits), unit, digits)}{note}"
         if self.low == -math.inf:
-            return f"{name} at most {with_unit(round_safely(self.high, 'below', digits), unit, digits)}{note}"
-        return f"{name} from {' to '.join(tell_apart(self.low, self.high, unit, digits))}{note}"
+            return f"{name} at most {with_unit(round_conservatively(self.high, 'below', digits), unit, digits)}{note}"
+        return f"{name} from {' to '.join(format_interval(self.low, self.high, unit, digits))}{note}"
 
 
 def count_steps(resolution: float) -> int:
@@ -113,7 +113,7 @@ def _round_inwards(low: float, high: float) -> tuple[float, float]:
 
     def shorten(digits: int) -> tuple[float, float]:
         """Round both ends into the interval."""
-        return round_safely(low, "above", digits), round_safely(high, "below", digits)
+        return round_conservatively(low, "above", digits), round_conservatively(high, "below", digits)
 
     return shorten(count_digits(lambda digits: shorten(digits)[0] < shorten(digits)[1]))
 

@@ -26,7 +26,7 @@ from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import SceneAnalysis, allows_negative
 from zwidth.words.errors import InputError, check_choice, describe_choice
 from zwidth.words.quantities import FIELDS, WALL
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.units import to_float
@@ -37,7 +37,7 @@ from zwidth.words.xp import is_jax, is_traced
 STIFFNESS_TOLERANCE = 1e-6
 
 
-@shown(frequency="Hz", kind=RidgeKind)
+@compact_repr(frequency="Hz", kind=RidgeKind)
 class StiffestWall(NamedTuple):
     """The stiffest stable wall in SI units, with codes of `zwidth.RidgeKind` and `zwidth.Status`."""
 
@@ -101,7 +101,7 @@ class Crossing(NamedTuple):
     enough: Side
 
 
-@shown()
+@compact_repr()
 class RequiredValue(NamedTuple):
     """Required value of a parameter, the side on which K_max is sufficient, and all crossings found, ascending."""
 
@@ -201,7 +201,7 @@ Goal = Literal["fast", "robust"]
 N_SAMPLES = 66  # values of B at which `best_damping` evaluates each stable interval before it refines the minima
 
 
-@shown()
+@compact_repr()
 class BestDamping(NamedTuple):
     """An optimal virtual damping in N s/m, with spectral radius, modulus margin and the code of `zwidth.Status`."""
 

@@ -22,7 +22,7 @@ from zwidth.arrays.held_mass import DelayClasses, classify_delays
 from zwidth.loops.rigid.normalization import Normalized, normalize, quantity_status
 from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slopes
 from zwidth.parts.checks import accept_units
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import namespace
@@ -81,7 +81,7 @@ def differentiate_max_stiffness(
     return value, (value / mass, -2.0 * value / period, slopes.by_delta * scale, slopes.by_d * scale)
 
 
-@shown(
+@compact_repr(
     stiffness_max="N/m",
     per_mass="N/m per kg",
     per_damping="N/m per N s/m",

@@ -11,12 +11,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from zwidth.parts.checks import check_whole
+from zwidth.parts.checks import check_integer
 from zwidth.scenes.base import wrap_function
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError, check_choice, describe_choice
 from zwidth.words.quantities import WALL
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 
 CONFIDENCE = 0.95  # confidence level of the interval of a share
 MAX_SAMPLES = 1_000_000  # largest number of drawn devices; bounds the memory
@@ -33,7 +33,7 @@ class Tolerance(NamedTuple):
     distribution: Literal["uniform", "normal"] = "uniform"
 
 
-@shown(
+@compact_repr(
     ("samples", "stable", "stable_low", "stable_high", "reliability", "stiffness", "stiffness_max"), stiffness_max="N/m"
 )
 @dataclass(frozen=True)
@@ -86,10 +86,10 @@ def simulate_tolerances(
         >>> print(f"stable on {100 * estimate.stable:.0f} %; 99 %: up to {estimate.stiffness / 1e3:.1f} kN/m")
         stable on 91 %; 99 %: up to 15.6 kN/m
     """
-    count = check_whole("samples", samples, 1, MAX_SAMPLES)
+    count = check_integer("samples", samples, 1, MAX_SAMPLES)
     if not 0 < reliability < 1:
         raise InputError(f"reliability: got {reliability!r}; pass a share between 0 and 1, such as 0.99")
-    drawn = _draw(scene, tolerances, count, check_whole("seed", seed, 0, 2**63 - 1))
+    drawn = _draw(scene, tolerances, count, check_integer("seed", seed, 0, 2**63 - 1))
     wall, variants = scene.wall, scene.loop.vary(drawn)
     labels = variants.labels(wall.stiffness, wall.virtual_damping)
     limits = variants.find_stiffness_limits(np.array([wall.virtual_damping]))[:, 0]

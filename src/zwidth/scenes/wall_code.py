@@ -24,7 +24,7 @@ import numpy as np
 from zwidth.parts.velocity import Estimate
 from zwidth.scenes.base import SceneParts
 from zwidth.words.errors import check_choice
-from zwidth.words.formatting import name_wall, with_unit
+from zwidth.words.formatting import format_wall, with_unit
 from zwidth.words.unit_system import UnitSystem
 
 _COLUMNS = 100  # characters per line of a comment
@@ -148,7 +148,7 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
     K, B, system = float(scene.wall.stiffness), float(scene.wall.virtual_damping), scene.unit_system
     estimator = f"velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}"
     limited = f" {'Torque' if system.rotary else 'Force'} limited to {with_unit(max_force, system['N'])}."
-    wall = f"Virtual wall: {name_wall(K, B, system)}, {estimator}.{limited if max_force < math.inf else ''}"
+    wall = f"Virtual wall: {format_wall(K, B, system)}, {estimator}.{limited if max_force < math.inf else ''}"
     head, law = "\n".join([wall, *_describe_cautions(scene, cautions)]), f"-({K!r} * x + {B!r} * v)"
     return WallProgram(head, count, states, start, [*force, f"v = {gain!r} * u"], law, float(max_force), system)
 

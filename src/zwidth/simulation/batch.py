@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.threads import run_in_threads
-from zwidth.parts.chain import chain_of
+from zwidth.parts.chain import build_chain
 from zwidth.parts.device import Device
 from zwidth.parts.paths import Parts, replace_parameters
 from zwidth.parts.velocity import FOAW, BackwardDifference
@@ -71,11 +71,11 @@ def build_model(scene: Any) -> Model:
     estimate, period, mass = scene.velocity, float(scene.timing.period), float(scene.mass)
     # FOAW is not a linear filter, so build the chain with another estimate and keep the FOAW parameters separately.
     adapts = isinstance(estimate, FOAW)
-    chain: Any = chain_of(replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene)
-    fraction = float(chain.d - chain.whole)
+    chain: Any = build_chain(replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene)
+    fraction = float(chain.d - chain.n_delay)
     if adapts:
-        return Model(chain, estimate, chain.whole, fraction, estimate.samples, period, mass)
-    return Model(chain, chain.estimate, chain.whole, fraction, chain.estimate.window, period, mass)
+        return Model(chain, estimate, chain.n_delay, fraction, estimate.samples, period, mass)
+    return Model(chain, chain.estimate, chain.n_delay, fraction, chain.estimate.window, period, mass)
 
 
 def run_scenes(

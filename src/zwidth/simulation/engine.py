@@ -22,7 +22,7 @@ from zwidth.simulation.flow import Flow
 from zwidth.simulation.parameters import ExternalInputs, Options, Parameters, Settings
 from zwidth.simulation.propagation import BodyState, advance, dot, propagate_with_friction, read, times
 from zwidth.words.types import Array
-from zwidth.words.xp import known_options
+from zwidth.words.xp import filter_options
 
 BLOCK = 128  # number of sampling periods that one call of the compiled program simulates
 SEGMENTS = 6  # number of equal segments of the tail; even, because the trend compares the two halves of the tail
@@ -371,7 +371,7 @@ def compile_block(options: Options) -> Any:
 
         return jax.lax.fori_loop(0, jnp.minimum(BLOCK, ends[-1] - inputs.k[0]), one, (state, rows))
 
-    return jax.jit(block, donate_argnums=2, compiler_options=known_options(*COMPILER_OPTIONS))
+    return jax.jit(block, donate_argnums=2, compiler_options=filter_options(*COMPILER_OPTIONS))
 
 
 def run_batch(

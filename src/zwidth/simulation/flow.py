@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.parts.chain import Resonance, body_position
+from zwidth.parts.chain import Resonance, express_body_position
 from zwidth.parts.system import System
 from zwidth.words.errors import InputError
 
@@ -60,13 +60,13 @@ def build_mechanics(chains: Sequence[Any]) -> Mechanics:
     lags = [chain.actuator for chain in chains]
     lag = _stack(lags) if isinstance(lags[0], Resonance) else None if lags[0] is None else np.array(lags, float)
     A, B, push = replace(first, **parts, actuator=lag).realize()
-    forces = [push] if first.plain else [B, push]
+    forces = [push] if first.drives_body_only else [B, push]
     rate = np.moveaxis(np.concatenate([A, np.stack(forces, 1)], 1), -1, 0)
     bodies, links, modes = parts.values()
     first_mode, count, size = len(bodies), len(bodies) + len(modes), len(A)
     place = np.zeros((len(bodies), size))
     for body in range(len(bodies)):
-        for entry, sign in body_position(body, first.sensor, len(bodies), len(modes)):
+        for entry, sign in express_body_position(body, first.sensor, len(bodies), len(modes)):
             place[body, entry] = sign
     motion = np.roll(place, count, axis=1)
     axes = np.eye(size)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.parts.state_space import estimate_matrices
+from zwidth.parts.state_space import realize_estimate
 from zwidth.parts.velocity import FOAW
 from zwidth.simulation.flow import DIGITS, Flow, Mechanics, flow
 from zwidth.words.errors import InputError
@@ -151,7 +151,7 @@ def build_estimators(estimates: Sequence[Any], which: np.ndarray) -> Estimator:
     count, adapts = len(estimates), isinstance(estimates[0], FOAW)
     # Leave the window out of the state space, because the engine keeps the last measured positions in a ring.
     filters = {
-        k: estimate_matrices(replace(each, window=0))
+        k: realize_estimate(replace(each, window=0))
         for k, each in enumerate(estimates)
         if not adapts and each.degree > each.window
     }

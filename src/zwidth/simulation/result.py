@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.words.errors import InputError
-from zwidth.words.showing import draw_line, find_unit, shown
+from zwidth.words.showing import compact_repr, draw_line, find_unit
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def _draw(motion: Motion) -> str:
     return draw_line(motion.time, motion.position, "position over time")
 
 
-@shown(
+@compact_repr(
     ("outcome", "time", *OF_WHOLE),
     _draw,
     {

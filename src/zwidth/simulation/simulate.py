@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from zwidth.parts.checks import check_whole
+from zwidth.parts.checks import check_integer
 from zwidth.simulation.arguments import (
     ARGUMENTS,
     check_memory,
@@ -127,9 +127,9 @@ def simulate(
     """
     given = {name: value for name, value in locals().items() if name in ARGUMENTS}
     check_choice("contact", contact, CONTACTS)
-    periods = check_whole("periods", periods, 1, 10**9)
-    substeps = check_whole("substeps", substeps, 1, 10_000)
-    tail = max(periods // 4, 1) if tail is None else check_whole("tail", tail, 1, periods)
+    periods = check_integer("periods", periods, 1, 10**9)
+    substeps = check_integer("substeps", substeps, 1, 10_000)
+    tail = max(periods // 4, 1) if tail is None else check_integer("tail", tail, 1, periods)
     settings = Settings(periods, substeps, tail, contact, record)
     distinct, which = list_scenes(scenes)
     if force is not None:

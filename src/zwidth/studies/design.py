@@ -34,7 +34,7 @@ from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiffest, summarize_stiffest, track_progress
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, header, short, spell_enough, with_unit
+from zwidth.words.formatting import describe, format_sufficient, header, short, with_unit
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
 from zwidth.words.status import Status
 from zwidth.words.unit_system import UnitSystem
@@ -175,7 +175,7 @@ class DesignStudy(ComputedStudy):
             rows.append(self._describe(nominal, stiffness, needed))
             notes += self._note(stiffness, needed)
             if needed.crossings and needed.status == Status.OK:
-                value = spell_enough(needed.value, needed.enough, [one.value for one in needed.crossings], unit)
+                value = format_sufficient(needed.value, needed.enough, [one.value for one in needed.crossings], unit)
                 answer.append(f"K_max = {with_unit(self.reserve * stiffness, units['N/m'])}: {self._name} of {value}")
         low, high = min(ends[0] for ends in ranges), max(ends[1] for ends in ranges)
         curve = self._trace(nominal, low, high)

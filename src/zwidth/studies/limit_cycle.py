@@ -28,7 +28,7 @@ from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
 from zwidth.studies.simulate import SimulatedStudy, SimulationConditions
-from zwidth.words.formatting import header, spell_short, with_unit
+from zwidth.words.formatting import format_short, header, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.showing import find_unit
 from zwidth.words.status import Status
@@ -191,7 +191,7 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
         if short or len(varied) == 1:
             family = _COLUMNS[short[0]] if len(varied) > 1 else ""
             draw = partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
-        low, high = (spell_short(bound, self.unit_system["m"]) for bound in bounds)
+        low, high = (format_short(bound, self.unit_system["m"]) for bound in bounds)
         rest = f"at rest: an amplitude below {low} in the last quarter of {self.duration}"
         notes.append(f"{rest}; limit cycle: amplitude from {low} to {high}")
         return Outcome(
@@ -230,7 +230,7 @@ def describe_outcomes(motion: Any, stable: np.ndarray, bounds: tuple[float, floa
     ends = {
         "at rest": rest,
         "in a limit cycle": ~rest & ~wide,
-        f"larger than {spell_short(bounds[1], find_unit(motion, 'm'))}": wide,
+        f"larger than {format_short(bounds[1], find_unit(motion, 'm'))}": wide,
     }
     parts = []
     for name, kind in {"linearly stable ": 1, "linearly unstable ": 0, "": -1}.items():

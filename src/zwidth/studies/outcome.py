@@ -27,7 +27,7 @@ from zwidth.figures.table import SI_COLUMNS
 from zwidth.scenes.assessment import name_kind
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
-from zwidth.words.formatting import convert_header, round_safely, to_cell, with_unit
+from zwidth.words.formatting import convert_header, round_conservatively, to_cell, with_unit
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
 Item = TypeVar("Item")
@@ -175,7 +175,7 @@ def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
 def spell_stiffest(row: Mapping[str, Any], system: UnitSystem) -> str:
     """Return K and B of a row of `summarize_stiffest` with units, K rounded down."""
     stiffness, damping = (row[name] for name in SI_COLUMNS)
-    K, B = with_unit(round_safely(stiffness, "below"), system["N/m"]), with_unit(damping, system["N s/m"])
+    K, B = with_unit(round_conservatively(stiffness, "below"), system["N/m"]), with_unit(damping, system["N s/m"])
     return f"K_max = {K} at B = {B}"
 
 

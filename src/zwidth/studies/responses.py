@@ -44,7 +44,7 @@ from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.trials import spell_hardware
 from zwidth.scenes.wall_search import RANGES, Grasps
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
-from zwidth.words.formatting import name_wall, plain, to_json, with_unit
+from zwidth.words.formatting import format_wall, plain, to_json, with_unit
 from zwidth.words.quantities import WALL_RANGE, Range
 
 
@@ -170,7 +170,7 @@ class StepStudy(WallsStudy, ResponseStudy):
             label = device.label or f"device {number}"
             if not device.label and isinstance(device, PhysicalDevice):
                 wall = device.to_scene().to_si(alpha=alpha, beta=beta)
-                label = name_wall(wall.stiffness, wall.virtual_damping, self.unit_system)
+                label = format_wall(wall.stiffness, wall.virtual_damping, self.unit_system)
             part, note = self.respond(device, alpha, beta, label=label, physical=physical)
             parts.append(part)
             notes += [f"{label}: {note}"] if note else []

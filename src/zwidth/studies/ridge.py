@@ -33,7 +33,7 @@ from zwidth.scenes.assessment import trace_passivity_boundary
 from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, find_device_share
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, header, name_wall, plain, round_safely, suggestion, with_unit
+from zwidth.words.formatting import describe, format_wall, header, plain, round_conservatively, suggestion, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.tables import read_columns
@@ -253,13 +253,16 @@ class WorkspaceStudy(ComputedStudy):
         weakest = int(np.nanargmin(stiffness))
         # Test the rounded wall in every pose, because a wall that is stable in the pose with the smallest K_max may be
         # unstable in others: their K_max has another virtual damping.
-        wall = round_safely(RECOMMENDED_SHARE * stiffness[weakest], "below"), float(f"{virtual_damping[weakest]:.4g}")
+        wall = (
+            round_conservatively(RECOMMENDED_SHARE * stiffness[weakest], "below"),
+            float(f"{virtual_damping[weakest]:.4g}"),
+        )
         is_stable_at = np.asarray(is_stable(wall[0] * self.period / rate, wall[1] / rate, delta, d))
         ends = stiffness[weakest], np.nanmax(stiffness)
-        low, high = (with_unit(round_safely(float(each), "below"), units["N/m"]) for each in ends)
+        low, high = (with_unit(round_conservatively(float(each), "below"), units["N/m"]) for each in ends)
         answer = (
             f"K_max from {low} at {self.poses.spell(weakest)} to {high}",
-            f"{name_wall(*wall, units)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
+            f"{format_wall(*wall, units)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
             f"stable in {np.count_nonzero(is_stable_at)} of {np.count_nonzero(has_result)} poses",
         )
         draw = partial(figures.draw_workspace, table, *coordinates, names=self.poses.names)

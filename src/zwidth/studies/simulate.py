@@ -28,7 +28,7 @@ from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion
 from zwidth.simulation.simulate import Contact
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import header, name_wall
+from zwidth.words.formatting import format_wall, header
 from zwidth.words.quantities import HARDWARE, NOT_NEGATIVE, POSITIVE, Range
 
 MAX_PERIODS = 1_000_000
@@ -158,7 +158,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
             else (each.alpha * scene.units.stiffness, each.beta * scene.units.virtual_damping)
             for each in self.walls or ()
         ]
-        return [(name_wall(*wall, scene.unit_system), *wall) for wall in walls]
+        return [(format_wall(*wall, scene.unit_system), *wall) for wall in walls]
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         simulated = self.set_velocity(self.device.to_scene())

@@ -23,7 +23,7 @@ from zwidth.sweep.store import (
     silence_zarr,
 )
 from zwidth.words.errors import StoreError, StoreExistsError
-from zwidth.words.files import hidden_beside
+from zwidth.words.files import temporary_sibling
 from zwidth.words.formatting import header, to_cell
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
 
@@ -93,7 +93,7 @@ def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> Non
     packed = {name: {"zlib": True, "complevel": 1} for name, variable in dataset.data_vars.items() if variable.ndim}
     for variable in (dataset, *dataset.variables.values()):
         variable.attrs = {key: _convert_attribute(value) for key, value in variable.attrs.items()}
-    with hidden_beside(target) as partial:
+    with temporary_sibling(target) as partial:
         # Use one thread, because the HDF5 library serializes all calls with a global lock.
         import dask
 
@@ -121,7 +121,7 @@ def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
         labels = [to_cell(str(label)) for label in np.atleast_1d(dataset["device"].values)]
         dataset["device"] = (dataset["device"].dims, np.reshape(labels, dataset["device"].shape))
     rows = dataset if dataset.sizes else dataset.expand_dims("point")
-    with hidden_beside(target) as partial:
+    with temporary_sibling(target) as partial:
         # Sort the columns, because the order in which a store lists its variables differs between file systems.
         table = rows.to_dataframe(dim_order=sorted(map(str, rows.sizes), key=_rank_variable))
         table = table[sorted(map(str, table.columns), key=_rank_variable)]

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, Perform, describe_failure
-from zwidth.words.errors import InputError, how_to_install
+from zwidth.words.errors import InputError, format_install_command
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -45,7 +45,7 @@ def connect(address: str) -> Iterator[Client]:
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
-        remedy = how_to_install("distributed")
+        remedy = format_install_command("distributed")
         raise InputError(f"scheduler: needs distributed, which is not installed; install it: {remedy}") from error
 
     with _silence_logs():

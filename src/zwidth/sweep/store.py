@@ -28,8 +28,8 @@ import numpy as np
 from zwidth.config.sweep import SweepStudy
 from zwidth.sweep.files import hash_json, read_or_empty
 from zwidth.sweep.plan import Plan, Task, restore_plan
-from zwidth.words.errors import InputError, StoreError, how_to_install
-from zwidth.words.files import hidden_beside, remove_quietly, write_whole
+from zwidth.words.errors import InputError, StoreError, format_install_command
+from zwidth.words.files import remove_quietly, temporary_sibling, write_atomically
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.words.status import Status
 
@@ -54,7 +54,9 @@ def check_installed() -> None:
     """Raise an `InputError` with the installation command if a library needed for stores is missing."""
     for name in ("dask", "h5netcdf", "h5py", "xarray", "zarr"):
         if find_spec(name) is None:
-            raise InputError(f"sweep: needs {name}, which is not installed; install it: {how_to_install('store')}")
+            raise InputError(
+                f"sweep: needs {name}, which is not installed; install it: {format_install_command('store')}"
+            )
 
 
 class Store:
@@ -233,7 +235,7 @@ def _temporary_store(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
 
     plan = restore_plan(SweepStudy.model_validate(attributes["study"]), attributes["plan"])
     grid = plan.grid
-    with hidden_beside(path) as fresh:
+    with temporary_sibling(path) as fresh:
         with silence_zarr():
             _write_arrays(fresh, plan)
             zarr.consolidate_metadata(fresh, zarr_format=3)
@@ -245,7 +247,7 @@ def _temporary_store(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
         document = json.loads((fresh / "zarr.json").read_text(encoding="utf-8")) | {"attributes": described}
         document["attributes"] = described | {CHECKSUM: _compute_checksum(document)}
         for name in _DESCRIPTIONS:
-            write_whole(fresh / name, json.dumps(document, indent=2).encode())
+            write_atomically(fresh / name, json.dumps(document, indent=2).encode())
         yield fresh
 
 

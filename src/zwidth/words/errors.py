@@ -68,7 +68,7 @@ class TracedDelayError(ZwidthError, TypeError):
 SYNONYMS = {"weight": "mass", "inertia": "mass", "frequency": "rate", "latency": "delay", "dead_time": "delay"}
 
 
-def how_to_install(extra: str) -> str:
+def format_install_command(extra: str) -> str:
     """Return the command that installs an optional dependency in the current environment."""
     import sys
     from pathlib import Path

@@ -29,7 +29,7 @@ REMEDIES = {
 
 
 @contextmanager
-def hidden_beside(path: Path) -> Iterator[Path]:
+def temporary_sibling(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to ``path``, for a file or folder that is renamed to ``path`` when complete.
 
     At the end of the context, a file or folder that still has the temporary name is removed.
@@ -57,9 +57,9 @@ def remove_quietly(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes) -> None:
     """Write a file atomically: under a temporary name, and rename it when it is complete."""
-    with hidden_beside(path) as partial:
+    with temporary_sibling(path) as partial:
         if path.exists() and not path.is_file():
             # Write directly to a pipe or a device such as /dev/stdout, because a file must not replace it.
             path.write_bytes(data)

@@ -50,28 +50,28 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     return f"{plain(value / 10**power, digits)} {PREFIXES[power]}{unit}"
 
 
-def spell_periods(count: float) -> str:
+def format_periods(count: float) -> str:
     """Format a number of sampling periods to four significant digits: ``1 period``, ``0.7 periods``."""
     rounded = float(f"{count:.4g}" if count < 1000 else f"{count:.0f}")
     return f"{short(rounded)} period{'' if count == 1 else 's'}"
 
 
-def spell_short(value: float, unit: str, digits: int = 3) -> str:
+def format_short(value: float, unit: str, digits: int = 3) -> str:
     """Format a quantity with its unit, rounded and without trailing zeros: ``1 mm``, ``349 mrad``."""
     number, space, name = with_unit(value, unit, digits).partition(" ")
     return f"{float(number):g}{space}{name}" if math.isfinite(value) else number
 
 
-def name_wall(stiffness: Any, virtual_damping: Any, system: UnitSystem) -> str:
+def format_wall(stiffness: Any, virtual_damping: Any, system: UnitSystem) -> str:
     """Format K and B of a wall with units; K is rounded down, so that it does not exceed a limit of stability."""
-    K = with_unit(round_safely(float(stiffness), "below"), system["N/m"])
+    K = with_unit(round_conservatively(float(stiffness), "below"), system["N/m"])
     return f"K = {K}, B = {with_unit(float(virtual_damping), system['N s/m'])}"
 
 
 ENOUGH = {"above": "or more", "below": "or less"}  # words after a limit, by sufficient side
 
 
-def round_safely(value: float, enough: str, digits: int = 4) -> float:
+def round_conservatively(value: float, enough: str, digits: int = 4) -> float:
     """Round a limit to a few digits, toward its sufficient side; return it unchanged if ``enough`` is no side."""
     if not (value and math.isfinite(value) and enough in ENOUGH):
         return value
@@ -91,23 +91,23 @@ def count_digits_apart(values: list[float], least: int = 4) -> int:
     return count_digits(lambda digits: len({f"{value:.{digits}g}" for value in values}) == len(set(values)), least)
 
 
-def spell_stiffness(value: float, system: UnitSystem, digits: int = 4) -> str:
+def format_stiffness(value: float, system: UnitSystem, digits: int = 4) -> str:
     """Format a stiffness, rounded down because most are upper limits; a rotary one also in mN m/deg."""
-    text = with_unit(round_safely(value, "below", digits), system["N/m"], digits)
-    per_degree = round_safely(value * 1e3 * math.pi / 180, "below", digits)
+    text = with_unit(round_conservatively(value, "below", digits), system["N/m"], digits)
+    per_degree = round_conservatively(value * 1e3 * math.pi / 180, "below", digits)
     return f"{text} ({plain(per_degree, digits)} mN m/deg)" if system.rotary and math.isfinite(value) else text
 
 
-def tell_apart(low: float, high: float, unit: str = "", least: int = 4) -> tuple[str, str]:
+def format_interval(low: float, high: float, unit: str = "", least: int = 4) -> tuple[str, str]:
     """Format both ends of an interval with unit, rounded inward, with so many digits that their texts differ."""
     for digits in range(least, 18):
-        ends = round_safely(low, "above", digits), round_safely(high, "below", digits)
+        ends = round_conservatively(low, "above", digits), round_conservatively(high, "below", digits)
         if ends[0] < ends[1]:
             return with_unit(ends[0], unit, digits), with_unit(ends[1], unit, digits)
     return with_unit(low, unit, least), with_unit(high, unit, least)
 
 
-def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, digits: int = 4) -> str:
+def format_sufficient(value: float, enough: str, others: Iterable[float], unit: str, digits: int = 4) -> str:
     """Format the interval of sufficient values, such as "2.5 mm or more" or "1 N/m to 2 N/m".
 
     Args:
@@ -121,8 +121,8 @@ def spell_enough(value: float, enough: str, others: Iterable[float], unit: str, 
     beyond = [side * other for other in others if side * other > side * value]
     if beyond:
         low, high = sorted((value, side * min(beyond)))
-        return " to ".join(tell_apart(low, high, unit, digits))
-    value = round_safely(value, enough, digits)
+        return " to ".join(format_interval(low, high, unit, digits))
+    value = round_conservatively(value, enough, digits)
     return f"{with_unit(value, unit, digits)} {ENOUGH[enough]}"
 
 

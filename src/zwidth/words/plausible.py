@@ -40,7 +40,7 @@ _SLIPS = {
 }
 
 
-def list_doubts(given: Mapping[str, Any], spell: Callable[[str, str], str], system: UnitSystem) -> list[str]:
+def list_implausible(given: Mapping[str, Any], spell: Callable[[str, str], str], system: UnitSystem) -> list[str]:
     """Return a warning for each implausible value, with a suggestion.
 
     Args:

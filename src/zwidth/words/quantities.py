@@ -301,7 +301,7 @@ OF_LOGS = {
 Family: TypeAlias = Literal["wall", "device"]  # an output per wall, or per device and delay
 # Color scales for truth values, for numbers with a good and a bad side, for other numbers, for positive numbers, and
 # for positive numbers that may be infinite.
-Look: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
+ColorScale: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
 NOT_COMPUTED = 255  # status of points whose chunk does not exist yet; the other codes are those of `zwidth.Status`
 
 
@@ -312,7 +312,7 @@ class Output:
     name: str  # in files and stores
     long_name: str  # description, a noun phrase, in stores
     symbol: str = ""  # symbol in figures, in mathtext
-    look: Look = "truth"  # color scale
+    color_scale: ColorScale = "truth"  # color scale
     family: Family = "wall"
     dtype: Literal["bool", "float64", "uint8"] = "float64"
     units: str = "1"  # unit in a normalized sweep
@@ -334,7 +334,7 @@ class Output:
     @property
     def logarithmic(self) -> bool:
         """True if its axes and colors are logarithmic; they cannot show the value 0."""
-        return self.look in ("logarithmic", "steep")
+        return self.color_scale in ("logarithmic", "steep")
 
     def units_in(self, physical: bool) -> str:
         """Return the unit in a sweep over SI quantities if ``physical``, otherwise in a normalized sweep."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.status import Method, RidgeKind
 from zwidth.words.types import Array
 
 
-@shown(omega="", kind=RidgeKind)
+@compact_repr(omega="", kind=RidgeKind)
 class RidgePoint(NamedTuple):
     """The stiffest stable wall of a device in normalized parameters; arrays for several devices."""
 
@@ -20,7 +20,7 @@ class RidgePoint(NamedTuple):
     status: Array  # `Status`
 
 
-@shown(phase_margin="degrees", delay_margin="periods")
+@compact_repr(phase_margin="degrees", delay_margin="periods")
 class Margins(NamedTuple):
     """Stability margins of a wall and the frequencies at which they occur, in rad per period.
 
@@ -36,7 +36,7 @@ class Margins(NamedTuple):
     modulus_frequency: Array  # wms
 
 
-@shown(method=Method)
+@compact_repr(method=Method)
 class Stability(NamedTuple):
     """Stability labels of walls, with the status and the deciding method of each wall; arrays of one shape."""
 

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from zwidth.words.formatting import round_safely, with_unit
+from zwidth.words.formatting import round_conservatively, with_unit
 from zwidth.words.status import Status
 from zwidth.words.unit_system import ROTARY, UnitSystem
 
@@ -27,7 +27,7 @@ _LINE = 120  # characters per line; longer results are displayed with one field 
 _ROWS = 40  # largest number of rows of a table
 
 
-def shown(
+def compact_repr(
     only: Sequence[str] = (),
     picture: Callable[[Any], str] | None = None,
     missing: Mapping[str, str] = MappingProxyType({}),
@@ -63,7 +63,7 @@ def shown(
         all_units = _DEFAULT_UNITS | units
 
         def spell(self: Any, name: str, value: Any) -> str:
-            text = spell_value(value, find_unit(self, all_units.get(name, "")))
+            text = format_value(value, find_unit(self, all_units.get(name, "")))
             if name in missing and "NaN" in text:
                 text += f"{',' if text == 'NaN' else '; NaN:'} {missing[name]}"
             return text
@@ -88,7 +88,7 @@ def shown(
 
 
 class ResultList(list[Any]):
-    """A list of `shown` results, displayed as tables in notebooks."""
+    """A list of `compact_repr` results, displayed as tables in notebooks."""
 
     def _repr_html_(self) -> str:
         return "\n".join(each._repr_html_() for each in self)
@@ -116,14 +116,14 @@ def with_units(result: Result, system: UnitSystem | None) -> Result:
     return result
 
 
-def spell_value(value: Any, unit: Unit = "") -> str:
+def format_value(value: Any, unit: Unit = "") -> str:
     """Format a value as a short text; a large array as its shape, range and number of NaN."""
     if isinstance(value, str):
         return value or "''"
     if isinstance(value, bool | np.bool_) or value is None:
         return str(value)
     if isinstance(value, Mapping):
-        parts = ", ".join(f"{name}: {spell_value(each, unit)}" for name, each in value.items())
+        parts = ", ".join(f"{name}: {format_value(each, unit)}" for name, each in value.items())
         return "{" + parts + "}" if len(parts) <= 2 * _LINE else f"{len(value)} entries, {', '.join(map(str, value))}"
     try:
         array = np.asarray(value)
@@ -156,7 +156,7 @@ def _spell_number(value: Any, unit: Unit) -> str:
         # Add 0 to remove the sign of a negative zero.
         return f"{float(value) + 0.0:.6g} {'' if unit == '1' else unit}".strip()
     # Round stiffnesses down, because most are upper limits.
-    value = round_safely(float(value), "below" if unit == "N/m" else "", 6)
+    value = round_conservatively(float(value), "below" if unit == "N/m" else "", 6)
     number, _, rest = with_unit(value, unit, 6).partition(" ")
     return f"{float(number):.6g} {rest}"
 

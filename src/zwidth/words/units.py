@@ -109,7 +109,7 @@ def find_other(dimension: Dimension) -> Dimension | None:
     return DIMENSIONS.get(_OTHER_KIND.get(dimension.base, ""))
 
 
-def tell_kind(value: Any) -> bool | None:
+def detect_kind(value: Any) -> bool | None:
     """Return True for a text with a unit of rotary devices, False for one of linear devices, None for other values."""
     if not isinstance(value, str):
         return None
@@ -124,7 +124,7 @@ def tell_kind(value: Any) -> bool | None:
     return _KIND_OF_EXPONENTS.get(size.exponents, True if size.exponents[3] else None)
 
 
-def spell_exactly(value: float, unit: str) -> str:
+def format_exactly(value: float, unit: str) -> str:
     """Format a quantity in SI as the shortest text that is converted to the same float64: 0.1 kg as ``100 g``."""
     number, dimension = Decimal(repr(float(value))), DIMENSIONS[unit]
     sizes = [(name, size) for name in dimension.units if (size := dimension.measure(name)) is not None]

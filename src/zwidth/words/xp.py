@@ -62,12 +62,12 @@ def namespace(*values: Any) -> Any:
     return np
 
 
-def repeat(
+def iterate(
     steps: int,
     step: Callable[[State], State],
     state: State,
     xp: Any,
-    arrived: Callable[[State, State], bool] = lambda old, new: False,
+    converged: Callable[[State, State], bool] = lambda old, new: False,
 ) -> State:
     """Iterate ``step`` a fixed number of times; with NumPy, stop as soon as the iteration has converged.
 
@@ -76,13 +76,13 @@ def repeat(
         step: function from a state to the next state.
         state: initial state.
         xp: namespace.
-        arrived: convergence test, a function of the previous and the new state. JAX ignores it.
+        converged: convergence test, a function of the previous and the new state. JAX ignores it.
     """
     # For JAX, use a compiled loop, because the compile time then does not depend on the number of steps.
     if xp is np:
         for _ in range(steps):
             old, state = state, step(state)
-            if arrived(old, state):
+            if converged(old, state):
                 break
         return state
     from jax.lax import fori_loop
@@ -100,7 +100,7 @@ def apply_each(function: Callable[[Any], State], values: Sequence[Any], xp: Any)
     return [jax.tree.map(lambda leaf, k=k: leaf[k], results) for k in range(len(values))]
 
 
-def frozen(values: State, xp: Any) -> State:
+def stop_gradient(values: State, xp: Any) -> State:
     """Return the values as constants for differentiation; see `jax.lax.stop_gradient`."""
     if xp is np:
         return values
@@ -117,7 +117,9 @@ def tree_map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
     return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
 
 
-def push_forward(function: Callable[..., Any], values: tuple[Any, ...], changes: tuple[Any, ...], xp: Any) -> Any:
+def differentiate_along(
+    function: Callable[..., Any], values: tuple[Any, ...], changes: tuple[Any, ...], xp: Any
+) -> Any:
     """Return the directional derivative of an analytic function.
 
     With NumPy it is computed by a complex step, with JAX by `jax.jvp`.
@@ -136,7 +138,7 @@ def push_forward(function: Callable[..., Any], values: tuple[Any, ...], changes:
     return tree_map(lambda result: np.imag(result) / _STEP, function(*moved))
 
 
-def along(values: np.ndarray, like: Any) -> Any:
+def expand_along(values: np.ndarray, like: Any) -> Any:
     """Reshape a vector for broadcasting along a new last axis of ``like``, and convert it to the type of ``like``."""
     return namespace(like).asarray(values, like.dtype).reshape((1,) * like.ndim + (-1,))
 
@@ -173,7 +175,7 @@ def _polynomial(coefficients: tuple[float, ...]) -> Callable[[Any], Any]:
     return function
 
 
-def roots(*values: Any) -> tuple[Any, ...]:
+def square_roots(*values: Any) -> tuple[Any, ...]:
     """Return the square roots of arrays, or of objects with a method ``sqrt`` such as balls."""
     if hasattr(values[0], "sqrt"):
         return tuple([value.sqrt() for value in values])
@@ -196,7 +198,7 @@ def nan_beyond(limits: tuple[float, float], *values: Array) -> list[np.ndarray]:
 
 # At an invalid point, values and derivatives must both be NaN. `where(ok, value, nan)` does not suffice, because its
 # derivative would be 0. If a kernel can compute with NaN, apply `nan_unless` to its arguments. Otherwise, as in
-# solvers, replace invalid arguments by valid ones and add `nan_with_nan_slopes` to the results.
+# solvers, replace invalid arguments by valid ones and add `nan_with_nan_derivatives` to the results.
 
 
 def nan_unless(ok: Array, *values: Array) -> tuple[Array, ...]:
@@ -206,7 +208,7 @@ def nan_unless(ok: Array, *values: Array) -> tuple[Array, ...]:
     return tuple([value * factor for value in values])
 
 
-def nan_with_nan_slopes(ok: Array, *inputs: Array) -> Array:
+def nan_with_nan_derivatives(ok: Array, *inputs: Array) -> Array:
     """Return a term to be added to a result: 0 where ``ok``, otherwise NaN with first and second derivatives NaN.
 
     Args:
@@ -227,7 +229,7 @@ WIDE = ("xla_cpu_prefer_vector_width", 512)
 
 
 @cache
-def known_options(*options: tuple[str, int]) -> dict[str, int]:
+def filter_options(*options: tuple[str, int]) -> dict[str, int]:
     """Return those compiler options that the installed XLA accepts, because an unknown option raises an error."""
     import jax
 
@@ -242,7 +244,7 @@ def known_options(*options: tuple[str, int]) -> dict[str, int]:
     return values if are_accepted(values := dict(options)) else {k: v for k, v in options if are_accepted({k: v})}
 
 
-def store_once(values: Values, witness: Array) -> Values:
+def materialize(values: Values, witness: Array) -> Values:
     """Return ``values`` such that XLA computes them only once, even if several fused loops use them.
 
     Args:
@@ -274,7 +276,7 @@ def fit_arcsine(terms: int) -> list[float]:
 
 # For JAX, polynomials replace library functions, which are slower because they handle all arguments. With SINE and
 # COSINE, the spectral radius is computed 2.9 times as fast. `angle` is 2.1 times as fast as the library function. With
-# `angle` and `find_turn`, the spectral radius is computed 1.06 times as fast and compiled in 0.7 of the time.
+# `angle` and `invert_haversine`, the spectral radius is computed 1.06 times as fast and compiled in 0.7 of the time.
 ARCSINE = fit_arcsine(19)  # coefficients of asin(sqrt(y))/sqrt(y) in powers of 4 y - 1
 # Taylor coefficients of sin(x)/x and cos(x) in powers of x^2. On [0, pi/2] the first omitted term is below 1e-17.
 SINE = [(-1.0) ** k / factorial(2 * k + 1) for k in range(11)]
@@ -295,7 +297,7 @@ def angle(re: Array, im: Array) -> Array:
     return xp.where(im < 0, -value, value)
 
 
-def find_turn(x: Array, y: Array, xp: Any) -> Array:
+def invert_haversine(x: Array, y: Array, xp: Any) -> Array:
     """Return the angle w in [0, pi] with ``sin^2(w/2) = x``.
 
     Args:

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
-from zwidth.words.formatting import plain, round_safely, with_unit
+from zwidth.words.formatting import plain, round_conservatively, with_unit
 
 HEAD = "version: 1\nname: small\n"
 STUDY = "studies: [{kind: recommend, name: best, stiffness_fraction: %s}]\n"
@@ -49,7 +49,7 @@ def test_a_recommendation_is_told_again_whenever_the_run_is(name, run):
     wall = 0.5 * float(top.stiffness), float(top.virtual_damping)
     assert (found.stiffness, found.virtual_damping) == pytest.approx(wall)
     # Stiffnesses are rounded down.
-    stiffness, top_stiffness = (with_unit(round_safely(K, "below"), "N/m") for K in (wall[0], 2 * wall[0]))
+    stiffness, top_stiffness = (with_unit(round_conservatively(K, "below"), "N/m") for K in (wall[0], 2 * wall[0]))
     assert told.startswith(f"best K = {stiffness}, B = {plain(wall[1])} N s/m: 50 % of K_max = {top_stiffness}")
     assert all(line in told for line in found.lines())
     assert f"passive: {'yes' if bare.is_passive(*wall) else 'no'}; " in told

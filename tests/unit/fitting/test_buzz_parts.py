@@ -8,7 +8,7 @@ import zwidth
 from zwidth.fitting.buzzing import Onsets
 from zwidth.fitting.device_estimate import DimensionlessDevice, differentiate, name_parameters
 from zwidth.fitting.required_wall import CriticalController
-from zwidth.parts.circle import circle
+from zwidth.parts.circle import circle_points
 from zwidth.words.status import Status
 
 VELOCITY = zwidth.BackwardDifference()
@@ -34,7 +34,7 @@ def differ(function, theta):
 @pytest.mark.parametrize("lag, modes", KINDS)
 def test_the_critical_controller_is_that_of_the_sampled_device(lag, modes):
     device = describe_device(lag, modes)
-    at = circle(np.array([1e-3, 0.05, 0.3, 0.72, 1.9, 3.0]))
+    at = circle_points(np.array([1e-3, 0.05, 0.3, 0.72, 1.9, 3.0]))
     found, wanted = (
         CriticalController(*device[1:]),
         device.to_scene(PERIOD, VELOCITY).loop.roots.evaluate_controller(at),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.parts.circle import circle
+from zwidth.parts.circle import circle_points
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -19,7 +19,7 @@ NEAR = 0.02
 
 def response(scene, hertz):
     """The sampled response of a model, delay and hold in it, in m/N."""
-    return scene.loop.roots.evaluate_response(circle(2 * np.pi * hertz * PERIOD)).value / scene.units.stiffness
+    return scene.loop.roots.evaluate_response(circle_points(2 * np.pi * hertz * PERIOD)).value / scene.units.stiffness
 
 
 def measured(scene, hertz, deviation=None, error=0.0):

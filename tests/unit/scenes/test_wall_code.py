@@ -10,7 +10,7 @@ import pytest
 from scipy import signal
 
 import zwidth
-from zwidth.parts.circle import circle
+from zwidth.parts.circle import circle_points
 from zwidth.scenes.wall_code import find_sections, write_wall
 
 BUTTER: Any = signal.butter(3, 60.0, fs=1000.0)
@@ -128,4 +128,4 @@ def test_sections_are_the_estimate(name):
         value *= np.polyval(top, zeta) / np.polyval(bottom, zeta)
     if estimate.window:
         value *= (1.0 - np.exp(-1j * w * estimate.window)) / estimate.window
-    np.testing.assert_allclose(value, estimate.jet(circle(w)).value, rtol=1e-11)
+    np.testing.assert_allclose(value, estimate.jet(circle_points(w)).value, rtol=1e-11)

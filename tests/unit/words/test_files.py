@@ -6,7 +6,7 @@ import stat
 
 import pytest
 
-from zwidth.words.files import hidden_beside, write_whole
+from zwidth.words.files import temporary_sibling, write_atomically
 
 
 def test_a_pipe_is_written_and_stays_a_pipe(tmp_path):
@@ -14,7 +14,7 @@ def test_a_pipe_is_written_and_stays_a_pipe(tmp_path):
     os.mkfifo(pipe)
     end = os.open(pipe, os.O_RDWR)
     try:
-        write_whole(pipe, b"all of it")
+        write_atomically(pipe, b"all of it")
         assert os.read(end, 100) == b"all of it"
     finally:
         os.close(end)
@@ -27,7 +27,7 @@ def test_a_full_disk_leaves_the_old_file_and_is_told_of_the_file_by_its_name(tmp
     file.write_bytes(b"before")
 
     def fill():
-        with hidden_beside(file) as partial:
+        with temporary_sibling(file) as partial:
             partial.write_bytes(b"ha")
             # The system names the file where it is opened, and nothing where it is written.
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), *((str(partial),) if named else ()))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from zwidth.words.formatting import plain, round_safely, spell_enough, tell_apart, with_unit
+from zwidth.words.formatting import format_interval, format_sufficient, plain, round_conservatively, with_unit
 
 
 @pytest.mark.parametrize(
@@ -56,13 +56,13 @@ def test_digits_are_those_asked_for():
 
 
 def test_two_ends_that_differ_read_differently_and_lie_inside():
-    assert tell_apart(-3.45678, 19844.99, "N/m") == ("-3.456 N/m", "19.84 kN/m")
-    assert tell_apart(1.23411, 1.23499) == ("1.2342", "1.2349")
-    assert tell_apart(10.5953e3, 10.5971e3, "N/m") == ("10.596 kN/m", "10.597 kN/m")
-    assert tell_apart(1.0, 2.0) == ("1.000", "2.000")
-    assert tell_apart(3.0, 3.0, "N/m") == ("3.000 N/m", "3.000 N/m")
-    assert tell_apart(-float("inf"), 1.0, "N/m") == ("-infinite", "1.000 N/m")
-    low, high = tell_apart(1.0, 1.0 + 2.3e-16)
+    assert format_interval(-3.45678, 19844.99, "N/m") == ("-3.456 N/m", "19.84 kN/m")
+    assert format_interval(1.23411, 1.23499) == ("1.2342", "1.2349")
+    assert format_interval(10.5953e3, 10.5971e3, "N/m") == ("10.596 kN/m", "10.597 kN/m")
+    assert format_interval(1.0, 2.0) == ("1.000", "2.000")
+    assert format_interval(3.0, 3.0, "N/m") == ("3.000 N/m", "3.000 N/m")
+    assert format_interval(-float("inf"), 1.0, "N/m") == ("-infinite", "1.000 N/m")
+    low, high = format_interval(1.0, 1.0 + 2.3e-16)
     assert low != high
 
 
@@ -71,18 +71,18 @@ def test_two_ends_that_differ_read_differently_and_lie_inside():
     [(1.23456, "above", 1.235), (1.23456, "below", 1.234), (-1.23456, "above", -1.234), (-1.23456, "below", -1.235)],
 )
 def test_a_number_is_rounded_to_the_side_on_which_there_is_enough(value, enough, rounded):
-    assert round_safely(value, enough) == pytest.approx(rounded, rel=1e-12)
-    assert round_safely(rounded, enough) == pytest.approx(rounded, rel=1e-12)
+    assert round_conservatively(value, enough) == pytest.approx(rounded, rel=1e-12)
+    assert round_conservatively(rounded, enough) == pytest.approx(rounded, rel=1e-12)
 
 
 def test_what_has_no_digits_stays():
-    assert round_safely(0.0, "above") == 0.0
-    assert round_safely(float("inf"), "below") == float("inf")
-    assert round_safely(1.23456, "") == 1.23456
+    assert round_conservatively(0.0, "above") == 0.0
+    assert round_conservatively(float("inf"), "below") == float("inf")
+    assert round_conservatively(1.23456, "") == 1.23456
 
 
 def test_a_range_in_which_there_is_enough_is_read_inside_of_it():
-    assert spell_enough(40.653e-6, "above", [40.653e-6, 224.97e-6], "s") == "40.66 µs to 224.9 µs"
-    assert spell_enough(224.97e-6, "below", [40.653e-6, 1.0], "s") == "40.66 µs to 224.9 µs"
-    assert spell_enough(1.00001, "above", [1.00002], "1") == "1.00001 to 1.00002"
-    assert spell_enough(224.97e-6, "below", [1.0], "s") == "224.9 µs or less"
+    assert format_sufficient(40.653e-6, "above", [40.653e-6, 224.97e-6], "s") == "40.66 µs to 224.9 µs"
+    assert format_sufficient(224.97e-6, "below", [40.653e-6, 1.0], "s") == "40.66 µs to 224.9 µs"
+    assert format_sufficient(1.00001, "above", [1.00002], "1") == "1.00001 to 1.00002"
+    assert format_sufficient(224.97e-6, "below", [1.0], "s") == "224.9 µs or less"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.words.showing import draw_line, spell_value
+from zwidth.words.showing import draw_line, format_value
 from zwidth.words.status import RidgeKind, Status
 
 SCENE = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(10e3, 40.0))
@@ -122,7 +122,7 @@ def test_poles_are_a_table_of_poles():
     ],
 )
 def test_values_in_words(value, unit, text):
-    assert spell_value(value, unit) == text
+    assert format_value(value, unit) == text
 
 
 def test_the_largest_stiffness_is_not_shown_larger():
@@ -156,4 +156,4 @@ def test_modules_show_their_own_names():
 def test_an_array_says_why_it_has_nan_and_a_zero_has_no_sign():
     motions = repr(SCENE.simulate([10e3, 1e3], 40.0, start_velocity=0.1, periods=100))
     assert "impact_velocity=[NaN, NaN]; NaN: the device does not enter the wall after the first sample" in motions
-    assert spell_value(np.array([-0.0, 1.0])) == "[0, 1]"
+    assert format_value(np.array([-0.0, 1.0])) == "[0, 1]"

@@ -21,8 +21,8 @@ from zwidth.words.units import (
     STIFFNESS,
     TIME,
     TORQUE,
+    format_exactly,
     read_quantity,
-    spell_exactly,
 )
 
 
@@ -231,7 +231,7 @@ def test_spans():
     ],
 )
 def test_a_spelled_quantity_is_read_back_bit_by_bit(value, unit, text):
-    spelled = spell_exactly(value, unit)
+    spelled = format_exactly(value, unit)
     assert text is None or spelled == text
     mantissa, _, shown = spelled.partition(" ")
     assert len(mantissa) <= 25

@@ -21,7 +21,7 @@ from zwidth.arrays.roots import false_position
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import evaluate_curve, find_field_zeros
 from zwidth.loops.linear.rows import Island, are_connected, find_stable_intervals
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 
 # Initial lines of constant B
 N_ACROSS = 65  # equidistant lines across the stable set
@@ -397,7 +397,7 @@ def _pair_ends(rows: _Rows, corners: np.ndarray) -> _Meetings:
     return _Meetings(gap, columns, walls, enclosed)
 
 
-@shown()
+@compact_repr()
 class Outline(NamedTuple):
     """A closed outline of the stable set, as a polygon of walls."""
 

@@ -35,7 +35,7 @@ from zwidth.loops.linear.curve import (
     place_nodes,
 )
 from zwidth.loops.linear.roots import LoopRoots
-from zwidth.parts.circle import are_on_circle, circle, depths
+from zwidth.parts.circle import are_on_circle, circle_points, distances_inside
 
 # Newton's method for a crossing
 MAX_STEPS = 120
@@ -198,7 +198,7 @@ class Boundary:
 
     def _evaluate_loop(self, w: np.ndarray) -> _LoopValues:
         """Evaluate the loop at angles, for lines of any damping."""
-        points, common, slope = circle(w), np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
+        points, common, slope = circle_points(w), np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
         for angle in self._pair_angles:
             factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
             common, slope = common * factor, slope * factor - common * np.sin(w)
@@ -367,12 +367,12 @@ class Boundary:
             excess: sign of beta minus the lossless damping; has no effect if the loop is not lossless.
         """
         loop = self.loop
-        depth, on_circle = depths(loop.zeros), are_on_circle(loop.zeros)
+        depth, on_circle = distances_inside(loop.zeros), are_on_circle(loop.zeros)
         leaving = 0
         for zero, order in zip(*np.unique(loop.zeros[on_circle], return_counts=True), strict=True):
             # Near a zero at w0, G = c x^order (1 + e x) with x = w - w0; poles satisfy G = -1/alpha, and |z| > 1 if and
             # only if Im x < 0 (V14).
-            points = circle(np.angle(1.0 - zero))
+            points = circle_points(np.angle(1.0 - zero))
             rest = replace(loop, zeros=loop.zeros[loop.zeros != zero]).evaluate_response(points)
             power = -side / (rest.value * (1j * points.z) ** order)
             x = power ** (1.0 / order) * np.exp(2j * np.pi * np.arange(order) / order)

@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.arrays.balls import BITS, available
-from zwidth.parts.chain import AnyChain, chain_of
+from zwidth.parts.chain import AnyChain, build_chain
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.velocity import Estimate
-from zwidth.words.errors import InputError, how_to_install
+from zwidth.words.errors import InputError, format_install_command
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -52,7 +52,9 @@ def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tupl
         InputError: if python-flint is not installed.
     """
     if not available():
-        raise InputError(f"method: 'certified' needs python-flint for this scene: {how_to_install('certified')}")
+        raise InputError(
+            f"method: 'certified' needs python-flint for this scene: {format_install_command('certified')}"
+        )
     polynomials = cache(lambda bits: _expand_polynomials(scene))
     stable, status = np.zeros(stiffness.shape, bool), np.zeros(stiffness.shape, np.int32)
     for index in np.ndindex(stiffness.shape):
@@ -105,15 +107,15 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
 
     exact = _convert_exactly(scene)
     period = exact.timing.period
-    chain = chain_of(exact, (scene.d, int(scene.d)), NO_ESTIMATE)
+    chain = build_chain(exact, (scene.d, int(scene.d)), NO_ESTIMATE)
     numerator, denominator = _expand_response(chain)
     estimate = _exact_estimate(exact, scene.velocity, scene.timing.period)
     f_numerator, f_denominator = _expand_estimate(estimate)
     unit = period * period / exact.mass
-    lag = chain.whole + (1 if chain.d > chain.whole else 0)
+    lag = chain.n_delay + (1 if chain.d > chain.n_delay else 0)
     delayed = flint.arb_poly([0] * lag + denominator.coeffs())
     # F(1) is exactly 0 if F is a windowed difference, or if one of its zeros is exactly z = 1.
-    has_rest = chain.free and (
+    has_rest = chain.has_integrator and (
         estimate.window > 0 or any(offset == 0 for offset in np.asarray(estimate.zeros).tolist())
     )
     return (
@@ -172,9 +174,9 @@ def _expand_response(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
             changed[k, 0] = changed[k, 0] - state[k, 0]
         return changed.charpoly() - denominator
 
-    if chain.d == chain.whole:
+    if chain.d == chain.n_delay:
         return expand_numerator(full), denominator
-    late = compute_transition(1 - flint.arb(float(chain.d - chain.whole)))[1]
+    late = compute_transition(1 - flint.arb(float(chain.d - chain.n_delay)))[1]
     return flint.arb_poly([0, 1]) * expand_numerator(late) + expand_numerator(full - late), denominator
 
 

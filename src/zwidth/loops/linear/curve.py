@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from zwidth.arrays.roots import find_zeros_between
 from zwidth.loops.linear.roots import LoopRoots
-from zwidth.parts.circle import are_on_circle, circle
+from zwidth.parts.circle import are_on_circle, circle_points
 
 # Nodes
 NODE_SPACING = 0.08  # relative change of q and F between neighboring nodes, estimated
@@ -42,7 +42,7 @@ class CurvePoints(NamedTuple):
 
 def evaluate_curve(loop: LoopRoots, w: np.ndarray) -> CurvePoints:
     """Evaluate the boundary curve at angles in (0, pi)."""
-    points = circle(w)
+    points = circle_points(w)
     with np.errstate(all="ignore"):
         q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
         beta = q.value.imag / f.value.imag
@@ -131,7 +131,7 @@ def find_lines(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
     """
     # There is no line if q or F is infinite, for example at a zero of G.
     w = np.array(angles, float)
-    points, is_end = circle(w), (w == 0.0) | (w == np.pi)
+    points, is_end = circle_points(w), (w == 0.0) | (w == np.pi)
     with np.errstate(all="ignore"):
         q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
         real = is_end | (np.abs(q.value.imag) <= REAL_TOLERANCE * np.abs(q.value))
@@ -139,7 +139,7 @@ def find_lines(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
     # Zeros of G within this distance count as located at the angle. The distance is smallest at z = 1, because offsets
     # of zeros near z = 1 have a small relative error.
     reach = np.where(w == 0.0, 1e-15, np.where(is_end, 1e-12, 1e-9))
-    near = np.abs(points.before[:, None] + loop.zeros) <= reach[:, None]
+    near = np.abs(points.z_minus_1[:, None] + loop.zeros) <= reach[:, None]
     selected = np.flatnonzero(real & ~near.any(1) & np.isfinite(values).all(1))
     return [CrossingLine(*values[k].tolist(), poles=1 if is_end[k] else 2) for k in selected]
 
@@ -242,7 +242,7 @@ def find_lossless(loop: LoopRoots, w: np.ndarray, curve: CurvePoints, damping: f
         damping: beta of the curve at z = 1. The only candidates are this value and 0.
     """
     tested = w >= LOSSLESS_ANGLE
-    z_minus_1, curve = circle(w[tested]).before[:, None], CurvePoints(*(values[tested] for values in curve))
+    z_minus_1, curve = circle_points(w[tested]).z_minus_1[:, None], CurvePoints(*(values[tested] for values in curve))
     roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
     with np.errstate(all="ignore"):
         # Conditioning: near a root, the relative error is proportional to 1/distance.

@@ -25,10 +25,10 @@ from zwidth.arrays.held_mass import Plant, discretize_mass, factor_numerator
 from zwidth.loops.linear.roots import LoopRoots, compute_aberth_step
 from zwidth.loops.linear.sampled_zeros import find_sampled_zeros
 from zwidth.parts.chain import AnyChain, Chain, is_zero
-from zwidth.parts.circle import CirclePoints, circle, lag_jet
-from zwidth.parts.state_space import StateSpace, estimate_matrices, in_series
+from zwidth.parts.circle import CirclePoints, circle_points, power_jet
+from zwidth.parts.state_space import StateSpace, connect_in_series, realize_estimate
 from zwidth.parts.system import System
-from zwidth.words.xp import frozen, namespace, repeat
+from zwidth.words.xp import iterate, namespace, stop_gradient
 
 # Zeros of G
 SLOW_ZERO = 0.1  # |zeta| below which a zero starts from its continuous-time counterpart
@@ -51,7 +51,7 @@ def compute_transition(A: Any, B: Any, time: Any) -> tuple[Any, Any]:
     # keep the program short, because compiling its derivatives takes time proportional to its length: with JAX's own
     # exponential, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to compile.
     xp = namespace(A)
-    norm = frozen(xp.abs(A * time).sum(0).max(), xp)
+    norm = stop_gradient(xp.abs(A * time).sum(0).max(), xp)
     doublings = xp.ceil(xp.log2(xp.maximum(2.0 * norm, 1.0)))
     small, identity = A * (time / 2.0**doublings), xp.eye(A.shape[0], dtype=A.dtype)
 
@@ -63,9 +63,9 @@ def compute_transition(A: Any, B: Any, time: Any) -> tuple[Any, Any]:
         k, both = state
         return k + 1.0, xp.where(k < doublings, 2.0 * both + both[:, :-1] @ both, both)
 
-    _, phi1 = repeat(SERIES_TERMS, add, (doublings * 0.0 + SERIES_TERMS + 1.0, identity), xp)
+    _, phi1 = iterate(SERIES_TERMS, add, (doublings * 0.0 + SERIES_TERMS + 1.0, identity), xp)
     both = phi1 @ xp.concatenate([small, B[:, None] * (time / 2.0**doublings)], 1)
-    both = repeat(MAX_DOUBLINGS, double, (doublings * 0.0, both), xp, lambda old, new: bool(new[0] >= doublings))[1]
+    both = iterate(MAX_DOUBLINGS, double, (doublings * 0.0, both), xp, lambda old, new: bool(new[0] >= doublings))[1]
     return both[:, :-1], both[:, -1]
 
 
@@ -86,7 +86,7 @@ def discretize_chain(chain: AnyChain) -> DiscreteChain | Plant:
     """Discretize a chain: a rigid one in closed form, all others by the matrix exponential."""
     if not (isinstance(chain, Chain) and chain.rigid):
         return discretize_states(chain)
-    fraction = chain.d - chain.whole
+    fraction = chain.d - chain.n_delay
     return discretize_mass(chain.bodies[0].damping, None if is_zero(fraction) else fraction)
 
 
@@ -94,23 +94,27 @@ def discretize_states(chain: AnyChain) -> DiscreteChain:
     """Discretize a chain by the matrix exponential."""
     A, B, _ = chain.realize()
     psi, full = compute_chain_transition(chain, A, B, 1.0)
-    fraction = chain.d - chain.whole
+    fraction = chain.d - chain.n_delay
     late = None if is_zero(fraction) else compute_chain_transition(chain, A, B, 1.0 - fraction)[1]
     return DiscreteChain(psi, full, late)
 
 
 def evaluate_controller(chain: AnyChain, w: Any, discretized: DiscreteChain | Plant) -> Any:
     """Evaluate ``q = -1/G`` at ``e^(jw)`` for one angle w, differentiably, because no root is computed."""
-    points: CirclePoints = circle(w)
+    points: CirclePoints = circle_points(w)
     if isinstance(discretized, Plant):
         # N(z)/z = a2 z + a1 + a0/z, the numerator of G.
         numerator = discretized.a2 * points.z + discretized.a1 + discretized.a0 / points.z
-        return -lag_jet(points, chain.whole).value * points.before * (points.before + discretized.em) / numerator
+        return (
+            -power_jet(points, chain.n_delay).value * points.z_minus_1 * (points.z_minus_1 + discretized.em) / numerator
+        )
     xp = namespace(discretized.psi, w)
-    force = discretized.full + 0j if discretized.late is None else points.before * discretized.late + discretized.full
-    lag = chain.whole if discretized.late is None else chain.whole + 1
-    state = xp.linalg.solve(points.before * xp.eye(discretized.psi.shape[0]) - discretized.psi, force)
-    return -lag_jet(points, lag).value / state[0]
+    force = (
+        discretized.full + 0j if discretized.late is None else points.z_minus_1 * discretized.late + discretized.full
+    )
+    lag = chain.n_delay if discretized.late is None else chain.n_delay + 1
+    state = xp.linalg.solve(points.z_minus_1 * xp.eye(discretized.psi.shape[0]) - discretized.psi, force)
+    return -power_jet(points, lag).value / state[0]
 
 
 def find_roots(chain: AnyChain) -> LoopRoots:
@@ -120,10 +124,10 @@ def find_roots(chain: AnyChain) -> LoopRoots:
     chain.check()
     discretized = discretize_states(chain)
     if isinstance(chain, System):
-        lag, (zeros, poles) = chain.whole + (chain.d != chain.whole), chain.device.offsets
+        lag, (zeros, poles) = chain.n_delay + (chain.d != chain.n_delay), chain.device.offsets
         gain = chain.device.gain * float(chain.mass) / float(chain.period) ** 2
         if not chain.sampled:
-            lead, zeros = find_sampled_zeros(chain.device, float(chain.period), float(chain.d) - chain.whole)
+            lead, zeros = find_sampled_zeros(chain.device, float(chain.period), float(chain.d) - chain.n_delay)
             gain = lead * float(chain.mass) / float(chain.period) ** 2
             poles = -np.expm1(chain.device.poles * float(chain.period))
         # Poles at z = 0 are periods of delay, and zeros at z = 0 cancel them.
@@ -134,7 +138,7 @@ def find_roots(chain: AnyChain) -> LoopRoots:
     poles = -np.expm1(poles)
     denominator = np.atleast_1d(np.poly(-poles)).real
     numerator = _expand_numerator(discretized, discretized.full, denominator)
-    lag = chain.whole
+    lag = chain.n_delay
     if discretized.late is not None:
         numerator = np.polyadd(np.append(_expand_numerator(discretized, discretized.late, denominator), 0.0), numerator)
         lag += 1
@@ -160,7 +164,8 @@ def find_roots(chain: AnyChain) -> LoopRoots:
         refined = -_refine_zeros(discretized, zeros * off_axis, is_refined)
         loop = LoopRoots(float(numerator[0]), lag, refined, poles, chain.estimate)
         error = np.abs(
-            loop.evaluate_controller(circle(TEST_ANGLE)).value / evaluate_controller(chain, TEST_ANGLE, discretized)
+            loop.evaluate_controller(circle_points(TEST_ANGLE)).value
+            / evaluate_controller(chain, TEST_ANGLE, discretized)
             - 1.0
         )
         if error < RESPONSE_TOLERANCE:
@@ -217,7 +222,7 @@ def _log_derivative(matrix: np.ndarray, change: np.ndarray) -> complex:
 
 def _factor_rigid_loop(chain: Chain) -> LoopRoots:
     """Return the open loop of a rigid device in closed form."""
-    delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.whole)
+    delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.n_delay)
     plant = discretize_mass(delta, fraction if fraction else None)
     if fraction:
         h, q = factor_numerator(plant)
@@ -226,12 +231,12 @@ def _factor_rigid_loop(chain: Chain) -> LoopRoots:
         # For delta = 0 the gap is 0, so the zero is at exactly z = -1.
         zeros = [2.0 - plant.gap / plant.a2]
     roots = (np.array(offsets, complex) for offsets in (zeros, [0.0, plant.em]))
-    return LoopRoots(float(plant.a2), chain.whole + len(zeros) - 1, *roots, estimate=chain.estimate)
+    return LoopRoots(float(plant.a2), chain.n_delay + len(zeros) - 1, *roots, estimate=chain.estimate)
 
 
 def realize_device(chain: AnyChain) -> StateSpace:
     """Return G in state space; its last states are the delayed forces."""
-    return add_input_delay(discretize_states(chain), chain.whole)
+    return add_input_delay(discretize_states(chain), chain.n_delay)
 
 
 def add_input_delay(discretized: DiscreteChain, n: int) -> StateSpace:
@@ -256,13 +261,13 @@ def add_input_delay(discretized: DiscreteChain, n: int) -> StateSpace:
 
 def realize_open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
     """Return ``L = (alpha + beta F) G`` in state space, from the input position of the wall to the sampled position."""
-    f = estimate_matrices(chain.estimate)
-    return in_series(StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D), realize_device(chain))
+    f = realize_estimate(chain.estimate)
+    return connect_in_series(StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D), realize_device(chain))
 
 
 def realize_closed_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
     """Return the closed loop with a wall, from an external force held on the device to the sampled position."""
-    loop, filter_order = realize_open_loop(chain, alpha, beta), len(estimate_matrices(chain.estimate).A)
+    loop, filter_order = realize_open_loop(chain, alpha, beta), len(realize_estimate(chain.estimate).A)
     A, _, external = chain.realize()
     B = np.zeros((len(loop.A), 1))
     B[filter_order : filter_order + len(external), 0] = compute_chain_transition(chain, A, external, 1.0)[1]

@@ -29,7 +29,7 @@ from zwidth.loops.linear.poles import compute_log_radius
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import label_walls
 from zwidth.parts.chain import AnyChain
-from zwidth.parts.circle import CirclePoints, Jet, circle
+from zwidth.parts.circle import CirclePoints, Jet, circle_points
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.results import Margins
 from zwidth.words.types import Array
@@ -57,14 +57,14 @@ class OpenLoop(NamedTuple):
         """Tabulate L at the nodes of a loop, refined for a wall."""
         w = np.append(nodes[nodes < np.pi], np.pi)
         n_integrators = int(np.count_nonzero(np.abs(loop.poles) <= POLE_AT_ONE))
-        first_gain = abs(alpha * loop.evaluate_response(circle(w[:1])).value[0])
+        first_gain = abs(alpha * loop.evaluate_response(circle_points(w[:1])).value[0])
         if n_integrators and 0.0 < first_gain < 1.0:
             # For a device with poles at z = 1, |L| grows without limit as w -> 0. With a soft wall its crossover may be
             # below all nodes, so add lower ones.
             octaves = 1.0 - np.log2(first_gain) / n_integrators
             w = np.concatenate([w[0] * np.exp2(-np.linspace(octaves, 1.0, int(np.ceil(octaves)))), w])
         for _ in range(MAX_HALVINGS):
-            f = loop.estimate.jet(circle(w))
+            f = loop.estimate.jet(circle_points(w))
             controller = np.abs(alpha + beta * f.value)
             step = np.diff(w)
             change = np.abs(beta * np.diff(f.value))
@@ -74,11 +74,11 @@ class OpenLoop(NamedTuple):
             if not wide.any():
                 break
             w = np.sort(np.concatenate([w, w[:-1][wide] + 0.5 * step[wide]]))
-        return cls(loop, alpha, beta, w, open_loop_response(loop, alpha, beta, circle(w)))
+        return cls(loop, alpha, beta, w, open_loop_response(loop, alpha, beta, circle_points(w)))
 
     def evaluate(self, w: np.ndarray) -> Jet:
         """Return L and its derivative in w."""
-        return open_loop_response(self.loop, self.alpha, self.beta, circle(w))
+        return open_loop_response(self.loop, self.alpha, self.beta, circle_points(w))
 
     def evaluate_at_one(self) -> float | None:
         """Return ``L(1)``; None if it is infinite or 0."""
@@ -270,7 +270,7 @@ def build_delayed_loops(chain: AnyChain) -> dict[float, tuple[LoopRoots, np.ndar
 
 def change_delay(chain: AnyChain, delay: float) -> LoopRoots:
     """Return the loop of a chain with another delay, in periods."""
-    return find_roots(replace(chain, d=float(delay), whole=int(np.floor(delay))))
+    return find_roots(replace(chain, d=float(delay), n_delay=int(np.floor(delay))))
 
 
 def find_delay_margin(
@@ -295,7 +295,7 @@ def find_delay_margin(
 
     def evaluate_at_nyquist(delay: float) -> float:
         """Return L(-1) with a delay."""
-        return open_loop_response(change_delay(chain, delay), *wall, circle(np.array([np.pi]))).value[0].real
+        return open_loop_response(change_delay(chain, delay), *wall, circle_points(np.array([np.pi]))).value[0].real
 
     at_nyquist = np.array([each.L.value[-1].real for each in loops])
     above = np.abs(at_nyquist) - 1.0
@@ -353,7 +353,7 @@ def _solve_delay(chain: AnyChain, wall: tuple[float, float], w: float, delay: fl
     for _ in range(MAX_STEPS):
         if not (0.0 < w < np.pi and delay >= 0.0):
             return np.nan
-        points, step = circle(np.array([w])), DIFFERENCE_STEP + RELATIVE_STEP * delay
+        points, step = circle_points(np.array([w])), DIFFERENCE_STEP + RELATIVE_STEP * delay
         L, shifted = (open_loop_response(change_delay(chain, delay + h), *wall, points) for h in (0.0, step))
         residual, d_w = np.log(-L.value[0]), L.slope[0] / L.value[0]
         d_delay = np.log(shifted.value[0] / L.value[0]) / step

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.parts.circle import circle
+from zwidth.parts.circle import circle_points
 from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 
@@ -106,7 +106,7 @@ class PassivityCondition:
 
     def _evaluate_quotient(self, w: np.ndarray) -> np.ndarray:
         """Return E; for a windowed difference it contains the mean of z^-1 to z^-window."""
-        n, value = self.quotient.window, replace(self.quotient, window=0).jet(circle(w)).value
+        n, value = self.quotient.window, replace(self.quotient, window=0).jet(circle_points(w)).value
         if n:
             s = np.sin(0.5 * w)
             mean = np.where(s == 0, 1.0, np.sin(0.5 * n * w) / (n * np.where(s == 0, 1.0, s)))
@@ -119,7 +119,7 @@ class PassivityCondition:
         s = np.sin(0.5 * w)
         kernel = np.where(s == 0, 2.0 * n + 1.0, np.sin((n + 0.5) * w) / np.where(s == 0, 1.0, s))
         damper = beta * self._evaluate_quotient(w)
-        wall: Array = alpha + damper * circle(w).before
+        wall: Array = alpha + damper * circle_points(w).z_minus_1
         a = -alpha * kernel + 2.0 * (np.exp(-1j * n * w) * damper).real
         if f == 0:
             return np.maximum(-0.5 * a, 0.0)
@@ -151,7 +151,7 @@ class PassivityCondition:
             value = _multiply_bounds(value, _bound_difference(low, high, zero))
         for pole in f.poles:
             middle = 0.5 * (low + high)
-            distance = np.abs(circle(middle).before + pole) - 0.5 * (high - low)
+            distance = np.abs(circle_points(middle).z_minus_1 + pole) - 0.5 * (high - low)
             # No point of the unit circle is closer to the pole than 1 - |pole|.
             depth = 1.0 - abs(1.0 - pole)
             distance = np.maximum(distance, depth)
@@ -176,7 +176,7 @@ def _bound_power(exponent: int, like: np.ndarray) -> tuple[np.ndarray, ...]:
 def _bound_difference(low: np.ndarray, high: np.ndarray, offset: complex) -> tuple[np.ndarray, ...]:
     """Return bounds of ``z - root`` and its first two derivatives; ``offset`` is 1 - root."""
     middle, one = 0.5 * (low + high), 1.0 + 0.0 * low
-    return np.abs(circle(middle).before + offset) + 0.5 * (high - low), one, one
+    return np.abs(circle_points(middle).z_minus_1 + offset) + 0.5 * (high - low), one, one
 
 
 def find_needed_damping(condition: PassivityCondition, alpha: float, beta: float) -> float:

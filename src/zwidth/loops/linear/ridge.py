@@ -27,11 +27,11 @@ from zwidth.loops.linear.curve import evaluate_curve
 from zwidth.loops.linear.held import compute_chain_transition
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import find_stable_intervals
-from zwidth.parts.chain import chain_of
-from zwidth.parts.circle import CirclePoints, circle, lag_jet
+from zwidth.parts.chain import build_chain
+from zwidth.parts.circle import CirclePoints, circle_points, power_jet
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import WALL
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 
@@ -228,7 +228,7 @@ def _differentiate_conditions(loop: LoopRoots, ridge: RidgeSolution) -> tuple[np
     Returns:
         The square Jacobian, and the indices of its equations.
     """
-    points = circle(np.array([ridge.w1, ridge.w2]))
+    points = circle_points(np.array([ridge.w1, ridge.w2]))
     with np.errstate(all="ignore"):
         q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
         slope = ridge.beta * f.slope - q.slope
@@ -265,7 +265,7 @@ ONE_SIDED_DIFFERENCE = [-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6]
 RESPONSE_TOLERANCE = 1e-8  # largest relative difference of G by the matrices of the chain and by its roots
 
 
-@shown()
+@compact_repr()
 class SceneSensitivities(NamedTuple):
     """K_max in N/m, its derivatives by dotted path in N/m per unit of the parameter, and the `zwidth.Status`."""
 
@@ -295,7 +295,7 @@ def list_ridge_parameters(scene: Any) -> tuple[str, ...]:
 def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> float:
     """Return the derivative of K_max in one parameter, with the same active constraints (V21); NaN if inaccurate."""
     matrix, equations = _differentiate_conditions(scene.loop.roots, ridge)
-    points = circle(np.array([ridge.w1, ridge.w2]))
+    points = circle_points(np.array([ridge.w1, ridge.w2]))
     # A longer period shortens a delay measured in periods. If the delay is an integer, it becomes a fractional delay
     # with an integer part that is smaller by one.
     n = scene.integer_delay - (path == "period" and scene.d == scene.integer_delay > 0)
@@ -322,7 +322,7 @@ def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> floa
 def _collect_dependencies(scene: Any, n: int, points: CirclePoints) -> tuple[Any, ...]:
     """Return the quantities that determine K_max: unit of stiffness, delay, A, B, F and dF/dw."""
     delay = scene.timing.delay / scene.timing.period
-    chain = chain_of(scene, (delay, n))
+    chain = build_chain(scene, (delay, n))
     if chain.sampled:
         # Refuse a period that differs from that of the sampled system.
         chain.check()
@@ -358,8 +358,8 @@ def _differentiate_controller(
         [f(x) for x in steps] for f in (np.real, lambda x: x.imag / COMPLEX_STEP)
     )
     lag, slopes = n + 1, np.full((2, points.w.size), complex(np.nan, np.nan))
-    exact, z_power = scene.loop.roots.evaluate_controller(points).value, lag_jet(points, lag)
-    for k, (zeta, zeta_slope) in enumerate(zip(points.before, 1j * points.z, strict=True)):
+    exact, z_power = scene.loop.roots.evaluate_controller(points).value, power_jet(points, lag)
+    for k, (zeta, zeta_slope) in enumerate(zip(points.z_minus_1, 1j * points.z, strict=True)):
         with np.errstate(all="ignore"):
             try:
                 inverse = np.linalg.inv(zeta * np.eye(len(psi)) - psi)

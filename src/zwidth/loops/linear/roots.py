@@ -19,7 +19,15 @@ from math import gcd
 import numpy as np
 
 from zwidth.arrays.polynomials import Affine
-from zwidth.parts.circle import CirclePoints, Jet, are_on_circle, circle, depths, lag_jet, product_jet
+from zwidth.parts.circle import (
+    CirclePoints,
+    Jet,
+    are_on_circle,
+    circle_points,
+    distances_inside,
+    power_jet,
+    product_jet,
+)
 from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 
@@ -40,12 +48,12 @@ class LoopRoots:
     def evaluate_controller(self, points: CirclePoints) -> Jet:
         """Evaluate the critical controller ``q = -1/G`` and its derivative in w."""
         quotient = product_jet(points, self.poles, -1.0).over(product_jet(points, self.zeros, self.gain))
-        return quotient.times(lag_jet(points, self.lag))
+        return quotient.times(power_jet(points, self.lag))
 
     def evaluate_response(self, points: CirclePoints) -> Jet:
         """Evaluate the response G and its derivative in w."""
         quotient = product_jet(points, self.zeros, self.gain).over(product_jet(points, self.poles, 1.0))
-        return quotient.times(lag_jet(points, -self.lag))
+        return quotient.times(power_jet(points, -self.lag))
 
     @property
     def order(self) -> int:
@@ -56,7 +64,7 @@ class LoopRoots:
     @property
     def device_is_unstable(self) -> bool:
         """True if the device without a wall has a pole outside the unit circle."""
-        return bool(np.any((depths(self.poles) < 0) & ~are_on_circle(self.poles)))
+        return bool(np.any((distances_inside(self.poles) < 0) & ~are_on_circle(self.poles)))
 
     def as_damper(self) -> LoopRoots | None:
         """Return the loop at K = 0 with the damping B as its gain in place of K.
@@ -98,12 +106,12 @@ class LoopRoots:
 
     def bound_variation(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return a bound on the relative derivatives in w of q and F, for angles within ``reach`` of w."""
-        z_minus_1 = circle(w).before[..., None]
+        z_minus_1 = circle_points(w).z_minus_1[..., None]
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         distance = np.abs(z_minus_1 + roots) - reach[..., None]
         # The factor z - root of a root on the circle has a phase that hardly varies there (V16); only its modulus
         # varies. Therefore limit the resolution near such a root.
-        floor = np.where(are_on_circle(roots), np.where(roots == 0, 1e-9, 1e-5), 0.5 * np.abs(depths(roots)))
+        floor = np.where(are_on_circle(roots), np.where(roots == 0, 1e-9, 1e-5), 0.5 * np.abs(distances_inside(roots)))
         by_roots = (1.0 / np.maximum(distance, floor)).sum(-1)
         return by_roots + self.lag + self.estimate.window + abs(self.estimate.lag) + 1.0
 

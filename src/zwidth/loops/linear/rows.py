@@ -18,7 +18,7 @@ from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import evaluate_curve
 from zwidth.loops.linear.poles import compute_poles_minus_one, log_modulus
 from zwidth.words.quantities import WALL_RANGE
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 
 # Batches, whose arrays fit in the cache
 BATCH_LINES = 1 << 12  # lines of constant B per batch
@@ -204,7 +204,7 @@ def are_connected(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return (low <= CONNECTED_START * high) & (high > 0)
 
 
-@shown()
+@compact_repr()
 class Island(NamedTuple):
     """A piece of the stable set that is not connected to K = 0: the ranges of stiffness and damping that it spans."""
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.parts.exact_polynomials import DIGITS, EXPONENT, Complex, Polynomial, iterate_roots, size
+from zwidth.parts.exact_polynomials import DIGITS, EXPONENT, Complex, Polynomial, iterate_roots, magnitude
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.words.errors import InputError
 
@@ -55,9 +55,9 @@ def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> 
         return False
     left = list(zeros)
     for zero in zeros2:
-        distances = [size(Complex(each.real - zero.real, each.imag - zero.imag)) for each in left]
+        distances = [magnitude(Complex(each.real - zero.real, each.imag - zero.imag)) for each in left]
         nearest = min(range(len(left)), key=distances.__getitem__)
-        if distances[nearest] > Decimal(PRECISION_TOLERANCE) * size(zero):
+        if distances[nearest] > Decimal(PRECISION_TOLERANCE) * magnitude(zero):
             return False
         del left[nearest]
     return True
@@ -95,8 +95,8 @@ def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits:
     zeros, _ = iterate_roots(shifted) if len(shifted) > 1 else ([], [])
     # Make conjugate pairs exact, and drop imaginary parts that are rounding errors.
     tolerance = Decimal(10) ** (-digits // 3)
-    pairs = [zero for zero in zeros if zero.imag > tolerance * size(zero)]
-    flat = [Complex(zero.real, Decimal(0)) for zero in zeros if abs(zero.imag) <= tolerance * size(zero)]
+    pairs = [zero for zero in zeros if zero.imag > tolerance * magnitude(zero)]
+    flat = [Complex(zero.real, Decimal(0)) for zero in zeros if abs(zero.imag) <= tolerance * magnitude(zero)]
     result = [*pairs, *(Complex(zero.real, -zero.imag) for zero in pairs), *flat]
     if has_zero_at_one:
         result.append(Complex(Decimal(0), Decimal(0)))

@@ -22,15 +22,15 @@ from zwidth.arrays.evaluate import broadcast_traced
 from zwidth.arrays.roots import polish_root
 from zwidth.loops.linear.held import discretize_chain, evaluate_controller
 from zwidth.loops.linear.ridge import Condition, list_ridge_parameters
-from zwidth.parts.chain import AnyChain, chain_of
-from zwidth.parts.circle import circle
+from zwidth.parts.chain import AnyChain, build_chain
+from zwidth.parts.circle import circle_points
 from zwidth.parts.paths import replace_parameters
 from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.results import RidgePoint
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
-from zwidth.words.xp import is_traced, nan_with_nan_slopes
+from zwidth.words.xp import is_traced, nan_with_nan_derivatives
 
 # Finite placeholder for batch entries without a ridge: alpha, beta, w1, w2, both conditions and the kind of ridge.
 PLACEHOLDER = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.NONE))
@@ -99,7 +99,7 @@ def compute_ridge(structure: Structure, *values: Array) -> RidgePoint:
         structure, _fill_template(structure, values), result[:4], conditions, exists
     )
     status = jnp.where(exists & ~close, int(Status.NOT_CONVERGED), status)
-    invalid = nan_with_nan_slopes(status == Status.OK, *values)
+    invalid = nan_with_nan_derivatives(status == Status.OK, *values)
     omega = jnp.where(result[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
     kind = jnp.where(status == Status.OK, result[6].astype(jnp.int32), int(RidgeKind.NONE))
     return RidgePoint(alpha + invalid, beta + invalid, omega + invalid, kind, status)
@@ -137,7 +137,7 @@ def _solve_conditions(
     Returns:
         alpha, beta, w1, w2, and whether they agree with ``start``.
     """
-    chain = chain_of(scene, (structure.d, int(structure.d)))
+    chain = build_chain(scene, (structure.d, int(structure.d)))
     estimate, complex_dtype = chain.estimate, jnp.result_type(start.dtype, jnp.complex64)
     # Scale the unknowns to order one.
     scales = jnp.stack([start[0], jnp.abs(start[0]) + jnp.abs(start[1]), start[2], start[3]])
@@ -169,7 +169,7 @@ def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
 
     def evaluate_r(w: Array) -> tuple[Array, Array]:
         """Return ``r = alpha + beta F - q``, relative to the magnitude of q, and F."""
-        q, f = evaluate_controller(chain, w, discretized), estimate.jet(circle(w)).value
+        q, f = evaluate_controller(chain, w, discretized), estimate.jet(circle_points(w)).value
         size = jax.lax.stop_gradient(jnp.abs(q))
         return (alpha + beta * f - q) / jnp.where(size > 0, size, 1.0), f
 

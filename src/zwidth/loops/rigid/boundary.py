@@ -33,12 +33,12 @@ from zwidth.loops.rigid.curve import (
 from zwidth.loops.rigid.normalization import wall_status
 from zwidth.loops.rigid.polynomial import Wall, build_frequency_loop, find_boundary_wall
 from zwidth.loops.rigid.ridge import ridge_kernel
-from zwidth.parts.checks import check_whole
+from zwidth.parts.checks import check_integer
 from zwidth.words.errors import InputError, check_choice
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, Vertices
-from zwidth.words.xp import frozen, namespace, nan_with_nan_slopes, store_once, tree_map
+from zwidth.words.xp import materialize, namespace, nan_with_nan_derivatives, stop_gradient, tree_map
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
 
@@ -80,13 +80,13 @@ def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
     """Compute the wall with a pole pair at ``e^(+-j omega)``, elementwise; NaN if an argument is out of range."""
     xp = namespace(omega, delta, d)
     ok = is_valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
-    nan_if_invalid = nan_with_nan_slopes(ok, omega, delta, d)
+    nan_if_invalid = nan_with_nan_derivatives(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
     curve = find_boundary_wall(omega, build_frequency_loop(delta, d))
     return Wall(curve.alpha + nan_if_invalid, curve.beta + nan_if_invalid)
 
 
-@shown()
+@compact_repr()
 class BoundaryPoint(NamedTuple):
     """A wall on the stability boundary, or arrays of such walls."""
 
@@ -172,22 +172,24 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
     xp, is_row, zero = namespace(delta, d, number), line == "row", 0.0 * number
     input_status = wall_status(*((zero, number) if is_row else (number, zero)), delta, d)
     curve = build_lobe(delta, d, kind)
-    frozen_curve, frozen_number = frozen((curve, number), xp)
+    frozen_curve, frozen_number = stop_gradient((curve, number), xp)
     if is_row:
-        limit = store_once(find_row_end(frozen_number, frozen_curve), delta)
+        limit = materialize(find_row_end(frozen_number, frozen_curve), delta)
         x, on_lobe, exists = limit.x, limit.meets_lobe, (limit.meets_lobe | limit.beyond) & (limit.alpha > 0)
         x = attach_root_derivatives(
             lambda x, curve, b: evaluate_lobe(x, curve).b - b, x, lambda *_: True, curve, number + delta
         )
         point = evaluate_lobe(x, curve)
         # Return the limit of alpha that `zwidth.is_stable` uses, but let its derivatives be those of the lobe's point.
-        alpha = limit.alpha if xp is np else frozen(limit.alpha, xp) + (point.alpha - frozen(point.alpha, xp))
+        alpha = (
+            limit.alpha if xp is np else stop_gradient(limit.alpha, xp) + (point.alpha - stop_gradient(point.alpha, xp))
+        )
         beta = number
     else:
         top = find_peak(frozen_curve, kind)
         exists = (frozen_number > 0) & (frozen_number < top.alpha)
         target = xp.where(exists, frozen_number, 0.5 * top.alpha)
-        x, on_line = store_once(find_column_end(target, top, frozen_curve, line == "upper"), delta)
+        x, on_line = materialize(find_column_end(target, top, frozen_curve, line == "upper"), delta)
         on_lobe = ~on_line
         x = attach_root_derivatives(
             lambda x, curve, alpha: evaluate_lobe(x, curve).alpha - alpha, x, lambda *_: True, curve, number
@@ -205,7 +207,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
     status = xp.where(exists, int(Status.OK), int(Status.NO_BOUNDARY))
     status = xp.where(input_status == int(Status.OK), status, input_status)
     # Values and derivatives are NaN if the point does not exist.
-    nan_if_missing = nan_with_nan_slopes(status == int(Status.OK), delta, d, number)
+    nan_if_missing = nan_with_nan_derivatives(status == int(Status.OK), delta, d, number)
     return BoundaryPoint(alpha + nan_if_missing, beta + nan_if_missing, omega + nan_if_missing, status.astype(np.int32))
 
 
@@ -217,7 +219,7 @@ class Piece(IntEnum):
     PLUS_ONE = 2
 
 
-@shown()
+@compact_repr()
 class StableRegion(NamedTuple):
     """Closed outline of the stable set: vertex k lies on ``piece[k]``, and alpha = 0 joins the last to the first."""
 
@@ -237,7 +239,7 @@ def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices,
     """Return frequencies along the first lobe of the boundary curve, and alpha and beta at these frequencies."""
     device = {"delta": as_number("delta", delta, 0.0), "d": as_number("d", d, 0.0)}
     check_scalars(device)
-    points = check_whole("points", points, 8, 10**7)
+    points = check_integer("points", points, 8, 10**7)
     kind = classify_delays(d)
     with np.errstate(all="ignore"):
         curve = build_lobe(np.float64(device["delta"]), np.float64(device["d"]), kind)
@@ -326,7 +328,7 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     """Compute the area of the stable set, elementwise: the integral of alpha d(b) along the lobe, plus a triangle."""
     xp = namespace(delta, d)
     curve = build_lobe(delta, d, kind)
-    end = frozen(curve.end, xp)
+    end = stop_gradient(curve.end, xp)
     # If the lobe ends in the corner, the outline continues to alpha = 0 along alpha + 2 beta = const.
     point = evaluate_lobe(end, curve)
     corner_alpha = xp.where(curve.to_corner, point.alpha, 0.0)
@@ -334,7 +336,7 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
         # Without a corner, alpha is 0 at the end of the lobe. Add one Newton step, because second derivatives of the
         # area need the derivative of this end.
         end = end - xp.where(
-            curve.to_corner, 0.0, point.alpha / frozen(xp.where(curve.to_corner, 1.0, point.d_alpha), xp)
+            curve.to_corner, 0.0, point.alpha / stop_gradient(xp.where(curve.to_corner, 1.0, point.d_alpha), xp)
         )
     # Add an axis for the quadrature nodes.
     expanded = tree_map(lambda value: None if value is None else value[..., None], curve)
@@ -344,4 +346,6 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
         return point.alpha * point.d_b
 
     under_lobe = integrate(integrand, (0.0 * end, end), (LOBE_NODES,))
-    return under_lobe + 0.25 * corner_alpha * corner_alpha + nan_with_nan_slopes(is_valid_device(delta, d), delta, d)
+    return (
+        under_lobe + 0.25 * corner_alpha * corner_alpha + nan_with_nan_derivatives(is_valid_device(delta, d), delta, d)
+    )

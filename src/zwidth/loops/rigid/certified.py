@@ -43,7 +43,7 @@ from zwidth.loops.rigid.normalization import wall_status
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
-from zwidth.words.xp import horner, namespace, nan_beyond, roots, store_once
+from zwidth.words.xp import horner, materialize, namespace, nan_beyond, square_roots
 
 if TYPE_CHECKING:
     import flint
@@ -106,7 +106,7 @@ class Sized:
 
     def sqrt(self) -> Sized:
         """Return the square root, with NaN if ``value`` is negative."""
-        root = roots(self.value)[0]
+        root = square_roots(self.value)[0]
         # The size follows from |sqrt x - sqrt v| = |x - v|/(sqrt x + sqrt v), with v the value and x the exact number.
         return Sized(root, self.size / root)
 
@@ -141,7 +141,7 @@ def size_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
     """Return the discretized device of exact delta and d as `Sized` numbers, NaN if out of range."""
     plant = discretize(delta, d, kind)
     if kind.fractional and kind.long:
-        plant = store_once(plant, delta)  # because several loops of the compiled program use it
+        plant = materialize(plant, delta)  # because several loops of the compiled program use it
     sized = DiscretePlant(*(Sized(value, abs(value) + TINY) for value in plant))
     sized = sized._replace(delta=Sized(plant.delta), f=Sized(plant.f), whole=plant.whole, a0=None)
     if kind.fractional:
@@ -163,7 +163,7 @@ def size_phase(u: Sized, n: Array) -> DelayPhase:
     """Return the phase lag (n + 1/2) w at the gain crossover u = 1 - cos w, with the sizes of its sine and cosine."""
     phase = evaluate_phase(u.value, n)
     # Half the phase lag, h, is at most pi/2, so h <= pi/2 sin h bounds the error of the sine.
-    cosine, sine = Sized(phase.cosine, 1.0), Sized(phase.sine, 4.0 * roots(phase.half_sine_squared)[0] + TINY)
+    cosine, sine = Sized(phase.cosine, 1.0), Sized(phase.sine, 4.0 * square_roots(phase.half_sine_squared)[0] + TINY)
     return DelayPhase(
         cosine, sine, Sized(phase.half_sine_squared, 5.0 * phase.half_sine_squared + TINY), phase.within, phase.beyond
     )

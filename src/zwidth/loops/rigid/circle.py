@@ -27,7 +27,7 @@ from zwidth.arrays.held_mass import discretize_mass, factor_numerator, split_del
 from zwidth.loops.rigid.crossover import find_first_root
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.words.types import Array
-from zwidth.words.xp import angle, apply_each, epsilon, find_turn, namespace, nan_unless, repeat
+from zwidth.words.xp import angle, apply_each, epsilon, invert_haversine, iterate, namespace, nan_unless
 
 # Maximum number of steps of the bracketed iteration for a zero of the cubic |T|^2 - |B|^2.
 CUBIC_STEPS = 6
@@ -172,7 +172,7 @@ def _find_zero_between(piece: tuple[Array, ...], circle: _Circle, xp: Any) -> Ar
     def has_converged(old: tuple[Array, ...], new: tuple[Array, ...]) -> bool:
         return bool(np.all((old[0] == new[0]) | ~exists))
 
-    x = repeat(CUBIC_STEPS, step, (xp.where(xp.abs(first) < xp.abs(last), low, high), low, high), xp, has_converged)[0]
+    x = iterate(CUBIC_STEPS, step, (xp.where(xp.abs(first) < xp.abs(last), low, high), low, high), xp, has_converged)[0]
     return xp.where(exists, x, np.nan)
 
 
@@ -213,7 +213,7 @@ def _evaluate_phase_difference(
     v_re, v_im = p_re * q_re - p_im * q_im, p_re * q_im + p_im * q_re
     phase = angle(v_re, v_im)
     phase = xp.where((v_im < 0) & (q_im >= 0), phase + 2.0 * np.pi, phase)
-    w = find_turn(x, y, xp)
+    w = invert_haversine(x, y, xp)
     theta = loop.n_plus_1 * w + phase + xp.where(loop.s < 0, np.pi, 0.0)
     if fractional:
         # Subtract arg(1 + q/z) = arg(z + q) - w, which is in [-pi, 0].
@@ -348,7 +348,7 @@ def count_poles_in_cell(
     valid = ~np.isnan(low)
     certain &= (valid == ~np.isnan(high)).all(0)
     first, second = (np.where(valid, end(low, high), 0.5) for end in (np.fmin, np.fmax))
-    w_first, w_second = (find_turn(x, 1.0 - x, np) for x in (first, second))
+    w_first, w_second = (invert_haversine(x, 1.0 - x, np) for x in (first, second))
     cuts = np.sin(0.5 * (w_first + PIECE_POINTS * (w_second - w_first))) ** 2
     first, x, second = cuts[:-1:2], cuts[1::2], cuts[2::2]
     turns = _evaluate_phase_difference(x, circle, loop, fractional, np)[0] / (2.0 * np.pi)

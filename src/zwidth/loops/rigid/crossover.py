@@ -46,7 +46,17 @@ from zwidth.arrays.held_mass import ANY, DelayClasses, DiscretePlant, discretize
 from zwidth.arrays.roots import attach_root_derivatives
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
-from zwidth.words.xp import ARCSINE, COSINE, SINE, find_turn, frozen, horner, namespace, roots, within
+from zwidth.words.xp import (
+    ARCSINE,
+    COSINE,
+    SINE,
+    horner,
+    invert_haversine,
+    namespace,
+    square_roots,
+    stop_gradient,
+    within,
+)
 
 # Newton steps for the cubic. The starting value is within 11 % of the root and each step squares the relative error:
 # 0.11^16 < 5e-16.
@@ -166,7 +176,7 @@ def decide_short_delay(alpha: Any, beta: Any, plant: Any) -> Verdict:
     # positive root y.
     constant, linear, quadratic = modulus[0] * b, u0 - b * modulus[1], b * modulus[2] - u1
     discriminant = linear * linear - constant * quadratic * 4.0
-    y = constant * 2.0 / (linear + roots(discriminant)[0])
+    y = constant * 2.0 / (linear + square_roots(discriminant)[0])
     # Compare alpha with alpha_w, both multiplied by V.
     left, right = alpha * horner(y, modulus), y * horner(y, stiffness) * 4.0
     meets_curve, misses_lobe = discriminant > 0, (discriminant < 0) | (y > 1.0)
@@ -213,7 +223,7 @@ def decide_long_delay(
     gain_difference = expand_gain_difference(alpha, beta, plant)
     u, certain = find_root(gain_difference)
     y = u * 0.5
-    sin_half, cos_half = roots(y, 1.0 - y)  # of w/2
+    sin_half, cos_half = square_roots(y, 1.0 - y)  # of w/2
     phase = evaluate_phase(u, n)
     E_terms, H_terms, V_terms, excess = expand_long_delay_curve(plant)
     # Evaluate E and F = H sin w, the real and imaginary part of (z - c) conj M.
@@ -332,13 +342,13 @@ def find_gain_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tupl
     coefficients = tuple(xp.where(above_half, *pair) for pair in zip(in_v, in_u, strict=True))
     root = attach_root_derivatives(
         lambda x, *powers: horner(x, powers),
-        find_first_root(frozen(coefficients, xp)),
+        find_first_root(stop_gradient(coefficients, xp)),
         lambda x, slope, _: slope != 0,
         *coefficients,
     )
     exists = (xp.abs(wall_at_nyquist) < device_at_nyquist) & (root > 0) & (root <= 1.0)
     u, v = xp.where(above_half, 2.0 - root, root), xp.where(above_half, root, 2.0 - root)
-    return find_turn(0.5 * u, 0.5 * v, xp), exists
+    return invert_haversine(0.5 * u, 0.5 * v, xp), exists
 
 
 def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses = ANY) -> Array:

@@ -33,7 +33,7 @@ from zwidth.loops.rigid.row_limit import (
     limit_short_delay,
 )
 from zwidth.words.types import Array
-from zwidth.words.xp import frozen, horner, namespace, repeat, store_once
+from zwidth.words.xp import horner, iterate, materialize, namespace, stop_gradient
 
 CUBIC_STEPS = 4  # steps to the point with a given alpha for n = 0; the start is within 28 % of x
 COLUMN_STEPS = 3  # Newton steps to the point with a given alpha for n >= 1; the start is within 0.3 % of x
@@ -70,18 +70,18 @@ class Peak(NamedTuple):
 def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
     """Return the lobe of each device; ``kind`` states which classes of delays (short, long, fractional) occur."""
     xp = namespace(delta, d)
-    plant = store_once(discretize_plant(delta, d, kind), delta)
+    plant = materialize(discretize_plant(delta, d, kind), delta)
     is_short = plant.whole < 1
     short_curve, long_lobe, ends = None, None, []
     to_corner = plant.delta < 0
     if kind.short:
         short_curve = expand_short_delay_curve(plant)
-        root, to_corner = _find_short_end(frozen(short_curve, xp))
+        root, to_corner = _find_short_end(stop_gradient(short_curve, xp))
         ends.append(root)
     if kind.long:
         # Compute the last five fields, the end of the lobe and starting values, without derivatives, because solvers
         # only start from them.
-        frozen_lobe = build_long_lobe(frozen(plant, xp))
+        frozen_lobe = build_long_lobe(stop_gradient(plant, xp))
         long_lobe = frozen_lobe if xp is np else LongLobe(*expand_long_lobe(plant)[:-5], *frozen_lobe[-5:])
         ends.append(long_lobe.end)
     if len(ends) < 2:
@@ -261,7 +261,7 @@ def _find_long_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> A
             step = 2.0 * root / (root + S) * (point.alpha - alpha) / point.d_alpha
             return xp.minimum(xp.maximum(x - xp.where(point.d_alpha < 0, step, 0.0), top.x), lobe.end)
 
-        return repeat(COLUMN_STEPS, outwards, x, xp)
+        return iterate(COLUMN_STEPS, outwards, x, xp)
     # Near omega = 0, alpha is alpha_rate omega^2 + .... The start interpolates between this parabola and the peak.
     long_lobe = lobe.long_lobe
     alpha_rate = ((long_lobe.k + 0.5) * long_lobe.E0 + long_lobe.H0) / long_lobe.V0
@@ -276,4 +276,4 @@ def _find_long_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> A
         step = 2.0 * root / (root + G) * (point.alpha / alpha) * (point.alpha - alpha) / (point.d_alpha * x)
         return xp.minimum(x / (1.0 + xp.where(point.d_alpha > 0, step, 0.0)), top.x)
 
-    return repeat(COLUMN_STEPS, inwards, x, xp)
+    return iterate(COLUMN_STEPS, inwards, x, xp)

@@ -31,10 +31,10 @@ from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.normalization import device_status, wall_status
 from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, build_frequency_loop, find_boundary_wall
 from zwidth.loops.rigid.ridge_newton import expand_curve, find_corner
-from zwidth.parts.circle import circle
+from zwidth.parts.circle import circle_points
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
-from zwidth.words.xp import nan_with_nan_slopes, store_once
+from zwidth.words.xp import materialize, nan_with_nan_derivatives
 
 # Number of bisections; 52 reduce a bracket to one unit in the last place of a float64.
 BISECTIONS = 52
@@ -63,15 +63,15 @@ def find_lobe_end(loop: FrequencyLoop, d: Array) -> Array:
 def evaluate_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyLoop) -> Array:
     """Return the real and imaginary part of ``P(e^(j omega))/e^(j (2 + n) omega)`` as one array."""
     plant, n = loop
-    point, half_cosine = circle(omega), jnp.cos(0.5 * omega)
-    # Evaluate (z - 1)(z - c) + z^-n M (alpha + beta (1 - 1/z)) with M = N(z)/z; ``point.before`` is z - 1.
+    point, half_cosine = circle_points(omega), jnp.cos(0.5 * omega)
+    # Evaluate (z - 1)(z - c) + z^-n M (alpha + beta (1 - 1/z)) with M = N(z)/z; ``point.z_minus_1`` is z - 1.
     m = (
         2.0 * (plant.a2 + plant.a0) * half_cosine * half_cosine
         - plant.gap
         + 1j * (plant.a2 - plant.a0) * jnp.sin(omega)
     )
-    wall_term = jnp.exp(-1j * n * omega) * m * (alpha + beta * point.before * jnp.conj(point.z))
-    value = point.before * (point.before + plant.em) + wall_term
+    wall_term = jnp.exp(-1j * n * omega) * m * (alpha + beta * point.z_minus_1 * jnp.conj(point.z))
+    value = point.z_minus_1 * (point.z_minus_1 + plant.em) + wall_term
     # Return real numbers, because optimistix requires real unknowns.
     return jnp.stack([value.real, value.imag])
 
@@ -115,14 +115,14 @@ def _solve_conditions(
         number: The given beta or alpha.
         loop: Plant and integer delay.
     """
-    wall = jax.lax.stop_gradient(store_once(find_boundary_wall(start, loop), start))
+    wall = jax.lax.stop_gradient(materialize(find_boundary_wall(start, loop), start))
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
     scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
     unknowns = jnp.stack([*wall, start]) / scales
     omega = polish_root(
         lambda *values: _evaluate_conditions(condition, *values), unknowns, (loop, number, scales), bracketed
     )[2]
-    omega = store_once(omega, start)
+    omega = materialize(omega, start)
     return omega, find_boundary_wall(omega, loop)
 
 
@@ -133,21 +133,21 @@ def kkt_kernel(delta: Array, d: Array) -> tuple[Array, ...]:
     ok, inputs = status == Status.OK, (delta, d)
     # Replace NaN by valid numbers, because a solver may stop all batch entries at the NaN of one.
     delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
-    loop = store_once(build_frequency_loop(delta, d), delta)
+    loop = materialize(build_frequency_loop(delta, d), delta)
     corner = find_corner(expand_curve(loop.plant), loop.n)
 
     def differentiate_alpha(omega: Array, loop: FrequencyLoop) -> Array:
         return jax.grad(lambda w: find_boundary_wall(w, loop).alpha)(omega)
 
-    end = store_once(find_lobe_end(loop, d), d)
+    end = materialize(find_lobe_end(loop, d), d)
     # Stay slightly below pi, because the derivative of alpha is 0 at pi by symmetry, even without a maximum there.
     upper = jnp.where(end < jnp.pi, end, jnp.pi * (1.0 - 1e-7))
     start, bracketed = bracket_root(differentiate_alpha, 1e-6 * end, upper, loop)
-    start = store_once(start, d)
+    start = materialize(start, d)
     omega, smooth = _solve_conditions("ridge", start, bracketed, d, loop)
     # Accept a solution close to its start, because rounding errors can keep Newton's method from its tolerance.
     converged = corner.is_ridge | (bracketed & (jnp.abs(omega - start) <= 1e-5 * end))
-    nan_if_invalid = nan_with_nan_slopes(ok & converged, *inputs)
+    nan_if_invalid = nan_with_nan_derivatives(ok & converged, *inputs)
     status = jnp.where(ok & ~converged, int(Status.NOT_CONVERGED), status)
     kind = jnp.where(corner.is_ridge, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
     kind = jnp.where(status == Status.OK, kind, int(RidgeKind.NONE))
@@ -212,6 +212,6 @@ def point_kernel(delta: Array, d: Array, number: Array, line: str, find_ridge: C
         exists = exists & (number > 0) & (number < ridge.alpha)
     status = jnp.where(exists, jnp.where(converged, int(Status.OK), int(Status.NOT_CONVERGED)), int(Status.NO_BOUNDARY))
     status = jnp.where(ok, status, input_status)
-    nan_if_invalid = nan_with_nan_slopes(status == Status.OK, *inputs)
+    nan_if_invalid = nan_with_nan_derivatives(status == Status.OK, *inputs)
     alpha, beta = (value, number) if is_row else (number, value)
     return alpha + nan_if_invalid, beta + nan_if_invalid, omega + nan_if_invalid, status.astype(jnp.int32)

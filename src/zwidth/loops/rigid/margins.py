@@ -29,7 +29,16 @@ from zwidth.loops.rigid.modulus import (
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.words.results import Margins
 from zwidth.words.types import Array, ArrayLike
-from zwidth.words.xp import along, apply_each, epsilon, frozen, horner, namespace, nan_with_nan_slopes, store_once
+from zwidth.words.xp import (
+    apply_each,
+    epsilon,
+    expand_along,
+    horner,
+    materialize,
+    namespace,
+    nan_with_nan_derivatives,
+    stop_gradient,
+)
 
 # Maximum number of steps of false position; every sixth step bisects the bracket.
 FALSE_POSITION_STEPS = 240
@@ -111,14 +120,14 @@ def margins_kernel(
     """Return `margins` of arrays of one shape; the delay and modulus margins are NaN if they are not requested."""
     xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d) & (alpha > 0)
-    nan_if_invalid = nan_with_nan_slopes(ok, alpha, beta, delta, d)
+    nan_if_invalid = nan_with_nan_derivatives(ok, alpha, beta, delta, d)
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
     # Set delta to 0 if its square or its inverse under- or overflows, because it then has no effect on the margins.
     delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), NEGLIGIBLE_DAMPING)), 0.0, delta)
-    plant = store_once(discretize_plant(delta, d), delta)
+    plant = materialize(discretize_plant(delta, d), delta)
     w, phase, crosses = evaluate_at_crossover(alpha, beta, plant)
-    stable = store_once(decide_in_floats(*frozen((alpha, beta, plant), xp), ANY), delta)
+    stable = materialize(decide_in_floats(*stop_gradient((alpha, beta, plant), xp), ANY), delta)
     gain, phase_crossover = _find_gain_margin(alpha, beta, plant, xp)
     delay = distance = closest = xp.nan * alpha
     if with_delay:
@@ -129,16 +138,16 @@ def margins_kernel(
     if with_modulus:
         distance, closest = find_modulus_margin(alpha, beta, plant)
     # Phases that differ by 360 degrees are equivalent: reduce the phase margin of an unstable wall to [-180, 0].
-    turns = 2.0 * np.pi * xp.round(frozen(phase, xp) / (2.0 * np.pi))
+    turns = 2.0 * np.pi * xp.round(stop_gradient(phase, xp) / (2.0 * np.pi))
     phase = xp.where(stable, phase, -xp.abs(phase - turns))
-    nan_if_undecided = nan_with_nan_slopes(crosses & (beta > -delta), alpha, beta, delta, d)
+    nan_if_undecided = nan_with_nan_derivatives(crosses & (beta > -delta), alpha, beta, delta, d)
     fields = (
         _place_by_verdict(gain, 1.0, epsilon(gain), stable, xp),
         _place_by_verdict(phase * (180.0 / np.pi), 0.0, LEAST_MARGIN, stable, xp) + nan_if_undecided,
         _place_by_verdict(delay, 0.0, LEAST_MARGIN, stable, xp),
         distance,
         phase_crossover,
-        w + nan_with_nan_slopes(crosses, alpha, beta, delta, d),
+        w + nan_with_nan_derivatives(crosses, alpha, beta, delta, d),
         closest,
     )
     return Margins(*(field + nan_if_invalid for field in fields))
@@ -156,7 +165,7 @@ def _place_by_verdict(margin: Array, edge: float, least: float, stable: Array, x
     """
     nearest = xp.where(stable, edge + least, edge)
     # Add a difference that is 0, because it keeps the derivatives of the margin.
-    return xp.where((margin < nearest) == stable, nearest + (margin - frozen(margin, xp)), margin)
+    return xp.where((margin < nearest) == stable, nearest + (margin - stop_gradient(margin, xp)), margin)
 
 
 def _find_gain_margin(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> tuple[Array, Array]:
@@ -179,7 +188,7 @@ def _find_gain_margin(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) 
             plant.delta * alpha * horner(y, modulus_terms),
             -alpha * y * (u0 + u1 * y),
         )
-        normalized = sum(terms) / frozen(sum(map(xp.abs, terms)), xp)
+        normalized = sum(terms) / stop_gradient(sum(map(xp.abs, terms)), xp)
         return xp.where(
             (n == 0) & (xp.abs(phase_at_w) < SMALL_PHASE), normalized, phase_at_w * ((w + em) / (w * w + em))
         )
@@ -188,7 +197,7 @@ def _find_gain_margin(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) 
     # the phase is above pi/2 - 1/2 there.
     n, em = plant.whole, plant.em
     slowness = 1.0 / xp.where(em > 0, em, 1e-9) + n + 2.0 + xp.abs(beta) / alpha
-    wall, (low, high) = frozen(((alpha, beta, plant), (-xp.log(2.0 * slowness), xp.log(np.pi / (n + 1.0)))), xp)
+    wall, (low, high) = stop_gradient(((alpha, beta, plant), (-xp.log(2.0 * slowness), xp.log(np.pi / (n + 1.0)))), xp)
     start, end = apply_each(lambda x: evaluate_phase(x, *wall), [low, high], xp)
     never_stable = ~(start > 0)
     bracket = low, high, xp.where(never_stable, 1.0, start), -1.0 + 0.0 * low
@@ -200,7 +209,7 @@ def _find_gain_margin(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) 
     # Require n = 0, because for d >= 1 the phase has a zero below w = pi, although rounding errors may hide it.
     ends_at_nyquist = (n == 0) & (wall_at_nyquist > 0) & (end > 0)
     gain = xp.where(never_stable, 0.0, xp.where(ends_at_nyquist, gain_at_nyquist, gain_at_zero))
-    return gain, xp.where(ends_at_nyquist, np.pi, w) + nan_with_nan_slopes(~never_stable, alpha, beta, plant.em)
+    return gain, xp.where(ends_at_nyquist, np.pi, w) + nan_with_nan_derivatives(~never_stable, alpha, beta, plant.em)
 
 
 def _is_falling(_: Array, slope: Array, step: Array) -> Array:
@@ -212,7 +221,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
     """Return the additional delay, in periods, at which a stable wall first becomes unstable."""
     # For a fixed fraction f, the wall is stable for integer delays n < nu(f), where nu(f) is the phase for n = 0 at the
     # gain crossover, divided by its frequency. The crossover does not depend on n, so the samples of nu serve all n.
-    frozen_wall = tuple(frozen(value, xp) for value in wall)
+    frozen_wall = tuple(stop_gradient(value, xp) for value in wall)
     n, fraction = split_delay(d)
     grid = _grade_fractions(frozen_wall[2], xp)
     crossings, phases, exist = _evaluate_fraction(grid, *(value[..., None] + 0.0 * grid for value in frozen_wall))
@@ -235,11 +244,11 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
             sample(limits, index),
             GOLDEN_SECTION_STEPS,
         )
-        dips = xp.any(dips, axis=-1)[..., None] & (along(np.arange(N_FRACTIONS + 1), xp.asarray(d)) == index)
+        dips = xp.any(dips, axis=-1)[..., None] & (expand_along(np.arange(N_FRACTIONS + 1), xp.asarray(d)) == index)
         grid, limits = xp.where(dips, f[..., None], grid), xp.where(dips, least[..., None], limits)
     # The delay n + f with f = 1 is the delay n + 1 with f = 0. Therefore set nu(1) = nu(0) - 1 without rounding errors.
     limits = xp.concatenate([limits[..., :-1], limits[..., :1] - 1.0], axis=-1)
-    n_now, f_now = frozen((n, fraction), xp)
+    n_now, f_now = stop_gradient((n, fraction), xp)
     later = (grid > f_now[..., None]) & (limits <= n_now[..., None])
     is_this_period = xp.any(later, axis=-1)
     n_lost = xp.where(is_this_period, n_now, xp.maximum(n_now + 1.0, xp.ceil(xp.min(limits, axis=-1))))[()]
@@ -249,7 +258,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
     low, excess_low = sample(grid, index - 1), sample(excesses, index - 1)
     starts_at_d = is_this_period & (low < f_now)
     low = xp.where(starts_at_d, f_now, low)[()]
-    excess_low = xp.where(starts_at_d, frozen(phase, xp), excess_low)[()]
+    excess_low = xp.where(starts_at_d, stop_gradient(phase, xp), excess_low)[()]
 
     def excess(f: Array, n_lost: Array, *wall: Array) -> Array:
         w, phase, exists = _evaluate_fraction(f, *wall)
@@ -266,7 +275,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
 
 def _grade_fractions(delta: Array, xp: Any) -> Array:
     """Return fractions f from 0 to almost 1 along a last axis, denser at both ends; evenly spaced for light damping."""
-    share = along(np.arange(N_FRACTIONS + 1) / N_FRACTIONS, xp.asarray(delta))
+    share = expand_along(np.arange(N_FRACTIONS + 1) / N_FRACTIONS, xp.asarray(delta))
     growth = xp.log1p(GRADING * xp.maximum(delta, LIGHT_DAMPING))[..., None]
     from_end = 0.5 * xp.expm1(2.0 * xp.minimum(share, 1.0 - share) * growth) / xp.expm1(growth)
     return xp.minimum(xp.where(share <= 0.5, from_end, 1.0 - from_end), 1.0 - epsilon(delta))
@@ -280,4 +289,4 @@ def _limit_delay(w: Array, phase: Array, exists: Array) -> Array:
 
 def _evaluate_fraction(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
     """Return the gain crossover, the phase there, and whether the crossover exists, for a delay f < 1."""
-    return evaluate_at_crossover(alpha, beta, store_once(discretize_plant(delta, f), f))
+    return evaluate_at_crossover(alpha, beta, materialize(discretize_plant(delta, f), f))

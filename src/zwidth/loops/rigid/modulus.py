@@ -26,7 +26,7 @@ from zwidth.arrays.held_mass import DiscretePlant
 from zwidth.arrays.roots import attach_root_derivatives, newton
 from zwidth.loops.rigid.crossover import find_gain_crossover
 from zwidth.words.types import Array
-from zwidth.words.xp import along, apply_each, frozen, namespace, store_once
+from zwidth.words.xp import apply_each, expand_along, materialize, namespace, stop_gradient
 
 
 def evaluate_gain_and_phase(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
@@ -60,7 +60,7 @@ def evaluate_at_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tu
     """Return the gain crossover w, the phase of L plus pi there, and whether w exists; otherwise w is arbitrary."""
     xp = namespace(alpha, plant.delta)
     w, exists = find_gain_crossover(alpha, beta, plant)
-    w, exists = store_once((xp.where(exists, w, 1.0), exists), alpha)
+    w, exists = materialize((xp.where(exists, w, 1.0), exists), alpha)
     return w, evaluate_gain_and_phase(w, alpha, beta, plant)[1], exists
 
 
@@ -123,7 +123,7 @@ def find_modulus_margin(alpha: Array, beta: Array, plant: DiscretePlant) -> tupl
     def is_dip(w: Array, curvature: Array, _: Array) -> Array:
         return (w < np.pi) & (curvature > 0)
 
-    lowest = _find_lowest(*frozen(wall, xp), xp)
+    lowest = _find_lowest(*stop_gradient(wall, xp), xp)
     w = attach_root_derivatives(
         lambda *point: _differentiate_distance(*point)[0],
         lowest,
@@ -141,7 +141,7 @@ def _find_lowest(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> Ar
         """Return the frequency at which |L| equals ``level``; pi if |L| is larger at all frequencies."""
         w, exists = find_gain_crossover(alpha / level, beta / level, plant)
         w = xp.where(exists, w, np.pi)
-        return store_once(w, w)
+        return materialize(w, w)
 
     alpha, beta = xp.asarray(alpha), xp.asarray(beta)
     plant = DiscretePlant(*(xp.asarray(field) for field in plant))
@@ -158,7 +158,7 @@ def _find_lowest(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> Ar
     high = xp.maximum(xp.minimum(end, center + turn), center)
 
     def list_fractions(count: int, least: float = 0.5) -> Array:
-        return along((np.arange(count) + least) / count, center)
+        return expand_along((np.arange(count) + least) / count, center)
 
     grid = [
         low[..., None] + (high - low)[..., None] * list_fractions(SAMPLES_PER_TURN, 1.0),

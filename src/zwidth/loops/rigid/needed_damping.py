@@ -23,7 +23,7 @@ import numpy as np
 from zwidth.arrays.held_mass import ANY, DelayClasses, split_delay
 from zwidth.arrays.roots import newton
 from zwidth.words.types import Array
-from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace
+from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, horner, namespace, stop_gradient
 
 # Newton steps to the peak, from a start that is within a few percent.
 PEAK_STEPS = 3
@@ -180,7 +180,7 @@ def compute_needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClass
     if not (kind.long or kind.fractional):
         return 0.5 * alpha + xp.abs(beta)
     delay = compute_delay_terms(d)
-    scale = frozen(alpha + xp.abs(beta), xp)
+    scale = stop_gradient(alpha + xp.abs(beta), xp)
     scale = xp.where(scale > 0, scale, 1.0)
     a, beta = 0.5 * alpha / scale, beta / scale
     at_zero, E, at_pi, reaches_pi = evaluate_ends(a, beta, delay)
@@ -190,10 +190,10 @@ def compute_needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClass
     safe_a, safe_beta = xp.where(has_peak, a, 0.0), xp.where(has_peak, beta, 1.0)
     safe_f = xp.where(has_peak, delay.f, 0.5)
     safe_delay = DelayTerms(safe_f, delay.k, 4.0 * safe_f * (1.0 - safe_f))
-    u = find_peak(*frozen((safe_a, safe_beta, safe_delay, xp.where(has_peak, E, 1.0)), xp))
+    u = find_peak(*stop_gradient((safe_a, safe_beta, safe_delay, xp.where(has_peak, E, 1.0)), xp))
     point = evaluate_condition(u, safe_a, safe_beta, safe_delay)
     # Add the effect of one more Newton step on N, which makes the second derivatives correct as well.
-    curvature = frozen(xp.where(point.curvature < 0, point.curvature * point.root / point.needed, -1.0), xp)
+    curvature = stop_gradient(xp.where(point.curvature < 0, point.curvature * point.root / point.needed, -1.0), xp)
     height = point.needed - xp.where(point.curvature < 0, 0.5 * point.slope * point.slope / curvature, 0.0)
     return scale * xp.where(rises, xp.where(reaches_pi, at_pi, height), at_zero)
 

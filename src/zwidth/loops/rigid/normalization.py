@@ -17,16 +17,16 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, evaluate, join_shapes
 from zwidth.arrays.held_mass import is_valid_device
-from zwidth.parts.checks import accept_units, in_periods
+from zwidth.parts.checks import accept_units, to_periods
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS, SI_RANGE, SIZES, WALL_RANGE
-from zwidth.words.showing import shown
+from zwidth.words.showing import compact_repr
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
 from zwidth.words.xp import is_jax, is_traced, namespace, nan_unless, within
 
 
-@shown()
+@compact_repr()
 class Normalized(NamedTuple):
     """The four dimensionless parameters that determine the stability of a wall."""
 
@@ -36,7 +36,7 @@ class Normalized(NamedTuple):
     d: Array
 
 
-@shown(mass="kg", damping="N s/m", period="s", delay="s")
+@compact_repr(mass="kg", damping="N s/m", period="s", delay="s")
 class Physical(NamedTuple):
     """The device, its loop and the wall in SI units: kg, N s/m, s, s, N/m, N s/m."""
 
@@ -148,7 +148,7 @@ def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tupl
         stiffness * period * period / mass,
         virtual_damping * period / mass,
         damping * period / mass,
-        in_periods(delay, period),
+        to_periods(delay, period),
     )
 
 

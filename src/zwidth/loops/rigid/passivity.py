@@ -22,7 +22,7 @@ from zwidth.loops.rigid.needed_damping import compute_needed_damping, find_direc
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import Array, ArrayLike
-from zwidth.words.xp import frozen, horner, is_traced, namespace, nan_with_nan_slopes
+from zwidth.words.xp import horner, is_traced, namespace, nan_with_nan_derivatives, stop_gradient
 
 # Terms of the Chebyshev series; the last one is below 1e-16 for every delay.
 N_TERMS = 30
@@ -39,7 +39,7 @@ def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Dela
     safe_alpha = xp.where(valid & (alpha >= 0), alpha, 0.0)
     safe_beta, safe_d = xp.where(valid, beta, 0.0), xp.where(valid, d, 0.0)
     margin = delta - compute_needed_damping(safe_alpha, safe_beta, safe_d, kind)
-    return _limit_margin(margin, alpha) + nan_with_nan_slopes(valid, alpha, beta, delta, d)
+    return _limit_margin(margin, alpha) + nan_with_nan_derivatives(valid, alpha, beta, delta, d)
 
 
 def _limit_margin(margin: Array, alpha: Array) -> Array:
@@ -278,7 +278,7 @@ def _passive_area_kernel(delta: Array, d: Array) -> Array:
     safe_d = xp.where(valid, d, 1.0)
     unit = 1.0 / (safe_d + 0.5)
     # Compute the ends of the parts without derivatives, because errors of the ends have no effect of first order.
-    lower, upper = (xp.arctan(t * frozen(unit, xp)) for t in find_directions(frozen(safe_d, xp)))
+    lower, upper = (xp.arctan(t * stop_gradient(unit, xp)) for t in find_directions(stop_gradient(safe_d, xp)))
     end = 0.5 * np.pi + 0.0 * safe_d
 
     def integrand(theta: Array) -> Array:
@@ -287,4 +287,4 @@ def _passive_area_kernel(delta: Array, d: Array) -> Array:
         return compute_needed_damping(alpha, xp.sin(theta), safe_d[..., None] + 0.0 * theta) ** -2
 
     inverse_squares = integrate(integrand, (-end, lower, upper, end), AREA_NODES)
-    return 0.5 * delta * delta * unit * inverse_squares + nan_with_nan_slopes(valid, delta, d)
+    return 0.5 * delta * delta * unit * inverse_squares + nan_with_nan_derivatives(valid, delta, d)

@@ -29,12 +29,12 @@ from zwidth.words.xp import (
     angle,
     apply_each,
     epsilon,
-    frozen,
+    iterate,
+    materialize,
     namespace,
     nan_unless,
-    nan_with_nan_slopes,
-    repeat,
-    store_once,
+    nan_with_nan_derivatives,
+    stop_gradient,
 )
 
 # Halley steps.
@@ -149,7 +149,7 @@ def approximate_larger_pole(loop: LoopFactors, fractional: bool) -> tuple[Array,
     xp = namespace(loop.alpha)
 
     def follow(start: tuple[Array, Array]) -> tuple[Array, Array]:
-        return repeat(STEPS_ON_BOTH, lambda point: halley_step(*point, loop, fractional), start, xp)
+        return iterate(STEPS_ON_BOTH, lambda point: halley_step(*point, loop, fractional), start, xp)
 
     slow, pair = apply_each(follow, [approximate_slow_pole(loop), approximate_first_pair(loop, fractional)], xp)
     slow_is_larger = (slow[0] >= pair[0]) | xp.isnan(pair[0])
@@ -159,7 +159,7 @@ def approximate_larger_pole(loop: LoopFactors, fractional: bool) -> tuple[Array,
 def find_candidate(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
     """Return the larger of the slow pole and the first pair, nearly converged."""
     start = approximate_larger_pole(loop, fractional)
-    return repeat(STEPS_ON_LARGER, lambda point: halley_step(*point, loop, fractional), start, namespace(loop.alpha))
+    return iterate(STEPS_ON_LARGER, lambda point: halley_step(*point, loop, fractional), start, namespace(loop.alpha))
 
 
 def certification_width(re: Array, tolerance: Any) -> Array:
@@ -200,7 +200,7 @@ def quick_kernel(
     alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool
 ) -> DominantPoles:
     """Return the dominant pole of each wall from two starting points; for most walls it is certified."""
-    loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
+    loop = materialize(factor_loop(alpha, beta, delta, d, fractional), delta)
     return certify_pole(*find_candidate(loop, fractional), tolerance, loop, fractional, fractional)
 
 
@@ -211,7 +211,7 @@ def _certify_largest(
     starts: tuple[np.ndarray, np.ndarray], steps: int, tolerance: float, loop: LoopFactors, fractional: bool
 ) -> DominantPoles:
     """Certify the largest of the poles to which starting points lead, by a count with any number of crossovers."""
-    re, im = repeat(steps, lambda at: halley_step(*at, loop, fractional), starts, np)
+    re, im = iterate(steps, lambda at: halley_step(*at, loop, fractional), starts, np)
     converged = newton_step(re, im, loop, fractional).radius < CONVERGED_RADIUS
     best = np.where(converged, re, -np.inf).argmax(0), np.arange(re.shape[1])
     return certify_pole(re[best], im[best], tolerance, loop, fractional, False)
@@ -263,14 +263,14 @@ def bisect_radius(_: DominantPoles, tolerance: float, loop: LoopFactors, fractio
         return low, low + width
 
     high = _bound_log_radius(loop)
-    _, radius = repeat(-(-BISECTIONS // BISECTIONS_PER_COUNT), step, (0.0 * high + MIN_LOG_RADIUS, high), np)
+    _, radius = iterate(-(-BISECTIONS // BISECTIONS_PER_COUNT), step, (0.0 * high + MIN_LOG_RADIUS, high), np)
     least_distance, im = np.inf, 0.0 * radius
     # On the circle with the bisected radius, the pole is at a crossover or on the real axis. Choose the candidate that
     # is nearest to a pole.
     for angle_guess in (0.0 * radius, 0.0 * radius + np.pi, *count_poles(radius, loop, fractional).crossovers):
         distance = newton_step(radius, angle_guess, loop, fractional).radius
         im, least_distance = np.where(distance < least_distance, angle_guess, im), np.minimum(distance, least_distance)
-    point = repeat(POLISHING_STEPS, lambda point: halley_step(*point, loop, fractional), (radius, im), np)
+    point = iterate(POLISHING_STEPS, lambda point: halley_step(*point, loop, fractional), (radius, im), np)
     poles = certify_pole(*point, tolerance, loop, fractional, False)
     # Near multiple poles the steps do not converge; keep the bisected radius.
     return poles._replace(re=np.where(poles.certified, poles.re, radius))
@@ -369,7 +369,7 @@ def _find_in_rounds(begin: Any, end: Any, loop: LoopFactors, fractional: bool) -
             width = xp.minimum(certification_width(re, tolerance) * 10.0 ** (k - first_trial), epsilon(re) ** 0.5)
             log_r = xp.where(k > BISECTIONS, re + width, middle)
             poles_outside = count_poles(log_r, loop, fractional)
-            inside_level = store_once(
+            inside_level = materialize(
                 xp.where(poles_outside.all_inside, xp.where(poles_outside.certain, 2.0, 1.0), 0.0), log_r
             )
             certifies = (
@@ -405,8 +405,8 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
     It is NaN if it could not be certified, or if the dominant pole is a multiple one.
     """
     xp = namespace(alpha, beta, delta, d)
-    loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
-    re, im, certified = _find_traced(frozen(loop, xp), fractional)
+    loop = materialize(factor_loop(alpha, beta, delta, d, fractional), delta)
+    re, im, certified = _find_traced(stop_gradient(loop, xp), fractional)
 
     def evaluate(log_pole: Array, loop: LoopFactors) -> list[Array]:
         return [
@@ -418,4 +418,4 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
         lambda *x: evaluate(*x)[0], make_complex(re, im), lambda *_: True, loop, slope=lambda *x: evaluate(*x)[1]
     )
     (log_radius,) = nan_unless(certified, log_pole.real)
-    return log_radius + nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    return log_radius + nan_with_nan_derivatives(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)

@@ -19,7 +19,7 @@ import numpy as np
 from zwidth.arrays.polynomials import abs2
 from zwidth.loops.rigid.circle import LoopFactors
 from zwidth.words.types import Array
-from zwidth.words.xp import COSINE, SINE, epsilon, horner, namespace, store_once
+from zwidth.words.xp import COSINE, SINE, epsilon, horner, materialize, namespace
 
 # Bound of the rounding error of P, in rounding units of the sum of the moduli of its terms. The rounding error of the
 # angle p im is added separately.
@@ -93,7 +93,7 @@ def _sine_and_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
 def _store_pair(value: Any, witness: Array) -> Any:
     """Return a pair that XLA computes only once, although several of its loops use the pair."""
     # Otherwise five loops would each repeat the series of this pair; computing it once saves 30 % of a step's time.
-    return Pair(*store_once((value.real, value.imag), witness))
+    return Pair(*materialize((value.real, value.imag), witness))
 
 
 def evaluate_polynomial(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> PolynomialValue:

@@ -37,7 +37,7 @@ from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import LONGEST_DELAY, MOST_POLES
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, Radii, RadiiFirst, Reals, Roots, RootsFirst
-from zwidth.words.xp import epsilon, is_traced, namespace, nan_with_nan_slopes, repeat, store_once
+from zwidth.words.xp import epsilon, is_traced, iterate, materialize, namespace, nan_with_nan_derivatives
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
 
@@ -59,7 +59,7 @@ BLOCK_SIZE = 1 << 15
 def factor_with_pole_axis(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> LoopFactors:
     """Return the factors of P of each wall, with a new first axis for its poles; NaN if the wall is out of range."""
     xp = namespace(alpha, beta, delta, d)
-    loop = store_once(factor_loop(alpha, beta, delta, d, degree.fractional), delta)
+    loop = materialize(factor_loop(alpha, beta, delta, d, degree.fractional), delta)
     return LoopFactors(*(xp.asarray(part)[None] for part in loop))
 
 
@@ -168,9 +168,9 @@ def compute_discs(z: RootsFirst, loop: LoopFactors, degree: Degree) -> tuple[Rad
 def aberth_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> tuple[Roots, Radii, Array]:
     """Return all poles, a bound of each error, and whether the bounds are certified and the iteration has converged."""
     loop = factor_with_pole_axis(alpha, beta, delta, d, degree)
-    nan_if_invalid = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    nan_if_invalid = nan_with_nan_derivatives(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
     xp, steps = namespace(loop.c), MIN_ABERTH_STEPS + degree.poles // 2
-    z = repeat(steps, lambda z: _take_aberth_step(z, loop, degree), _guess_poles(loop, degree), xp)
+    z = iterate(steps, lambda z: _take_aberth_step(z, loop, degree), _guess_poles(loop, degree), xp)
     radius, disjoint, converged = compute_discs(z, loop, degree)
     # If a disc contains exactly one pole and meets the real axis, this pole is real, unless its conjugate is in a
     # neighboring disc.
@@ -203,7 +203,7 @@ def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, d
     """Improve poles by short Newton steps, each accepted only if it lowers |P|; multiple poles are not moved."""
     xp = namespace(z, alpha)
     loop = factor_with_pole_axis(alpha, beta, delta, d, degree)
-    nan_if_invalid = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    nan_if_invalid = nan_with_nan_derivatives(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
 
     def evaluate(z: RootsFirst) -> tuple[Pair, Pair]:
         return _evaluate(_split(z), loop, degree)
@@ -219,7 +219,7 @@ def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, d
         )
 
     first = xp.moveaxis(z, -1, 0)
-    last = repeat(POLISHING_STEPS, step, first, xp)
+    last = iterate(POLISHING_STEPS, step, first, xp)
     better = abs2(evaluate(last)[0]) < abs2(evaluate(first)[0])
     return xp.moveaxis(xp.where(better, last, first), 0, -1) + nan_if_invalid[..., None]
 

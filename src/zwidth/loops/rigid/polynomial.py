@@ -20,7 +20,7 @@ from zwidth.loops.rigid.folding import Degree, map_by_degree
 from zwidth.loops.rigid.normalization import valid_wall
 from zwidth.loops.rigid.ridge_newton import evaluate_wall, evaluate_wave_at, expand_curve
 from zwidth.words.types import Array, ArrayLike, Coefficients, Reals
-from zwidth.words.xp import namespace, nan_with_nan_slopes
+from zwidth.words.xp import namespace, nan_with_nan_derivatives
 
 
 def expand_affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
@@ -117,5 +117,5 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike)
 
 
 def _char_poly_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
-    nan_if_invalid = nan_with_nan_slopes(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    nan_if_invalid = nan_with_nan_derivatives(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
     return compute_coefficients(alpha, beta, delta, d, degree) + nan_if_invalid[..., None]

@@ -23,8 +23,8 @@ from zwidth.arrays.roots import bisect
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.folding import find_degree
 from zwidth.loops.rigid.outermost_poles import find_dominant_pole
-from zwidth.parts.checks import check_whole
-from zwidth.words.showing import shown
+from zwidth.parts.checks import check_integer
+from zwidth.words.showing import compact_repr
 from zwidth.words.types import Array, Samples
 
 SETTLING_BAND = 0.02  # relative deviation from the final position that counts as settled, as in control textbooks
@@ -107,7 +107,7 @@ def decay_time(rate: Array) -> Array:
         return np.where(rate > 0, -math.log(SETTLING_BAND) / rate, np.where(np.isnan(rate), np.nan, np.inf))
 
 
-@shown()
+@compact_repr()
 class StepResponse(NamedTuple):
     """Response of the device, at rest in contact with the wall, to a constant external force that begins at time 0."""
 
@@ -195,8 +195,8 @@ def step_response(
     """
     alpha, beta, force = as_number("alpha", alpha), as_number("beta", beta), as_number("force", force)
     delta, d = as_number("delta", delta, 0.0), as_number("d", d, 0.0)
-    periods = check_whole("periods", periods, 1, 10**7)
-    substeps = check_whole("substeps", substeps, 1, 10_000)
+    periods = check_integer("periods", periods, 1, 10**7)
+    substeps = check_integer("substeps", substeps, 1, 10_000)
     fractions = np.arange(substeps) / substeps
     with np.errstate(all="ignore"):
         samples = _simulate(alpha, beta, delta, d, force, periods)

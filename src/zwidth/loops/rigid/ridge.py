@@ -44,7 +44,7 @@ from zwidth.words.errors import check_choice
 from zwidth.words.results import RidgePoint
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array, ArrayLike
-from zwidth.words.xp import epsilon, horner, namespace, nan_unless, push_forward, store_once
+from zwidth.words.xp import differentiate_along, epsilon, horner, materialize, namespace, nan_unless
 
 
 def _compute_chi(x: Array, gap: Array) -> Array:
@@ -197,7 +197,9 @@ def differentiate_point(
     point, has_converged = _make_point(ridge, status), converged(ridge)
 
     def differentiate(change: Plant) -> RidgePoint:
-        derivatives = push_forward(lambda plant: recompute_ridge(ridge.s, plant, n, kind), (plant,), (change,), np)
+        derivatives = differentiate_along(
+            lambda plant: recompute_ridge(ridge.s, plant, n, kind), (plant,), (change,), np
+        )
         return point._replace(
             **dict(zip(RidgePoint._fields, nan_unless(has_converged, *derivatives[:3]), strict=False))
         )
@@ -220,9 +222,9 @@ def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlop
     xp, wave = namespace(ridge.s), evaluate_wave(ridge.s, n, not kind.long)
 
     def differentiate(change: Plant) -> Array:
-        return push_forward(lambda plant: evaluate_wall(wave, expand_curve(plant))[0], (plant,), (change,), xp)
+        return differentiate_along(lambda plant: evaluate_wall(wave, expand_curve(plant))[0], (plant,), (change,), xp)
 
-    slopes = map(differentiate, store_once(plant_slopes(delta, f), ridge.s))
+    slopes = map(differentiate, materialize(plant_slopes(delta, f), ridge.s))
     by_delta, by_d = nan_unless(converged(ridge), *slopes)
     return RidgeSlopes(_make_point(ridge, status), by_delta, by_d)
 
@@ -251,7 +253,7 @@ def _solve_point(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Arr
         plant = discretize_mass(delta, f) if namespace(delta, f) is np else _jax_plant()(delta, f)
     else:
         plant = discretize_mass(delta)
-    ridge = store_once(differentiable_ridge(plant, n, start, kind), delta)
+    ridge = materialize(differentiable_ridge(plant, n, start, kind), delta)
     return ridge, status, plant, n, (delta, f)
 
 

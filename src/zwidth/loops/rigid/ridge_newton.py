@@ -22,7 +22,7 @@ import numpy as np
 
 from zwidth.arrays.held_mass import ANY, DelayClasses, DiscretePlant, Plant
 from zwidth.words.types import Array
-from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
+from zwidth.words.xp import ARCSINE, COSINE, SINE, epsilon, horner, iterate, materialize, namespace, stop_gradient
 
 
 class Curve(NamedTuple):
@@ -207,7 +207,7 @@ def guess_start(
 ) -> Start:
     """Return the starting point of Newton's method from a fit over delta and d; ``strength`` = 1: delta -> infinity."""
     xp = namespace(delta, d)
-    delta, d, f = frozen((delta, d, fraction), xp)
+    delta, d, f = stop_gradient((delta, d, fraction), xp)
     r = delta * (d + 1.0)
     u, t = 1.0 / (d + 1.0), r / (r + 3.0) if strength is None else strength
     s = power = corner = zero = 0.0 * u
@@ -242,7 +242,7 @@ def _find_stationary(curve: Curve, n: Array, start: Start, undelayed: bool) -> t
         new = s - first * s / (second * s + start.power * first)
         return xp.minimum(xp.maximum(new, lower), upper), s
 
-    s, before = repeat(NEWTON_STEPS, step, (s, s), xp)
+    s, before = iterate(NEWTON_STEPS, step, (s, s), xp)
     return s, s - before
 
 
@@ -250,7 +250,7 @@ def solve_ridge(plant: Plant | DiscretePlant, n: Array, start: Start, kind: Dela
     """Return the ridge of one plant with a delay of n periods."""
     xp = namespace(plant.a2, n)
     undelayed = not kind.long
-    curve = expand_curve(store_once(plant, start.scale))
+    curve = expand_curve(materialize(plant, start.scale))
     s, last = _find_stationary(curve, n, start, undelayed)
     # Keep s below 1, because a smooth maximum near the corner may round to 1.
     s = xp.minimum(s, 1.0 - 0.5 * epsilon(s))

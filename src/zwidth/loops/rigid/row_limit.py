@@ -25,7 +25,7 @@ from zwidth.loops.rigid.crossover import expand_long_delay_curve, expand_short_d
 from zwidth.loops.rigid.folding import Points, group_by_value
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
-from zwidth.words.xp import COSINE, SINE, horner, namespace, nan_beyond, repeat
+from zwidth.words.xp import COSINE, SINE, horner, iterate, namespace, nan_beyond
 
 # Newton steps. Each doubles the number of correct digits.
 END_STEPS = 6  # to the end of a lobe; the last one only confirms
@@ -229,7 +229,7 @@ def _find_lobe_end(lobe: LongLobe, start_ratio: Array, d: Array) -> Array:
     # Use a loop, which compiles five times faster than unrolled steps. Its slower execution does not matter, because
     # each device is solved once.
     start = 0.5 * np.pi / n_plus_1 * (1.0 + 0.7 * start_ratio / (start_ratio + 1.0 / n_plus_1))
-    return repeat(END_STEPS, step, start, xp)
+    return iterate(END_STEPS, step, start, xp)
 
 
 def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:

@@ -34,7 +34,7 @@ from zwidth.studies.document import Config, load_config
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OF_PARTS, PARAMETERS, Parameter
 from zwidth.words.unit_system import LINEAR, ROTARY, UnitSystem
-from zwidth.words.units import spell_exactly
+from zwidth.words.units import format_exactly
 
 _MOST_POLES = 80  # largest number of poles; more poles take too long to follow a dragged slider
 _LARGEST = 1e100  # largest magnitude of a number from the page, in units of the page
@@ -340,7 +340,7 @@ def _add_units(value: Any, system: UnitSystem, path: str = "") -> Any:
     if isinstance(value, list | tuple):
         return [_add_units(part, system, f"{path}.{k}") for k, part in enumerate(value)]
     unit = system[get_unit(path)]
-    return spell_exactly(value, unit) if unit else value
+    return format_exactly(value, unit) if unit else value
 
 
 def to_yaml(controls: Controls) -> str:
@@ -380,4 +380,4 @@ def _spell(value: Any, path: str, system: UnitSystem | None) -> str:
     if isinstance(value, tuple) and any(hasattr(item, "__dataclass_fields__") for item in value):
         return f"[{', '.join(_spell(item, f'{path}.{k}', system) for k, item in enumerate(value))}]"
     unit = get_unit(path)
-    return json.dumps(spell_exactly(value, system[unit])) if system and unit else repr(value)  # pyright: ignore
+    return json.dumps(format_exactly(value, system[unit])) if system and unit else repr(value)  # pyright: ignore

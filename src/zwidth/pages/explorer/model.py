@@ -28,7 +28,7 @@ from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of, round_margin, trace_passivity_boundary
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.ending import describe_ending
-from zwidth.words.formatting import plain, round_safely, tell_apart
+from zwidth.words.formatting import format_interval, plain, round_conservatively
 
 Curve = tuple[np.ndarray, np.ndarray]
 Range = tuple[float, float]
@@ -214,12 +214,12 @@ def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
 
 def format_normalized_verdict(verdict: Assessment) -> list[str]:
     """Return the lines of the verdict on a normalized wall, in units of the sampling period and the mass."""
-    span = " to ".join(tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper))
+    span = " to ".join(format_interval(verdict.virtual_damping_lower, verdict.virtual_damping_upper))
     gain, phase, delay, modulus = (
         plain(round_margin(f"{name}_margin", verdict, verdict.stable)) for name in ("gain", "phase", "delay", "modulus")
     )
     limit, spare, most = (
-        plain(round_safely(end, "below"))
+        plain(round_conservatively(end, "below"))
         for end in (verdict.stiffness_limit, verdict.passivity_margin, verdict.alpha_max)
     )
     rows = {

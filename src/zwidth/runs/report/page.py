@@ -36,8 +36,8 @@ from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, hash_file
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.store import SUFFIX, Store
 from zwidth.words.errors import StoreError
-from zwidth.words.files import write_whole
-from zwidth.words.formatting import tell_apart
+from zwidth.words.files import write_atomically
+from zwidth.words.formatting import format_interval
 from zwidth.words.quantities import OUTPUTS, STATUS_OF, VARIABLES
 from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS
@@ -90,7 +90,7 @@ def write_report(folder: str | os.PathLike[str], out: str | os.PathLike[str] | N
         raise StoreError(f"{where}: no study of the run is done; continue it with 'zwidth run CONFIG --resume'")
     _check_files(record, done)
     target = where / FILE if out is None else Path(os.fsdecode(out))
-    write_whole(target, _write_page(where, record.content, done).encode())
+    write_atomically(target, _write_page(where, record.content, done).encode())
     return target
 
 
@@ -335,7 +335,7 @@ def _explain_colors(scale: ColorScale, unit: str) -> str:
         "max": "; higher values: arrow",
         "both": "; values outside: arrows",
     }
-    return f"Color bar: {' to '.join(tell_apart(scale.low, scale.high))} {unit}".rstrip() + ends[scale.extend]
+    return f"Color bar: {' to '.join(format_interval(scale.low, scale.high))} {unit}".rstrip() + ends[scale.extend]
 
 
 def _encode_edges(part: xarray.DataArray, x: str, edges: Edges) -> dict[str, list[str]]:

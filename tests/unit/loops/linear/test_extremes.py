@@ -12,7 +12,7 @@ import pytest
 import zwidth
 from zwidth.loops.linear.curve import evaluate_curve
 from zwidth.loops.linear.held import discretize_states, evaluate_controller
-from zwidth.parts.circle import circle
+from zwidth.parts.circle import circle_points
 
 T = 1e-3
 Draw = Callable[[float, float], float]
@@ -119,7 +119,7 @@ def test_roots_just_before_a_whole_delay_are_those_of_the_exact_response(before,
     response = discretize_states(loop.chain)
     for w in (1e-3, 0.1, 1.0, 3.0):
         exact = evaluate_controller(loop.chain, w, response)
-        np.testing.assert_allclose(loop.roots.evaluate_controller(circle(w)).value, exact, rtol=1e-11)
+        np.testing.assert_allclose(loop.roots.evaluate_controller(circle_points(w)).value, exact, rtol=1e-11)
 
 
 def test_zeros_that_a_period_forgets_are_right_together():
@@ -131,7 +131,7 @@ def test_zeros_that_a_period_forgets_are_right_together():
     response = discretize_states(loop.chain)
     for w in (1e-3, 0.1, 1.0, 3.0):
         exact = evaluate_controller(loop.chain, w, response)
-        np.testing.assert_allclose(loop.roots.evaluate_controller(circle(w)).value, exact, rtol=1e-10)
+        np.testing.assert_allclose(loop.roots.evaluate_controller(circle_points(w)).value, exact, rtol=1e-10)
 
 
 def test_a_device_without_any_damping_is_not_stable_behind_a_spring_alone():

@@ -7,7 +7,7 @@ import pytest
 from zwidth.loops.rigid.normalization import device_status, wall_status
 from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE
 from zwidth.words.status import Status
-from zwidth.words.xp import nan_unless, nan_with_nan_slopes
+from zwidth.words.xp import nan_unless, nan_with_nan_derivatives
 
 
 @pytest.mark.parametrize("place, end", [(0, LARGEST_DAMPING), (1, LONGEST_DELAY)])
@@ -38,7 +38,7 @@ def test_ends_of_a_wall(place, sign):
 
 
 @pytest.mark.parametrize(
-    "mark", [lambda ok, x: nan_unless(ok, x)[0] ** 2, lambda ok, x: x * x + nan_with_nan_slopes(ok, x)]
+    "mark", [lambda ok, x: nan_unless(ok, x)[0] ** 2, lambda ok, x: x * x + nan_with_nan_derivatives(ok, x)]
 )
 def test_a_bad_point_is_nan_with_its_derivatives_and_a_good_one_untouched(mark):
     for order in range(3):
