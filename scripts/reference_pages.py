@@ -1,4 +1,7 @@
+#!/usr/bin/env python3
 """Generate the tables of the reference pages: commands, configuration files, units and status codes.
+
+    scripts/reference_pages.py NAME      prints one of them
 
 `scripts/refresh_docs.py` writes them between ``<!-- include: NAME -->`` and ``<!-- end -->``.
 """
@@ -7,6 +10,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +29,7 @@ SECTION = "Section"  # suffix of the models of scene components
 
 def list_commands() -> str:
     """Return one section per command, then the tables of the options that several commands share."""
-    context = click.Context(cli, info_name="zwidth")
+    context = click.Context(cli, info_name="zwidth", **cli.context_settings)
     shared: dict[str, dict[str, str]] = {name: {} for name in GROUPS if name != OWN}
     parts = [_describe_command(cli.commands[name], context, shared) for name in sorted(cli.commands)]
     parts.append("## Shared options")
@@ -187,7 +191,7 @@ def _short(value: Any) -> str:
 
 
 def _escape(text: str) -> str:
-    return _join_lines(text).replace("|", "\\|")
+    return _join_lines(text).replace("|", "\\|").replace("[", "\\[")
 
 
 def _join_lines(text: str) -> str:
@@ -204,3 +208,6 @@ TABLES = {
     "units": list_units,
     "statuses": list_statuses,
 }
+
+if __name__ == "__main__":
+    print(TABLES[sys.argv[1]]())

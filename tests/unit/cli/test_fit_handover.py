@@ -85,7 +85,7 @@ def test_beyond_the_safe_limit_only_on_demand_and_with_a_warning(tmp_path):
     assert free["stiffness"] > 12e3
     assert not true.is_stable(free["stiffness"], free["virtual_damping"])
     wall = "--stiffness", free["stiffness"], "--virtual-damping", free["virtual_damping"]
-    assert "; CAUTION: exceeds the safe limit" in " ".join(run("check", file, *wall).split())
+    assert "; CAUTION: limit cycle, exceeds the safe limit" in " ".join(run("check", file, *wall).split())
     assert "this wall exceeds the safe limit" in json.loads(run("check", file, *wall, "--json"))["cautions"][0]
     assert "exceeds the safe limit" in " ".join(run("simulate", file, *wall, "--duration", "100 periods").split())
     own = "--stiffness", document["stiffness"], "--virtual-damping", document["virtual_damping"]

@@ -44,8 +44,8 @@ def test_a_filter_and_a_compliance():
 def test_what_cannot_be_computed_comes_last(monkeypatch):
     scene = RIGID.replace(velocity=LowPass(cutoff=100.0), coupling=Coupling(0.05, 2e4, 1.0))
     names = [limit.name for limit in limits_of(scene)]
-    known, half = assessment._stiffness, Timing(1e-3, 0.5e-3)
-    monkeypatch.setattr(assessment, "_stiffness", lambda of: np.nan if of.timing == half else known(of))
+    known, half = assessment._compute_max_stiffness, Timing(1e-3, 0.5e-3)
+    monkeypatch.setattr(assessment, "_compute_max_stiffness", lambda of: np.nan if of.timing == half else known(of))
     names.remove("delay")
     assert [limit.name for limit in limits_of(scene)] == [*names, "delay"]
 
@@ -87,5 +87,5 @@ def test_amplifier_and_structure():
 
 def test_a_window_too_long_for_twice_the_rate_has_no_such_step(monkeypatch):
     # Which steps there are does not depend on how stiff they make the wall.
-    monkeypatch.setattr(assessment, "_stiffness", lambda of: 1.0)
+    monkeypatch.setattr(assessment, "_compute_max_stiffness", lambda of: 1.0)
     assert "period" not in {limit.name for limit in limits_of(RIGID.replace(velocity=WindowedDifference(70)))}

@@ -42,7 +42,7 @@ REAL_TOLERANCE = 1e-13  # imaginary part of a real pole, relative to |zeta|; sma
 BLOCK_SIZE = 1 << 20  # values per block of walls; eigenvalues and pole differences take order^2 values per wall
 
 
-class PolynomialValue(NamedTuple):
+class FactoredValue(NamedTuple):
     """P, its derivative, and the sum of the magnitudes of its terms, which scales the rounding error of P."""
 
     value: Array
@@ -81,7 +81,7 @@ def log_modulus(zeta: Array) -> Array:
         return 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -1.0))
 
 
-def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> PolynomialValue:
+def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> FactoredValue:
     """Evaluate P and its derivative in the factored form, for arrays that broadcast."""
     f = loop.estimate
     delay = f.window + f.lag
@@ -95,7 +95,7 @@ def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array)
     wall = Jet(alpha * Q.value + beta * R.value, alpha * Q.slope + beta * R.slope)
     first, second = g_denominator.times(Q), g_numerator.times(wall)
     size = np.abs(first.value) + np.abs(g_numerator.value) * (np.abs(alpha * Q.value) + np.abs(beta * R.value))
-    return PolynomialValue(first.value + second.value, first.slope + second.slope, size)
+    return FactoredValue(first.value + second.value, first.slope + second.slope, size)
 
 
 def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
