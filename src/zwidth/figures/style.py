@@ -73,7 +73,7 @@ Size: TypeAlias = tuple[float, float | None]
 _ONE_COLUMN = 5.0  # least width of a figure with several columns of panels, in inches, because labels need room
 
 
-class _Settings(NamedTuple):
+class _FigureSettings(NamedTuple):
     """Settings of figures in the current context, in addition to matplotlib's rcParams."""
 
     style: Mapping[Any, Any] = {}  # rcParams of a style sheet, which override the house style
@@ -82,8 +82,8 @@ class _Settings(NamedTuple):
     system: UnitSystem = LINEAR  # units of axes and labels
 
 
-_DEFAULTS = _Settings()
-_settings: ContextVar[_Settings] = ContextVar("settings", default=_DEFAULTS)
+_DEFAULTS = _FigureSettings()
+_settings: ContextVar[_FigureSettings] = ContextVar("settings", default=_DEFAULTS)
 
 
 @contextmanager
@@ -121,7 +121,9 @@ def style_sheet(
         style = outer.style if file is None else dict(rc_params_from_file(file, use_default_template=False))
     except OSError as error:
         raise InputError(f"style: {file}: {error.strerror}; name a style sheet of matplotlib") from error
-    with set_temporarily(_settings, _Settings(style, outer.size or size, outer.dpi or dpi, system or outer.system)):
+    with set_temporarily(
+        _settings, _FigureSettings(style, outer.size or size, outer.dpi or dpi, system or outer.system)
+    ):
         yield
 
 

@@ -40,7 +40,7 @@ FRICTION = 6  # c, deceleration by the Coulomb friction
 N_COLUMNS = 7
 
 
-class Parts(NamedTuple):
+class SlipParts(NamedTuple):
     """The two parts of all periods, arrays of shape (2, periods), and the stops within them."""
 
     start: np.ndarray  # velocity at the start of each part
@@ -116,7 +116,7 @@ class Recording:
 
 def _integrate_without_friction(
     acceleration: np.ndarray, spans: np.ndarray, phi: PhiFunctions, delta: float, v0: float, friction: float
-) -> Parts:
+) -> SlipParts:
     """Return the velocities of a mass without friction; ``friction`` is ignored.
 
     Args:
@@ -132,12 +132,14 @@ def _integrate_without_friction(
     start = np.append(v0, late[:-1])
     middle, none = phi.c[0] * start + gains[0], np.zeros(0, int)
     still = np.zeros_like(gains)
-    return Parts(np.array([start, middle]), np.array([middle, late]), still, still > 0, (none, none, 0.0 * none, none))
+    return SlipParts(
+        np.array([start, middle]), np.array([middle, late]), still, still > 0, (none, none, 0.0 * none, none)
+    )
 
 
 def _integrate_with_friction(
     acceleration: np.ndarray, spans: np.ndarray, phi: PhiFunctions, delta: float, v0: float, friction: float
-) -> Parts:
+) -> SlipParts:
     """Return the velocities of a mass with friction, and its stops; arguments as `_integrate_without_friction`."""
     count, slow, rates = acceleration.size, phi.c.tolist(), (spans * phi.phi1).tolist()
     # All parts are treated in the order of time. Let G_k be s v at the end of part k for a mass that starts at rest and
@@ -207,11 +209,11 @@ def _integrate_with_friction(
     start, end, direction, sticks = (
         np.ascontiguousarray(each.reshape(-1, 2).T) for each in (np.append(v0, end[:-1]), end, direction, sticks)
     )
-    return Parts(start, end, direction, sticks, (k % 2, k // 2, before, after))
+    return SlipParts(start, end, direction, sticks, (k % 2, k // 2, before, after))
 
 
 def _integrate_positions(
-    parts: Parts,
+    parts: SlipParts,
     force: np.ndarray,
     acceleration: np.ndarray,
     spans: np.ndarray,
