@@ -132,14 +132,15 @@ def split_delay(d: Array) -> tuple[Array, Array]:
 
 
 class DelayClasses(NamedTuple):
-    """The classes of delays among the points of a kernel, so that code for other classes is not executed."""
+    """The classes of delays that occur among the points of a kernel. Code for other classes is not executed."""
 
     short: bool  # below one period
     long: bool  # of one period or more
     fractional: bool  # not an integer
 
 
-# Delays of any class, for traced delays.
+# All three classes. The value of a delay traced by JAX is unknown at compilation, so the kernel needs the code for all
+# classes.
 ANY = DelayClasses(True, True, True)
 
 

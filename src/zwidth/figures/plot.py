@@ -331,7 +331,8 @@ def bode(
         upper.plot([phase_crossover] * 2, [1.0, 1.0 / gain], label=f"gain margin {rounded['gain']:.3g}", **bar)
     if np.isfinite(phase):
         angle = float(np.interp(gain_crossover, hertz, angles))
-        # Let the bar begin at the odd multiple of 180 degrees next to the phase, because there L would be negative.
+        # Start the bar at the odd multiple of 180 degrees nearest to the phase, because L is real and negative at this
+        # phase.
         foot = angle - (angle + 180.0 + 180.0) % 360.0 + 180.0
         lower.plot([gain_crossover] * 2, [foot, angle], label=f"phase margin {rounded['phase']:.3g}°", **bar)
     upper.set(yscale="log", ylabel="$|L|$")

@@ -104,8 +104,8 @@ def mark_wall(
     if text:
         place: Any = {"xytext": (6 if right else -8, 0), "ha": "left" if right else "right", "va": "center"}
         if room < _LETTER_WIDTH * max(map(len, text.split("\n"))) + 8:
-            # Write the text above the mark from the vertical axis on, with a white background, because lines may cross
-            # the text there.
+            # Write the text above the mark, starting at the vertical axis. Give the text a white background, because
+            # lines may cross the text there.
             background = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 1.0}
             place = {"xytext": (4 - room, 6), "ha": "left", "va": "bottom", "bbox": background}
         ax.annotate(text, wall, textcoords="offset points", fontsize=8, zorder=6, **place)

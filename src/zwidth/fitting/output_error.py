@@ -153,8 +153,8 @@ class FittedModel:
     @cached_property
     def excess(self) -> float:
         """The mean square of sums of neighboring residuals, relative to that of the noise; 1 if not significant."""
-        # The sums have twice the cube root of the number of samples, a usual bandwidth for errors of unknown
-        # autocorrelation (Newey, West 1987).
+        # Each sum adds 2 N^(1/3) of the N residuals. This is a usual bandwidth for errors of unknown autocorrelation
+        # (Newey, West 1987).
         from scipy.special import chdtri
 
         weights, total = self.model.noise or self.noise, self.residuals.size

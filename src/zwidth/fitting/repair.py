@@ -320,7 +320,7 @@ def _filter_median(values: np.ndarray, reach: int) -> np.ndarray:
 
 
 class EvenTimes(NamedTuple):
-    """Samples at even times whose timestamps were rounded to the ticks of a coarse clock."""
+    """Evenly spaced samples whose timestamps were rounded to the ticks of a coarse clock."""
 
     place: np.ndarray  # time of each sample, in periods after the first sample
     tick: float  # s
@@ -328,7 +328,9 @@ class EvenTimes(NamedTuple):
 
 
 def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
-    """Return samples at even times if the timestamps are such times rounded to ticks, e.g. to 1 ms; None otherwise.
+    """Return the evenly spaced times that a coarse clock has rounded to its ticks, e.g. to 1 ms.
+
+    Return None if the timestamps are not rounded, or if the times before rounding were not evenly spaced.
 
     Raises:
         InputError: the ticks are the periods of a loop that logs only some of its samples.

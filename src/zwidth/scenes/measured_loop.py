@@ -78,9 +78,10 @@ class MeasuredLoop(LinearLoop):
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod = "auto", exact: Any = ()
     ) -> Stability:
-        """Return labels and status; UNDECIDED if lines are too far apart or too uncertain, or their range too narrow.
+        """Return for each wall whether it is stable, and whether the measured response is sufficient to decide this.
 
-        The argument ``exact`` of the base class is ignored.
+        The status is UNDECIDED if the lines are too far apart or have too large errors, or
+        if the range of measured frequencies is too narrow. The argument ``exact`` of the base class is ignored.
         """
         if method not in ("auto", "crossover"):
             raise InputError(f"method: got {method!r}, which needs a model; use 'crossover' for a measured response")

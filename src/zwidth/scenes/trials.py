@@ -83,13 +83,13 @@ class Experiment(NamedTuple):
 
     @property
     def present(self) -> dict[str, float]:
-        """The present wall and hardware, by the argument names of `simulate`."""
+        """The wall of the scene and the hardware, by the argument names of `simulate`."""
         wall = self.scene.wall
         walls = {"stiffness": float(wall.stiffness), "virtual_damping": float(wall.virtual_damping)}
         return self.hardware._asdict() | walls
 
     def measure(self, **changes: Any) -> SustainedMotion:
-        """Run one trial for each value of the changed parameters, all other parameters at their present values."""
+        """Run one trial for each value of the changed parameters, with the values of `present` for all others."""
         count = max([np.size(value) for value in changes.values()], default=1)
         width = TRIALS if self.scene.d <= LONG_DELAY else 1
         rows = [np.minimum(np.arange(start, start + width), count - 1) for start in range(0, count, width)]
@@ -125,7 +125,7 @@ class Experiment(NamedTuple):
 
 
 def list_starts(scene: Any, hardware: Hardware) -> Starts:
-    """Return the initial conditions for the present wall and hardware."""
+    """Return the initial conditions of the simulations of a trial with the wall of ``scene`` and with ``hardware``."""
     K, Q, period = float(scene.wall.stiffness), hardware.resolution, scene.timing.period
     position = [Q * factor for factor in DISPLACEMENTS if Q > 0]
     half_steps = [0.0] * len(position) + [1.0] * len(position)

@@ -71,9 +71,10 @@ def find_system(scenes: list[Any]) -> UnitSystem:
 
 
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments with one initial position and velocity per body, such as "start_position.tip_position".
+    """Return the arguments with ``start_position`` and ``start_velocity`` split into one argument per body.
 
-    A body for which the user specifies no initial value has that of the device.
+    An example of a new argument is "start_position.tip_position". A body for which the user specifies no initial value
+    has that of the device.
     """
     bodies = dict.fromkeys(["position", *(name for scene in scenes for name in name_bodies(scene))])
     for name in STARTS:

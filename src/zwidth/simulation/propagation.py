@@ -242,13 +242,17 @@ class _Joint(NamedTuple):
         held, driven, limit = slip == 0, self.drive(slip), jnp.minimum(state.left, self.longest)
 
         def search(trip: _Trip, turn: Array) -> Any:
-            """Propagate over the whole step (turn 0), to the minimum of the reserve (turn 1), or to the event (turn 2).
+            """Propagate by one of three searches: over the whole step, to the minimum of the reserve, or to the event.
 
-            Turns 1 and 2 apply only to the batch entries whose reserve has a minimum, or is negative after turn 1.
+            Args:
+                trip: result of the previous search.
+                turn: index of the search, 0, 1 or 2. Search 1 applies only to the batch entries whose reserve has a
+                    minimum during the step, search 2 only to those whose reserve is negative after search 1.
             """
             side = self.find_side(x, trip.far)
             wanted = jnp.stack([self.dips(x, slip, trip.far, side), self.reserve(trip.x, slip, side) < 0])
-            # In turn 0 all entries are propagated, and the index -1 reads a value that is not used.
+            # Search 0 propagates all batch entries. Its index turn - 1 = -1 is out of range, but has no effect, because
+            # ``turn == 0`` is true for all entries.
             wanted = (turn == 0) | read(wanted, turn - 1)
 
             def keep(after: Array) -> Array:

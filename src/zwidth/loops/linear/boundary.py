@@ -433,7 +433,8 @@ def _estimate_crossing(below: np.ndarray, above: np.ndarray, first: _RowValues, 
     share = -first.ratio / rise
     bends = rise * (1.0 - share) / first.ratio_slope, rise * share / last.ratio_slope
     cubic = below + share * (share * (3.0 - 2.0 * share) * width + (1.0 - share) * (bends[0] - bends[1]))
-    # The parabola uses the smaller of the two derivatives, because near an extremum of beta it vanishes at one end.
+    # The parabola has the values of ``ratio`` at both angles, and its derivative at the angle where the derivative is
+    # smaller. Near an extremum of beta, this derivative vanishes, and the cubic fails.
     flat = np.abs(first.ratio_slope) < np.abs(last.ratio_slope)
     start, slope = np.where(flat, first.ratio, last.ratio), np.where(flat, first.ratio_slope, -last.ratio_slope) * width
     rise = np.where(flat, rise, -rise)

@@ -151,8 +151,9 @@ def list_circle_zeros(loop: LoopRoots) -> np.ndarray:
     return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
 
 
-# Errors of alpha between two nodes, relative to `CurvePoints.size`
-COARSE_TOLERANCE = 0.02  # added to 1.5 times the difference of the nodes if alpha may not be interpolated
+# Errors of alpha between two nodes, relative to `CurvePoints.size`. If linear interpolation between the nodes is not
+# accurate, the bound of the error is COARSE_TOLERANCE plus 1.5 times the difference of alpha between the nodes.
+COARSE_TOLERANCE = 0.02
 ROUNDING_TOLERANCE = 1e-6  # bound of the rounding errors
 
 
@@ -278,9 +279,10 @@ def bound_interpolation(
     Returns:
         Two arrays of shape (nodes,); an entry describes the step from the previous node.
     """
-    # If the slope of beta hardly changes over a step, linear interpolation misses alpha by at most an eighth of the
-    # step times the change of alpha's slope, plus the curvature of beta. Allow four times this error. For other steps
-    # allow more than the difference of both ends.
+    # Interpolate alpha linearly in beta if d beta/dw changes by less than a factor of 2 over the step. If alpha(w) and
+    # beta(w) are quadratic, the error is at most the sum of two terms: step/8 times the change of d alpha/dw, because
+    # alpha(w) is curved, and |ratio - 1|/6 times the change of alpha, because beta(w) is curved. The bound is at least
+    # four times this sum. On other steps, the bound exceeds the difference of alpha between both nodes.
     with np.errstate(all="ignore"):
         ratio = beta_slope / np.roll(beta_slope, 1)
         straight = (ratio > 0.5) & (ratio < 2.0)

@@ -190,8 +190,8 @@ def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> RidgeSolu
         and other - w > 1e-6
     ):
         return RidgeSolution(alpha, beta, w, other, _classify_angle(w), _classify_angle(other))
-    # A double pole at z = -1, or at z = 1 for a device that moves against its force: the curve ends there, on the
-    # crossing line.
+    # The corner is a double pole at z = -1, or at z = 1 for a device with negative static gain. There, the end of the
+    # boundary curve lies on the crossing line.
     for w in (np.pi, 0.0):
         limit, damping = stable_set.boundary.limits[w]
         if abs(limit - alpha) <= NEAR_CORNER * abs(alpha):

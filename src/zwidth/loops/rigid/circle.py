@@ -33,8 +33,9 @@ from zwidth.words.xp import angle, apply_each, epsilon, invert_haversine, iterat
 CUBIC_STEPS = 6
 # Factor by which the bounds of a cell are widened, to cover their rounding errors.
 WIDENING = 1.0 + 1e-12
-# Points at which the range of w of a crossover over all walls of a cell is divided, relative to this range: end points
-# and midpoints, alternating, of four pieces. The phase change is bounded on each piece separately.
+# If the wall varies within a cell, the angle w of a crossover varies within an interval. This interval is divided into
+# four equal pieces, on each of which the phase change is bounded separately. These are the positions in the interval,
+# from 0 to 1, of the ends of the pieces (even indices) and of their midpoints (odd indices).
 PIECE_POINTS = np.arange(9)[:, None, None] / 8.0
 
 

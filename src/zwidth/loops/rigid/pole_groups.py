@@ -122,7 +122,10 @@ class Group(NamedTuple):
 
     @property
     def log_error(self) -> np.ndarray:
-        """Error of log |z| for one pole, or of the sums times U for two poles, by order and cell."""
+        """Bound of the error of log |z| for one pole, or of the sum of u over two poles, of shape (orders, cells).
+
+        The sum of u^2/U over two poles has at most twice this error.
+        """
         return (self.error + ROUNDING) * (self.disk / (1.0 - self.disk)) + ROUNDING * np.abs(self.re)
 
     def is_disjoint(self, other: Group) -> np.ndarray:

@@ -119,7 +119,8 @@ class Controls:
 
     scene: Scene = _SMALL_DEVICE
     normalized: bool = False
-    # Mass, period and kind (rotary or not) to which a normalized scene returns in SI units.
+    # Mass, period and kind (True if rotary) of the scene before its normalization. With these values, `_convert`
+    # converts a normalized scene back to SI units.
     scale: tuple[float, float, bool] = (0.1, 1e-3, False)
 
     @property

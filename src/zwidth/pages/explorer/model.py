@@ -166,8 +166,9 @@ def find_contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]
     for k, level in enumerate(LEVELS):
         lines: Any = generator.lines(level)
         for line in sorted(lines, key=len, reverse=True):
-            # Label only the longest piece of a level, at the point below the ridge (large K, small B). The weight of B
-            # decreases with the level, which moves each label closer to the tip and separates the labels.
+            # Label only the longest contour line of a level, at a point with large K and small B: the point with the
+            # largest K minus weighted B, both relative to the ranges of the axes. The weight decreases with the level,
+            # which moves the labels of higher levels toward larger K and so separates the labels of different levels.
             named = line[np.argmax(line[:, 0] / np.ptp(across) - (2.0 - 0.35 * k) * line[:, 1] / np.ptp(up))]
             text = f"{level:g}" if line is max(lines, key=len) else ""
             # Drop unlabeled pieces smaller than two cells of the grid, because the grid does not resolve them.
