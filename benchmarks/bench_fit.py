@@ -306,10 +306,11 @@ def share(found: list[bool]) -> str:
 
 
 def spell_widths(rows: list[dict[str, Any]]) -> str:
-    """How wide intervals of K_max are."""
+    """Return a sentence about the widths of the intervals of K_max."""
     widths = [row["width"] for row in rows if np.isfinite(row["width"])]
     middle, high = 100 * np.quantile(widths, [0.5, 0.9])
-    return f"{middle:.1f} % of it wide in the median, a tenth of them more than {high:.0f} %"
+    median = f"The median width of the intervals of K_max is {middle:.1f} % of K_max"
+    return f"{median}; one in ten is wider than {high:.0f} %."
 
 
 def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
@@ -322,7 +323,7 @@ def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
     doubted, troubled = sum(bool(row["doubts"]) for row in fitted), sum(row["status"] != 0 for row in fitted)
     return "\n".join([
         f"Refused: {len(rows) - len(fitted)}; with a doubt: {doubted}; with a status that is not OK: {troubled}.",
-        f"Intervals of K_max are {spell_widths(fitted)}.",
+        spell_widths(fitted),
         f"Without either, off by more than 5 standard errors in anything: {len(wrong)} of {len(sure)}.",
         f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}. They have {spread}:",
         "the logs do not show which resonances it has not.",

@@ -171,7 +171,7 @@ def list_units() -> str:
             units = ", ".join(f"`{unit}`" for unit in dimension.units)
             lines.append(f"| {dimension.base} | {units} | `{dimension.example}` |")
     words = ", ".join(f"`{word}`" for word in PERIOD_WORDS), ", ".join(f"`{word}`" for word in COUNTS)
-    return "\n".join(lines) + f"\n\nDelays also in {words[0]}, encoder positions also in {words[1]}."
+    return "\n".join(lines) + f"\n\nDelays can also be given in {words[0]}, encoder positions in {words[1]}."
 
 
 def list_statuses() -> str:

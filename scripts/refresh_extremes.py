@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write docs/extremes.md: which method holds where, measured against certified labels."""
+"""Write docs/extremes.md: which method holds where, measured against certified stability results."""
 
 from __future__ import annotations
 

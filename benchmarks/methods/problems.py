@@ -47,7 +47,7 @@ class Walls(NamedTuple):
 
 
 class Labelled(NamedTuple):
-    """Walls with certified labels and their relative distance in alpha from the boundary."""
+    """Walls with certified stability results and their relative distance in alpha from the boundary."""
 
     walls: Walls
     stable: np.ndarray

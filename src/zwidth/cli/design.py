@@ -74,7 +74,7 @@ _TOLERANCE = Parsed("NAME=SHARE", _read_tolerance, "write NAME=SHARE, such as ma
     show_default=True,
     help="Meaning of a tolerance: largest deviation (uniform), or standard deviation (normal).",
 )
-@click.option("--samples", type=int, help="Number of random devices.  [default: 10,000, or 200 for scenes with parts]")
+@click.option("--samples", type=int, help="Number of random devices.  [default: 10,000, or 200 with additional parts]")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random devices.")
 @json_option
 def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: bool, **drawn: Any) -> None:

@@ -116,10 +116,10 @@ def fit(
 ) -> None:
     """Identify mass, damping and delay of a device, and recommend a wall.
 
-    With LOG.csv: from its free motion under the force commanded by a computer; also identifies friction. Several logs
-    must be of the same device, with the same columns. Units are in the headers, as 'encoder [counts]', or follow a
-    colon. With --buzz: from walls, at two or more values of B, at which the device began to oscillate while K was
-    raised, and their frequencies.
+    With LOG.csv: from its free motion under the force commanded by a computer; also identifies friction. If several
+    logs are given, they must come from the same device and have the same columns. Units are in the headers, as 'encoder
+    [counts]', or follow a colon. With --buzz: from walls, at two or more values of B, at which the device began to
+    oscillate while K was raised, and their frequencies.
     SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, the motor's largest force, and
     the period of walls and of logs without a column of times; options override it. --max-force limits the force in the
     program of --code and in the simulation. Exit code 1: no wall is recommended (0 with --yaml).

@@ -86,7 +86,7 @@ def simulate(
     figure: Path | None,
     as_json: bool,
 ) -> None:
-    """Simulate a hit on a wall, a constant push, or the release of the device in the wall.
+    """Simulate a hit on a wall, a constant push, or the release of the device from inside the wall.
 
     In a hit the wall is unilateral; otherwise it is bilateral. Without --hit, --push and --hold the device is released
     at a depth of 1 mm (1 mrad if rotary), or of 50 encoder steps if --resolution is given. Required: --stiffness,

@@ -52,7 +52,7 @@ _RIDGE_POINTS = 101  # values of delta on the path of maximum stiffness
 
 @register
 class BoundaryStudy(CurvesStudy):
-    """Boundary of the stable virtual walls for each delta and d, or of a device with parts."""
+    """Boundary of the stable virtual walls for each delta and d, or for a device with parts such as an actuator."""
 
     method = "Closed form of the boundary, to a few rounding errors; the stable side by counting poles."
     reads_scene = True
@@ -150,7 +150,7 @@ class BoundaryStudy(CurvesStudy):
 
 
 def trace_device(device: PhysicalDevice, label: str) -> Outcome:
-    """Return the outlines of the stable set of a device with parts, islands and holes included, and its K_max."""
+    """Return the outlines of the stable set, with islands and holes, and K_max of a device with additional parts."""
     outlines, walls = tabulate_sets({label: device.to_scene()})
     if not outlines:
         return Outcome(notes=("no wall of this device is stable",))

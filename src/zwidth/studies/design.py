@@ -105,7 +105,7 @@ class DesignStudy(ComputedStudy):
     deviation."""
 
     samples: Count | None = None
-    """Number of random devices for each required stiffness. Default: 10000, or 200 for a device with parts."""
+    """Number of random devices for each required stiffness. Default: 10000; 200 for a device with additional parts."""
 
     @classmethod
     def explain_missing(cls, name: str) -> tuple[str, str]:
@@ -264,7 +264,7 @@ class DesignStudy(ComputedStudy):
 
 @register
 class FiltersStudy(ComputedStudy):
-    """Maximum stable stiffness and velocity noise over the cut-off of a low-pass and the window of a difference."""
+    """K_max and velocity noise versus cut-off frequency of a low-pass filter or window length of a difference."""
 
     method = "The maximum over all boundary curves of the stable set, for each filter, to about 1e-13."
     from_scene = ("device",)
