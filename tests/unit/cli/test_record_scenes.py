@@ -152,7 +152,7 @@ def test_a_scene_supplies_its_hardware_to_studies_that_simulate(files):
     )
     files[2].write_text(text)
     study: Any = load_config(files[2]).studies[0]
-    found = study.options(1e-3)
+    found = study.list_options(1e-3)
     assert (found["resolution"], found["max_force"]) == (pytest.approx(2.0 * np.pi / 16384), 5e-3)
 
 

@@ -126,7 +126,7 @@ PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
         ("devices: {csv: missing.csv}, stiffness: 1", "", "axes.devices.csv", "no such file"),
         ("devices: {csv: wrong.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "line 3: mass: got -1 kg"),
         ("devices: {csv: short.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "line 2: damping is missing"),
-        ("devices: {csv: mixed.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "'1,500' in line 2; a comma is"),
+        ("devices: {csv: mixed.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "'1,500' in line 2; "),
         ("devices: {csv: typo.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "did you mean 'damping'?"),
         ("devices: {csv: empty.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "0 rows"),
         ("devices: {csv: wrong.csv, unit: g}, stiffness: 1", "", "axes.devices.unit", "has the keys 'csv'"),

@@ -131,7 +131,7 @@ def test_bad_input(options: dict[str, Any], field: str) -> None:
     with pytest.raises(zwidth.InputError, match=f"^{field}: got"):
         zwidth.diagnose(PHANTOM, 8008, 33, **options)
     walls: Any = [8008, 9000]
-    with pytest.raises(zwidth.InputError, match=r"got shape \(2,\); one wall"):
+    with pytest.raises(zwidth.InputError, match=r"got shape \(2,\); pass one wall"):
         zwidth.diagnose(PHANTOM, walls, 33)
     with pytest.raises(zwidth.InputError, match="stiffness: none is given"):
         zwidth.diagnose(PHANTOM)
