@@ -1,1 +1,1 @@
-"""Shared definitions: errors, status codes, types, units, quantities, formatting, tables and array namespaces."""
+"""Definitions for all packages: errors, status codes, types, units, quantities, formatting, tables, NumPy and JAX."""

@@ -7,17 +7,18 @@ from contextlib import suppress
 
 import numpy as np
 
-# Optional date, time of day and optional time zone, as in 2024-05-01T12:00:00.001Z, with T or a blank before the time.
+# Pattern of a time of day, optionally with a date before it, separated by T or a blank, and a time zone after it, as in
+# 2024-05-01T12:00:00.001Z.
 CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?(\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?)(Z|[+-]\d\d:?\d\d)?")
 _DAY = "1970-01-01T"  # date assumed for times of day without a date
-_BATCH = 20_000  # texts converted at once; bounds the memory
-# Durations in the format of MATLAB timetables, as in "0.001 sec".
+_BATCH = 20_000  # largest number of texts that are converted at once, because all texts at once may need much memory
+# Pattern of a duration as MATLAB writes it in timetables: a number and a unit, as in "0.001 sec".
 _DURATION = re.compile(r"([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s+(sec|min|hr)")
-_SECONDS = {"sec": 1.0, "min": 60.0, "hr": 3600.0}  # units of durations, in s
+_SECONDS = {"sec": 1.0, "min": 60.0, "hr": 3600.0}  # seconds per unit of a duration
 
 
 def read_duration(cell: str) -> str:
-    """Convert a duration such as "0.001 sec" to a text in seconds without unit; return any other text unchanged."""
+    """Convert a duration such as "1 min" to its number of seconds as text, "60.0"; return any other text unchanged."""
     match = _DURATION.fullmatch(cell)
     return cell if match is None else repr(float(match[1]) * _SECONDS[match[2]])
 
@@ -30,7 +31,7 @@ def is_time(text: str) -> bool:
 
 
 def read_clock(texts: np.ndarray) -> np.ndarray:
-    """Convert texts to seconds since the first of these times.
+    """Convert an array of times of day, with or without dates, to an array of the seconds since its first entry.
 
     Raises:
         ValueError: a text is not a time, or the time zones differ.

@@ -20,7 +20,7 @@ class InputError(ZwidthError, ValueError):
 
 
 class UnusableValueError(InputError):
-    """An invalid value, raised by functions that do not have the name of its field; callers add the name.
+    """An invalid value, raised by functions that do not receive the name of the field; their callers add the name.
 
     Args:
         received: description of the value, "got ...".
@@ -61,15 +61,18 @@ class PrecisionWarning(UserWarning):
 
 
 class TracedDelayError(ZwidthError, TypeError):
-    """A traced delay in a function whose array shapes depend on the value of the delay, through the number of poles."""
+    """A delay that JAX traces, passed to a function whose arrays have one entry per pole and therefore need its value.
+
+    The integer part of the delay determines the number of poles.
+    """
 
 
-# Common names of quantities, and the names of the corresponding fields, for suggestions in messages.
+# Names that users may write for a quantity, with the name of its field, which messages suggest.
 SYNONYMS = {"weight": "mass", "inertia": "mass", "frequency": "rate", "latency": "delay", "dead_time": "delay"}
 
 
 def format_install_command(extra: str) -> str:
-    """Return the command that installs an optional dependency in the current environment."""
+    """Return the shell command that installs an *extra*, a named group of optional dependencies of zwidth."""
     import sys
     from pathlib import Path
 
@@ -79,7 +82,7 @@ def format_install_command(extra: str) -> str:
 
 
 def describe_choice(value: object, allowed: tuple[str, ...]) -> str:
-    """Return a text with the received name, the allowed names, and the most similar allowed name if there is one."""
+    """Return the part of a message with the received name, the allowed names, and the most similar of these, if any."""
     import difflib
 
     synonym = SYNONYMS.get(str(value))

@@ -25,7 +25,10 @@ REMEDIES = {
     errno.ENOENT: "choose a folder that can be created",
     errno.EEXIST: "choose another name",
 }
-"""Remedies by error number. The first six errors do not depend on the name of the file that is written."""
+"""Remedies for messages, by error number of the operating system.
+
+The first six errors do not depend on the name of the file: they would also occur for all further files in the folder.
+"""
 
 
 @contextmanager
@@ -44,7 +47,7 @@ def temporary_sibling(path: Path) -> Iterator[Path]:
             error.filename = str(path)
         raise
     finally:
-        # Ignore errors here, because a folder without write permission has raised one already.
+        # Ignore errors of the removal, because a folder without write permission has raised an error already.
         with suppress(OSError):
             remove_quietly(partial)
 
@@ -58,7 +61,7 @@ def remove_quietly(path: Path) -> None:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file atomically: under a temporary name, and rename it when it is complete."""
+    """Write bytes to a file under a temporary name, and rename the file when it is complete."""
     with temporary_sibling(path) as partial:
         if path.exists() and not path.is_file():
             # Write directly to a pipe or a device such as /dev/stdout, because a file must not replace it.

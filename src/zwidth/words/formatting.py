@@ -15,7 +15,7 @@ from typing import Any
 from zwidth.words.unit_system import UNIT_PAIRS, UnitSystem
 
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}  # SI prefixes by power of ten
-LONGEST_VALUE = 60  # characters of a received value in a message
+LONGEST_VALUE = 60  # largest number of characters of a received value in a message; longer values are shortened
 
 
 def plain(value: float, digits: int = 4) -> str:
@@ -51,55 +51,61 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
 
 
 def format_periods(count: float) -> str:
-    """Format a number of sampling periods to four significant digits: ``1 period``, ``0.7 periods``."""
+    """Format a number of sampling periods with four significant digits, as in ``1 period`` or ``0.7 periods``."""
     rounded = float(f"{count:.4g}" if count < 1000 else f"{count:.0f}")
     return f"{short(rounded)} period{'' if count == 1 else 's'}"
 
 
 def format_short(value: float, unit: str, digits: int = 3) -> str:
-    """Format a quantity with its unit, rounded and without trailing zeros: ``1 mm``, ``349 mrad``."""
+    """Format a quantity with an SI prefix of its unit, without trailing zeros, as in ``1 mm`` or ``349 mrad``."""
     number, space, name = with_unit(value, unit, digits).partition(" ")
     return f"{float(number):g}{space}{name}" if math.isfinite(value) else number
 
 
 def format_wall(stiffness: Any, virtual_damping: Any, system: UnitSystem) -> str:
-    """Format K and B of a wall with units; K is rounded down, so that it does not exceed a limit of stability."""
+    """Format stiffness K and damping B of a wall; K is rounded down, because it may be the largest stable stiffness."""
     K = with_unit(round_conservatively(float(stiffness), "below"), system["N/m"])
     return f"K = {K}, B = {with_unit(float(virtual_damping), system['N s/m'])}"
 
 
-ENOUGH = {"above": "or more", "below": "or less"}  # words after a limit, by sufficient side
+ENOUGH = {"above": "or more", "below": "or less"}  # words that are printed after a limit, by its sufficient side
 
 
 def round_conservatively(value: float, enough: str, digits: int = 4) -> float:
-    """Round a limit to a few digits, toward its sufficient side; return it unchanged if ``enough`` is no side."""
+    """Round a limit to ``digits`` significant digits, toward its sufficient side.
+
+    Args:
+        value: the limit.
+        enough: its sufficient side, "above" or "below". For other texts, the limit is returned unchanged.
+        digits: number of significant digits.
+    """
     if not (value and math.isfinite(value) and enough in ENOUGH):
         return value
     step = 10.0 ** (math.floor(math.log10(abs(value))) + 1 - digits)
-    # Tolerate the rounding error of the quotient, so that a value with few digits is not changed.
+    # Tolerate a rounding error of the quotient, so that a value that already has few digits does not change.
     steps = math.ceil(value / step - 1e-9) if enough == "above" else math.floor(value / step + 1e-9)
     return steps * step
 
 
 def count_digits(holds: Callable[[int], Any], least: int = 4) -> int:
-    """Return the smallest number of digits, at least ``least``, for which ``holds`` returns True; at most 17."""
+    """Return the smallest number of digits from ``least`` to 16 for which ``holds(digits)`` is true, otherwise 17."""
     return next((digits for digits in range(least, 17) if holds(digits)), 17)
 
 
 def count_digits_apart(values: list[float], least: int = 4) -> int:
-    """Return the smallest number of digits, at least ``least``, with which different numbers have different texts."""
+    """Return the smallest number of significant digits, at least ``least``, that formats unequal values differently."""
     return count_digits(lambda digits: len({f"{value:.{digits}g}" for value in values}) == len(set(values)), least)
 
 
 def format_stiffness(value: float, system: UnitSystem, digits: int = 4) -> str:
-    """Format a stiffness, rounded down because most are upper limits; a rotary one also in mN m/deg."""
+    """Format a stiffness, rounded down because most stiffnesses are upper limits; a rotary one also in mN m/deg."""
     text = with_unit(round_conservatively(value, "below", digits), system["N/m"], digits)
     per_degree = round_conservatively(value * 1e3 * math.pi / 180, "below", digits)
     return f"{text} ({plain(per_degree, digits)} mN m/deg)" if system.rotary and math.isfinite(value) else text
 
 
 def format_interval(low: float, high: float, unit: str = "", least: int = 4) -> tuple[str, str]:
-    """Format both ends of an interval with unit, rounded inward, with so many digits that their texts differ."""
+    """Return the two ends of an interval as texts, rounded inward, with enough digits that the texts differ."""
     for digits in range(least, 18):
         ends = round_conservatively(low, "above", digits), round_conservatively(high, "below", digits)
         if ends[0] < ends[1]:
@@ -127,18 +133,19 @@ def format_sufficient(value: float, enough: str, others: Iterable[float], unit: 
 
 
 def header(name: str, unit: str) -> str:
-    """Return the header of a column in CSV files, such as ``stiffness_N_per_m``; the name alone if it has no unit."""
+    """Return the header of a CSV column, such as ``stiffness_N_per_m``; only the name for a quantity without unit."""
     if unit in ("", "1", "sampling periods"):
         return name
     return f"{name}_{unit.replace('/', '_per_').replace(' ', '_').replace('^', '')}"
 
 
-# Units in headers, for linear and for rotary devices. Long ones come first, because "_N_per_m" also ends with "_m".
+# Pairs of the text for a unit in headers, for linear and for rotary devices. Long texts come first, because "_N_per_m"
+# also ends with "_m".
 _ENDINGS = sorted(([header("", unit) for unit in pair] for pair in UNIT_PAIRS), key=lambda pair: -len(pair[0]))
 
 
 def convert_header(name: str, system: UnitSystem) -> str:
-    """Replace the unit in a header, as in ``stiffness_N_per_m``, by that of a linear or rotary device."""
+    """Replace the unit at the end of a CSV header, as in ``stiffness_N_per_m``, by the unit in a unit system."""
     for pair in _ENDINGS:
         old = pair[not system.rotary]
         if name.endswith(old):
@@ -161,12 +168,12 @@ def to_cell(value: Any) -> Any:
 
 
 def from_cell(cell: str) -> str:
-    """Return the original text of a CSV cell from `to_cell`."""
+    """Return the text from which `to_cell` made a CSV cell, without the apostrophe that `to_cell` added."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
-# Start of a formula, also in full-width characters, which East Asian versions of spreadsheets accept. Leading
-# apostrophes are included, so that `from_cell` restores a text that begins with an apostrophe of its own.
+# Pattern of the start of a formula, also in full-width characters, which East Asian versions of spreadsheets accept.
+# Apostrophes may precede it, so that `to_cell` adds a further one to such a text and `from_cell` removes only this one.
 _FORMULA = re.compile(r"'*\s*[=+\-@\uff1d\uff0b\uff0d\uff20\t\r\n]")
 
 
@@ -203,12 +210,12 @@ def resembling(name: Any, names: Iterable[str]) -> str | None:
 
 
 def suggestion(name: Any, names: Iterable[str], otherwise: str) -> str:
-    """Return the question "did you mean ...?" with the most similar names name; ``otherwise`` if none is similar."""
+    """Return "did you mean ...?" with the most similar of the allowed names; ``otherwise`` if no name is similar."""
     similar = resembling(name, names)
     return f"did you mean {similar!r}?" if similar else otherwise
 
 
 def short(value: float) -> str:
-    """Format a number as the shortest text that is read as the same float, without ``.0`` for integers."""
+    """Format a number as the shortest text that represents exactly this float, without ``.0`` for integers."""
     text = f"{value:g}"
     return text if float(text) == value else repr(value)

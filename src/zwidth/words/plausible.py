@@ -1,4 +1,7 @@
-"""Plausibility warnings: values far from any real device, probably because of a wrong unit; the values are accepted."""
+"""Warnings for implausible values: far outside the range of real devices, probably because of a wrong unit.
+
+A *kind of quantity* is a key of the table of plausible ranges, such as "mass". Implausible values are not rejected.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ from zwidth.words.formatting import short
 from zwidth.words.quantities import FIELDS
 from zwidth.words.unit_system import UnitSystem
 
-# Smallest and largest plausible values by kind of quantity, in SI units. The smallest mass is so small because the
-# range is also used for inertias of rotary devices, in kg m^2.
+# Smallest and largest plausible values by kind of quantity, in SI units. The smallest mass is only 1e-9, because the
+# range also applies to inertias of rotary devices, in kg m^2.
 _PLAUSIBLE = {
     "mass": (1e-9, 20.0),
     "damping": (0.0, 1e4),
@@ -24,10 +27,10 @@ _PLAUSIBLE = {
     "resolution": (1e-10, 0.01),
 }
 _STEP_ANGLE = (1e-9, 1.1)  # plausible resolutions of rotary encoders in rad: from 32 bits to 6 steps per revolution
-# Kinds of quantities by unit, for parameters whose name is not a kind.
+# Kind of quantity by SI unit, for parameters whose name is not a kind.
 _OF_UNIT = {"N s/m": "damping", "N/m": "spring", "s": "period", "kg": "mass"}
-# Likely mistakes by kind of quantity: the intended parameter ("" if it is the same), the intended unit of the number,
-# its size in SI, and a text that replaces the suggestion.
+# Likely mistakes by kind of quantity. Each mistake has four entries: the intended parameter ("" if the name is right),
+# the intended unit, the conversion factor of this unit to SI, and a suggestion ("" to suggest parameter and unit).
 _SLIPS = {
     "mass": (("", "g", 1e-3, ""),),
     "damping": (("", "mN s/m", 1e-3, ""),),
@@ -41,11 +44,12 @@ _SLIPS = {
 
 
 def list_implausible(given: Mapping[str, Any], spell: Callable[[str, str], str], system: UnitSystem) -> list[str]:
-    """Return a warning for each implausible value, with a suggestion.
+    """Return a list with one warning per implausible value: a sentence with the value and a suggested correction.
 
     Args:
-        given: values in SI units by path.
-        spell: formats a path with a value, as the user would write it; formats only the path if the value is "".
+        given: values in SI units, by dotted path of the parameter.
+        spell: function that formats a path and a value as the user would write them, or only the path if the value
+            is "".
         system: units of the device.
     """
     lines = []

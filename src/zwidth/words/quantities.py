@@ -44,18 +44,18 @@ ANY = Range()
 NOT_NEGATIVE = Range(low=0.0)
 POSITIVE = Range(low=0.0, low_open=True)
 FRACTION = Range(0.0, 1.0, low_open=True, high_open=True)
-# Wide enough for any sampled loop, and narrow enough that T^2 and 1/T^2 neither overflow nor underflow.
+# These ranges are wide enough for any sampled loop, and T^2 and 1/T^2 neither overflow nor underflow in them.
 PERIODS = Range(1e-12, 1e9)  # allowed sampling periods in s
 RATES = Range(1e-9, 1e12)  # allowed sampling rates in Hz
-# Ranges in which results are computed.
+# Ranges of the parameters in which results are computed.
 SI_RANGE = (1e-30, 1e30)  # magnitudes of nonzero quantities in SI units
-WALL_RANGE = (1e-60, 1e60)  # magnitudes of nonzero alpha and beta
-LARGEST_DAMPING = 1e12  # delta
-LONGEST_DELAY = 1e5  # d, in periods
+WALL_RANGE = (1e-60, 1e60)  # magnitudes of nonzero normalized stiffness alpha and normalized virtual damping beta
+LARGEST_DAMPING = 1e12  # largest normalized physical damping delta
+LONGEST_DELAY = 1e5  # longest delay d, in periods
 # Smallest and largest magnitude of the nonzero values of each normalized parameter.
 SIZES = {"alpha": WALL_RANGE, "beta": WALL_RANGE, "delta": (0.0, LARGEST_DAMPING), "d": (0.0, LONGEST_DELAY)}
 MAX_DELAY_PERIODS = 10_000.0  # longest delay in files, in periods; a longer one indicates a wrong unit
-MOST_POLES = 4000  # largest degree for which all poles are computed, in minutes and with 0.3 GB
+MOST_POLES = 4000  # largest number of poles that are computed, because this many already take minutes and 0.3 GB
 RECOMMENDED_SHARE = 0.75  # stiffness of a recommended wall, relative to the stiffest stable wall
 
 
@@ -65,10 +65,10 @@ class Parameter:
 
     name: str  # path in files and stores, such as "mass" or "coupling.mass"
     long_name: str  # description, a noun phrase, in stores, in the schema and in help texts
-    symbol: str  # in mathtext, without dollar signs
-    allowed: Range  # allowed values, in its unit
+    symbol: str  # symbol of the quantity, in mathtext without dollar signs
+    allowed: Range  # range of allowed values, in the unit of the parameter
     unit: str = "1"  # SI unit on a linear device; "1" for a quantity without unit
-    slider: tuple[float, float] | None = None  # range of the slider in the explorer, in its unit; None without slider
+    slider: tuple[float, float] | None = None  # range of its slider in the explorer; None without a slider
     note: str = ""  # conditions and default, in the schema and in help texts
     short_name: str = ""  # name in figures and in the explorer, if it differs from ``long_name``
     definition: str = ""  # definition of a normalized quantity, in mathtext
@@ -76,7 +76,10 @@ class Parameter:
 
     @cached_property
     def sign(self) -> Range:
-        """The range by sign only: any value, >= 0 or > 0. Python functions use it instead of the range of files."""
+        """The part of the range that concerns the sign: any value, >= 0 or > 0.
+
+        Functions in Python check only the sign, because the full range is meant for configuration files.
+        """
         if self.allowed.low < 0:
             return ANY
         return POSITIVE if self.allowed.low > 0 or self.allowed.low_open else NOT_NEGATIVE
@@ -111,16 +114,16 @@ class Parameter:
         return self.long_name[0].upper() + self.long_name[1:]
 
 
-MOST_MODES = 3  # modes in files, on axes and on the command line; in Python there is no limit
+MOST_MODES = 3  # largest number of modes in files, on axes of sweeps and on the command line; Python has no limit
 
 
 def _describe_mode(path: str, name: str, index: str) -> tuple[Parameter, ...]:
-    """Return the parameters of a structural mode.
+    """Return the parameters of a structural mode: frequency, damping ratio and modal mass.
 
     Args:
-        path: first part of the paths of its parameters.
-        name: name of the mode in descriptions.
-        index: index of its symbols.
+        path: first part of the dotted paths of the parameters, such as "modes.0".
+        name: name of the mode in the descriptions.
+        index: subscript of the symbols.
     """
     ratios = Range(0.0, 10.0, low_open=True)
     return (
@@ -137,8 +140,8 @@ def _describe_mode(path: str, name: str, index: str) -> tuple[Parameter, ...]:
     )
 
 
-# The order is that of the dimensions of a store. The wall is last, so that the values of a plane of walls are
-# contiguous.
+# The parameters have the order of the dimensions of a store. Those of the wall are last, so that the results for all
+# walls of one device are contiguous in memory.
 _PARAMETERS = (
     Parameter("period", "sampling period T", "T", PERIODS, "s", (5e-5, 0.02), short_name="sampling period"),
     Parameter("rate", "sampling rate 1/T", "1/T", RATES, "Hz", None, "instead of the period", "sampling rate"),
@@ -289,7 +292,7 @@ CHOICES = {
     "coupling.sensor": Choice(("motor", "tip"), "Location of the position sensor; default: motor"),
 }
 
-# Descriptions of the options for log files.
+# Help texts of the options that describe the columns of a log file, by name of the option.
 OF_LOGS = {
     "time": "Time column: HEADER, HEADER:ms, or HEADER:s+HEADER:ns for two columns. Default: recognized by its header.",
     "position": "Position column: HEADER, or with a unit HEADER:mm, HEADER:counts or HEADER:deg.",
@@ -298,9 +301,9 @@ OF_LOGS = {
     "motor_constant": "Motor constant, i.e. force per ampere, e.g. 5N/A, if the force column is a current in A.",
 }
 
-Family: TypeAlias = Literal["wall", "device"]  # an output per wall, or per device and delay
-# Color scales for truth values, for numbers with a good and a bad side, for other numbers, for positive numbers, and
-# for positive numbers that may be infinite.
+Family: TypeAlias = Literal["wall", "device"]  # an output has one value per wall, or one value per device and delay
+# Kinds of color scales: for truth values, for numbers with a good and a bad side, for other numbers, for positive
+# numbers, and for positive numbers that may be infinite.
 ColorScale: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
 NOT_COMPUTED = 255  # status of points whose chunk does not exist yet; the other codes are those of `zwidth.Status`
 
@@ -309,19 +312,20 @@ NOT_COMPUTED = 255  # status of points whose chunk does not exist yet; the other
 class Output:
     """An output of a sweep: a variable of a store."""
 
-    name: str  # in files and stores
-    long_name: str  # description, a noun phrase, in stores
+    name: str  # name in files and stores
+    long_name: str  # description in stores, a noun phrase
     symbol: str = ""  # symbol in figures, in mathtext
-    color_scale: ColorScale = "truth"  # color scale
+    color_scale: ColorScale = "truth"  # kind of the color scale in figures
     family: Family = "wall"
     dtype: Literal["bool", "float64", "uint8"] = "float64"
     units: str = "1"  # unit in a normalized sweep
     physical_units: str | None = None  # unit in a sweep over SI quantities; None if it is ``units``
     physical_only: bool = False  # True if a normalized sweep cannot compute it
     with_parts: bool = False  # True if it can be computed for devices with a velocity filter, a hand or a coupling
-    source: str = ""  # output from which it is derived at no cost; "" if it is not derived
-    rates: tuple[float, float] = (1e6, 10.0)  # approximate points per second and core: rigid devices, and with parts
-    label: str = ""  # name in figures; "" if it is ``name``
+    source: str = ""  # other output from which this one is computed at no cost; "" if there is none
+    # Approximate numbers of points per second and core, for rigid devices and for devices with parts.
+    rates: tuple[float, float] = (1e6, 10.0)
+    label: str = ""  # name in figures, if it differs from ``name``
     center: float = 0.0  # value between the good and the bad side: the limit of stability or passivity
     below: bool = False  # True if the good side is below the center
     flags: dict[str, Any] = field(default_factory=dict)  # meanings of codes and truth values, as CF attributes
@@ -342,7 +346,7 @@ class Output:
 
 
 def _flags(values: list[int], meanings: str) -> dict[str, Any]:
-    """Return the CF attributes of a variable with codes; the meanings are separated by blanks."""
+    """Return the attributes that the CF conventions require for a variable of codes; blanks separate the meanings."""
     return {"flag_values": values, "flag_meanings": meanings}
 
 
@@ -425,7 +429,7 @@ STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
 
 
 def status_flags() -> dict[str, Any]:
-    """Return the CF attributes of a status variable."""
+    """Return the attributes of a status variable, with the codes and their meanings as in the CF conventions."""
     codes = [*(int(status) for status in Status), NOT_COMPUTED]
     meanings = " ".join([*(status.name.lower() for status in Status), "not_computed"])
     return {"long_name": "status of each point", **_flags(codes, meanings)}

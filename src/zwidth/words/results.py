@@ -1,4 +1,4 @@
-"""Result types of all kinds of loops: stiffest wall, stability margins, and stability labels of walls."""
+"""Named tuples of results for any kind of device: stiffest wall, stability margins, and stability of walls."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class RidgePoint(NamedTuple):
     alpha: Array  # normalized stiffness
     beta: Array  # normalized damping
     omega: Array  # frequency of the pole pair on the unit circle, in rad per period
-    kind: Array  # `RidgeKind`
-    status: Array  # `Status`
+    kind: Array  # kind of the optimum, a code of `RidgeKind`
+    status: Array  # code of `Status`
 
 
 @compact_repr(phase_margin="degrees", delay_margin="periods")
@@ -27,19 +27,19 @@ class Margins(NamedTuple):
     The comments give the names of python-control.
     """
 
-    gain_margin: Array  # gm
-    phase_margin: Array  # in degrees; pm
+    gain_margin: Array  # common factor of stiffness and damping at the limit of stability; gm in python-control
+    phase_margin: Array  # in degrees; pm in python-control
     delay_margin: Array  # in periods
-    modulus_margin: Array  # smallest distance of the open loop from -1; sm
-    phase_crossover: Array  # wpc
-    gain_crossover: Array  # wgc
-    modulus_frequency: Array  # wms
+    modulus_margin: Array  # smallest distance of the open loop from -1; sm in python-control
+    phase_crossover: Array  # frequency of the gain margin; wpc in python-control
+    gain_crossover: Array  # frequency of the phase margin; wgc in python-control
+    modulus_frequency: Array  # frequency of the modulus margin; wms in python-control
 
 
 @compact_repr(method=Method)
 class Stability(NamedTuple):
-    """Stability labels of walls, with the status and the deciding method of each wall; arrays of one shape."""
+    """Stability of walls, with the status and the deciding method of each wall; all arrays have the same shape."""
 
     stable: Array  # True if all poles are inside the unit circle
-    status: Array  # `Status`
-    method: Array  # `Method`
+    status: Array  # code of `Status`
+    method: Array  # code of `Method`

@@ -17,12 +17,12 @@ from zwidth.words.unit_system import ROTARY, UnitSystem
 
 Kind = TypeVar("Kind", bound=type)
 Result = TypeVar("Result")
-Unit = str | type[IntEnum]  # a unit as text, or the enumeration of a code
+Unit = str | type[IntEnum]  # unit of a field as text, or the enumeration to which the codes of a field belong
 
-# Default units of fields, by name.
+# Units on linear devices of fields that several result types have, by name of the field.
 _DEFAULT_UNITS: dict[str, Unit] = {"stiffness": "N/m", "virtual_damping": "N s/m", "status": Status}
 _BARE = ("", "1", "degrees", "periods")  # units without SI prefixes
-_FEW = 4  # arrays with up to this number of entries are displayed with all entries
+_FEW = 4  # largest number of entries of an array that is displayed with all entries
 _LINE = 120  # characters per line; longer results are displayed with one field per line
 _ROWS = 40  # largest number of rows of a table
 
@@ -49,7 +49,8 @@ def compact_repr(
         shown_kind: Any = kind
         base: Any = kind
         if issubclass(kind, tuple):
-            # Create a subclass, because named tuples cannot have further attributes. JAX handles it like a named tuple.
+            # Create a subclass, because named tuples cannot have further attributes. JAX handles the subclass like a
+            # named tuple.
             names = ("__module__", "__qualname__", "__doc__")
             shown_kind = type(kind.__name__, (kind,), {name: getattr(kind, name) for name in names})
             shown_kind._replace = lambda self, **changes: with_units(base._replace(self, **changes), self.unit_system)
@@ -95,9 +96,10 @@ class ResultList(list[Any]):
 
 
 def find_unit(result: Any, unit: Any) -> Any:
-    """Return a unit in the unit system of a result.
+    """Convert a unit of linear devices to the unit for the display of a result: "N/m" to "N m/rad" on a rotary device.
 
-    If the result has no unit system, return "" for a unit that differs between linear and rotary devices.
+    Enumerations of codes are returned unchanged. If the result has no unit system, a unit that differs between linear
+    and rotary devices is converted to "", because the kind of the device is unknown.
     """
     if isinstance(unit, type) or ROTARY[unit] == unit:
         return unit
@@ -143,7 +145,7 @@ def format_value(value: Any, unit: Unit = "") -> str:
 
 
 def _spell_number(value: Any, unit: Unit) -> str:
-    """Format one number with its unit, or a code by its name."""
+    """Format one number with its unit; for a code of an enumeration, return its name."""
     if isinstance(unit, type):
         return unit(int(value)).name
     if isinstance(value, np.bool_ | np.integer):
@@ -162,7 +164,7 @@ def _spell_number(value: Any, unit: Unit) -> str:
 
 
 def _spell_range(array: np.ndarray, unit: Unit) -> str:
-    """Format the range of an array, or the number of its entries per code or truth value."""
+    """Return the smallest and largest entry of an array as text; for codes or Booleans, the number of each of them."""
     if array.dtype.kind == "b":
         return f"{np.count_nonzero(array)} True"
     if isinstance(unit, type):
@@ -179,13 +181,13 @@ def _spell_range(array: np.ndarray, unit: Unit) -> str:
 
 
 def _is_table(columns: Iterable[Any]) -> bool:
-    """Return whether all fields are one-dimensional arrays of the same length, at most ``_ROWS``."""
+    """Return whether all columns are one-dimensional arrays of the same length, at most ``_ROWS``."""
     shapes = {each.shape if isinstance(each, np.ndarray) else () for each in columns}
     return len(shapes) == 1 and all(len(shape) == 1 and 0 < shape[0] <= _ROWS for shape in shapes)
 
 
 def write_table(title: str, rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
-    """Return an HTML table.
+    """Return the HTML code of a table.
 
     Args:
         title: caption of the table.
@@ -201,7 +203,7 @@ def write_table(title: str, rows: Iterable[Sequence[str]], head: Sequence[str] =
 
 
 def draw_line(x: np.ndarray, y: np.ndarray, words: str) -> str:
-    """Return a small SVG picture of a curve without its infinite and NaN points; "" if fewer than 2 points are left.
+    """Return the SVG code of a small picture of a curve, drawn through its finite points; "" for fewer than 2 of them.
 
     Args:
         x: horizontal coordinates.

@@ -1,4 +1,4 @@
-"""Integer codes of results: the status of each point, the method that decided it, and the kind of an optimum.
+"""Integer codes in results: the status of each point, the method that decided its stability, the kind of an optimum.
 
 Compiled code cannot raise exceptions, and one invalid point must not prevent results at other points. A point without
 result is therefore NaN and has one of these status codes.
@@ -11,7 +11,7 @@ from enum import IntEnum
 
 
 class Status(IntEnum):
-    """Status of a point: 0 if its value is valid, otherwise the reason why it has none."""
+    """Status of a point: OK if its result is valid, otherwise the reason for the missing result."""
 
     OK = 0
     INVALID_INPUT = 1
@@ -29,7 +29,7 @@ class Status(IntEnum):
 
 
 def note_failures(counts: Iterable[int], of: str = "points") -> tuple[str, ...]:
-    """Return a note with the number of points without result, by status; an empty tuple if all points are OK.
+    """Return a tuple with one sentence that counts the points without result by status; empty if all points are OK.
 
     Args:
         counts: number of points by status code, starting with OK.
@@ -57,7 +57,7 @@ class RidgeKind(IntEnum):
     SMOOTH = 0
     CORNER = 1
     NO_DAMPING = 2  # B = 0, if walls are restricted to B >= 0 and the optimum is at this bound
-    NONE = 3  # there is no stiffest wall; the status contains the reason
+    NONE = 3  # there is no stiffest wall; the status is the reason
 
 
 _MESSAGES = {

@@ -1,9 +1,10 @@
-"""Reader of tables in files of many programs: text, NumPy or MATLAB. Numbers are converted only when requested.
+"""Reader of tables that many programs write, as text or as files of NumPy or MATLAB.
 
-The columns of a text are separated by commas, semicolons, tabs or blanks. The separator is the one for which the first
-*samples*, lines of numbers, contain the least other text. The column names are in the nearest line above the samples
-with the same number of cells, possibly after # or %. A line of units between names and samples is added to the names;
-the lines above the names are a preamble and ignored. In files of NumPy and MATLAB, each array is a column.
+Texts are converted to numbers only when a column is requested. The columns of a text are separated by commas,
+semicolons, tabs or blanks. Lines of numbers are called *samples*; the separator is the one for which the first sample
+has the largest fraction of cells with numbers. The column names are in the nearest line above the samples with the same
+number of cells, possibly after # or %. A line of units between names and samples is added to the names; the lines above
+the names are a preamble and ignored. In files of NumPy and MATLAB, each array is a column.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ from zwidth.words.clocks import CLOCK, is_time, read_clock, read_duration, to_se
 from zwidth.words.errors import InputError
 from zwidth.words.units import is_unit, looks_like_number, split_head
 
-_MOST_BYTES = 2**28  # largest size of a file
+_MOST_BYTES = 2**28  # largest size of a file in bytes
 _CODINGS = ("utf-8-sig", "cp1252", "latin-1")  # character encodings, tried in this order
 _GZIP = b"\x1f\x8b"  # first bytes of a file compressed by gzip
 _NO_TEXT = re.compile("[\0-\x08\x0e-\x1f]")  # control characters, which do not occur in tables
-# The part of a number up to a decimal comma.
+# Pattern of the digits before a decimal comma and the comma.
 _DECIMAL_COMMA = re.compile(r"^([-+]?[0-9]*),(?=[0-9][^.]*$)")
 _FRACTION = re.compile(r"[-+]?[0-9]*([.,])[0-9]+(?:[eE][-+]?[0-9]+)?")  # number with a decimal point or comma
 _PREAMBLE = 500  # largest number of lines above the samples
@@ -51,7 +52,8 @@ class NamedColumns:
     # Function of column indices, a type (float by default, or complex) and ``gaps``, which returns these columns as
     # arrays. With gaps=True, missing numbers become NaN; otherwise they raise an error.
     numbers: Callable[..., list[np.ndarray]]
-    nameless: str = ""  # message if the file has no column names and ``heads`` are "1", "2", ...
+    # Error message for callers that need column names, if the file has none and ``heads`` are "1", "2", ...
+    nameless: str = ""
 
 
 def read_columns(file: Path) -> NamedColumns:
@@ -107,7 +109,7 @@ def read_lines(file: Path, most_bytes: int) -> list[str]:
 
 
 def split_lines(file: Path, lines: list[str], first: int, separator: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number, counted from 1, and the cells of each line that is not empty.
+    """Yield the line number, counted from 1, and the list of cells of each line that is not empty.
 
     Args:
         file: path of the file, for messages.
@@ -126,7 +128,7 @@ def split_lines(file: Path, lines: list[str], first: int, separator: str) -> Ite
 
 
 def with_point(cell: str) -> str:
-    """Replace a decimal comma by a point."""
+    """Replace the decimal comma of a number by a point; return other texts unchanged."""
     return _DECIMAL_COMMA.sub(r"\1.", cell)
 
 
@@ -138,7 +140,7 @@ class DecimalSigns:
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        self.first: dict[str, tuple[int, str]] = {}  # for each sign, line and text of its first number
+        self.first: dict[str, tuple[int, str]] = {}  # line number and text of the first number, by its decimal sign
 
     def read(self, line: int, cell: str) -> str:
         """Replace a decimal comma of a cell by a point; raise `InputError` if an earlier cell has the other sign."""
@@ -177,13 +179,13 @@ def _load_arrays(file: Path) -> dict[str, Any]:
     except NotImplementedError:
         raise InputError(f"{file}: got MATLAB format 7.3; save it again with save('log.mat', '-v7')") from None
     except Exception as error:
-        # Catch all exceptions, because damaged files cause various ones in the readers.
+        # Catch all exceptions, because the readers raise exceptions of many types for damaged files.
         contents = "Python objects, which may run code" if "pickle" in str(error).lower() else "no readable arrays"
         raise InputError(f"{file}: got {contents}; save columns of numbers, or a CSV file") from error
 
 
 def _read_arrays(file: Path, arrays: dict[str, Any]) -> NamedColumns:
-    """Return the one-dimensional arrays as columns; if there is only one matrix, its columns."""
+    """Return the one-dimensional arrays of a file as columns; if the file has only one matrix, the matrix's columns."""
     columns = {name: array for name, array in arrays.items() if getattr(array, "size", 0) > 1}
     flat = {name: array.ravel() for name, array in columns.items() if max(array.shape) == array.size}
     wide = {name: array for name, array in columns.items() if name not in flat and array.ndim == 2}
@@ -218,16 +220,21 @@ def _read_arrays(file: Path, arrays: dict[str, Any]) -> NamedColumns:
 
 
 class _Layout(NamedTuple):
-    """The indices of the lines of a table, and its separator."""
+    """Layout of a table in a text: the indices of its lines, counted from 0, and its separator."""
 
-    names: int | None  # line of the column names; None without names
-    units: int | None  # line of the units; None without such a line
-    begin: int  # first line of the samples
+    names: int | None  # index of the line with the column names; None without names
+    units: int | None  # index of the line with the units; None without such a line
+    begin: int  # index of the first sample
     separator: str  # separator of cells
 
 
 def _read_text(file: Path, lines: list[str]) -> NamedColumns:
-    """Return the columns of a text."""
+    """Return the columns of a text; raise `InputError` if it has only one column or no samples.
+
+    Args:
+        file: path of the text, for messages.
+        lines: all lines of the text.
+    """
     if not any(map(holds_data, lines)):
         raise InputError(f"{file}: it is empty; write a line of column names and one line per sample")
     layout = _find_layout(lines)
@@ -241,7 +248,7 @@ def _read_text(file: Path, lines: list[str]) -> NamedColumns:
         heads = [str(k + 1) for k in range(len(heads))]
     elif layout.units is not None:
         units = [cell.strip("[]()") for cell in _split(lines[layout.units], separator)]
-        # Prefer a unit that is part of the name.
+        # Add no unit to a name that already contains one.
         added = [
             f" [{unit}]" if is_unit(unit) and not split_head(head)[1] else ""
             for head, unit in zip(heads, units, strict=False)
@@ -279,13 +286,19 @@ def _count_numbers(cells: list[str]) -> int:
 
 
 def _holds_sample(row: list[str]) -> bool:
-    """Return whether a row is a sample: it has two numbers, or one number and otherwise at least two empty cells."""
+    """Return whether a row is a sample.
+
+    A sample has at least two numbers, or one number while all other cells, at least two, are empty.
+    """
     numbers = _count_numbers(row)
     return numbers >= 2 or (numbers == 1 and len(row) > 2 and sum(map(bool, row)) == 1)
 
 
 def _read_number(text: str, kind: type) -> Any:
-    """Convert a text to a finite number; complex numbers have i or j at the end. Return None for other texts."""
+    """Convert a text to a finite number of type ``kind``, float or complex; return None for other texts.
+
+    Complex numbers end with i or j.
+    """
     if looks_like_number(text):
         return kind(text) if np.isfinite(float(text)) else None
     if kind is complex and text[-1:] in ("i", "j") and "_" not in text:
@@ -296,7 +309,7 @@ def _read_number(text: str, kind: type) -> Any:
 
 
 def _find_layout(lines: list[str]) -> _Layout:
-    """Find the separator, the first sample, and the lines of names and units above it."""
+    """Determine the separator, the first sample, and the lines of names and units above the first sample."""
     # Skip the headers of LabVIEW files, because their lines contain numbers as well.
     headers = [k for k, line in enumerate(lines[:_PREAMBLE]) if line.startswith(_LABVIEW)]
     first = headers[-1] + 1 if headers else 0
@@ -318,12 +331,12 @@ def _find_layout(lines: list[str]) -> _Layout:
     _, begin, separator = best
     width = len(_trim(_split(lines[begin], separator)))
     above = [k for k in reversed(nonempty) if k < begin]
-    # LabVIEW writes an additional name "Comment", for a column that the samples lack.
+    # LabVIEW writes an additional name "Comment" at the end, although the samples have no such column.
     if above and (heads := _split(lines[above[0]], separator))[-1:] == ["Comment"] and len(heads) == width + 1:
         return _Layout(above[0], None, begin, separator)
     cells = len(_split(lines[begin], separator))
     named = [k for k in above if len(_trim(_split(lines[k], separator))) == width]
-    # If the first sample ends with empty cells, a line of names may have as many cells as the sample with these.
+    # If no line matches and the first sample ends with empty cells, count these, because each may have a column name.
     named = named or [k for k in above if len(_split(lines[k], separator)) == cells]
     if not named:
         plain = [k for k in above if holds_data(lines[k])]
@@ -347,7 +360,7 @@ def _read_with_numpy(lines: list[str], layout: _Layout, count: int, indices: Seq
     begin, separator = layout.begin, layout.separator
     time_columns = _find_time_columns(lines, layout, indices)
     if separator != "," and all(any(sign in line for line in islice(lines, begin, None)) for sign in ",."):
-        # Commas and points both occur; `_read_cells` checks that all numbers have the same decimal sign.
+        # If commas and points occur, `_read_cells` must check that all numbers have the same decimal sign.
         return None
     if separator == " ":
         width = max(len(line.split()) for line in lines[begin:])
@@ -391,7 +404,7 @@ def _read_cells(
         heads: names of all columns.
         indices: indices of the columns to read.
         kind: float or complex.
-        gaps: return NaN for missing numbers.
+        gaps: return NaN for missing numbers instead of raising an error.
 
     Raises:
         InputError: a cell contains no number and is not a missing number, or a line has too many cells.
@@ -424,6 +437,6 @@ def _read_cells(
 
 
 def _find_time_columns(lines: list[str], layout: _Layout, indices: Sequence[int]) -> list[int]:
-    """Return those of the columns whose first cell is a date-time or a time of day."""
+    """Return those of the given column indices whose first sample is a time of day, with or without a date."""
     first = _split(lines[layout.begin], layout.separator)
     return [k for k in indices if k < len(first) and CLOCK.fullmatch(first[k])]

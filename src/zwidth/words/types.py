@@ -23,23 +23,23 @@ Array: TypeAlias = Any
 ArrayLike: TypeAlias = Num[Any, "*#points"]
 # One real number per point: an argument of a kernel, whose arguments all have the same shape.
 Reals: TypeAlias = Float[Array, "*points"]
-# One nonnegative integer per point, for numbers of items.
+# One nonnegative integer per point, such as a number of poles.
 Counts: TypeAlias = Integer[Array, "*points"]
 # Coefficients of a polynomial per point, highest power first.
 Coefficients: TypeAlias = Inexact[Array, "*points coefficients"]
-# Zeros or poles, in no particular order.
+# Zeros or poles of each point along the last axis, in no particular order.
 Roots: TypeAlias = Complex[Array, "*points roots"]
-# Zeros or poles in an argument of a public function.
+# Zeros or poles as an argument of a public function; numbers and lists are accepted, too.
 RootsLike: TypeAlias = Num[Any, "*#points _roots"]
 # Zeros or poles along the first axis, for kernels that iterate over them.
 RootsFirst: TypeAlias = Complex[Array, "roots *points"]
-# Bound on the error of each root.
+# Bound on the error of each root, with the roots along the last axis.
 Radii: TypeAlias = Float[Array, "*points roots"]
 # Bound on the error of each root, with the roots along the first axis.
 RadiiFirst: TypeAlias = Float[Array, "roots *points"]
-# Companion matrices.
+# One companion matrix per point, a square matrix whose eigenvalues are the roots of a polynomial.
 Matrices: TypeAlias = Inexact[Array, "*points roots roots"]
-# Values along a curve.
+# One coordinate or other value per vertex of a polygonal curve.
 Vertices: TypeAlias = Float[np.ndarray, "vertices"]
-# Values along time.
+# One value per sample of a signal over time.
 Samples: TypeAlias = Float[np.ndarray, "samples"]

@@ -1,8 +1,8 @@
 """Parser of unit expressions: products, quotients and powers of unit symbols with SI prefixes.
 
 Examples are ``N m/deg``, ``mNm/°``, ``N*m*s / rad``, ``kgf/cm`` and ``ozf in``. The result is the conversion factor to
-SI and the exponents of kg, m, s and rad. Powers of ten are stored separately from other factors, because a shift of the
-decimal exponent causes a single rounding error: 0.3 ms becomes exactly the float64 number 0.0003.
+SI and the exponents of kg, m, s and rad. Powers of ten are stored separately from other factors, because adding them to
+the decimal exponent of a number causes only one rounding error: 0.3 ms becomes exactly the float64 number 0.0003.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ class UnitSize(NamedTuple):
 
 # Powers of ten of the SI prefixes; u stands for micro.
 _PREFIXES = {"": 0, "n": -9, "u": -6, "μ": -6, "m": -3, "c": -2, "d": -1, "k": 3, "M": 6}
-# Dimensions of the unit symbols.
+# Dimensions of the unit symbols: exponents of kg, m, s and rad.
 _MASS = (1, 0, 0, 0)
 _LENGTH = (0, 1, 0, 0)
 _TIME = (0, 0, 1, 0)
 _ANGLE = (0, 0, 0, 1)
 _FORCE = (1, 1, -2, 0)
 _PER_TIME = (0, 0, -1, 0)
-# For each symbol: power of ten, further factor, dimension, and the allowed prefixes.
+# Unit symbols with their power of ten, their further factor to SI, their dimension and their allowed prefixes.
 _SYMBOLS: dict[str, tuple[int, float, Exponents, str]] = {
     "m": (0, 1.0, _LENGTH, "nuμmck"),
     "g": (-3, 1.0, _MASS, "uμmk"),
@@ -62,19 +62,19 @@ _SYMBOLS: dict[str, tuple[int, float, Exponents, str]] = {
     **dict.fromkeys(("deg", "°", "degree", "degrees"), (0, math.pi / 180, _ANGLE, "")),
     **dict.fromkeys(("rev", "turn", "turns", "revolution", "revolutions"), (0, 2 * math.pi, _ANGLE, "")),
 }
-# The sizes of all symbols with their allowed prefixes.
+# Sizes of all symbols, without prefix and with each allowed prefix.
 _READINGS = {
     prefix + symbol: UnitSize(power + _PREFIXES[prefix], factor, exponents)
     for symbol, (power, factor, exponents, prefixes) in _SYMBOLS.items()
     for prefix in ("", *prefixes)
 }
-_LONGEST = max(map(len, _READINGS))  # characters of the longest symbol with its prefix
+_LONGEST = max(map(len, _READINGS))  # number of characters of the longest symbol, including its prefix
 _GRAVITY = 9.80665  # standard gravity, m/s^2
-# Mass units that denote weights in units of torque and other derived units, as in "oz in" or "kg cm".
+# Pattern of a mass unit that denotes a weight, i.e. a force, in units of torque and similar units, as in "oz in".
 _WEIGHT = re.compile(r"(?<![A-Za-z])(kg|g|lb|oz)(?![A-Za-z])|^(kg|g)(?=[cm]?m)")
-# Symbols and an exponent, as in "m^2", "m**2" or "m2".
+# Pattern of symbols with an exponent, as in "m^2", "m**2" or "m2".
 _POWER = re.compile(r"(.*?)(?:\^|\*\*)?(-?[1-4])?", re.DOTALL)
-# A denominator that is a quotient, as in "N m/(rad/s)".
+# Pattern of a denominator that is itself a quotient, as in "N m/(rad/s)".
 _DIVIDED_RATE = re.compile(r"/\(([^()/]+)/([^()/]+)\)")
 
 
@@ -105,10 +105,15 @@ def measure_unit(text: str, exponents: Exponents | None = None) -> UnitSize | No
 
 
 def _read_weights(text: str, exponents: Exponents) -> UnitSize | None:
-    """Return the size of a unit in which kg, g, lb or oz denotes a weight, as in "oz in"; None if exponents differ."""
+    """Return the size of a unit whose kg, g, lb or oz denotes a weight, as in "oz in"; None for other dimensions.
+
+    Args:
+        text: the unit.
+        exponents: required exponents of kg, m, s and rad.
+    """
     text = normalize_symbols(text)
     mass = _WEIGHT.search(text)
-    # Exclude forces, because "2 kg" for a force may be a mass given by mistake.
+    # Exclude forces, because "2 kg" as a force may be a mass that the user gave by mistake.
     if mass is None or exponents[1] == 1:
         return None
     sizes = [size for size in _read(f"{text[: mass.start()]}N {text[mass.end() :]}") if size.exponents == exponents]
@@ -139,7 +144,10 @@ def _read(text: str) -> list[UnitSize]:
 
 
 def _read_run(atom: str) -> Iterator[UnitSize]:
-    """Yield the possible sizes of symbols without separators, as in "mNm"; an exponent applies to the last symbol."""
+    """Yield the size of each interpretation of a text without separators, such as "mNm" or "cm2".
+
+    An exponent at the end applies to the last symbol only.
+    """
     match = _POWER.fullmatch(atom)
     letters, power = (match[1], int(match[2] or 1)) if match else (atom, 1)
     # Try long symbols first, so that interpretations with few symbols are yielded first.
@@ -157,13 +165,13 @@ def _read_run(atom: str) -> Iterator[UnitSize]:
 
 
 def _raise_to(size: UnitSize, power: int) -> UnitSize:
-    """Return a unit raised to a power."""
+    """Return the size of a unit that is raised to an integer power."""
     kg, m, s, rad = size.exponents
     return UnitSize(size.power * power, size.factor**power, (kg * power, m * power, s * power, rad * power))
 
 
 def _join(first: UnitSize, second: UnitSize, sign: int) -> UnitSize:
-    """Return the product of two units, or their quotient if the sign is -1."""
+    """Return the size of the product of two units, or of their quotient if ``sign`` is -1."""
     (a, b, c, d), (e, f, g, h) = first.exponents, second.exponents
     exponents = (a + sign * e, b + sign * f, c + sign * g, d + sign * h)
     return UnitSize(first.power + sign * second.power, first.factor * second.factor**sign, exponents)

@@ -1,7 +1,7 @@
 """SI units of linear and of rotary devices.
 
 The equations of linear and of rotary devices are the same, only their units differ. The source code identifies a
-quantity by its unit on a linear device. A `UnitSystem` converts this unit to the unit on its kind of device:
+quantity by its unit on a linear device. A `UnitSystem` converts this unit to the unit on a linear or rotary device:
 ``ROTARY["N/m"]`` is ``"N m/rad"``.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-# Units on rotary devices by unit on linear devices.
+# Unit of a quantity on rotary devices, by its unit on linear devices.
 _ROTARY_UNITS = {
     "kg": "kg m^2",
     "N s/m": "N m s/rad",
@@ -21,7 +21,7 @@ _ROTARY_UNITS = {
     "N/s": "N m/s",
 }
 UNIT_PAIRS = tuple(_ROTARY_UNITS.items())
-"""Pairs of units of one quantity: on linear devices and on rotary devices."""
+"""Pairs of the units of one quantity: the unit on linear devices and the unit on rotary devices."""
 
 
 class UnitSystem(Enum):
@@ -36,7 +36,7 @@ class UnitSystem(Enum):
         return self is ROTARY
 
     def __getitem__(self, unit: str) -> str:
-        """Return the unit on this kind of device for a unit on linear devices; quotients "N/m per kg" are allowed."""
+        """Convert a unit of linear devices to the unit on this kind of device, also in quotients like "N/m per kg"."""
         if self is LINEAR:
             return unit
         return " per ".join(_ROTARY_UNITS.get(part, part) for part in unit.split(" per "))

@@ -21,16 +21,17 @@ from zwidth.words.quantities import ANY, SI_RANGE, Range
 from zwidth.words.unit_symbols import Exponents, UnitSize, measure_unit, normalize_symbols
 from zwidth.words.unit_system import UNIT_PAIRS
 
-# Mantissa, exponent and unit. The length of the exponent is limited, so that conversions do not create huge integers.
+# Pattern of a quantity: mantissa, exponent and unit. The length of the exponent is limited, so that conversions do not
+# create huge integers.
 _QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-9]{1,6}))?\s*(\S.{0,30})", re.DOTALL)
 
-# The pattern matches a sequence of digits in one way only, because alternatives would cost quadratic time for long
-# texts that do not match.
+# Pattern of a number without unit. It can match a sequence of digits in one way only, because with several ways the
+# search would take quadratic time for long texts that do not match.
 _NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
 
-# The number at the start of a quantity, possibly with thousands separators and a decimal separator.
+# Pattern of the number at the start of a quantity, possibly with thousands separators and a decimal separator.
 _DIGITS = re.compile(r"\s*[-+]?[0-9][0-9.,'’_\u00a0\u2009\u202f ]*[0-9](?![0-9])")
-# An integer with thousands separators.
+# Pattern of an integer with thousands separators, all of them the same character.
 _GROUPED = re.compile(r"[1-9][0-9]{0,2}(?:(?P<mark>[.,'’_\u00a0\u2009\u202f ])[0-9]{3})(?:(?P=mark)[0-9]{3})*")
 
 
@@ -94,18 +95,18 @@ _SCALES = (
     *(INERTIA, ANGULAR_DAMPING, ANGULAR_STIFFNESS, TORQUE, TORQUE_RATE, ANGLE, ANGULAR_SPEED),
 )
 DIMENSIONS = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
-# Base unit on the other kind of device, by base unit.
+# Base unit of a quantity on the other kind of device, by its base unit: "N m/rad" for "N/m" and vice versa.
 _OTHER_KIND = {one: other for pair in UNIT_PAIRS for one, other in (pair, pair[::-1])}
 _ROTARY_UNITS = [rotary for _, rotary in UNIT_PAIRS]
 
 PERIOD_WORDS = ("periods", "period")
-"""Units of times in sampling periods."""
+"""Accepted units of a time that is given as a number of sampling periods."""
 COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
-"""Units of encoder positions; the resolution of the encoder converts them to SI."""
+"""Accepted units of encoder positions in counts; multiplication by the encoder resolution converts these to SI."""
 
 
 def find_other(dimension: Dimension) -> Dimension | None:
-    """Return the dimension of the same quantity on the other kind of device; None if it has the same dimension."""
+    """Return the dimension of a quantity on the other kind of device; None if both have the same, as for times."""
     return DIMENSIONS.get(_OTHER_KIND.get(dimension.base, ""))
 
 
@@ -130,7 +131,7 @@ def format_exactly(value: float, unit: str) -> str:
     sizes = [(name, size) for name in dimension.units if (size := dimension.measure(name)) is not None]
     powers = {name: size.power for name, size in sizes if size.factor == 1.0 and not size.power % 3}
     fitting = [name for name, power in powers.items() if abs(number.scaleb(-power)) >= 1]
-    # If several units have the same power of ten, `max` selects the first one, which is the usual one.
+    # If several units have the same power of ten, `max` selects the first of them, which is the most common unit.
     chosen = max(fitting, key=lambda name: powers[name]) if fitting else unit
     digits = number.scaleb(-powers[chosen]).normalize()
     return f"{digits:{'f' if -6 < digits.adjusted() < 15 else ''}} {chosen}"
@@ -142,13 +143,13 @@ def looks_like_number(text: str) -> bool:
 
 
 def check_range(value: float, allowed: Range, unit: str = "", remedy: str = "") -> float:
-    """Return a value that is finite and in its range; raise `UnusableValueError` for others.
+    """Return a value unchanged if it is finite and in its range; otherwise raise `UnusableValueError`.
 
     Args:
         value: the value.
         allowed: allowed range.
         unit: unit of the value in messages.
-        remedy: remedy in messages. Default: to write a number in the range.
+        remedy: remedy in messages. Default: "write a number in this range", or "write a finite number".
     """
     bounds = str(allowed)
     needed = f"it must be {bounds}{f' {unit}' if unit else ''}" if bounds else "it must be finite"
@@ -229,7 +230,7 @@ def _drop_separators(text: str, *, strict: bool = True) -> str:
 
 
 def _last(number: str, mark: str) -> int:
-    """Return the index of the last separator other than ``mark``; -1 if there is none."""
+    """Return the index of the last character that is neither a digit nor ``mark``; -1 if there is none."""
     return max((k for k, sign in enumerate(number) if not sign.isdigit() and sign != mark), default=-1)
 
 
@@ -256,7 +257,7 @@ def _read_counts(mantissa: str, unit: str) -> tuple[float, Dimension] | None:
 
 
 def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> tuple[float, str]:
-    """Convert a quantity to its base unit, without a check of its range; see `read_quantity`."""
+    """Convert a quantity to its base unit as `read_quantity` does, but without checking its range."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return to_float(value), dimension.base
     units = (*dimension.units, *PERIOD_WORDS) if periods else dimension.units
@@ -319,14 +320,14 @@ def _find_same_letters(unit: str, candidates: Sequence[str]) -> str:
     """
 
     def fold(name: str) -> str:
-        """Return a unit in lower case except for m and M."""
+        """Return a unit without blanks and in lower case, except that m and M are unchanged."""
         return "".join(sign if sign in "mM" else sign.lower() for sign in _canonical(name).replace(" ", ""))
 
     def split(name: str) -> list[str]:
         return re.split(r"([ /])", _canonical(name))
 
     def misspells(name: str) -> bool:
-        """Return whether the unit differs from a correct one only by the spelling of symbols of 3 letters or more."""
+        """Return whether the unit is the unit ``name`` except for misspelled symbols of 3 or more letters."""
         pairs = list(zip(split(unit), split(name), strict=False))
         if len(split(unit)) != len(split(name)):
             return False
@@ -366,7 +367,7 @@ def read_quantity(
 
 
 def read_share(text: str) -> float:
-    """Convert a fraction such as "2%" or "0.02" to a number; raise `ValueError` for other texts."""
+    """Convert a text such as "2%" or "0.02" to the number 0.02; raise `ValueError` for other texts."""
     text = text.strip()
     return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
 
@@ -375,14 +376,14 @@ def read_share(text: str) -> float:
 _COLUMN_DIMENSIONS = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
 # Further units of these columns.
 _COLUMN_UNITS = ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s", "krad/s", "dB", "m/N", "mm/N", "um/N", "µm/N")
-# A name and a unit in brackets, as in "time [s]" or "time (s)".
+# Pattern of a name and a unit in brackets, as in "time [s]" or "time (s)".
 _TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
-# Separators between a name and a unit without brackets, as in time_s, time/s and time s.
+# Pattern of the separator between a name and a unit without brackets, as in time_s, time/s and time s.
 _JOINT = re.compile(r"\s*[/,]\s*|_|\s+")
 
 
 def split_title(title: str) -> tuple[str, str]:
-    """Split the title of a column into its name and the unit in brackets at its end; "" without unit."""
+    """Split the title of a column into its name and the unit in brackets at its end, or "" if it has no unit."""
     match = _TITLE.fullmatch(title.strip())
     return (match[1], (match[2] or match[3] or "").strip()) if match else (title, "")
 
@@ -390,7 +391,8 @@ def split_title(title: str) -> tuple[str, str]:
 def split_head(head: str) -> tuple[str, str]:
     """Split the title of a column into its name and its unit.
 
-    The unit is in brackets, or it is a known unit after a slash, a comma, an underscore or a blank.
+    The unit is in brackets, or it is a known unit after a slash, a comma, an underscore or a blank. It is "" if the
+    title has no unit.
     """
     name, unit = split_title(head)
     if unit or name != head.strip():
@@ -402,7 +404,7 @@ def split_head(head: str) -> tuple[str, str]:
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a text is a unit of columns of logs or frequency responses."""
+    """Return whether a text is a unit that a column of a log or of a frequency response may have."""
     return (
         text in _COLUMN_UNITS
         or text.lower() in COUNTS

@@ -2,7 +2,7 @@
 
 A *kernel* is a function of arrays of one shape. It computes elementwise with the *namespace* of its arguments, NumPy or
 `jax.numpy`, iterates a fixed number of steps, and selects values by ``xp.where``. Some code is written for the compiler
-of JAX (XLA on a CPU); its comments give the gain, as the ratio of compile times or run times without and with it,
+of JAX (XLA on a CPU). Its comments state the gain as a ratio of compile times or run times, without and with this code,
 measured by `benchmarks/bench_xla.py` on 2 cores with AVX-512. Importing this module does not import JAX.
 """
 
@@ -91,7 +91,7 @@ def iterate(
 
 
 def apply_each(function: Callable[[Any], State], values: Sequence[Any], xp: Any) -> list[State]:
-    """Apply a function to each value, such that JAX traces and compiles the function only once."""
+    """Return the list of the function's results for each value; JAX traces and compiles the function only once."""
     if xp is np:
         return [function(value) for value in values]
     import jax
@@ -185,7 +185,7 @@ def square_roots(*values: Any) -> tuple[Any, ...]:
 def within(value: Array, limits: tuple[float, float]) -> Array:
     """Return whether a value is 0 or has a magnitude within ``limits``, elementwise."""
     size = abs(value)
-    # Reduce the upper limit to the largest number of the type, because it would overflow in float32.
+    # Reduce the upper limit to the largest number of the type, because a limit such as 1e60 would overflow in float32.
     kind = getattr(size, "dtype", np.float64)
     most = limits[1] if kind == np.float64 else min(limits[1], float(np.finfo(kind).max))
     return (size <= most) & ((size >= limits[0]) | (size == 0)) if limits[0] else size <= most
@@ -240,7 +240,7 @@ def filter_options(*options: tuple[str, int]) -> dict[str, int]:
             return False
         return True
 
-    # Test all options together first, because usually all are accepted.
+    # Test all options together first, because usually all are accepted and a single compilation then suffices.
     return values if are_accepted(values := dict(options)) else {k: v for k, v in options if are_accepted({k: v})}
 
 
@@ -307,7 +307,7 @@ def invert_haversine(x: Array, y: Array, xp: Any) -> Array:
     """
     if xp is np:
         return 2.0 * np.arctan2(np.sqrt(x), np.sqrt(y))
-    # Select with ``where``, because the derivative of ``minimum`` at x = y is the mean of the derivatives of x and y.
+    # Use ``where``, because the derivative of ``minimum`` at x = y would be the mean of the derivatives of x and y.
     beyond = x > y
     low = xp.where(beyond, y, x)
     value = 2.0 * xp.sqrt(low) * horner(4.0 * low - 1.0, ARCSINE)
