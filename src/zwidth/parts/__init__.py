@@ -1,6 +1,6 @@
 """Models of the parts of a haptic loop: device, actuator, modes, operator, timing, velocity estimate, wall and others.
 
-Each module contains one part, with its equations, units and sources. The constructor of a part checks its values.
+The module of a part states its equations, units and sources. The constructor of a part checks its values.
 """
 
 import lazy_loader

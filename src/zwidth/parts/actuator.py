@@ -43,7 +43,7 @@ class Actuator(Part):
     """
 
     _owner = "actuator"
-    # Presets of the explorer.
+    # Arguments of the presets in the explorer, by name of the preset.
     usual: ClassVar[dict[str, dict[str, float]]] = {
         "first order": {"cutoff": 300.0},
         "second order": {"cutoff": 300.0, "order": 2, "damping_ratio": 0.7},

@@ -1,10 +1,11 @@
 """Continuous-time model of the mechanism: up to three bodies in a row, structural modes and an actuator.
 
-The bodies are the motor side, the tip and the hand of the operator. Each has a damper and a spring to ground;
-neighboring bodies are connected by a *link*, a spring and a damper. The actuator force acts on the first body and on
-the modes; an *external force*, held constant over each sampling period, acts on the first body only. The modes add to
-the measured position. Times are in sampling periods T and masses in units of the mass of the first body (V1 and V2 in
-docs/theory/scenes.md). With the commanded force u, the state-space model is
+The bodies are the motor side of the device, its tip (the second mass behind a compliant coupling) and the hand of the
+operator. Each has a damper and a spring to ground; neighboring bodies are connected by a *link*, a spring and a damper.
+The actuator force acts on the first body and on the modes; an *external force*, held constant over each sampling
+period, acts on the first body only. The modes add to the measured position. Times are in sampling periods T and masses
+in units of the mass of the first body (V1 and V2 in docs/theory/scenes.md). With the commanded force u, the state-space
+model is
 
     x' = A x + B u,   x = (y, e2, e3, q1, .., y', e2', e3', q1', .., a, a')
 
@@ -29,7 +30,7 @@ from zwidth.words.xp import namespace
 
 
 class Body(NamedTuple):
-    """A mass with a damper and a spring to ground, in units of T and of the first mass."""
+    """A mass with a damper and a spring to ground, in units of the sampling period and the mass of the first body."""
 
     mass: Any
     damping: Any
@@ -37,14 +38,17 @@ class Body(NamedTuple):
 
 
 class Link(NamedTuple):
-    """The spring and the damper between two neighboring bodies, in units of T and of the first mass."""
+    """The spring and the damper between two neighboring bodies, in units of the period and the first body's mass."""
 
     stiffness: Any
     damping: Any
 
 
 class Resonance(NamedTuple):
-    """``(1/mass)/(s^2 + 2 zeta w s + w^2)``: a structural mode, or with mass 1/w^2 a second-order actuator."""
+    """Transfer function ``(1/mass)/(s^2 + 2 zeta w s + w^2)`` of a structural mode, or of an actuator of second order.
+
+    For an actuator, the mass is 1/w^2, so that the static gain is 1.
+    """
 
     rate: Any  # w in rad per period
     damping_ratio: Any  # zeta
@@ -52,22 +56,22 @@ class Resonance(NamedTuple):
 
     @property
     def poles(self) -> np.ndarray:
-        """The two poles in s."""
+        """The two roots of s^2 + 2 zeta w s + w^2, complex numbers in rad per period."""
         w, zeta = float(self.rate), float(self.damping_ratio)
         root = np.sqrt(complex(zeta * zeta - 1.0))
-        # Compute the slow real pole from the product of both, w^2, because a difference would cancel.
+        # Compute the slower of two real poles as w^2 divided by the faster one, because zeta - root would cancel.
         fast = -w * (zeta + root)
         return np.array([fast, w * w / fast if root.real else fast.conjugate()])
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Bodies in a row with modes and an actuator, the delay of the force, and the velocity estimate."""
+    """The plant of a device with known masses, together with the delay of the force and the velocity estimate."""
 
     bodies: tuple[Body, ...]
     links: tuple[Link, ...]
     modes: tuple[Resonance, ...]
-    actuator: Resonance | Any | None  # of first order: only the corner frequency, in rad per period
+    actuator: Resonance | Any | None  # `Resonance` for order 2, corner frequency in rad per period for order 1
     sensor: int  # index of the body whose position is measured
     d: Any  # delay in periods
     n_delay: int  # integer part of d
@@ -77,12 +81,12 @@ class Chain:
 
     @property
     def rigid(self) -> bool:
-        """True for a single mass with a damper, without spring, modes and actuator."""
+        """True if the device is a single mass with a damper to ground, without spring, modes and actuator lag."""
         return len(self.bodies) == 1 and self.drives_body_only and is_zero(self.bodies[0].stiffness)
 
     @property
     def drives_body_only(self) -> bool:
-        """True if a commanded force has the same effect as an external force: without modes and actuator."""
+        """True without modes and actuator lag: a commanded force then acts exactly like an external force."""
         return not self.modes and self.actuator is None
 
     @property
@@ -91,7 +95,7 @@ class Chain:
         return all(body.stiffness == 0 for body in self.bodies)
 
     def state_units(self, speed: float, force: float) -> list[float]:
-        """Return the unit of each state in SI, with positions in m.
+        """Return the list of the units of all states in SI, with 1 m as the unit of positions.
 
         Args:
             speed: unit of velocities in m/s for positions in m, i.e. 1/T.
@@ -102,7 +106,10 @@ class Chain:
         return [1.0] * count + [speed] * count + [force, force * speed][:actuator_states]
 
     def realize(self) -> Realization:
-        """Return the matrices A and B, and the input of the external force; parameters may be JAX arrays or balls."""
+        """Return A, B and the input vector of the external force.
+
+        The parameters may be floats, JAX arrays or balls (intervals of python-flint).
+        """
         lag = self.actuator
         parameters = [value for part in (*self.bodies, *self.links, *self.modes) for value in part]
         xp = namespace(*parameters, *(lag if isinstance(lag, Resonance) else () if lag is None else (lag,)))
@@ -110,15 +117,15 @@ class Chain:
         count, actuator_states = bodies + modes, 0 if lag is None else 2 if isinstance(lag, Resonance) else 1
         size = 2 * count + actuator_states
         zero = xp.asarray(0.0 * (self.bodies[0].mass + self.bodies[-1].damping + sum(mode.rate for mode in self.modes)))
-        # Linear forms of the states, the command and the external force are rows of coefficients. These are the rows of
-        # the states and of both inputs.
+        # Every quantity is a linear combination of the states, the command and the external force, stored as a row of
+        # coefficients. The unit vectors in ``axes`` represent the states and both inputs themselves.
         axes = xp.asarray(np.eye(size + 2).astype(zero.dtype)).reshape(size + 2, size + 2, *[1] * zero.ndim)
         command, external = axes[size:]
         actuator_force = command if lag is None else axes[2 * count]
         forces = [
             link.stiffness * axes[k] + link.damping * axes[count + k] for k, link in enumerate(self.links, start=1)
         ]
-        # The first body has no link before it, the last one none after it.
+        # Add zero forces at both ends, because no link is in front of the first body or after the last one.
         forces = [zero, *forces, zero]
         accelerations = []
         for k, body in enumerate(self.bodies):
@@ -144,7 +151,7 @@ class Chain:
 
     @cached_property
     def continuous(self) -> tuple[np.ndarray, np.ndarray]:
-        """The finite zeros and the poles in s of the response from command to measured position."""
+        """The finite zeros and the poles of the response from command to position, two arrays in rad per period."""
         numerator, denominator = expand_compliance(self)
         poles = [_find_roots(denominator), *(mode.poles for mode in self.modes)]
         factors = [np.array([1.0, 2.0 * m.damping_ratio * m.rate, m.rate * m.rate], float) for m in self.modes]
@@ -159,7 +166,7 @@ class Chain:
         return _find_roots(np.trim_zeros(numerator, "f")), np.concatenate(poles).astype(complex)
 
     def check(self) -> None:
-        """Raise `InputError` for a resonance or damper that is too fast for e^A to be computed accurately."""
+        """Raise `InputError` for a resonance or damper that is so fast that e^A would be inaccurate."""
         smallest_mass = min(float(body.mass) for body in self.bodies)
         rates = {"coupling.stiffness: the link": [float(link.stiffness / smallest_mass) ** 0.5 for link in self.links]}
         rates["modes.frequency: the mode"] = [float(mode.rate) for mode in self.modes]
@@ -218,7 +225,7 @@ def build_chain(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Es
         links.append((hand.coupling_stiffness, hand.coupling_damping))
     unit = masses[0][0]
     stiffness_factor, damping_factor = period * period / unit, period / unit
-    # Keep zero stiffness exactly zero even if the period is traced, because `is_zero` depends on it.
+    # Do not multiply a zero stiffness, because `is_zero` would return False for the product with a traced period.
     bodies = tuple(
         Body(m / unit, b * damping_factor, 0.0 if is_zero(k) else k * stiffness_factor) for m, b, k in masses
     )
@@ -251,9 +258,9 @@ def express_body_position(body: int, sensor: int, bodies: int, modes: int) -> li
 
 
 def expand_compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """Return numerator and denominator in s of the response from actuator force to the position of the sensor body.
+    """Return numerator and denominator of the response from actuator force to the position of the sensor body.
 
-    The highest power is first. Modes are not included.
+    Both are arrays of coefficients in s, highest power first. Modes are not included.
     """
     # The loop adds one body after the other, from the last one to the first. The bodies added so far have the dynamic
     # stiffness (force over position of the first of them) numerator/denominator. Once they include the sensor body, its
@@ -276,12 +283,12 @@ def expand_compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_roots(polynomial: np.ndarray) -> np.ndarray:
-    """Return the roots of a polynomial in s, refined by two Newton steps."""
+    """Return the roots of a polynomial given by its coefficients, highest power first, refined by two Newton steps."""
     n_zero = polynomial.size - 1 - int(np.flatnonzero(polynomial)[-1])
     rest = polynomial[: polynomial.size - n_zero]
     if rest.size % 2 and not rest[1::2].any():
-        # Without damping the polynomial contains only even powers. Solve for s^2, so that the roots are exactly on the
-        # imaginary axis.
+        # Without damping, the polynomial contains only even powers. Solve it for s^2, because the square roots are then
+        # exactly on the imaginary axis.
         half = np.sqrt(np.roots(rest[::2]).astype(complex))
         roots = np.concatenate([half, -half])
     else:

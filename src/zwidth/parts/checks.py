@@ -59,14 +59,14 @@ class Span(NamedTuple):
 
 
 def read_span(value: Any, allowed: Range) -> Span:
-    """Convert a number of seconds, or a text such as "1 ms" or "1.5 periods", to a `Span`."""
+    """Convert a number of seconds, or a text such as "1 ms" or "1.5 periods", to a `Span` and check its range."""
     if isinstance(value, Span):
         return value
     amount, unit = read_quantity(value, TIME, allowed, periods=True)
     return Span(amount, "periods" if unit == "periods" else "s")
 
 
-# Names and units of the two kinds of devices in messages, indexed by "is rotary".
+# Names and units of both kinds of devices for messages. The index is False for linear and True for rotary devices.
 _KINDS = ("linear", "rotary")
 _UNITS = ("kg, N s/m and N/m", "kg m^2, N m s/rad and N m/rad")
 
@@ -117,7 +117,14 @@ def read_texts(field: str, value: Any, unit: str) -> Any:
 
 
 def _in_si(name: str, value: Any, period: Any, system: UnitSystem) -> Any:
-    """Return an argument of a function with all texts converted to SI; the period converts a delay in periods."""
+    """Convert all texts in an argument to numbers in SI units; return other values unchanged.
+
+    Args:
+        name: name of the argument, usually that of a parameter.
+        value: value of the argument, or a nested list of values.
+        period: sampling period in s, by which a delay in periods is multiplied; None if unknown.
+        system: units of the device.
+    """
     if name not in PARAMETERS or PARAMETERS[name].unit == "1":
         return value
     if name != "delay":
@@ -138,15 +145,16 @@ def _in_si(name: str, value: Any, period: Any, system: UnitSystem) -> Any:
 class Part:
     """Base class of the parts of a scene.
 
-    The constructor checks all fields. ``repr`` returns the expression that creates the part.
+    The constructor checks all fields and converts them to SI units. ``repr`` returns the expression that creates the
+    part.
     """
 
     _owner: ClassVar[str] = ""  # first part of the dotted paths of the fields, as in "coupling.mass"
 
     def __post_init__(self) -> None:
         """Convert all fields to SI units; raise `InputError` for a value out of the range in `words.quantities`."""
-        # Fields that are None by default are optional and remain None. ``rotary`` stores the kind of device if a unit
-        # determines it.
+        # Fields whose default is None are optional, so that None needs no check. If a unit determines the kind of
+        # device, the attribute ``rotary`` stores it.
         items = {f"{self._owner}.{item.name}".lstrip("."): item for item in fields(self)}  # pyright: ignore[reportArgumentType]
         kind = find_kind({path: getattr(self, item.name) for path, item in items.items()})
         if kind is not None:
@@ -165,7 +173,7 @@ class Part:
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The units of the device: rotary if a unit or the argument ``rotary`` says so, otherwise linear."""
+        """The units of the device: those of rotary devices if ``rotary`` is True, otherwise those of linear devices."""
         return SYSTEMS[bool(getattr(self, "rotary", False))]
 
     def __repr__(self) -> str:
@@ -181,7 +189,7 @@ class Part:
 
 
 def _flatten(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield each value with its name; for lists with texts, each entry with the name of the list."""
+    """Yield pairs of name and value; for a list that contains texts, one pair per entry with the name of the list."""
     for name, value in given.items():
         if isinstance(value, list | tuple) and _has_text(value):
             for each in value:
@@ -191,12 +199,12 @@ def _flatten(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _kind_of(value: Any) -> bool | None:
-    """Return the kind of device that a text with a unit or a part belongs to; None if it determines none."""
+    """Return the kind of device to which a text with a unit, or a part, belongs; None if it determines no kind."""
     return detect_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
 
 
 def find_kind(given: dict[str, Any]) -> bool | None:
-    """Return the kind of device that the values, by name, belong to; None if no unit determines it.
+    """Return the kind of device to which all values belong: True for rotary, False for linear, None if undetermined.
 
     Args:
         given: quantities and parts by name.
@@ -230,12 +238,12 @@ def check_kind(rotary: bool, given: dict[str, Any]) -> None:
 
 
 def find_range(item: Field[Any], path: str) -> Range:
-    """Return the allowed range of a field: from its metadata if defined there, otherwise from `words.quantities`."""
+    """Return the allowed range of a dataclass field: that of its metadata, otherwise that in `words.quantities`."""
     return item.metadata.get("allowed", FIELDS[path].allowed)
 
 
 def check_number(field: str, value: Any, unit: str = "", allowed: Range | None = None) -> Any:
-    """Convert one quantity to a float in its SI unit; return a value that JAX traces unchanged.
+    """Convert a single quantity to a float in SI units and check its range; return values that JAX traces unchanged.
 
     Args:
         field: path of the parameter, for messages.

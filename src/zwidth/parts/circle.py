@@ -1,8 +1,8 @@
-"""Rational functions on the unit circle, with their derivatives, evaluated from their roots.
+"""Values and derivatives of rational functions on the unit circle, computed from their zeros and poles.
 
-A function is given by the *offsets* ``1 - root`` of its zeros and poles, because slow loops have roots near z = 1, and
-there float64 represents the offset far more accurately than the root. On the circle, z = e^(jw). Derivatives are taken
-with respect to the angle w.
+A function is given by the *offsets* ``1 - root`` of its zeros and poles, because loops that are slow compared with the
+sampling period have roots near z = 1, and there float64 represents the offset far more accurately than the root. On the
+circle, z = e^(jw). Derivatives are taken with respect to the angle w.
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ import numpy as np
 from zwidth.words.types import Array
 from zwidth.words.xp import namespace, stop_gradient
 
-# A root is on the unit circle, as that of an undamped mode, if its distance from the circle is at most
-# _ON_CIRCLE (_AT_ONE + |offset|). The limit decreases with the offset, because the distance of a root near z = 1
-# determines its decay time even if the distance is very small.
+# A root counts as a root on the unit circle, like that of an undamped mode, if its distance from the circle is at most
+# _ON_CIRCLE (_AT_ONE + |offset|). This limit decreases with the offset, because near z = 1 even a very small distance
+# is meaningful: it determines the decay time of the root.
 _ON_CIRCLE = 1e-12  # relative tolerance
 _AT_ONE = 1e-3  # value added to the offset, so that the tolerance at z = 1 is not 0
-# Offsets whose root is closer to the circle, relative to the offset, differ from an exact root on the circle by
-# rounding errors only.
+# Largest distance of a root from the circle, relative to its offset, that rounding errors of the offset can explain.
 _UNDAMPED = 8.0 * np.finfo(float).eps
 
 
@@ -31,11 +30,11 @@ class Jet(NamedTuple):
     slope: Array  # derivative with respect to w
 
     def times(self, other: Jet) -> Jet:
-        """Return the product with another function, by the product rule."""
+        """Return the product with another function, with the derivative by the product rule."""
         return Jet(self.value * other.value, self.slope * other.value + self.value * other.slope)
 
     def over(self, other: Jet) -> Jet:
-        """Return the quotient by another function, by the quotient rule."""
+        """Return the quotient of this and another function, with the derivative by the quotient rule."""
         value = self.value / other.value
         return Jet(value, (self.slope - value * other.slope) / other.value)
 
@@ -64,7 +63,7 @@ def distances_inside(offsets: np.ndarray) -> np.ndarray:
 
 
 def are_on_circle(offsets: np.ndarray) -> np.ndarray:
-    """Return whether roots, given by their offsets, are on the unit circle except for rounding errors."""
+    """Return a Boolean array: True for roots, given by their offsets, that are on the unit circle within tolerance."""
     return np.abs(distances_inside(offsets)) <= _ON_CIRCLE * (_AT_ONE + np.abs(offsets))
 
 
@@ -93,12 +92,13 @@ def product_jet(points: CirclePoints, offsets: Any, factor: Any) -> Jet:
     for offset in offsets:
         is_number = isinstance(offset, np.number)
         if is_number and offset.imag and abs(2.0 * offset.real - abs(offset) ** 2) < _UNDAMPED * abs(offset):
-            # Near a root on the circle, the sum z - 1 + offset would cancel and lose its phase as well.
+            # For a root on the circle, compute z - root from the difference of the angles, because near the root the
+            # sum z - 1 + offset would cancel and have a wrong phase.
             angle, xp = np.angle(1.0 - offset), namespace(points.w)
             difference = 2j * xp.sin(0.5 * (points.w - angle)) * xp.exp(0.5j * (points.w + angle))
         else:
-            # Expand about z = -1 for roots in the left half-plane, otherwise about z = 1: the difference is accurate
-            # near the root.
+            # Compute z - root from z + 1 for roots in the left half-plane, otherwise from z - 1, because the nearer of
+            # -1 and 1 yields an accurate difference near the root.
             difference = (
                 points.z_plus_1 + (offset - 2.0) if is_number and offset.real > 1.0 else points.z_minus_1 + offset
             )

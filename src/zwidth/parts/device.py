@@ -36,7 +36,7 @@ class Coupling(Part):
     """
 
     _owner = "coupling"
-    # Presets of the explorer.
+    # Arguments of the presets in the explorer, by name of the preset.
     usual: ClassVar[dict[str, dict[str, Any]]] = {
         "motor": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0},
         "tip": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0, "sensor": "tip"},
@@ -76,7 +76,7 @@ class Device(Part):
     damping: Any = 0.0
     coupling: Coupling | None = None
     actuator: Actuator | None = None
-    # Any, because `__post_init__` converts a list or a single mode to a tuple.
+    # The type is Any, because `__post_init__` converts a list or a single mode to a tuple.
     modes: Any = ()
     rotary: bool | None = None
 

@@ -24,7 +24,7 @@ __all__ = ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_dev
 
 
 def __dir__() -> list[str]:
-    """Return the names of ``__all__``, without imported names."""
+    """Return the public names of this module for completion at the prompt, without imported names."""
     return sorted(__all__)
 
 
@@ -144,7 +144,7 @@ class KnownDevice:
         return [name for name in ("mass", "damping") if name not in given and getattr(self, name) is None]
 
     def _choose(self, name: str, given: Any) -> Any:
-        """Return the given value, otherwise the published one; raise `InputError` if there is neither."""
+        """Return the passed value, or the published one if None is passed; raise `InputError` if none is published."""
         if given is not None:
             return given
         published = getattr(self, name)
@@ -154,7 +154,7 @@ class KnownDevice:
         return published.value
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields as JSON values, None (null) for unpublished parameters."""
+        """Return the fields by name, with values that JSON can represent; unpublished parameters are None (null)."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value._asdict() if isinstance(value, Published) else value for name, value in values.items()}
 
@@ -183,11 +183,11 @@ class KnownHand:
 
 
 def _read_published() -> tuple[tuple[KnownDevice, ...], KnownHand]:
-    """Return the devices and the hand of ``published.json``."""
+    """Return a tuple of all devices of ``published.json``, and the hand."""
     catalog = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
 
     def convert(entry: dict[str, Any]) -> dict[str, Any]:
-        """Return an entry with each parameter as `Published`, with the text of its source in place of the key."""
+        """Convert the parameters of an entry to `Published`, with the text of the source in place of its key."""
         return {
             name: Published(value[0], value[1], catalog["sources"][value[2]], *value[3:])
             if isinstance(value, list)
@@ -199,7 +199,7 @@ def _read_published() -> tuple[tuple[KnownDevice, ...], KnownHand]:
 
 
 DEVICES, HAND = _read_published()
-"""The devices of the catalog, those with measured parameters first; and the hand, for `zwidth.Scene`."""
+"""All devices of the catalog, those with measured parameters first; and a hand with published parameters."""
 
 
 def find_device(name: str) -> KnownDevice:

@@ -68,7 +68,7 @@ def differentiate(polynomial: Polynomial) -> Polynomial:
 
 
 def shift(polynomial: Polynomial) -> Polynomial:
-    """Return the polynomial p(1 - x) for a polynomial p(x)."""
+    """Return the coefficients of p(1 - x) for the coefficients of a polynomial p(x)."""
     # Horner's scheme (synthetic division) yields p(1 + x); reverse the sign of odd powers afterwards.
     values = list(polynomial)
     for k in range(1, len(values)):
@@ -92,8 +92,8 @@ def find_common_factor(one: Polynomial, other: Polynomial) -> Polynomial:
     """Return the monic greatest common divisor of two polynomials, by Euclid's algorithm."""
     a, b = _to_integers(one), _to_integers(other)
     while b:
-        # Compute pseudo-remainders, which avoid fractions. Division by the common factor of the coefficients keeps the
-        # integers small.
+        # Compute pseudo-remainders, because they need no fractions. Divide each of them by the common factor of its
+        # coefficients, because the integers would otherwise grow fast.
         while len(a) >= len(b):
             a = [x * b[0] - a[0] * y for x, y in zip(a, b + [0] * (len(a) - len(b)), strict=True)][1:]
         first = next((k for k, value in enumerate(a) if value), len(a))
@@ -102,13 +102,13 @@ def find_common_factor(one: Polynomial, other: Polynomial) -> Polynomial:
 
 
 def _to_integers(polynomial: Polynomial) -> list[int]:
-    """Scale a polynomial with rational coefficients to coprime integer coefficients."""
+    """Multiply a polynomial by a number such that its coefficients become integers without a common factor."""
     scale = lcm(*(value.denominator for value in polynomial))
     return _without_content([int(value * scale) for value in polynomial])
 
 
 def _without_content(values: list[int]) -> list[int]:
-    """Divide integers by their greatest common divisor."""
+    """Return integers divided by their greatest common divisor."""
     common = gcd(*values)
     return [value // common for value in values] if common > 1 else values
 
@@ -132,7 +132,8 @@ def find_roots(polynomial: Polynomial, offsets: bool = False) -> np.ndarray:
 
     Args:
         polynomial: the polynomial.
-        offsets: return 1 - root in place of each root, because this difference is inaccurate in float64 near 1.
+        offsets: return 1 - root in place of each root, because a caller could not compute this difference accurately
+            from a root near 1 in float64.
     """
     rest = shift(polynomial) if offsets else polynomial
     roots: list[complex] = []
@@ -144,9 +145,9 @@ def find_roots(polynomial: Polynomial, offsets: bool = False) -> np.ndarray:
 
 
 def _split_by_multiplicity(polynomial: Polynomial) -> list[Polynomial]:
-    """Return the square-free factorization (Yun 1976).
+    """Return the list of the square-free factors of a polynomial, by Yun's algorithm (1976).
 
-    The k-th factor has the roots of multiplicity k of the polynomial, counted from 1, as simple roots.
+    The simple roots of the k-th factor, counted from 1, are the roots of the polynomial with multiplicity k.
     """
     factors = []
     derivative = differentiate(polynomial)
@@ -169,7 +170,7 @@ def _simple_roots(polynomial: Polynomial) -> list[complex]:
         with localcontext(Context(prec=digits, Emax=EXPONENT, Emin=-EXPONENT)):
             exact = [Decimal(value.numerator) / Decimal(value.denominator) for value in polynomial]
             roots, errors = iterate_roots(exact)
-            # Require small errors, because otherwise a close pair of roots may be either real or complex.
+            # Require small errors, because larger ones leave open whether two close roots are real or complex.
             if all(error <= ACCURATE * magnitude(root) for root, error in zip(roots, errors, strict=True)):
                 return _pair_up(roots, errors)
     raise InputError("device: some poles or zeros are too close together; remove modes that hardly affect the output")
@@ -180,7 +181,7 @@ def _pair_up(roots: list[Complex], errors: list[Decimal]) -> list[complex]:
 
     Args:
         roots: approximate roots.
-        errors: bounds on the errors of the roots. Real and imaginary parts below the bound become 0.
+        errors: bounds on the errors of the roots. A real or imaginary part within its bound becomes exactly 0.
     """
     pairs = []
     for root, error in zip(roots, errors, strict=True):
@@ -249,8 +250,9 @@ def iterate_roots(coefficients: list[Decimal]) -> tuple[list[Complex], list[Deci
 
 
 def _newton(coefficients: list[Decimal], x: Complex) -> tuple[Complex, Decimal]:
-    """Return the Newton step p/p' at x, and a bound on its magnitude that includes the rounding error of p."""
-    # Horner's scheme for p and p'. ``total`` is the sum of the magnitudes of all terms; it bounds the rounding error.
+    """Return the Newton step p/p' of a polynomial at x, and a bound on its magnitude despite rounding errors of p."""
+    # Evaluate p and p' by Horner's scheme. The sum of the magnitudes of all terms, ``total``, bounds the rounding errors
+    # of p.
     value, derivative, total = Complex(Decimal(0), Decimal(0)), Complex(Decimal(0), Decimal(0)), Decimal(0)
     radius = magnitude(x)
     for coefficient in coefficients:

@@ -1,7 +1,7 @@
 """Coefficients and roots of the sections of a velocity filter.
 
-A filter is a product of *sections*, polynomials in z with the highest power first. Roots are returned as *offsets*
-``1 - root``, which are accurate for roots near z = 1.
+Numerator and denominator of a filter are products of *sections*, polynomials in z with the highest power first. Roots
+are returned as *offsets* ``1 - root``, which are accurate for roots near z = 1.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ NEXT_TO_ONE = 1e-2  # radius around z = 1 within which rounding errors of the co
 
 
 def ball_offsets(coefficients: tuple[Any, ...]) -> np.ndarray:
-    """Return the offsets of a polynomial with exact coefficients, as balls that enclose them."""
+    """Return the offsets of all roots of a polynomial with exact coefficients, as balls (flint) that contain them."""
     import flint
 
     exact = flint.fmpq_poly([flint.arb(value).fmpq() for value in reversed(coefficients)])
@@ -26,7 +26,7 @@ def ball_offsets(coefficients: tuple[Any, ...]) -> np.ndarray:
 
 
 def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
-    """Return the coefficients of each section, without leading zeros.
+    """Return the sections of a numerator or denominator, each a tuple of coefficients without leading zeros.
 
     Args:
         name: "numerator" or "denominator", for messages.
@@ -60,7 +60,10 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
 
 
 def is_rounding(coefficients: tuple[float, ...]) -> bool:
-    """Return whether rounding errors of the coefficients can explain all roots on or outside the unit circle."""
+    """Return whether rounding errors of the coefficients can cause all roots of a section on or outside the circle.
+
+    The circle is the unit circle. The result is False if no root is on or outside it.
+    """
     roots = 1.0 - offsets(np.trim_zeros(np.array(coefficients), "b"))
     points = np.exp(1j * np.angle(roots[np.abs(roots) >= 1.0]))
     # If the value at a point of the unit circle is within this bound, a polynomial whose coefficients differ only by
@@ -70,12 +73,12 @@ def is_rounding(coefficients: tuple[float, ...]) -> bool:
 
 
 def count_trailing_zeros(polynomial: np.ndarray) -> int:
-    """Return the number of zero coefficients after the last nonzero one."""
+    """Return the number of zero coefficients after the last nonzero one, i.e. the multiplicity of the root z = 0."""
     return polynomial.size - int(np.flatnonzero(polynomial)[-1]) - 1
 
 
 def offsets(polynomial: np.ndarray) -> np.ndarray:
-    """Return the offsets of all roots in float64, computed from the coefficients in powers of z - 1."""
+    """Return the offsets of all roots of a polynomial in float64, computed from its coefficients in powers of z - 1."""
     if polynomial.size < 2:
         return np.zeros(0, complex)
     shifted = Polynomial(polynomial[::-1])(Polynomial([1.0, 1.0])).coef

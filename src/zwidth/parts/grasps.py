@@ -9,7 +9,7 @@ from zwidth.parts.checks import check_number
 from zwidth.parts.operator import Operator
 from zwidth.words.quantities import POSITIVE
 
-HAND = Operator(**Operator.usual["rigid"])  # measured hand with a rigid grasp
+HAND = Operator(**Operator.usual["rigid"])  # measured hand; its rigid grasp is replaced by a spring and a damper
 SPRINGS = {"soft": 1e3, "firm": 10e3}  # coupling stiffness between hand and device, in N/m
 DAMPERS = {"light": 1.0, "medium": 5.0, "strong": 20.0}  # coupling damping between hand and device, in N s/m
 # Distances of the hand from the axis of a rotary device, in m. They are closely spaced, because a grasp with light

@@ -35,7 +35,7 @@ _FORMS = (
 
 
 class RationalResponse(NamedTuple):
-    """``numerator/denominator`` in s, or in z for a sampled system, with exact coefficients."""
+    """Transfer function ``numerator/denominator`` in s, or in z for a discrete-time system, with exact coefficients."""
 
     numerator: Polynomial
     denominator: Polynomial
@@ -49,7 +49,7 @@ class ResponseDevice:
     actuator: ClassVar[None] = None
     modes: ClassVar[tuple[()]] = ()
     rotary: bool = False
-    # The physical damping is part of the response.
+    # The damping is 0, because the response already includes the physical damping.
     damping: ClassVar[float] = 0.0
 
     @property
@@ -133,7 +133,7 @@ class LinearDevice(ResponseDevice):
 
     @cached_property
     def mass(self) -> float:
-        """A mass in kg whose response has a similar magnitude; the unit of mass of normalized parameters."""
+        """The mass in kg that is the unit of normalized parameters; its response is of similar size as the device's."""
         relative_degree = self.poles.size - self.zeros.size
         if self.dt is None and relative_degree == 2 and self.gain > 0:
             return 1.0 / self.gain
@@ -147,7 +147,7 @@ class LinearDevice(ResponseDevice):
 
 
 def parse_fraction(text: str) -> tuple[list[float], list[float]]:
-    """Parse a text "NUMERATOR / DENOMINATOR" whose coefficients, highest power first, have blanks or commas between."""
+    """Return the coefficients of numerator and denominator from a text such as "1 / 0.1 10 0", highest power first."""
     try:
         numerator, denominator = ([float(c) for c in side.replace(",", " ").split()] for side in text.split("/"))
     except ValueError:
@@ -159,7 +159,7 @@ def parse_fraction(text: str) -> tuple[list[float], list[float]]:
 
 
 def _read(given: Any) -> RationalResponse:
-    """Return the exact response of a system in any accepted form; raise `InputError` for other values."""
+    """Convert a system in any accepted form to an exact transfer function; raise `InputError` for other values."""
     given = parse_fraction(given) if isinstance(given, str) else given
     dt = getattr(given, "dt", None)
     if dt is True:
@@ -195,7 +195,7 @@ def _reject_unstable_hidden_modes(roots: np.ndarray, letter: str) -> None:
 
 
 def _read_form(given: Any) -> tuple[Polynomial, Polynomial]:
-    """Return the exact numerator and denominator of a system given by matrices, coefficients or roots."""
+    """Return the exact numerator and denominator of a system that is given by matrices, coefficients or roots."""
     if hasattr(given, "A") and hasattr(given, "C"):
         given = (given.A, given.B, given.C, given.D)
     elif hasattr(given, "num") and hasattr(given, "den"):
@@ -240,9 +240,9 @@ def _expand(roots: Any) -> Polynomial:
 
 
 def _reduce(numerator: Polynomial, denominator: Polynomial) -> tuple[Polynomial, Polynomial]:
-    """Divide numerator and denominator by their common factor.
+    """Return numerator and denominator divided by their greatest common divisor.
 
-    A sum of two responses, for example, has a common factor if both have the same integrator.
+    For example, the sum of two transfer functions with the same integrator has a common factor s.
     """
     if not numerator or len(numerator) >= len(denominator):
         return numerator, denominator

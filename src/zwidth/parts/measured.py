@@ -23,7 +23,7 @@ from zwidth.words.formatting import suggestion
 from zwidth.words.tables import read_columns
 from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, Dimension, split_head
 
-_MIN_LINES = 8  # fewer frequencies do not define a curve
+_MIN_LINES = 8  # smallest number of frequencies, because fewer do not define a curve
 SUFFIXES = (".csv", ".txt", ".dat", ".npz", ".mat")  # suffixes of files that contain a measured response
 # Accepted names of each column, in lower case.
 _NAMES = {
@@ -36,11 +36,11 @@ _NAMES = {
     "deviation": ("deviation", "radius", "uncertainty"),
 }
 _TURN = 2.0 * math.pi  # rad per revolution
-# Units of the columns.
+# Dimensions of the columns, with the units that are accepted.
 _FREQUENCY = Dimension(RATE.names, RATE.example, {"rad/s": 1.0 / _TURN, "1/s": 1.0 / _TURN, "krad/s": 1e3 / _TURN})
 _COMPLIANCE = Dimension(", ".join(f"{length}/{force}" for length in LENGTH.units for force in FORCE.units), "1 mm/N")
 _ANGULAR_COMPLIANCE = Dimension("rad/(N m), rad/(mN m), mrad/(N m), mrad/(mN m), deg/(N m), deg/(mN m)", "1 rad/(N m)")
-# Decibels with an optional reference unit, as in "dB", "dB re 1 m/N" or "dB (mm/N)".
+# Pattern of decibels with an optional reference unit, as in "dB", "dB re 1 m/N" or "dB (mm/N)".
 _DECIBELS = re.compile(r"dB(?:\s*(?:\(?re\.?\s*)?(?:1\s*)?(m\s*/\s*N|mm\s*/\s*N|um\s*/\s*N|µm\s*/\s*N)\)?)?")
 
 
@@ -111,7 +111,7 @@ class MeasuredDevice(ResponseDevice):
             object.__setattr__(self, name, values)
 
     def __eq__(self, other: object) -> bool:
-        """Return whether all values are equal."""
+        """Return whether two devices have the same frequencies, responses, deviations and kind, linear or rotary."""
         return isinstance(other, MeasuredDevice) and self._key == other._key
 
     def __hash__(self) -> int:
@@ -128,7 +128,7 @@ class MeasuredDevice(ResponseDevice):
 
     @property
     def _key(self) -> tuple[bytes, ...]:
-        """All values as bytes, for comparisons and hashes."""
+        """Frequencies, responses, deviations and kind of device as bytes, for comparisons and hashes."""
         parts = (self.frequency, self.response, self.deviation)
         return (*(b"" if part is None else part.tobytes() for part in parts), bytes([self.rotary]))
 
@@ -155,7 +155,7 @@ class MeasuredDevice(ResponseDevice):
         return cls(*_read_table(file))
 
     def save(self, file: str | Path, *remarks: str) -> None:
-        """Write a table for `read`, in full precision; remarks become its first lines, after a #."""
+        """Write the response to a text file for `read`, in full precision; remarks become its first lines, after a #."""
         unit = "rad/(N m)" if self.rotary else "m/N"
         heads = ["frequency [Hz]", f"real [{unit}]", f"imag [{unit}]"]
         columns = [self.frequency, np.real(self.response), np.imag(self.response)]
@@ -239,7 +239,15 @@ def _read_table(file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
 
 
 def _size(file: Path, name: str, unit: str, dimension: Dimension, allowed: tuple[str, ...]) -> float:
-    """Return the factor that converts a unit of a column to SI; raise `InputError` for an unknown or missing unit."""
+    """Return the factor that converts the unit of a column to SI; raise `InputError` for an unknown or missing unit.
+
+    Args:
+        file: path of the table, for messages.
+        name: name of the column.
+        unit: unit of the column; "" if its header has none.
+        dimension: dimension of the column.
+        allowed: usual units of the column, for messages.
+    """
     size = dimension.in_base("1", 0, unit) if unit else None
     if size is None:
         remedy = suggestion(unit, allowed, f"write one of {', '.join(allowed)} in brackets after the name")

@@ -1,6 +1,7 @@
 """Structural mode of a device: a resonance that contributes to the measured position.
 
-The position is the sum of the displacement of the bodies and of one term per mode. The displacement q of a mode is
+The measured position is the position of the sensor's body plus the displacements of all modes. The displacement q of a
+mode satisfies
 
     q'' + 2 zeta w q' + w^2 q = F/mass
 

@@ -14,7 +14,7 @@ import numpy as np
 from zwidth.parts.state_space import realize_estimate
 from zwidth.parts.velocity import Estimate, Velocity
 
-DOUBLINGS = 60  # doublings of the number of summed terms; 2^60 terms cover time constants of 1e15 periods
+DOUBLINGS = 60  # largest number of doublings of the number of terms; 2^60 terms suffice for time constants of 1e15 T
 
 
 def find_velocity_noise(velocity: Velocity, period: Any, resolution: float) -> float:
@@ -30,7 +30,7 @@ def find_velocity_noise(velocity: Velocity, period: Any, resolution: float) -> f
 
 
 def _sum_squared_response(estimate: Estimate) -> float:
-    """Return the sum of the squared impulse response of a velocity estimate that is normalized to T = 1."""
+    """Return the sum of the squares of the impulse response of a velocity estimate that is normalized to T = 1."""
     if estimate.window and not estimate.zeros.size and not estimate.poles.size:
         return 2.0 * (float(estimate.gain) / estimate.window) ** 2
     A, B, C, D, _ = realize_estimate(estimate)

@@ -14,7 +14,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.xp import is_jax
 
-# Measured hand, from the reference of `Operator`; kg, N s/m and N/m.
+# Parameters of a measured hand in kg, N s/m and N/m; `Operator` names the source.
 _HAND = {"mass": 0.554, "damping": 6.45, "stiffness": 135.0}
 
 
@@ -39,7 +39,7 @@ class Operator(Part):
     """
 
     _owner = "operator"
-    # Presets of the explorer.
+    # Arguments of the presets in the explorer, by name of the preset.
     usual: ClassVar[dict[str, dict[str, float]]] = {
         "rigid": _HAND,
         "grasp": {**_HAND, "coupling_stiffness": 1e3, "coupling_damping": 5.0},
@@ -54,9 +54,9 @@ class Operator(Part):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.rigid:
-            # Check the mass only now, because `Part` has converted it to SI.
+            # Check the mass after the base class has converted it to SI.
             check_number("operator.mass", self.mass, self.unit_system["kg"], POSITIVE)
-        # Count any JAX value as nonzero, because a traced value cannot be compared.
+        # Treat any JAX value as nonzero, because the value of a traced one is unknown.
         if self.rigid and (is_jax(self.coupling_damping) or self.coupling_damping):
             raise InputError(
                 f"operator.coupling_damping: got {self.coupling_damping!r} without a coupling spring; pass "

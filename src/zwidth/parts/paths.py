@@ -25,7 +25,7 @@ from zwidth.words.xp import is_jax
 
 
 class Parts(Protocol):
-    """Protocol of a scene, restricted to its parts, for modules that `zwidth.Scene` itself imports."""
+    """Interface of a scene for annotations in modules that cannot import `zwidth.Scene`, because it imports them."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]  # allows calls of `dataclasses.replace`
 
@@ -44,29 +44,29 @@ class Parts(Protocol):
 AnyScene = TypeVar("AnyScene", bound=Parts)
 
 _BARE = ("device", "timing", "wall")  # parts whose parameters have paths without prefix
-_WHOLE = ("safe_limit",)  # parts that can only be replaced as a whole; their parameters have no paths
+_WHOLE = ("safe_limit",)  # parts that can only be replaced as a whole, because their parameters have no paths
 PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator}
-"""The optional parts of a scene, in the order of descriptions."""
+"""Classes of the optional parts of a scene, by name, in the order in which descriptions list these parts."""
 _OF_DEVICE = ("coupling", "actuator")  # optional parts that are fields of the device
-# Fields of the scene whose parameters have the name of the part as prefix.
+# Fields of the scene whose name is the first part of the paths of their parameters.
 _NAMED = ("velocity", *(name for name in PARTS if name not in _OF_DEVICE))
 
 
 def find_parts(scene: Parts) -> dict[str, Any]:
-    """Return the velocity estimate, the optional parts and the modes of a scene, by name."""
+    """Return a dictionary, by name, of the velocity estimate and of the optional parts and modes that a scene has."""
     parts = {name: getattr(scene, name) for name in _NAMED} | {name: getattr(scene.device, name) for name in _OF_DEVICE}
     parts |= {f"modes.{k}": mode for k, mode in enumerate(scene.device.modes)}
     return {name: part for name, part in parts.items() if part is not None}
 
 
 def _parts(scene: Parts) -> list[tuple[str, str, Any]]:
-    """Return prefix of the paths, name and value of each part of a scene, the wall last."""
+    """Return a tuple (prefix of the paths of its parameters, name, part) for each part of a scene, the wall last."""
     *bare, wall = (("", name, getattr(scene, name)) for name in _BARE)
     return [*bare, *((f"{name}.", name, part) for name, part in find_parts(scene).items()), wall]
 
 
 def list_parameters(scene: Parts) -> dict[str, Any]:
-    """Return every numeric parameter of a scene by its dotted path, the parameters of the wall last."""
+    """Return a dictionary of all numeric parameters of a scene by dotted path, the parameters of the wall last."""
     values = {
         prefix + item.name: getattr(part, item.name) for prefix, _, part in _parts(scene) for item in fields(part)
     }
@@ -78,7 +78,9 @@ def list_parameters(scene: Parts) -> dict[str, Any]:
 
 
 def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
-    """Return a scene with the given changes; all other parameters keep their values in SI units.
+    """Return a copy of a scene with some parameters or parts replaced.
+
+    All other parameters keep their values in SI units, except that a delay in periods keeps its number of periods.
 
     Args:
         scene: the scene.
@@ -96,7 +98,7 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 
 
 def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
-    """Return a scene with changes by path, all of which refer to the present parts of the scene."""
+    """Return a copy of a scene with new values by path; raise `InputError` for a path that the scene does not have."""
     parts = {name: part for _, name, part in _parts(scene)}
     owners = {prefix + item.name: (name, item.name) for prefix, name, part in _parts(scene) for item in fields(part)}
     owners |= {name: ("", name) for name in (*_BARE, *_NAMED, *_WHOLE)}
@@ -107,10 +109,11 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
         part, name = owners[path]
         changed.setdefault(part, {})[name] = value
     if "rate" in changed.get("timing", {}):
-        # Discard the period, because the rate determines it.
+        # Pass None as the period, because `Timing` accepts either period or rate.
         changed["timing"].setdefault("period", None)
     if "timing" in changed:
-        # Pass the delay in its original unit, so that a delay in periods keeps its number of periods.
+        # If the user gave the delay as a number of periods, this number must not change with the sampling period.
+        # Therefore pass the delay as it was given, because `replace` would pass it in seconds.
         changed["timing"].setdefault("delay", scene.timing.span)
     if isinstance(scene.wall, NoWall):
         parts["wall"] = VirtualWall(0.0)
@@ -125,7 +128,7 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 
 
 def spell_scene(scene: Any) -> dict[str, Any]:
-    """Return the section ``scene`` of a configuration, with the keys whose values differ from the defaults."""
+    """Return the section ``scene`` of a configuration as a dictionary, without keys that have their default values."""
     parts: dict[str, Any] = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
     if scene.safe_limit is not None:
         parts["safe_limit"] = spell_part(scene.safe_limit)
@@ -140,7 +143,7 @@ def spell_scene(scene: Any) -> dict[str, Any]:
 
 
 def spell_estimate(velocity: Velocity, *, every: bool = False) -> dict[str, Any]:
-    """Return the key ``velocity`` of a configuration; empty for the default, the backward difference.
+    """Return a dictionary with the key ``velocity`` of a configuration; empty for the default, the backward difference.
 
     Args:
         velocity: the velocity estimate.
@@ -151,7 +154,12 @@ def spell_estimate(velocity: Velocity, *, every: bool = False) -> dict[str, Any]
 
 
 def spell_part(part: Any, *, every: bool = False) -> dict[str, Any]:
-    """Return the fields of a part that differ from their defaults; with ``every``, all fields that are not None."""
+    """Return a dictionary of the fields of a part that differ from their defaults.
+
+    Args:
+        part: the part.
+        every: return all fields that are not None instead.
+    """
     values = {field.name: (getattr(part, field.name), field.default) for field in fields(part)}
     return {
         name: value

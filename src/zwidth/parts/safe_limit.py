@@ -1,4 +1,9 @@
-"""Safe limit of a device: the stiffest wall whose stability the measurements support, with its reason and warnings."""
+"""Safe limit of a device: an upper limit on stiffness and damping of its walls, derived from measurements.
+
+The limit is a wall (K, B): the stiffest one that is stable for nearly all devices that are consistent with the
+measurements. A fit of the device computes the limit, a scene stores it, and a recommended wall does not exceed it,
+unless the user requests a stiffer wall explicitly.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +21,13 @@ ROUNDING = 5e-4  # relative tolerance of `allows`, so that the limit allows a wa
 
 @dataclass(frozen=True, repr=False)
 class SafeLimit(Part):
-    """The stiffest wall (K, B) whose stability the measurements of a device support.
+    """The stiffest wall (K, B) that measurements of a device show to be stable, with the reason for this limit.
 
-    The limit allows a wall (K', B') if K' <= K and B' is between B K'/K and B. In the first extreme, stiffness and
-    damping are reduced by the same factor; in the second, only the stiffness is reduced.
+    The limit allows a wall (K', B') if K' <= K and B' is between B K'/K and B. At the first end of this interval,
+    stiffness and damping are reduced by the same factor; at the second end, only the stiffness is reduced.
 
     Args:
-        stiffness: K in N/m, >= 0; 0 if the measurements support no wall.
+        stiffness: K in N/m, >= 0; 0 if the measurements are insufficient for any wall.
         virtual_damping: B in N s/m.
         reason: the effect that limits the stiffness, and the measurement that could raise the limit.
         warnings: faults of the measurements, one sentence each.
@@ -84,5 +89,5 @@ class SafeLimit(Part):
 
 
 def reserve_damping(scene: Any) -> float:
-    """Return the physical damping of a device that does not count for passivity, from the safe limit of its scene."""
+    """Return the physical damping in N s/m that does not count for passivity; 0 for a scene without safe limit."""
     return 0.0 if scene.safe_limit is None else scene.safe_limit.damping_reserve

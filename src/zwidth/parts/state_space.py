@@ -1,8 +1,8 @@
 """Discrete-time state-space models, their series connection, and the realization of a velocity estimate.
 
 A velocity estimate is realized as a shift register, which yields the difference over its window, followed by a filter
-in powers of zeta = z - 1. For a filter that is slow compared with the period, these coefficients are more accurate than
-those in powers of z.
+whose polynomials are in powers of z - 1. For a filter that is slow compared with the period, these coefficients are
+more accurate than those in powers of z.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from zwidth.words.showing import compact_repr
 
 @compact_repr(dt="s")
 class StateSpace(NamedTuple):
-    """``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``, with a step every ``dt`` seconds."""
+    """State-space model ``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]`` with sampling period ``dt`` in s."""
 
     A: np.ndarray
     B: np.ndarray
@@ -36,9 +36,12 @@ class StateSpace(NamedTuple):
 
 
 def _realize_filter(estimate: Estimate) -> StateSpace:
-    """Return the filter of an estimate, without its window, in controllable canonical form in powers of z - 1."""
-    # A factor z^-lag adds poles or zeros at z = 0, whose offset 1 - z is 1. Afterwards there are at least as many poles
-    # as zeros, because the filter is causal.
+    """Return the filter of a velocity estimate, without the difference over its window, in controllable canonical form.
+
+    The form is that of the polynomials in z - 1, so that 1 is added to the diagonal of A.
+    """
+    # The factor z^-lag adds poles or zeros at z = 0, whose offset 1 - z is 1. With these, the filter has at least as
+    # many poles as zeros, because it is causal.
     zeros = np.concatenate([estimate.zeros, np.ones(max(-estimate.lag, 0))])
     poles = np.concatenate([estimate.poles, np.ones(max(estimate.lag, 0))])
     size = poles.size

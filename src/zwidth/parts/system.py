@@ -2,8 +2,8 @@
 
 The device is a transfer function in s, or in z if it was sampled. This module builds a state-space realization whose
 first state is the output. Times are in sampling periods T and forces in units of mass/T^2, as for a device with known
-bodies (`zwidth.parts.chain`). In float64, sections of order 1 or 2 in series keep each root accurate; in ball
-arithmetic (python-flint), the companion form of the exact coefficients does.
+masses (`zwidth.parts.chain`). In float64, the realization consists of sections of order 1 or 2 in series, which keep
+each root accurate. In ball arithmetic (intervals, python-flint), it is the companion form of the exact coefficients.
 """
 
 from __future__ import annotations
@@ -17,13 +17,16 @@ from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 
-# Limits of the accuracy of e^A.
+# Beyond these limits, e^A cannot be computed accurately.
 FASTEST = 1e4  # largest magnitude of a pole in rad per period
 STRONGEST = 1e10  # largest rate of decay by a damper, per period
 
 
 class Realization(NamedTuple):
-    """``x' = A x + B u + external f``; u: commanded force, f: external force; the first state is the output."""
+    """State equation ``x' = A x + B u + external f`` with commanded force u and external force f.
+
+    The first state is the output, the measured position.
+    """
 
     A: Any
     B: Any
@@ -53,11 +56,11 @@ class System:
         return sum(denominator) == 0 if self.sampled else denominator[-1] == 0
 
     def state_units(self, speed: float, force: float) -> list[float]:
-        """Return 1 for each state, because the units of its states are unknown; the arguments are those of `Chain`."""
+        """Return a list with 1 for each state, because the states have no known units; arguments as for `Chain`."""
         return [1.0] * self.device.poles.size
 
     def realize(self) -> Realization:
-        """Return the matrices of x'; for a sampled device, those of x[k+1]."""
+        """Return the state equation in units of the period and the mass; for a sampled device, that of x[k+1]."""
         A, B = _realize_companion(self.device) if hasattr(self.mass, "mid") else _realize_sections(self.device)
         if self.sampled:
             B = B * (self.mass / self.period**2)
@@ -66,7 +69,7 @@ class System:
         return Realization(A * self.period, B, B)
 
     def check(self) -> None:
-        """Raise `InputError` if the period or the delay does not fit the device."""
+        """Raise `InputError` if a sampled device does not match period or delay, or a continuous one has a fast pole."""
         if self.sampled:
             dt, period = self.device.dt or 0.0, float(self.period)
             if abs(dt - period) > 1e-9 * period:
@@ -88,9 +91,9 @@ class System:
 
 
 def _realize_sections(device: LinearDevice) -> tuple[np.ndarray, np.ndarray]:
-    """Return A and B of sections of order 1 or 2 in series.
+    """Return A and B of a realization by sections of order 1 or 2 in series.
 
-    The rounding errors of one root then do not affect other roots.
+    With such sections, rounding errors of one root do not affect the roots of other sections.
     """
     # A, B, C and D are the matrices of the sections connected so far, without the gain.
     A, B, C, D = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
@@ -123,8 +126,8 @@ def _pair_roots(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, 
         return sorted([*pairs, *(real[k : k + 2] for k in range(0, real.size, 2))], key=lambda each: np.abs(each).min())
 
     sections = sorted(group(poles), key=lambda each: each.size, reverse=True)
-    # Assign each group of zeros to the free section with the most similar magnitude. A pair of zeros always finds a
-    # section with two poles, because there are more poles than zeros.
+    # Assign each group of zeros to the free section whose poles have the most similar magnitude. A section with two
+    # poles is always free for a pair of zeros, because there are more poles than zeros.
     left, chosen = list(range(len(sections))), {}
     for each in sorted(group(zeros), key=lambda each: each.size, reverse=True):
         far = [abs(np.log((1e-300 + np.abs(sections[k]).max()) / (1e-300 + np.abs(each).max()))) for k in left]
@@ -138,7 +141,7 @@ def _pair_roots(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, 
 
 
 def _realize_companion(device: LinearDevice) -> tuple[Any, Any]:
-    """Return A and B as balls, in companion form, from the exact coefficients."""
+    """Return A and B of the companion form as arrays of balls, computed from the exact coefficients of the device."""
     import flint
 
     def ball(value: Any) -> Any:
@@ -155,7 +158,7 @@ def _realize_companion(device: LinearDevice) -> tuple[Any, Any]:
 
 
 def _output_as_first_state(A: Any, B: Any, C: Any) -> tuple[Any, Any]:
-    """Return A and B of the same system with the output y = C x as first state.
+    """Return A and B after a change of the state variables that makes the output y = C x the first state.
 
     Args:
         A: state matrix.

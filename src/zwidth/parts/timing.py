@@ -32,8 +32,8 @@ class Timing(Part):
     period: Any = None
     delay: Any = 0.0
     rate: Any = None
-    # The delay in periods if it was given in periods. It is stored, because the quotient of delay and period in seconds
-    # may have a rounding error.
+    # Delay in periods if the user gave it in periods, otherwise None. This number is stored, because the quotient of
+    # delay and period in seconds may have a rounding error.
     _periods: ClassVar[float | None] = None
 
     def __post_init__(self) -> None:
@@ -61,12 +61,12 @@ class Timing(Part):
 
     @property
     def span(self) -> Any:
-        """The delay in its original unit: a `Span` in periods, or a number of seconds."""
+        """The delay in the unit in which the user gave it: a `Span` in periods, or a number of seconds."""
         return self.delay if self._periods is None else Span(self._periods, "periods")
 
     @property
     def kept_delay(self) -> str:
-        """The delay as text in its original unit, in which it is constant if the period changes: "1 period", "1 ms"."""
+        """The delay as text, "1 period" or "1 ms", in the unit in which it remains constant if the period changes."""
         if self._periods is None:
             return with_unit(float(self.delay), "s")
         return format_periods(self._periods)

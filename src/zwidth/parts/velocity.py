@@ -58,7 +58,7 @@ class Estimate:
             delayed = power_jet(points, -self.window)
             n = self.window
             s = xp.sin(0.5 * n * points.w)
-            # 1 - cos(n w) = 2 sin^2(n w/2) avoids cancellation at low frequencies.
+            # Replace 1 - cos(n w) by 2 sin^2(n w/2), because the difference would cancel at low frequencies.
             value = xp.where(points.w >= np.pi, 1.0 - delayed.value, 2.0 * s * s - 1j * delayed.value.imag) / n
             product = product.times(Jet(value, -delayed.slope / n))
         return product
@@ -72,7 +72,7 @@ class Estimate:
 
     @property
     def degree(self) -> int:
-        """The number of zeros, poles and delays; larger than ``window`` if the estimate has a filter."""
+        """The sum of window, abs(lag) and the numbers of zeros and poles; larger than ``window`` if F has a filter."""
         return self.window + abs(self.lag) + self.zeros.size + self.poles.size
 
 
@@ -96,7 +96,7 @@ class BackwardDifference(_Checked):
     coded_period: Any = None
 
     def estimate(self, period: Any) -> Estimate:
-        """Return the estimate for a loop with a period in s, normalized to T = 1."""
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
         return Estimate(window=1, gain=_ratio(period, self.coded_period))
 
 
@@ -116,7 +116,7 @@ class WindowedDifference(_Checked):
     coded_period: Any = None
 
     def estimate(self, period: Any) -> Estimate:
-        """Return the estimate for a loop with a period in s, normalized to T = 1."""
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
         return Estimate(window=self.samples, gain=_ratio(period, self.coded_period))
 
 
@@ -153,7 +153,7 @@ class LowPass(_Checked):
         super().__post_init__()
 
     def estimate(self, period: Any) -> Estimate:
-        """Return the estimate for a loop with a period in s, normalized to T = 1."""
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
         coded = period if self.coded_period is None else self.coded_period
         if self.time_constant is None:
             check_cutoff(self.cutoff, coded)
@@ -185,7 +185,7 @@ class Butterworth(_Checked):
     coded_period: Any = None
 
     def estimate(self, period: Any) -> Estimate:
-        """Return the estimate for a loop with a period in s, normalized to T = 1."""
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
         coded = period if self.coded_period is None else self.coded_period
         check_cutoff(self.cutoff, coded)
         # The analog poles are on a circle, whose radius is prewarped so that the bilinear transform s = (z - 1)/(z + 1)
@@ -242,8 +242,8 @@ class VelocityFilter(Part):
         if largest < 1.0:
             return
         got = f"velocity.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
-        # Rounding errors of the coefficients move poles only if there are several near z = 1. A single pole there is
-        # intended: an integrator.
+        # Rounding errors of the coefficients move poles far enough only if several poles are near z = 1. A single pole
+        # there is probably an intended integrator.
         slow = np.abs(poles) < NEXT_TO_ONE
         if np.sum(slow) != 1 and any(is_rounding(section) for section in self._sections[1]):
             cause = "Cause: rounding errors of the coefficients; use sections in series (scipy.signal: output='sos')"
@@ -262,7 +262,7 @@ class VelocityFilter(Part):
 
     @cached_property
     def _roots(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """The offsets of zeros and poles, without roots at z = 0; and the number of poles minus zeros at z = 0."""
+        """The offsets of all zeros and of all poles except at z = 0, and the excess of poles over zeros at z = 0."""
         roots, trailing = [], []
         for part in self._sections:
             sections = [np.array(section) for section in part]
@@ -271,7 +271,7 @@ class VelocityFilter(Part):
         return roots[0], roots[1], trailing[1] - trailing[0]
 
     def estimate(self, period: Any) -> Estimate:
-        """Return the estimate for a loop with a period in s, normalized to T = 1."""
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
         tops, bottoms = self._sections
         gain = period
         for section in tops:
@@ -279,7 +279,8 @@ class VelocityFilter(Part):
         for section in bottoms:
             gain = gain / section[0]
         if hasattr(period, "mid"):
-            # Compute the roots as balls from the exact coefficients, because zeros at z = 1 must be exact.
+            # For a period that is a ball, compute the roots as balls from the exact coefficients, because zeros at z = 1
+            # must be exact.
             exact = (np.concatenate([ball_offsets(section) for section in part]) for part in (tops, bottoms))
             return Estimate(0, gain, 0, *exact)
         zeros, poles, lag = self._roots
@@ -305,7 +306,7 @@ class FOAW(_Checked):
     samples: int = field(default=15, metadata={"allowed": Range(1, 64)})
 
     def estimate(self, period: Any) -> Estimate:
-        """Raise `InputError`, because the estimate depends on the motion."""
+        """Raise `InputError`, because FOAW is nonlinear and has no transfer function F(z)."""
         raise InputError(
             "velocity: FOAW has no linear form, so the loop has no poles; simulate it, or use a linear estimate such "
             "as zwidth.WindowedDifference"
@@ -325,7 +326,7 @@ ESTIMATES = {
 
 
 def name_estimate(velocity: Velocity) -> str:
-    """Return the name that selects an estimate in configurations; raise `InputError` for other classes."""
+    """Return the name of the kind of an estimate in configurations; raise `InputError` for other classes."""
     for kind, part in ESTIMATES.items():
         if type(velocity) is part:
             return kind
@@ -336,7 +337,7 @@ def name_estimate(velocity: Velocity) -> str:
 
 
 def is_plain(velocity: Velocity, period: Any) -> bool:
-    """Return whether an estimate is the backward difference over the period of the loop, without parameters."""
+    """Return whether an estimate is a backward difference without any parameter, divided by the period of the loop."""
     if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
         return False
     estimate = velocity.estimate(period)
@@ -355,11 +356,11 @@ def check_cutoff(cutoff: Any, period: Any) -> None:
 
 
 def _ratio(period: Any, coded: Any) -> Any:
-    """Return the period of the loop divided by the coded period; 1 if no coded period is given."""
+    """Return the period of the loop divided by the coded period; 1 if the coded period is None."""
     return 1.0 if coded is None else period / coded
 
 
-# Operations that differ between floats, JAX arrays and balls.
+# The following operations differ between floats, JAX arrays and balls.
 
 
 def _pi(like: Any) -> Any:

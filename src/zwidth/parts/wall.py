@@ -1,4 +1,4 @@
-"""The virtual wall of a scene, and the choice between this wall and stiffness and damping passed as arguments."""
+"""The virtual wall of a scene, and the rule by which a wall passed as arguments replaces the wall of the scene."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class VirtualWall(Part):
 
 @dataclass(frozen=True, repr=False)
 class NoWall(VirtualWall):
-    """Placeholder for the wall of a scene without wall: no force, and no default for stiffness and damping."""
+    """Placeholder for the wall of a scene that has none: its force is 0, and it is not used as default wall."""
 
     stiffness: Any = field(default=0.0, init=False, repr=False)
     virtual_damping: Any = field(default=0.0, init=False, repr=False)
 
 
 def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any, system: UnitSystem) -> tuple[Any, Any]:
-    """Return K and B in SI units: the arguments, or the parameters of the scene's wall if both arguments are None.
+    """Return K and B in SI units: those passed, or those of the scene's wall if stiffness and damping are both None.
 
     K without B means B = 0 if the scene has no wall. If it has one, K without B is ambiguous and raises `InputError`.
     """
