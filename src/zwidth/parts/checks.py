@@ -112,7 +112,13 @@ def _map_texts(read: Callable[[str], Any], value: Any) -> Any:
 
 
 def read_texts(field: str, value: Any, unit: str) -> Any:
-    """Convert texts with a unit, alone or in lists and arrays, to numbers in SI; return other values unchanged."""
+    """Convert texts with a unit to numbers in SI units; return other values unchanged.
+
+    Args:
+        field: path of the parameter, for messages.
+        value: a text, a number, or a list or array of texts.
+        unit: SI unit of the parameter.
+    """
     return value if unit in ("", "1") else _map_texts(lambda text: check_number(field, text, unit, ANY), value)
 
 
@@ -265,7 +271,13 @@ def check_number(field: str, value: Any, unit: str = "", allowed: Range | None =
 
 
 def check_limit(name: str, value: Any, unit: str) -> float:
-    """Convert a limit of the motor to SI units; infinity means no limit and is returned unchanged."""
+    """Convert a limit of the motor, such as its largest force, to SI units; return infinity (no limit) unchanged.
+
+    Args:
+        name: name of the limit, for messages.
+        value: a number, or a text with a unit.
+        unit: SI unit of the limit.
+    """
     unlimited = isinstance(value, int | float | np.floating) and value == math.inf
     return math.inf if unlimited else check_number(name, value, unit, POSITIVE)
 
@@ -276,7 +288,13 @@ def check_span(field: str, value: Any) -> Any:
 
 
 def _read(field: str, value: Any, read: Callable[[Any], Any]) -> Any:
-    """Apply ``read`` to a single value; if ``read`` rejects it, raise `InputError` with the name of the field."""
+    """Convert a single value by a function; raise `InputError` with the name of the field if the value is invalid.
+
+    Args:
+        field: path of the parameter, for messages.
+        value: the value; arrays with one entry are converted to numbers first.
+        read: function of the value that raises `UnusableValueError` for an invalid one.
+    """
     if not isinstance(value, str | Span) and np.ndim(value) != 0:
         raise InputError(f"{field}: got an array of shape {np.shape(value)}; it must be a single number")
     if isinstance(value, np.ndarray) or is_jax(value):

@@ -251,7 +251,7 @@ def iterate_roots(coefficients: list[Decimal]) -> tuple[list[Complex], list[Deci
 
 def _newton(coefficients: list[Decimal], x: Complex) -> tuple[Complex, Decimal]:
     """Return the Newton step p/p' of a polynomial at x, and a bound on its magnitude despite rounding errors of p."""
-    # Evaluate p and p' by Horner's scheme. The sum of the magnitudes of all terms, ``total``, bounds the rounding errors
+    # Evaluate p and p' by Horner's scheme. ``total``, the sum of the magnitudes of all terms, bounds the rounding error
     # of p.
     value, derivative, total = Complex(Decimal(0), Decimal(0)), Complex(Decimal(0), Decimal(0)), Decimal(0)
     radius = magnitude(x)

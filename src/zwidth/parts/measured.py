@@ -155,7 +155,7 @@ class MeasuredDevice(ResponseDevice):
         return cls(*_read_table(file))
 
     def save(self, file: str | Path, *remarks: str) -> None:
-        """Write the response to a text file for `read`, in full precision; remarks become its first lines, after a #."""
+        """Write the response to a text file for `read`, in full precision; the first lines are the remarks, after #."""
         unit = "rad/(N m)" if self.rotary else "m/N"
         heads = ["frequency [Hz]", f"real [{unit}]", f"imag [{unit}]"]
         columns = [self.frequency, np.real(self.response), np.imag(self.response)]
@@ -167,7 +167,16 @@ class MeasuredDevice(ResponseDevice):
 
 
 def _as_line(name: str, values: Any, kind: type) -> np.ndarray:
-    """Return a copy of the values as a one-dimensional array of finite numbers; raise `InputError` for other values."""
+    """Return a copy of the values as a one-dimensional array of finite numbers, one per frequency.
+
+    Args:
+        name: name of the argument, for messages.
+        values: the values.
+        kind: float or complex.
+
+    Raises:
+        InputError: the values are not numbers, not finite, or not one-dimensional.
+    """
     try:
         with np.errstate(all="ignore"):
             array = np.array(values)
@@ -258,7 +267,10 @@ def _size(file: Path, name: str, unit: str, dimension: Dimension, allowed: tuple
 def _compliance(file: Path, name: str, unit: str) -> tuple[float, bool]:
     """Return the factor that converts a unit of compliance to m/N or rad/(N m), and whether the unit is rotary.
 
-    For decibels the factor is that of the reference unit, m/N by default.
+    Args:
+        file: path of the table, for messages.
+        name: name of the column; only "magnitude" may be in decibels.
+        unit: unit of the column. For decibels, the factor is that of the reference unit, m/N by default.
     """
     decibels = _DECIBELS.fullmatch(unit) if name == "magnitude" else None
     unit = (decibels[1] if decibels else unit) or "m/N"

@@ -69,7 +69,7 @@ class System:
         return Realization(A * self.period, B, B)
 
     def check(self) -> None:
-        """Raise `InputError` if a sampled device does not match period or delay, or a continuous one has a fast pole."""
+        """Raise `InputError` if a sampled device does not match period or delay, or if another one has a fast pole."""
         if self.sampled:
             dt, period = self.device.dt or 0.0, float(self.period)
             if abs(dt - period) > 1e-9 * period:

@@ -279,7 +279,7 @@ class VelocityFilter(Part):
         for section in bottoms:
             gain = gain / section[0]
         if hasattr(period, "mid"):
-            # For a period that is a ball, compute the roots as balls from the exact coefficients, because zeros at z = 1
+            # If the period is a ball, compute the roots as balls from the exact coefficients, because zeros at z = 1
             # must be exact.
             exact = (np.concatenate([ball_offsets(section) for section in part]) for part in (tops, bottoms))
             return Estimate(0, gain, 0, *exact)

@@ -105,7 +105,14 @@ def format_stiffness(value: float, system: UnitSystem, digits: int = 4) -> str:
 
 
 def format_interval(low: float, high: float, unit: str = "", least: int = 4) -> tuple[str, str]:
-    """Return the two ends of an interval as texts, rounded inward, with enough digits that the texts differ."""
+    """Return the two ends of an interval as texts, rounded inward, with enough digits that the texts differ.
+
+    Args:
+        low: lower end of the interval.
+        high: upper end of the interval.
+        unit: unit of both ends; "" for numbers without unit.
+        least: smallest number of significant digits.
+    """
     for digits in range(least, 18):
         ends = round_conservatively(low, "above", digits), round_conservatively(high, "below", digits)
         if ends[0] < ends[1]:

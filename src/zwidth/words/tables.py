@@ -353,9 +353,13 @@ def _trim(cells: list[str]) -> list[str]:
 
 
 def _read_with_numpy(lines: list[str], layout: _Layout, count: int, indices: Sequence[int]) -> list[np.ndarray] | None:
-    """Read columns with `numpy.loadtxt`, which is fast; return None if it cannot read them.
+    """Read columns with `numpy.loadtxt`, because it is fast; return None if it fails, for a call of `_read_cells`.
 
-    `_read_cells` then reads them, or raises an error with the number of the line.
+    Args:
+        lines: lines of the table.
+        layout: first line of the samples, and the separator.
+        count: number of columns of the table.
+        indices: indices of the columns to read.
     """
     begin, separator = layout.begin, layout.separator
     time_columns = _find_time_columns(lines, layout, indices)
