@@ -50,8 +50,8 @@ class Resonance(NamedTuple):
     For an actuator, the mass is 1/w^2, so that the static gain is 1.
     """
 
-    rate: Any  # w in rad per period
-    damping_ratio: Any  # zeta
+    rate: Any  # natural frequency w in rad per period
+    damping_ratio: Any  # damping ratio zeta
     mass: Any
 
     @property
@@ -208,7 +208,7 @@ def build_chain(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Es
     d, n_delay = delay or (timing.d, int(np.floor(timing.d)))
     estimate = estimate or scene.velocity.estimate(period)
     if isinstance(device, LinearDevice):
-        # If the period is a ball, convert the mass to an exact ball, too.
+        # If the period is a ball, convert the mass to an exact ball, too, because `System` then uses ball arithmetic.
         mass = type(period)(device.mass) if hasattr(period, "mid") else device.mass
         return System(device, period, mass, d, n_delay, estimate)
     masses = [(device.mass, device.damping, 0.0)]
@@ -262,10 +262,10 @@ def expand_compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
 
     Both are arrays of coefficients in s, highest power first. Modes are not included.
     """
-    # The loop adds one body after the other, from the last one to the first. The bodies added so far have the dynamic
-    # stiffness (force over position of the first of them) numerator/denominator. Once they include the sensor body, its
-    # position in response to this force is sensor_numerator/numerator. All terms are positive, so nothing cancels and
-    # slow roots are accurate.
+    # The loop adds the bodies from the last one to the first. numerator/denominator is the dynamic stiffness of the
+    # bodies added so far: a force on the body added last, divided by the position of this body. Once the sensor body is
+    # added, its position divided by this force is sensor_numerator/numerator. All terms are positive, so that nothing
+    # cancels and slow roots are accurate.
     numerator, denominator, sensor_numerator = np.zeros(0), np.ones(1), np.ones(1)
     for k in reversed(range(len(chain.bodies))):
         body = chain.bodies[k]
@@ -273,8 +273,8 @@ def expand_compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
         if numerator.size:
             link = np.array([chain.links[k].damping, chain.links[k].stiffness], float)
             denominator = np.polyadd(np.convolve(link, denominator), numerator)
-            # The link and the bodies in series have the dynamic stiffness link * numerator/denominator, with the new
-            # denominator.
+            # The link in series with the bodies added so far has the dynamic stiffness link * numerator/denominator,
+            # where the denominator is the new one.
             numerator = np.polyadd(np.convolve(dynamic_stiffness, denominator), np.convolve(link, numerator))
             sensor_numerator = denominator if k == chain.sensor else np.convolve(link, sensor_numerator)
         else:

@@ -23,10 +23,9 @@ from zwidth.words.errors import InputError
 Polynomial: TypeAlias = tuple[Fraction, ...]
 """Exact coefficients, highest power first, without leading zeros; empty for the zero polynomial."""
 
-DIGITS = tuple(
-    50 << k for k in range(6)
-)  # working precisions in decimal digits, tried in this order: 50, 100, .., 1600
-STEPS = 400  # largest number of Aberth steps; about 10 suffice from the eigenvalues of the companion matrix
+# Working precisions in decimal digits, tried in this order: 50, 100, .., 1600.
+DIGITS = tuple(50 << k for k in range(6))
+STEPS = 400  # largest number of Aberth steps; about 10 suffice, starting from the eigenvalues of the companion matrix
 ACCURATE = Decimal("1e-22")  # required relative error bound of a root, well below the float64 resolution of 1e-16
 EXPONENT = 10**9  # largest magnitude of decimal exponents, so large that no intermediate result overflows
 

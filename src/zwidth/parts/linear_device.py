@@ -133,7 +133,7 @@ class LinearDevice(ResponseDevice):
 
     @cached_property
     def mass(self) -> float:
-        """The mass in kg that is the unit of normalized parameters; its response is of similar size as the device's."""
+        """The unit of mass in normalized parameters, in kg: a mass whose response is about as large as the device's."""
         relative_degree = self.poles.size - self.zeros.size
         if self.dt is None and relative_degree == 2 and self.gain > 0:
             return 1.0 / self.gain

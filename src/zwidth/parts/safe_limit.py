@@ -89,5 +89,8 @@ class SafeLimit(Part):
 
 
 def reserve_damping(scene: Any) -> float:
-    """Return the physical damping in N s/m that does not count for passivity; 0 for a scene without safe limit."""
+    """Return the physical damping in N s/m that does not count for passivity, because its estimate is uncertain.
+
+    It is 0 for a scene without safe limit.
+    """
     return 0.0 if scene.safe_limit is None else scene.safe_limit.damping_reserve

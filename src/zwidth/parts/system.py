@@ -19,7 +19,7 @@ from zwidth.words.errors import InputError
 
 # Beyond these limits, e^A cannot be computed accurately.
 FASTEST = 1e4  # largest magnitude of a pole in rad per period
-STRONGEST = 1e10  # largest rate of decay by a damper, per period
+STRONGEST = 1e10  # largest decay rate that a damper causes, damping/mass, per period
 
 
 class Realization(NamedTuple):

@@ -43,8 +43,8 @@ class Estimate:
     window: int = 1
     gain: Any = 1.0
     lag: int = 0
-    zeros: Any = field(default_factory=lambda: np.zeros(0, complex))  # 1 - z_i
-    poles: Any = field(default_factory=lambda: np.zeros(0, complex))  # 1 - p_i
+    zeros: Any = field(default_factory=lambda: np.zeros(0, complex))  # offsets 1 - z_i of the zeros
+    poles: Any = field(default_factory=lambda: np.zeros(0, complex))  # offsets 1 - p_i of the poles
 
     def jet(self, points: CirclePoints) -> Jet:
         """Return F and its derivative with respect to w at points e^(jw) of the unit circle."""

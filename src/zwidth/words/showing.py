@@ -96,7 +96,7 @@ class ResultList(list[Any]):
 
 
 def find_unit(result: Any, unit: Any) -> Any:
-    """Convert a unit of linear devices to the unit for the display of a result: "N/m" to "N m/rad" on a rotary device.
+    """Convert a unit of linear devices to the unit in which a result is displayed: "N/m" to "N m/rad" if rotary.
 
     Enumerations of codes are returned unchanged. If the result has no unit system, a unit that differs between linear
     and rotary devices is converted to "", because the kind of the device is unknown.

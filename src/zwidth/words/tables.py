@@ -353,7 +353,9 @@ def _trim(cells: list[str]) -> list[str]:
 
 
 def _read_with_numpy(lines: list[str], layout: _Layout, count: int, indices: Sequence[int]) -> list[np.ndarray] | None:
-    """Read columns with `numpy.loadtxt`, because it is fast; return None if it fails, for a call of `_read_cells`.
+    """Read columns with `numpy.loadtxt`, which is fast; return None if the function cannot read them.
+
+    The caller then uses `_read_cells`, whose errors name the line.
 
     Args:
         lines: lines of the table.

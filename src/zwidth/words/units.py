@@ -106,7 +106,7 @@ COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
 
 
 def find_other(dimension: Dimension) -> Dimension | None:
-    """Return the dimension of a quantity on the other kind of device; None if both have the same, as for times."""
+    """Return the dimension of a quantity on the other kind of device; None if both kinds have the same, such as s."""
     return DIMENSIONS.get(_OTHER_KIND.get(dimension.base, ""))
 
 

@@ -91,7 +91,7 @@ def iterate(
 
 
 def apply_each(function: Callable[[Any], State], values: Sequence[Any], xp: Any) -> list[State]:
-    """Return the list of the function's results for each value; JAX traces and compiles the function only once."""
+    """Return the list of the results of a function for all values; JAX traces and compiles the function only once."""
     if xp is np:
         return [function(value) for value in values]
     import jax
@@ -144,7 +144,7 @@ def expand_along(values: np.ndarray, like: Any) -> Any:
 
 
 def epsilon(value: Any) -> float:
-    """Return the machine epsilon of the type of an array; of float64 for numbers."""
+    """Return the machine epsilon of the type of an array; for a number, that of float64."""
     return float(np.finfo(getattr(value, "dtype", np.float64)).eps)
 
 
