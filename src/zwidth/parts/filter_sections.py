@@ -60,9 +60,9 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
 
 
 def is_rounding(coefficients: tuple[float, ...]) -> bool:
-    """Return whether rounding errors of the coefficients can cause all roots of a section on or outside the circle.
+    """Return whether rounding errors of the coefficients of a section can cause all its roots of magnitude >= 1.
 
-    The circle is the unit circle. The result is False if no root is on or outside it.
+    The result is False if there is no such root.
     """
     roots = 1.0 - offsets(np.trim_zeros(np.array(coefficients), "b"))
     points = np.exp(1j * np.angle(roots[np.abs(roots) >= 1.0]))

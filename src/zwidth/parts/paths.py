@@ -25,7 +25,7 @@ from zwidth.words.xp import is_jax
 
 
 class Parts(Protocol):
-    """Interface of a scene for annotations in modules that cannot import `zwidth.Scene`, because it imports them."""
+    """Interface of a scene for annotations in modules that `zwidth.Scene` imports and that cannot import `Scene`."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]  # allows calls of `dataclasses.replace`
 

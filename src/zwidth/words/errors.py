@@ -61,9 +61,9 @@ class PrecisionWarning(UserWarning):
 
 
 class TracedDelayError(ZwidthError, TypeError):
-    """A delay that JAX traces, passed to a function whose arrays have one entry per pole and therefore need its value.
+    """A delay that JAX traces, passed to a function whose array shapes depend on the value of the delay.
 
-    The integer part of the delay determines the number of poles.
+    The integer part of the delay determines the number of poles, and thus the shapes of arrays with one entry per pole.
     """
 
 
