@@ -76,7 +76,7 @@ class _PhysicalPlant(_Parts, SampledMass):
 
     @property
     def parts_beyond(self) -> tuple[str, ...]:
-        """Names of the given parts, which only some kinds of study accept."""
+        """Names of the parts that a rigid mass with backward difference lacks; only some kinds of study accept them."""
         return self.to_scene().parts_beyond
 
     @property
