@@ -214,7 +214,8 @@ def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) 
     """Validate the key ``period`` by ``read``; if it is absent, return the inverse of the key ``rate``, in s."""
     if value is not None:
         return read(value)
-    # Use 1 for a rate that is absent from the data because its own validation failed: that problem is already reported.
+    # Use 1 in place of a rate whose validation failed, which is absent from ``info.data``, because this problem is
+    # already reported.
     rate = info.data.get("rate", 1.0)
     if rate is None:
         raise problem("missing", "the sampling period or its rate is needed", "add 'period: 1 ms' or 'rate: 1 kHz'")

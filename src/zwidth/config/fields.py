@@ -195,7 +195,7 @@ class Strict(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", defer_build=True)
 
     noun: ClassVar[str] = "a mapping"  # noun of the section for messages, such as "a device"
-    described_by: ClassVar[tuple[type[Strict], ...]] = ()  # models that describe fields of the same name
+    described_by: ClassVar[tuple[type[Strict], ...]] = ()  # models whose docstrings describe fields of the same name
 
     def __init_subclass__(cls, *, noun: str = "", **config: Any) -> None:
         super().__init_subclass__(**config)

@@ -102,8 +102,8 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
 
     ``data`` is a configuration or one of its values, and ``key`` the key of this value.
     """
-    # One rotary value makes all devices of a file rotary. Skip fit studies, because each one determines from its
-    # logs if its device is rotary.
+    # One rotary value makes all devices of a file rotary. Skip fit studies, because the units in their logs
+    # determine whether their devices are rotary.
     if isinstance(data, Mapping):
         return data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
     if isinstance(data, list):
@@ -210,12 +210,12 @@ def _find_position(text: str, index: int) -> tuple[int, int]:
 
 
 def _find_mark(mark: yaml.Mark) -> tuple[int, int]:
-    """Return the line and column of a PyYAML mark, both converted from counting from 0 to counting from 1."""
+    """Convert a PyYAML mark, which counts from 0, to a line and a column that count from 1."""
     return mark.line + 1, mark.column + 1
 
 
 class _Resolver(BaseResolver):
-    """Resolver that determines the type of a scalar by YAML 1.2 (core schema), because PyYAML's follows YAML 1.1."""
+    """Resolver of the types of scalars by YAML 1.2 (core schema); the resolvers of PyYAML follow YAML 1.1."""
 
 
 for _tag, _pattern, _first in (

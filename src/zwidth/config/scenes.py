@@ -195,7 +195,7 @@ class PhysicalScene(_PhysicalPlant, noun="a scene"):
 
     @property
     def hardware(self) -> dict[str, float]:
-        """Given parameters of encoder, friction and motor, by name."""
+        """Values of the given parameters of encoder, friction and motor, by the name of the parameter."""
         return {name: value for name in HARDWARE if (value := getattr(self, name)) is not None}
 
     @cached_property
@@ -238,7 +238,7 @@ class NormalizedScene(_NormalizedPlant, noun="a scene"):
     beta: Number | None = None
 
     def without_wall(self) -> NormalizedDevice:
-        """Return the scene without its wall."""
+        """Return the device and the delay of the scene, without the wall."""
         return NormalizedDevice(delta=self.delta, d=self.d)
 
     @property
@@ -262,7 +262,7 @@ def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
 
 
 def is_normalized(raw: dict[str, Any]) -> bool:
-    """Return whether a mapping is normalized: its first key that is only physical or only normalized decides."""
+    """Return whether the first key of a mapping that belongs to only one kind is a normalized key."""
     decisive = [key for key in raw if key in PHYSICAL_KEYS | NORMALIZED_KEYS]
     return bool(decisive) and decisive[0] in NORMALIZED_KEYS
 

@@ -63,7 +63,7 @@ class Study(Strict):
     from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")  # fields whose default is the value of the file's scene
     # True if the kind accepts devices with parts; it then has a field ``device`` or ``devices``, or is a sweep.
     takes_parts: ClassVar[bool] = False
-    simulates: ClassVar[bool] = False  # True if it accepts velocity estimates without a linear form (FOAW)
+    simulates: ClassVar[bool] = False  # True if the kind accepts velocity estimates without a linear form (FOAW)
     method: ClassVar[str] = ""  # method and accuracy of the results, in a sentence for reports
     point_bytes: ClassVar[int] = 80  # approximate size of the result in bytes per point
     remedy_if_too_large: ClassVar[str] = "use fewer values on an axis, or split the study"

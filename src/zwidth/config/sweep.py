@@ -53,7 +53,7 @@ from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
 MAX_SWEEP_POINTS = 10**12  # points per sweep
 
-# Remedies to report if an axis changes a part that the device does not have, by parameter or part.
+# Remedies to report if an axis changes a part that the device does not have, by the name of the parameter or the part.
 _EXAMPLES = {
     "velocity": "velocity: {kind: low_pass, cutoff: 100 Hz}",
     "velocity.samples": "velocity: {kind: windowed_difference, samples: 5}",
@@ -95,7 +95,7 @@ class Axes(_Axes):
         return _find_mixed_kinds([key for key in raw if key in PARAMETERS], "axes")
 
     def find_faults(self) -> Iterable[LocatedProblem]:
-        """Yield a problem for each parameter given twice, and for each one that mixes SI and normalized parameters."""
+        """Yield a problem for each parameter given twice, and for mixing physical and normalized parameters."""
         columns = tuple(self.devices.columns) if self.devices else ()
         axes = [name for name in PARAMETERS if getattr(self, name) is not None]
         for name in axes:
@@ -145,7 +145,7 @@ class Axes(_Axes):
         return min(source), max(source)
 
     def find_key(self, name: str) -> str:
-        """Return the key that contains a parameter: its own, or "devices" for a column of the table."""
+        """Return the key that contains the values of a parameter: its name, or "devices" for a column of the table."""
         return "devices" if getattr(self, name) is None else name
 
     @property
@@ -339,7 +339,7 @@ class SweepStudy(_Parts, Study):
             yield from self._find_part_faults()
 
     def _find_part_faults(self) -> Iterable[LocatedProblem]:
-        """Yield problems of axes that belong to absent parts, and of values that the parts refuse."""
+        """Yield problems of axes that belong to absent parts, and of values that are invalid for the parts."""
         absent = [name for name in self.axes.part_parameters if not self._has_parameter(name)]
         for name in absent:
             part, _, key = name.partition(".")
@@ -362,7 +362,7 @@ class SweepStudy(_Parts, Study):
             yield (("axes", self.axes.find_key(name)) if name in self.axes.given else ("axes",)), message
 
     def _has_parameter(self, name: str) -> bool:
-        """Return whether the part of a dotted parameter is present and has this key."""
+        """Return whether the device has the part and the key of a dotted parameter, such as "velocity.cutoff"."""
         part, _, key = name.partition(".")
         section = getattr(self, part)
         if part == "modes":

@@ -236,7 +236,7 @@ def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bo
     Args:
         raw: list of the configuration.
         entry: function that reads one value.
-        distinct: refuse equal entries.
+        distinct: True to refuse a list with equal entries.
     """
     if not raw:
         raise problem("got an empty list", "an axis has at least one value", "fill the list")
