@@ -41,7 +41,7 @@ from zwidth.words.unit_system import UnitSystem
 
 # Names of the parameters for which the design study can solve.
 FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
-_TRIALS = 60  # evaluations of K_max per required stiffness, a typical number for the estimate of `points`
+_TRIALS = 60  # typical number of evaluations of K_max per required stiffness; used to estimate `points`
 
 
 def _read_range(raw: Any, info: ValidationInfo) -> tuple[float, ...]:
@@ -241,7 +241,10 @@ class DesignStudy(ComputedStudy):
         return dict(zip(names, (drawn.stable, drawn.stable_low, drawn.stable_high, drawn.stiffness), strict=True))
 
     def _note(self, stiffness: float, needed: RequiredValue) -> Iterable[str]:
-        """Yield a note if the search failed, if every value is sufficient, or if K_max is reached at several values."""
+        """Yield a note if the search failed, if every value is sufficient, or if several values solve the equation.
+
+        The equation is K_max = reserve * K, with K = ``stiffness``.
+        """
         wanted = with_unit(self.reserve * stiffness, self.unit_system["N/m"])
         low, high = (with_unit(end, self.unit_system[PARAMETERS[self.find].unit]) for end in needed.range)
         if needed.status != Status.OK:

@@ -237,7 +237,7 @@ class FitStudy(ComputedStudy):
         )
 
     def _fit(self) -> list[_Fitted]:
-        """Return the fit to the logs and the fit to the walls, if their data are given."""
+        """Fit the device to the logs and, separately, to the walls, if they are given; return all fits."""
         velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.instance, []
         period = self.period
         if self.log:

@@ -54,7 +54,7 @@ class Outcome:
     arrays: dict[str, np.ndarray] = field(default_factory=dict)  # arrays of the study's npz file
     # Functions that draw a figure and return its Axes, by the suffix of the file name after the name of the study.
     figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
-    documents: dict[str, str] = field(default_factory=dict)  # texts by file name
+    documents: dict[str, str] = field(default_factory=dict)  # contents of text files, by the name of the file
     answer: tuple[str, ...] = ()  # main results, in one or two lines for a terminal
     notes: tuple[str, ...] = ()  # restrictions of the results, such as points without a result
 
@@ -104,7 +104,7 @@ class ComputedStudy(Study):
 class CurvesStudy(ComputedStudy):
     """Base of the studies whose results are curves for each delta and d."""
 
-    point_bytes = 32  # alpha, beta, frequency and two codes
+    point_bytes = 32  # bytes of alpha, beta, frequency and two codes
 
     delta: DeltaAxis
     d: DelayAxis
@@ -195,7 +195,7 @@ def _name_column(name: str, system: UnitSystem) -> str:
 
 
 def csv_text(table: dict[str, np.ndarray], system: UnitSystem = LINEAR) -> str:
-    """Return a table as CSV text, with all digits, and with texts escaped that spreadsheets evaluate as formulas."""
+    """Return a table as CSV text, with all digits; cells that spreadsheets would evaluate as formulas are escaped."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow([_name_column(name, system) for name in table])

@@ -35,15 +35,15 @@ from zwidth.words.formatting import with_unit
 
 SOURCE = "Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006"
 
-# Parameters of the example in section VIII
-MASS = 0.1  # kg
-PERIOD = 1e-3  # s
-DELAY_FACTOR = 1  # d, in sampling periods
-DAMPINGS = (0.0, 10.0, 100.0)  # N s/m
-STIFFNESS_FRACTION = 0.75  # fraction of alpha_max
+# Parameters of the example in section VIII of the paper
+MASS = 0.1  # kg; mass of the device
+PERIOD = 1e-3  # s; sampling period
+DELAY_FACTOR = 1  # sampling periods; delay d
+DAMPINGS = (0.0, 10.0, 100.0)  # N s/m; physical dampings of the three devices
+STIFFNESS_FRACTION = 0.75  # stiffness of the walls as a fraction of alpha_max
 MASSIE_SALISBURY = 3.5e3  # N/m; maximum stiffness of the PHANToM, which section VIII cites from Massie and Salisbury
-SLOPE_DELAYS = (0.0, 1.0, 2.0, 4.0)  # d of Fig. 5, and the integer d of Fig. 10
-FIG10_DELAYS = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # d of Fig. 10
+SLOPE_DELAYS = (0.0, 1.0, 2.0, 4.0)  # sampling periods; delays d of Fig. 5, and the integer ones of Fig. 10
+FIG10_DELAYS = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # sampling periods; delays d of Fig. 10
 LINEAR_WITHIN = 0.1  # largest relative difference between d alpha_max/d delta and its limit g that counts as linear
 FILTER_LAG = 0.05  # s; lag of the velocity filter, cited in section VIII
 _LINE_APPEARS = "delta above which the line appears for d = 0"
@@ -154,8 +154,8 @@ def linear_from() -> float:
     limit = np.array([limit_slope(d) for d in FIG10_DELAYS])
 
     def excess(delta: np.ndarray) -> np.ndarray:
-        """Return the largest relative difference of d alpha_max/d delta from g among all curves, minus 10 %."""
-        step = 0.008  # fourth-order central differences; their truncation and rounding errors move the root by 2e-10
+        """Return the largest relative difference of d alpha_max/d delta from g of all curves, minus `LINEAR_WITHIN`."""
+        step = 0.008  # step of delta in fourth-order central differences, whose errors move the root by 2e-10
         deltas = np.asarray(delta)[..., None] + step * np.array([-2.0, -1.0, 1.0, 2.0])
         values = np.array([maximize_alpha(deltas, d)[0] for d in FIG10_DELAYS])
         derivatives = values @ np.array([1.0, -8.0, 8.0, -1.0]) / (12.0 * step)
@@ -168,8 +168,9 @@ def linear_from() -> float:
 
 def corner_takes_over() -> float:
     """Compute the delta above which, for d = 0, the stiffest stable wall is in the corner at z = -1."""
-    # For d = 0 the curve is a graph over beta, ``alpha = (1 - c + beta (phi2 + c psi) - beta^2 psi phi1)/(psi (1 + phi2
-    # beta))``. Its maximum reaches the corner, where the curve ends, if ``d alpha/d beta = 0`` there.
+    # For d = 0 the boundary curve is a function of beta,
+    # ``alpha = (1 - c + beta (phi2 + c psi) - beta^2 psi phi1)/(psi (1 + phi2 beta))``. Its maximum reaches the
+    # corner, where the curve ends, at the delta for which ``d alpha/d beta = 0`` in the corner.
     # Use extended precision if the machine has it, because rounding errors of float64 affect the last two digits.
     return float(bisect(lambda delta: _slope_at_corner(delta) < 0, np.longdouble(2.5), np.longdouble(6.0)))
 

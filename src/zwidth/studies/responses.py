@@ -54,7 +54,7 @@ class ResponseStudy(ComputedStudy):
     """Base of the studies that compute responses to a step of the external force."""
 
     remedy_if_too_large = "shorten the duration, or lower substeps"
-    point_bytes = 32  # time, position, velocity and force
+    point_bytes = 32  # bytes of time, position, velocity and force
 
     duration: Duration = Span(100.0, "periods")
     """Duration of the response, in s or in periods."""
@@ -74,7 +74,7 @@ class ResponseStudy(ComputedStudy):
         Args:
             device: device without parts.
             alpha: normalized stiffness of the wall.
-            beta: normalized damping of the wall.
+            beta: normalized virtual damping of the wall.
             label: name of the response.
             physical: True for a step of 1 N and columns in SI units, False for normalized columns.
         """

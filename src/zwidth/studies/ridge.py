@@ -42,7 +42,7 @@ from zwidth.words.status import RidgeKind, Status
 from zwidth.words.tables import read_columns
 from zwidth.words.units import split_head
 
-_STRONG_DAMPING = 100.0  # delta; above it, alpha_max/delta is within some percent of its limit g(d)
+_STRONG_DAMPING = 100.0  # normalized damping delta above which alpha_max/delta is within some percent of g(d)
 _SLOPE_SAMPLES = 64  # samples of g(d) per unit of d; integer delays are included, because g has kinks there
 
 
@@ -204,7 +204,7 @@ class Poses(Strict, noun="a table of poses"):
 
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
-        """Name and unit of both coordinates."""
+        """Pairs of name and unit of the two coordinates, that of ``across`` first."""
         return tuple((name, unit) for name, unit, _ in self._coordinates)
 
     def spell(self, pose: int) -> str:
