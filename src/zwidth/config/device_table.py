@@ -35,22 +35,23 @@ from zwidth.words.units import looks_like_number, split_title
 
 LABEL = "label"  # column with a name for each device
 MAX_ROWS = 100_000  # devices per table
-_COLUMNS = (LABEL, *PARAMETERS)  # names of columns that are read; a CSV file may have others
-MAX_CSV_BYTES = 2**25
+_COLUMNS = (LABEL, *PARAMETERS)  # names of the columns that are read; others are ignored
+MAX_CSV_BYTES = 2**25  # bytes per file (32 MiB)
 
 _FORMS = "lists of equal length under the names of parameters, or {csv: FILE}"
 
-# Folder of the configuration that is being read. A context variable, because validators receive only values.
+# Folder of the configuration that is being read. It is stored in a context variable, because pydantic passes only the
+# value of a field to a validator.
 _folder: ContextVar[Path] = ContextVar("folder", default=Path())
 
 
 def files_relative_to(folder: Path) -> AbstractContextManager[None]:
-    """Return a context manager in which file names in a configuration are relative to a folder."""
+    """Return a context manager; while it is active, `find_file` resolves file names relative to ``folder``."""
     return set_temporarily(_folder, folder)
 
 
 def find_file(name: str) -> Path:
-    """Return the path of a file named in the configuration that is being read."""
+    """Return the path of a file whose name in the configuration is relative to the folder of the configuration."""
     return _folder.get() / name
 
 
@@ -59,7 +60,7 @@ class DeviceTable:
     """Parameters of several devices, one row per device."""
 
     columns: dict[str, tuple[float, ...]]  # values by the name of the parameter, in SI base units
-    labels: tuple[str, ...] = ()  # names of all rows, or empty
+    labels: tuple[str, ...] = ()  # one name per device, or empty if the devices have no names
     in_periods: bool = False  # True if the column ``delay`` is in sampling periods instead of seconds
 
     @property
@@ -68,11 +69,11 @@ class DeviceTable:
         return len(next(iter(self.columns.values())))
 
     def values(self, name: str) -> np.ndarray:
-        """Return a column as an array."""
+        """Return the column of a parameter as a float64 array with one value per device."""
         return np.array(self.columns[name], dtype=np.float64)
 
     def serialize(self) -> dict[str, Any]:
-        """Return the table as lists in the form of a configuration file, also if it was read from a CSV file."""
+        """Return the table as a dict of lists by column name, the form in which a configuration file contains it."""
         lists: dict[str, Any] = {LABEL: list(self.labels)} if self.labels else {}
         lists |= {name: list(values) for name, values in self.columns.items()}
         if self.in_periods:
@@ -81,14 +82,14 @@ class DeviceTable:
 
 
 def read_table(raw: Any) -> DeviceTable:
-    """Return the table that a value of a configuration describes: lists, or the name of a CSV file."""
+    """Read a table of devices from its value in a configuration: a mapping of lists, or ``{csv: FILE}``."""
     if not isinstance(raw, dict):
         raise problem(f"got {describe(raw)}", f"devices are {_FORMS}", "write {csv: devices.csv}")
     return _read_csv(raw) if "csv" in raw else _read_lists(raw)
 
 
 def _read_lists(raw: dict[str, Any]) -> DeviceTable:
-    """Return the table of lists of equal length by the names of columns; raise one error with all problems."""
+    """Convert a mapping of column names to lists of equal length to a table; raise one error with all problems."""
     problems: list[LocatedProblem] = []
     columns: dict[str, tuple[Any, ...]] = {}
     in_periods = False
@@ -124,20 +125,20 @@ def _read_lists(raw: dict[str, Any]) -> DeviceTable:
 
 
 def _check_label(cell: Any) -> Any:
-    """Return a label unchanged; raise a problem if it is not a text."""
+    """Return a label unchanged; raise a problem if it is not a text or is empty."""
     if not isinstance(cell, str) or not cell.strip():
         raise problem(f"got {describe(cell)}", "a label is text", "put it in quotes")
     return cell
 
 
 class _TableFile(Strict, noun="a table from a file"):
-    """Mapping ``{csv: FILE}``."""
+    """Model of the mapping ``{csv: FILE}``, which names the CSV file of a table."""
 
     csv: str
 
 
 def _read_csv(raw: dict[str, Any]) -> DeviceTable:
-    """Return the table of a CSV file."""
+    """Read a table of devices from the CSV file that the mapping ``{csv: FILE}`` names."""
     name = _TableFile.model_validate(raw).csv
     try:
         rows = _read_rows(name)
@@ -147,11 +148,11 @@ def _read_csv(raw: dict[str, Any]) -> DeviceTable:
 
 
 def _read_rows(name: str) -> list[tuple[int, list[str]]]:
-    """Return the header and the rows of a CSV file that are not empty, each with its line number.
+    """Return a list of pairs (line number, cells): the header of a CSV file, then its rows that are not empty.
 
-    Comments above the header begin with # or %, or are the ``sep=;`` of spreadsheets. The separator is the first of
-    tab, semicolon and comma that the header contains. If the separator is not the comma, commas in numbers are decimal
-    signs.
+    Lines above the header are skipped if they are comments, which begin with # or %, or the line ``sep=;`` that
+    spreadsheets write. The separator of the cells is the first of tab, semicolon and comma that the header contains.
+    If the separator is not the comma, commas in numbers are decimal signs.
     """
     file = find_file(name)
     try:
@@ -174,7 +175,10 @@ def _read_rows(name: str) -> list[tuple[int, list[str]]]:
 
 
 def _choose_columns(header: list[str], name: str) -> dict[str, tuple[int, str]]:
-    """Return the index and the unit of the column of each parameter in the header; ignore other columns."""
+    """Return the column index and the unit of each parameter in the header, by the name of the parameter.
+
+    Columns that are not parameters are ignored. ``name`` is the name of the file for messages.
+    """
     chosen: dict[str, tuple[int, str]] = {}
     for index, title in enumerate(header):
         key, unit = split_title(title)
@@ -195,11 +199,11 @@ def _choose_columns(header: list[str], name: str) -> dict[str, tuple[int, str]]:
 
 
 def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> DeviceTable:
-    """Return the table of the chosen columns of a CSV file; errors are reported with their lines.
+    """Convert the chosen columns of a CSV file to a table; error messages contain the line in the file.
 
     Args:
         rows: line number and cells of each row, the header first.
-        chosen: index and unit of the columns to read, by parameter.
+        chosen: index and unit of each column to read, by the name of its parameter.
         name: name of the file for messages.
     """
     lists: dict[str, list[Any]] = {key: [] for key in chosen}
@@ -219,12 +223,12 @@ def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, 
 
 
 def _to_value(cell: str, unit: str) -> float | str:
-    """Return a cell as a value of a configuration; a number without a unit gets the unit of the header."""
+    """Convert a CSV cell to a number or a text with a unit; a number without a unit gets the unit of its column."""
     return cell if not looks_like_number(cell) else f"{cell} {unit}" if unit else float(cell)
 
 
 def _make_schema() -> dict[str, Any]:
-    """Return the JSON Schema of tables of devices."""
+    """Return the JSON Schema of a table of devices in both forms, lists and ``{csv: FILE}``."""
     column = share_schema("column", {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}})
     labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
     lists = {LABEL: labels, **dict.fromkeys(PARAMETERS, column)}

@@ -30,7 +30,7 @@ from zwidth.words.formatting import describe, suggestion
 from zwidth.words.quantities import HARDWARE, POSITIVE
 
 FORMS = "a published name, 'NUMERATOR / DENOMINATOR' in s, a table FILE.csv of a response, or a mapping"
-# Keys of a linear system by form; the last key of a form is always required.
+# Keys of each form of a linear system. The last key identifies the form, because it is required and in no other form.
 _SYSTEM_FORMS = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"))
 
 
@@ -94,7 +94,7 @@ class SystemSection(PartSection, noun="a linear system"):
 
     @cached_property
     def instance(self) -> LinearDevice:
-        """The linear system."""
+        """The linear system as an object of `zwidth.parts`, built from the keys of the given form."""
         form = next(form for form in _SYSTEM_FORMS if getattr(self, form[-1]) is not None)
         names = {"numerator": "num", "denominator": "den"}
         arguments: dict[str, Any] = {names.get(name, name): _to_array(getattr(self, name)) for name in form}
@@ -106,7 +106,8 @@ class SystemSection(PartSection, noun="a linear system"):
 
     @classmethod
     def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        # Skip this check if a key is unknown, because a misspelled key is reported and may complete the form.
+        # Skip this check if a key is unknown, because the unknown key is reported anyway and may be a misspelling of
+        # the missing one.
         if raw.keys() <= cls.model_fields.keys() and not _is_complete(raw):
             given, forms = (
                 quote_names(raw.keys() - {"sampled"}) or "nothing",
@@ -115,12 +116,12 @@ class SystemSection(PartSection, noun="a linear system"):
             yield (), problem(f"got {given}", f"a linear system has {forms}", "write one of these")
 
     def find_faults(self) -> Iterable[LocatedProblem]:
-        # Locate the problems at the section instead of a key, because their messages name the key.
+        # Report the problems at the path of the section instead of a key, because their messages already name the key.
         return [((), fault) for _, fault in super().find_faults()] if _is_complete(self.model_fields_set) else []
 
 
 def _is_complete(given: Iterable[str]) -> bool:
-    """Return whether keys form one complete description of a linear system; the zeros are optional."""
+    """Return whether the keys are exactly those of one form of a linear system; the key ``zeros`` is optional."""
     return any(set(form) - {"zeros"} <= set(given) <= {*form, "sampled"} for form in _SYSTEM_FORMS)
 
 
@@ -144,7 +145,11 @@ class ResponseSection(PartSection, noun="a response"):
 
     @classmethod
     def read(cls, file: str) -> ResponseSection:
-        """Return the response in a table file; the record of a run then contains the values instead of the name."""
+        """Read a response from a table file.
+
+        The section contains the values instead of the name of the file, so that the saved configuration of a run does
+        not depend on the file.
+        """
         response = MeasuredDevice.read(find_file(file))
         columns = {"frequency": response.frequency, "real": response.response.real, "imag": response.response.imag}
         columns |= {} if response.deviation is None else {"deviation": response.deviation}
@@ -152,7 +157,7 @@ class ResponseSection(PartSection, noun="a response"):
 
     @cached_property
     def instance(self) -> MeasuredDevice:
-        """The measured response."""
+        """The measured response as an object of `zwidth.parts`."""
         real, imag = (_to_array(part) for part in (self.real, self.imag))
         if real.shape != imag.shape:
             raise InputError(f"imag: got {imag.size} numbers and {real.size} of real; give one per frequency")
@@ -160,7 +165,7 @@ class ResponseSection(PartSection, noun="a response"):
 
 
 def _read_form(raw: Any) -> SystemSection | ResponseSection:
-    """Return the model of a linear system or a measured response, from any of its forms."""
+    """Return the model of a linear system or a measured response, from a mapping, a text or the name of a file."""
     if isinstance(raw, SystemSection | ResponseSection):
         return raw
     try:
@@ -187,7 +192,7 @@ NORMALIZED_KEYS = frozenset({"delta", "d", "alpha", "beta"})
 
 
 class OneKind(Strict):
-    """Base of sections that are either physical or normalized, with messages for keys of the other kind."""
+    """Base of the sections that are either physical or normalized; its messages explain keys of the other kind."""
 
     @classmethod
     def explain_unknown(cls, name: str) -> tuple[str, str, str]:
@@ -206,10 +211,11 @@ class OneKind(Strict):
 
 
 def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float:
-    """Return the period, given as such or as the inverse of the rate."""
+    """Validate the key ``period`` by ``read``; if it is absent, return the inverse of the key ``rate``, in s."""
     if value is not None:
         return read(value)
-    # A rate that failed its own check is absent from the data; that fault is enough.
+    # Use 1 in place of a rate whose validation failed, which is absent from ``info.data``, because this problem is
+    # already reported.
     rate = info.data.get("rate", 1.0)
     if rate is None:
         raise problem("missing", "the sampling period or its rate is needed", "add 'period: 1 ms' or 'rate: 1 kHz'")
@@ -217,7 +223,7 @@ def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) 
 
 
 def _validate_mass(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float | None:
-    """Return the mass; None for a linear system or a measured response."""
+    """Validate the key ``mass`` by ``read``; return None if a linear system or a measured response replaces it."""
     if value is not None:
         return read(value)
     if info.data.get("device", ...) is None:
@@ -227,14 +233,14 @@ def _validate_mass(value: Any, read: Callable[[Any], float], info: ValidationInf
 
 
 def find_second_period(keys: Iterable[str]) -> Iterable[LocatedProblem]:
-    """Return a problem if both period and rate are given."""
+    """Yield a problem if ``keys`` contains both ``period`` and ``rate``."""
     for second in [key for key in keys if key in ("period", "rate")][1:]:
         allowed = "the period is the inverse of the rate"
         yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
 
 
 def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
-    """Return problems of parameters that a linear system or measured response already contains."""
+    """Yield a problem for each key that a linear system or measured response replaces: mass, damping and parts."""
     for key in keys:
         if key.partition(".")[0] in ("mass", "damping", *PARTS, "modes") and keys[key]:
             message, allowed = f"got {key!r} together with a system or response", "the system or response contains it"
@@ -242,7 +248,7 @@ def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
 
 
 def read_rotary(value: Any = None) -> bool | None:
-    """Validate the key ``rotary``; return True for a file of rotary devices, None for a file of linear devices."""
+    """Validate the key ``rotary``; return True if the devices of the file are rotary, otherwise None."""
     if value is not None and not isinstance(value, bool):
         raise problem(f"got {describe(value)}", "it must be true or false", "remove it: the units determine the kind")
     if value is False and get_system().rotary:
@@ -254,7 +260,7 @@ Rotary = Annotated[bool | None, PlainValidator(read_rotary, json_schema_input_ty
 
 
 def _add_device(schema: dict[str, Any]) -> None:
-    """Add the texts that name a device in place of mass and damping to the schema for editors."""
+    """Add to the JSON Schema that the key ``device`` may also be a text, such as the name of a published device."""
     forms = schema["properties"]["device"]["anyOf"]
     forms[:0] = [{"enum": [device.name for device in DEVICES]}, {"type": "string"}]
 
@@ -262,7 +268,7 @@ def _add_device(schema: dict[str, Any]) -> None:
 class SampledMass(OneKind):
     """A sampled mass with damping, in SI units."""
 
-    # The schema also allows the name of a published device, which `prepare` replaces by its parameters.
+    # Add texts to the schema, because `prepare` replaces the name of a published device by its parameters.
     model_config = ConfigDict(json_schema_extra=_add_device)
 
     @classmethod

@@ -1,9 +1,10 @@
 """Building blocks of the configuration's models: error reports, a strict base class, names and lists.
 
-Errors are reported in three steps. A validator has no access to the position of its value in the file; it raises a
-`problem` (message, allowed values, remedy). Pydantic adds the path of the field, such as ``("studies", 0, "delta")``;
-path and problem together are a `LocatedProblem`. `locate_faults` looks up the line and column of the path, and returns
-a `Fault`. All faults of a file are collected into one `ConfigFileError`.
+A section is one mapping of a configuration, such as a device or a study. Errors are reported in three steps. A
+validator has no access to the position of its value in the file; it raises a `problem` (message, allowed values,
+remedy). Pydantic adds the path of the field, such as ``("studies", 0, "delta")``; path and problem together are a
+`LocatedProblem`. `locate_faults` looks up the line and column of the path, and returns a `Fault`. All faults of a file
+are collected into one `ConfigFileError`.
 
 `Strict` is the base of all models of sections. Subclasses add checks and messages by overriding its hooks: `prepare`,
 `find_conflicts`, `find_faults`, `explain_missing` and `explain_unknown`. The descriptions of keys in the JSON Schema
@@ -40,7 +41,7 @@ from zwidth.words.quantities import FIELDS, Parameter
 FieldPath: TypeAlias = tuple[str | int, ...]
 Kind = TypeVar("Kind")
 LocatedProblem: TypeAlias = tuple[FieldPath, PydanticCustomError]
-"""Path of a field relative to the model that is validated, and the problem there."""
+"""Pair of the path of a field, relative to the model that is being validated, and the `problem` of this field."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ class Fault:
     column: int | None  # column in characters, counted from 1
     field: str  # path of the field, such as ``studies[0].delta``; empty for the file as a whole
     problem: str  # description of the problem, with the value received
-    allowed: str = ""
-    remedy: str = ""
+    allowed: str = ""  # description of the allowed values
+    remedy: str = ""  # change that makes the value valid
 
     def __str__(self) -> str:
         position = escape_unprintable(self.file)
@@ -67,13 +68,14 @@ class ConfigFileError(ConfigError):
     """Error that reports all faults of a configuration file, one per line of the message, in the order of the file."""
 
     def __init__(self, message: str, faults: Sequence[Fault] = ()) -> None:
-        # Pass only the message to the base class, because unpickling in another process calls the class with ``args``.
+        # Pass only the message to the base class, because unpickling an exception calls its class with the arguments
+        # of the base class.
         super().__init__(message)
         self.faults = tuple(faults)
 
     @classmethod
     def of(cls, faults: Iterable[Fault]) -> ConfigFileError:
-        """Return the error that reports ``faults``, sorted by position."""
+        """Return the error that reports ``faults`` in the order of their lines and columns."""
         ordered = sorted(faults, key=lambda fault: (fault.line or 0, fault.column or 0))
         return cls("\n".join(str(fault) for fault in ordered), ordered)
 
@@ -85,13 +87,13 @@ def problem(message: str, allowed: str = "", remedy: str = "", *, on_key: bool =
         message: the problem, with the value received.
         allowed: the allowed values.
         remedy: the change that makes the value valid.
-        on_key: report the position of the key of the field instead of the position of its value.
+        on_key: True to report the position of the key of the field instead of the position of its value.
     """
     context = {"message": message, "allowed": allowed, "remedy": remedy, "on_key": on_key}
     return PydanticCustomError("zwidth", "{message}; {allowed}; {remedy}", context)
 
 
-# Allowed values and remedy for errors that pydantic itself detects, by its type of error.
+# Allowed values and remedy to report for errors that pydantic itself detects, by pydantic's name of the error type.
 _PYDANTIC_ERRORS = {
     "bool_type": ("it must be true or false", "write true or false, without quotes"),
     "string_type": ("it must be text", "put the text in quotes"),
@@ -99,11 +101,20 @@ _PYDANTIC_ERRORS = {
     "dict_type": ("it must be a mapping", "write 'key: value' lines, or {key: value}"),
 }
 
-_REMOVED_KEYS = ("delay_model", "delay_models")  # keys of earlier releases
+_REMOVED_KEYS = ("delay_model", "delay_models")  # keys that studies had in earlier releases
 
 
 def list_problems(error: ValidationError | PydanticCustomError, *above: str) -> list[LocatedProblem]:
-    """Return all problems of an error with the paths to their fields; ``above`` precedes each path."""
+    """Convert an error to a list of pairs (path, problem), one pair for each invalid field.
+
+    Errors that pydantic itself detected, such as a wrong type, are converted to a `problem` with allowed values and a
+    remedy.
+
+    Args:
+        error: error of pydantic, which contains one entry per invalid field; or a single `problem` without a path.
+        above: keys from an outer model to the field that caused the error. They are prepended to each path, so that
+            the paths are relative to the outer model.
+    """
     if not isinstance(error, ValidationError):
         return [(above, error)]
     problems = []
@@ -122,23 +133,23 @@ def list_problems(error: ValidationError | PydanticCustomError, *above: str) -> 
 
 
 def combine_problems(title: str, problems: Iterable[LocatedProblem]) -> ValidationError:
-    """Return one pydantic error that contains several problems; a validator raises it to report all of them."""
+    """Return one pydantic error that contains all ``problems``, for a validator to raise; ``title`` names the model."""
     details = [InitErrorDetails(type=error, loc=path, input=None) for path, error in problems]
     return ValidationError.from_exception_data(title, details)
 
 
 def quote_names(names: Iterable[str]) -> str:
-    """Return names as a list for a message: ``'a', 'b', 'c'``."""
+    """Return the names in quotes and separated by commas, as text for a message: ``'a', 'b', 'c'``."""
     return ", ".join(repr(name) for name in names)
 
 
 def escape_unprintable(text: str) -> str:
-    """Return the text unchanged if it is printable, otherwise with line breaks and other characters escaped."""
+    """Return a printable text unchanged; otherwise return its ASCII form in quotes, with line breaks escaped."""
     return text if text.isprintable() else ascii(text)
 
 
 def format_path(path: FieldPath) -> str:
-    """Return a path such as ``("studies", 0, "delta")`` in the form ``studies[0].delta``."""
+    """Convert a path such as ``("studies", 0, "delta")`` to the text ``studies[0].delta``; shorten long keys."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -155,10 +166,15 @@ def locate_faults(
     values: Mapping[FieldPath, tuple[int, int]],
     keys: Mapping[FieldPath, tuple[int, int]],
 ) -> list[Fault]:
-    """Return the faults of a file, from the problems and from the positions (line, column) of its values and keys.
+    """Convert the problems of a configuration to faults, by adding the line and column of each field.
 
-    A missing field has no position; its fault gets that of the mapping in which the field is missing. Without a file,
-    ``values`` and ``keys`` are empty and the faults have no positions.
+    A missing field has no position; its fault gets the position of the mapping in which the field is missing.
+
+    Args:
+        file: path of the file as given by the user; empty for a configuration that is not a file.
+        problems: problems with paths relative to the whole configuration.
+        values: line and column of each value by its path; empty without a file.
+        keys: line and column of each key by the path of its value; empty without a file.
     """
     faults = []
     for path, error in problems:
@@ -170,12 +186,16 @@ def locate_faults(
 
 
 class Strict(BaseModel):
-    """Base of the models of sections: frozen, without unknown keys or conversion of types, all faults in one error."""
+    """Base of the models of sections.
+
+    Instances are immutable. Unknown keys are refused, types are not converted, and one error reports all problems of a
+    section.
+    """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", defer_build=True)
 
     noun: ClassVar[str] = "a mapping"  # noun of the section for messages, such as "a device"
-    described_by: ClassVar[tuple[type[Strict], ...]] = ()  # models whose descriptions apply to fields of the same name
+    described_by: ClassVar[tuple[type[Strict], ...]] = ()  # models whose docstrings describe fields of the same name
 
     def __init_subclass__(cls, *, noun: str = "", **config: Any) -> None:
         super().__init_subclass__(**config)
@@ -184,22 +204,22 @@ class Strict(BaseModel):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Return the mapping with keys added before its validation. Hook; by default the mapping is unchanged."""
+        """Return the mapping to validate, e.g. with derived keys added. Hook; by default it is ``raw`` itself."""
         return raw
 
     @classmethod
     def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        """Return the problems of keys that exclude or require each other; the values are not validated yet. Hook."""
+        """Return the problems of keys that exclude or require each other. Hook, called before values are validated."""
         return ()
 
     @classmethod
     def explain_missing(cls, name: str) -> tuple[str, str]:
-        """Return the rule and the remedy to report if a required key is missing. Hook."""
+        """Return the allowed values and the remedy to report if the required key ``name`` is missing. Hook."""
         return f"{cls.noun} needs it", f"add {name!r}"
 
     @classmethod
     def explain_unknown(cls, name: str) -> tuple[str, str, str]:
-        """Return the message, the allowed keys and the remedy to report for an unknown key. Hook."""
+        """Return the message, the allowed keys and the remedy to report for the unknown key ``name``. Hook."""
         if name == "<<":
             return "unknown key", "YAML 1.2 has no merge keys", "write the keys out"
         if name in _REMOVED_KEYS:
@@ -212,7 +232,7 @@ class Strict(BaseModel):
         return "unknown key", allowed, suggestion(name, cls.model_fields, "remove it")
 
     def find_faults(self) -> Iterable[LocatedProblem]:
-        """Return the problems that involve several fields; called only if each field is valid by itself. Hook."""
+        """Return the problems of combinations of fields. Hook, called only if every single field is valid."""
         return ()
 
     @classmethod
@@ -230,7 +250,10 @@ class Strict(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _validate(cls, raw: Any, handler: Handler[Any]) -> Any:
-        """Return the model of a mapping; raise one error with all its problems. ``handler`` validates the fields."""
+        """Return the model of the mapping ``raw``; raise one error with all problems of the mapping if it is invalid.
+
+        ``handler`` is pydantic's validation of the single fields.
+        """
         if isinstance(raw, cls):
             return raw
         if not isinstance(raw, dict):
@@ -261,7 +284,10 @@ class Strict(BaseModel):
 
     @classmethod
     def _add_remedies(cls, error: ValidationError, skipped: set[Any]) -> Iterable[LocatedProblem]:
-        """Yield the problems of an error, with the messages of `explain_missing` for required keys that are absent."""
+        """Yield the problems of ``error``; those of absent required keys get the texts of `explain_missing`.
+
+        ``skipped`` contains the unusable keys of the mapping, whose problems are already reported.
+        """
         # Do not report a required key as missing if it is present without a value or misspelled, because that problem
         # is already reported.
         explained = skipped | {resembling(key, cls.model_fields) for key in skipped}
@@ -277,11 +303,12 @@ class Strict(BaseModel):
 
 
 def _find_docstrings(model: type[Strict]) -> Iterator[tuple[str, str]]:
-    """Yield the names of the fields defined in the body of a class, and the docstrings below them."""
+    """Yield the name and the docstring of each field that has a docstring in the body of the class ``model``."""
     try:
         body = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0]
     except (OSError, TypeError):
-        # Models made by `create_model` have no source; their fields have descriptions instead of docstrings.
+        # Yield nothing for models made by `create_model`, because they have no source code; their fields have
+        # descriptions instead of docstrings.
         return
     assert isinstance(body, ast.ClassDef), "this is a class"
     for field, below in pairwise(body.body):
@@ -303,7 +330,7 @@ def _validate_name(value: Any) -> str:
 
 
 def require_entries(noun: str) -> Callable[[Any, Callable[[Any], Any]], Any]:
-    """Return a validator of lists that requires at least one entry and no entry twice.
+    """Return a validator that accepts only lists with at least one entry and without repeated entries.
 
     Args:
         noun: plural noun of the entries for messages, such as "devices".
@@ -342,7 +369,7 @@ def find_kind(
         models: models by the names of their kinds.
         noun: noun of the section for messages, such as "a study".
         example: remedy to report if the value is not a mapping.
-        refused: rule and remedy to report for kinds that exist but are not allowed in this section.
+        refused: allowed values and remedy to report, by kind, for kinds that exist but are not accepted here.
     """
     kinds = f"{noun} is a mapping with one of the kinds {quote_names(models)}"
     if not isinstance(raw, dict):
@@ -358,7 +385,10 @@ def find_kind(
 
 
 def find_repeated(raw: Iterable[Any], remedy: str, allowed: str = "each value once") -> Iterable[LocatedProblem]:
-    """Yield a problem for each number or text of a list that equals an earlier entry, with its index."""
+    """Yield a problem for each number or text of a list that equals an earlier entry.
+
+    The path of a problem is the index of the repeated entry; ``remedy`` and ``allowed`` are texts of the problem.
+    """
     seen: dict[Any, int] = {}
     for index, value in enumerate(raw):
         if isinstance(value, str | int | float) and not isinstance(value, bool):
@@ -373,6 +403,6 @@ Name = Annotated[
 
 
 def describe_parameter(parameter: Parameter, bounds: str = "") -> str:
-    """Return the description of a parameter for the schema: quantity, unit, bounds and note."""
+    """Return the description of a parameter for the JSON Schema: quantity, unit, text of the bounds, and note."""
     unit = "" if parameter.unit == "1" else f", in {parameter.unit} or with a unit"
     return f"{parameter.sentence}{unit}{bounds}{'; ' if parameter.note else ''}{parameter.note}"

@@ -36,18 +36,22 @@ from zwidth.words.quantities import CHOICES, FIELDS, NOT_NEGATIVE
 
 PART_NAMES = ("velocity", *PARTS, "modes")
 
+# Allowed values and remedy to report if FOAW, an adaptive velocity estimate, is given but a linear one is required.
 NO_LINEAR_FORM = "FOAW chooses its window by the motion and has no linear form"
 SIMULATED = "use the kind 'simulate' or 'limit_cycle', or a linear estimate such as 'windowed_difference'"
 
 
 def parse_input_error(error: InputError) -> LocatedProblem:
-    """Return the path and the problem of an error of a part or a scene, from the field that begins its message."""
+    """Convert the error of a part or a scene to a pair (path, problem).
+
+    Its message begins with the path of the field, as in "coupling.mass: got ...".
+    """
     field, _, text = str(error).partition(": ")
     return tuple(field.split(".")), parse_message(text)
 
 
 def parse_message(text: str) -> Any:
-    """Return the problem of a message ``received; allowed; remedy`` or ``received; remedy``."""
+    """Convert a message of the form ``received; allowed; remedy`` or ``received; remedy`` to a `problem`."""
     message, _, rest = text.partition("; ")
     allowed, _, remedy = rest.rpartition("; ")
     return problem(message, allowed, remedy)
@@ -60,7 +64,7 @@ class PartSection(Strict):
 
     @cached_property
     def instance(self) -> Any:
-        """The part with the values of the keys."""
+        """The part as an object of `zwidth.parts`, with the values of the keys of this section."""
         given = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return self.part(**given)
 
@@ -74,7 +78,7 @@ class PartSection(Strict):
 
 
 def _read_coefficients(raw: Any) -> tuple[Any, ...]:
-    """Return coefficients, or sections in series, each with its coefficients."""
+    """Validate the coefficients of a polynomial, or a list of such lists for sections in series; return tuples."""
     if not isinstance(raw, list | tuple):
         raise problem(f"got {describe(raw)}", "coefficients are a list, highest power first", "write [1000, -1000]")
     sections = any(isinstance(each, list | tuple) for each in raw)
@@ -96,7 +100,7 @@ def make_section(part: Any, owner: str, noun: str, kind: str = "") -> type[PartS
 
     Args:
         part: class of the part.
-        owner: name of the part in `words.quantities`.
+        owner: prefix of the names of the part's parameters in `words.quantities`, such as "coupling".
         noun: noun of the section for messages, such as "a coupling".
         kind: value of the key ``kind``; "" for a section without this key.
     """
@@ -116,7 +120,10 @@ def _head(part: Any) -> str:
 
 
 def _describe(path: str, item: Any) -> tuple[Any, str]:
-    """Return the annotation of a key and its description for the schema."""
+    """Return the type annotation of a key, and its description for the schema.
+
+    ``path`` is the name of the key in `words.quantities`, ``item`` the field of the dataclass.
+    """
     if path in CHOICES:
         return Literal[CHOICES[path].names], f"{CHOICES[path].sentence}."
     if path not in FIELDS:
@@ -148,7 +155,7 @@ def read_velocity(raw: Any, sections: dict[str, type[PartSection]] = _LINEAR) ->
 
 
 def _make_one_of(sections: dict[str, type[PartSection]]) -> GetPydanticSchema:
-    """Return the annotation of a field for one of several velocity estimates, which differ in the key ``kind``."""
+    """Return the annotation of a field that accepts each velocity estimate in ``sections``, by its key ``kind``."""
     every = Annotated[Union[tuple(sections.values())], Field(discriminator="kind")]  # noqa: UP007
     read = Annotated[every, WrapValidator(lambda raw, _: read_velocity(raw, sections))]
     return GetPydanticSchema(lambda _, handler: handler.generate_schema(read))
@@ -187,8 +194,8 @@ def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Stri
     """Create the base class of models that have one section per optional part of a scene.
 
     Args:
-        no_estimate: default of the velocity estimate, for descriptions.
-        no_part: default of the other parts, for descriptions.
+        no_estimate: text of the default of the velocity estimate, for descriptions in the schema.
+        no_part: text of the default of the other parts, for the same descriptions.
         more: sentence to append to the descriptions.
     """
     parts: dict[str, Any] = {"velocity": ("Velocity estimate", VelocityField, no_estimate)}
@@ -202,16 +209,17 @@ def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Stri
 
 
 def list_parts(owner: Any) -> dict[str, Any]:
-    """Return the sections of the parts that a device, scene or study has, by name; "modes" is a list of sections.
+    """Return the sections of the given parts of a device, scene or study, by the name of the part.
 
-    "device" is a linear system or a measured response that replaces mass and damping.
+    The entry "modes" is a list of sections; "device" is a linear system or a measured response that replaces mass and
+    damping.
     """
     parts = {name: getattr(owner, name, None) for name in ("device", *PART_NAMES)}
     return {name: section for name, section in parts.items() if section is not None and section != []}
 
 
 def build_parts(owner: Any) -> dict[str, Any]:
-    """Return the parts that a device, scene or study has, by name, as objects of `zwidth.parts`."""
+    """Return the given parts of a device, scene or study as objects of `zwidth.parts`, by the name of the part."""
     return {
         name: [each.instance for each in section] if isinstance(section, list) else section.instance
         for name, section in list_parts(owner).items()

@@ -49,15 +49,15 @@ from zwidth.words.units import detect_kind, split_head
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
-# Keys whose values do not indicate rotary devices: free texts, and an angle that every device has.
+# Keys whose values do not indicate rotary devices: free texts, and the phase margin, an angle for all devices.
 _KEYS_WITHOUT_UNIT = ("name", "description", "label", "phase_margin")
-MAX_FILE_BYTES = 2**20
-MAX_NODES = 50_000  # values per file, with those of aliases counted once per use
-MAX_DEPTH = 20  # nesting levels
+MAX_FILE_BYTES = 2**20  # bytes (1 MiB)
+MAX_NODES = 50_000  # values per file; aliased values count once per use
+MAX_DEPTH = 20  # nesting levels of mappings and lists
 
 
 def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Model:
-    """Return the model of a configuration file; raise a `ConfigFileError` that lists all faults."""
+    """Read a configuration file and return its validated model; raise a `ConfigFileError` that lists all faults."""
     file = os.fsdecode(path)
     tree = _Tree(file, _read_text(file))
     with files_relative_to(Path(file).parent):
@@ -67,7 +67,7 @@ def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Mo
 
 
 def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
-    """Return the model of a mapping; raise a `ConfigFileError` whose faults have fields but no line numbers."""
+    """Validate a mapping and return its model; raise a `ConfigFileError` whose faults have no line numbers."""
     problems: list[LocatedProblem] = []
     simple = _simplify(data, (), problems)
     return _check(
@@ -78,7 +78,14 @@ def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
 def _check(
     model: type[_Model], data: Any, faults: list[Fault], locate: Callable[[list[LocatedProblem]], list[Fault]]
 ) -> _Model:
-    """Return the model of plain values; raise a `ConfigFileError` with ``faults`` and those of the model."""
+    """Validate plain values and return their model; raise one `ConfigFileError` with all faults.
+
+    Args:
+        model: class of the model.
+        data: plain Python values of the configuration.
+        faults: faults detected before the validation, such as repeated keys.
+        locate: function that converts the problems of the validation to faults with positions.
+    """
     instance = None
     try:
         with read_in_units(SYSTEMS[has_rotary_devices(data)]):
@@ -91,8 +98,12 @@ def _check(
 
 
 def has_rotary_devices(data: Any, key: str = "") -> bool:
-    """Return whether a configuration has rotary devices, by its units, ``rotary: true``, device names or data files."""
-    # One rotary value makes all devices of a file rotary. Skip fits, because they determine the kind from their logs.
+    """Return whether a unit, ``rotary: true``, a published device or a data file indicates rotary devices.
+
+    ``data`` is a configuration or one of its values, and ``key`` the key of this value.
+    """
+    # One rotary value makes all devices of a file rotary. Skip fit studies, because the units in their logs
+    # determine whether their devices are rotary.
     if isinstance(data, Mapping):
         return data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
     if isinstance(data, list):
@@ -105,7 +116,7 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
             return False
         return any(device.rotary for device in DEVICES if device.name == data)
     if key == "csv" and isinstance(data, str):
-        # Coordinates in degrees do not make a device rotary, so only parameters count.
+        # Inspect only columns of parameters, because linear devices may also have other columns in degrees.
         with suppress(InputError):
             heads = map(split_head, read_columns(find_file(data)).heads)
             return any(detect_kind(f"1 {unit}") is True for name, unit in heads if name in PARAMETERS)
@@ -114,7 +125,7 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
 
 
 def _simplify(value: Any, path: FieldPath, problems: list[LocatedProblem]) -> Any:
-    """Return a value with arrays and tuples as lists; append a problem for each key that is not a text, and omit it.
+    """Convert arrays and tuples in a value to lists; omit keys that are not text, and append a problem for each.
 
     Args:
         value: mapping, list or scalar.
@@ -137,16 +148,17 @@ def _simplify(value: Any, path: FieldPath, problems: list[LocatedProblem]) -> An
 
 
 def write_yaml(data: Mapping[str, Any]) -> str:
-    """Return plain values as the text of a configuration file, which reads back to the same values."""
+    """Return the YAML text of a configuration with the given plain values; reading the text returns the same values."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
 
 
 def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
-    """Return all scalar values of a key in a valid file, each with the indices of its start and end in the text."""
+    """Return all scalar values of ``key`` in a valid YAML text, each as a tuple (value, start index, end index)."""
     values: dict[int, tuple[str, int, int]] = {}
     for path, (value, first, last) in _Tree("", text).scalars.items():
         if path[-1:] == (key,):
-            # Exclude an anchor before the value and a line break after folded text, which PyYAML's marks include.
+            # Exclude an anchor (``&name``) before the value and a line break after folded text, because the range
+            # between PyYAML's marks contains both.
             anchor = re.match(r"&\S+\s+", text[first:last])
             first += anchor.end() if anchor else 0
             values[first] = (value, first, first + len(text[first:last].rstrip()))
@@ -154,7 +166,7 @@ def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
 
 
 def _fail(file: str, position: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
-    """Return an error with one fault; ``parts`` are its problem, allowed values and remedy."""
+    """Return an error that reports one fault; ``parts`` are the problem, the allowed values and the remedy."""
     line, column = position or (None, None)
     return ConfigFileError.of([Fault(file, line, column, format_path(path), *parts)])
 
@@ -173,7 +185,7 @@ def _read_text(file: str) -> str:
     except PermissionError as error:
         raise _fail(file, None, "permission denied", "", "make the file readable") from error
     except (OSError, ValueError) as error:
-        # A path with a null character raises a ValueError.
+        # Catch ValueError as well, because `open` raises it for a path with a null character.
         reason = f"cannot be read ({getattr(error, 'strerror', None) or error})"
         missing = isinstance(error, FileNotFoundError)
         raise _fail(file, None, "no such file" if missing else reason, "", "check the path") from error
@@ -183,7 +195,7 @@ def _read_text(file: str) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        # Use the bytes of the error, because its position does not count a byte order mark.
+        # Use the bytes in the error instead of ``data``, because ``error.start`` does not count a byte order mark.
         good = error.object[: error.start].decode("utf-8")
         message = f"got the byte 0x{error.object[error.start]:02x}, which is not UTF-8"
         raise _fail(
@@ -192,18 +204,18 @@ def _read_text(file: str) -> str:
 
 
 def _find_position(text: str, index: int) -> tuple[int, int]:
-    """Return line and column, both from 1, of an index in a text."""
+    """Return the line and column of the character with the given index in a text; both count from 1."""
     before = re.split(r"\r\n|[\n\r\x85\u2028\u2029]", text[:index])
     return len(before), len(before[-1]) + 1
 
 
 def _find_mark(mark: yaml.Mark) -> tuple[int, int]:
-    """Return line and column, both from 1, of a mark of PyYAML, which counts from 0."""
+    """Convert a PyYAML mark, which counts from 0, to a line and a column that count from 1."""
     return mark.line + 1, mark.column + 1
 
 
 class _Resolver(BaseResolver):
-    """Resolver of scalars by the core schema of YAML 1.2; PyYAML's own follows YAML 1.1."""
+    """Resolver of the types of scalars by YAML 1.2 (core schema); the resolvers of PyYAML follow YAML 1.1."""
 
 
 for _tag, _pattern, _first in (
@@ -220,7 +232,7 @@ MAX_INLINE_KEYS = 4  # mappings of scalars with up to this many keys are written
 
 
 class _Dumper(yaml.SafeDumper):
-    """Dumper that quotes texts which the core schema would read as numbers."""
+    """YAML serializer that quotes a text if the core schema would read it as a number, a bool or null."""
 
     yaml_implicit_resolvers = _Resolver.yaml_implicit_resolvers
 
@@ -236,11 +248,11 @@ class _Dumper(yaml.SafeDumper):
 
 
 class _Alias(yaml.Node):
-    """Node of an alias: ``value`` is the node that it refers to, the marks are those of the alias."""
+    """YAML node for an alias: ``value`` is the node to which the alias refers, the marks are those of the alias."""
 
 
 class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
-    """Plain Python values of a YAML text (``data``), with the positions of all values and keys, and tag or key faults.
+    """Plain Python values of a YAML text (``data``), positions of all values and keys, and faults of tags and keys.
 
     Args:
         file: name of the file for messages.
@@ -275,14 +287,15 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
         except yaml.MarkedYAMLError as error:
             raise self._explain_syntax_error(error) from error
         except (ValueError, OverflowError) as error:
-            # PyYAML does not catch errors of chr() and int(), e.g. for "\U00110000" or a version of 5000 digits.
+            # Catch the errors of chr() and int(), e.g. for "\U00110000" or a number of 5000 digits, because PyYAML does
+            # not convert them to its own errors.
             if isinstance(error, ConfigFileError):
                 raise
             message = "an escape or a number that does not exist"
             raise _fail(self.file, _find_mark(self.get_mark()), message, "", "correct or remove it") from error
 
     def _explain_syntax_error(self, error: yaml.MarkedYAMLError) -> ConfigFileError:
-        """Return PyYAML's description of a syntax error as an error with position and remedy."""
+        """Convert a syntax error of PyYAML to a `ConfigFileError` with position and remedy."""
         mark = error.problem_mark or error.context_mark
         position = _find_mark(mark) if mark else (1, 1)
         message, context = escape_unprintable((error.problem or "unreadable").replace("\n", " ")), error.context or ""
@@ -307,7 +320,8 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
         """Compose a node and its children; in addition to PyYAML, enforce limits and keep the positions of aliases."""
         event, above, arguments = self.peek_event(), self._path, (parent, index)
         position, anchor = _find_mark(event.start_mark), event.anchor
-        # The last element of the path is the key or index; for the node of a key itself, its text.
+        # Append the key or index of the node to the path. For the node of a key, append the text of the key, because
+        # PyYAML passes no index for it.
         key = getattr(event if index is None else index, "value", index)
         self._path = () if parent is None else (*above, key if isinstance(key, int | str) else "?")
         if isinstance(event, yaml.AliasEvent):
@@ -318,7 +332,7 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
         else:
             self._count_node(position, self._path)
             if event.tag is not None:
-                # Report the tag, and continue without it to find further faults.
+                # Add a fault instead of raising an error, because all faults of a file are reported together.
                 message = f"got the tag {describe(event.tag)}"
                 self._add_fault(position, self._path, message, "tags are not used", "remove the tag")
             self._unfinished |= {anchor} - self.anchors.keys() - {None}
@@ -338,11 +352,11 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
             raise _fail(self.file, position, message, allowed, "use fewer levels", path=path)
 
     def _add_fault(self, position: tuple[int, int], path: FieldPath, *parts: str) -> None:
-        """Append a fault; ``parts`` are its problem, allowed values and remedy."""
+        """Append a fault to `faults`; ``parts`` are the problem, the allowed values and the remedy."""
         self.faults.append(Fault(self.file, *position, format_path(path), *parts))
 
     def _read(self, node: Any, path: FieldPath, in_alias: bool = False) -> Any:
-        """Return the value of a node, and record its position; an aliased value has that of the alias.
+        """Convert a node to plain Python values and record their positions; an aliased value is located at its alias.
 
         Args:
             node: composed node.
@@ -362,7 +376,7 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
         return self._read_scalar(node)
 
     def _read_mapping(self, node: Any, path: FieldPath, in_alias: bool) -> dict[str, Any]:
-        """Return a mapping as a dict; report keys that are not texts or occur twice as faults, and omit them."""
+        """Convert a mapping node to a dict; omit keys that are not text or occur twice, and add a fault for each."""
         mapping: dict[str, Any] = {}
         for name, value in node.value:
             position = _find_mark(name.start_mark)
@@ -379,7 +393,7 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
         return mapping
 
     def _read_scalar(self, node: Any) -> Any:
-        """Return the value of a scalar by the core schema; numbers that overflow float64 become infinite."""
+        """Convert a scalar node to None, bool, int, float or str by the core schema; overflow results in infinity."""
         text = node.value
         kind = self.resolve(yaml.ScalarNode, text, (node.style is None, True)).rpartition(":")[2]
         if kind == "null":
@@ -388,7 +402,8 @@ class _Tree(Reader, Scanner, Parser, Composer, _Resolver):
             return text.lower() == "true"
         if kind == "int" and text[:2] in ("0o", "0x"):
             return int(text, 0)
-        # Read longer integers as floats, because Python refuses thousands of digits, and float64 overflows at 309.
+        # Read integers of 400 or more digits as floats, which are then infinite (float64 overflows above 309 digits),
+        # because Python refuses to convert thousands of digits to int.
         if kind == "int" and len(text) < 400:
             return int(text)
         if kind not in ("int", "float"):

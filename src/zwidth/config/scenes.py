@@ -2,7 +2,8 @@
 
 A scene is a device with its timing, optional parts and optional wall, and supplies the default values of the studies.
 A plant is a device with its timing, but without a wall. Normalized parameters are those of `zwidth.Scene.normalized`:
-delta, d, alpha and beta. The kind of a mapping is that of its first key that only one kind has.
+delta, d, alpha and beta. The first key of a mapping that belongs to only one of the two kinds determines the kind of
+the mapping.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ class _PhysicalPlant(_Parts, SampledMass):
             yield ("delay",), problem(f"got {self.delay}, which is {short(self.d)} periods", allowed, "check the units")
             return
         if self.device is not None and any(getattr(self, name) for name in (*PARTS, "modes")):
-            # Parts in addition to a linear system or measured response are reported as conflicting keys.
+            # Skip the checks below, because parts that conflict with a linear system or measured response are already
+            # reported.
             return
         try:
             scene = self.to_scene()
@@ -74,12 +76,12 @@ class _PhysicalPlant(_Parts, SampledMass):
 
     @property
     def parts_beyond(self) -> tuple[str, ...]:
-        """Names of the parts that only some kinds of study accept."""
+        """Names of the parts that a rigid mass with backward difference lacks; only some kinds of study accept them."""
         return self.to_scene().parts_beyond
 
     @property
     def delta(self) -> float:
-        """Normalized damping of the device, including that of an operator with a rigid grasp."""
+        """Normalized damping delta of the device and, with a rigid grasp, of the operator."""
         return float(self.to_scene().delta)
 
     @property
@@ -88,14 +90,15 @@ class _PhysicalPlant(_Parts, SampledMass):
         return self.delay.periods(self.period)
 
     def to_scene(self) -> Scene:
-        """Return the device, its timing and, if given, its wall in SI units."""
+        """Return the device, its timing and, if given, its wall as a `Scene` in SI units."""
         return self._scene
 
     @cached_property
     def _scene(self) -> Scene:
         # Pass the delay as a `Span`, because the conversion of periods to seconds has rounding errors.
         timing = Timing(self.period, self.delay)
-        # A linear system or measured response is one of the parts, and replaces this device.
+        # Use a mass of 1 kg if none is given, because `replace_parameters` then replaces this device by the linear
+        # system or measured response.
         device = Device(mass=self.mass or 1.0, damping=self.damping, rotary=bool(self.rotary))
         limit = getattr(self, "safe_limit", None)
         return replace_parameters(Scene(device, timing, safe_limit=limit and limit.instance), build_parts(self))
@@ -111,7 +114,7 @@ class _NormalizedPlant(OneKind):
     d: Annotated[float, quantity_of("d")] = 0.0
 
     def to_scene(self) -> Scene:
-        """Return the device with a mass of 1 kg and a period of 1 s."""
+        """Return the plant as a `Scene` with a mass of 1 kg and a period of 1 s."""
         return Scene(Device(1.0, self.delta), Timing(self.period, self.d))
 
 
@@ -164,7 +167,10 @@ class NormalizedWall(OneKind, noun="a wall"):
 
 
 def _pick_wall(scene: Any, kind: Any) -> Any:
-    """Return the wall of a scene, with an absent parameter as 0; None if both are absent."""
+    """Return the wall of a scene as an instance of ``kind``; None if both of its parameters are absent.
+
+    If only one parameter is absent, it is 0.
+    """
     given = {name: getattr(scene, name) for name in kind.model_fields}
     return None if set(given.values()) == {None} else kind(**{name: value or 0.0 for name, value in given.items()})
 
@@ -189,24 +195,27 @@ class PhysicalScene(_PhysicalPlant, noun="a scene"):
 
     @property
     def hardware(self) -> dict[str, float]:
-        """Given parameters of encoder, friction and motor, by name."""
+        """Values of the given parameters of encoder, friction and motor, by the name of the parameter."""
         return {name: value for name in HARDWARE if (value := getattr(self, name)) is not None}
 
     @cached_property
     def _scene(self) -> Scene:
-        # Use stiffness 0 and damping 0 for a wall that is not given.
+        # Represent an absent wall by stiffness 0 and damping 0, because such a wall exerts no force.
         wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
         return replace(super()._scene, wall=wall)
 
     def without_wall(self, kind: type[PhysicalDevice] = PhysicalDevice) -> PhysicalDevice:
-        """Return the scene without its wall, by default as a device with a linear velocity estimate."""
+        """Return the device, timing, parts and safe limit of the scene as a device model of class ``kind``.
+
+        The default class accepts only velocity estimates with a linear form.
+        """
         names = "mass", "damping", "period", "delay", "rotary", "safe_limit"
         values = {name: getattr(self, name) for name in names}
         return kind(**{name: value for name, value in values.items() if value is not None}, **list_parts(self))
 
     @property
     def doubts(self) -> list[str]:
-        """Warnings on implausible values, one line each."""
+        """Warnings about implausible values of parameters, one line each."""
         parameters = {
             path: value for path, value in self.to_scene().parameters().items() if path not in ("period", "rate")
         }
@@ -229,7 +238,7 @@ class NormalizedScene(_NormalizedPlant, noun="a scene"):
     beta: Number | None = None
 
     def without_wall(self) -> NormalizedDevice:
-        """Return the scene without its wall."""
+        """Return the device and the delay of the scene, without the wall."""
         return NormalizedDevice(delta=self.delta, d=self.d)
 
     @property
@@ -245,7 +254,7 @@ def is_adaptive(owner: Any) -> bool:
 
 
 def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
-    """Return alpha and beta of a wall on a device."""
+    """Return the normalized stiffness alpha and the normalized damping beta of a wall on a device."""
     if isinstance(wall, NormalizedWall):
         return wall.alpha, wall.beta
     alpha, beta = device.to_scene().normalize_walls(wall.stiffness, wall.virtual_damping)
@@ -253,13 +262,13 @@ def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
 
 
 def is_normalized(raw: dict[str, Any]) -> bool:
-    """Return whether the first key that only one kind has is a normalized key."""
+    """Return whether the first key of a mapping that belongs to only one kind is a normalized key."""
     decisive = [key for key in raw if key in PHYSICAL_KEYS | NORMALIZED_KEYS]
     return bool(decisive) and decisive[0] in NORMALIZED_KEYS
 
 
 def _read_either(raw: Any, physical: type[Any], normalized: type[Any]) -> Any:
-    """Return the physical or the normalized model of a mapping; its first key that only one kind has decides."""
+    """Validate a mapping with the physical or the normalized model, selected by `is_normalized`, and return it."""
     if isinstance(raw, physical | normalized):
         return raw
     if not isinstance(raw, dict):
@@ -275,7 +284,7 @@ AnyWall: TypeAlias = PhysicalWall | NormalizedWall
 
 
 def read_scene(raw: Any) -> AnyScene:
-    """Return the model of a scene, physical or normalized."""
+    """Validate the mapping of a scene and return its model, physical or normalized."""
     return _read_either(raw, PhysicalScene, NormalizedScene)
 
 

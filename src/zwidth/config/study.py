@@ -21,16 +21,20 @@ from zwidth.config.values import Axis, get_system
 from zwidth.words.unit_system import UnitSystem
 
 MAX_POINTS = 150_000_000  # points per study, except sweeps
-MAX_BYTES = 2**30  # estimated size of the result per study, except sweeps
+MAX_BYTES = 2**30  # bytes; estimated size of the result per study, except sweeps
 
 KINDS: dict[str, type[Study]] = {}
-"""Models of the studies by the name of their kind."""
+"""Registered models of studies, by the name of their kind."""
 
 _Kind = TypeVar("_Kind", bound="type[Study]")
 
 
 def register(model: _Kind) -> _Kind:
-    """Register a kind of study, a `zwidth.studies.ComputedStudy` whose field ``kind`` has one literal: its name."""
+    """Register the model of a kind of study, and return the model; to be used as a class decorator.
+
+    The model is a subclass of `zwidth.studies.ComputedStudy`. Its field ``kind`` has the type ``Literal[NAME]``, where
+    NAME is the name of the kind.
+    """
     KINDS[model.kind_name()] = model
     if "noun" not in vars(model):
         model.noun = f"a {model.kind_name()} study"
@@ -38,12 +42,15 @@ def register(model: _Kind) -> _Kind:
 
 
 def name_parts(parts: Iterable[str]) -> str:
-    """Return names of parts in words; the part "device" is a system or response in place of a mass."""
+    """Return the names of parts as text, joined by "and"; the part "device" is described instead of named."""
     return " and ".join("a system or response in place of its mass" if name == "device" else name for name in parts)
 
 
 def make_parts_error(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticCustomError:
-    """Return the problem of a device with parts in a study that would ignore them."""
+    """Return the problem that a study of ``kind`` reports for a device with ``parts``, which it would ignore.
+
+    ``remedy`` is an alternative to the use of another kind of study.
+    """
     message = f"got a device with {name_parts(parts)}"
     allowed = f"the kind {kind!r} accepts only a rigid mass with the difference of two samples"
     kinds = f"use one of the kinds {quote_names(name for name in sorted(KINDS) if KINDS[name].takes_parts)}"
@@ -51,12 +58,12 @@ def make_parts_error(kind: str, parts: Iterable[str], remedy: str = "") -> Pydan
 
 
 class Study(Strict):
-    """Base of all studies."""
+    """Base of the models of all kinds of studies."""
 
     from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")  # fields whose default is the value of the file's scene
     # True if the kind accepts devices with parts; it then has a field ``device`` or ``devices``, or is a sweep.
     takes_parts: ClassVar[bool] = False
-    simulates: ClassVar[bool] = False  # True if it accepts a velocity estimate without a linear form
+    simulates: ClassVar[bool] = False  # True if the kind accepts velocity estimates without a linear form (FOAW)
     method: ClassVar[str] = ""  # method and accuracy of the results, in a sentence for reports
     point_bytes: ClassVar[int] = 80  # approximate size of the result in bytes per point
     remedy_if_too_large: ClassVar[str] = "use fewer values on an axis, or split the study"
@@ -68,7 +75,7 @@ class Study(Strict):
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The unit system of the study's devices."""
+        """Unit system of the study's devices, linear or rotary."""
         return self._system
 
     @classmethod
@@ -83,7 +90,7 @@ class Study(Strict):
 
     @classmethod
     def kind_name(cls) -> str:
-        """Return the name of the kind, the only literal of the field ``kind``."""
+        """Return the name of the kind of study, the only literal in the type of the field ``kind``."""
         (name,) = get_args(cls.model_fields["kind"].annotation)
         return name
 
@@ -94,7 +101,7 @@ class Study(Strict):
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        """Return the keys of a study with absent ones supplied by the scene."""
+        """Return the mapping of a study, in which the scene supplies the absent keys of `from_scene`."""
         absent = cls._list_absent(raw)
         supplied: dict[str, Any] = {"delta": scene.delta, "d": scene.d}
         if isinstance(scene, PhysicalScene):
@@ -108,20 +115,20 @@ class Study(Strict):
 
     @classmethod
     def _list_absent(cls, raw: dict[str, Any]) -> list[str]:
-        """Return the absent keys that the scene supplies; a rate counts as a period."""
+        """Return the keys of `from_scene` that the mapping ``raw`` does not contain; ``rate`` counts as ``period``."""
         given = {*raw, "period"} if "rate" in raw else raw
         return [name for name in cls.from_scene if name not in given]
 
     @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
-        """Raise a problem if the study would take parameters of the scene and ignore its parts."""
+        """Raise a problem if the study would take parameters from a scene with parts, but ignore the parts."""
         taken = cls._list_absent(raw)
         if taken and not cls.takes_parts and scene.parts_beyond:
             raise make_parts_error(cls.kind_name(), list_parts(scene), f"add {' and '.join(taken)} to the study")
 
     @classmethod
     def check_estimate(cls, raw: dict[str, Any], scene: AnyScene) -> None:
-        """Raise a problem if the study takes parameters from a scene whose velocity estimate has no linear form."""
+        """Raise a problem if the study needs a linear velocity estimate, but the scene that it uses has FOAW."""
         if (cls.takes_parts or cls._list_absent(raw)) and not cls.simulates and is_adaptive(scene):
             raise problem("got scene.velocity of kind 'foaw'", NO_LINEAR_FORM, SIMULATED)
 
@@ -135,7 +142,7 @@ class Study(Strict):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Sizes of the grid of the results by the name of the dimension; by default the sizes of the axes."""
+        """Number of points of the results along each dimension, by its name; by default one dimension per `Axis`."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
         return {name: axis.size for name, axis in values.items() if isinstance(axis, Axis)}
 

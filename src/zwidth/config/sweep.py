@@ -53,7 +53,7 @@ from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
 MAX_SWEEP_POINTS = 10**12  # points per sweep
 
-# Remedies to report if an axis changes a part that the device does not have, by parameter or part.
+# Remedies to report if an axis changes a part that the device does not have, by the name of the parameter or the part.
 _EXAMPLES = {
     "velocity": "velocity: {kind: low_pass, cutoff: 100 Hz}",
     "velocity.samples": "velocity: {kind: windowed_difference, samples: 5}",
@@ -64,19 +64,20 @@ _EXAMPLES = {
 
 
 def _make_axis_field(name: str) -> tuple[Any, Any]:
-    """Return the annotation and the pydantic field of an axis, or of the table of devices."""
+    """Return the type annotation and the pydantic field of the axis ``name``, or of the table "devices"."""
     if name == "devices":
         rows = "Parameters that vary together, one row per device: lists of equal length, or a CSV file."
         return TableField | None, Field(default=None, description=rows)  # pyright: ignore[reportOperatorIssue]
     axis: Any = Annotated[Axis, axis_of(name)]
-    # Omit the note of the parameter with its default, because the scene supplies the default of an axis.
+    # Replace the note of the parameter, which may state a default, because the default of an axis is the value of the
+    # scene.
     description = describe_parameter(
         replace(PARAMETERS[name], note="" if name in WALL else "default: that of the scene")
     )
     return axis | None, Field(default=None, description=f"{description}.")
 
 
-# The order of the fields is that of the configuration in existing stores.
+# Keep the order of these fields, because existing stores contain their configuration in this order.
 _OF_WALL = ("stiffness", "virtual_damping")
 _OF_DEVICE = ("mass", "damping", "period", "rate", "delay")
 _FIELDS: Any = {name: _make_axis_field(name) for name in (*OF_PARTS, "devices", *NORMALIZED, *_OF_WALL, *_OF_DEVICE)}
@@ -94,10 +95,7 @@ class Axes(_Axes):
         return _find_mixed_kinds([key for key in raw if key in PARAMETERS], "axes")
 
     def find_faults(self) -> Iterable[LocatedProblem]:
-        """Yield problems of parameters given twice, and of a table whose columns are of the other kind than the axes.
-
-        Kinds are SI units and normalized.
-        """
+        """Yield a problem for each parameter given twice, and for mixing physical and normalized parameters."""
         columns = tuple(self.devices.columns) if self.devices else ()
         axes = [name for name in PARAMETERS if getattr(self, name) is not None]
         for name in axes:
@@ -133,7 +131,7 @@ class Axes(_Axes):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Number of values by dimension of the grid; axes written as one number are not dimensions."""
+        """Number of values along each dimension of the grid, by its name; axes with one number are not dimensions."""
         sizes = {"device": self.devices.size} if self.devices else {}
         for name in PARAMETERS:
             axis = getattr(self, name)
@@ -142,12 +140,12 @@ class Axes(_Axes):
         return sizes
 
     def find_range(self, name: str) -> tuple[float, float]:
-        """Return the smallest and the largest value of a given parameter."""
+        """Return the smallest and the largest value of the parameter ``name``, an axis or a column of the table."""
         source = self.devices.columns[name] if self.find_key(name) == "devices" else getattr(self, name).entries
         return min(source), max(source)
 
     def find_key(self, name: str) -> str:
-        """Return the key that contains a parameter: its own, or "devices" for a column of the table."""
+        """Return the key that contains the values of a parameter: its name, or "devices" for a column of the table."""
         return "devices" if getattr(self, name) is None else name
 
     @property
@@ -163,13 +161,16 @@ class Axes(_Axes):
         return longest * (self.find_range("rate")[1] if "rate" in self.given else 1.0 / self.find_range("period")[0])
 
 
-# Normalized parameters and the corresponding physical ones.
+# Pairs of a normalized parameter and the corresponding physical one.
 _PAIRS = (("alpha", "stiffness"), ("beta", "virtual_damping"), ("delta", "damping"), ("d", "delay"))
 _COUNTERPARTS = dict(_PAIRS) | {physical: normalized for normalized, physical in _PAIRS}
 
 
 def _find_mixed_kinds(keys: list[str], subject: str) -> Iterable[LocatedProblem]:
-    """Yield a problem for each key that is not of the kind of the first key (SI units or normalized)."""
+    """Yield a problem for each normalized key if the first key is in SI units, or vice versa.
+
+    A period given together with a rate is also a problem. ``subject`` is the subject of the messages.
+    """
     if not keys:
         return
     physical = keys[0] in PHYSICAL
@@ -211,13 +212,14 @@ class SweepStudy(_Parts, Study):
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The unit system of the study's devices, also for a study that is read from a store."""
+        """Unit system of the study's devices, determined by ``rotary``, which is also saved in the store."""
         return SYSTEMS[bool(self.rotary)]
 
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(require_entries("outputs"))] = ("stable",)
     """Outputs to compute."""
 
-    # The lower bound keeps the circles of the two pole counts that certify a radius apart by more than rounding errors.
+    # The lower bound is 1e-12, because a radius is certified by counting the poles inside two circles, whose radii must
+    # differ by more than the rounding errors.
     accuracy: Annotated[float, Quantity(allowed=Range(1e-12, 0.1))] = 1e-9
     """Certified relative error of the spectral radius.
 
@@ -229,14 +231,15 @@ class SweepStudy(_Parts, Study):
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        """Let the scene supply the device and the timing."""
+        """Return the mapping of a sweep, in which the scene supplies the device and timing that the axes lack."""
         raw = super().fill(raw, scene)
         axes = raw.get("axes")
         if not isinstance(axes, dict):
             return raw
         given = _list_given(axes)
         if given & set(PHYSICAL):
-            # Add nothing from the scene to mixed keys, because it would cause further errors in addition to the mixing.
+            # Take no values from the scene if the axes mix physical and normalized keys, because these values would
+            # cause further errors.
             if not isinstance(scene, PhysicalScene) or given & set(NORMALIZED):
                 return raw
             supplied: dict[str, Any] = {"delay": str(scene.delay)}
@@ -259,11 +262,11 @@ class SweepStudy(_Parts, Study):
 
     @property
     def with_parts(self) -> bool:
-        """True if the devices have parts; each of them is then computed as a separate scene."""
+        """True if the devices have parts; each device is then computed as a separate `Scene`."""
         return bool(list_parts(self) or self.axes.part_parameters)
 
     def find_faults(self) -> Iterable[LocatedProblem]:
-        """Yield problems of missing and ineffective parameters, delays that are too long, and too many points."""
+        """Yield problems of missing parameters, parameters without an effect, too long delays and too many points."""
         given, physical = self.axes.given, self.axes.physical
         if "rate" not in given and "period" not in given and physical:
             yield ("axes",), problem("period missing", "a physical sweep has period or rate", "add 'period: 1 ms'")
@@ -283,7 +286,10 @@ class SweepStudy(_Parts, Study):
             yield (), problem(message, f"at most {MAX_SWEEP_POINTS:.4g} points per study", self.remedy_if_too_large)
 
     def _check_outputs(self, given: tuple[str, ...], physical: bool) -> Iterable[LocatedProblem]:
-        """Yield problems of outputs without the parameters that they need, and of parameters without an effect."""
+        """Yield problems of outputs that lack a required parameter, and of parameters that change no output.
+
+        ``given`` are the names of the parameters that are axes or columns; ``physical`` is true for SI units.
+        """
         stiffness = "stiffness" if physical else "alpha"
         walls = [name for name in self.outputs if OUTPUTS[name].family == "wall"]
         if walls and stiffness not in given:
@@ -307,14 +313,14 @@ class SweepStudy(_Parts, Study):
 
         Args:
             given: names of the parameters that are axes or columns.
-            physical: True if they are in SI units.
+            physical: True if the parameters are in SI units.
         """
         if not physical:
             for name in list_parts(self):
                 yield (name,), problem(f"got {name!r} with normalized axes", "parts are in SI units", "remove it")
             return
         parts = build_parts(self)
-        # A linear system or measured response is checked by its own attributes, because it contains all other parts.
+        # Check the attributes of a linear system or measured response in place of parts, because it contains all parts.
         obstacle = find_unsupported_reason(**(vars(parts["device"]) if "device" in parts else parts))
         for index, name in enumerate(self.outputs):
             if name not in OUTPUTS_WITH_PARTS:
@@ -333,14 +339,15 @@ class SweepStudy(_Parts, Study):
             yield from self._find_part_faults()
 
     def _find_part_faults(self) -> Iterable[LocatedProblem]:
-        """Yield problems of axes that belong to absent parts, and of values that the parts refuse."""
+        """Yield problems of axes that belong to absent parts, and of values that are invalid for the parts."""
         absent = [name for name in self.axes.part_parameters if not self._has_parameter(name)]
         for name in absent:
             part, _, key = name.partition(".")
             message = f"got the axis {name!r}, but no {part} with the key {key!r}"
             remedy = f"add {_EXAMPLES.get(name, _EXAMPLES.get(part, part))!r}"
             yield ("axes", self.axes.find_key(name)), problem(message, "an axis needs the part that it changes", remedy)
-        # Check the parts with every parameter at its smallest value, and with each parameter of a part at its largest.
+        # Check the parts only with every parameter at its smallest value, and with one parameter of a part at its
+        # largest, because the grid may have too many points to check all of them.
         smallest = {name: self.axes.find_range(name)[0] for name in self.axes.given if name not in WALL}
         faults = {}
         for changed in (
@@ -355,7 +362,7 @@ class SweepStudy(_Parts, Study):
             yield (("axes", self.axes.find_key(name)) if name in self.axes.given else ("axes",)), message
 
     def _has_parameter(self, name: str) -> bool:
-        """Return whether the part of a dotted parameter is present and has this key."""
+        """Return whether the device has the part and the key of a dotted parameter, such as "velocity.cutoff"."""
         part, _, key = name.partition(".")
         section = getattr(self, part)
         if part == "modes":
@@ -377,14 +384,14 @@ class SweepStudy(_Parts, Study):
             values_of_part = {
                 name.partition(".")[2]: value for name, value in given.items() if name.startswith(f"{part}.")
             }
-            # Create a part that has axes but no section from the values of the axes.
+            # Create a part that has no section from the values of its axes at this point of the grid.
             parts |= {part: PARTS[part](**values_of_part)} if values_of_part else {}
         device = Device(mass=given.pop("mass", 1.0), damping=given.pop("damping", 0.0), rotary=bool(self.rotary))
         return Scene(device, Timing(period=period, delay=delay)).replace(**parts, **given)
 
     @property
     def families(self) -> dict[Family, tuple[str, ...]]:
-        """Names of the outputs by family: per wall, or per device and delay."""
+        """Names of the outputs by family: outputs with one value per wall, or with one per device and delay."""
         groups: dict[Family, tuple[str, ...]] = {
             family: tuple(name for name in self.outputs if OUTPUTS[name].family == family) for family in STATUS_OF
         }
@@ -396,7 +403,7 @@ class SweepStudy(_Parts, Study):
 
 
 def _list_given(axes: dict[str, Any]) -> set[str]:
-    """Return the names of the parameters that are axes or columns of the table, before validation."""
+    """Return the names of the parameters that are axes or columns of the table, from axes not validated yet."""
     raw, given = axes.get("devices"), set(axes)
     # Ignore errors of the table here, because the validation of the axes reports them.
     with suppress(PydanticCustomError, ValidationError):

@@ -48,17 +48,18 @@ Entry: TypeAlias = Callable[[Any], float]
 
 _FORMS = "a number, a list of numbers, {linear: {start, stop, num}} or {log: {start, stop, num}}"
 
-# A context variable, because a value may have no unit: other values of the file determine the kind of device.
+# Unit system of the file that is being read. It is stored in a context variable, because a value without a unit gets
+# its unit from the kind of devices in the whole file, which is not passed to a validator.
 _system: ContextVar[UnitSystem] = ContextVar("system", default=LINEAR)
 
 
 def read_in_units(system: UnitSystem) -> AbstractContextManager[None]:
-    """Return a context manager in which values of a configuration are read in a unit system."""
+    """Return a context manager; while it is active, quantities are read in the units of ``system``."""
     return set_temporarily(_system, system)
 
 
 def get_system() -> UnitSystem:
-    """Return the unit system of the configuration that is being read."""
+    """Return the unit system, linear or rotary, of the configuration that is being read."""
     return _system.get()
 
 
@@ -71,11 +72,11 @@ class Quantity:
     whole: bool = False  # True if the value must be a whole number
     periods: bool = False  # True for a duration in s or in sampling periods, which is read as a `Span`
     remedy: str = ""  # remedy to report for a number out of range
-    turns: bool = True  # True if the unit becomes that of an angle, a torque, ... for rotary devices
+    turns: bool = True  # True if rotary devices have the corresponding unit of rotation, e.g. rad for m
     counts: bool = False  # True for an encoder step, which may also be given as "2000 counts"
 
     def read(self, value: Any) -> Any:
-        """Return a value of a configuration in ``unit``; a `Span` for durations in s or in periods."""
+        """Validate a value of a configuration and return it in ``unit``, or as a `Span` if ``periods`` is true."""
         try:
             if self.periods:
                 return read_span(value, self.allowed)
@@ -87,9 +88,9 @@ class Quantity:
             raise problem(*error.parts) from None
 
     def read_alike(self) -> tuple[Entry, set[str]]:
-        """Return a function that reads the values of an axis, and the set of the units that it has read.
+        """Return a function that reads one value of an axis, and the set to which the function adds the value's unit.
 
-        The set is filled only for durations, which must be either all in seconds or all in periods.
+        Only units of durations are added, because the durations of an axis must be all in seconds or all in periods.
         """
         units: set[str] = set()
 
@@ -104,7 +105,7 @@ class Quantity:
         return entry if self.periods else self.read, units
 
     def _read_number(self, value: Any) -> float:
-        """Return a number without a unit."""
+        """Validate a dimensionless number; return an int if ``whole`` is true, otherwise a float."""
         if isinstance(value, int if self.whole else int | float) and not isinstance(value, bool):
             number = check_range(to_float(value), self.allowed, remedy=self.remedy)
             return value if self.whole else number
@@ -123,7 +124,7 @@ class Quantity:
 
     @property
     def schema(self) -> dict[str, Any]:
-        """JSON Schema of the value."""
+        """JSON Schema of the value: its possible units, or the range of a dimensionless number."""
         if self.unit != "1":
             rotary = find_other(DIMENSIONS[self.unit]) if self.turns else None
             return describe_entry(self.unit, *(PERIOD_WORDS if self.periods else ()), *(rotary.units if rotary else ()))
@@ -143,7 +144,7 @@ class Quantity:
 
 
 def quantity_of(name: str) -> Quantity:
-    """Return the annotation of a parameter, by its name."""
+    """Return the unit and range of the named parameter, as the annotation of a field."""
     parameter = FIELDS[name]
     counts = name == "resolution"
     return Quantity(parameter.unit, parameter.allowed, parameter.whole, name == "delay", counts=counts)
@@ -157,12 +158,15 @@ Duration = Annotated[Span, Quantity("s", POSITIVE, periods=True)]
 
 
 def share_schema(name: str, schema: dict[str, Any]) -> dict[str, Any]:
-    """Return a schema marked for `config_json_schema`, which moves it to ``$defs`` and replaces it by a reference."""
+    """Return the schema marked as shared, so that `config_json_schema` moves it to ``$defs`` under ``name``."""
     return {"allOf": [{"shared": re.sub(r"\W+", "_", name.replace("/", " per ")), **schema}]}
 
 
 def describe_entry(unit: str, *more: str) -> dict[str, Any]:
-    """Return the JSON Schema of a number in an SI unit, or with another unit of the same dimension or in ``more``."""
+    """Return the JSON Schema of a quantity: a number in an SI unit, or a text with a unit.
+
+    The units of the text are those of the same dimension, and those in ``more``.
+    """
     dimension = DIMENSIONS[unit]
     pattern = r"^\s*[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
     description = f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}."
@@ -181,13 +185,13 @@ class Axis:
     in_periods: bool = False  # True if the values are delays in sampling periods
 
     def values(self) -> np.ndarray:
-        """Return all values as an array."""
+        """Return all values as a float64 array of shape (size,)."""
         if self.form in _SPACINGS:
             return _SPACINGS[self.form](*self.entries, self.size)
         return np.array(self.entries, dtype=np.float64)
 
     def serialize(self) -> Any:
-        """Return the axis in the form of a configuration file."""
+        """Return the number, list or mapping that represents the axis in a configuration file."""
         written = [f"{value!r} periods" if self.in_periods else value for value in self.entries]
         if self.form in _SPACINGS:
             return {self.form: {"start": written[0], "stop": written[1], "num": self.size}}
@@ -232,7 +236,7 @@ def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bo
     Args:
         raw: list of the configuration.
         entry: function that reads one value.
-        distinct: refuse equal entries.
+        distinct: True to refuse a list with equal entries.
     """
     if not raw:
         raise problem("got an empty list", "an axis has at least one value", "fill the list")
@@ -259,13 +263,13 @@ class AxisOf:
 
     @property
     def _forms(self) -> dict[str, Quantity]:
-        """Quantity of the first and last value by form; those of ``log`` must be positive."""
+        """Quantity of the first and last value of each mapping form; the values of ``log`` must be positive."""
         low, high, low_open, high_open = self.quantity.allowed
         positive = Range(max(low, 0.0), high, low_open or low <= 0.0, high_open)
         return {"linear": self.quantity, "log": replace(self.quantity, allowed=positive)}
 
     def read(self, raw: Any) -> Axis:
-        """Return the axis that a value of a configuration describes."""
+        """Validate an axis, written in any form (number, list, ``linear`` or ``log``), and return it."""
         if isinstance(raw, Axis):
             return raw
         form, ends = "number", raw
@@ -322,7 +326,7 @@ class AxisOf:
 
 
 def axis_of(name: str) -> AxisOf:
-    """Return the annotation of an axis of a parameter, by its name."""
+    """Return the annotation of a field that is an axis of the named parameter."""
     return AxisOf(quantity_of(name))
 
 

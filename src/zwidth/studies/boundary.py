@@ -1,7 +1,9 @@
 """Studies of the stable set: boundaries ("boundary"), comparison of devices ("compare") and grids ("map").
 
 Boundaries are closed forms over the frequency for rigid devices, and outlines of the stable region for devices with
-parts. A stable region may have islands, i.e. pieces that are not connected to K = 0.
+parts. A stable region may have islands, i.e. pieces that are not connected to K = 0. The symbols alpha, beta, delta and
+d are the normalized stiffness, virtual damping, physical damping and delay; omega is the angular frequency in rad per
+sample.
 """
 
 from __future__ import annotations
@@ -88,7 +90,10 @@ class BoundaryStudy(CurvesStudy):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Take delta and d from the device; errors of the device are reported at its fields."""
+        """Return the mapping with delta and d of its device.
+
+        For an invalid device both are 0, because the validation of the field ``device`` reports the errors.
+        """
         if "device" not in raw:
             return raw
         try:
@@ -150,7 +155,10 @@ class BoundaryStudy(CurvesStudy):
 
 
 def trace_device(device: PhysicalDevice, label: str) -> Outcome:
-    """Return the outlines of the stable set, with islands and holes, and K_max of a device with additional parts."""
+    """Compute the outlines of the stable set, with islands and holes, and the stiffest wall of a device with parts.
+
+    ``label`` is the name of the device in the table and the figure.
+    """
     outlines, walls = tabulate_sets({label: device.to_scene()})
     if not outlines:
         return Outcome(notes=("no wall of this device is stable",))
@@ -160,7 +168,7 @@ def trace_device(device: PhysicalDevice, label: str) -> Outcome:
 
 
 def tabulate_boundary(delta: float, d: float) -> dict[str, Any]:
-    """Return the boundary of the stable set of one device, as columns."""
+    """Return columns with omega, alpha, beta and the name of the piece for points on a rigid device's boundary."""
     region = stable_region(delta, d)
     columns = {"omega": region.omega, "alpha": region.alpha, "beta": region.beta}
     columns["piece"] = np.array([Piece(int(code)).name.lower() for code in region.piece])
@@ -168,7 +176,15 @@ def tabulate_boundary(delta: float, d: float) -> dict[str, Any]:
 
 
 def tabulate_stable_intervals(deltas: np.ndarray, delays: np.ndarray) -> list[dict[str, Any]]:
-    """Return the stable interval of the virtual damping for alpha -> 0 over delta, as columns per delay."""
+    """Return the lower and upper end of the stable interval of beta for alpha -> 0 over delta.
+
+    Args:
+        deltas: values of delta, shape (n,).
+        delays: values of d, shape (m,).
+
+    Returns:
+        m tables, one per delay, each a dict of columns of length n.
+    """
     # Use the smallest alpha in range, because alpha = 0 is on the stability boundary.
     upper = boundary_point(deltas, delays[:, None], alpha=WALL_RANGE[0], side="upper").beta
     shared = {"delta": deltas, "beta_lower": -deltas}
@@ -225,13 +241,13 @@ class CompareStudy(ComputedStudy):
 
 
 def _complete(device: Any, scene: PhysicalScene) -> Any:
-    """Return the mapping of a device with absent keys supplied by the scene; other values unchanged."""
+    """Return the mapping of a device, in which the scene supplies the absent keys; return other values unchanged."""
     if not isinstance(device, dict):
         return device
     supplied = {"mass": scene.mass, "damping": scene.damping, "delay": scene.delay, **list_parts(scene)}
     supplied |= {} if {"period", "rate"} & set(device) else {"period": scene.period}
-    # Supply no mass, damping or mechanical parts to a linear system or measured response, which contains them, and no
-    # system or response to a device with a mass.
+    # Supply no mass, damping or mechanical parts to a linear system or measured response, because it contains them,
+    # and no system or response to a device with a mass, because only one of them is allowed.
     if "device" in device:
         supplied = {name: value for name, value in supplied.items() if name in ("period", "delay", "velocity")}
     elif "mass" in device:

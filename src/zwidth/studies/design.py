@@ -1,8 +1,8 @@
 """Studies for the choice of parameters: "design" and "filters".
 
-"design" solves K_max = reserve * K for one parameter of the device, where K_max is the maximum stable stiffness and K
-the required stiffness, and simulates tolerances of the other parameters. "filters" computes K_max over velocity
-filters, and the noise of their velocity from the encoder steps.
+"design" solves K_max = reserve * K for one parameter of the device, where K_max is the maximum stable stiffness, K the
+required stiffness and reserve >= 1 a factor of safety, and simulates random devices within tolerances. "filters"
+computes K_max over velocity filters, and the noise of their velocity from the encoder steps.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
 from zwidth.words.status import Status
 from zwidth.words.unit_system import UnitSystem
 
-# Parameters that the design study can solve for.
+# Names of the parameters for which the design study can solve.
 FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
-_TRIALS = 60  # typical evaluations of K_max per solution, for the estimated number of points
+_TRIALS = 60  # typical number of evaluations of K_max per required stiffness; used to estimate `points`
 
 
 def _read_range(raw: Any, info: ValidationInfo) -> tuple[float, ...]:
-    """Return the two ends of the search range, in the unit of the parameter that the key ``find`` names."""
+    """Validate a search range [low, high] with 0 < low < high; return it in the SI unit of the parameter to find."""
     name = info.data.get("find")
     if not isinstance(raw, list | tuple) or len(raw) != 2:
         raise problem(f"got {describe(raw)}", "a range is a list of its two ends", "write [low, high]")
@@ -132,7 +132,7 @@ class DesignStudy(ComputedStudy):
         yield from self._check_tolerances(parameters)
 
     def _check_tolerances(self, parameters: dict[str, float]) -> Iterable[LocatedProblem]:
-        """Yield problems of tolerances of unknown parameters, or that are too large or without an effect."""
+        """Yield a problem for each tolerance that is too large, has no effect, or belongs to an unknown parameter."""
         bound = 1 / 3 if self.distribution == "normal" else 1.0
         for name, tolerance in (self.tolerances or {}).items():
             if name not in parameters or name == "rate":
@@ -144,7 +144,7 @@ class DesignStudy(ComputedStudy):
                 yield ("tolerances", name), fault
 
     def _list_parameters(self) -> dict[str, float]:
-        """Return the parameters of the device that the study can solve for, by name."""
+        """Return the current values of the parameters for which the study can solve, by name, in SI units."""
         every = self.device.to_scene().parameters()
         parameters = {name: float(value) for name, value in every.items() if name in FINDS and isinstance(value, float)}
         return parameters | {"rate": 1.0 / parameters["period"]}
@@ -162,7 +162,7 @@ class DesignStudy(ComputedStudy):
 
     @property
     def _name(self) -> str:
-        """Name of the parameter: "inertia" for the mass of a rotary device."""
+        """Name of the parameter ``find`` for messages: "inertia" in place of "mass" for a rotary device."""
         return "inertia" if self.find == "mass" and self.unit_system.rotary else self.find
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
@@ -189,10 +189,10 @@ class DesignStudy(ComputedStudy):
         )
 
     def _describe(self, nominal: Scene, stiffness: float, needed: RequiredValue) -> dict[str, Any]:
-        """Return a row of the table: the required value of the parameter, the stiffest wall and the tolerances.
+        """Return a row of the table: required value of the parameter, stiffest wall, and results of random devices.
 
         Args:
-            nominal: device with the present value of the parameter.
+            nominal: device with the current value of the parameter.
             stiffness: required stiffness in N/m.
             needed: result of the search for the parameter.
         """
@@ -220,10 +220,13 @@ class DesignStudy(ComputedStudy):
         return row | (self._tolerate(scene, stiffness, row[SI_COLUMNS[1]]) if self.tolerances is not None else {})
 
     def _tolerate(self, nominal: Scene | None, stiffness: float, virtual_damping: float) -> dict[str, float]:
-        """Return the share of random devices that are stable with the required stiffness, as columns.
+        """Simulate random devices within the tolerances, and return the share of stable ones as columns.
+
+        The columns are the share of devices that are stable with the required stiffness, its confidence interval, and
+        the stiffness with which 99 % of the devices are stable.
 
         Args:
-            nominal: nominal device with the required value of the parameter; None if there is no such value.
+            nominal: device with the required value of the parameter; None if no such value exists.
             stiffness: required stiffness in N/m.
             virtual_damping: virtual damping at K_max of the nominal device, in N s/m.
         """
@@ -238,7 +241,10 @@ class DesignStudy(ComputedStudy):
         return dict(zip(names, (drawn.stable, drawn.stable_low, drawn.stable_high, drawn.stiffness), strict=True))
 
     def _note(self, stiffness: float, needed: RequiredValue) -> Iterable[str]:
-        """Yield a note if the search failed, if every value is sufficient, or if several values reach the stiffness."""
+        """Yield a note if the search failed, if every value is sufficient, or if several values solve the equation.
+
+        The equation is K_max = reserve * K, with K = ``stiffness``.
+        """
         wanted = with_unit(self.reserve * stiffness, self.unit_system["N/m"])
         low, high = (with_unit(end, self.unit_system[PARAMETERS[self.find].unit]) for end in needed.range)
         if needed.status != Status.OK:
@@ -250,7 +256,12 @@ class DesignStudy(ComputedStudy):
             yield f"{wanted}: K_max crosses this value at {count} values of {self._name}; the nearest is reported"
 
     def _trace(self, nominal: Scene, low: float, high: float) -> dict[str, np.ndarray]:
-        """Return K_max over the parameter as columns, with NaN for invalid values and devices without a stable wall."""
+        """Compute K_max and its virtual damping over the parameter, from ``low`` to ``high`` in logarithmic steps.
+
+        Returns:
+            Columns with the values of the parameter, K_max and virtual damping. The latter two are NaN where the value
+            is invalid or no wall is stable.
+        """
         rows = []
         for value in np.geomspace(low, high, self.num).tolist():
             wall = (math.nan, math.nan)
@@ -316,7 +327,7 @@ class FiltersStudy(ComputedStudy):
 
     @property
     def dampings(self) -> np.ndarray:
-        """Values of the physical damping."""
+        """Values of the physical damping, in N s/m; that of the device if the field ``damping`` is absent."""
         return np.array([self.device.damping]) if self.damping is None else self.damping.values()
 
     @property
@@ -325,7 +336,10 @@ class FiltersStudy(ComputedStudy):
         return {"damping": self.dampings.size, "filters": filters}
 
     def estimates(self) -> Iterator[tuple[dict[str, Any], Velocity]]:
-        """Yield each velocity estimate with the columns that identify it; the backward difference is the first."""
+        """Yield a pair for each velocity estimate: the columns that identify it, and the estimate.
+
+        The backward difference is the first estimate, for comparison.
+        """
         absent = {"cutoff_Hz": np.nan, "samples": np.nan}
         yield {"estimate": "backward_difference", **absent, "samples": 1.0}, BackwardDifference()
         for cutoff in () if self.cutoff is None else self.cutoff.values().tolist():
@@ -348,7 +362,8 @@ class FiltersStudy(ComputedStudy):
         if self.resolution is not None:
             limit = np.nan if self.noise_limit is None else self.noise_limit
             quiet = [row for row in rows if row["velocity_noise_m_per_s"] <= limit and np.isfinite(row[SI_COLUMNS[0]])]
-            # Mark the row with the largest K_max per damping; rows of equal damping are adjacent for groupby.
+            # Mark the row with the largest K_max for each damping. `groupby` needs no sorting before, because rows of
+            # equal damping are adjacent.
             groups = groupby(quiet, itemgetter("damping_N_s_per_m"))
             best = {id(max(group, key=itemgetter(SI_COLUMNS[0]))) for _, group in groups}
             rows = [{**row, "best": id(row) in best} for row in rows]
@@ -358,7 +373,7 @@ class FiltersStudy(ComputedStudy):
 
 
 def _spell_best(row: dict[str, Any], system: UnitSystem) -> str:
-    """Return the best filter for a damping in one line."""
+    """Return a line of text with the damping, the filter and the stiffest wall of a row of the table."""
     size = f"{row['samples']:g} samples"
     size = size if row["samples"] == row["samples"] else with_unit(row["cutoff_Hz"], "Hz")
     damping, estimate = with_unit(row["damping_N_s_per_m"], system["N s/m"]), row["estimate"].replace("_", " ")

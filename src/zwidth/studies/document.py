@@ -53,7 +53,10 @@ for _module in iter_modules([str(Path(__file__).parent)], "zwidth.studies."):
 
 
 def _find_model(kind: Any) -> type[Study] | None:
-    """Return the model of a kind, or None; unknown kinds are searched in the entry points ``zwidth.studies``."""
+    """Return the model of a kind of study, or None if no such kind exists.
+
+    A kind that is not registered yet is loaded from the entry points ``zwidth.studies`` of other packages.
+    """
     if isinstance(kind, str) and kind not in KINDS:
         for entry_point in entry_points(group="zwidth.studies", name=kind):
             register(entry_point.load())
@@ -61,7 +64,7 @@ def _find_model(kind: Any) -> type[Study] | None:
 
 
 def _read_study(raw: Any) -> Any:
-    """Return the model of a study, selected by its key ``kind``; raise the value if it is already a problem."""
+    """Validate a study with the model of its kind, and return it; raise ``raw`` if it is a problem of `_fill_study`."""
     if isinstance(raw, Study):
         return raw
     if isinstance(raw, PydanticCustomError):
@@ -73,7 +76,10 @@ def _read_study(raw: Any) -> Any:
 
 
 class _OfAnyKind:
-    """Annotation for the schema of a study of any kind; the kinds are read late, to include those of other packages."""
+    """Annotation that creates the JSON Schema of a study of any kind.
+
+    It reads the registered kinds only when the schema is created, to include the kinds of other packages.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -85,7 +91,7 @@ _AnyStudy = Annotated[SerializeAsAny[Study], PlainValidator(_read_study), _OfAny
 
 
 def _check_version(value: Any) -> int:
-    """Return the version of the format; raise a problem if this release cannot read it."""
+    """Return the version of the configuration format unchanged; raise a problem if this release cannot read it."""
     if value == FORMAT_VERSION and isinstance(value, int) and not isinstance(value, bool):
         return value
     remedy = f"write 'version: {FORMAT_VERSION}'"
@@ -118,12 +124,12 @@ class FigureLook(Strict, noun="the look of figures"):
 
     @property
     def formats(self) -> tuple[str, ...]:
-        """Extensions of the files."""
+        """Formats in which each figure is saved, as extensions of the file names."""
         return ("png", "svg") if self.format is None else (self.format,)
 
     @property
     def size(self) -> tuple[float, None] | None:
-        """Width in inches, and None because the height follows; None for the usual size."""
+        """Width in inches, and None for a height that follows from the width; None for the usual size of figures."""
         return None if self.width is None else (self.width / 0.0254, None)
 
 
@@ -166,7 +172,7 @@ class Config(Strict, noun="a configuration"):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Return the mapping with absent keys of the studies supplied by the scene."""
+        """Return the mapping of the file, in which the scene supplies the absent keys of the studies."""
         studies = raw.get("studies")
         if "scene" not in raw or not isinstance(studies, list | tuple):
             return raw
@@ -185,7 +191,7 @@ class Config(Strict, noun="a configuration"):
 
 
 def _read_scene_or_substitute(raw: Any) -> AnyScene:
-    """Return the scene of the file; a valid substitute if it has faults.
+    """Return the scene of the file, or a valid substitute if the scene has faults.
 
     Without a substitute, the faults of the scene would cause further faults in every study.
     """
@@ -198,9 +204,10 @@ def _read_scene_or_substitute(raw: Any) -> AnyScene:
 
 
 def _fill_study(study: Any, scene: AnyScene) -> Any:
-    """Return the mapping of a study with absent keys supplied by the scene; other values unchanged.
+    """Return the mapping of a study, in which the scene supplies the absent keys.
 
-    If the study does not accept the scene, return the problem, which `_read_study` raises.
+    A study of unknown kind is returned unchanged. If the kind does not accept the scene, the problem is returned in
+    place of the study, and `_read_study` raises it.
     """
     model = _find_model(study.get("kind")) if isinstance(study, dict) else None
     if model is None:
@@ -209,7 +216,8 @@ def _fill_study(study: Any, scene: AnyScene) -> Any:
         model.check_estimate(study, scene)
         model.check_parts(study, scene)
     except PydanticCustomError as error:
-        # Return the problem instead of raising it, because only `_read_study` is called with the path of the study.
+        # Return the problem instead of raising it, because pydantic adds the path of the study only to errors that
+        # `_read_study` raises.
         return error
     return model.fill(study, scene)
 
@@ -226,10 +234,10 @@ def config_json_schema() -> dict[str, Any]:
 
 
 def _simplify_schema(schema: Any, shared: dict[str, Any]) -> Any:
-    """Return a schema without null types, and with shared parts replaced by references.
+    """Return a JSON Schema without null types, and with references in place of shared subschemas.
 
-    Null means "not given" in the models and is never written in a file. Parts marked by `share_schema` are moved to
-    the dict ``shared``.
+    Null types are removed because a file never contains null: in the models, None represents an absent key. The
+    subschemas that `share_schema` marked are moved to the dict ``shared``.
     """
     if isinstance(schema, list):
         return [_simplify_schema(item, shared) for item in schema if item != {"type": "null"}]
@@ -242,7 +250,7 @@ def _simplify_schema(schema: Any, shared: dict[str, Any]) -> Any:
         name = kept.pop("shared")
         return {"$ref": f"#/$defs/{name}"} if shared.setdefault(name, kept) == kept else kept
     for key in ("allOf", "anyOf"):
-        # Replace a choice with only one alternative by this alternative.
+        # Replace a list of one alternative by this alternative, which remains after the removal of null types.
         if len(kept.get(key, ())) == 1:
             return {**kept.pop(key)[0], **kept}
     return kept

@@ -2,7 +2,8 @@
 ("buzz"), or from both.
 
 Fits to logs and to walls are computed separately (`zwidth.fitting`); if both are given, a chi-squared test compares
-their parameters. The study writes tables with the fitted parameters and the evidence, and a scene file for each fit.
+their parameters. The study writes a table of the fitted parameters, tables that show the quality of the fits (such as
+residuals and stability boundaries), and a scene file for each fit.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from zwidth.words.status import Status
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
 _CHI_SQUARED_95 = 7.815  # 95 % quantile of chi-squared with three degrees of freedom
-_NORMAL_95 = 1.96  # half-width of the 95 % interval of a normal distribution, in standard deviations
+_NORMAL_95 = 1.96  # standard deviations; half-width of the 95 % interval of a normal distribution
 
 
 def _read_resolution(raw: Any) -> Any:
@@ -70,14 +71,14 @@ class LogSection(Strict, noun="a log"):
         return "a log is a CSV file", "add 'csv: log.csv'"
 
     def read(self, period: float | None) -> LoggedMotion:
-        """Return the logged motion; ``period`` replaces the times of the log."""
+        """Read the file and return the logged motion; ``period`` in s, if given, replaces the times of the log."""
         columns = {name: getattr(self, name) for name in ("time", "position", "force")}
         options = {"resolution": self.resolution, "motor_constant": self.motor_constant}
         return read_log(find_file(self.csv), columns, period=period, **options)
 
 
 def _read_logs(raw: Any, handler: Any) -> Any:
-    """Return one log or a list of logs as a tuple of models."""
+    """Validate the key ``log``, one log or a list of logs, and return a tuple of `LogSection`."""
     if isinstance(raw, str):
         raise problem(f"got {describe(raw)}", "a log is a CSV file and its columns", "write {csv: NAME.csv}")
     if isinstance(raw, dict):
@@ -86,7 +87,7 @@ def _read_logs(raw: Any, handler: Any) -> Any:
 
 
 class _OneOrSeveral:
-    """Annotation for the schema of a list that may be written as one entry without a list."""
+    """Annotation that adds the form of a single entry to the JSON Schema of a list."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -107,7 +108,7 @@ class BuzzSection(Strict, noun="a wall at the onset of instability"):
 
 
 class _Fitted(NamedTuple):
-    """One of the fits of a study."""
+    """Fit of a study to its logs or to its walls, with a name and the source of the data."""
 
     name: str  # "log" or "buzz", part of file names
     source: str  # description of the data
@@ -122,7 +123,7 @@ class FitStudy(ComputedStudy):
     method = "Least squares with exact derivatives; the band of the boundary by 200 devices drawn from the covariance."
     from_scene = ()
     remedy_if_too_large = "shorten the logs"
-    point_bytes = 48  # time, force, position, model, residual and number of the log
+    point_bytes = 48  # bytes of time, force, position, model, residual and number of the log
 
     kind: Literal["fit"]
 
@@ -170,11 +171,11 @@ class FitStudy(ComputedStudy):
             try:
                 motions.append(section.read(self.period if section.time is None else None))
             except InputError as error:
-                # Escape characters that are not printable, which file names and headers may contain.
+                # Escape unprintable characters, because the message may contain a file name or header with line breaks.
                 text = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in str(error))
                 path, message = parse_input_error(InputError(text))
                 is_key = len(path) == 1 and path[0] in LogSection.model_fields
-                # Omit the index for one log, because a single log is written without a list.
+                # Omit the index from the path if there is one log, because it may be written without a list.
                 place = ("log", *((k,) if len(self.log or ()) > 1 else ()))
                 yield (*place, *(path if is_key else ("csv",))), (message if is_key else parse_message(text))
         self._motions = tuple(motions)
@@ -206,7 +207,7 @@ class FitStudy(ComputedStudy):
 
     @property
     def unit_system(self) -> UnitSystem:
-        """Unit system of linear devices, because column names already have the units of the fitted device."""
+        """Unit system of linear devices, because the columns already have the units of the device."""
         return LINEAR
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
@@ -236,7 +237,7 @@ class FitStudy(ComputedStudy):
         )
 
     def _fit(self) -> list[_Fitted]:
-        """Return the fit to the logs and the fit to the walls, if their data are given."""
+        """Fit the device to the logs and, separately, to the walls, if they are given; return all fits."""
         velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.instance, []
         period = self.period
         if self.log:
@@ -252,7 +253,7 @@ class FitStudy(ComputedStudy):
 
 
 def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
-    """Return a row of the table: each parameter with its standard error and 95 % interval."""
+    """Return a row of the table: each parameter of a fit with its standard error and 95 % confidence interval."""
     row: dict[str, Any] = {"fitted_to": source, "status": Status(fit.status).name}
     errors = fit.errors | {"stiffness_max": fit.stiffness_error}
     log_parameters = [name for name in ("friction", "offset") if name in errors]
@@ -264,15 +265,15 @@ def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
 
 
 def _compare(one: DeviceFit, other: DeviceFit) -> str:
-    """Return a line with the result of a chi-squared test of the difference between two fits of one device.
+    """Test if two fits of one device agree, by a chi-squared test, and return a line of text with the result.
 
-    The statistic is the squared difference of mass, damping and delay in units of its covariance, the sum of both
-    covariances.
+    The statistic is e' C^-1 e, with the difference e of mass, damping and delay between the fits, and the sum C of
+    their covariances.
     """
     values = [np.array([fit.mass, fit.damping, fit.delay]) for fit in (one, other)]
     difference = values[0] - values[1]
     covariance = sum((fit.reach / _NORMAL_95) ** 2 * fit.covariance[:3, :3] for fit in (one, other))
-    # Add a lower bound to the variances, because they are 0 for data without noise.
+    # Add a small value to the variances, because they are 0 for data without noise, and the matrix would be singular.
     floor = (1e-9 * np.maximum(np.abs(values[0]), np.abs(values[1]))) ** 2 + 1e-300
     statistic = float(difference @ np.linalg.solve(covariance + np.diag(floor), difference))
     verdict = "log and buzzing walls agree" if statistic <= _CHI_SQUARED_95 else "log and buzzing walls do NOT agree"

@@ -35,14 +35,14 @@ from zwidth.words.status import Status
 
 _COLUMNS = {parameter.name: column for column, parameter in AXES.items()}
 _OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
-_MAX_CURVES = 6  # values of a list that are drawn as curves; a longer list is drawn as a plane
-# Default of the largest amplitude that counts as a limit cycle: key False for linear devices (in m), True for rotary
-# devices (in rad).
+_MAX_CURVES = 6  # largest number of values of a list that are drawn as curves; a longer list is drawn as a plane
+# Default of the largest amplitude that counts as a limit cycle: in m for linear devices (key False), in rad for rotary
+# devices (key True).
 WIDEST = {False: 1e-3, True: math.radians(20.0)}
-WIDEST_STEPS = 10.0  # lower bound of that default, in encoder steps
+WIDEST_STEPS = 10.0  # encoder steps; lower bound of the default amplitude above
 
 
-# A condition may override every parameter of the study; None means not overridden.
+# Make every field of `SimulationConditions` optional, because a condition contains only the values that it overrides.
 _OVERRIDES: Any = {
     name: (hint | None, None)
     for name, hint in get_type_hints(SimulationConditions, include_extras=True).items()
@@ -76,7 +76,7 @@ class CycleAxes(Strict, noun="the axes of a limit_cycle study"):
 
     @property
     def given(self) -> dict[str, Axis]:
-        """Axes by the name of the parameter."""
+        """Given axes, with one or several values, by the name of the parameter."""
         return {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
 
     @property
@@ -85,7 +85,7 @@ class CycleAxes(Strict, noun="the axes of a limit_cycle study"):
         return {name: axis for name, axis in self.given.items() if axis.size > 1}
 
     def broadcast(self) -> dict[str, np.ndarray]:
-        """Return the values of every axis, shaped to broadcast to the grid."""
+        """Return the values of each axis by its name: a number, or an array that broadcasts to the grid."""
         grid = np.meshgrid(*(axis.values() for axis in self.varied.values()), indexing="ij", sparse=True)
         return {name: axis.values()[0] for name, axis in self.given.items()} | dict(zip(self.varied, grid, strict=True))
 
@@ -136,12 +136,12 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
         for index, (condition, faults) in enumerate(zip(self.conditions, problems, strict=True)):
             for path, message in faults:
                 is_overridden = getattr(condition, str(path[0])) is not None
-                # Report a fault of the whole study only once.
+                # Report a fault of a value of the study itself only once, because it is the same in every condition.
                 if is_overridden or index == 0:
                     yield (("conditions", index, *path) if is_overridden else path), message
 
     def list_conditions(self) -> list[SimulationConditions]:
-        """Return the complete conditions of each panel, with absent parameters from the study."""
+        """Return the complete conditions of each panel; the study supplies the parameters that are not overridden."""
         common = {name: getattr(self, name) for name in SimulationConditions.model_fields}
         overrides = [{name: getattr(each, name) for name in common} for each in self.conditions]
         return [
@@ -152,7 +152,7 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
         ]
 
     def bound_amplitudes(self, scene: Scene) -> tuple[float, float]:
-        """Return the smallest and the largest amplitude counted as a limit cycle, in SI units."""
+        """Return the smallest and the largest amplitude that count as a limit cycle, in m or rad."""
         if self.widest is not None:
             return self.silence, self.widest
         steps = [self.resolution, *(each.resolution or 0.0 for each in self.conditions)]
@@ -185,7 +185,8 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
         arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
         arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in results.items()}
         table = stack(edges)
-        # Draw a curve per value of a short list, or one curve for one varied parameter; otherwise draw a plane.
+        # Draw curves if only one parameter varies or if one has a short list of values, because a plane needs two
+        # parameters with many values.
         short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MAX_CURVES]
         draw = partial(figures.draw_limit_cycles, arrays, table, bounds)
         if short or len(varied) == 1:
@@ -203,7 +204,20 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
 
 
 def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Return the linear boundary in the plane of two axes, as columns: outlines, or lines if K or B is fixed."""
+    """Compute the linear stability boundary of one panel in the plane of its varied parameters.
+
+    If K and B vary, the curves are the outlines of the stable set. If only one of them varies, they are straight lines
+    at the limits of its stable intervals. If neither varies, there are no curves.
+
+    Args:
+        scene: device with the velocity estimate of the panel.
+        label: name of the condition.
+        varied: axes with several values, by the name of the parameter.
+        axes: values of all axes, by the name of the parameter.
+
+    Returns:
+        One dict of columns per curve.
+    """
     walls = [name for name in ("stiffness", "virtual_damping") if name in varied]
     if not walls:
         return []
@@ -223,7 +237,13 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
 
 
 def describe_outcomes(motion: Any, stable: np.ndarray, bounds: tuple[float, float]) -> str:
-    """Return the numbers of linearly stable and unstable walls at rest, in a limit cycle or at a larger amplitude."""
+    """Return a text with the number of walls at rest, in a limit cycle and at a larger amplitude.
+
+    Args:
+        motion: motions of all walls.
+        stable: 1 for linearly stable walls, 0 for unstable ones, -1 if the velocity estimate has no linear form.
+        bounds: smallest and largest amplitude that count as a limit cycle, in m or rad.
+    """
     wide = (motion.outcome == MotionKind.DIVERGED) | (motion.amplitude > bounds[1])
     rest = ~wide & (motion.amplitude < bounds[0])
     complete = motion.status == Status.OK

@@ -1,8 +1,11 @@
-"""Base classes of studies that are computed at once (all kinds but sweeps), and their results.
+"""Base classes of studies that one call computes completely (all kinds but sweeps), and their results.
 
 `ComputedStudy.compute` returns an `Outcome`: a table, arrays, figures, documents and lines for the terminal. Sweeps
 are computed in chunks by `zwidth.sweep` instead. Tables have column names with linear units, such as
-``stiffness_N_per_m``; they are converted to rotary units when they are written.
+``stiffness_N_per_m``; they are converted to rotary units when the tables are written.
+
+Symbols: alpha, beta, delta and d are normalized stiffness, virtual damping, physical damping and delay. K and B are
+stiffness and virtual damping in SI units.
 """
 
 from __future__ import annotations
@@ -32,12 +35,12 @@ from zwidth.words.unit_system import LINEAR, UnitSystem
 
 Item = TypeVar("Item")
 
-# Progress callback for long studies; its arguments are the number of finished parts and of all parts.
+# Callback that reports the progress of long studies; its arguments are the numbers of finished parts and of all parts.
 LISTENER: ContextVar[Callable[[int, int], None]] = ContextVar("LISTENER", default=lambda done, total: None)
 
 
 def track_progress(parts: Sequence[Item]) -> Iterator[Item]:
-    """Yield the parts of a study, and report the number of finished ones to ``LISTENER``."""
+    """Yield the parts of a study one by one, and report the number of finished parts to the callback ``LISTENER``."""
     for done, part in enumerate(parts):
         LISTENER.get()(done, len(parts))
         yield part
@@ -45,20 +48,27 @@ def track_progress(parts: Sequence[Item]) -> Iterator[Item]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of one study."""
+    """Results of one study: data, functions that draw figures, and lines for the terminal."""
 
     table: dict[str, np.ndarray] = field(default_factory=dict)  # columns of the study's CSV file, all of one length
     arrays: dict[str, np.ndarray] = field(default_factory=dict)  # arrays of the study's npz file
     # Functions that draw a figure and return its Axes, by the suffix of the file name after the name of the study.
     figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
-    documents: dict[str, str] = field(default_factory=dict)  # texts by file name
+    documents: dict[str, str] = field(default_factory=dict)  # contents of text files, by the name of the file
     answer: tuple[str, ...] = ()  # main results, in one or two lines for a terminal
     notes: tuple[str, ...] = ()  # restrictions of the results, such as points without a result
 
     def write(
         self, folder: Path, name: str, system: UnitSystem = LINEAR, formats: Sequence[str] = ("png", "svg")
     ) -> None:
-        """Write all files, data before figures, and convert column names from linear units to those of ``system``."""
+        """Write all files of the study, data before figures.
+
+        Args:
+            folder: existing folder for the files.
+            name: name of the study, with which the names of the files begin.
+            system: unit system of the columns; linear units in their names are converted to it.
+            formats: file formats of the figures.
+        """
         for file, text in self.documents.items():
             (folder / file).write_text(text, encoding="utf-8")
         if self.table:
@@ -71,7 +81,7 @@ class Outcome:
 
 
 class ComputedStudy(Study):
-    """Base of the kinds of studies that are computed at once.
+    """Base of the kinds of studies that one call of `compute` computes completely.
 
     A subclass is the model of the study and computes its results. It defines a field ``kind`` with one literal, the
     fields of its configuration, `sizes` (unless those of its axes are sufficient) and `compute`, and is registered
@@ -82,7 +92,7 @@ class ComputedStudy(Study):
     reads_scene: ClassVar[bool] = False
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """Compute all results; figures are drawn later by the functions in the outcome.
+        """Compute all results; figures are drawn later, by calls of the functions in `Outcome.figures`.
 
         Args:
             scene: scene of the file; None if the file has none.
@@ -92,9 +102,9 @@ class ComputedStudy(Study):
 
 
 class CurvesStudy(ComputedStudy):
-    """Base of the studies over delta and d."""
+    """Base of the studies whose results are curves for each delta and d."""
 
-    point_bytes = 32  # alpha, beta, frequency and two codes
+    point_bytes = 32  # bytes of alpha, beta, frequency and two codes
 
     delta: DeltaAxis
     d: DelayAxis
@@ -135,9 +145,9 @@ def add_si_columns(
     """Return a table of walls with columns in SI units added, if delta and d are those of a rigid device.
 
     Args:
-        table: columns with alpha and beta.
-        delta: axis of the study.
-        d: axis of the study.
+        table: columns, with alpha and beta of the walls among them.
+        delta: values of delta of the study.
+        d: values of d of the study.
         owner: scene or device. If it is normalized, has parts, or has another delta or d than the axes, or the axes
             have several values, the table is returned unchanged.
     """
@@ -159,7 +169,7 @@ def find_device_share(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) 
 
 
 def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Scene | None:
-    """Return the scene of a rigid device in SI units if both axes have only its values of delta and d, else None."""
+    """Return the scene of a rigid device in SI units if the axes contain only its delta and d, otherwise None."""
     if not isinstance(owner, PhysicalScene | PhysicalDevice) or owner.parts_beyond:
         return None
     alone = [axis.values().tolist() for axis in (delta, d)] == [[owner.delta], [owner.d]]
@@ -167,25 +177,25 @@ def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Sce
 
 
 def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
-    """Return K, B, frequency and kind of a stiffest wall, by column name."""
+    """Return K, B, frequency and kind of a stiffest wall as a dict by the names of the columns of a table."""
     columns = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
     return {**columns, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 
 
 def spell_stiffest(row: Mapping[str, Any], system: UnitSystem) -> str:
-    """Return K and B of a row of `summarize_stiffest` with units, K rounded down."""
+    """Return a text with K_max, rounded down, and its B, with units, from a row made by `summarize_stiffest`."""
     stiffness, damping = (row[name] for name in SI_COLUMNS)
     K, B = with_unit(round_conservatively(stiffness, "below"), system["N/m"]), with_unit(damping, system["N s/m"])
     return f"K_max = {K} at B = {B}"
 
 
 def _name_column(name: str, system: UnitSystem) -> str:
-    """Return the name of a column with the units of rotary devices if the system is rotary."""
+    """Convert the linear unit at the end of a column name to its rotary counterpart if the system is rotary."""
     return convert_header(name, system) if system.rotary else name
 
 
 def csv_text(table: dict[str, np.ndarray], system: UnitSystem = LINEAR) -> str:
-    """Return a table as CSV: numbers with all digits, and texts that spreadsheets do not evaluate as formulas."""
+    """Return a table as CSV text, with all digits; cells that spreadsheets would evaluate as formulas are escaped."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow([_name_column(name, system) for name in table])

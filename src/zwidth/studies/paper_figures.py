@@ -4,8 +4,9 @@ The models are the exact fractional delay ("held": the force changes within a pe
 d ("fractional_power"). For integer d both are equal. For other d, z^d has several branches, and poles are not defined.
 On the principal branch, the boundary is the closed form for integer delays, evaluated at real d.
 
-Symbols as in `loops.rigid.ridge_newton`: ``s = sin(omega/2)``, with the angular frequency omega in rad per sample;
-``lag`` is the delay d in sampling periods.
+Symbols: alpha, beta and delta are normalized stiffness, virtual damping and physical damping. As in
+`loops.rigid.ridge_newton`, ``s = sin(omega/2)``, with the angular frequency omega in rad per sample, and ``lag`` is the
+delay d in sampling periods.
 
 References:
     Hulin, Preusche, Hirzinger 2006, sections V and VII.
@@ -40,11 +41,17 @@ from zwidth.studies.outcome import CurvesStudy, Outcome
 from zwidth.studies.ridge import ridge_table
 from zwidth.words.quantities import WALL_RANGE
 
-_NEWTON_STEPS = 16  # sufficient for the shortest delays, whose maximum is close to omega = pi
+_NEWTON_STEPS = 16  # Newton iterations; sufficient for the shortest delays, whose maximum is close to omega = pi
 
 
 def _find_maximum(curve: Curve, lag: Any, start: Start) -> Any:
-    """Return s at the maximum of alpha along the boundary, for a fractional delay."""
+    """Compute s at the maximum of alpha along the boundary by Newton's method, for a fractional delay.
+
+    Args:
+        curve: coefficients of the boundary curve for each delta.
+        lag: delay d for each delta.
+        start: initial estimate of s, and its scale 1/(d + 1).
+    """
     # For short delays the maximum is close to omega = pi, where q = 1 - s^2 solves A + B q = C d q^(-3/2) with
     # coefficients A, B, C that depend on delta. Therefore q is of the order of d^(2/3), and s is bounded away from 1.
     rest = 0.3 * np.minimum(lag, 0.05) ** (2.0 / 3.0)
@@ -58,7 +65,7 @@ def _find_maximum(curve: Curve, lag: Any, start: Start) -> Any:
 
 
 def maximize_alpha(delta: np.ndarray, d: float) -> tuple[Any, Any, Any]:
-    """Return the maximum of alpha with the paper's z^(1+d), and beta and omega there."""
+    """Return alpha, beta and omega at the maximum of alpha for each delta, with the paper's z^(1+d)."""
     if d.is_integer():
         return alpha_max(delta, d)[:3]
     curve, lag = expand_curve(discretize_mass(delta)), np.full_like(delta, d)
@@ -67,7 +74,7 @@ def maximize_alpha(delta: np.ndarray, d: float) -> tuple[Any, Any, Any]:
 
 
 def limit_slope(d: float) -> float:
-    """Return the limit of alpha_max/delta for strong damping with the paper's z^(1+d)."""
+    """Return the limit of alpha_max/delta for delta -> infinity, with the paper's z^(1+d)."""
     if d.is_integer():
         return float(stiffness_slope(d))
     zero, lag = np.zeros(1), np.full(1, d)
@@ -79,7 +86,7 @@ def limit_slope(d: float) -> float:
 
 
 def find_upper_damping(delta: np.ndarray, d: float) -> np.ndarray:
-    """Return the largest stable beta for alpha -> 0 with the paper's z^(1+d), for a fractional d."""
+    """Return the largest stable beta for alpha -> 0 and each delta, with the paper's z^(1+d) at a non-integer d."""
     curve, lag = expand_curve(discretize_mass(delta)), np.full_like(delta, d)
     top = _find_maximum(curve, lag, guess_start(delta, lag, 0.0 * delta))
     limit = np.full_like(delta, np.sin(0.5 * np.pi / max(1.0, d + 0.5)))  # upper bound of s on the stability lobe
@@ -88,18 +95,24 @@ def find_upper_damping(delta: np.ndarray, d: float) -> np.ndarray:
 
 
 class _PaperStudy(CurvesStudy):
-    """Base of the studies that draw the exact delay and the paper's z^(1+d)."""
+    """Base of the studies that compare the exact delay with the paper's z^(1+d)."""
 
     method = "Closed forms of the exact delay, and of integer delays evaluated at real d, to a few rounding errors."
 
     @property
     def fractional(self) -> list[float]:
-        """The delays for which the paper's z^(1+d) is not exact."""
+        """Non-integer values of d in the study, for which the paper's z^(1+d) is not the exact delay."""
         return [d for d in self.d.values().tolist() if not d.is_integer()]
 
 
 def _tabulate(columns: Iterable[str], exact: Iterable[Mapping[str, Any]], power: Iterable[Mapping[str, Any]]) -> Any:
-    """Return a table of both delay models with columns in the given order."""
+    """Return one table with the rows of both delay models.
+
+    Args:
+        columns: names of the columns in their order.
+        exact: parts of the table for the exact delay, each a mapping of columns.
+        power: parts for the paper's z^(1+d).
+    """
     models = {"held": exact, "fractional_power": power}
     table = stack({"delay_model": model, **part} for model, parts in models.items() for part in parts)
     return {name: table[name] for name in columns}

@@ -4,6 +4,7 @@ A printed number agrees if the computed one is within half a unit of its last di
 more precise values of numbers that the paper gives roughly or not at all ("sharpened"). Symbols of the paper: alpha,
 beta, delta and d are normalized stiffness, virtual damping, physical damping and delay; g is the limit of
 alpha_max/delta for strong damping; phi1, phi2, psi and c are the coefficients of the sampled mass (docs/theory/model).
+P(z) is the characteristic polynomial. The corner at z = -1 is the end of the boundary curve, at omega = pi.
 
 References:
     Hulin, Preusche, Hirzinger 2006, Stability Boundary for Haptic Rendering: Influence of Physical Damping.
@@ -34,15 +35,15 @@ from zwidth.words.formatting import with_unit
 
 SOURCE = "Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006"
 
-# Parameters of the example in section VIII
-MASS = 0.1  # kg
-PERIOD = 1e-3  # s
-DELAY_FACTOR = 1  # d, in sampling periods
-DAMPINGS = (0.0, 10.0, 100.0)  # N s/m
-STIFFNESS_FRACTION = 0.75  # fraction of alpha_max
+# Parameters of the example in section VIII of the paper
+MASS = 0.1  # kg; mass of the device
+PERIOD = 1e-3  # s; sampling period
+DELAY_FACTOR = 1  # sampling periods; delay d
+DAMPINGS = (0.0, 10.0, 100.0)  # N s/m; physical dampings of the three devices
+STIFFNESS_FRACTION = 0.75  # stiffness of the walls as a fraction of alpha_max
 MASSIE_SALISBURY = 3.5e3  # N/m; maximum stiffness of the PHANToM, which section VIII cites from Massie and Salisbury
-SLOPE_DELAYS = (0.0, 1.0, 2.0, 4.0)  # d of Fig. 5, and the integer d of Fig. 10
-FIG10_DELAYS = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # d of Fig. 10
+SLOPE_DELAYS = (0.0, 1.0, 2.0, 4.0)  # sampling periods; delays d of Fig. 5, and the integer ones of Fig. 10
+FIG10_DELAYS = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # sampling periods; delays d of Fig. 10
 LINEAR_WITHIN = 0.1  # largest relative difference between d alpha_max/d delta and its limit g that counts as linear
 FILTER_LAG = 0.05  # s; lag of the velocity filter, cited in section VIII
 _LINE_APPEARS = "delta above which the line appears for d = 0"
@@ -55,15 +56,15 @@ _LINEAR_FROM = (
 class Comparison:
     """A number printed in the paper, and its computed value; None if the paper cites the number from another paper."""
 
-    quantity: str
-    where: str
-    printed: str
+    quantity: str  # description of the number
+    where: str  # equation or section of the paper
+    printed: str  # number with the digits that the paper prints
     computed: float | None
-    note: str = ""
+    note: str = ""  # note on a cited number
 
     @property
     def agrees(self) -> bool | None:
-        """True if both agree within half a unit of the last printed digit; None for a cited number."""
+        """True if both numbers agree within half a unit of the last printed digit; None for a cited number."""
         if self.computed is None:
             return None
         if not np.isfinite(self.computed):
@@ -76,14 +77,17 @@ class Comparison:
 class Sharpened:
     """A computed value of a number that the paper gives roughly or not at all, and the method of its computation."""
 
-    quantity: str
-    where: str
+    quantity: str  # description of the number
+    where: str  # equation or remark of the paper, with its rough value
     computed: float
-    how: str
+    how: str  # method of the computation
 
 
 def published_numbers() -> list[Comparison]:
-    """Compare all numbers printed in the paper except its inputs (parameters of section VIII and of the figures)."""
+    """Return a comparison for each number printed in the paper, except for its inputs.
+
+    Inputs are the parameters of the example in section VIII and those of the figures.
+    """
     deltas = [float(normalize(mass=MASS, damping=damping, period=PERIOD).delta) for damping in DAMPINGS]
     ridge = [_maximize_alpha(delta, DELAY_FACTOR) for delta in deltas]
     columns = (
@@ -94,7 +98,7 @@ def published_numbers() -> list[Comparison]:
     undamped, damped = (STIFFNESS_FRACTION * _maximize_alpha(delta, DELAY_FACTOR)[0] for delta in (0.0, 1.0))
     over_practice = undamped * MASS / PERIOD**2 / MASSIE_SALISBURY
     return [
-        # Remark 4 of the paper prints these two values of K_max T^2/m without physical damping.
+        # The next two numbers are K_max T^2/m without physical damping, which remark 4 of the paper prints.
         Comparison("alpha_max(delta = 0, d = 0)", "eq. (24)", "0.6863", _maximize_alpha(0.0, 0)[0]),
         Comparison("alpha_max(delta = 0, d = 1)", "eq. (25)", "0.1445", _maximize_alpha(0.0, 1)[0]),
         *(
@@ -112,7 +116,7 @@ def published_numbers() -> list[Comparison]:
 
 
 def _with_lag() -> str:
-    """Describe how the filter lag that the paper quotes changes K_max of the undamped device of its section VIII."""
+    """Return a text with K_max and its B without and with `FILTER_LAG`, for the undamped device of section VIII."""
     scene = Scene(Device(MASS), Timing(period=PERIOD, delay=DELAY_FACTOR * PERIOD))
     # Use a window of 2 lag/T differences, because the mean of n differences lags by n/2 periods.
     walls = [scene, scene.replace(velocity=WindowedDifference(round(2 * FILTER_LAG / PERIOD)))]
@@ -125,33 +129,33 @@ def _with_lag() -> str:
 
 
 def _maximize_alpha(delta: float, d: float) -> tuple[float, float]:
-    """Return alpha_max and its beta."""
+    """Return the maximum stable alpha of a rigid device, and the beta of this wall."""
     point = alpha_max(delta, d)
     return float(point.alpha), float(point.beta)
 
 
 def line_appears() -> float:
-    """Return the delta above which, for d = 0, the line of a real pole at z = -1 bounds the stable set."""
+    """Compute the delta above which, for d = 0, the line of walls with a real pole at z = -1 bounds the stable set."""
     # The boundary curve ends at omega = pi, in the corner where two poles are at z = -1. The line starts at this
     # corner, so it bounds the stable set (alpha > 0) above the delta at which the corner crosses alpha = 0.
     # Import scipy.optimize here, because it loads slowly and no other study needs it.
     from scipy.optimize import root_scalar
 
-    # Use tolerances of a few rounding errors.
+    # Set the tolerances to a few rounding errors, because the page of results prints 15 digits.
     exact: dict[str, Any] = {"bracket": (1.0, 6.0), "method": "brentq", "xtol": 1e-15, "rtol": 1e-15}
     return float(root_scalar(lambda delta: float(boundary(np.pi, delta, 0).alpha), **exact).root)
 
 
 def linear_from() -> float:
-    """Return the delta above which d alpha_max/d delta is within 10 % of its limit g for every curve of Fig. 10.
+    """Compute the delta above which d alpha_max/d delta is within 10 % of its limit g for every curve of Fig. 10.
 
     Fractional delays are modeled as fractional powers of z, as in the paper.
     """
     limit = np.array([limit_slope(d) for d in FIG10_DELAYS])
 
     def excess(delta: np.ndarray) -> np.ndarray:
-        """Return the largest relative difference from g among the curves, minus the allowed difference."""
-        step = 0.008  # fourth-order central differences; their truncation and rounding errors move the root by 2e-10
+        """Return the largest relative difference of d alpha_max/d delta from g of all curves, minus `LINEAR_WITHIN`."""
+        step = 0.008  # step of delta in fourth-order central differences, whose errors move the root by 2e-10
         deltas = np.asarray(delta)[..., None] + step * np.array([-2.0, -1.0, 1.0, 2.0])
         values = np.array([maximize_alpha(deltas, d)[0] for d in FIG10_DELAYS])
         derivatives = values @ np.array([1.0, -8.0, 8.0, -1.0]) / (12.0 * step)
@@ -163,9 +167,10 @@ def linear_from() -> float:
 
 
 def corner_takes_over() -> float:
-    """Return the delta above which, for d = 0, the stiffest stable wall is in the corner at z = -1."""
-    # For d = 0 the curve is a graph over beta, ``alpha = (1 - c + beta (phi2 + c psi) - beta^2 psi phi1)/(psi (1 + phi2
-    # beta))``. Its maximum reaches the corner, where the curve ends, if ``d alpha/d beta = 0`` there.
+    """Compute the delta above which, for d = 0, the stiffest stable wall is in the corner at z = -1."""
+    # For d = 0 the boundary curve is a function of beta,
+    # ``alpha = (1 - c + beta (phi2 + c psi) - beta^2 psi phi1)/(psi (1 + phi2 beta))``. Its maximum reaches the
+    # corner, where the curve ends, at the delta for which ``d alpha/d beta = 0`` in the corner.
     # Use extended precision if the machine has it, because rounding errors of float64 affect the last two digits.
     return float(bisect(lambda delta: _slope_at_corner(delta) < 0, np.longdouble(2.5), np.longdouble(6.0)))
 
@@ -173,7 +178,7 @@ def corner_takes_over() -> float:
 def _slope_at_corner(delta: np.longdouble) -> np.longdouble:
     """Return the numerator of d alpha/d beta at the corner for d = 0, where P(-1) = P'(-1) = 0 determines beta."""
     c = np.exp(-delta)
-    # The quotients do not cancel, because delta is at least 2.5 here.
+    # Compute the quotients without series for small delta, because delta >= 2.5 and no digits cancel.
     p1 = -np.expm1(-delta) / delta
     p2 = (1 - p1) / delta
     psi = p1 - p2
@@ -185,7 +190,7 @@ def _slope_at_corner(delta: np.longdouble) -> np.longdouble:
 
 
 def sharpened_numbers() -> list[Sharpened]:
-    """Compute numbers that the paper gives roughly or not at all."""
+    """Return more precise values of numbers that the paper gives roughly or not at all, each with its method."""
     alpha, beta = _maximize_alpha(0.0, 0)
     slopes = np.asarray(stiffness_slope(np.array(SLOPE_DELAYS)))
     return [
@@ -211,7 +216,7 @@ def sharpened_numbers() -> list[Sharpened]:
 
 
 def as_json(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
-    """Return the comparison as JSON."""
+    """Return the printed and the sharpened numbers, and the inputs of the paper, as the text of a JSON file."""
     given = {"where": "section VIII", "mass_kg": MASS, "period_s": PERIOD, "d": DELAY_FACTOR}
     content = {
         "source": SOURCE,
@@ -227,12 +232,12 @@ _AGREEMENT = {True: "yes", False: "**NO**", None: "cited"}
 
 
 def _spell(row: Comparison) -> str:
-    """Return the computed number with ten digits, or the note on a cited number."""
+    """Return the computed number of a row as text with ten digits, or the note of a cited number."""
     return row.note if row.computed is None else f"{row.computed:{'#' if row.computed else ''}.10g}"
 
 
 def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
-    """Return the comparison as a page in Markdown."""
+    """Return a page in Markdown with a table of the printed numbers and a table of the sharpened ones."""
     computed = [row for row in printed if row.computed is not None]
     agreeing = sum(row.agrees is True for row in computed)
     cited = f" Cited from other papers: {len(printed) - len(computed)}." if len(computed) < len(printed) else ""

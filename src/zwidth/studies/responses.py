@@ -1,7 +1,9 @@
 """Studies of step responses: "step" for given walls, and "recommend" for the recommended wall of a device.
 
 The response of the position to a step of 1 N (or 1 N m) is computed with the wall acting on both sides of its surface.
-The recommended wall is the stiffest one that satisfies the required margins (`zwidth.scenes.recommendation`).
+The recommended wall is the stiffest one that satisfies the required margins (`zwidth.scenes.recommendation`). The
+symbols alpha, beta, delta and d are normalized stiffness, virtual damping, physical damping and delay; K_max is the
+maximum stable stiffness, and alpha_max its normalized value.
 """
 
 from __future__ import annotations
@@ -49,10 +51,10 @@ from zwidth.words.quantities import WALL_RANGE, Range
 
 
 class ResponseStudy(ComputedStudy):
-    """Base of the studies that compute responses."""
+    """Base of the studies that compute responses to a step of the external force."""
 
     remedy_if_too_large = "shorten the duration, or lower substeps"
-    point_bytes = 32  # time, position, velocity and force
+    point_bytes = 32  # bytes of time, position, velocity and force
 
     duration: Duration = Span(100.0, "periods")
     """Duration of the response, in s or in periods."""
@@ -67,12 +69,12 @@ class ResponseStudy(ComputedStudy):
     def respond(
         self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
     ) -> tuple[dict[str, Any], str]:
-        """Return the step response of a device with a wall as columns, and a note on settling or "".
+        """Compute the step response of a device with a wall; return its columns, and a note on settling (may be "").
 
         Args:
             device: device without parts.
             alpha: normalized stiffness of the wall.
-            beta: normalized damping of the wall.
+            beta: normalized virtual damping of the wall.
             label: name of the response.
             physical: True for a step of 1 N and columns in SI units, False for normalized columns.
         """
@@ -135,7 +137,7 @@ class StepStudy(WallsStudy, ResponseStudy):
         yield from self._wall_limits()
 
     def _wall_limits(self) -> Iterable[LocatedProblem]:
-        """Yield problems of walls that are not valid for their devices, once per wall."""
+        """Yield a problem for each wall that is out of range, or in SI units although its device is normalized."""
         least, most = WALL_RANGE
         faults: dict[int, PydanticCustomError] = {}
         for number, (device, wall) in enumerate(self.pairs()):
@@ -178,7 +180,7 @@ class StepStudy(WallsStudy, ResponseStudy):
         return Outcome(table=table, figures={"": partial(figures.draw_step, table)}, notes=tuple(notes))
 
 
-# Parameters of the device that the report does not list among its parts.
+# Parameters that the report does not list among the parts of the device.
 _DEVICE_NAMES = ("mass", "damping", "period", "delay", "delta", "d")
 
 
@@ -228,7 +230,8 @@ class RecommendStudy(ResponseStudy):
         summary, notes, response = recommendation.as_dict(), list(recommendation.notes), None
         lines = (*recommendation.lines(), *self._simulate(recommendation, scene))
         if not bare.parts_beyond and recommendation.verdict is not None:
-            # Use the normalized wall of the verdict, because conversion to SI units and back has rounding errors.
+            # Use the normalized wall of the verdict instead of the wall in SI units, because a conversion has rounding
+            # errors.
             wall = recommendation.verdict.alpha, recommendation.verdict.beta
             columns, note = self.respond(self.device, *wall, label=label, physical=True)
             summary["recommended"]["settling_time"] = to_json(float(columns["settling_time_s"]))
@@ -246,7 +249,12 @@ class RecommendStudy(ResponseStudy):
         )
 
     def _simulate(self, recommendation: Recommendation, scene: AnyScene | None) -> list[str]:
-        """Return a line with the diagnosis of the wall, with encoder, friction and motor of the scene of the file."""
+        """Simulate the recommended wall with the encoder, friction and motor of the file's scene.
+
+        Returns:
+            A line with the diagnosis of the simulated motion; an empty list if no wall is recommended, the scene has
+            none of these parameters, or the device is a measured response.
+        """
         hardware = {}
         if isinstance(scene, PhysicalScene) and self.device == scene.without_wall():
             hardware = scene.hardware
@@ -260,15 +268,25 @@ class RecommendStudy(ResponseStudy):
 
 @house_style()
 def draw(recommendation: Recommendation, response: Table | None = None) -> Any:
-    """Draw a recommendation into a figure that pyplot does not know, and return its Axes."""
-    # Omit the step response of a measured device (without a frequency in its verdict), which has no model to simulate.
+    """Draw a recommendation and, if given, its step response in a new figure, and return the Axes.
+
+    The figure is not registered with pyplot, so that the caller need not close it.
+    """
+    # Omit the panel of the step response for a measured device, whose verdict has no frequency, because there is no
+    # model to simulate.
     columns = 1 if recommendation.verdict is None or math.isnan(recommendation.verdict.frequency) else 2
     _, axes = new_figure(WIDTH if columns == 2 else 5.6, 3.5, 1, columns)
     return figures.plot.recommendation(recommendation, axes, response=response)
 
 
 def _describe(recommendation: Recommendation, summary: dict[str, Any], lines: Iterable[str]) -> str:
-    """Return a recommendation as Markdown: the device, the lines of the terminal, and changes for more stiffness."""
+    """Return a page in Markdown: the device, the results, and changes of the device that allow more stiffness.
+
+    Args:
+        recommendation: recommended wall of the device.
+        summary: content of the JSON file of the study.
+        lines: results, as printed in the terminal.
+    """
     scene, settled, results = recommendation.scene, summary["recommended"]["settling_time"], list(lines)
     times = (with_unit(time, "s") for time in (scene.timing.period, scene.timing.delay))
     parts = [f"{name} = {value}" for name, value in summary["device"].items() if name not in _DEVICE_NAMES]

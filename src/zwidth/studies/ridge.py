@@ -3,6 +3,9 @@
 The ridge is the path of the stiffest stable wall, alpha_max and its beta, over delta for a fixed delay d. Its limit
 alpha_max/delta for strong damping is g(d). Passive walls are those of Colgate's condition; for a fixed d, their set
 scales with delta, so it is computed once for delta = 1.
+
+Symbols: alpha, beta, delta and d are normalized stiffness, virtual damping, physical damping and delay; K_max is the
+maximum stable stiffness in SI units.
 """
 
 from __future__ import annotations
@@ -39,7 +42,7 @@ from zwidth.words.status import RidgeKind, Status
 from zwidth.words.tables import read_columns
 from zwidth.words.units import split_head
 
-_STRONG_DAMPING = 100.0  # delta at which alpha_max/delta is within some percent of its limit g(d)
+_STRONG_DAMPING = 100.0  # normalized damping delta above which alpha_max/delta is within some percent of g(d)
 _SLOPE_SAMPLES = 64  # samples of g(d) per unit of d; integer delays are included, because g has kinks there
 
 
@@ -63,7 +66,11 @@ class RidgeStudy(CurvesStudy):
 
 
 def ridge_table(delta: np.ndarray, d: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the stiffest stable walls over ``delta`` per delay, and notes about points without a result."""
+    """Compute the stiffest stable wall for each combination of delta and d.
+
+    Returns:
+        A table with one row per combination, ordered by d, and notes on the number of rows without a result.
+    """
     deltas, delays = np.tile(delta, d.size), np.repeat(d, delta.size)
     points = alpha_max(deltas, delays)
     columns = {"alpha_max": points.alpha, "beta": points.beta, "omega": points.omega}
@@ -77,7 +84,10 @@ def ridge_table(delta: np.ndarray, d: np.ndarray) -> tuple[dict[str, np.ndarray]
 
 
 def slope_table(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the limit g(d) of alpha_max/delta at the delays of a ridge table and at delays between them."""
+    """Return columns with d and the limit g(d) of alpha_max/delta.
+
+    The values of d are those of a ridge table, and equally spaced values from 0 to the longest delay of the table.
+    """
     longest = max(1, math.ceil(table["d"].max()))
     d = np.union1d(np.linspace(0.0, longest, longest * _SLOPE_SAMPLES + 1), table["d"])
     return {"d": d, "slope": np.asarray(stiffness_slope(d))}
@@ -103,12 +113,15 @@ class PassivityStudy(CurvesStudy):
 
 
 def trace_unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return alpha and beta on the boundary of the passive set for delta = 1, by increasing beta."""
+    """Return alpha and beta of points on the boundary of the passive set for delta = 1, ordered by increasing beta."""
     return trace_passivity_boundary(Scene(Device(1.0, 1.0), Timing(1.0, d)))
 
 
 def find_edges(scene: Scene) -> dict[str, Outlines]:
-    """Return the outlines of the stable set of a scene and, for a rigid device, of the passive set."""
+    """Return the outlines of the stable set of a scene and, for a damped rigid device, of the passive set.
+
+    The keys of the dict are "stable" and "passive".
+    """
     edges: dict[str, Outlines] = {"stable": [(np.stack(piece[:2], -1), piece.hole) for piece in scene.stable_region()]}
     if not scene.parts_beyond and scene.device.damping > 0:
         edges["passive"] = [(np.stack(trace_passivity_boundary(scene), -1), False)]
@@ -116,7 +129,7 @@ def find_edges(scene: Scene) -> dict[str, Outlines]:
 
 
 def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0) -> Iterator[dict[str, Any]]:
-    """Yield the boundary of the passive set of each device with damping, as columns.
+    """Yield alpha and beta on the boundary of the passive set as columns, for each d and each delta > 0.
 
     ``share`` is the proportion of the damping that belongs to the device and not to an operator.
     """
@@ -128,7 +141,7 @@ def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0)
 
 
 def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[str, Any]]:
-    """Yield the passive interval of the virtual damping for alpha -> 0 over delta, as columns."""
+    """Yield, for each d, columns with delta and both ends of the passive interval of beta for alpha -> 0."""
     for d in delays:
         _, beta = trace_unit_outline(float(d))
         yield {"curve": "passive", "d": d, "delta": deltas,
@@ -182,20 +195,20 @@ class Poses(Strict, noun="a table of poses"):
 
     @cached_property
     def table(self) -> DeviceTable:
-        """Mass and damping of all poses."""
+        """Table with the columns mass and damping in SI units, one row per pose."""
         return read_table({"csv": self.csv})
 
     def tabulate(self) -> dict[str, np.ndarray]:
-        """Return the coordinates as columns, ``across`` first."""
+        """Return the two coordinates of all poses as columns of a table, that of ``across`` first."""
         return {header(name, unit): np.array(values) for name, unit, values in self._coordinates}
 
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
-        """Name and unit of both coordinates."""
+        """Pairs of name and unit of the two coordinates, that of ``across`` first."""
         return tuple((name, unit) for name, unit, _ in self._coordinates)
 
     def spell(self, pose: int) -> str:
-        """Return the coordinates of a pose as text, by the index of its row."""
+        """Return the coordinates of the pose with the given index as text, such as "shoulder 30 deg, elbow 45 deg"."""
         return ", ".join(f"{name} {values[pose]:.4g} {unit}".rstrip() for name, unit, values in self._coordinates)
 
 

@@ -34,7 +34,7 @@ from zwidth.words.quantities import HARDWARE, NOT_NEGATIVE, POSITIVE, Range
 MAX_PERIODS = 1_000_000
 """Largest duration of a motion in sampling periods."""
 
-# Variables of the controller, which are constant between samples and have no values at substeps.
+# Variables of the controller, whose arrays have one value per sample instead of one per substep.
 _OF_SAMPLES = ("measured", "estimated_velocity", "command", "contact")
 
 
@@ -69,7 +69,7 @@ class SimulationConditions(Strict):
     """Seed of the random numbers, a whole number."""
 
     def find_inconsistencies(self, scene: Scene) -> Iterable[LocatedProblem]:
-        """Yield problems of values that are inconsistent with each other, the device or its sampling period."""
+        """Yield a problem for each value that is inconsistent with another value, the device or the sampling period."""
         period = scene.timing.period
         if self.static is not None and self.static < self.coulomb:
             message = f"got {self.static:g} N, below coulomb, {self.coulomb:g} N"
@@ -90,11 +90,11 @@ class SimulationConditions(Strict):
                 yield parse_input_error(error)
 
     def set_velocity(self, scene: Scene) -> Scene:
-        """Return the scene with the velocity estimate of these conditions."""
+        """Return the scene with the velocity estimate of these conditions, or unchanged if they have none."""
         return scene if self.velocity is None else scene.replace(velocity=self.velocity.instance)
 
     def list_options(self, period: float) -> dict[str, Any]:
-        """Return the conditions as keyword arguments of `Scene.simulate`, for a sampling period."""
+        """Return the conditions as keyword arguments of `Scene.simulate`; ``period`` is the sampling period in s."""
         names = [name for name in SimulationConditions.model_fields if name not in ("duration", "velocity", "jitter")]
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         periods = max(1, round(self.duration.periods(period)))
@@ -144,7 +144,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
         return {"motions": count, "periods": periods, "points a period": self.substeps}
 
     def list_walls(self, scene: Scene) -> list[tuple[str, float, float]]:
-        """Return label, stiffness and virtual damping of each wall, in SI units."""
+        """Return a tuple (label, stiffness, virtual damping) for each wall of the study, in SI units."""
         if self.stiffness_fraction is not None:
             top = scene.max_stiffness()
             stiffness, damping = float(top.stiffness), float(top.virtual_damping)
@@ -187,7 +187,10 @@ class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
 
 
 def tabulate_motion(motion: Motion, k: int, substeps: int) -> dict[str, np.ndarray]:
-    """Return the k-th motion over time as columns, with ``substeps`` points per period."""
+    """Return columns with the time and all recorded variables of the motion with index ``k``.
+
+    Variables with one value per sample are repeated ``substeps`` times, to the length of the other columns.
+    """
     assert motion.time is not None, "it is recorded"
     columns = {"time_s": motion.time if motion.time.ndim == 1 else motion.time[k]}
     for name, (_, unit) in OF_MOTION.items():
