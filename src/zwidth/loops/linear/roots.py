@@ -67,18 +67,19 @@ class LoopRoots:
         return bool(np.any((distances_inside(self.poles) < 0) & ~are_on_circle(self.poles)))
 
     def as_damper(self) -> LoopRoots | None:
-        """Return the loop at K = 0 with the damping B as its gain in place of K.
+        """Return the loop of walls with K = 0, in which the damping B takes the place of K as the loop gain.
 
-        A pole of the device at z = 1 cancels against the zero of the velocity estimate there. Return None if either
-        does not exist.
+        The zero of the velocity estimate at z = 1 cancels a pole of the device there. Return None if the zero or the
+        pole does not exist.
         """
         f = self.estimate
         device_poles, estimate_zeros = np.flatnonzero(self.poles == 0), np.flatnonzero(f.zeros == 0)
         if not device_poles.size or not (f.window or estimate_zeros.size):
             return None
-        # Zeros of F/(z - 1) for a window of n samples: the n-th roots of 1 without 1 itself, as offsets 1 - z.
+        # Compute the zeros of F/(z - 1) as offsets 1 - z: for a window of n samples they are the n-th roots of 1 except
+        # 1.
         angles = 2.0 * np.pi * np.arange(1, f.window) / max(f.window, 1)
-        # For z = -1 the offset is exactly 2, as for a device with a zero at exactly z = -1.
+        # Set the offset of z = -1 to exactly 2, so that it equals the offset of a zero of the device at z = -1.
         window = np.where(angles == np.pi, 2.0, -2j * np.sin(0.5 * angles) * np.exp(0.5j * angles))
         lag = self.lag + f.lag + f.window
         velocity = f.zeros if f.window else np.delete(f.zeros, estimate_zeros[0])
@@ -109,8 +110,8 @@ class LoopRoots:
         z_minus_1 = circle_points(w).z_minus_1[..., None]
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         distance = np.abs(z_minus_1 + roots) - reach[..., None]
-        # The factor z - root of a root on the circle has a phase that hardly varies there (V16); only its modulus
-        # varies. Therefore limit the resolution near such a root.
+        # Limit the resolution near a root on the unit circle. The phase of its factor z - root hardly varies near the
+        # root (V16), and only the modulus needs to be resolved.
         floor = np.where(are_on_circle(roots), np.where(roots == 0, 1e-9, 1e-5), 0.5 * np.abs(distances_inside(roots)))
         by_roots = (1.0 / np.maximum(distance, floor)).sum(-1)
         return by_roots + self.lag + self.estimate.window + abs(self.estimate.lag) + 1.0
@@ -133,7 +134,7 @@ def compute_aberth_step(roots: Array, rate: Array) -> Array:
 
 
 def _expand(*offsets: np.ndarray) -> np.ndarray:
-    """Return the coefficients of the monic polynomial with the given offsets; real, because roots come in pairs."""
+    """Return the coefficients of the monic polynomial with the given offsets; real, because roots occur in pairs."""
     return np.atleast_1d(np.poly(1.0 - np.concatenate(offsets))).real
 
 
@@ -150,7 +151,7 @@ def expand_estimate(loop: LoopRoots) -> tuple[np.ndarray, np.ndarray]:
 
 
 def affine_polynomial(loop: LoopRoots) -> Affine:
-    """Return D, N1 and N2 of the characteristic polynomial."""
+    """Return the coefficients of D, N1 and N2, from which P follows for any wall."""
     f_numerator, f_denominator = expand_estimate(loop)
     denominator, numerator = np.pad(_expand(loop.poles), (0, loop.lag)), loop.gain * _expand(loop.zeros)
     parts = [
