@@ -58,7 +58,7 @@ def hardware_options(command: Command) -> Command:
         hardware = {name: value for _, name, *_ in _HARDWARE if (value := given.pop(name)) is not None}
         if "resolution" in hardware:
             warn_implausible({"resolution": hardware["resolution"]}, given["scene"].unit_system)
-        # A measured response has no model to simulate with the hardware of the file.
+        # Ignore the hardware of the file for a measured response, which has no model to simulate with it.
         from_file = {} if isinstance(given["scene"].device, MeasuredDevice) else get_hardware()
         return command(hardware=from_file | hardware, **given)
 
@@ -69,7 +69,7 @@ def hardware_options(command: Command) -> Command:
 
 
 def spell_hardware_of_file(scene: Scene) -> str:
-    """Return in words the encoder, friction and motor that the scene file of the command supplies; "" if none."""
+    """Return a phrase with encoder, friction and motor from the scene file of the command; "" if it has none."""
     from zwidth.scenes.trials import spell_hardware
 
     given = click.get_current_context().params

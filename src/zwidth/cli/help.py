@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-# Options of a complete scene, for examples.
+# Options that specify a complete scene, used in the examples of several commands.
 OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
 
 OWN = "This command"  # heading of the options that belong to no other group

@@ -43,7 +43,7 @@ from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 from zwidth.words.units import detect_kind
 
-# Entry such as "K=3.2kN/m": a letter, "=", and the text up to the next letter with "=".
+# Pattern of an entry such as "K=3.2kN/m": a letter, "=", and the text up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
 
 
@@ -360,7 +360,7 @@ def _print_response(
 
 
 def spell_safe_wall(scene: Any, wall: Any) -> str:
-    """Return a safe wall in words, with K reduced until the rounded wall is stable for the whole error band."""
+    """Return a phrase with a safe wall, its K reduced until the rounded wall is stable for the whole error band."""
     stiffness, damping = float(wall.stiffness), float(f"{float(wall.virtual_damping):.4g}")
     for _ in range(_SOFTER):
         stiffness = round_conservatively(stiffness, "below")
@@ -372,19 +372,19 @@ def spell_safe_wall(scene: Any, wall: Any) -> str:
 
 
 def _compliance(deviation: Any, system: UnitSystem) -> str:
-    """Return the median of compliances in m/N (rotary: rad/(N m)) in words."""
+    """Return the median of compliances in m/N (rotary: rad/(N m)), as text with a unit."""
     import numpy as np
 
     return with_unit(float(np.median(deviation)), system["m/N"], 3)
 
 
 def _plain(wall: Any) -> dict[str, float]:
-    """Return the values of a maximum of stiffness as a dict for JSON."""
+    """Return stiffness, damping, frequency and status of a safe wall as a dict for JSON."""
     return {name: float(getattr(wall, name)) for name in ("stiffness", "virtual_damping", "frequency", "status")}
 
 
 def _draw(scene: Any, wall: Any) -> Any:
-    """Draw the response with its error band, and the open loop of a wall."""
+    """Draw the measured response with its error band, and the open loop with a wall."""
     from zwidth import figures
     from zwidth.figures.style import style_sheet
 

@@ -113,7 +113,7 @@ def simulate(
     load = "torque" if units.rotary else "force"
     depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}, "
     depth += f"{load} up to {with_unit(force, units['N'], 3)}; "
-    # Omit the extremes of a growing motion, because they depend only on the simulated time.
+    # Omit the largest depth and force of a growing motion, because they depend only on the simulated time.
     depth = "" if int(motion.outcome) == MotionKind.GROWING else depth
     lines = [
         format_row("start", ", ".join(filter(None, start)) or "at rest"),
@@ -148,7 +148,7 @@ def _choose_start(
     if hold is None and push is None:
         depth = DEFAULT_STEPS * hardware["resolution"] if "resolution" in hardware else DEFAULT_DEPTH
         if isinstance(scene.device, LinearDevice):
-            # Displace a linear system by an external force, because it always starts at rest at 0.
+            # Displace a linear system by a constant external force, because its simulation always starts at rest at 0.
             return {"push": depth * float(scene.wall.stiffness)}
         hold = depth
     return {"start_position": hold or 0.0, "push": push or 0.0}

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
 
-# Keys in the context of a command.
+# Keys under which data are stored in the click context of a command.
 _WITH_KIND = "zwidth.with_kind"  # options whose units determine the kind of device, linear or rotary
 _HARDWARE = "zwidth.hardware"  # encoder, friction and motor of the scene file
 BOTH_PERIODS = "--period and --rate are both given; give only one of them"
@@ -56,13 +56,13 @@ _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
 class Parsed(click.ParamType):
-    """Type of an option that a function parses; ``remedy`` completes the message of its `ValueError`."""
+    """Type of a click option whose text ``read`` converts; ``remedy`` completes the message of its `ValueError`."""
 
     def __init__(self, name: str, read: Callable[[str], Any], remedy: str = "") -> None:
         self.name, self.read, self.remedy = name, read, remedy
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse one option."""
+        """Return the value of an option, converted from its text; report a `ValueError` as a usage error."""
         if self.name == "quantity" and ctx is not None and param is not None and detect_kind(value) is not None:
             ctx.meta.setdefault(_WITH_KIND, {})[param.opts[0]] = value
         try:
@@ -77,7 +77,7 @@ def get_options_with_kind() -> dict[str, Any]:
 
 
 def get_hardware() -> dict[str, float]:
-    """Return encoder, friction and motor of the scene file of the running command, as in `zwidth.diagnose`."""
+    """Return the hardware of the scene file of the running command: the arguments of `zwidth.diagnose` by name."""
     return click.get_current_context().meta.get(_HARDWARE, {})
 
 
@@ -261,7 +261,7 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
         same = "kind" not in part_values and part_values.keys() <= {item.name for item in fields(scene.velocity)}
         kept = {"kind": name_estimate(scene.velocity), **spell_part(scene.velocity)} if same else {}
         if part_values.keys() & _ONE_OF_TWO:
-            # Drop both, because a low-pass filter takes either a cutoff or a time constant.
+            # Drop the cutoff and the time constant of the file, because a low-pass filter takes only one of them.
             kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
         changes["velocity"] = make_velocity({**kept, **part_values})
     parts = {} if device else find_parts(scene)
@@ -338,7 +338,7 @@ def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[
 
 
 def _list_needed(kind: Any) -> list[str]:
-    """Return the required fields of a part."""
+    """Return the names of the fields of a part's class that have no default value."""
     return [item.name for item in fields(kind) if item.default is MISSING]
 
 
@@ -353,7 +353,7 @@ def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
 
 
 def _select_part(given: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the given parameters of one part, by field name."""
+    """Return the parameters of one part from the options, as a dict by field name."""
     return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
 
 

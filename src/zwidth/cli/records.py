@@ -115,7 +115,7 @@ def log_options(command: Command) -> Command:
 def read_logs(
     logs: Iterable[Path], loop: RecordLoop, *, resolution: str | None, motor_constant: str | None, **columns: Any
 ) -> list[Any]:
-    """Return the motions of logs; print the names of long logs to the error stream.
+    """Return the recorded motion of each log; print the names of long logs to the error stream.
 
     Args:
         logs: paths of the logs.

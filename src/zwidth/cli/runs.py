@@ -104,7 +104,7 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi:
                 # The options have the names of the arguments of `zwidth.run`.
                 result = run_studies(path, progress=progress, **options)
         except KeyboardInterrupt:
-            # Interrupted before the first study began.
+            # Return no result, because the run was interrupted before its first study began.
             result = None
     if result is not None:
         _report_end(result, command)
@@ -329,7 +329,7 @@ def reporter() -> Iterator[Callable[[StudyEvent], None]]:
 
 
 def _lines(event: StudyEvent) -> Iterator[str]:
-    """Yield the lines of a finished study: number, name, kind, run time, number of files, and notes."""
+    """Yield the printed lines of a finished study: number, name, kind, run time, number of files, and notes."""
     result = event.result
     if result is None:
         return
@@ -345,7 +345,7 @@ def _lines(event: StudyEvent) -> Iterator[str]:
 
 
 def _state(progress: Progress) -> str:
-    """Return the speed of a sweep and the estimated remaining time."""
+    """Return a text with the speed of a sweep in points per second and its estimated remaining time."""
     left = progress.seconds_left
     text = f"{plain(progress.rate, 3)} points/s"
     if left == left and left > 0:

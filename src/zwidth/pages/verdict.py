@@ -63,7 +63,7 @@ GRASP_WORDS = {
 
 
 def spell_device(scene: Scene, omitted: frozenset[str] = frozenset()) -> str:
-    """Return device and timing in words; ``omitted`` contains the names of options that were not given."""
+    """Return a phrase with device and timing; ``omitted`` contains the names of options that were not given."""
     device, timing = scene.device, scene.timing
 
     def name_default(name: str) -> str:
@@ -107,7 +107,8 @@ def format_check(
     lines = [format_line(word, wall_words + (alarm if word == "STABLE" else "")), format_line("device", device_words)]
     lines += [*format_parts(scene), *format_hardware(hardware)]
     lines += [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
-    # A measured response has no poles.
+    # With K = 0, print the stable dampings of a pure damper. Exclude a measured response, whose frequency is NaN
+    # because it has no poles.
     damper = wall.stiffness == 0 and not isnan(verdict.frequency)
     dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
     if word == "MARGINAL":
@@ -138,14 +139,14 @@ def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | Non
 
 
 def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
-    """Return the stable intervals of K at the B of the wall, and of B at its K, in words."""
+    """Return a phrase with the stable intervals of K at the B of the wall, and of B at its K."""
     units = verdict.unit_system
     rooms = (("K", verdict.stable_stiffness, units["N/m"], "B"), ("B", dampings, units["N s/m"], "K"))
     return "; ".join(_spell_intervals(*room) for room in rooms)
 
 
 def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> str:
-    """Return the stable intervals of K or B, ``name``, in words."""
+    """Return a phrase with the stable intervals of the parameter ``name`` (K or B) if the ``other`` one is fixed."""
     if not intervals:
         return f"no stable {name} at this {other}"
     spelled = []
@@ -206,7 +207,7 @@ def format_decay(verdict: Assessment) -> list[str]:
 
 
 def spell_passivity(scene: Scene, verdict: Assessment) -> str:
-    """Return the passivity of a wall in words; with a coupling the condition is sufficient but not necessary."""
+    """Return a phrase on the passivity of a wall; with a coupling the condition is sufficient but not necessary."""
     stiffness, margin = scene.wall.stiffness, verdict.passivity_margin
     if verdict.passive is None:
         return f"not known {find_unsupported_reason(**vars(scene.device)).partition(':')[0]}"

@@ -42,12 +42,12 @@ _NO_BREAK = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
 
 
 def format_row(label: str, text: str) -> str:
-    """Return a line of a printed result with a long label."""
+    """Return a printed line: a label in a wide column for long labels, and a text."""
     return f"{label:<20}  {text}"
 
 
 def format_line(label: str, text: str) -> str:
-    """Return a line of a printed result with its label."""
+    """Return a printed line: a label in a narrow column of `LABEL` characters, and a text."""
     return f"{label:<{LABEL - 1}} {text}"
 
 
@@ -79,7 +79,7 @@ def print_lines(lines: Iterable[str], indent: int = 24) -> None:
 
 
 def print_result(result: Any, lines: Iterable[str], as_json: bool, indent: int = 24) -> None:
-    """Print a result as JSON, or its lines."""
+    """Print a result as JSON if ``as_json`` is True, otherwise print its lines."""
     if as_json:
         print_json(result)
     else:
@@ -114,14 +114,14 @@ def get_unit(path: str) -> str:
 
 
 def name_verdict(verdict: Assessment) -> str:
-    """Return the verdict in one word."""
+    """Return the verdict as one word: undecided, marginal, stable or UNSTABLE."""
     if verdict.stable is None:
         return "undecided"
     return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
 
 
 def spell_radius(radius: float) -> str:
-    """Return a spectral radius in words, with six decimals unless it is very large."""
+    """Return the spectral radius as text with six decimals, or in fewer digits if it is very large."""
     return f"spectral radius {f'{radius:.6f}' if radius < 1e4 else plain(radius)}"
 
 
@@ -153,7 +153,7 @@ def list_period_notes(scene: Scene) -> list[str]:
 
 
 def list_notes(scene: Scene) -> list[str]:
-    """Return notes on a scene in addition to its verdict."""
+    """Return the notes on a scene: undecided walls, period of the estimate, islands of stability, safe limit."""
     from zwidth.scenes.assessment import describe_islands
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
@@ -161,7 +161,7 @@ def list_notes(scene: Scene) -> list[str]:
 
 
 def compare_with_limit(scene: Scene) -> list[str]:
-    """Return a warning if the wall exceeds the scene's safe limit, and the warnings that the limit carries."""
+    """Return the warnings of the scene's safe limit, preceded by a caution if the wall exceeds this limit."""
     limit = scene.safe_limit
     return [] if limit is None or isinstance(scene.wall, NoWall) else [*list_limit_cautions(scene), *limit.warnings]
 
@@ -184,14 +184,14 @@ def spell_diagnosis(diagnosis: Diagnosis | None) -> list[tuple[str, str]]:
 
 
 def spell_alarm(diagnosis: Diagnosis | None, *alarms: str) -> str:
-    """Return the words with which a headline points to cautions: an oscillation, if diagnosed, and ``alarms``."""
+    """Return the text appended to a headline to announce cautions: a diagnosed oscillation, if any, and ``alarms``."""
     oscillation = [] if diagnosis is None or diagnosis.cause == "none" else [diagnosis.word.lower()]
     words = [*oscillation, *filter(None, alarms)]
     return f"; CAUTION: {', '.join(words)}" if words else ""
 
 
 def format_diagnosis(diagnosis: Diagnosis | None) -> list[str]:
-    """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+    """Return printed lines with the result of a diagnosis and, if the device oscillates, its remedies."""
     return [format_line(*each) for each in spell_diagnosis(diagnosis)]
 
 
@@ -205,7 +205,7 @@ def list_omission_cautions(scene: Scene, omitted: Collection[str]) -> list[str]:
 
     ``omitted`` contains the names of options that were not given.
     """
-    # Omit both for a measured response, because it usually contains the delay, and it cannot be simulated.
+    # Return no caution for a measured response, because it usually contains the delay, and it cannot be simulated.
     if isinstance(scene.device, MeasuredDevice):
         return []
     cautions = {
@@ -248,10 +248,11 @@ def list_slopes(scene: Scene) -> list[Slope]:
     slopes, system = [], scene.unit_system
     for path, slope in per.items():
         unit, value = system[get_unit(path)], float(slope)
-        # The scale of a delay is the period, because a delay may be 0; that of a linear damping is 1 N s/m.
+        # Choose a scale: for a delay the period, because the delay may be 0; for a linear damping 1 N s/m; else the
+        # value.
         size = scene.timing.period if path == "delay" else values[path]
         by_one = not size or unit == "N s/m"
-        # The step is the power of ten nearest to one percent of the scale.
+        # Choose the power of ten nearest to one percent of the scale as the step.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
         effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
         if isfinite(value) and (change := value * step):
