@@ -27,8 +27,8 @@ from zwidth.words.showing import compact_repr
 N_ACROSS = 65  # equidistant lines across the stable set
 BEYOND = 0.05  # distance of the first and last of them from the stable nodes, relative to the range of dampings
 
-# Refinement near meetings
-# Offsets in beta of new lines of constant B near a meeting, relative to the gap between the lines that enclose it.
+# Refinement near meetings. Offsets in beta of new lines of constant B near a meeting, relative to the gap between the
+# lines that enclose it.
 MEETING_OFFSETS = np.array([-1e-3, -1e-7, 1e-7, 1e-3])
 # Largest final gap between two lines that enclose a meeting, relative to the gap before refinement.
 ENCLOSED_GAP = 3e-7
@@ -67,7 +67,7 @@ class _Rows(NamedTuple):
 
 
 class _Meetings(NamedTuple):
-    """The meetings of pairs of columns between neighboring lines of constant B."""
+    """The meetings of two columns each, in the gaps between neighboring lines of constant B."""
 
     gap: np.ndarray  # index of the line above
     columns: np.ndarray  # shape (meetings, 2)
@@ -77,13 +77,13 @@ class _Meetings(NamedTuple):
 
 @dataclass(frozen=True)
 class StableSet:
-    """The stable walls of one loop, by the edges of the set."""
+    """The set of stable walls of one loop, represented by the edges that bound it."""
 
     boundary: Boundary
 
     @cached_property
     def _nodes(self) -> np.ndarray:
-        """Angles, alpha and beta at the nodes of the curve and the extrema of alpha: shape (3, nodes)."""
+        """Angle, alpha and beta (first axis) at the nodes of the curve and the extrema of alpha: shape (3, nodes)."""
         w = np.union1d(self.boundary.w, self.boundary.alpha_extrema)
         return np.stack([w, *evaluate_curve(self.boundary.loop, w)[:2]])
 
@@ -93,7 +93,7 @@ class StableSet:
         return self.boundary.lossless if len(self.boundary.lines) == 2 else np.nan
 
     def _place_rows(self) -> np.ndarray:
-        """Return the dampings of the initial lines of constant B.
+        """Return the dampings beta of the initial lines of constant B.
 
         They are equidistant across the stable set, and close to each point of the curve where an edge starts or ends.
         """
@@ -196,7 +196,7 @@ class StableSet:
         )
 
     def _subtract_columns(self, columns: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return the difference in alpha of two columns on each line of constant B; NaN if the line misses either."""
+        """Return the difference in alpha of two columns on each line; NaN if the line does not cross both."""
         return np.subtract(*self.boundary.find_alpha(columns.T.ravel(), np.tile(beta, 2)).reshape(2, -1))
 
     @cached_property
@@ -207,7 +207,7 @@ class StableSet:
             return self._triangle if meetings.gap.size else []
         bounds = np.pad(np.isfinite(rows.alpha.T), ((0, 0), (1, 1)))
         begins, ends = bounds[:, 1:-1] & ~bounds[:, :-2], bounds[:, 1:-1] & ~bounds[:, 2:]
-        # Two edges bound the same piece if they bound the same interval of a line or if they meet.
+        # Assign two edges to the same piece if they bound the same interval of a line or meet.
         number = np.cumsum(begins).reshape(begins.shape).T - 1
         row, below = np.nonzero(rows.upper >= 0)
         pairs = [number[row, below], number[row, rows.upper[row, below]]]
@@ -285,12 +285,12 @@ class StableSet:
         return frozenset([min(stiff, key=lambda piece: (piece not in damped, np.min(ends[piece])))])
 
     def find_softest(self, least: float) -> float:
-        """Return the lowest alpha on the edges of the `main` pieces at dampings of at least ``least``; NaN if none."""
+        """Return the lowest alpha with beta >= ``least`` on the edges of `main` pieces; NaN if there is none."""
         walls = [edge.alpha[edge.beta >= least] for edge in self.main_edges(least)]
         return float(min((alpha.min() for alpha in walls if alpha.size), default=np.nan))
 
     def is_in_main(self, alpha: float, beta: float) -> bool:
-        """Return whether a wall lies in a `main` piece."""
+        """Return whether a wall lies in a `main` piece, one that is connected to K = 0."""
         # Find the edge at the upper end of the wall's stable interval, and compare it with the edges of main pieces.
         # Near a meeting, rounding errors may select a neighboring edge, so also search two lines of constant B close to
         # the wall.
@@ -350,17 +350,17 @@ class StableSet:
             (piece, one) for piece, one in outlines if np.ptp(one.virtual_damping) > DAMPING_TOLERANCE * self.width
         ]
         outlines.sort(key=lambda each: -each[1].area)
-        # The largest outline of a piece is its outer one; all others are holes.
+        # Mark all outlines of a piece except the largest as holes, because the largest one is its outer outline.
         outer = {piece: k for k, (piece, _) in reversed(list(enumerate(outlines)))}
         return [outline._replace(hole=outer[piece] != k) for k, (piece, outline) in enumerate(outlines)]
 
 
 def _join_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return the connected components of the graph on ``count`` nodes with these edges, shape (2, pairs).
+    """Return the connected component of each of ``count`` nodes of a graph with edges of shape (2, pairs).
 
-    Each component is denoted by its smallest node.
+    A component is denoted by the smallest index of its nodes.
     """
-    # `scipy.sparse.csgraph` would do the same, but takes a third of a second to import.
+    # Do not use `scipy.sparse.csgraph`, because its import takes a third of a second.
     least, before = np.arange(count), np.full(count, -1)
     while not np.array_equal(least, before):
         before = least.copy()
@@ -397,7 +397,7 @@ def _pair_ends(rows: _Rows, corners: np.ndarray) -> _Meetings:
 
 @compact_repr()
 class Outline(NamedTuple):
-    """A closed outline of the stable set, as a polygon of walls."""
+    """A closed outline of the stable set, a polygon whose corners are walls."""
 
     stiffness: np.ndarray
     virtual_damping: np.ndarray

@@ -75,7 +75,7 @@ class Boundary:
 
     @classmethod
     def trace(cls, loop: LoopRoots) -> Boundary:
-        """Compute the boundary of a loop."""
+        """Compute the stability boundary of a loop: its nodes, arcs and crossing lines."""
         w = place_nodes(loop)
         curve = evaluate_curve(loop, w)
         vertical = find_field_zeros(loop, w, curve.im_f, "im_f")
@@ -102,7 +102,7 @@ class Boundary:
             return np.abs(beta - self.lossless) <= EQUAL_DAMPING * np.abs(self.lossless)
 
     def find_crossings(self, beta: np.ndarray) -> Crossings:
-        """Return the crossings of the lines of constant B with these dampings, shape (rows,)."""
+        """Return the crossings of lines of constant B with all arcs and crossing lines; ``beta`` has shape (rows,)."""
         beta, consistent = self.shift_ambiguous(beta)
         joined = self._joined
         column, row, k = joined.list_crossings(beta)
@@ -169,7 +169,7 @@ class Boundary:
         signs = [np.sign(middle - np.cos(w)) for w in self._pair_angles]
         rising = joined.leaving[arc] * np.prod(signs, axis=0) > 0
         first, last = nodes.select(lower).evaluate_rows(beta), nodes.select(upper).evaluate_rows(beta)
-        # A line of constant B through an end of the arc crosses it there, and no iteration is needed.
+        # Skip the iteration for a line of constant B through an end of the arc, because the crossing is this end.
         angle = np.where(
             last.ratio == 0, above, np.where(first.ratio == 0, below, _estimate_crossing(below, above, first, last))
         )
@@ -214,7 +214,7 @@ class Boundary:
 
     @cached_property
     def _joined(self) -> JoinedArcs:
-        """The arcs in one sequence of nodes."""
+        """The nodes of all arcs in one sequence."""
         return JoinedArcs.join(self.arcs)
 
     def find_arc(self, w: np.ndarray) -> np.ndarray:
@@ -250,7 +250,7 @@ class Boundary:
         return [line.w for line in self.lines if line.poles == 2]
 
     def shift_ambiguous(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Shift dampings whose lines of constant B have inconsistent crossings (V15).
+        """Shift the dampings of lines of constant B whose crossings are inconsistent (V15).
 
         A line within rounding errors of an extremum of beta may miss one of the two arcs that meet there. A line with a
         slightly different damping replaces it.
@@ -352,7 +352,7 @@ class Boundary:
     def _count_far(self, side: float, beta: np.ndarray) -> np.ndarray | int:
         """Return, for each beta, the number of poles outside the circle as alpha -> inf (side 1) or -inf (side -1)."""
         less, more = self._far_counts[side]
-        # The number depends on the damping only if the loop is lossless.
+        # Compare with the lossless damping, because the number depends on beta only if the loop is lossless.
         return less if less == more else np.where(beta > self.lossless, more, less)
 
     @cached_property
@@ -411,11 +411,11 @@ class _LoopValues(NamedTuple):
     common_slope: np.ndarray
 
     def select(self, index: np.ndarray) -> _LoopValues:
-        """Return the values at the selected angles."""
+        """Return all values at the angles selected by an index or a mask."""
         return _LoopValues(*(part[index] for part in self))
 
     def evaluate_rows(self, beta: np.ndarray) -> _RowValues:
-        """Return ``Im(q - beta F)``, alpha and their derivatives for one damping per angle."""
+        """Return the `_RowValues`, that is, ``ratio``, alpha and their derivatives, for one damping per angle."""
         with np.errstate(all="ignore"):
             value, slope = self.q - beta * self.f, self.q_slope - beta * self.f_slope
             is_zero = self.common == 0
@@ -428,7 +428,7 @@ class _LoopValues(NamedTuple):
 
 @np.errstate(all="ignore")
 def _estimate_crossing(below: np.ndarray, above: np.ndarray, first: _RowValues, last: _RowValues) -> np.ndarray:
-    """Estimate a zero of ``ratio`` between two angles from values and derivatives at both.
+    """Estimate the angle at which ``ratio`` is 0, from its values and derivatives at two angles.
 
     The estimate is the cubic interpolation of the inverse function or, if this leaves the interval, the root of a
     parabola.
@@ -437,8 +437,8 @@ def _estimate_crossing(below: np.ndarray, above: np.ndarray, first: _RowValues, 
     share = -first.ratio / rise
     bends = rise * (1.0 - share) / first.ratio_slope, rise * share / last.ratio_slope
     cubic = below + share * (share * (3.0 - 2.0 * share) * width + (1.0 - share) * (bends[0] - bends[1]))
-    # The parabola has the values of ``ratio`` at both angles, and its derivative at the angle where the derivative is
-    # smaller. Near an extremum of beta, this derivative vanishes, and the cubic fails.
+    # The parabola has the values of ``ratio`` at both angles, and its derivative at the angle where this is smaller.
+    # Near an extremum of beta the derivative is 0, and the cubic interpolation fails.
     flat = np.abs(first.ratio_slope) < np.abs(last.ratio_slope)
     start, slope = np.where(flat, first.ratio, last.ratio), np.where(flat, first.ratio_slope, -last.ratio_slope) * width
     rise = np.where(flat, rise, -rise)

@@ -103,7 +103,7 @@ def are_zeros_inside(p: flint.arb_poly) -> bool | None:
 
 
 def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly, bool]:
-    """Return D, N1 and N2 in SI units, and whether K = 0 puts a pole at exactly z = 1."""
+    """Return the polynomials D, N1 and N2 in SI units, and whether K = 0 puts a pole at exactly z = 1."""
     import flint
 
     exact = _convert_exactly(scene)
@@ -154,7 +154,7 @@ def _expand_response(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
     size = len(B)
 
     def compute_transition(time: flint.arb) -> tuple[flint.arb_mat, flint.arb_mat]:
-        """Return e^(A t), and the state after a unit force held for time t from rest."""
+        """Return e^(A t), and the state at time t after a unit force held from rest."""
         rows = [[time * value for value in (*row, force)] for row, force in zip(A, B, strict=True)]
         block = flint.arb_mat([*rows, [0] * (size + 1)]).exp()
         return (
@@ -182,7 +182,7 @@ def _expand_response(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
 
 
 def _exact_estimate(exact: Any, velocity: Any, period: float) -> Estimate:
-    """Return the velocity estimate in balls, or in floats, taken as exact, if its class supports only floats."""
+    """Return the velocity estimate in balls; in floats, which count as exact, if its class supports only floats."""
     try:
         return exact.velocity.estimate(exact.timing.period)
     except (ArithmeticError, AttributeError, TypeError, ValueError):
@@ -192,7 +192,7 @@ def _exact_estimate(exact: Any, velocity: Any, period: float) -> Estimate:
 
 
 def _expand_estimate(estimate: Estimate) -> tuple[flint.arb_poly, flint.arb_poly]:
-    """Return the numerator and the denominator of the velocity estimate F, for T = 1."""
+    """Return the numerator and the denominator polynomials of the velocity estimate F in z, for T = 1."""
     import flint
 
     z, delay = flint.arb_poly([0, 1]), estimate.window + estimate.lag
@@ -204,7 +204,7 @@ def _expand_estimate(estimate: Estimate) -> tuple[flint.arb_poly, flint.arb_poly
 
 
 def _expand(offsets: Any) -> flint.arb_poly:
-    """Return the real monic polynomial of roots in conjugate pairs, given as offsets ``1 - z``."""
+    """Return the monic polynomial with real coefficients of roots in conjugate pairs, given as offsets ``1 - z``."""
     import flint
 
     product = flint.acb_poly([1])

@@ -110,7 +110,7 @@ class CrossingLine(NamedTuple):
 
     @property
     def curve_beta(self) -> float:
-        """The damping at which the boundary curve meets the line, ``Im q'/Im F'``; NaN if they do not meet."""
+        """The damping ``Im q'/Im F'`` at which the boundary curve meets the line; NaN if they do not meet."""
         return self.im_q_slope / self.im_f_slope if abs(self.im_f_slope) > MIN_ESTIMATE_SLOPE else np.nan
 
     def count_leaving(self, beta: np.ndarray) -> np.ndarray:
@@ -329,7 +329,7 @@ class JoinedArcs(NamedTuple):
         return cls(w, beta, others[0], *bound_interpolation(w, *others), keys, dampings, first, *ends, *by_arc)
 
     def sum_crossed(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return the sum of the weights of the arcs that each line of constant B crosses.
+        """Return, for each line of constant B, the sum of the weights of the arcs that it crosses.
 
         A line through an end of an arc is treated as if its beta were slightly larger.
         """

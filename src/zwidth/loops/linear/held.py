@@ -103,7 +103,7 @@ def evaluate_controller(chain: AnyChain, w: Any, discretized: DiscreteChain | Pl
     """Return q at ``e^(jw)`` for one angle w; it is differentiable in all parameters, because no root is computed."""
     points: CirclePoints = circle_points(w)
     if isinstance(discretized, Plant):
-        # N(z)/z = a2 z + a1 + a0/z, the numerator of G.
+        # Evaluate the numerator of G, divided by z: a2 z + a1 + a0/z.
         numerator = discretized.a2 * points.z + discretized.a1 + discretized.a0 / points.z
         return (
             -power_jet(points, chain.n_delay).value * points.z_minus_1 * (points.z_minus_1 + discretized.em) / numerator
@@ -221,14 +221,14 @@ def _log_derivative(matrix: np.ndarray, change: np.ndarray) -> complex:
 
 
 def _factor_rigid_loop(chain: Chain) -> LoopRoots:
-    """Return the open loop of a rigid device in closed form."""
+    """Return the open loop of a rigid device by zeros, poles and gain, in closed form."""
     delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.n_delay)
     plant = discretize_mass(delta, fraction if fraction else None)
     if fraction:
         h, q = factor_numerator(plant)
         zeros = [1.0 + h / plant.a2, 1.0 + q]
     else:
-        # For delta = 0 the gap is 0, so the zero is at exactly z = -1.
+        # Use ``gap``, because it is exactly 0 for delta = 0, and the zero is then at exactly z = -1.
         zeros = [2.0 - plant.gap / plant.a2]
     roots = (np.array(offsets, complex) for offsets in (zeros, [0.0, plant.em]))
     return LoopRoots(float(plant.a2), chain.n_delay + len(zeros) - 1, *roots, estimate=chain.estimate)
@@ -260,13 +260,13 @@ def add_input_delay(discretized: DiscreteChain, n: int) -> StateSpace:
 
 
 def realize_open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
-    """Return ``L = (alpha + beta F) G`` in state space, from the input position of the wall to the sampled position."""
+    """Return ``L = (alpha + beta F) G`` in state space, from the position at the wall to the sampled position."""
     f = realize_estimate(chain.estimate)
     return connect_in_series(StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D), realize_device(chain))
 
 
 def realize_closed_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
-    """Return the closed loop with a wall, from an external force held on the device to the sampled position."""
+    """Return the closed loop with a wall in state space, from a held external force to the sampled position."""
     loop, filter_order = realize_open_loop(chain, alpha, beta), len(realize_estimate(chain.estimate).A)
     A, _, external = chain.realize()
     B = np.zeros((len(loop.A), 1))

@@ -81,7 +81,7 @@ class OpenLoop(NamedTuple):
         return open_loop_response(self.loop, self.alpha, self.beta, circle_points(w))
 
     def evaluate_at_one(self) -> float | None:
-        """Return ``L(1)``; None if it is infinite or 0."""
+        """Return L at z = 1; None if it is infinite or 0."""
         value = self.evaluate(np.zeros(1)).value[0]
         return float(value.real) if np.isfinite(value) and value.real != 0 else None
 
@@ -350,7 +350,7 @@ def _list_starts(
 
 
 def _solve_delay(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) -> float:
-    """Return the delay near a start at which a pole is on the unit circle, by Newton's method on log(-L); else NaN."""
+    """Return the delay in periods that puts a pole on the unit circle, by Newton's method on log(-L); else NaN."""
     residual = np.inf
     for _ in range(MAX_STEPS):
         if not (0.0 < w < np.pi and delay >= 0.0):
@@ -398,7 +398,7 @@ def compute_margins(
     stable = label_walls(boundary, alpha, beta)
     in_range = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
     delayed: dict[float, tuple[LoopRoots, np.ndarray]] = {}
-    # A sampled system does not define its response between samples, so fractional delays are impossible.
+    # Omit the delay margin of a sampled system, which does not define its response at fractional delays.
     with_delay = "delay_margin" in wanted and not chain.sampled
     out = np.full((len(Margins._fields), *alpha.shape), np.nan)
     for index in np.ndindex(alpha.shape):

@@ -82,7 +82,7 @@ def log_modulus(zeta: Array) -> Array:
 
 
 def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> FactoredValue:
-    """Evaluate P and its derivative in the factored form, for arrays that broadcast."""
+    """Return P, its derivative in zeta and the scale of its rounding error, for arrays that broadcast."""
     f = loop.estimate
     delay = f.window + f.lag
     g_denominator = _product(zeta, loop.poles).times(_power(zeta, loop.lag))
@@ -121,7 +121,7 @@ def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
 
 
 def _refine_poles(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array, walls: Array) -> None:
-    """Apply Aberth's steps, in place, to the poles of the walls with these indices until all have converged."""
+    """Refine poles ``zeta`` in place by Aberth's steps, for the walls with the indices ``walls``, until all converge."""
     for _ in range(MAX_STEPS):
         if not walls.size:
             break
@@ -195,8 +195,8 @@ def is_marginal(loop: LoopRoots, alpha: float, beta: float) -> bool:
     wall = np.array([alpha]), np.array([beta])
     P = evaluate_polynomial(loop, *wall, np.zeros(1, complex))
     undamped = evaluate_polynomial(loop, wall[0], 0.0 * wall[1], np.zeros(1, complex))
-    # If the negative damping of the wall cancels the damping of the device, P'(1) is a rounding error of 0, and the
-    # pole at z = 1 is double.
+    # Treat P'(1) as 0 if it is a rounding error, because the negative damping of the wall may cancel that of the
+    # device, and then the pole at z = 1 is double.
     terms = np.abs(undamped.slope[0]) + np.abs(P.slope[0] - undamped.slope[0])
     if P.value[0] != 0 or np.abs(P.slope[0]) <= CANCELLATION * terms:
         return False
@@ -228,7 +228,7 @@ def compute_log_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray) -> 
 
 
 def spectral_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, stable: np.ndarray) -> np.ndarray:
-    """Return ``max|z|`` over the poles of walls, below 1 if and only if ``stable``.
+    """Return the spectral radius ``max|z|`` of each wall, which is below 1 if and only if ``stable`` is True.
 
     Within rounding errors of the stability boundary the computed radius may contradict the verdict; it is then 1, or
     the next smaller float64 for a stable wall.

@@ -45,7 +45,7 @@ ON_LOSSLESS = 1e-9  # tolerance of the lossless damping, relative to the width o
 # If a wall above the ridge is stable, the ridge is wrong. Smaller relative differences in alpha are rounding errors.
 CONTRADICTION = 1e-7
 
-# Test of a maximum on neighboring lines of constant B
+# Test of a maximum on lines of constant B at these offsets, relative to the width of the stable set plus |beta|.
 NEIGHBOR_OFFSETS = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3])  # in beta, relative to its scale
 REACHED_FRACTION = 0.99  # of alpha, up to which one of these lines must be stable
 
@@ -72,12 +72,12 @@ class RidgeSolution(NamedTuple):
 
     @property
     def omega(self) -> float:
-        """The angle at which the loop oscillates with this wall; at a corner, the higher of the two."""
+        """The angle of the poles on the unit circle with this wall; at a corner, the higher of the two angles."""
         return max(self.w1, self.w2) if self.second <= Condition.PLUS_ONE else self.w1
 
     @property
     def kind(self) -> RidgeKind:
-        """The kind of maximum: smooth, a corner, or at the limit beta = 0."""
+        """The kind of the maximum: smooth, a corner, or at the limit beta = 0 of the allowed dampings."""
         if self.second == Condition.NO_DAMPING:
             return RidgeKind.NO_DAMPING
         smooth = self.first == Condition.PAIR and self.second == Condition.STATIONARY
@@ -221,7 +221,7 @@ def _find_nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[floa
 
 
 def _differentiate_conditions(loop: LoopRoots, ridge: RidgeSolution) -> tuple[np.ndarray, list[int]]:
-    """Return the Jacobian of the active constraints in the free unknowns.
+    """Return the Jacobian of the active constraints with respect to the free unknowns.
 
     The five possible equations are Re r and Im r at w1, the same at w2, and Im dr/dw at w1; the unknowns are alpha,
     beta, w1 and w2. An angle is free only if it belongs to a pole pair. At a smooth maximum w1 may stay fixed, because
@@ -299,8 +299,8 @@ def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> floa
     """Return the derivative of K_max in one parameter, with the same active constraints (V21); NaN if inaccurate."""
     matrix, equations = _differentiate_conditions(scene.loop.roots, ridge)
     points = circle_points(np.array([ridge.w1, ridge.w2]))
-    # A longer period shortens a delay measured in periods. If the delay is an integer, it becomes a fractional delay
-    # with an integer part that is smaller by one.
+    # Reduce the integer delay by one if the period changes and the delay is an integer: a longer period shortens a
+    # delay measured in periods, so the delay becomes a fractional one with a smaller integer part.
     n = scene.integer_delay - (path == "period" and scene.d == scene.integer_delay > 0)
     for weights in _list_differences(scene, path):
         try:
@@ -335,7 +335,7 @@ def _collect_dependencies(scene: Any, n: int, points: CirclePoints) -> tuple[Any
 def _differentiate_controller(
     scene: Any, n: int, points: CirclePoints, d_A: np.ndarray, d_B: np.ndarray, d_delay: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of ``q = -1/G`` and of dq/dw in a parameter, by the chain rule.
+    """Return the derivatives of q and dq/dw with respect to a parameter, by the chain rule.
 
     Args:
         scene: the scene.
@@ -382,7 +382,7 @@ def _differentiate_controller(
 
 
 def _list_differences(scene: Any, path: str) -> Iterator[list[tuple[float, float]]]:
-    """Yield sixth-order finite differences in a parameter: a central one, one above its value, and one below.
+    """Yield sixth-order finite differences for a parameter: central, above its value, and below its value.
 
     Each is a list of values of the parameter and their weights.
     """

@@ -46,12 +46,12 @@ class LoopRoots:
     estimate: Estimate
 
     def evaluate_controller(self, points: CirclePoints) -> Jet:
-        """Evaluate the critical controller ``q = -1/G`` and its derivative in w."""
+        """Return the critical controller ``q = -1/G`` and its derivative in w at points of the unit circle."""
         quotient = product_jet(points, self.poles, -1.0).over(product_jet(points, self.zeros, self.gain))
         return quotient.times(power_jet(points, self.lag))
 
     def evaluate_response(self, points: CirclePoints) -> Jet:
-        """Evaluate the response G and its derivative in w."""
+        """Return the response G and its derivative in w at points of the unit circle."""
         quotient = product_jet(points, self.zeros, self.gain).over(product_jet(points, self.poles, 1.0))
         return quotient.times(power_jet(points, -self.lag))
 
@@ -88,7 +88,7 @@ class LoopRoots:
         return LoopRoots(self.gain * float(f.gain) / max(f.window, 1), max(lag, 0), zeros, poles, Estimate())
 
     def contract_powers(self) -> tuple[LoopRoots, int]:
-        """Find the largest k for which G and F are functions of z^k, and return them with z^k replaced by z.
+        """Return the loop with z^k replaced by z, for the largest k for which G and F are functions of z^k, and this k.
 
         Returns:
             The loop whose poles are the k-th powers of the poles of this one, and k. For most loops k is 1.
@@ -106,7 +106,7 @@ class LoopRoots:
         return replace(self, lag=lags[0], zeros=roots[0], poles=roots[1], estimate=slow), k
 
     def bound_variation(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """Return a bound on the relative derivatives in w of q and F, for angles within ``reach`` of w."""
+        """Return a bound of the relative derivatives of q and F in w, over the angles within ``reach`` of w."""
         z_minus_1 = circle_points(w).z_minus_1[..., None]
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         distance = np.abs(z_minus_1 + roots) - reach[..., None]
@@ -118,7 +118,7 @@ class LoopRoots:
 
 
 def compute_aberth_step(roots: Array, rate: Array) -> Array:
-    """Compute Aberth's step for approximations of all roots of P along the last axis.
+    """Return Aberth's steps for approximations of all roots of P, along the last axis.
 
     The step is Newton's, corrected for the other roots, so that no two approximations converge to the same root.
 

@@ -20,7 +20,7 @@ from zwidth.loops.linear.poles import compute_poles_minus_one, log_modulus
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.showing import compact_repr
 
-# Batches, whose arrays fit in the cache
+# Sizes of batches, chosen so that their arrays fit in the cache.
 BATCH_LINES = 1 << 12  # lines of constant B per batch
 BATCH_PAIRS = 1 << 16  # pairs of lines and arcs per batch, which allows more lines if there are few arcs
 # Walls per line of constant B below which counting the poles of each wall is faster than solving for all crossings.
@@ -94,7 +94,7 @@ def _list_intervals(boundary: Boundary, beta: np.ndarray) -> tuple[np.ndarray, .
 
 
 def arrange_by_line(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Arrange the values of all lines in an array with one row per line.
+    """Return the values of all lines in one array, with one row per line.
 
     Args:
         lines: number of lines.
@@ -140,7 +140,7 @@ def _count_poles(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.
         part = slice(start, start + size)
         alpha, beta = (np.where(finite[part], column[part], 0.0) for column in columns)
         outside = boundary.count_outside(alpha, beta)
-        # If the crossings of a line are inconsistent, compute all poles of its walls.
+        # Compute all poles of walls on lines with inconsistent crossings, because counting by crossings failed there.
         left = np.flatnonzero(outside < 0)
         if left.size:
             outside[left] = (log_modulus(compute_poles_minus_one(boundary.loop, alpha[left], beta[left])) >= 0).sum(1)
@@ -172,7 +172,7 @@ def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
         return np.zeros((0, 2))
 
     def label(beta: np.ndarray) -> np.ndarray:
-        """Return whether the walls with this alpha are stable."""
+        """Return the labels of the walls with this alpha and the given beta: True if stable."""
         return label_walls(boundary, np.full(beta.size, alpha), beta)
 
     reach = np.ptp(crossed) + np.abs(crossed).max() + 1.0
@@ -200,7 +200,7 @@ CONNECTED_START = 1e-6
 
 
 def are_connected(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return whether stable intervals of alpha, or of K, start at K = 0 or below, up to rounding errors."""
+    """Return a mask of the stable intervals of alpha (or K) that start at K = 0 or below, up to rounding errors."""
     return (low <= CONNECTED_START * high) & (high > 0)
 
 

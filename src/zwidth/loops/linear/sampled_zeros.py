@@ -88,7 +88,7 @@ def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits:
         (-1) ** power * sum(response[order - k] * comb(k, power) for k in range(power, order + 1))
         for power in range(order, -1, -1)
     ]
-    # A zero at s = 0 (no static response to a constant force) becomes a zero at exactly z = 1.
+    # Set the zero to exactly z = 1 if the system has a zero at s = 0, that is, no static response to a constant force.
     has_zero_at_one = device.system.numerator[-1] == 0
     if has_zero_at_one:
         shifted = shifted[:-1]
@@ -116,7 +116,7 @@ def _as_decimal(value: Fraction) -> Decimal:
 def _discretize(
     denominator: list[Decimal], numerator: list[Decimal], time: Decimal
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the transition matrix, the state after a unit force held for ``time`` from rest, and the output row."""
+    """Return the transition matrix, the state after a unit force held for ``time`` from rest, and the output vector."""
     order = len(denominator) - 1
     monic = [value / denominator[0] for value in denominator]
     # Scale time so that all coefficients of the denominator are at most 1.

@@ -37,7 +37,7 @@ PLACEHOLDER = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR),
 
 
 class Structure(NamedTuple):
-    """The static part of a scene with traced parameters; one program is compiled per structure."""
+    """The static part of a scene with traced parameters, for each of which one program is compiled."""
 
     template: Any  # the scene, with placeholders for the traced parameters
     paths: tuple[str, ...]  # of the traced parameters
@@ -46,7 +46,7 @@ class Structure(NamedTuple):
 
 
 def build_structure(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
-    """Return the static part of a scene.
+    """Return the static part of a scene: placeholders for its traced parameters, and its delay in periods.
 
     Args:
         scene: the scene.
@@ -118,14 +118,14 @@ def _search_on_host(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> 
 
 
 def _fill_template(structure: Structure, values: Iterable[Any]) -> Any:
-    """Return the scene with these values in place of the placeholders."""
+    """Return the scene of the template with values in place of the placeholders."""
     return replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
 
 
 def _solve_conditions(
     structure: Structure, scene: Any, start: Array, conditions: Array, exists: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Solve the two active conditions by Newton's method.
+    """Solve the two active conditions for alpha, beta, w1 and w2 by Newton's method.
 
     Args:
         structure: the static part of the scene.
