@@ -45,7 +45,7 @@ LIMITS = ("max_force", "max_rate")  # limits of the motor; the only arguments th
 
 
 def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
-    """Return the distinct scenes, and an array with the index of the scene of each simulation."""
+    """Return the distinct scenes as a list, and an array with the index of the scene of each simulation."""
     listed = isinstance(scenes, Iterable) and not isinstance(scenes, np.ndarray)
     array = np.array(list(scenes) if listed else scenes, object)
     numbers: dict[int, int] = {}
@@ -71,7 +71,7 @@ def find_system(scenes: list[Any]) -> UnitSystem:
 
 
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments with ``start_position`` and ``start_velocity`` split into one argument per body.
+    """Return all arguments by name, with ``start_position`` and ``start_velocity`` split into one per body.
 
     An example of a new argument is "start_position.tip_position". A body for which the user specifies no initial value
     has that of the device.
@@ -110,7 +110,7 @@ def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, push: Any, per
 
 
 def _read_history(name: str, values: Any, length: int, unit: str) -> np.ndarray:
-    """Return a history as float64 in SI units; raise `InputError` unless its last axis has the required length."""
+    """Return a history as a float64 array in SI units; raise `InputError` unless its last axis has the given length."""
     history = as_float64(name, read_texts(name, values, unit))
     if not history.ndim or history.shape[-1] != length:
         raise InputError(f"{name}: got an array of shape {history.shape}; its last axis needs {length} values")
@@ -142,7 +142,8 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
             # Trace the law twice, because a law that keeps values between calls yields a different program the second
             # time, or fails.
             for _ in range(2):
-                # Wrap the law in a new function, because JAX would reuse the cached trace of the same function.
+                # Wrap the law in a new function for each trace, because JAX would reuse the cached trace of the same
+                # function.
                 trace = jax.jit(lambda *args: force(*args)).trace(*[jax.ShapeDtypeStruct((2,), float)] * 3)
                 traces.append((trace.lower().as_text(), len(trace.jaxpr.in_avals), trace.out_info))
         except Exception as error:
@@ -258,12 +259,12 @@ def _unit(name: str) -> str:
 
 
 def _spell(name: str) -> str:
-    """Return an argument's name as users write it: "start_position" in place of "start_position.position"."""
+    """Return the name of an argument as users write it, "start_position" for "start_position.position"."""
     return name.removesuffix(".position")
 
 
 def _check(name: str, array: np.ndarray, arrays: dict[str, np.ndarray], period: Any) -> tuple[Any, str]:
-    """Return a mask of the valid values of an argument, and its allowed range in words.
+    """Return a mask of the valid values of an argument, and a phrase with its allowed range for messages.
 
     Args:
         name: name of the argument.

@@ -145,7 +145,7 @@ def build_batch(
     options: Options,
     names: tuple[str, ...],
 ) -> tuple[Parameters, ExternalInputs]:
-    """Build the normalized parameters and external inputs of one group of simulations.
+    """Return the normalized parameters and the external inputs of one group of simulations.
 
     Args:
         models: models of the scenes in the group.

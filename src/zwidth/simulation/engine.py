@@ -94,7 +94,7 @@ def _write(rows: Array, row: Array, index: Array) -> Array:
 
 
 def look_back(ring: Array, k: Array, back: Array) -> Array:
-    """Return the entry that was written into a ring ``back`` samples before sample k.
+    """Return the entry of a ring that was written ``back`` samples before sample k.
 
     ``back`` has the shape (batch,), or (1,) if it is equal for all simulations. The length of a ring is a power of 2.
     """
@@ -194,7 +194,7 @@ def propagate(
     indices: tuple[Array | int, Array | int],
     time: Array,
 ) -> tuple[BodyState, Array]:
-    """Propagate the bodies over one piece of a period, with constant forces, and update the energies.
+    """Propagate the bodies over one piece with constant forces, and add the work and the losses to the energies.
 
     Args:
         params: parameters of the simulations.
@@ -233,7 +233,7 @@ def propagate(
 
 
 def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, int]) -> State:
-    """Return the state before the first sample, reached by uniform motion without commands and with modes at rest (T2).
+    """Return the state before the first sample: uniform motion so far, no commands, and modes at rest (T2).
 
     ``rings`` contains the lengths of the rings of positions and of commands.
     """

@@ -54,7 +54,7 @@ class Options(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """Settings that all simulations of a batch share."""
+    """Settings that all simulations of a batch share: lengths, kind of contact and force law."""
 
     periods: int  # number of sampling periods
     substeps: int  # number of substeps per period
@@ -65,7 +65,7 @@ class Settings(NamedTuple):
 
 
 class ExternalInputs(NamedTuple):
-    """Initial state, external forces and random numbers in normalized units, and these units in SI."""
+    """Initial state, external forces and random numbers in normalized units, and the values of these units in SI."""
 
     positions: np.ndarray  # initial positions, (bodies, batch)
     velocities: np.ndarray  # initial velocities, (bodies, batch)
@@ -78,7 +78,7 @@ class ExternalInputs(NamedTuple):
 
 
 class Motor(NamedTuple):
-    """Limits of the motor (infinite if it has none) and its dry friction (0 if it has none)."""
+    """Limits of the motor (infinite without limits) and dry friction of the first body (0 without friction)."""
 
     max_force: Array  # largest magnitude of the command
     max_rate: Array  # largest change of the command per period
@@ -98,7 +98,7 @@ class Estimator(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """Parameters of the simulations of a batch."""
+    """Parameters of the simulations of a batch, in the units of the module."""
 
     alpha: Array  # normalized stiffness
     beta: Array  # normalized virtual damping
@@ -147,7 +147,7 @@ def round_up(size: int) -> int:
 
 
 def build_estimators(estimates: Sequence[Any], which: np.ndarray) -> Estimator:
-    """Return the velocity estimates of a batch, with all filters padded to the largest order.
+    """Return the velocity estimate of each simulation, with all filters padded to the largest order.
 
     ``estimates`` contains the estimate of each scene, ``which`` the index of the scene of each simulation.
     """

@@ -31,7 +31,7 @@ FRACTION = 8
 
 
 class BodyState(NamedTuple):
-    """State of the bodies, and slip of the first body."""
+    """State of the bodies, and slip of the first body, for each batch entry."""
 
     x: Array  # state, (n, batch)
     slip: Array  # slip of the first body: -1, 0 or 1, (batch,)
@@ -100,7 +100,7 @@ def advance(
 
 
 def _take(part: Array, which: Array | None) -> Array:
-    """Return the selected batch entries of an array; an index out of range selects the last entry."""
+    """Return the batch entries of an array with the indices ``which``; an index out of range selects the last entry."""
     return part if which is None or part.shape[-1] == 1 else part.at[..., which].get(mode="clip")
 
 
@@ -179,7 +179,7 @@ class _Joint(NamedTuple):
         return jnp.where(slip == 0, stuck, slip * (self.pressed(x) - slip * self.coulomb))
 
     def find_side(self, x: Array, far: Array) -> Array:
-        """Return the side: the sign of the mean force on a held body during a step from ``x`` to ``far``."""
+        """Return the side, that is, the sign of the mean force on a held body over a step from ``x`` to ``far``."""
         return jnp.sign(self.pressed(x) + self.pressed(far))
 
     def dips(self, x: Array, slip: Array, far: Array, side: Array) -> Array:
@@ -211,7 +211,7 @@ class _Joint(NamedTuple):
         )
 
     def glide(self, state: _Slide, whole: Flow) -> _Slide:
-        """Propagate the batch entries without an event over the whole piece, in one step with a precomputed flow."""
+        """Propagate the batch entries without an event over their whole piece, in one step with a precomputed flow."""
         x, slip = state.body
 
         def go(_: Any) -> Any:
@@ -242,7 +242,7 @@ class _Joint(NamedTuple):
         held, driven, limit = slip == 0, self.drive(slip), jnp.minimum(state.left, self.longest)
 
         def search(trip: _Trip, turn: Array) -> Any:
-            """Propagate by one of three searches: over the whole step, to the minimum of the reserve, or to the event.
+            """Propagate by one of three searches: for the end of the step, the minimum of the reserve, or the event.
 
             Args:
                 trip: result of the previous search.

@@ -117,7 +117,7 @@ def _draw(motion: Motion) -> str:
 )
 @dataclass(frozen=True)
 class Motion:
-    """Result of one simulation or a batch: arrays of the batch shape, those over time with one more axis at the end.
+    """Result of one simulation or a batch: arrays of the batch shape; motions over time have the time as last axis.
 
     Attributes:
         time: instants in s, ``substeps`` per period, the first 0; one axis if all simulations share the period.
@@ -230,8 +230,8 @@ def classify(summary: Any, memory: np.ndarray, tail: int) -> np.ndarray:
     width = np.stack([_measure_width(summary, k, k + 1)[0] for k in range(1, len(summary.turns))])
     before, (first, second) = _measure_width(summary, 0, 1), _measure_halves(summary)
     still = (second.max(0) <= AT_REST * widest) & (first.max(0) <= np.sqrt(AT_REST) * widest)
-    # Require that the second half of the tail is longer than the delay plus the window of the velocity estimate,
-    # because commands computed from earlier positions can still move the bodies.
+    # A motion counts as rest only if the second half of the tail is longer than the delay plus the window of the
+    # velocity estimate, because commands computed from earlier positions can still move the bodies.
     still &= tail // 2 > np.maximum(memory, LEAST_REST)
     before, trend, second = before[0], second[0] / first[0], second[0]
     oscillating = summary.turns[1:].min(0) >= 1
