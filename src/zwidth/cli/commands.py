@@ -176,7 +176,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_obstacles(scene: Any) -> list[str]:
-    """Return notes that name the measurements required to certify a stiffer wall on a measured response."""
+    """Return notes on the measurements that would be required to certify a stiffer wall on a measured response."""
     if not isinstance(scene.device, MeasuredDevice):
         return []
     from zwidth.fitting.respond import find_nominal_limit

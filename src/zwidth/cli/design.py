@@ -43,7 +43,7 @@ from zwidth.words.units import read_share
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
 _TRIED = 41  # values of a parameter at which K_max is computed, to find the largest K_max in a range
-# Parameters with tolerances for which `zwidth.scenes.robust` finds a wall that is stable on all devices.
+# Parameters whose tolerances `zwidth.scenes.robust` supports in the search for a wall that is stable on all devices.
 _BOX = ("mass", "damping", "period", "delay")
 
 
@@ -107,7 +107,7 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
 
 
 def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
-    """Return the value of one parameter at which K_max reaches the given stiffness, as data and as lines."""
+    """Return the value of a parameter at which K_max reaches the given stiffness, as a dict and as printed lines."""
     path = _FINDS[find]
     if path == "virtual_damping":
         return _choose_damping(scene)
@@ -148,7 +148,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     else:
         values = [crossing.value for crossing in needed.crossings]
         text = f"{format_sufficient(needed.value, needed.enough, values, unit)}"
-        # Subtract the one or two crossings that the text already contains.
+        # Subtract the crossings of K_max with the goal (one or two) that the text already contains.
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
@@ -160,7 +160,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
 
 
 def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, float]:
-    """Return the value of a parameter with the largest K_max in a range, and that K_max; both 0 if none is stable."""
+    """Return the value in a range at which K_max is largest, and this K_max; both 0 if no wall is stable."""
     maxima = {}
     for value in [*([0.0] if path == "delay" else []), *np.geomspace(*ends, _TRIED).tolist()]:
         with suppress(InputError):
@@ -171,7 +171,7 @@ def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, fl
 
 
 def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
-    """Return the virtual damping with which a wall of given stiffness settles fastest, as data and as lines."""
+    """Return the B with which a wall of the given stiffness settles fastest, as a dict and as printed lines."""
     wanted, best, units = float(scene.wall.stiffness), scene.best_damping(), scene.unit_system
     result = {"parameter": "virtual_damping", "value": best.virtual_damping, "unit": units["N s/m"]}
     result |= {"spectral_radius": best.spectral_radius, "modulus_margin": best.modulus_margin}
@@ -192,7 +192,7 @@ def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
 def _tolerate(
     scene: Any, shares: dict[str, float], distribution: Any, samples: int | None, seed: int
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the share of random devices within the tolerances on which the wall is stable, as data and as lines."""
+    """Return the share of random devices on which the wall is stable, as a dict and as printed lines."""
     from zwidth.scenes.assessment import describe_islands
     from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 
@@ -226,7 +226,7 @@ def _tolerate(
 
 
 def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:
-    """Return the stiffest wall that is stable on all devices within the tolerances, as data and as lines."""
+    """Return the stiffest wall that is stable for all tolerances, as a dict and as printed lines."""
     from zwidth.scenes.robust import DIGITS, Interval, robust_max_stiffness, robust_wall
 
     nominal = (scene.mass, scene.damping, scene.timing.period, scene.timing.delay)

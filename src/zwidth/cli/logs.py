@@ -48,7 +48,7 @@ _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
 
 
 def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
-    """Return K, B and f of a wall at the onset of oscillation, and True if it is rotary; None if it has no unit."""
+    """Return K, B and f of a wall at the onset of oscillation, and if it is rotary (None without a unit)."""
     entries = _ENTRY.findall(text.replace(",", " "))
     amounts = dict(entries)
     if _ENTRY.sub("", text.replace(",", " ")).strip() or {"K", "f"} - set(amounts) or len(amounts) < len(entries):
@@ -185,7 +185,7 @@ def fit(
 
 
 def _diagnose(device_fit: Any, motor: dict[str, float]) -> Any:
-    """Return the diagnosis of the recommended wall with fitted friction and encoder, and the motor's largest force.
+    """Return the diagnosis of the recommended wall, simulated with fitted friction, encoder and the motor's limit.
 
     Return None if none of these is known, or if no wall is recommended.
     """
@@ -198,7 +198,7 @@ def _diagnose(device_fit: Any, motor: dict[str, float]) -> Any:
 
 
 def _list_lines(device_fit: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
-    """Return the printed lines of a fit, including the checks in a hand and by simulation of `zwidth recommend`."""
+    """Return the printed lines of a fit, with the checks of the recommended wall in a hand and by simulation."""
     from zwidth.fitting.words import detail_fit, summarize_fit
 
     checks, more = [], "details: --verbose; scene for the other commands: --yaml"
@@ -269,7 +269,7 @@ def excite(
 
 
 def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
-    """Print the properties of a designed record and the safe wall that it is expected to determine."""
+    """Print the properties of a force designed for identification, and the safe wall expected from its log."""
     low, high = (with_unit(end, "Hz") for end in made.frequency[[0, -1]])
     units = SYSTEMS[made.rotary]
     lines = [

@@ -137,7 +137,7 @@ def simulate(
 def _choose_start(
     scene: Any, hit: float | None, push: float | None, hold: float | None, hardware: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the initial conditions of a simulation, as arguments of `zwidth.simulate`."""
+    """Return the initial conditions and the external force of a simulation, as arguments of `zwidth.simulate`."""
     if hit is not None and hold is not None:
         raise InputError(
             "--hold: given together with --hit; give only one of them, because a hit starts outside the wall"
@@ -155,7 +155,7 @@ def _choose_start(
 
 
 def _choose_length(scene: Any) -> int:
-    """Return the number of periods needed to show the slowest decay of the linear loop."""
+    """Return the length of a simulation in periods that covers the slowest decay of the linear loop."""
     dominant = scene.loop.find_dominant(float(scene.alpha), float(scene.beta))
     rate = abs(float(dominant.rate))
     return int(min(max(TIME_CONSTANTS / rate, FEWEST_PERIODS), MOST_PERIODS)) if 0 < rate < math.inf else MOST_PERIODS

@@ -54,7 +54,7 @@ MARGINAL_DAMPER = (
 )
 MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
 
-# Requirements on stability in the reference grasps (hands that hold the device), in words.
+# Phrases for the required stability in the reference grasps, that is, with hands that hold the device.
 GRASP_WORDS = {
     "all": "stable in all six reference grasps",
     "soft": "stable in the soft reference grasps",
@@ -92,7 +92,7 @@ def format_check(
     diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
-    """Return the lines of `zwidth check` without notes.
+    """Return the printed lines of `zwidth check` without notes: verdict, device, margins and remedies.
 
     ``limits=None`` omits gains and remedies, which take longer. ``hardware`` is the encoder, friction and motor of a
     file in words.
@@ -133,7 +133,7 @@ def format_check(
 
 
 def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | None) -> str:
-    """Return the lines of `zwidth check` and its notes as one folded text without color."""
+    """Return the printed lines and notes of `zwidth check` as one text, wrapped and without colors."""
     lines = [*format_check(scene, verdict, limits), *(format_line("note", note) for note in list_notes(scene))]
     return "\n".join(wrap_lines(lines))
 
@@ -159,7 +159,7 @@ def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> 
 
 
 def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]:
-    """Return lines with the stiffest stable wall of the device and the share of its K used by this wall."""
+    """Return printed lines with the stiffest stable wall of the device and the percentage of its K that this wall has."""
     if not isfinite(verdict.stiffness_max):
         none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
         return [format_line("K_max", none)]
@@ -226,7 +226,7 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
 
 
 def format_gains(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:
-    """Return a table of improvements of a device and their gains; small gains are omitted unless ``verbose``."""
+    """Return the lines of a table of improvements of a device and their gains; ``verbose`` includes small gains."""
     shown = [limit for limit in limits if isfinite(limit.gain) and (verbose or limit.gain > NOTEWORTHY)]
     if not shown:
         return []
@@ -248,7 +248,7 @@ def format_recommendation(
     diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
-    """Return the lines of `zwidth recommend` without notes; ``hardware`` as in `format_check`.
+    """Return the printed lines of `zwidth recommend` without notes; ``hardware`` is defined as in `format_check`.
 
     ``diagnosis`` is that of the recommended wall.
     """

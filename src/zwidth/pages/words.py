@@ -37,7 +37,8 @@ COLORS = {"STABLE": "green", "SET": "green", "UNSTABLE": "red", "NO WALL": "red"
 COLORS |= dict.fromkeys(("MARGINAL", "UNDECIDED", "CAUTION"), "yellow")
 _NARROW = 60  # smallest width with a separate column for labels
 _COLUMN = re.compile(r" {2,}")
-# Spaces at which lines do not break: within quantities such as "B = 3 N s/m", and some others, which is harmless.
+# Pattern of spaces at which lines must not break: those within quantities such as "B = 3 N s/m". It also matches some
+# other spaces, which is harmless.
 _NO_BREAK = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
 
 
@@ -57,7 +58,7 @@ def print_json(result: Any) -> None:
 
 
 def wrap_lines(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) -> Iterator[str]:
-    """Yield lines wrapped to a width, continuation lines indented; no break separates a number from its unit.
+    """Yield lines wrapped to a width, with continuation lines indented and no break between a number and its unit.
 
     A narrow width has no separate column for labels, because the text would wrap after every word.
     """
@@ -71,7 +72,7 @@ def wrap_lines(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) ->
 
 
 def print_lines(lines: Iterable[str], indent: int = 24) -> None:
-    """Print lines as wide as ``COLUMNS`` or the terminal, at most 100 columns, with colored labels."""
+    """Print lines, wrapped to ``COLUMNS`` or the width of the terminal, at most 100 columns, with colored labels."""
     width = shutil.get_terminal_size((WIDTH, 24)).columns
     for each in wrap_lines(lines, indent, min(width, WIDTH)):
         word = each[: LABEL - 1].rstrip()
@@ -87,7 +88,7 @@ def print_result(result: Any, lines: Iterable[str], as_json: bool, indent: int =
 
 
 def format_parts(scene: Scene) -> list[str]:
-    """Return a line for each part of a scene apart from the rigid device, in order from the motor outwards."""
+    """Return a printed line for each part of a scene except the rigid device, in order from the motor to the hand."""
     lines = []
     velocity = type(scene.velocity).__name__
     parts, values = find_parts(scene), scene.parameters()
@@ -126,7 +127,7 @@ def spell_radius(radius: float) -> str:
 
 
 def spell_decay(constant: float, frequency: float) -> str:
-    """Return the decay of the dominant pole in words, from its time constant in s (negative: growth) and frequency."""
+    """Return a phrase on the dominant pole, from its time constant in s (negative: growth) and its frequency in Hz."""
     swing = f", oscillating at {with_unit(frequency, 'Hz')}" if frequency else ""
     if isnan(constant):
         return f"has a rate below numerical resolution, near the boundary or poles of equal magnitude{swing}"
@@ -196,12 +197,12 @@ def format_diagnosis(diagnosis: Diagnosis | None) -> list[str]:
 
 
 def format_hardware(hardware: str) -> list[str]:
-    """Return the line with encoder, friction and motor of a file, in words; no line for an empty text."""
+    """Return the printed line with the hardware of a file, a phrase; an empty list if the phrase is empty."""
     return [format_line("hardware", hardware)] if hardware else []
 
 
 def list_omission_cautions(scene: Scene, omitted: Collection[str]) -> list[str]:
-    """Return the cautions about a delay and a friction that are 0 only because they were not given.
+    """Return cautions if the delay or the friction is 0 only because it was not given.
 
     ``omitted`` contains the names of options that were not given.
     """
@@ -231,17 +232,17 @@ class Slope(NamedTuple):
     words: str  # effect of a small change
 
     def line(self) -> str:
-        """Return the derivative as a printed line."""
+        """Return a printed line with the derivative, its unit and the effect of a small change."""
         name = "inertia" if self.name == "mass" and self.unit.endswith("kg m^2") else self.name
         return format_row(f"dK_max/d({name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return derivative and unit for JSON."""
+        """Return a dict of the derivative and its unit for JSON output."""
         return {"value": self.value, "unit": self.unit}
 
 
 def list_slopes(scene: Scene) -> list[Slope]:
-    """Return the sensitivity of the maximum stiffness to each parameter of a scene, with its effect in words."""
+    """Return the derivatives of K_max with respect to all parameters of a scene, each with its effect in words."""
     if isinstance(scene.device, MeasuredDevice):
         return []
     per, values = scene.sensitivities().per, scene.parameters()
