@@ -360,7 +360,7 @@ def _print_response(
 
 
 def spell_safe_wall(scene: Any, wall: Any) -> str:
-    """Return a phrase with a safe wall, its K reduced until the rounded wall is stable for the whole error band."""
+    """Return a safe wall as a phrase; its K is reduced until the rounded wall is stable for the whole error band."""
     stiffness, damping = float(wall.stiffness), float(f"{float(wall.virtual_damping):.4g}")
     for _ in range(_SOFTER):
         stiffness = round_conservatively(stiffness, "below")

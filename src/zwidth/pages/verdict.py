@@ -159,7 +159,7 @@ def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> 
 
 
 def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]:
-    """Return printed lines with the stiffest stable wall of the device and the percentage of its K that this wall has."""
+    """Return printed lines with K_max and its wall, and the percentage of K_max that the wall of the scene uses."""
     if not isfinite(verdict.stiffness_max):
         none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
         return [format_line("K_max", none)]

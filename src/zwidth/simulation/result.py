@@ -117,7 +117,7 @@ def _draw(motion: Motion) -> str:
 )
 @dataclass(frozen=True)
 class Motion:
-    """Result of one simulation or a batch: arrays of the batch shape; motions over time have the time as last axis.
+    """Result of one simulation or a batch: arrays of the batch shape, those over time with one more axis at the end.
 
     Attributes:
         time: instants in s, ``substeps`` per period, the first 0; one axis if all simulations share the period.
@@ -292,7 +292,8 @@ def convert_to_si(
     units |= dict.fromkeys(("wall_force", "command", *FRAME[3:]), force)
     for rows, names in ((frames, (*bodies, *FRAME)), (readings[:, None], READING)):
         # Convert each array from the axes (periods, substeps, rows, batch) to (rows, batch, instants), where a row is
-        # one recorded quantity and the axis of instants joins the periods with their substeps, in order of time.
+        # one recorded quantity. The axes of periods and substeps are merged into one axis of recorded instants, in
+        # order of time.
         flat = np.moveaxis(rows, (2, 3), (0, 1)).reshape(len(names), len(period), -1)
         columns |= {name: row * units.get(name, np.ones(1))[:, None] for name, row in zip(names, flat, strict=True)}
     columns["sticking"] = (columns["sticking"] == 0) & dry[:, None]

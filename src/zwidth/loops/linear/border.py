@@ -242,7 +242,7 @@ class StableSet:
         return [*edges, Edge(-1, 0, slice(0), (1, 2), w, alpha, np.full(w.size, self._triangle_beta))]
 
     def _trace_edge(self, column: int, angles: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Tabulate an edge, that is, a column between the walls at both of its ends.
+        """Return the tabulated points of an edge, the part of a column between two walls.
 
         Args:
             column: index of the column.
@@ -320,8 +320,7 @@ class StableSet:
         for piece in {edge.piece for edge in self.edges} - self.main:
             walls = np.concatenate([edge[-2:] for edge in self.edges if edge.piece == piece], 1)
             islands.append(Island(*(tuple(pair) for pair in np.stack([walls.min(1), walls.max(1)], 1).tolist())))
-        # Drop islands whose largest alpha is positive only by rounding errors, because they consist of walls with K <=
-        # 0.
+        # Drop islands of walls with K <= 0, whose largest alpha is positive only by rounding errors.
         islands = [one for one in islands if one.stiffness[1] > NEAR_EDGE * np.ptp(one.stiffness)]
         islands = [one for one in islands if one.virtual_damping[1] > least]
         return sorted(islands, key=lambda one: -one.stiffness[1])

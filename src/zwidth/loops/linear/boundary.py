@@ -332,8 +332,7 @@ class Boundary:
         arc, block = self.find_arc(w), max(1, BLOCK_SIZE // max(1, len(self.arcs)))
         for part in np.array_split(np.flatnonzero(result), 1 + result.sum() // block):
             sums, consistent = self._sum_below(curve.alpha[part], curve.beta[part], arc[part])
-            # Use ``leaving`` of the whole arc, because rounding errors may change the sign of d beta/dw at single
-            # angles.
+            # Use ``leaving`` of the whole arc, because at a single angle rounding errors may change its sign.
             below = self.count_below(curve.beta[part])
             result[part] = consistent & (below + sums == np.where(self._joined.leaving[arc[part]] > 0, 0, 2))
         return result
@@ -352,7 +351,7 @@ class Boundary:
     def _count_far(self, side: float, beta: np.ndarray) -> np.ndarray | int:
         """Return, for each beta, the number of poles outside the circle as alpha -> inf (side 1) or -inf (side -1)."""
         less, more = self._far_counts[side]
-        # Compare with the lossless damping, because the number depends on beta only if the loop is lossless.
+        # Compare beta with the lossless damping, because the number depends on beta only in a lossless loop.
         return less if less == more else np.where(beta > self.lossless, more, less)
 
     @cached_property
@@ -384,8 +383,8 @@ class Boundary:
                 # lossless damping moves it off the circle: x becomes x (1 - (beta - lossless) F/alpha).
                 leaving += int(np.sum(side * excess * loop.estimate.jet(points).value.imag * x.real > 0))
                 continue
-            # If x is real, the pole leaves the zero along the circle. The sign of the next term of its expansion, -e
-            # x^2/order, then decides if the pole is outside.
+            # If x is real, the pole leaves the zero along the circle. The next term of its expansion, -e x^2/order,
+            # then decides by its sign if the pole is outside.
             bend = -(rest.slope / rest.value + 0.5j * order) * x * x / order
             leaving += int(np.sum(np.where(np.abs(x.imag) > TANGENT_TOLERANCE * np.abs(x), x.imag, bend.imag) < 0))
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on_circle] < 0)) + leaving

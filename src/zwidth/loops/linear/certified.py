@@ -186,7 +186,7 @@ def _exact_estimate(exact: Any, velocity: Any, period: float) -> Estimate:
     try:
         return exact.velocity.estimate(exact.timing.period)
     except (ArithmeticError, AttributeError, TypeError, ValueError):
-        # Return an estimate in floats if its class, defined by a user, calls functions of ``math``, which accept only
+        # Use floats for an estimate whose class, defined by a user, calls functions of ``math``, which accept only
         # floats.
         return velocity.estimate(period)
 

@@ -200,9 +200,9 @@ def cut_arcs(
             nodes = np.array([0.5 * (a + b)])
             inner = evaluate_curve(loop, nodes)
         rising = np.sum(np.sign(inner.wronskian)) > 0
-        # If alpha increases past the arc at constant beta, a pole pair leaves the unit circle if (d beta/dw) Im F > 0,
-        # and enters it if this product is negative (V11, V12). Take each factor's sign at the majority of the nodes,
-        # because rounding errors may change the sign at single nodes near the ends of the arc.
+        # As alpha increases past the arc at constant beta, a pole pair leaves the unit circle if (d beta/dw) Im F > 0,
+        # and enters it if this product is negative (V11, V12). Take the sign that each factor has at the majority of
+        # the nodes, because rounding errors may change the sign at single nodes near the ends of the arc.
         leaving = 2.0 if rising == (np.sum(np.sign(inner.im_f)) > 0) else -2.0
         first, last = (
             betas[end] if np.isfinite(betas[end]) else side * np.inf

@@ -33,8 +33,7 @@ SHARES = np.arange(1, N_PARTS)[:, None] / N_PARTS  # inner points of a divided i
 CERTIFIED_ERROR = 1e-13  # relative error of the maximum
 
 
-# Fields of a device for which no passivity condition is available; each with a description and a reason with its
-# remedy.
+# Fields of a device for which no passivity condition is available, each with a description, a reason and a remedy.
 UNSUPPORTED = {
     "response": (
         "a measured response",
@@ -198,8 +197,7 @@ def find_needed_damping(condition: PassivityCondition, alpha: float, beta: float
         if not undecided.any():
             return best
         if undecided.sum() > MAX_INTERVALS:
-            # Stop and return the upper bound, which is conservative, because N is so flat that too many intervals
-            # remain.
+            # Return the upper bound, which is conservative, because N is so flat that too many intervals remain.
             break
         (low, high), needs = ends[:, undecided], needs[:, undecided]
         angles = low + (high - low) * SHARES

@@ -99,7 +99,7 @@ def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array)
 
 
 def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
-    """Return zeta of all poles of each wall, as an array of shape (walls, order), by Aberth's method."""
+    """Return zeta of all poles of each wall by Aberth's method, as an array of shape (walls, order)."""
     D, N1, N2 = affine_polynomial(loop)
     monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
     zeta = np.linalg.eigvals(companion(monic)) - 1.0 + 0j
@@ -121,7 +121,7 @@ def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
 
 
 def _refine_poles(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array, walls: Array) -> None:
-    """Refine poles ``zeta`` in place by Aberth's steps, for the walls with the indices ``walls``, until all converge."""
+    """Refine the poles ``zeta`` of the walls with the indices ``walls`` in place, until Aberth's steps converge."""
     for _ in range(MAX_STEPS):
         if not walls.size:
             break

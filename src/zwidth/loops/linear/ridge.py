@@ -42,7 +42,8 @@ MAX_STEPS = 4  # Newton steps
 CONVERGED_STEP = 1e-15  # relative to beta
 
 ON_LOSSLESS = 1e-9  # tolerance of the lossless damping, relative to the width of the stable set in beta
-# If a wall above the ridge is stable, the ridge is wrong. Smaller relative differences in alpha are rounding errors.
+# Relative excess in alpha of a stable wall over the ridge, above which the ridge is rejected; smaller ones are rounding
+# errors.
 CONTRADICTION = 1e-7
 
 # Test of a maximum on lines of constant B at these offsets, relative to the width of the stable set plus |beta|.

@@ -76,8 +76,8 @@ class LoopRoots:
         device_poles, estimate_zeros = np.flatnonzero(self.poles == 0), np.flatnonzero(f.zeros == 0)
         if not device_poles.size or not (f.window or estimate_zeros.size):
             return None
-        # Compute the zeros of F/(z - 1) as offsets 1 - z: for a window of n samples they are the n-th roots of 1 except
-        # 1.
+        # Compute the zeros of F/(z - 1) as offsets 1 - z. For a window of n samples they are the n-th roots of 1, but
+        # not 1 itself.
         angles = 2.0 * np.pi * np.arange(1, f.window) / max(f.window, 1)
         # Set the offset of z = -1 to exactly 2, so that it equals the offset of a zero of the device at z = -1.
         window = np.where(angles == np.pi, 2.0, -2j * np.sin(0.5 * angles) * np.exp(0.5j * angles))
