@@ -24,20 +24,21 @@ from zwidth.words.files import REMEDIES
 for _module in iter_modules(__path__, f"{__name__}."):
     import_module(_module.name)
 
-# Exit codes after SIGINT and SIGTERM.
+# Exit codes after SIGINT and SIGTERM: 128 plus the signal number, as in a shell.
 _STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit."""
+    """Run the command line with the given arguments, by default those of the process, and exit with a code."""
     use_compilation_cache()
     try:
-        # Click ignores NO_COLOR and terminals without colors, so check them here; with None, click decides.
+        # Check NO_COLOR and terminals without colors, because click ignores both. With None, click decides about
+        # colors.
         color = False if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" else None
         cli.main(args=arguments, prog_name="zwidth", standalone_mode=False, color=color)
     except SystemExit as end:
         if arguments is None and end.code in _STOPPED:
-            # End without interpreter shutdown, which would crash if JAX is compiling in another thread.
+            # Exit without the shutdown of the interpreter, which would crash if JAX is compiling in another thread.
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(int(end.code))
@@ -65,7 +66,7 @@ def _report(message: str) -> None:
 
 
 def _format_fault(error: click.ClickException) -> str:
-    """Return the message for invalid arguments, preceded by the option or followed by the command that shows help."""
+    """Return the message for invalid arguments, which names the option, or the command that shows help."""
     message = error.format_message()
     if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
         return re.sub(r"^Invalid value for '?(.*?)'?: ", r"\1: ", message, count=1)
@@ -74,7 +75,7 @@ def _format_fault(error: click.ClickException) -> str:
 
 
 def _describe(error: Exception) -> str:
-    """Return the message of an exception; for an error of the operating system: file, reason and remedy."""
+    """Return the message of an exception; for an error of the operating system it has the file, reason and remedy."""
     if not isinstance(error, OSError):
         return f"{type(error).__name__}: {error} (set ZWIDTH_TRACEBACK=1 for the traceback)"
     reason = os.strerror(error.errno) if error.errno else str(error)

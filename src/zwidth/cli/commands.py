@@ -45,7 +45,7 @@ from zwidth.words.status import Status
 EXIT_FAILED = 1  # exit code if no wall exists or a computation fails
 EXIT_INPUT = 2  # exit code for invalid input
 _PACKAGE = Path(__file__).resolve().parents[1]
-# Reference of a configuration to a table in its folder.
+# Pattern of a reference in a configuration to a table in the folder of the configuration.
 _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
 
 
@@ -133,7 +133,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
     if isinstance(scene.device, Device):
-        # Normalized parameters exist only for a device with a known mass.
+        # Add normalized parameters, which exist only for a device with a known mass.
         omega = wall.frequency * (2.0 * math.pi * scene.timing.period)
         numbers = {"delta": scene.delta, "d": scene.d, "alpha_max": alpha, "beta": beta, "omega": omega}
         result = {name: float(number) for name, number in numbers.items()}
@@ -176,7 +176,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_obstacles(scene: Any) -> list[str]:
-    """Return notes that name the measurements required to certify a stiffer wall on a measured response."""
+    """Return notes on the measurements that would be required to certify a stiffer wall on a measured response."""
     if not isinstance(scene.device, MeasuredDevice):
         return []
     from zwidth.fitting.respond import find_nominal_limit
@@ -219,7 +219,7 @@ def devices(name: str | None, as_json: bool) -> None:
 
 
 def _complete(context: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
-    """Return the names of examples that complete the text ``begun`` in a shell."""
+    """Return the names of examples that begin with ``begun``, the text typed in the shell so far."""
     return [name for name in find_examples() if name.startswith(begun)]
 
 
@@ -252,7 +252,8 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
     if not re.fullmatch("[a-z0-9_-]{1,64}", name):
         raise InputError(f"NAME: got {name!r}; write 1 to 64 of a-z, 0-9, _ and -, such as my_device")
     text = examples[example].read_text(encoding="utf-8")
-    # Remove the path of the schema, which exists in a checkout only; rename the results with the configuration.
+    # Remove the line with the path of the schema, which exists only in a checkout. Set the name in the configuration to
+    # that of the new file, because the results of a run have this name.
     text = re.sub(r"\A# yaml-language-server:.*\n(?:#\n)?", "", text)
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", text, count=1)
     contents = {Path(f"{name}.yaml"): text}

@@ -39,16 +39,16 @@ from zwidth.words.quantities import PARAMETERS
 from zwidth.words.status import Status
 from zwidth.words.units import read_share
 
-# Values of --find, and the path of the parameter in a scene.
+# Path in a scene of the parameter that each value of --find selects.
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
 _TRIED = 41  # values of a parameter at which K_max is computed, to find the largest K_max in a range
-# Parameters with tolerances for which `zwidth.scenes.robust` finds a wall that is stable on all devices.
+# Parameters whose tolerances `zwidth.scenes.robust` supports in the search for a wall that is stable on all devices.
 _BOX = ("mass", "damping", "period", "delay")
 
 
 def _read_tolerance(text: str) -> tuple[str, float]:
-    """Return a parameter and its relative tolerance."""
+    """Parse "NAME=SHARE"; return the path of a parameter and its tolerance relative to its value."""
     name, _, share = text.partition("=")
     return name.strip(), read_share(share)
 
@@ -90,7 +90,8 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
         raise click.UsageError("give --find or --tolerance, or both")
     shares, uniform = tolerances, drawn["distribution"] == "uniform"
     searchable = shares and uniform and not scene.parts_beyond and all(name in _BOX for name in shares)
-    # The search assumes independent intervals of period and delay, but a delay in periods varies with the period.
+    # Exclude this combination, because the search assumes independent intervals of period and delay, but a delay in
+    # periods varies with the period.
     searchable = searchable and not ("period" in shares and scene.timing.in_periods)
     parts = {
         "required": _require(scene, find) if find is not None else None,
@@ -106,7 +107,7 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
 
 
 def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
-    """Return the value of one parameter at which K_max reaches the given stiffness, as data and as lines."""
+    """Return the value of a parameter at which K_max reaches the given stiffness, as a dict and as printed lines."""
     path = _FINDS[find]
     if path == "virtual_damping":
         return _choose_damping(scene)
@@ -118,13 +119,14 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
             f"--find {find}: not a parameter of this scene; give {name_option(path)} as a starting value"
         )
     present = values[path]
-    # The default range is relative to the present value. If that is 0, search a range that covers any device.
+    # Search a range that covers any device if the current value is 0, because the default range is relative to this
+    # value.
     period = scene.timing.period
     within = None if present else {"damping": (1e-6, 1e4), "delay": (1e-3 * period, 500 * period)}[path]
     wanted = float(scene.wall.stiffness)
     needed = scene.required(path, wanted, within=within)
     if path == "delay" and needed.status == Status.UNREACHABLE and within is None:
-        # Extend the default range downwards, because a large stiffness may require a very short delay.
+        # Extend the default range to shorter delays, because a large stiffness may require a very short delay.
         needed = scene.required(path, wanted, within=(1e-4 * present, needed.range[1]))
     result = {"parameter": path, "value": needed.value, "unit": unit, "enough": needed.enough}
     result["status"] = Status(needed.status).name
@@ -146,7 +148,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     else:
         values = [crossing.value for crossing in needed.crossings]
         text = f"{format_sufficient(needed.value, needed.enough, values, unit)}"
-        # Subtract the one or two crossings that the text already contains.
+        # Subtract the crossings of K_max with the goal (one or two) that the text already contains.
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
@@ -158,7 +160,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
 
 
 def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, float]:
-    """Return the value of a parameter with the largest K_max in a range, and that K_max; both 0 if none is stable."""
+    """Return the value in a range at which K_max is largest, and this K_max; both 0 if no wall is stable."""
     maxima = {}
     for value in [*([0.0] if path == "delay" else []), *np.geomspace(*ends, _TRIED).tolist()]:
         with suppress(InputError):
@@ -169,7 +171,7 @@ def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, fl
 
 
 def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
-    """Return the virtual damping with which a wall of given stiffness settles fastest, as data and as lines."""
+    """Return the B with which a wall of the given stiffness settles fastest, as a dict and as printed lines."""
     wanted, best, units = float(scene.wall.stiffness), scene.best_damping(), scene.unit_system
     result = {"parameter": "virtual_damping", "value": best.virtual_damping, "unit": units["N s/m"]}
     result |= {"spectral_radius": best.spectral_radius, "modulus_margin": best.modulus_margin}
@@ -190,7 +192,7 @@ def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:
 def _tolerate(
     scene: Any, shares: dict[str, float], distribution: Any, samples: int | None, seed: int
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the share of random devices within the tolerances on which the wall is stable, as data and as lines."""
+    """Return the share of random devices on which the wall is stable, as a dict and as printed lines."""
     from zwidth.scenes.assessment import describe_islands
     from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 
@@ -204,7 +206,7 @@ def _tolerate(
     stiffness, stiffness_best = (
         with_unit(round_conservatively(end, "below"), unit) for end in (simulation.stiffness, simulation.stiffness_max)
     )
-    # Round towards the safe side, so that 100 % means all devices.
+    # Round the result towards the safe side, so that a printed share of 100 % means all devices.
     ends = (
         (simulation.stable, "below"),
         (simulation.stable_low, "below"),
@@ -224,7 +226,7 @@ def _tolerate(
 
 
 def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:
-    """Return the stiffest wall that is stable on all devices within the tolerances, as data and as lines."""
+    """Return the stiffest wall that is stable for all tolerances, as a dict and as printed lines."""
     from zwidth.scenes.robust import DIGITS, Interval, robust_max_stiffness, robust_wall
 
     nominal = (scene.mass, scene.damping, scene.timing.period, scene.timing.delay)
@@ -232,7 +234,8 @@ def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], l
     device_values = (scene.device.mass, scene.device.damping, 0.0, 0.0)
     for (name, value), device in zip(list(box.items()), device_values, strict=True):
         if name in shares:
-            # The mass and damping of a rigid hand have no tolerance.
+            # Apply the tolerance to the value of the device only, because mass and damping of a rigid hand have no
+            # tolerance.
             reach = shares[name] * (device or value)
             box[name] = Interval(value - reach, value + reach)
     wall, best = robust_wall(**box), robust_max_stiffness(**box)
@@ -241,7 +244,7 @@ def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], l
         "virtual_damping": float(wall.virtual_damping),
         "stiffness_max": float(best.stiffness),
     }
-    # Round the stiffness down: softer walls of the same damping are stable too.
+    # Round the stiffness down, because softer walls of the same damping are stable, too.
     units, names = scene.unit_system, ("stiffness", "stiffness_max")
     stiffness, stiffness_best = (with_unit(round_conservatively(result[name], "below"), units["N/m"]) for name in names)
     damping = with_unit(result["virtual_damping"], units["N s/m"], DIGITS)

@@ -18,7 +18,7 @@ from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
 
-# Option, name of the parameter, SI unit, allowed range, and help text.
+# Parameters of the hardware: option, name of the parameter, SI unit, allowed range, and help text.
 _HARDWARE = (
     (
         "--resolution",
@@ -41,7 +41,7 @@ _HARDWARE = (
 
 
 def add_option(command: Command, chosen: str) -> Command:
-    """Add the option of one hardware parameter, such as "max_force"."""
+    """Return a command with the option of one hardware parameter added, for example "max_force"."""
     flag, name, unit, allowed, text = next(each for each in _HARDWARE if each[1] == chosen)
     kind = quantity_type(unit, allowed, counts=name == "resolution")
     return click.option(flag, name, type=kind, help=text)(command)
@@ -58,7 +58,7 @@ def hardware_options(command: Command) -> Command:
         hardware = {name: value for _, name, *_ in _HARDWARE if (value := given.pop(name)) is not None}
         if "resolution" in hardware:
             warn_implausible({"resolution": hardware["resolution"]}, given["scene"].unit_system)
-        # A measured response has no model to simulate with the hardware of the file.
+        # Ignore the hardware of the file for a measured response, which has no model to simulate with it.
         from_file = {} if isinstance(given["scene"].device, MeasuredDevice) else get_hardware()
         return command(hardware=from_file | hardware, **given)
 
@@ -69,7 +69,7 @@ def hardware_options(command: Command) -> Command:
 
 
 def spell_hardware_of_file(scene: Scene) -> str:
-    """Return in words the encoder, friction and motor that the scene file of the command supplies; "" if none."""
+    """Return a phrase with encoder, friction and motor from the scene file of the command; "" if it has none."""
     from zwidth.scenes.trials import spell_hardware
 
     given = click.get_current_context().params
@@ -80,7 +80,7 @@ def spell_hardware_of_file(scene: Scene) -> str:
 
 
 def diagnose_wall(scene: Scene, hardware: dict[str, Any], *, remedies: bool) -> Any:
-    """Return the `zwidth.diagnose` result of a wall with the given hardware; None without hardware.
+    """Return the result of `zwidth.diagnose` for a wall on the given hardware; None if no hardware is given.
 
     ``remedies=False`` omits the search for remedies, which takes most of the run time.
     """

@@ -6,11 +6,11 @@ from typing import Any
 
 import click
 
-# Options of a complete scene, for examples.
+# Options that specify a complete scene, used in the examples of several commands.
 OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
 
 OWN = "This command"  # heading of the options that belong to no other group
-# Option groups: each heading with the prefixes of its options.
+# Groups of options in the help: the heading of each group, and the prefixes of the options in it.
 GROUPS = {
     "Wall": ("--stiffness", "--virtual-damping"),
     "Device": ("--device", "--mass", "--damping"),
@@ -29,7 +29,7 @@ class GroupedCommand(click.Command):
     """Command whose help lists its options in groups."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the options, one section per group."""
+        """Write the options to the help text, in one section per group."""
         rows: dict[str, list[tuple[str, str]]] = {name: [] for name in GROUPS}
         for option in self.get_params(ctx):
             if isinstance(option, click.Option) and (record := option.get_help_record(ctx)) is not None:
@@ -49,6 +49,6 @@ def find_group(flag: str) -> str:
 
 
 def show_example(command: str, *more: str) -> dict[str, Any]:
-    """Return arguments for ``cli.command`` that group the options in the help and append an example."""
+    """Return arguments of ``cli.command`` for a command with grouped options and an example in its help."""
     example = "\b\nExample:\n" + " \\\n    ".join((f"  zwidth {command}", *more))
     return {"cls": GroupedCommand, "epilog": example}

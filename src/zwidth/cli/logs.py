@@ -43,12 +43,12 @@ from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 from zwidth.words.units import detect_kind
 
-# Entry such as "K=3.2kN/m": a letter, "=", and the text up to the next letter with "=".
+# Pattern of an entry such as "K=3.2kN/m": a letter, "=", and the text up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
 
 
 def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
-    """Return K, B and f of a wall at the onset of oscillation, and True if it is rotary; None if it has no unit."""
+    """Return K, B and f of a wall at the onset of oscillation, and if it is rotary (None without a unit)."""
     entries = _ENTRY.findall(text.replace(",", " "))
     amounts = dict(entries)
     if _ENTRY.sub("", text.replace(",", " ")).strip() or {"K", "f"} - set(amounts) or len(amounts) < len(entries):
@@ -185,7 +185,7 @@ def fit(
 
 
 def _diagnose(device_fit: Any, motor: dict[str, float]) -> Any:
-    """Return the diagnosis of the recommended wall with fitted friction and encoder, and the motor's largest force.
+    """Return the diagnosis of the recommended wall, simulated with fitted friction, encoder and the motor's limit.
 
     Return None if none of these is known, or if no wall is recommended.
     """
@@ -198,7 +198,7 @@ def _diagnose(device_fit: Any, motor: dict[str, float]) -> Any:
 
 
 def _list_lines(device_fit: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
-    """Return the printed lines of a fit, including the checks in a hand and by simulation of `zwidth recommend`."""
+    """Return the printed lines of a fit, with the checks of the recommended wall in a hand and by simulation."""
     from zwidth.fitting.words import detail_fit, summarize_fit
 
     checks, more = [], "details: --verbose; scene for the other commands: --yaml"
@@ -269,7 +269,7 @@ def excite(
 
 
 def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
-    """Print the properties of a designed record and the safe wall that it is expected to determine."""
+    """Print the properties of a force designed for identification, and the safe wall expected from its log."""
     low, high = (with_unit(end, "Hz") for end in made.frequency[[0, -1]])
     units = SYSTEMS[made.rotary]
     lines = [
@@ -360,7 +360,7 @@ def _print_response(
 
 
 def spell_safe_wall(scene: Any, wall: Any) -> str:
-    """Return a safe wall in words, with K reduced until the rounded wall is stable for the whole error band."""
+    """Return a safe wall as a phrase; its K is reduced until the rounded wall is stable for the whole error band."""
     stiffness, damping = float(wall.stiffness), float(f"{float(wall.virtual_damping):.4g}")
     for _ in range(_SOFTER):
         stiffness = round_conservatively(stiffness, "below")
@@ -372,19 +372,19 @@ def spell_safe_wall(scene: Any, wall: Any) -> str:
 
 
 def _compliance(deviation: Any, system: UnitSystem) -> str:
-    """Return the median of compliances in m/N (rotary: rad/(N m)) in words."""
+    """Return the median of compliances in m/N (rotary: rad/(N m)), as text with a unit."""
     import numpy as np
 
     return with_unit(float(np.median(deviation)), system["m/N"], 3)
 
 
 def _plain(wall: Any) -> dict[str, float]:
-    """Return the values of a maximum of stiffness as a dict for JSON."""
+    """Return stiffness, damping, frequency and status of a safe wall as a dict for JSON."""
     return {name: float(getattr(wall, name)) for name in ("stiffness", "virtual_damping", "frequency", "status")}
 
 
 def _draw(scene: Any, wall: Any) -> Any:
-    """Draw the response with its error band, and the open loop of a wall."""
+    """Draw the measured response with its error band, and the open loop with a wall."""
     from zwidth import figures
     from zwidth.figures.style import style_sheet
 

@@ -113,7 +113,7 @@ def simulate(
     load = "torque" if units.rotary else "force"
     depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}, "
     depth += f"{load} up to {with_unit(force, units['N'], 3)}; "
-    # Omit the extremes of a growing motion, because they depend only on the simulated time.
+    # Omit the largest depth and force of a growing motion, because they depend only on the simulated time.
     depth = "" if int(motion.outcome) == MotionKind.GROWING else depth
     lines = [
         format_row("start", ", ".join(filter(None, start)) or "at rest"),
@@ -137,7 +137,7 @@ def simulate(
 def _choose_start(
     scene: Any, hit: float | None, push: float | None, hold: float | None, hardware: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the initial conditions of a simulation, as arguments of `zwidth.simulate`."""
+    """Return the initial conditions and the external force of a simulation, as arguments of `zwidth.simulate`."""
     if hit is not None and hold is not None:
         raise InputError(
             "--hold: given together with --hit; give only one of them, because a hit starts outside the wall"
@@ -148,14 +148,14 @@ def _choose_start(
     if hold is None and push is None:
         depth = DEFAULT_STEPS * hardware["resolution"] if "resolution" in hardware else DEFAULT_DEPTH
         if isinstance(scene.device, LinearDevice):
-            # Displace a linear system by an external force, because it always starts at rest at 0.
+            # Displace a linear system by a constant external force, because its simulation always starts at rest at 0.
             return {"push": depth * float(scene.wall.stiffness)}
         hold = depth
     return {"start_position": hold or 0.0, "push": push or 0.0}
 
 
 def _choose_length(scene: Any) -> int:
-    """Return the number of periods needed to show the slowest decay of the linear loop."""
+    """Return the length of a simulation in periods that covers the slowest decay of the linear loop."""
     dominant = scene.loop.find_dominant(float(scene.alpha), float(scene.beta))
     rate = abs(float(dominant.rate))
     return int(min(max(TIME_CONSTANTS / rate, FEWEST_PERIODS), MOST_PERIODS)) if 0 < rate < math.inf else MOST_PERIODS

@@ -37,32 +37,32 @@ if TYPE_CHECKING:
     from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
 
-# Keys in the context of a command.
+# Keys under which data are stored in the click context of a command.
 _WITH_KIND = "zwidth.with_kind"  # options whose units determine the kind of device, linear or rotary
 _HARDWARE = "zwidth.hardware"  # encoder, friction and motor of the scene file
 BOTH_PERIODS = "--period and --rate are both given; give only one of them"
 Command: TypeAlias = Callable[..., Any]
 
-# Names of the parts of a scene, and the paths of their parameters, sorted by part.
+# Names of the parts of a scene, and the paths of the parameters of all parts, sorted by part.
 _PART_NAMES = tuple(dict.fromkeys(path.rpartition(".")[0] for path in OF_PARTS))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
-# Parts that a linear system or a measured response already contains.
+# Parts that cannot be added to a linear system or a measured response, because these devices contain them.
 _CONTAINED = ("operator", "coupling", "actuator", "modes")
-# Names of the resonances, "modes.0" and so on.
+# Names of the parts that are resonances: "modes.0" and so on.
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
 _BARE = {"mass", "damping"}  # parameters of a rigid device
-# Parameters of a low-pass filter of which exactly one is given.
+# Parameters of a low-pass filter, exactly one of which must be given.
 _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
 class Parsed(click.ParamType):
-    """Type of an option that a function parses; ``remedy`` completes the message of its `ValueError`."""
+    """Type of a click option whose text ``read`` converts; ``remedy`` completes the message of its `ValueError`."""
 
     def __init__(self, name: str, read: Callable[[str], Any], remedy: str = "") -> None:
         self.name, self.read, self.remedy = name, read, remedy
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse one option."""
+        """Return the value of an option, converted from its text; report a `ValueError` as a usage error."""
         if self.name == "quantity" and ctx is not None and param is not None and detect_kind(value) is not None:
             ctx.meta.setdefault(_WITH_KIND, {})[param.opts[0]] = value
         try:
@@ -72,17 +72,17 @@ class Parsed(click.ParamType):
 
 
 def get_options_with_kind() -> dict[str, Any]:
-    """Return the option values of the running command whose units imply a linear or a rotary device."""
+    """Return the options of the running command by name whose units imply a linear or a rotary device."""
     return click.get_current_context().meta.get(_WITH_KIND, {})
 
 
 def get_hardware() -> dict[str, float]:
-    """Return encoder, friction and motor of the scene file of the running command, as in `zwidth.diagnose`."""
+    """Return the hardware of the scene file of the running command: the arguments of `zwidth.diagnose` by name."""
     return click.get_current_context().meta.get(_HARDWARE, {})
 
 
 def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, counts: bool = False) -> Parsed:
-    """Return the type of an option whose value is a number in an SI unit, or a number with a unit.
+    """Return the click type of an option for a quantity: a number in an SI unit, or a number with a unit.
 
     With ``periods`` the value is a duration, which may also be given in sampling periods, and becomes a `Span`.
 
@@ -97,7 +97,8 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
             number = text
         if periods:
             return read_span(number, allowed)
-        # Read each option in the system of its own unit; the options are compared when the scene is built.
+        # Read each option in the unit system of its unit. The systems of all options are compared when the scene is
+        # built.
         dimension = DIMENSIONS[SYSTEMS[bool(detect_kind(number))][unit]]
         return read_quantity(number, dimension, allowed, counts=counts)[0]
 
@@ -108,13 +109,13 @@ SHARE = Parsed("SHARE", read_share, "write a share, such as 2% or 0.02")
 
 
 def read_factor(text: str) -> float:
-    """Parse a factor such as ``2`` or ``6 dB``."""
+    """Return the factor given by a text such as ``2`` or ``6 dB``."""
     number = float(text.strip().removesuffix("dB"))
     return 10.0 ** (number / 20.0) if text.strip().endswith("dB") else number
 
 
 def _read_figure(text: str) -> Path:
-    """Parse the path of a figure in an existing folder."""
+    """Return the path of a figure to write; raise an error if its folder does not exist."""
     file = Path(text)
     if file.suffix not in (".png", ".svg", ".pdf"):
         raise ValueError(f"got {text!r}; name a file that ends with .png, .svg or .pdf")
@@ -124,12 +125,12 @@ def _read_figure(text: str) -> Path:
 
 
 def name_option(path: str) -> str:
-    """Return the option of a parameter: ``--velocity-cutoff`` for ``velocity.cutoff``."""
+    """Return the name of the option for a parameter, ``--velocity-cutoff`` for ``velocity.cutoff``."""
     return "--" + path.replace(".", "-").replace("_", "-")
 
 
 def _add_option(command: Command, path: str) -> Command:
-    """Add the option of one parameter, given by its path in a scene."""
+    """Return a command with the option of one parameter added; ``path`` is the path of the parameter in a scene."""
     if path == "device":
         words = (
             "A published device of `zwidth devices`, with its period and delay; other options add or replace "
@@ -153,7 +154,7 @@ def _add_option(command: Command, path: str) -> Command:
 
 
 def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
-    """Add the options of a scene, with or without its wall, and the argument for a scene file.
+    """Return a decorator that adds the options of a scene, with or without wall, and the argument of a scene file.
 
     The command receives a `zwidth.Scene` as ``scene``, or None if ``instead`` names alternative options and no scene
     option is given.
@@ -187,7 +188,8 @@ def take_options(
                     from zwidth.parts.devices import read_device
 
                     values["device"] = read_device(values["device"])
-                    # Ignore kind and hardware of the file's device, because the option --device replaces it.
+                    # Ignore the unit system and the hardware of the file, because the option --device replaces its
+                    # device.
                     context.meta.pop(_HARDWARE, None)
                     with_kind = context.meta.get(_WITH_KIND, {}) | {"--device": values["device"]}
                 return function(**{name: make(values, SYSTEMS[bool(find_kind(with_kind))])}, **given)
@@ -207,7 +209,7 @@ def take_options(
 
 
 def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
-    """Write a warning to the error stream for each implausible value of ``given``, a dict of SI values by path."""
+    """Print a warning on stderr for each implausible value of ``given``, a dict of SI values by path."""
     for line in list_implausible(
         given, lambda path, value: f"{name_option(path)} '{value}'" if value else name_option(path), system
     ):
@@ -215,7 +217,7 @@ def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
 
 
 def read_scene_file(path: Path) -> Scene:
-    """Return the scene of a configuration file, or of the run in a folder; write its warnings to the error stream."""
+    """Return the scene of a configuration file, or of the run in a folder; print its warnings on stderr."""
     from zwidth.runs.record import find_config
     from zwidth.studies.document import load_config, load_scene
 
@@ -228,7 +230,7 @@ def read_scene_file(path: Path) -> Scene:
 
 
 def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *, wall: bool = False) -> Scene | None:
-    """Return the scene described by options, given by path; ``given["scene"]`` supplies all other parameters.
+    """Return the scene with the parameters ``given`` (by path); ``given["scene"]`` is a scene with all others.
 
     Return None if no option is given and ``instead`` names alternative options.
     """
@@ -249,7 +251,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
-    """Return the scene of a file with the parameters given as options replaced."""
+    """Return the scene of a file after replacing the parameters that are given as options."""
     from zwidth.parts.devices import KnownDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}
@@ -261,7 +263,7 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
         same = "kind" not in part_values and part_values.keys() <= {item.name for item in fields(scene.velocity)}
         kept = {"kind": name_estimate(scene.velocity), **spell_part(scene.velocity)} if same else {}
         if part_values.keys() & _ONE_OF_TWO:
-            # Drop both, because a low-pass filter takes either a cutoff or a time constant.
+            # Drop the cutoff and the time constant of the file, because a low-pass filter takes only one of them.
             kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
         changes["velocity"] = make_velocity({**kept, **part_values})
     parts = {} if device else find_parts(scene)
@@ -289,7 +291,7 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
 
 
 def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scene:
-    """Return the scene described by options only, without a scene file."""
+    """Return the scene built from options, without a scene file."""
     from zwidth.parts.devices import KnownDevice
     from zwidth.scenes.scene import Scene
 
@@ -304,7 +306,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
         raise click.UsageError(f"give {f'either {instead} alone, or also ' if instead else ''}{', and '.join(missing)}")
 
     def select(*names: str) -> dict[str, Any]:
-        """Return the given values of some parameters."""
+        """Return the given values of the named parameters, as a dict by name."""
         return {name: given[name] for name in names if name in given}
 
     parts: dict[str, Any] = {
@@ -330,7 +332,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
 
 
 def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[str] = ()) -> None:
-    """Raise an error that lists the options required for the unpublished parameters of a device."""
+    """Raise an error if parameters of a device are unpublished and not given as options; list these options."""
     remedies = {"mass": "--mass", "damping": "--damping (0 if unknown)"}
     flags = [*(remedies[name] for name in device.list_missing(given)), *more]
     if flags:
@@ -338,7 +340,7 @@ def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[
 
 
 def _list_needed(kind: Any) -> list[str]:
-    """Return the required fields of a part."""
+    """Return the names of the fields of a part's class that have no default value."""
     return [item.name for item in fields(kind) if item.default is MISSING]
 
 
@@ -353,12 +355,12 @@ def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
 
 
 def _select_part(given: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the given parameters of one part, by field name."""
+    """Return the parameters of one part from the options, as a dict by field name."""
     return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
 
 
 def make_velocity(given: dict[str, Any]) -> Any:
-    """Return the velocity estimate described by options, given by field name."""
+    """Return the velocity estimate built from the parameters ``given``, a dict by field name."""
     kind = given.pop("kind", None)
     if kind is None:
         low = {"cutoff", "time_constant"} & set(given)
@@ -397,7 +399,7 @@ def find_omitted() -> frozenset[str]:
 
 
 def read_pairs(context: click.Context, option: click.Parameter, pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the values of a repeated option by name; raise an error if a name is repeated."""
+    """Return the values of an option given several times, as a dict by name; raise an error for a repeated name."""
     values: dict[str, Any] = {}
     for name, value in pairs:
         if name in values:
@@ -407,7 +409,7 @@ def read_pairs(context: click.Context, option: click.Parameter, pairs: Iterable[
 
 
 def save_figure(drawn: Any, file: Path) -> str:
-    """Write a figure to a file; return the line to print."""
+    """Write a figure to a file, and return the line that reports its path."""
     from zwidth.figures import save
 
     save(drawn, file.with_suffix(""), (file.suffix[1:],))

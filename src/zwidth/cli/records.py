@@ -35,7 +35,7 @@ _LONG = 2**23  # bytes; size of a log above which a message is printed before it
 
 
 class RecordLoop(NamedTuple):
-    """Control loop of a record, given by options and a scene file."""
+    """Control loop in which a record was measured, from options and a scene file."""
 
     period: float | None  # in s, from the options
     velocity: Velocity | None  # velocity estimate from the options or the file
@@ -47,7 +47,7 @@ class RecordLoop(NamedTuple):
         return self.scene.timing.period if self.period is None and self.scene is not None else self.period
 
     def check_kind(self, rotary: bool) -> None:
-        """Raise an error if a record, the scene of the file and the options belong to different kinds of devices."""
+        """Raise an error if record, scene file and options do not all belong to linear, or all to rotary devices."""
         implied = {"the scene file has": self.scene and self.scene.device.rotary}
         implied |= {f"{flag} has units of": find_kind({flag: text}) for flag, text in get_options_with_kind().items()}
         kinds = ("rotary", "linear") if rotary else ("linear", "rotary")
@@ -57,7 +57,7 @@ class RecordLoop(NamedTuple):
 
 
 def _make_loop(given: dict[str, Any], _: UnitSystem) -> RecordLoop:
-    """Return the loop described by options, given by path, and by a scene file."""
+    """Return the control loop built from the options in ``given`` (by path) and from a scene file."""
     scene = given.pop("scene", None)
     if {"period", "rate"} <= given.keys():
         raise click.UsageError(BOTH_PERIODS)
@@ -78,7 +78,7 @@ def _is_scene(path: Path) -> bool:
 
 
 def loop_options(*, logs: bool) -> Callable[[Command], Command]:
-    """Add the options of period and velocity estimate, and the argument for a scene file.
+    """Return a decorator that adds the options of period and velocity estimate, and the argument of a scene file.
 
     The command receives a `RecordLoop` as ``loop``. With ``logs``, the arguments are logs, one of which may be a scene
     file, and the command receives the paths of the others as ``logs``.
@@ -106,7 +106,7 @@ def loop_options(*, logs: bool) -> Callable[[Command], Command]:
 
 
 def log_options(command: Command) -> Command:
-    """Add the options for the columns of a log, the encoder step and the motor constant."""
+    """Return a command with the options for the columns of a log, the encoder step and the motor constant added."""
     for name, text in reversed(OF_LOGS.items()):
         command = click.option(name_option(name), help=text)(command)
     return command
@@ -115,7 +115,7 @@ def log_options(command: Command) -> Command:
 def read_logs(
     logs: Iterable[Path], loop: RecordLoop, *, resolution: str | None, motor_constant: str | None, **columns: Any
 ) -> list[Any]:
-    """Return the motions of logs; print the names of long logs to the error stream.
+    """Return the recorded motion of each log; print the names of long logs to the error stream.
 
     Args:
         logs: paths of the logs.

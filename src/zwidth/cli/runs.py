@@ -34,7 +34,7 @@ _SECONDS_BETWEEN_LINES = 10.0  # shortest time between two lines of progress, if
 
 
 def _read_size(text: str) -> int:
-    """Parse a memory size such as "512 MiB"; return it in bytes."""
+    """Return a memory size in bytes from a text such as "512 MiB"."""
     match = re.fullmatch(r"(.*?)\s*(B|KiB|MiB|GiB|)", text.strip())
     assert match is not None, "the pattern matches any text"
     size = float(match[1]) * 1024 ** ("B", "KiB", "MiB", "GiB").index(match[2] or "B")
@@ -44,7 +44,7 @@ def _read_size(text: str) -> int:
 
 
 def _read_slice(text: str) -> tuple[str, str]:
-    """Parse "NAME=VALUE"; return name and value as texts."""
+    """Return NAME and VALUE of a text "NAME=VALUE", both as texts."""
     name, _, value = (part.strip() for part in text.partition("="))
     if not name or not value:
         raise ValueError
@@ -52,7 +52,7 @@ def _read_slice(text: str) -> tuple[str, str]:
 
 
 def _read_figure_size(text: str) -> tuple[float, float | None]:
-    """Parse the size of a figure; return width and height in inches. The height is None for a single width in mm."""
+    """Return width and height of a figure in inches from a text; the height is None for a single width in mm."""
     metric = text.strip().endswith("mm")
     width, *rest = (float(part.replace("mm", "")) / (25.4 if metric else 1.0) for part in text.split("x"))
     if not all(1 <= side <= 100 for side in (width, *rest)) or len(rest) != 1 - (metric and not rest):
@@ -101,10 +101,10 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi:
     with _interrupt_on_sigterm() as signals:
         try:
             with reporter() as progress, style_sheet(size=size, dpi=dpi):
-                # The options have the names of the arguments of `zwidth.run`.
+                # Pass the options as arguments, because they have the names of the arguments of `zwidth.run`.
                 result = run_studies(path, progress=progress, **options)
         except KeyboardInterrupt:
-            # Interrupted before the first study began.
+            # Return no result, because the run was interrupted before its first study began.
             result = None
     if result is not None:
         _report_end(result, command)
@@ -279,7 +279,7 @@ def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
 
     Required: a checkout of the project, whose benchmarks/methods it runs, and the extra "test" for the errors.
     """
-    # The benchmarks exist only in a checkout, because a wheel does not contain them.
+    # Find the benchmarks in the checkout, because a wheel does not contain them.
     folder = Path(__file__).parents[3] / "benchmarks"
     if not (folder / "methods").is_dir():
         raise ResourceError(
@@ -329,7 +329,7 @@ def reporter() -> Iterator[Callable[[StudyEvent], None]]:
 
 
 def _lines(event: StudyEvent) -> Iterator[str]:
-    """Yield the lines of a finished study: number, name, kind, run time, number of files, and notes."""
+    """Yield the printed lines of a finished study: number, name, kind, run time, number of files, and notes."""
     result = event.result
     if result is None:
         return
@@ -345,7 +345,7 @@ def _lines(event: StudyEvent) -> Iterator[str]:
 
 
 def _state(progress: Progress) -> str:
-    """Return the speed of a sweep and the estimated remaining time."""
+    """Return a text with the speed of a sweep in points per second and its estimated remaining time."""
     left = progress.seconds_left
     text = f"{plain(progress.rate, 3)} points/s"
     if left == left and left > 0:

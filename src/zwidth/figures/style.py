@@ -100,10 +100,7 @@ def units() -> UnitSystem:
 
 @contextmanager
 def style_sheet(
-    file: Path | None = None,
-    size: Size | None = None,
-    dpi: float | None = None,
-    system: UnitSystem | None = None,
+    file: Path | None = None, size: Size | None = None, dpi: float | None = None, system: UnitSystem | None = None
 ) -> Iterator[None]:
     """Change the settings of figures within the context; arguments that are None keep the current settings.
 
@@ -342,10 +339,7 @@ def figure_of(drawn: AnyAxes | Figure) -> Figure:
 
 
 def save(
-    drawn: AnyAxes | Figure,
-    stem: Path,
-    formats: Sequence[str] = ("png", "svg"),
-    dpi: float | None = None,
+    drawn: AnyAxes | Figure, stem: Path, formats: Sequence[str] = ("png", "svg"), dpi: float | None = None
 ) -> tuple[Path, ...]:
     """Write a figure to one file per format and return their paths; the same figure always has the same bytes.
 

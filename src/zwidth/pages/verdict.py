@@ -54,7 +54,7 @@ MARGINAL_DAMPER = (
 )
 MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
 
-# Requirements on stability in the reference grasps (hands that hold the device), in words.
+# Phrases for the required stability in the reference grasps, that is, with hands that hold the device.
 GRASP_WORDS = {
     "all": "stable in all six reference grasps",
     "soft": "stable in the soft reference grasps",
@@ -63,7 +63,7 @@ GRASP_WORDS = {
 
 
 def spell_device(scene: Scene, omitted: frozenset[str] = frozenset()) -> str:
-    """Return device and timing in words; ``omitted`` contains the names of options that were not given."""
+    """Return a phrase with device and timing; ``omitted`` contains the names of options that were not given."""
     device, timing = scene.device, scene.timing
 
     def name_default(name: str) -> str:
@@ -92,7 +92,7 @@ def format_check(
     diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
-    """Return the lines of `zwidth check` without notes.
+    """Return the printed lines of `zwidth check` without notes: verdict, device, margins and remedies.
 
     ``limits=None`` omits gains and remedies, which take longer. ``hardware`` is the encoder, friction and motor of a
     file in words.
@@ -107,7 +107,8 @@ def format_check(
     lines = [format_line(word, wall_words + (alarm if word == "STABLE" else "")), format_line("device", device_words)]
     lines += [*format_parts(scene), *format_hardware(hardware)]
     lines += [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
-    # A measured response has no poles.
+    # With K = 0, print the stable dampings of a pure damper. Exclude a measured response, whose frequency is NaN
+    # because it has no poles.
     damper = wall.stiffness == 0 and not isnan(verdict.frequency)
     dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
     if word == "MARGINAL":
@@ -132,20 +133,20 @@ def format_check(
 
 
 def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | None) -> str:
-    """Return the lines of `zwidth check` and its notes as one folded text without color."""
+    """Return the printed lines and notes of `zwidth check` as one text, wrapped and without colors."""
     lines = [*format_check(scene, verdict, limits), *(format_line("note", note) for note in list_notes(scene))]
     return "\n".join(wrap_lines(lines))
 
 
 def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
-    """Return the stable intervals of K at the B of the wall, and of B at its K, in words."""
+    """Return a phrase with the stable intervals of K at the B of the wall, and of B at its K."""
     units = verdict.unit_system
     rooms = (("K", verdict.stable_stiffness, units["N/m"], "B"), ("B", dampings, units["N s/m"], "K"))
     return "; ".join(_spell_intervals(*room) for room in rooms)
 
 
 def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> str:
-    """Return the stable intervals of K or B, ``name``, in words."""
+    """Return a phrase with the stable intervals of the parameter ``name`` (K or B) if the ``other`` one is fixed."""
     if not intervals:
         return f"no stable {name} at this {other}"
     spelled = []
@@ -158,7 +159,7 @@ def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> 
 
 
 def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]:
-    """Return lines with the stiffest stable wall of the device and the share of its K used by this wall."""
+    """Return printed lines with K_max and its wall, and the percentage of K_max that the wall of the scene uses."""
     if not isfinite(verdict.stiffness_max):
         none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
         return [format_line("K_max", none)]
@@ -206,7 +207,7 @@ def format_decay(verdict: Assessment) -> list[str]:
 
 
 def spell_passivity(scene: Scene, verdict: Assessment) -> str:
-    """Return the passivity of a wall in words; with a coupling the condition is sufficient but not necessary."""
+    """Return a phrase on the passivity of a wall; with a coupling the condition is sufficient but not necessary."""
     stiffness, margin = scene.wall.stiffness, verdict.passivity_margin
     if verdict.passive is None:
         return f"not known {find_unsupported_reason(**vars(scene.device)).partition(':')[0]}"
@@ -225,7 +226,7 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
 
 
 def format_gains(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:
-    """Return a table of improvements of a device and their gains; small gains are omitted unless ``verbose``."""
+    """Return the lines of a table of improvements of a device and their gains; ``verbose`` includes small gains."""
     shown = [limit for limit in limits if isfinite(limit.gain) and (verbose or limit.gain > NOTEWORTHY)]
     if not shown:
         return []
@@ -247,7 +248,7 @@ def format_recommendation(
     diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
-    """Return the lines of `zwidth recommend` without notes; ``hardware`` as in `format_check`.
+    """Return the printed lines of `zwidth recommend` without notes; ``hardware`` is defined as in `format_check`.
 
     ``diagnosis`` is that of the recommended wall.
     """

@@ -37,17 +37,18 @@ COLORS = {"STABLE": "green", "SET": "green", "UNSTABLE": "red", "NO WALL": "red"
 COLORS |= dict.fromkeys(("MARGINAL", "UNDECIDED", "CAUTION"), "yellow")
 _NARROW = 60  # smallest width with a separate column for labels
 _COLUMN = re.compile(r" {2,}")
-# Spaces at which lines do not break: within quantities such as "B = 3 N s/m", and some others, which is harmless.
+# Pattern of spaces at which lines must not break: those within quantities such as "B = 3 N s/m". It also matches some
+# other spaces, which is harmless.
 _NO_BREAK = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
 
 
 def format_row(label: str, text: str) -> str:
-    """Return a line of a printed result with a long label."""
+    """Return a printed line: a label in a wide column for long labels, and a text."""
     return f"{label:<20}  {text}"
 
 
 def format_line(label: str, text: str) -> str:
-    """Return a line of a printed result with its label."""
+    """Return a printed line: a label in a narrow column of `LABEL` characters, and a text."""
     return f"{label:<{LABEL - 1}} {text}"
 
 
@@ -57,7 +58,7 @@ def print_json(result: Any) -> None:
 
 
 def wrap_lines(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) -> Iterator[str]:
-    """Yield lines wrapped to a width, continuation lines indented; no break separates a number from its unit.
+    """Yield lines wrapped to a width, with continuation lines indented and no break between a number and its unit.
 
     A narrow width has no separate column for labels, because the text would wrap after every word.
     """
@@ -71,7 +72,7 @@ def wrap_lines(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) ->
 
 
 def print_lines(lines: Iterable[str], indent: int = 24) -> None:
-    """Print lines as wide as ``COLUMNS`` or the terminal, at most 100 columns, with colored labels."""
+    """Print lines, wrapped to ``COLUMNS`` or the width of the terminal, at most 100 columns, with colored labels."""
     width = shutil.get_terminal_size((WIDTH, 24)).columns
     for each in wrap_lines(lines, indent, min(width, WIDTH)):
         word = each[: LABEL - 1].rstrip()
@@ -79,7 +80,7 @@ def print_lines(lines: Iterable[str], indent: int = 24) -> None:
 
 
 def print_result(result: Any, lines: Iterable[str], as_json: bool, indent: int = 24) -> None:
-    """Print a result as JSON, or its lines."""
+    """Print a result as JSON if ``as_json`` is True, otherwise print its lines."""
     if as_json:
         print_json(result)
     else:
@@ -87,7 +88,7 @@ def print_result(result: Any, lines: Iterable[str], as_json: bool, indent: int =
 
 
 def format_parts(scene: Scene) -> list[str]:
-    """Return a line for each part of a scene apart from the rigid device, in order from the motor outwards."""
+    """Return a printed line for each part of a scene except the rigid device, in order from the motor to the hand."""
     lines = []
     velocity = type(scene.velocity).__name__
     parts, values = find_parts(scene), scene.parameters()
@@ -114,19 +115,19 @@ def get_unit(path: str) -> str:
 
 
 def name_verdict(verdict: Assessment) -> str:
-    """Return the verdict in one word."""
+    """Return the verdict as one word: undecided, marginal, stable or UNSTABLE."""
     if verdict.stable is None:
         return "undecided"
     return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
 
 
 def spell_radius(radius: float) -> str:
-    """Return a spectral radius in words, with six decimals unless it is very large."""
+    """Return the spectral radius as text with six decimals, or in fewer digits if it is very large."""
     return f"spectral radius {f'{radius:.6f}' if radius < 1e4 else plain(radius)}"
 
 
 def spell_decay(constant: float, frequency: float) -> str:
-    """Return the decay of the dominant pole in words, from its time constant in s (negative: growth) and frequency."""
+    """Return a phrase on the dominant pole, from its time constant in s (negative: growth) and its frequency in Hz."""
     swing = f", oscillating at {with_unit(frequency, 'Hz')}" if frequency else ""
     if isnan(constant):
         return f"has a rate below numerical resolution, near the boundary or poles of equal magnitude{swing}"
@@ -153,7 +154,7 @@ def list_period_notes(scene: Scene) -> list[str]:
 
 
 def list_notes(scene: Scene) -> list[str]:
-    """Return notes on a scene in addition to its verdict."""
+    """Return the notes on a scene: undecided walls, period of the estimate, islands of stability, safe limit."""
     from zwidth.scenes.assessment import describe_islands
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
@@ -161,7 +162,7 @@ def list_notes(scene: Scene) -> list[str]:
 
 
 def compare_with_limit(scene: Scene) -> list[str]:
-    """Return a warning if the wall exceeds the scene's safe limit, and the warnings that the limit carries."""
+    """Return the warnings of the scene's safe limit, preceded by a caution if the wall exceeds this limit."""
     limit = scene.safe_limit
     return [] if limit is None or isinstance(scene.wall, NoWall) else [*list_limit_cautions(scene), *limit.warnings]
 
@@ -184,28 +185,28 @@ def spell_diagnosis(diagnosis: Diagnosis | None) -> list[tuple[str, str]]:
 
 
 def spell_alarm(diagnosis: Diagnosis | None, *alarms: str) -> str:
-    """Return the words with which a headline points to cautions: an oscillation, if diagnosed, and ``alarms``."""
+    """Return the text appended to a headline to announce cautions: a diagnosed oscillation, if any, and ``alarms``."""
     oscillation = [] if diagnosis is None or diagnosis.cause == "none" else [diagnosis.word.lower()]
     words = [*oscillation, *filter(None, alarms)]
     return f"; CAUTION: {', '.join(words)}" if words else ""
 
 
 def format_diagnosis(diagnosis: Diagnosis | None) -> list[str]:
-    """Return lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+    """Return printed lines with the result of a diagnosis and, if the device oscillates, its remedies."""
     return [format_line(*each) for each in spell_diagnosis(diagnosis)]
 
 
 def format_hardware(hardware: str) -> list[str]:
-    """Return the line with encoder, friction and motor of a file, in words; no line for an empty text."""
+    """Return the printed line with the hardware of a file, a phrase; an empty list if the phrase is empty."""
     return [format_line("hardware", hardware)] if hardware else []
 
 
 def list_omission_cautions(scene: Scene, omitted: Collection[str]) -> list[str]:
-    """Return the cautions about a delay and a friction that are 0 only because they were not given.
+    """Return cautions if the delay or the friction is 0 only because it was not given.
 
     ``omitted`` contains the names of options that were not given.
     """
-    # Omit both for a measured response, because it usually contains the delay, and it cannot be simulated.
+    # Return no caution for a measured response, because it usually contains the delay, and it cannot be simulated.
     if isinstance(scene.device, MeasuredDevice):
         return []
     cautions = {
@@ -231,27 +232,28 @@ class Slope(NamedTuple):
     words: str  # effect of a small change
 
     def line(self) -> str:
-        """Return the derivative as a printed line."""
+        """Return a printed line with the derivative, its unit and the effect of a small change."""
         name = "inertia" if self.name == "mass" and self.unit.endswith("kg m^2") else self.name
         return format_row(f"dK_max/d({name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return derivative and unit for JSON."""
+        """Return a dict of the derivative and its unit for JSON output."""
         return {"value": self.value, "unit": self.unit}
 
 
 def list_slopes(scene: Scene) -> list[Slope]:
-    """Return the sensitivity of the maximum stiffness to each parameter of a scene, with its effect in words."""
+    """Return the derivatives of K_max with respect to all parameters of a scene, each with its effect in words."""
     if isinstance(scene.device, MeasuredDevice):
         return []
     per, values = scene.sensitivities().per, scene.parameters()
     slopes, system = [], scene.unit_system
     for path, slope in per.items():
         unit, value = system[get_unit(path)], float(slope)
-        # The scale of a delay is the period, because a delay may be 0; that of a linear damping is 1 N s/m.
+        # Choose a scale: for a delay the period, because the delay may be 0; for a linear damping 1 N s/m; else the
+        # value.
         size = scene.timing.period if path == "delay" else values[path]
         by_one = not size or unit == "N s/m"
-        # The step is the power of ten nearest to one percent of the scale.
+        # Choose the power of ten nearest to one percent of the scale as the step.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
         effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
         if isfinite(value) and (change := value * step):

@@ -28,8 +28,8 @@ from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
 from zwidth.words.unit_system import LINEAR, UnitSystem
 from zwidth.words.xp import compute_concretely, is_traced
 
-# Estimated memory of one call of `simulate`, in bytes. JITTER_BYTES and DRAWN_BYTES count only for the simulations that
-# run at the same time.
+# Estimated memory of one call of `simulate`, in bytes. The estimate includes JITTER_BYTES and DRAWN_BYTES only for the
+# simulations that run at the same time.
 RECORDED_BYTES = 2 * 14 * 8  # memory per recorded instant: 14 float64 values, twice for the conversion to SI units
 JITTER_BYTES = 20 * 8  # memory per instant for the durations between jittered samples
 DRAWN_BYTES = 4 * 8  # memory per period for noise, and again for external forces
@@ -45,7 +45,7 @@ LIMITS = ("max_force", "max_rate")  # limits of the motor; the only arguments th
 
 
 def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
-    """Return the distinct scenes, and an array with the index of the scene of each simulation."""
+    """Return the distinct scenes as a list, and an array with the index of the scene of each simulation."""
     listed = isinstance(scenes, Iterable) and not isinstance(scenes, np.ndarray)
     array = np.array(list(scenes) if listed else scenes, object)
     numbers: dict[int, int] = {}
@@ -64,14 +64,14 @@ def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
 
 
 def find_system(scenes: list[Any]) -> UnitSystem:
-    """Return the unit system of the scenes; raise `InputError` if some devices are rotary and others linear."""
+    """Return the unit system of the scenes, linear or rotary; raise `InputError` if they have different ones."""
     if len(systems := {scene.device.unit_system for scene in scenes}) > 1:
         raise InputError("scenes: got both rotary and linear devices; simulate one kind per call")
     return systems.pop() if systems else LINEAR
 
 
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments with ``start_position`` and ``start_velocity`` split into one argument per body.
+    """Return all arguments by name, with ``start_position`` and ``start_velocity`` split into one per body.
 
     An example of a new argument is "start_position.tip_position". A body for which the user specifies no initial value
     has that of the device.
@@ -88,14 +88,12 @@ def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
 
 
 def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, push: Any, periods: int) -> Any:
-    """Return the external force on the device, averaged over each period, including the force of the moving hand.
+    """Return the external force on the device in N, averaged over each period, plus the force of the moving hand.
 
     Args:
         scenes: distinct scenes, each with a rigid operator.
         which: index of the scene of each simulation.
-        hand: recorded positions of the hand, (..., periods + 1); it moves the operator's spring and damper.
-        push: other external force, (..., periods), or None.
-        periods: number of sampling periods.
+        hand: recorded positions of the hand, the far end of the operator's spring and damper, (..., periods + 1).
     """
     places = _read_history("hand_history", hand, periods + 1, find_system(scenes)["m"])
     for scene in scenes:
@@ -112,7 +110,7 @@ def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, push: Any, per
 
 
 def _read_history(name: str, values: Any, length: int, unit: str) -> np.ndarray:
-    """Return a history as float64 in SI units; raise `InputError` unless its last axis has the required length."""
+    """Return a history as a float64 array in SI units; raise `InputError` unless its last axis has the given length."""
     history = as_float64(name, read_texts(name, values, unit))
     if not history.ndim or history.shape[-1] != length:
         raise InputError(f"{name}: got an array of shape {history.shape}; its last axis needs {length} values")
@@ -122,7 +120,7 @@ def _read_history(name: str, values: Any, length: int, unit: str) -> np.ndarray:
 
 
 def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
-    """Return a force law traced by JAX.
+    """Return a force law of the user together with the program that JAX traces from it.
 
     Raises:
         InputError: stiffness or damping is also specified, JAX cannot trace the law, or the law keeps values between
@@ -130,7 +128,7 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
     """
     if stiffness is not None or virtual_damping is not None:
         raise InputError("force: got a law and a stiffness or damping; include the wall in the law, or remove one")
-    # Import JAX only here, because importing zwidth must not load it.
+    # Import JAX inside this function, because importing zwidth must not load JAX.
     import jax
 
     name, traces = getattr(force, "__name__", repr(force)), []
@@ -141,9 +139,11 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
     with compute_concretely(), jax.numpy_rank_promotion("allow"):
         try:
             hash(force)
-            # Trace twice, because a law that keeps values between calls changes its program or fails the second time.
+            # Trace the law twice, because a law that keeps values between calls yields a different program the second
+            # time, or fails.
             for _ in range(2):
-                # Wrap the law in a new function, because JAX would reuse the cached trace of the same function.
+                # Wrap the law in a new function for each trace, because JAX would reuse the cached trace of the same
+                # function.
                 trace = jax.jit(lambda *args: force(*args)).trace(*[jax.ShapeDtypeStruct((2,), float)] * 3)
                 traces.append((trace.lower().as_text(), len(trace.jaxpr.in_avals), trace.out_info))
         except Exception as error:
@@ -155,7 +155,8 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
                 "jax.numpy, jnp.where in place of if"
             ) from error
     program, inputs, result = traces[0]
-    # JAX passes a value that the law kept from an earlier trace as a fourth input.
+    # Reject a law with a fourth input, because JAX passes a value that the law kept from an earlier trace as such an
+    # input.
     if traces[1] != traces[0] or inputs != 3:
         raise memory
     kind = getattr(result, "dtype", np.dtype(object)).kind
@@ -167,7 +168,7 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
 def read_arguments(
     scenes: list[Any], which: np.ndarray, given: dict[str, Any], seed: Any, history: Any, periods: int
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    """Return the checked arguments of all simulations.
+    """Return the arguments of all simulations in SI units, checked and broadcast to the batch.
 
     Args:
         scenes: distinct scenes.
@@ -253,17 +254,17 @@ def check_memory(numbers: dict[str, np.ndarray], settings: Settings) -> None:
 
 
 def _unit(name: str) -> str:
-    """Return the unit of an argument; its name may end with a body, as in "start_position.tip_position"."""
+    """Return the SI unit of an argument; its name may end with a body, as in "start_position.tip_position"."""
     return ARGUMENTS[name.partition(".")[0]][0]
 
 
 def _spell(name: str) -> str:
-    """Return an argument's name as users write it: "start_position" in place of "start_position.position"."""
+    """Return the name of an argument as users write it, "start_position" for "start_position.position"."""
     return name.removesuffix(".position")
 
 
 def _check(name: str, array: np.ndarray, arrays: dict[str, np.ndarray], period: Any) -> tuple[Any, str]:
-    """Return a mask of the valid values of an argument, and its allowed range in words.
+    """Return a mask of the valid values of an argument, and a phrase with its allowed range for messages.
 
     Args:
         name: name of the argument.

@@ -38,17 +38,18 @@ GROUP = 1 << 10  # simulations per compiled call: enough for vector units, few e
 
 
 def find_structure(scene: Parts) -> tuple[Any, ...]:
-    """Return the properties that must be equal for scenes to share a compiled program."""
+    """Return the structure of a scene, a tuple that is equal for scenes that can share a compiled program."""
     sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
     orders = len(scene.device.modes), 0 if scene.device.actuator is None else scene.device.actuator.order
-    # Linear systems have no common structure, so compile a separate program for each system and period.
+    # Include the system and its period in the structure of a `LinearDevice`, because each of them needs a separate
+    # program.
     system = None if isinstance(scene.device, Device) else (scene.device, scene.timing.period)
     longest = scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
     return *name_bodies(scene), sensor, *orders, longest, system
 
 
 def name_bodies(scene: Parts) -> tuple[str, ...]:
-    """Return the names of the fields of `Motion` that contain the positions of the bodies."""
+    """Return the fields of `Motion` with the positions of the bodies: position and, if present, tip and hand."""
     tip = ("tip_position",) if scene.device.coupling is not None else ()
     hand = ("hand_position",) if scene.operator is not None and not scene.operator.rigid else ()
     return "position", *tip, *hand
@@ -69,7 +70,8 @@ class Model(NamedTuple):
 def build_model(scene: Any) -> Model:
     """Build the simulation model of a scene."""
     estimate, period, mass = scene.velocity, float(scene.timing.period), float(scene.mass)
-    # FOAW is not a linear filter, so build the chain with another estimate and keep the FOAW parameters separately.
+    # For FOAW, build the chain with another velocity estimate and keep the FOAW parameters separately, because FOAW is
+    # not a linear filter.
     adapts = isinstance(estimate, FOAW)
     chain: Any = build_chain(replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene)
     fraction = float(chain.d - chain.n_delay)
@@ -81,7 +83,7 @@ def build_model(scene: Any) -> Model:
 def run_scenes(
     scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray], settings: Settings
 ) -> dict[str, np.ndarray]:
-    """Simulate scenes of equal structure, in groups of at most `GROUP` simulations.
+    """Simulate scenes of equal structure, divided into groups of at most `GROUP` simulations.
 
     Args:
         scenes: distinct scenes.
@@ -103,8 +105,8 @@ def run_scenes(
         record=settings.record,
         law=settings.law,
     )
-    # Lengths of the rings of positions and of commands. Use a common minimum length, because each length needs a
-    # compilation, and a ring that is longer than necessary costs no time.
+    # Compute the lengths of the rings of positions and of commands. Use at least the same minimum length in all calls,
+    # because each length needs a compilation, and a ring that is longer than necessary costs no time.
     rings = (
         round_up(max(3, *(model.window for model in models)) + 1),
         round_up(max(5, *(model.late for model in models)) + 3),
@@ -114,7 +116,7 @@ def run_scenes(
     unknown = set() if isinstance(scenes[0].device, Device) else OF_ENERGY
 
     def run(rows: np.ndarray) -> dict[str, np.ndarray]:
-        # Import the engine only here, because it loads JAX, which importing zwidth must not do.
+        # Import the engine inside this function, because it loads JAX, which importing zwidth must not do.
         from zwidth.simulation.engine import run_batch
 
         used, scene_of = np.unique(which[rows], return_inverse=True)
@@ -127,10 +129,10 @@ def run_scenes(
         return columns | {name: np.full_like(columns[name], np.nan) for name in unknown & columns.keys()}
 
     size = min(GROUP, 1 << (count - 1).bit_length())
-    # Fill the last group by repeating the last simulation, because each group size needs a compilation.
+    # Repeat the last simulation until the last group is full, because each group size needs a compilation.
     groups = [np.minimum(np.arange(first, first + size), count - 1) for first in range(0, count, size)]
-    # Run the first group alone, so that it compiles the program. Threads then run the other groups in parallel, because
-    # JAX releases the interpreter lock.
+    # Run the first group before all others, so that it compiles the program. Threads then run the other groups in
+    # parallel, because JAX releases the interpreter lock.
     results = [run(groups[0]), *run_in_threads(run, groups[1:])]
     return {name: np.concatenate([each[name] for each in results])[:count] for name in results[0]}
 
@@ -143,7 +145,7 @@ def build_batch(
     options: Options,
     names: tuple[str, ...],
 ) -> tuple[Parameters, ExternalInputs]:
-    """Build the normalized parameters and external inputs of one group of simulations.
+    """Return the normalized parameters and the external inputs of one group of simulations.
 
     Args:
         models: models of the scenes in the group.
@@ -215,7 +217,7 @@ def draw_noise(seeds: np.ndarray, sizes: np.ndarray, periods: int) -> np.ndarray
 def draw_instants(
     seeds: np.ndarray, most: np.ndarray, whole: np.ndarray, fractions: np.ndarray, settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw the jittered instants of the samples, and compute the durations of constant force (simulation.md, T3).
+    """Draw the jittered sampling instants, and compute the durations of the pieces with constant force (T3).
 
     Args:
         seeds: seed of each simulation; equal seeds yield equal jitter.
@@ -237,8 +239,8 @@ def draw_instants(
     k = np.arange(periods)[:, None]
     effective = []
     for age in (1, 0, -1):
-        # Compute the time within the period at which the command of this age takes effect. Clip the index of its
-        # sample, because no command exists before the first sample.
+        # Compute the time within the period at which a command takes effect, for each age (number of samples since it
+        # was computed). Clip the index of its sample, because no command exists before the first sample.
         sample = np.clip(k - whole - age, 0, periods)
         effective.append(fractions - age + np.take_along_axis(late, sample, 0) - late[:-1])
     durations = cut_period(1.0 + np.diff(late, axis=0), effective, settings.substeps)

@@ -22,12 +22,12 @@ WORDS = {
 
 
 def describe_ending(motion: Motion, index: Any = ()) -> str:
-    """Return the observed behavior of a recorded motion in words; ``index`` selects one entry of a batch."""
+    """Return a phrase for the observed behavior of a recorded motion; ``index`` selects one entry of a batch."""
     kind = MotionKind(int(motion.outcome[index]))
     if kind in (MotionKind.DIVERGED, MotionKind.INVALID):
         return WORDS[kind]
     time, contact = motion.time if motion.time.ndim == 1 else motion.time[index], motion.contact[index]
-    # Extend the time by one step, because the last recorded instant precedes the end of the simulation by one step.
+    # Add one step to the last recorded instant, because it precedes the end of the simulation by one step.
     duration = with_unit(float(time[-1]) * time.size / max(time.size - 1, 1), "s", 3)
     hits = np.flatnonzero(contact[1:] & ~contact[:-1]) + 1
     if not contact[-max(contact.size // 4, 1) :].any():

@@ -26,7 +26,8 @@ from zwidth.words.xp import filter_options
 
 BLOCK = 128  # number of sampling periods that one call of the compiled program simulates
 SEGMENTS = 6  # number of equal segments of the tail; even, because the trend compares the two halves of the tail
-# Factor on the noise bound of FOAW, because rounding errors must not exclude deviations of exactly one encoder count.
+# Factor on the noise bound of FOAW, slightly above 1, so that deviations of exactly one encoder count are admissible in
+# spite of rounding errors.
 SLACK = 1.0 + 1e-9
 # Use XLA's older loop emitters without splitting, because they halve the compile time at the same speed. Require full
 # optimization even if XLA_FLAGS sets a lower level, because a simulation runs for thousands of periods.
@@ -38,7 +39,7 @@ COMPILER_OPTIONS = (
 
 
 class Controller(NamedTuple):
-    """State of the control program between two samples."""
+    """State of the control program between two samples: previous measurements, commands and filter state."""
 
     positions: Array  # ring of measured positions, (length, batch)
     filtered: Array  # state of the velocity filter, (order, batch)
@@ -56,7 +57,7 @@ class Reading(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """Statistics of the motion up to the current sample.
+    """Statistics of the motion from the start to the current sample.
 
     Index 0 of the first axis of `far` and `turns` is the time before the tail; the others are the segments of the tail.
     """
@@ -70,7 +71,7 @@ class Summary(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of the simulations at a sample."""
+    """State of all simulations of the batch at a sample."""
 
     body: BodyState  # state of the bodies
     controller: Controller  # state of the control program
@@ -88,12 +89,12 @@ class PeriodInputs(NamedTuple):
 
 
 def _write(rows: Array, row: Array, index: Array) -> Array:
-    """Return an array in which the row at an index (first axis) is replaced."""
+    """Return a copy of an array in which one row (index along the first axis) is replaced."""
     return jax.lax.dynamic_update_index_in_dim(rows, row, index, 0, allow_negative_indices=False)
 
 
 def look_back(ring: Array, k: Array, back: Array) -> Array:
-    """Return the entry that was written into a ring ``back`` samples before sample k.
+    """Return the entry of a ring that was written ``back`` samples before sample k.
 
     ``back`` has the shape (batch,), or (1,) if it is equal for all simulations. The length of a ring is a power of 2.
     """
@@ -144,7 +145,7 @@ def control(
         force = -(params.alpha * measured + params.beta * velocity)
     else:
         force = options.law(measured, velocity / params.period, k * params.period) / params.force
-        # Count a force law as in contact if its force is nonzero, because a law has no surface.
+        # With a force law, count a nonzero force as contact, because a law has no surface.
         touching &= force != 0
     force = jnp.where(touching, force, 0.0)
     force = jnp.where(params.pulling, force, jnp.minimum(force, 0.0))
@@ -179,7 +180,7 @@ def _adapt_window(ring: Array, k: Array, newest: Array, bound: Array, longest: i
 
 
 def stored_energy(params: Parameters, x: Array) -> Array:
-    """Return the kinetic and elastic energy of all bodies in the state ``x``."""
+    """Return the sum of the kinetic and the elastic energies of all bodies in the state ``x``."""
     return dot(x, jnp.stack([dot(row, x) for row in params.energy]))
 
 
@@ -193,7 +194,7 @@ def propagate(
     indices: tuple[Array | int, Array | int],
     time: Array,
 ) -> tuple[BodyState, Array]:
-    """Propagate the bodies over one piece of a period, with constant forces, and update the energies.
+    """Propagate the bodies over one piece with constant forces, and add the work and the losses to the energies.
 
     Args:
         params: parameters of the simulations.
@@ -225,21 +226,21 @@ def propagate(
     if direct:
         given = force * dot(params.place[0], after.x - body.x)
     else:
-        # Compute the work of the wall from the energy balance, because with an actuator or modes the force on the
+        # Compute the work of the wall from the energy balance, because with an actuator or modes its force on the
         # bodies varies within the piece.
         given = stored_energy(params, after.x) - stored_energy(params, body.x) + lost + rubbed - pushed
     return after, work + jnp.stack([given, pushed, lost, rubbed])
 
 
 def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, int]) -> State:
-    """Return the state before the first sample, reached by uniform motion without commands and with modes at rest (T2).
+    """Return the state before the first sample: uniform motion so far, no commands, and modes at rest (T2).
 
     ``rings`` contains the lengths of the rings of positions and of commands.
     """
     count, size = params.place.shape[:2]
     body = np.zeros((size, inputs.positions.shape[1]))
-    # Set only the coordinates of the bodies and leave the modes at 0. Links between bodies at equal positions are then
-    # unstretched.
+    # Set the coordinates of the bodies and leave those of the modes at 0. Links between bodies at equal positions are
+    # then unstretched.
     inverse, first = np.linalg.inv(params.place[:, :count, 0]), np.argmax(params.motion[0, :, 0])
     body[:count], body[first : first + count] = inverse @ inputs.positions, inverse @ inputs.velocities
     x, v = body[0], body[first]
@@ -255,9 +256,9 @@ def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, 
 
 
 def _settle(estimator: Any, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return the stationary state of the velocity filter in uniform motion, at position x with velocity v per period.
+    """Return the stationary state of the velocity filter for uniform motion at position x, with velocity v per period.
 
-    The input of the filter is constant if the filter follows a difference over a window; otherwise it is a ramp.
+    If the filter follows a position difference over a window, its input is constant; otherwise the input is a ramp.
     """
     A, B, window = (np.asarray(part) for part in (estimator.A, estimator.B, estimator.window))
     level, slope = np.where(window > 0, v, x), np.where(window > 0, 0.0, v)
@@ -269,7 +270,7 @@ def _settle(estimator: Any, x: np.ndarray, v: np.ndarray) -> np.ndarray:
 def _simulate_period(
     params: Parameters, options: Options, ends: Array, state: State, inputs: PeriodInputs
 ) -> tuple[State, Any]:
-    """Simulate one period.
+    """Simulate one sampling period: run the control program at its start and propagate the bodies to its end.
 
     Args:
         params: parameters of the simulations.
@@ -282,8 +283,9 @@ def _simulate_period(
         The state at the next sample, and the reading and the frames of the period; None if nothing is recorded.
     """
     controller, reading = control(params, options, state.controller, inputs.k, state.body.x[0] + inputs.noise)
-    # List the commands that may act before the next sample, in the order in which they take effect, by their age: the
-    # number of samples by which a command precedes that of sample k - late, where late is the integer delay.
+    # List the commands that may act before the next sample, in the order in which they take effect. Each is selected by
+    # its age, the number of samples by which it precedes the command of sample k - late, where late is the integer
+    # delay.
     ages = {1: (0,), 2: (1, 0), 4: (2, 1, 0, -1)}[options.pieces]
     forces = [look_back(controller.commands, inputs.k, params.late + age) for age in ages]
     durations = inputs.durations if options.jitter else params.durations
@@ -291,8 +293,8 @@ def _simulate_period(
     def substep(carry: Any, j: Any) -> Any:
         (body, work), frame, lasting = carry, None, read(durations, j)
         if options.record:
-            # Record the force of the first piece with a positive duration, because forces of pieces without duration
-            # never act.
+            # Record the force of the first piece whose duration is positive, because a force over a piece without
+            # duration has no effect.
             acting = forces[-1]
             for piece in reversed(range(options.pieces - 1)):
                 acting = jnp.where(lasting[piece] > 0, forces[piece], acting)
@@ -305,7 +307,8 @@ def _simulate_period(
             body, work = carry
             return propagate(params, options, body, work, force, inputs.push, (j, number), read(lasting, number)), None
 
-        # Loop over the pieces by `scan` with friction or jitter, so that the long program of a piece is compiled once.
+        # With friction or jitter, loop over the pieces by `scan`, so that the long program of a piece is compiled only
+        # once.
         if options.friction or options.jitter:
             return jax.lax.scan(one, carry, (np.arange(options.pieces), jnp.stack(forces)))[0], frame
         for piece in enumerate(forces):
@@ -325,7 +328,7 @@ def _simulate_period(
 def _summarize(
     params: Parameters, state: State, reading: Reading, body: BodyState, work: Array, k: Array, ends: Array
 ) -> Summary:
-    """Return the statistics updated by period k.
+    """Return the statistics of the motion, updated by the motion during period k.
 
     Args:
         params: parameters of the simulations.
@@ -377,7 +380,7 @@ def compile_block(options: Options) -> Any:
 def run_batch(
     params: Parameters, options: Options, settings: Settings, inputs: ExternalInputs, rings: tuple[int, int]
 ) -> tuple[State, np.ndarray | None, np.ndarray | None]:
-    """Simulate a batch.
+    """Simulate a batch block by block, from the initial state to the last period.
 
     Args:
         params: parameters of the simulations.
@@ -391,7 +394,7 @@ def run_batch(
         batch). Readings and frames are None if nothing is recorded.
     """
     edges = settings.periods - settings.tail * np.arange(SEGMENTS, -1, -1) // SEGMENTS
-    # Transfer all arrays to JAX in one call, because separate transfers would take as long as the simulation.
+    # Transfer all arrays to JAX in one call, because separate transfers would take as long as the simulation itself.
     start: Any = initial_state(params, inputs, rings)
     state, placed, ends = jax.device_put((start, params, edges))
     recorded: Any = []
@@ -402,7 +405,8 @@ def run_batch(
             params.push[None] + _select_block(inputs.history, first, (1,)),
             _select_block(inputs.durations, first, (0, 0, 1)),
         )
-        # Allow rank promotion even if the caller forbids it, because arrays without a batch axis broadcast by design.
+        # Allow rank promotion even if the caller's settings of JAX forbid it, because arrays without a batch axis must
+        # broadcast.
         with jax.numpy_rank_promotion("allow"):
             state, block_records = compile_block(options)(placed, ends, state, block)
         if options.record:
@@ -415,7 +419,7 @@ def run_batch(
 
 
 def _select_block(values: np.ndarray | None, first: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the values of the block of periods that begins at ``first``.
+    """Return the values of the periods in one block; ``first`` is the index of its first period.
 
     Args:
         values: values per period along the first axis; None if all are 0.

@@ -20,7 +20,8 @@ from zwidth.simulation.flow import DIGITS, Flow, Mechanics, flow
 from zwidth.words.errors import InputError
 from zwidth.words.types import Array
 
-# Longest step with friction, as a phase of the fastest motion in rad; a longer step could hide two events (T5).
+# Longest step with friction: the angle in rad by which the fastest motion advances. A longer step could contain two
+# events (T5).
 LONGEST_ANGLE = 0.25
 MOST_STEPS = 256  # largest number of steps per period with friction, to limit the run time
 
@@ -31,7 +32,7 @@ s. All arguments are JAX arrays with one value per simulation."""
 
 
 class TracedLaw(NamedTuple):
-    """Force law, and the program that JAX traces from it."""
+    """Force law of the user, together with the program that JAX traces from it."""
 
     force: Law  # function of the user
     program: str  # text of the traced program, so that laws with different constants do not share a compiled block
@@ -41,7 +42,7 @@ class TracedLaw(NamedTuple):
 
 
 class Options(NamedTuple):
-    """Structure of the compiled program."""
+    """Options that determine the compiled program of a simulation."""
 
     substeps: int  # number of substeps per period
     pieces: int  # number of pieces per substep, that is, of different forces within it
@@ -53,7 +54,7 @@ class Options(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """Settings that all simulations of a batch share."""
+    """Settings that all simulations of a batch share: lengths, kind of contact and force law."""
 
     periods: int  # number of sampling periods
     substeps: int  # number of substeps per period
@@ -64,7 +65,7 @@ class Settings(NamedTuple):
 
 
 class ExternalInputs(NamedTuple):
-    """Initial state, external forces and random numbers in normalized units, and these units in SI."""
+    """Initial state, external forces and random numbers in normalized units, and the values of these units in SI."""
 
     positions: np.ndarray  # initial positions, (bodies, batch)
     velocities: np.ndarray  # initial velocities, (bodies, batch)
@@ -77,7 +78,7 @@ class ExternalInputs(NamedTuple):
 
 
 class Motor(NamedTuple):
-    """Limits of the motor (infinite if it has none) and its dry friction (0 if it has none)."""
+    """Limits of the motor (infinite without limits) and dry friction of the first body (0 without friction)."""
 
     max_force: Array  # largest magnitude of the command
     max_rate: Array  # largest change of the command per period
@@ -97,7 +98,7 @@ class Estimator(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """Parameters of the simulations of a batch."""
+    """Parameters of the simulations of a batch, in the units of the module."""
 
     alpha: Array  # normalized stiffness
     beta: Array  # normalized virtual damping
@@ -115,15 +116,17 @@ class Parameters(NamedTuple):
     motion: Array  # rows of the velocities of the bodies, (bodies, n, batch)
     energy: Array  # quadratic form in x of the kinetic and elastic energy, (n, n, batch)
     durations: Array  # durations of the pieces without jitter, (substeps, pieces, batch)
-    # Flows over these durations, (1 or 2, substeps, pieces, ..., batch): slipping and, with friction, held.
+    # Flows over the durations above, (1 or 2, substeps, pieces, ..., batch): while the first body slips and, with
+    # friction, while it is held.
     pieces: Flow
-    # Flows over the binary digits of time, (1 or 2, DIGITS, ..., batch): slipping and, with friction, held.
+    # Flows over the binary digits of time, (1 or 2, DIGITS, ..., batch): while the first body slips and, with friction,
+    # while it is held.
     digits: Flow
     longest: Array  # longest step with friction, in periods
 
 
 def spread_scenes(parts: Any, which: np.ndarray) -> Any:
-    """Return values per scene as values per simulation.
+    """Return an array with one value per simulation, from an array with one value per scene.
 
     Args:
         parts: array whose first axis is the scene, or a named tuple of such arrays.
@@ -139,17 +142,17 @@ def spread_scenes(parts: Any, which: np.ndarray) -> Any:
 
 
 def round_up(size: int) -> int:
-    """Return a size rounded up to a power of 2, at least 2, to limit the number of compilations; 0 for 0."""
+    """Return the next power of 2, at least 2, to limit the number of compilations; 0 for a size of 0."""
     return 0 if size == 0 else max(2, 1 << (size - 1).bit_length())
 
 
 def build_estimators(estimates: Sequence[Any], which: np.ndarray) -> Estimator:
-    """Return the velocity estimates of a batch, with all filters padded to the largest order.
+    """Return the velocity estimate of each simulation, with all filters padded to the largest order.
 
     ``estimates`` contains the estimate of each scene, ``which`` the index of the scene of each simulation.
     """
     count, adapts = len(estimates), isinstance(estimates[0], FOAW)
-    # Leave the window out of the state space, because the engine keeps the last measured positions in a ring.
+    # Realize the estimate without its window, because the engine keeps the last measured positions in a ring.
     filters = {
         k: realize_estimate(replace(each, window=0))
         for k, each in enumerate(estimates)
@@ -168,7 +171,7 @@ def build_estimators(estimates: Sequence[Any], which: np.ndarray) -> Estimator:
 
 
 def cut_period(lengths: np.ndarray, effective: Sequence[np.ndarray], substeps: int) -> np.ndarray:
-    """Divide periods into substeps, and these into pieces with constant force.
+    """Divide each period into substeps, and each substep into pieces with constant force.
 
     Args:
         lengths: lengths of the periods, (..., batch).
@@ -205,7 +208,7 @@ def find_longest_steps(machine: Mechanics) -> np.ndarray:
 
 
 def build_flows(machine: Mechanics, durations: np.ndarray, which: np.ndarray, options: Options) -> dict[str, Any]:
-    """Return the fields of `Parameters` that follow from the mechanisms.
+    """Return the matrices of the mechanisms and their flows by name, as fields of `Parameters`.
 
     Args:
         machine: matrices of the mechanisms of all scenes.

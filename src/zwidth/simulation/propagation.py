@@ -25,13 +25,13 @@ from zwidth.words.types import Array
 
 MOST_EVENTS = 512  # largest number of steps per piece, nearly all to an event; beyond it the state is set to NaN
 LAST_DIGIT = 0.5 ** (DIGITS - 1)  # shortest step, in sampling periods
-# Propagate simulations with events in groups of 1/FRACTION of the batch, because a piece with an event takes a hundred
-# times as long as a piece without one.
+# Propagate the simulations whose piece contains an event in groups of 1/FRACTION of the batch, because such a piece
+# takes a hundred times as long as one without an event.
 FRACTION = 8
 
 
 class BodyState(NamedTuple):
-    """State of the bodies, and slip of the first body."""
+    """State of the bodies, and slip of the first body, for each batch entry."""
 
     x: Array  # state, (n, batch)
     slip: Array  # slip of the first body: -1, 0 or 1, (batch,)
@@ -61,7 +61,7 @@ def advance(
     keep: Callable[[Array], Array] | None = None,
     which: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Propagate by decreasing binary digits of time, and take each step at whose end the condition ``keep`` is true.
+    """Propagate by decreasing binary digits of time; omit a step if the condition ``keep`` is false at its end.
 
     This bisects to the instant at which the condition becomes false, or propagates up to ``limit`` if it stays true.
 
@@ -100,12 +100,12 @@ def advance(
 
 
 def _take(part: Array, which: Array | None) -> Array:
-    """Return the selected batch entries of an array; an index out of range selects the last entry."""
+    """Return the batch entries of an array with the indices ``which``; an index out of range selects the last entry."""
     return part if which is None or part.shape[-1] == 1 else part.at[..., which].get(mode="clip")
 
 
 class _Slide(NamedTuple):
-    """Intermediate state of the propagation over a piece with friction."""
+    """Intermediate state of the propagation over a piece with friction, with the energies dissipated so far."""
 
     body: BodyState  # state of the bodies
     left: Array  # remaining duration
@@ -120,7 +120,7 @@ class _Slide(NamedTuple):
 
 
 class _Trip(NamedTuple):
-    """State, time and dissipated energy at the end of a step, with and without an event."""
+    """Result of a step: the state at its end, or at the event that ends it, its duration, and the dissipated energy."""
 
     x: Array  # state at the end of the step
     time: Array  # duration of the step
@@ -163,23 +163,23 @@ class _Joint(NamedTuple):
             stopped: mask of the batch entries whose first body has stopped; the others are left unchanged.
         """
         push = self.pressed(x)
-        # Set the velocity of the first body to exactly 0 by an impulse on it, because the search for the event leaves a
-        # rounding error.
+        # Set the velocity of the stopped first body to exactly 0 by an impulse on it, because the search for the event
+        # leaves a rounding error.
         x = jnp.where(stopped, x - self.rate[:, -1] * self.speed(x), x)
         return BodyState(x, jnp.where(stopped, jnp.where(jnp.abs(push) > self.static, jnp.sign(push), 0.0), slip))
 
     def reserve(self, x: Array, slip: Array, side: Array) -> Array:
-        """Return the reserve, for a state, the slip and the side."""
+        """Return the reserve of the first body in the state ``x``, for its slip and side."""
         return jnp.where(slip == 0, self.static - side * self.pressed(x), slip * self.speed(x))
 
     def slope(self, x: Array, slip: Array, side: Array) -> Array:
-        """Return the time derivative of the reserve, for a state, the slip and the side."""
+        """Return the time derivative of the reserve in the state ``x``, for the slip and the side of the first body."""
         change = times(self.rate, jnp.concatenate([x, self.drive(slip)]))
         stuck = -side * dot(self.pull[: len(x)], change - self.rate[:, -1] * self.speed(change))
         return jnp.where(slip == 0, stuck, slip * (self.pressed(x) - slip * self.coulomb))
 
     def find_side(self, x: Array, far: Array) -> Array:
-        """Return the side: the sign of the mean force on a held body during a step from ``x`` to ``far``."""
+        """Return the side, that is, the sign of the mean force on a held body over a step from ``x`` to ``far``."""
         return jnp.sign(self.pressed(x) + self.pressed(far))
 
     def dips(self, x: Array, slip: Array, far: Array, side: Array) -> Array:
@@ -188,7 +188,7 @@ class _Joint(NamedTuple):
         Steps at whose end the reserve is negative are excluded, because they contain an event in any case.
         """
         dips = (self.slope(x, slip, side) < 0) & (self.slope(far, slip, side) > 0)
-        # Exclude a body that slips with velocity 0, because it has just been released and no event can follow at once.
+        # Exclude a body that slips with velocity 0: it has just been released, so no event can follow at once.
         return (self.reserve(far, slip, side) > 0) & dips & ((slip == 0) | (self.speed(x) != 0))
 
     def account(self, state: _Slide, moving: Array, after: BodyState, left: Array, lost: Array) -> _Slide:
@@ -211,7 +211,7 @@ class _Joint(NamedTuple):
         )
 
     def glide(self, state: _Slide, whole: Flow) -> _Slide:
-        """Propagate the batch entries without an event over the whole piece, in one step with a precomputed flow."""
+        """Propagate the batch entries without an event over their whole piece, in one step with a precomputed flow."""
         x, slip = state.body
 
         def go(_: Any) -> Any:
@@ -223,8 +223,8 @@ class _Joint(NamedTuple):
             calm = (self.reserve(far, slip, side) >= 0) & monotone & (state.left > 0) & (state.left <= self.longest)
             return far, dot(z, times(loss, z)), calm
 
-        # Skip the computation if the piece has no duration. In addition, the conditional prevents XLA from computing
-        # the mask again at each use.
+        # Skip the computation if no simulation has a remaining duration. In addition, the conditional prevents XLA from
+        # computing the mask again at each use.
         far, lost, calm = jax.lax.cond(
             jnp.any(state.left > 0), go, lambda _: (x, 0.0 * state.left, state.left < 0), None
         )
@@ -242,7 +242,7 @@ class _Joint(NamedTuple):
         held, driven, limit = slip == 0, self.drive(slip), jnp.minimum(state.left, self.longest)
 
         def search(trip: _Trip, turn: Array) -> Any:
-            """Propagate by one of three searches: over the whole step, to the minimum of the reserve, or to the event.
+            """Propagate by one of three searches: for the end of the step, the minimum of the reserve, or the event.
 
             Args:
                 trip: result of the previous search.
@@ -251,8 +251,8 @@ class _Joint(NamedTuple):
             """
             side = self.find_side(x, trip.far)
             wanted = jnp.stack([self.dips(x, slip, trip.far, side), self.reserve(trip.x, slip, side) < 0])
-            # Search 0 propagates all batch entries. Its index turn - 1 = -1 is out of range, but has no effect, because
-            # ``turn == 0`` is true for all entries.
+            # Search 0 propagates all batch entries. Its index turn - 1 = -1 is not an index of ``wanted``, but has no
+            # effect, because ``turn == 0`` is true for all entries.
             wanted = (turn == 0) | read(wanted, turn - 1)
 
             def keep(after: Array) -> Array:
@@ -268,7 +268,8 @@ class _Joint(NamedTuple):
         trip = jax.lax.scan(search, _Trip(x, limit, zero, x, zero, zero > 0), np.arange(3))[0]
         over, side = trip.over & (state.left > 0), self.find_side(x, trip.far)
         after = self.decide(trip.x, slip, over)
-        # Release a held body at its event even if, by a rounding error, the force does not exceed static friction.
+        # Release a held body at its event even if the computed force does not exceed static friction, because the
+        # difference is a rounding error.
         after = BodyState(jnp.where(over, after.x, trip.far), jnp.where(over & held, side, after.slip))
         left, lost = state.left - jnp.where(over, trip.time, limit), jnp.where(over, trip.lost, trip.spent)
         return self.account(state, state.left > 0, after, left, lost)
@@ -277,7 +278,7 @@ class _Joint(NamedTuple):
 def propagate_with_friction(
     params: Parameters, body: BodyState, forces: Array, duration: Array, whole: Flow | None
 ) -> tuple[BodyState, Array, Array]:
-    """Propagate over one piece with constant forces and dry friction.
+    """Propagate the bodies over one piece with constant forces and dry friction, from event to event.
 
     Args:
         params: parameters of the batch.
@@ -293,7 +294,7 @@ def propagate_with_friction(
     motion, motor, zero = params.motion[0], params.motor, 0.0 * forces[-1]
     pull = jnp.stack([dot(motion, column) for column in jnp.moveaxis(params.rate, 1, 0)])
     joint = _Joint(motion, params.place[0], params.rate, pull, params.longest, motor.coulomb, motor.static, forces)
-    # Decide again for bodies that are held or at rest, because the forces have changed since the last piece.
+    # Decide again whether held or resting bodies slip, because the forces have changed since the last piece.
     start = joint.decide(body.x, body.slip, (body.slip == 0) | (joint.speed(body.x) == 0))
     state = _Slide(start, duration + zero, zero, zero, zero)
     size = zero.shape[-1]

@@ -97,7 +97,7 @@ OF_ENERGY = {"wall_work", "push_work", "damping_loss", "friction_loss", "energy"
 
 
 def _draw(motion: Motion) -> str:
-    """Return a text plot of a single recorded motion; "" for others."""
+    """Return a plot of position over time in text characters; "" unless the motion is single and recorded."""
     if motion.position is None or np.ndim(motion.position) != 1:
         return ""
     return draw_line(motion.time, motion.position, "position over time")
@@ -204,13 +204,13 @@ class Motion:
 
 
 def _measure_width(summary: Any, start: int, stop: int) -> np.ndarray:
-    """Return the width of the motion of each body, over segments ``start`` to ``stop - 1``; NaN if they are empty."""
+    """Return the width of the motion of each body over segments ``start`` to ``stop - 1``; NaN if these are empty."""
     width = summary.far[start:stop].max(0).sum(0)
     return np.where(width >= 0, width, np.nan)
 
 
 def _measure_halves(summary: Any) -> list[np.ndarray]:
-    """Return the widths of the motions in both halves of the tail, two arrays of shape (bodies, batch)."""
+    """Return the widths in the first and in the second half of the tail, two arrays of shape (bodies, batch)."""
     count = len(summary.far)
     return [_measure_width(summary, *half) for half in ((1, (1 + count) // 2), ((1 + count) // 2, count))]
 
@@ -221,19 +221,17 @@ def find_largest(summary: Any) -> np.ndarray:
 
 
 def classify(summary: Any, memory: np.ndarray, tail: int) -> np.ndarray:
-    """Return the code of `MotionKind` of each motion.
+    """Return the observed behavior of each motion, as a code of `MotionKind` (T7).
 
     Args:
-        summary: extreme positions and oscillations per segment.
-        memory: number of past samples that can affect the next command.
-        tail: number of periods in the tail.
+        summary: extreme positions and number of oscillations per segment.
     """
     widest = find_largest(summary)
     width = np.stack([_measure_width(summary, k, k + 1)[0] for k in range(1, len(summary.turns))])
     before, (first, second) = _measure_width(summary, 0, 1), _measure_halves(summary)
     still = (second.max(0) <= AT_REST * widest) & (first.max(0) <= np.sqrt(AT_REST) * widest)
-    # Require that the second half of the tail is longer than the delay plus the window of the velocity estimate,
-    # because commands computed from earlier positions can still move the bodies.
+    # A motion counts as rest only if the second half of the tail is longer than the delay plus the window of the
+    # velocity estimate, because commands computed from earlier positions can still move the bodies.
     still &= tail // 2 > np.maximum(memory, LEAST_REST)
     before, trend, second = before[0], second[0] / first[0], second[0]
     oscillating = summary.turns[1:].min(0) >= 1
@@ -255,7 +253,7 @@ def classify(summary: Any, memory: np.ndarray, tail: int) -> np.ndarray:
 def convert_to_si(
     simulated: Any, inputs: Any, dry: np.ndarray, memory: np.ndarray, bodies: tuple[str, ...], settings: Any
 ) -> dict[str, np.ndarray]:
-    """Return the fields of `Motion` by name, in SI units and with one row per simulation.
+    """Return a dict of the fields of `Motion`, converted to SI units, with one row per simulation.
 
     Args:
         simulated: result of `run_batch`: final state, readings and frames.
@@ -271,8 +269,8 @@ def convert_to_si(
     first, second = _measure_halves(summary)
     turns = summary.turns[1:].sum(0)
     frequency = (turns - 1) / (np.diff(summary.turned, axis=0)[0] * period)
-    # A state that is not finite although the motion was small is a failure: of the search for friction events, or of a
-    # force law that returned no finite force.
+    # If the state is not finite although the motion was small, the simulation has failed: in the search for friction
+    # events, or because a force law returned a force that is not finite.
     lost = ~np.isfinite(state.body.x).all(0) & (find_largest(summary) < BEYOND)
     outcome = np.where(lost, MotionKind.INVALID, classify(summary, memory, settings.tail))
     columns = {
@@ -293,7 +291,9 @@ def convert_to_si(
     units = {"velocity": 1.0 / period, "estimated_velocity": 1.0 / period}
     units |= dict.fromkeys(("wall_force", "command", *FRAME[3:]), force)
     for rows, names in ((frames, (*bodies, *FRAME)), (readings[:, None], READING)):
-        # Reorder the axes (periods, substeps, rows, batch) to (rows, batch, instants).
+        # Convert each array from the axes (periods, substeps, rows, batch) to (rows, batch, instants), where a row is
+        # one recorded quantity. The axes of periods and substeps are merged into one axis of recorded instants, in
+        # order of time.
         flat = np.moveaxis(rows, (2, 3), (0, 1)).reshape(len(names), len(period), -1)
         columns |= {name: row * units.get(name, np.ones(1))[:, None] for name, row in zip(names, flat, strict=True)}
     columns["sticking"] = (columns["sticking"] == 0) & dry[:, None]

@@ -154,7 +154,7 @@ def simulate(
                 results[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
             results[name][indices] = column
     for column in results.values():
-        # Discard the motions of simulations with invalid arguments, because 0 replaced these arguments.
+        # Replace the results of simulations with invalid arguments, because these arguments were replaced by 0.
         column[~good] = _missing(column.dtype)
     results["status"][~good] = Status.INVALID_INPUT
     results["outcome"][~good] = MotionKind.INVALID
@@ -168,7 +168,7 @@ def simulate(
 
 
 def _build_time(distinct: list[Any], which: np.ndarray, steps: np.ndarray, drawn: np.ndarray | None) -> np.ndarray:
-    """Return the recorded instants in s; on a single axis if all simulations have the same sampling period.
+    """Return the recorded instants in s: one axis if all simulations have the same sampling period, else one row each.
 
     Args:
         distinct: distinct scenes.
@@ -184,5 +184,5 @@ def _build_time(distinct: list[Any], which: np.ndarray, steps: np.ndarray, drawn
 
 
 def _missing(dtype: np.dtype) -> Any:
-    """Return the value that replaces a missing result: NaN, or 0 for integers and booleans."""
+    """Return the value of a missing result of the type ``dtype``: NaN, or 0 for integers and booleans."""
     return np.nan if dtype.kind == "f" else 0

@@ -27,8 +27,8 @@ from zwidth.words.showing import compact_repr
 N_ACROSS = 65  # equidistant lines across the stable set
 BEYOND = 0.05  # distance of the first and last of them from the stable nodes, relative to the range of dampings
 
-# Refinement near meetings
-# Offsets in beta of new lines of constant B near a meeting, relative to the gap between the lines that enclose it.
+# Refinement near meetings. Offsets in beta of new lines of constant B near a meeting, relative to the gap between the
+# lines that enclose it.
 MEETING_OFFSETS = np.array([-1e-3, -1e-7, 1e-7, 1e-3])
 # Largest final gap between two lines that enclose a meeting, relative to the gap before refinement.
 ENCLOSED_GAP = 3e-7
@@ -37,13 +37,13 @@ MAX_CORNER_STEPS = 60  # steps of false position for a corner
 DAMPING_TOLERANCE = 1e-13  # relative accuracy of the damping of a corner
 
 # Edges
-MIN_NODES = 5  # edges with fewer nodes of the curve
-N_FILLED = 33  # receive this many points
+MIN_NODES = 5  # nodes of the curve; an edge with fewer is tabulated at N_FILLED points instead
+N_FILLED = 33  # points of such an edge
 NEAR_EDGE = 1e-9  # relative distance in beta within which a wall may be on a neighboring edge
 
 
 class Edge(NamedTuple):
-    """The part of one column between two meetings along which stable intervals end, in ascending damping."""
+    """The part of one column between two meetings along which stable intervals end, tabulated in ascending damping."""
 
     column: int
     piece: int
@@ -55,9 +55,9 @@ class Edge(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Stable intervals of lines of constant B in ascending order: shape (rows, columns), NaN if a column bounds none.
+    """Ends of stable intervals on lines of constant B: shape (rows, columns), NaN if a column bounds no interval.
 
-    ``alpha`` and ``w`` locate the end of an interval in each column.
+    The rows are in ascending order of beta. ``alpha`` and ``w`` are those of the end that lies in the column.
     """
 
     beta: np.ndarray  # shape (rows,)
@@ -67,7 +67,7 @@ class _Rows(NamedTuple):
 
 
 class _Meetings(NamedTuple):
-    """The meetings of pairs of columns between neighboring lines of constant B."""
+    """The meetings of two columns each, in the gaps between neighboring lines of constant B."""
 
     gap: np.ndarray  # index of the line above
     columns: np.ndarray  # shape (meetings, 2)
@@ -77,13 +77,13 @@ class _Meetings(NamedTuple):
 
 @dataclass(frozen=True)
 class StableSet:
-    """The stable walls of one loop, by the edges of the set."""
+    """The set of stable walls of one loop, represented by the edges that bound it."""
 
     boundary: Boundary
 
     @cached_property
     def _nodes(self) -> np.ndarray:
-        """Angles, alpha and beta at the nodes of the curve and the extrema of alpha: shape (3, nodes)."""
+        """Angle, alpha and beta (first axis) at the nodes of the curve and the extrema of alpha: shape (3, nodes)."""
         w = np.union1d(self.boundary.w, self.boundary.alpha_extrema)
         return np.stack([w, *evaluate_curve(self.boundary.loop, w)[:2]])
 
@@ -93,7 +93,7 @@ class StableSet:
         return self.boundary.lossless if len(self.boundary.lines) == 2 else np.nan
 
     def _place_rows(self) -> np.ndarray:
-        """Return the dampings of the initial lines of constant B.
+        """Return the dampings beta of the initial lines of constant B.
 
         They are equidistant across the stable set, and close to each point of the curve where an edge starts or ends.
         """
@@ -107,14 +107,14 @@ class StableSet:
             return reached
         margin = BEYOND * (np.ptp(reached) + abs(reached[0]) + 1e-300)
         across = np.linspace(reached.min() - margin, reached.max() + margin, N_ACROSS)
-        # If no node is on an edge, the set may still contain walls without damping: the softest walls of a device that
-        # comes to rest are stable.
+        # If no node is on an edge, the set may still contain walls with beta = 0, because on a device that comes to
+        # rest by itself all sufficiently soft walls are stable.
         across = across if is_edge.any() else np.union1d(across, 0.0)
-        # Drop nodes outside this range, because they may lie next to an asymptote of the curve.
+        # Drop nodes outside the range of ``across``, because they may lie near an asymptote of the curve.
         return np.union1d(across, near[(near > across[0]) & (near < across[-1])])
 
     def _scan_rows(self, beta: np.ndarray) -> _Rows:
-        """Return the stable intervals of those lines of constant B whose crossings are consistent."""
+        """Return the stable intervals on lines of constant B; lines with inconsistent crossings are left out."""
         b = self.boundary
         beta = beta[b.shift_ambiguous(beta)[1]]
         intervals, shape = find_stable_intervals(b, beta), (beta.size, len(b.arcs) + len(b.lines))
@@ -131,7 +131,7 @@ class StableSet:
 
     @cached_property
     def _enclosed(self) -> tuple[_Rows, _Meetings]:
-        """Lines of constant B on both sides of all meetings, and the meetings."""
+        """Stable intervals on lines of constant B that enclose all meetings closely, and these meetings."""
         if np.isfinite(self._triangle_beta):
             one, other = self.boundary.lines
             corner = (one.q - other.q) / (one.f - other.f)
@@ -158,24 +158,22 @@ class StableSet:
         return rows, meetings
 
     def _refine_meetings(self, rows: _Rows, meetings: _Meetings, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Locate meetings between lines of constant B.
+        """Locate meetings more accurately, and place new lines of constant B close to both sides of each.
 
         Args:
-            rows: all lines.
-            meetings: all meetings.
-            left: indices of the meetings to locate.
+            rows: stable intervals on all lines so far.
 
         Returns:
             Dampings of further lines near these meetings, and the located corners as in `_pair_ends`.
         """
         b, columns, beta = self.boundary, meetings.columns[left], rows.beta
-        # Extend the range, because the set may extend beyond the first and the last line of constant B.
+        # Add a gap below the first and above the last line of constant B, because the set may extend beyond them.
         size = np.ptp(beta[np.isfinite(rows.alpha).any(1)]) + np.spacing(np.abs(beta).max())
         low, high = np.concatenate([[beta[0] - size], beta, [beta[-1] + size]])[
             meetings.gap[left] + np.array([[0], [1]])
         ]
-        # A meeting is the end of an arc or, if none ends in the gap, the corner of two columns whose difference changes
-        # sign. If neither is the case, the gap is halved.
+        # Locate a meeting at an end of an arc in the gap or, if there is none, at the corner of the two columns,
+        # provided that their difference in alpha changes its sign. If neither exists, halve the gap.
         ends = np.moveaxis(b.ends[..., columns], -1, 1).reshape(2, -1, left.size)
         inside = (ends[1] > low) & (ends[1] < high)
         alpha, damping = np.where(inside.any(0), ends[:, inside.argmax(0), np.arange(left.size)], np.nan)
@@ -198,7 +196,7 @@ class StableSet:
         )
 
     def _subtract_columns(self, columns: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return the difference in alpha of two columns on each line of constant B; NaN if the line misses either."""
+        """Return the difference in alpha of two columns on each line; NaN if the line does not cross both."""
         return np.subtract(*self.boundary.find_alpha(columns.T.ravel(), np.tile(beta, 2)).reshape(2, -1))
 
     @cached_property
@@ -209,7 +207,7 @@ class StableSet:
             return self._triangle if meetings.gap.size else []
         bounds = np.pad(np.isfinite(rows.alpha.T), ((0, 0), (1, 1)))
         begins, ends = bounds[:, 1:-1] & ~bounds[:, :-2], bounds[:, 1:-1] & ~bounds[:, 2:]
-        # Two edges bound the same piece if they bound the same interval of a line or if they meet.
+        # Assign two edges to the same piece if they bound the same interval of a line or meet.
         number = np.cumsum(begins).reshape(begins.shape).T - 1
         row, below = np.nonzero(rows.upper >= 0)
         pairs = [number[row, below], number[row, rows.upper[row, below]]]
@@ -228,7 +226,7 @@ class StableSet:
 
     @property
     def _triangle(self) -> list[Edge]:
-        """The edges if all pole pairs cross at one damping: two crossing lines, and the curve at this damping."""
+        """The edges of a triangular stable set: two crossing lines, and the curve at the damping `_triangle_beta`."""
         b, ends, edges = self.boundary, [], []
         corner = next(wall[1] for wall in self._enclosed[1].walls[self._enclosed[1].enclosed].tolist())
         for k, line in enumerate(b.lines):
@@ -244,12 +242,10 @@ class StableSet:
         return [*edges, Edge(-1, 0, slice(0), (1, 2), w, alpha, np.full(w.size, self._triangle_beta))]
 
     def _trace_edge(self, column: int, angles: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Return points along a column between two walls.
+        """Return the tabulated points of an edge, the part of a column between two walls.
 
         Args:
-            column: the column.
-            angles: angles of the first and last line of constant B. An edge with few nodes gets more points between.
-            ends: alpha and beta of both walls, shape (2, 2).
+            column: index of the column.
 
         Returns:
             Angle (NaN at both walls), alpha and beta, shape (3, points).
@@ -268,15 +264,15 @@ class StableSet:
 
     @cached_property
     def width(self) -> float:
-        """The difference of the largest and the smallest damping of the edges."""
+        """The range of beta on all edges: the largest minus the smallest value."""
         return float(np.ptp([edge.beta[[0, -1]] for edge in self.edges]))
 
     @cached_property
     def main(self) -> frozenset[int]:
         """Indices of the pieces of the stable set that are connected to K = 0.
 
-        A piece that narrows to a point at K = 0 counts as connected. If no piece is, because the device is unstable
-        without a wall: the piece that contains the softest stable wall, among the pieces with B > 0 if any exist.
+        A piece that narrows to a point at K = 0 counts as connected. If no piece is connected, because the device is
+        unstable without a wall, this is the piece with the softest stable wall, if possible one with B > 0.
         """
         ends: dict[int, list[float]] = {}
         damped = {edge.piece for edge in self.edges if edge.beta[-1] > 0}
@@ -289,14 +285,15 @@ class StableSet:
         return frozenset([min(stiff, key=lambda piece: (piece not in damped, np.min(ends[piece])))])
 
     def find_softest(self, least: float) -> float:
-        """Return the lowest alpha on the edges of the `main` pieces at dampings of at least ``least``; NaN if none."""
+        """Return the lowest alpha with beta >= ``least`` on the edges of `main` pieces; NaN if there is none."""
         walls = [edge.alpha[edge.beta >= least] for edge in self.main_edges(least)]
         return float(min((alpha.min() for alpha in walls if alpha.size), default=np.nan))
 
     def is_in_main(self, alpha: float, beta: float) -> bool:
-        """Return whether a wall lies in a `main` piece."""
-        # Compare the edge at the upper end of the wall's interval. Near a meeting of several edges it may be any of
-        # them, so use the neighboring lines of constant B as well.
+        """Return whether a wall lies in a `main` piece, one that is connected to K = 0."""
+        # Find the edge at the upper end of the wall's stable interval, and compare it with the edges of main pieces.
+        # Near a meeting, rounding errors may select a neighboring edge, so also search two lines of constant B close to
+        # the wall.
         rows = beta + NEAR_EDGE * (abs(beta) + self.width) * np.array([0.0, -1.0, 1.0])
         intervals = find_stable_intervals(self.boundary, rows)
         row, k = np.nonzero((intervals.low < alpha) & (alpha < intervals.high))
@@ -305,12 +302,12 @@ class StableSet:
         return any(edge.beta[0] <= row <= edge.beta[-1] and edge.column == end for edge in edges for row, end in above)
 
     def main_edges(self, least: float) -> list[Edge]:
-        """Return the edges of `main` pieces that reach above a damping by more than rounding errors."""
+        """Return the edges of `main` pieces whose largest damping exceeds ``least`` by more than rounding errors."""
         main = [edge for edge in self.edges if edge.piece in self.main]
         return [edge for edge in main if edge.beta[-1] - least > DAMPING_TOLERANCE * np.ptp(edge.beta)]
 
     def find_highest(self, least: float) -> float:
-        """Return the largest alpha on lines of constant B in `main` pieces, for beta >= ``least``; -inf if none."""
+        """Return the largest stable alpha on lines with beta >= ``least``, in `main` pieces; -inf if none is stable."""
         rows, highest = self._enclosed[0], -np.inf
         for edge in self.main_edges(least):
             alpha = rows.alpha[edge.rows, edge.column]
@@ -323,13 +320,13 @@ class StableSet:
         for piece in {edge.piece for edge in self.edges} - self.main:
             walls = np.concatenate([edge[-2:] for edge in self.edges if edge.piece == piece], 1)
             islands.append(Island(*(tuple(pair) for pair in np.stack([walls.min(1), walls.max(1)], 1).tolist())))
-        # An island with K < 0 that ends at K = 0 may have positive alpha by rounding errors.
+        # Drop islands of walls with K <= 0, whose largest alpha is positive only by rounding errors.
         islands = [one for one in islands if one.stiffness[1] > NEAR_EDGE * np.ptp(one.stiffness)]
         islands = [one for one in islands if one.virtual_damping[1] > least]
         return sorted(islands, key=lambda one: -one.stiffness[1])
 
     def outlines(self) -> list[Outline]:
-        """Join all edges to closed outlines, the largest first."""
+        """Join the edges of the stable set to closed outlines; return them by area, the largest first."""
         joined: dict[int, list[tuple[int, int]]] = {}
         for k, edge in enumerate(self.edges):
             for end, meeting in enumerate(edge.meetings):
@@ -346,22 +343,23 @@ class StableSet:
                 current = successor[current[0], 1 - current[1]]
             stiffness, damping = np.concatenate(path, 1)
             outlines.append((piece, Outline(stiffness, damping, False, piece not in self.main)))
-        # Drop spurious outlines along a part of the curve whose damping is constant up to rounding errors.
+        # Drop outlines without width in beta. Rounding errors create them along parts of the curve with constant
+        # damping.
         outlines = [
             (piece, one) for piece, one in outlines if np.ptp(one.virtual_damping) > DAMPING_TOLERANCE * self.width
         ]
         outlines.sort(key=lambda each: -each[1].area)
-        # The largest outline of a piece is its outer one; all others are holes.
+        # Mark all outlines of a piece except the largest as holes, because the largest one is its outer outline.
         outer = {piece: k for k, (piece, _) in reversed(list(enumerate(outlines)))}
         return [outline._replace(hole=outer[piece] != k) for k, (piece, outline) in enumerate(outlines)]
 
 
 def _join_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return the connected components of the graph on ``count`` nodes with these edges, shape (2, pairs).
+    """Return the connected component of each of ``count`` nodes of a graph with edges of shape (2, pairs).
 
-    Each component is denoted by its smallest node.
+    A component is denoted by the smallest index of its nodes.
     """
-    # `scipy.sparse.csgraph` would do the same, but takes a third of a second to import.
+    # Do not use `scipy.sparse.csgraph`, because its import takes a third of a second.
     least, before = np.arange(count), np.full(count, -1)
     while not np.array_equal(least, before):
         before = least.copy()
@@ -372,15 +370,14 @@ def _join_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 def _pair_ends(rows: _Rows, corners: np.ndarray) -> _Meetings:
-    """Find the meetings between neighboring lines of constant B.
+    """Return the meetings of columns in each gap between neighboring lines of constant B.
 
     Args:
-        rows: the lines.
-        corners: alpha and beta of located meetings, and the largest gap between the lines that may enclose each; shape
-            (corners, 3).
+        rows: stable intervals on the lines.
     """
-    # A column that bounds an interval on one line but not on the next takes part in a meeting, and so does a second
-    # column: an interval begins, ends, splits, or changes a column. In order of alpha, these columns form pairs.
+    # A column that bounds an interval on one line but not on the next takes part in a meeting between these lines,
+    # together with a second column, because an interval begins, ends, splits, or changes a column. In order of alpha,
+    # these columns form pairs.
     alpha = np.pad(rows.alpha, ((1, 1), (0, 0)), constant_values=np.nan)
     bounds = np.isfinite(alpha)
     gap, column = np.nonzero(bounds[1:] != bounds[:-1])
@@ -399,7 +396,7 @@ def _pair_ends(rows: _Rows, corners: np.ndarray) -> _Meetings:
 
 @compact_repr()
 class Outline(NamedTuple):
-    """A closed outline of the stable set, as a polygon of walls."""
+    """A closed outline of the stable set, a polygon whose corners are walls."""
 
     stiffness: np.ndarray
     virtual_damping: np.ndarray

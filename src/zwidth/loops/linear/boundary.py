@@ -41,11 +41,12 @@ from zwidth.parts.circle import are_on_circle, circle_points, distances_inside
 MAX_STEPS = 120
 CONVERGED_STEP = 1e-10  # relative to w; the error after it is of the order of its square
 
-# Relative changes of beta, tried in this order, for lines whose crossings are ambiguous by rounding errors (V15).
+# Relative changes of beta, tried in this order if rounding errors make the crossings of a line ambiguous (V15).
 SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
-# Distance of a probe of the curve from an angle at which it is undefined, relative to the distance of the next node.
+# Distance from an angle at which the curve is undefined to an additional point of the curve, relative to the distance
+# of the next node.
 PROBE_DISTANCE = 1e-6
-# Relative imaginary part of x below which a pole leaves a zero of G along the unit circle (V14).
+# Ratio of radial to total displacement below which a pole leaves a zero of G along the unit circle (V14).
 TANGENT_TOLERANCE = 1e-9
 EQUAL_DAMPING = 1e-12  # dampings with a smaller relative difference are equal up to rounding errors
 BLOCK_SIZE = 1 << 17  # pairs of lines and arcs per batch; its arrays fit in the cache
@@ -74,7 +75,7 @@ class Boundary:
 
     @classmethod
     def trace(cls, loop: LoopRoots) -> Boundary:
-        """Compute the boundary of a loop."""
+        """Compute the stability boundary of a loop: its nodes, arcs and crossing lines."""
         w = place_nodes(loop)
         curve = evaluate_curve(loop, w)
         vertical = find_field_zeros(loop, w, curve.im_f, "im_f")
@@ -96,12 +97,12 @@ class Boundary:
         return cls(loop, w, tuple(arcs), tuple(lines), asymptotes, limits, lossless)
 
     def are_lossless(self, beta: np.ndarray) -> np.ndarray:
-        """Return whether dampings equal that of a lossless loop, at which no wall is stable (`find_lossless`)."""
+        """Return a mask of the dampings that make the loop lossless, so that no wall is stable (`find_lossless`)."""
         with np.errstate(invalid="ignore"):
             return np.abs(beta - self.lossless) <= EQUAL_DAMPING * np.abs(self.lossless)
 
     def find_crossings(self, beta: np.ndarray) -> Crossings:
-        """Return the crossings of the lines of constant B with these dampings, shape (rows,)."""
+        """Return the crossings of lines of constant B with all arcs and crossing lines; ``beta`` has shape (rows,)."""
         beta, consistent = self.shift_ambiguous(beta)
         joined = self._joined
         column, row, k = joined.list_crossings(beta)
@@ -138,7 +139,7 @@ class Boundary:
 
     @cached_property
     def ends(self) -> np.ndarray:
-        """The walls at both ends of each arc: shape (alpha and beta, 2, columns); NaN for crossing lines."""
+        """Alpha and beta (first axis) at both ends (second axis) of each column; NaN for crossing lines."""
         w = np.array([arc.w[[0, -1]] for arc in self.arcs]).T
         alpha = evaluate_curve(self.loop, w.ravel()).alpha.reshape(w.shape)
         for angle, (limit, _) in self.limits.items():
@@ -157,8 +158,9 @@ class Boundary:
         Returns:
             Angle and alpha of each crossing.
         """
-        # Solve ``ratio(w) = 0``. Im(q - beta F) increases with w where a pair leaves the circle (V11); ``signs`` are
-        # those of the factors by which ``ratio`` divides it. Converged crossings leave the iteration.
+        # Solve ``ratio(w) = 0``. Im(q - beta F) increases with w at the crossing if a pair leaves the circle (V11);
+        # ``ratio`` is Im(q - beta F) divided by factors with the signs ``signs``. Converged crossings leave the
+        # iteration.
         joined, nodes = self._joined, self._node_values
         lower = np.where(joined.w[k - 1] < joined.w[k], k - 1, k)
         upper = 2 * k - 1 - lower
@@ -167,7 +169,7 @@ class Boundary:
         signs = [np.sign(middle - np.cos(w)) for w in self._pair_angles]
         rising = joined.leaving[arc] * np.prod(signs, axis=0) > 0
         first, last = nodes.select(lower).evaluate_rows(beta), nodes.select(upper).evaluate_rows(beta)
-        # A line of constant B through an end of the arc crosses it there, and no iteration is needed.
+        # Skip the iteration for a line of constant B through an end of the arc, because the crossing is this end.
         angle = np.where(
             last.ratio == 0, above, np.where(first.ratio == 0, below, _estimate_crossing(below, above, first, last))
         )
@@ -186,8 +188,8 @@ class Boundary:
             # Accept a converged step even if rounding errors put it outside the bracket.
             good |= np.abs(new - x) <= CONVERGED_STEP * x
             new = np.where(good, np.clip(new, below[active], above[active]), 0.5 * (below[active] + above[active]))
-            # After the last step the error is of the order of its square. Extrapolate alpha by the exact step, because
-            # near an undamped mode the rounding error of the angle alone would change alpha too much.
+            # The error after the last step is about the square of this step. Extrapolate alpha by the exact step,
+            # because near an undamped mode the rounding error of the angle alone would change alpha too much.
             move = np.where(new == x + move, move, new - x)
             angle[active], alpha[active] = new, row.alpha + move * row.alpha_slope
             left = (np.abs(new - x) > CONVERGED_STEP * new) & (above[active] - below[active] > CONVERGED_STEP * new)
@@ -197,7 +199,7 @@ class Boundary:
         return angle, alpha
 
     def _evaluate_loop(self, w: np.ndarray) -> _LoopValues:
-        """Evaluate the loop at angles, for lines of any damping."""
+        """Return q, F and their derivatives at angles w, from which `_RowValues` follow for every damping."""
         points, common, slope = circle_points(w), np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
         for angle in self._pair_angles:
             factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
@@ -207,12 +209,12 @@ class Boundary:
 
     @cached_property
     def _node_values(self) -> _LoopValues:
-        """The values of the loop at the nodes of all arcs."""
+        """q, F and their derivatives at the nodes of all arcs."""
         return self._evaluate_loop(self._joined.w)
 
     @cached_property
     def _joined(self) -> JoinedArcs:
-        """The arcs in one sequence of nodes."""
+        """The nodes of all arcs in one sequence."""
         return JoinedArcs.join(self.arcs)
 
     def find_arc(self, w: np.ndarray) -> np.ndarray:
@@ -233,7 +235,7 @@ class Boundary:
         for a, b in pairwise(sorted(self.limits)):
             inner = nodes[(nodes > a) & (nodes < b)]
             inner = inner if inner.size else np.array([0.5 * (a + b)])
-            # Bracket intersections near an infinite end of the curve by probes close to it.
+            # Add a point near each end of the interval to bracket intersections there, because the end may be infinite.
             probes = a + PROBE_DISTANCE * (inner[0] - a), b - PROBE_DISTANCE * (b - inner[-1])
             inner = np.concatenate([probes[:1], inner, probes[1:]])
             pieces.append(np.concatenate([[a], inner, [b]]))
@@ -244,11 +246,11 @@ class Boundary:
 
     @property
     def _pair_angles(self) -> list[float]:
-        """The angles inside (0, pi) of crossing lines; ``Im(q - beta F)`` vanishes there for every beta."""
+        """Angles in (0, pi) of the crossing lines; ``Im(q - beta F)`` is 0 there for every beta."""
         return [line.w for line in self.lines if line.poles == 2]
 
     def shift_ambiguous(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Shift dampings whose lines of constant B have inconsistent crossings (V15).
+        """Shift the dampings of lines of constant B whose crossings are inconsistent (V15).
 
         A line within rounding errors of an extremum of beta may miss one of the two arcs that meet there. A line with a
         slightly different damping replaces it.
@@ -267,11 +269,11 @@ class Boundary:
         return beta, mismatch == 0
 
     def _count_mismatch(self, beta: np.ndarray) -> np.ndarray:
-        """Return, per line, the count far below plus all poles that leave, minus the count far above: 0 if correct."""
+        """Return `count_below` plus the sum of ``leaving`` minus `count_above` of each line; 0 if consistent."""
         return self.count_below(beta) - self.count_above(beta) + self._sum_leaving(beta)
 
     def _sum_leaving(self, beta: np.ndarray, limit: float = np.inf) -> np.ndarray:
-        """Return the sum of ``leaving``, each at most ``limit``, over all crossings of each line of constant B."""
+        """Return the sum of ``leaving``, limited to ``limit`` from above, over all crossings of each line."""
         joined = self._joined
         total = joined.sum_crossed(np.minimum(joined.leaving, limit), beta)
         return total + sum(np.minimum(line.count_leaving(beta), limit) for line in self.lines)
@@ -297,8 +299,8 @@ class Boundary:
         Returns:
             The sums, and whether the crossings of each wall's line of constant B are consistent.
         """
-        # Most walls are far from the crossing. For these the interpolated alpha and the bound of its error decide, and
-        # only the others need the exact crossing.
+        # Compare alpha of each wall with the interpolated alpha of the crossing. Solve for the exact crossing only if
+        # they differ by less than the error bound of the interpolation, because few walls are so close.
         excluded = np.broadcast_to(excluded, beta.shape)
         beta, consistent = self.shift_ambiguous(beta)
         joined = self._joined
@@ -320,47 +322,47 @@ class Boundary:
         return total.astype(int), consistent
 
     def are_stable_edges(self, w: np.ndarray) -> np.ndarray:
-        """Return whether the stable set lies on one side of the curve at each angle (V18)."""
+        """Return a mask of the angles at which the curve bounds the stable set, which lies on one side of it (V18)."""
         curve = evaluate_curve(self.loop, w)
         result = np.isfinite(curve.alpha) & np.isfinite(curve.beta)
-        # With a long delay most lines of constant B contain no stable wall, because fewer poles enter the circle along
-        # them than are outside far below. Exclude these lines before solving for crossings.
+        # Exclude most lines of constant B without stable walls before solving for crossings: with a long delay, fewer
+        # poles enter the circle along most lines than are outside as alpha -> -inf.
         beta = self.shift_ambiguous(curve.beta[result])[0]
         result[result] = self.count_below(beta) + self._sum_leaving(beta, 0.0) <= 0
         arc, block = self.find_arc(w), max(1, BLOCK_SIZE // max(1, len(self.arcs)))
         for part in np.array_split(np.flatnonzero(result), 1 + result.sum() // block):
             sums, consistent = self._sum_below(curve.alpha[part], curve.beta[part], arc[part])
-            # Use the direction of the whole arc, because the derivative at one angle may be a rounding error.
+            # Use ``leaving`` of the whole arc, because at a single angle rounding errors may change its sign.
             below = self.count_below(curve.beta[part])
             result[part] = consistent & (below + sums == np.where(self._joined.leaving[arc[part]] > 0, 0, 2))
         return result
 
     def count_below(self, beta: np.ndarray) -> np.ndarray | int:
-        """Return the number of poles outside the circle for alpha below all crossings, for each beta (V14)."""
+        """Return, for each beta, the number of poles outside the circle if alpha is below all crossings (V14)."""
         return self._count_far(-1.0, beta)
 
     def count_above(self, beta: np.ndarray) -> np.ndarray | int:
-        """Return the number of poles outside the circle for alpha above all crossings, for each beta (V14).
+        """Return, for each beta, the number of poles outside the circle if alpha is above all crossings (V14).
 
-        On every line of constant B the poles that cross account for the difference from `count_below`.
+        The difference from `count_below` is the sum of ``leaving`` over the crossings of the line of constant B.
         """
         return self._count_far(1.0, beta)
 
     def _count_far(self, side: float, beta: np.ndarray) -> np.ndarray | int:
-        """Return the number of poles outside the circle as alpha -> side * inf."""
+        """Return, for each beta, the number of poles outside the circle as alpha -> inf (side 1) or -inf (side -1)."""
         less, more = self._far_counts[side]
-        # The number depends on the damping only if the loop is lossless.
+        # Compare beta with the lossless damping, because the number depends on beta only in a lossless loop.
         return less if less == more else np.where(beta > self.lossless, more, less)
 
     @cached_property
     def _far_counts(self) -> dict[float, tuple[int, int]]:
-        """Poles outside at alpha -> -inf (key -1) and +inf (key 1): for beta below and above the lossless damping."""
+        """Number of poles outside as alpha -> -inf (key -1) and inf (key 1), below and above the lossless damping."""
         return {side: (self._far_outside(side, -1.0), self._far_outside(side, 1.0)) for side in (-1.0, 1.0)}
 
     def _far_outside(self, side: float, excess: float) -> int:
         """Return the number of poles outside the unit circle as |alpha| -> inf.
 
-        Poles then approach the zeros of the device; the remaining poles go to infinity.
+        As many poles as the device has zeros approach these zeros; the remaining poles go to infinity.
 
         Args:
             side: sign of alpha.
@@ -377,18 +379,19 @@ class Boundary:
             power = -side / (rest.value * (1j * points.z) ** order)
             x = power ** (1.0 / order) * np.exp(2j * np.pi * np.arange(order) / order)
             if np.isfinite(self.lossless):
-                # alpha moves the pole along the circle. Only excess damping moves it off the circle: x becomes
-                # x (1 - (beta - lossless) F/alpha).
+                # In a lossless loop, alpha moves the pole along the circle, and only a difference of beta from the
+                # lossless damping moves it off the circle: x becomes x (1 - (beta - lossless) F/alpha).
                 leaving += int(np.sum(side * excess * loop.estimate.jet(points).value.imag * x.real > 0))
                 continue
-            # A pole with real x leaves tangentially; the next order, -e x^2/order, then decides.
+            # If x is real, the pole leaves the zero along the circle. The next term of its expansion, -e x^2/order,
+            # then decides by its sign if the pole is outside.
             bend = -(rest.slope / rest.value + 0.5j * order) * x * x / order
             leaving += int(np.sum(np.where(np.abs(x.imag) > TANGENT_TOLERANCE * np.abs(x), x.imag, bend.imag) < 0))
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on_circle] < 0)) + leaving
 
 
 class _RowValues(NamedTuple):
-    """Values at one angle per line of constant B; a crossing is a zero of ``ratio``."""
+    """Im(q - beta F) and alpha at one angle per line of constant B; a crossing is a zero of ``ratio``."""
 
     ratio: np.ndarray  # Im(q - beta F)/common, with ``common`` of `_LoopValues`
     ratio_slope: np.ndarray  # its derivative in w
@@ -397,7 +400,7 @@ class _RowValues(NamedTuple):
 
 
 class _LoopValues(NamedTuple):
-    """q, F and their derivatives in w at angles, and the factor of ``Im(q - beta F)`` that every beta shares."""
+    """q, F and their derivatives at angles w, and the factor of ``Im(q - beta F)`` that all beta have in common."""
 
     q: np.ndarray
     q_slope: np.ndarray
@@ -407,11 +410,11 @@ class _LoopValues(NamedTuple):
     common_slope: np.ndarray
 
     def select(self, index: np.ndarray) -> _LoopValues:
-        """Return the values at the selected angles."""
+        """Return all values at the angles selected by an index or a mask."""
         return _LoopValues(*(part[index] for part in self))
 
     def evaluate_rows(self, beta: np.ndarray) -> _RowValues:
-        """Evaluate `_RowValues` for one damping per angle."""
+        """Return the `_RowValues`, that is, ``ratio``, alpha and their derivatives, for one damping per angle."""
         with np.errstate(all="ignore"):
             value, slope = self.q - beta * self.f, self.q_slope - beta * self.f_slope
             is_zero = self.common == 0
@@ -424,7 +427,7 @@ class _LoopValues(NamedTuple):
 
 @np.errstate(all="ignore")
 def _estimate_crossing(below: np.ndarray, above: np.ndarray, first: _RowValues, last: _RowValues) -> np.ndarray:
-    """Estimate a zero of ``ratio`` between two angles from values and derivatives at both.
+    """Estimate the angle at which ``ratio`` is 0, from its values and derivatives at two angles.
 
     The estimate is the cubic interpolation of the inverse function or, if this leaves the interval, the root of a
     parabola.
@@ -433,8 +436,8 @@ def _estimate_crossing(below: np.ndarray, above: np.ndarray, first: _RowValues, 
     share = -first.ratio / rise
     bends = rise * (1.0 - share) / first.ratio_slope, rise * share / last.ratio_slope
     cubic = below + share * (share * (3.0 - 2.0 * share) * width + (1.0 - share) * (bends[0] - bends[1]))
-    # The parabola has the values of ``ratio`` at both angles, and its derivative at the angle where the derivative is
-    # smaller. Near an extremum of beta, this derivative vanishes, and the cubic fails.
+    # The parabola has the values of ``ratio`` at both angles, and its derivative at the angle where this is smaller.
+    # Near an extremum of beta the derivative is 0, and the cubic interpolation fails.
     flat = np.abs(first.ratio_slope) < np.abs(last.ratio_slope)
     start, slope = np.where(flat, first.ratio, last.ratio), np.where(flat, first.ratio_slope, -last.ratio_slope) * width
     rise = np.where(flat, rise, -rise)

@@ -33,12 +33,12 @@ from zwidth.words.status import Status
 if TYPE_CHECKING:
     import flint
 
-# Placeholder for the velocity estimate of the chain, because the estimate is expanded separately.
+# Placeholder for the velocity estimate in the chain of the device, because F is expanded separately.
 NO_ESTIMATE = Estimate(0, 0.0)
 
 
 def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Decide the stability of walls.
+    """Decide with a certificate whether walls are stable, in arithmetic of sufficient precision.
 
     Args:
         scene: the scene.
@@ -63,7 +63,7 @@ def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tupl
 
 
 def _decide(polynomials: Callable[[int], Any], stiffness: float, damping: float) -> tuple[bool, Status]:
-    """Return the label and the status of one wall."""
+    """Return True if one wall is stable, and the `Status` of this result."""
     import flint
 
     if not (np.isfinite(stiffness) and np.isfinite(damping)):
@@ -74,7 +74,8 @@ def _decide(polynomials: Callable[[int], Any], stiffness: float, damping: float)
             p = D + N1 * flint.arb(stiffness) + N2 * flint.arb(damping)
             at_one = stiffness == 0 and has_rest
             if at_one:
-                # z = 1 is a pole, so the wall is on the boundary if all other poles are inside.
+                # Divide out the pole at z = 1, because the wall is on the stability boundary if all other poles are
+                # inside.
                 p = p // flint.arb_poly([-1, 1])
             verdict = are_zeros_inside(p)
         if verdict is not None:
@@ -102,7 +103,7 @@ def are_zeros_inside(p: flint.arb_poly) -> bool | None:
 
 
 def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly, bool]:
-    """Return D, N1 and N2 in SI units, and whether K = 0 puts a pole at exactly z = 1."""
+    """Return the polynomials D, N1 and N2 in SI units, and whether K = 0 puts a pole at exactly z = 1."""
     import flint
 
     exact = _convert_exactly(scene)
@@ -127,18 +128,18 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
 
 
 def _convert_exactly(part: Any) -> Any:
-    """Return a scene or one of its parts with exact balls in place of floats.
+    """Return a copy of a scene, or of one of its parts, in which every float is an exact ball (radius 0).
 
-    Constructors are bypassed, because their checks require floats.
+    Constructors are bypassed, because they accept only floats.
     """
     import flint
 
     if isinstance(part, tuple):
         return tuple(map(_convert_exactly, part))
     if isinstance(part, LinearDevice) or not is_dataclass(part):
-        # The coefficients of a linear device are exact fractions.
+        # Keep the coefficients of a linear device, because they are exact fractions.
         return flint.arb(part) if isinstance(part, float) else part
-    # Copy only fields, because cached values are floats.
+    # Copy only the fields and no cached results, because cached results are floats.
     copy = object.__new__(type(part))
     for item in fields(part):
         object.__setattr__(copy, item.name, _convert_exactly(getattr(part, item.name)))
@@ -146,14 +147,14 @@ def _convert_exactly(part: Any) -> Any:
 
 
 def _expand_response(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
-    """Return numerator and denominator of G in normalized units, without the poles at z = 0 that the delay causes."""
+    """Return the numerator and denominator polynomials of G in normalized units, without the delay's poles at z = 0."""
     import flint
 
     A, B, _ = (array.tolist() for array in chain.realize())
     size = len(B)
 
     def compute_transition(time: flint.arb) -> tuple[flint.arb_mat, flint.arb_mat]:
-        """Return e^(A t), and the state after a unit force held for time t from rest."""
+        """Return e^(A t), and the state at time t after a unit force held from rest."""
         rows = [[time * value for value in (*row, force)] for row, force in zip(A, B, strict=True)]
         block = flint.arb_mat([*rows, [0] * (size + 1)]).exp()
         return (
@@ -168,7 +169,7 @@ def _expand_response(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
     denominator = transition.charpoly()
 
     def expand_numerator(state: flint.arb_mat) -> flint.arb_poly:
-        """Return ``C adj(z - transition) state`` by the matrix determinant lemma; C selects the first state."""
+        """Return the polynomial ``C adj(z - transition) state`` by the determinant lemma; C selects the first state."""
         changed = flint.arb_mat(transition)
         for k in range(size):
             changed[k, 0] = changed[k, 0] - state[k, 0]
@@ -181,16 +182,17 @@ def _expand_response(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
 
 
 def _exact_estimate(exact: Any, velocity: Any, period: float) -> Estimate:
-    """Return the velocity estimate in balls, or in floats, taken as exact, if its class supports only floats."""
+    """Return the velocity estimate in balls; in floats, which count as exact, if its class supports only floats."""
     try:
         return exact.velocity.estimate(exact.timing.period)
     except (ArithmeticError, AttributeError, TypeError, ValueError):
-        # Estimates defined by users may call functions of ``math``, which accept only floats.
+        # Use floats for an estimate whose class, defined by a user, calls functions of ``math``, which accept only
+        # floats.
         return velocity.estimate(period)
 
 
 def _expand_estimate(estimate: Estimate) -> tuple[flint.arb_poly, flint.arb_poly]:
-    """Return the numerator and the denominator of the velocity estimate F, for T = 1."""
+    """Return the numerator and the denominator polynomials of the velocity estimate F in z, for T = 1."""
     import flint
 
     z, delay = flint.arb_poly([0, 1]), estimate.window + estimate.lag
@@ -202,7 +204,7 @@ def _expand_estimate(estimate: Estimate) -> tuple[flint.arb_poly, flint.arb_poly
 
 
 def _expand(offsets: Any) -> flint.arb_poly:
-    """Return the real monic polynomial of roots in conjugate pairs, given as offsets ``1 - z``."""
+    """Return the monic polynomial with real coefficients of roots in conjugate pairs, given as offsets ``1 - z``."""
     import flint
 
     product = flint.acb_poly([1])

@@ -30,7 +30,7 @@ LAST_NODE = 1e-4  # pi - w of the last node, for a loop without delay and withou
 
 
 class CurvePoints(NamedTuple):
-    """Points of the boundary curve."""
+    """Points of the boundary curve, one array entry per angle w."""
 
     alpha: np.ndarray
     beta: np.ndarray
@@ -41,7 +41,7 @@ class CurvePoints(NamedTuple):
 
 
 def evaluate_curve(loop: LoopRoots, w: np.ndarray) -> CurvePoints:
-    """Evaluate the boundary curve at angles in (0, pi)."""
+    """Return the points of the boundary curve at angles w in (0, pi)."""
     points = circle_points(w)
     with np.errstate(all="ignore"):
         q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
@@ -55,20 +55,21 @@ def evaluate_curve(loop: LoopRoots, w: np.ndarray) -> CurvePoints:
 
 
 def place_nodes(loop: LoopRoots) -> np.ndarray:
-    """Return angles from nearly 0 to nearly pi, so dense that q and F change little from one to the next (V16)."""
+    """Return the angles of the nodes in (0, pi), so dense that q and F change little between neighbors (V16)."""
     roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
     from_one, from_minus_one = np.abs(roots), np.abs(roots - 2.0)
     delay_angle = 1.0 / (loop.lag + loop.estimate.window + 1.0)
     first = 1e-3 * min([delay_angle, *from_one[from_one > 1e-13]])
-    # Near z = -1, with x = pi - w, imaginary parts have a relative error of eps/x, and beta varies as
-    # (x/from_minus_one)^2. The last node is as close to pi as the resulting error of d beta/dw allows.
+    # Let x = pi - w. Near z = -1, imaginary parts have a relative rounding error of eps/x, and beta changes in
+    # proportion to (x/from_minus_one)^2. Place the last node as close to pi as the resulting error of d beta/dw allows.
     last = LAST_NODE * min([delay_angle, *from_minus_one[from_minus_one > 1e-13]]) ** (2.0 / 3.0)
     w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - last, 32)[1:]])
     nodes, low, high = [w], w[:-1], w[1:]
     for _ in range(MAX_ROUNDS):
         half = 0.5 * (high - low)
-        # Change over the interval, by the bound within it (first row) and by the value at its middle (second row).
-        # The bound overestimates the change near roots, so a 16 times larger value of it is accepted.
+        # Estimate the change of q and F over each interval from two bounds of their derivatives: over the whole
+        # interval (first row) and at its midpoint (second row). Accept a 16 times larger change by the first bound,
+        # because this bound overestimates the change near roots.
         change = 2.0 * half * loop.bound_variation(low + half, half * np.array([[1.0], [0.0]]))
         wide = (change > NODE_SPACING * np.array([[16.0], [1.0]])).any(0)
         if not wide.any():
@@ -80,7 +81,7 @@ def place_nodes(loop: LoopRoots) -> np.ndarray:
 
 
 def find_field_zeros(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
-    """Return the zeros of a field of `CurvePoints` at sign changes between nodes.
+    """Return the angles at which a field of `CurvePoints` is 0, by a search between nodes at which its signs differ.
 
     Args:
         loop: the loop without a wall.
@@ -98,7 +99,7 @@ MIN_ESTIMATE_SLOPE = 1e-12  # |Im F'| below which F does not vary to first order
 
 
 class CrossingLine(NamedTuple):
-    """The line ``alpha + beta F = q`` of walls with poles on the unit circle at w, where F and q are real."""
+    """The walls with ``alpha + beta F = q`` and poles on the unit circle at an angle w where F and q are real."""
 
     w: float
     q: float
@@ -109,13 +110,13 @@ class CrossingLine(NamedTuple):
 
     @property
     def curve_beta(self) -> float:
-        """The damping at which the boundary curve meets the line, ``Im q'/Im F'``; NaN if they do not meet."""
+        """The damping ``Im q'/Im F'`` at which the boundary curve meets the line; NaN if they do not meet."""
         return self.im_q_slope / self.im_f_slope if abs(self.im_f_slope) > MIN_ESTIMATE_SLOPE else np.nan
 
     def count_leaving(self, beta: np.ndarray) -> np.ndarray:
         """Return the net number of poles that leave the unit circle as alpha increases past the line (V11).
 
-        A line of constant B through `curve_beta` counts as one just above it.
+        A line of constant B through `curve_beta` is treated as if its beta were slightly larger.
         """
         if np.isnan(self.curve_beta):
             return np.full(beta.shape, self.poles * np.sign(self.im_q_slope))
@@ -123,21 +124,21 @@ class CrossingLine(NamedTuple):
 
 
 def find_lines(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
-    """Return the crossing lines at those of the angles at which q is real.
+    """Return the crossing lines at the given angles; none for an angle at which q is not real.
 
     Args:
         loop: the loop without a wall.
         angles: zeros of Im F, including 0 and pi.
     """
-    # There is no line if q or F is infinite, for example at a zero of G.
+    # Skip angles at which q or F is infinite, for example at a zero of G, because no wall solves the equation there.
     w = np.array(angles, float)
     points, is_end = circle_points(w), (w == 0.0) | (w == np.pi)
     with np.errstate(all="ignore"):
         q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
         real = is_end | (np.abs(q.value.imag) <= REAL_TOLERANCE * np.abs(q.value))
     values = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
-    # Zeros of G within this distance count as located at the angle. The distance is smallest at z = 1, because offsets
-    # of zeros near z = 1 have a small relative error.
+    # Treat a zero of G as located at an angle if their distance is at most ``reach``, because of rounding errors.
+    # ``reach`` is smallest at z = 1, because the offsets of zeros near z = 1 have a small relative error.
     reach = np.where(w == 0.0, 1e-15, np.where(is_end, 1e-12, 1e-9))
     near = np.abs(points.z_minus_1[:, None] + loop.zeros) <= reach[:, None]
     selected = np.flatnonzero(real & ~near.any(1) & np.isfinite(values).all(1))
@@ -145,20 +146,20 @@ def find_lines(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
 
 
 def list_circle_zeros(loop: LoopRoots) -> np.ndarray:
-    """Return the angles of zeros on the unit circle: of G, where q is infinite, and of F, where Im F may touch 0."""
+    """Return the angles of zeros of G (where q is infinite) and of F (where Im F may touch 0) on the unit circle."""
     zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
     angles = np.angle(1.0 - zeros[are_on_circle(zeros)])
     return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
 
 
-# Errors of alpha between two nodes, relative to `CurvePoints.size`. If linear interpolation between the nodes is not
-# accurate, the bound of the error is COARSE_TOLERANCE plus 1.5 times the difference of alpha between the nodes.
+# Parts of the error bound of alpha between two nodes, relative to `CurvePoints.size`. If linear interpolation is not
+# accurate, the bound is COARSE_TOLERANCE plus 1.5 times the difference of alpha between the nodes.
 COARSE_TOLERANCE = 0.02
 ROUNDING_TOLERANCE = 1e-6  # bound of the rounding errors
 
 
 class Arc(NamedTuple):
-    """A part of the boundary curve on which beta is monotone, by its nodes in ascending beta."""
+    """A part of the boundary curve on which beta is monotone, tabulated at nodes in ascending order of beta."""
 
     w: np.ndarray
     beta: np.ndarray
@@ -177,7 +178,7 @@ class Arc(NamedTuple):
 def cut_arcs(
     loop: LoopRoots, w: np.ndarray, curve: CurvePoints, extrema: np.ndarray, limits: dict[float, tuple[float, float]]
 ) -> list[Arc]:
-    """Cut the curve at extrema of beta, where it runs to infinity, and where Im F changes its sign.
+    """Cut the curve into arcs at extrema of beta, at angles where the curve is infinite, and where Im F changes sign.
 
     Args:
         loop: the loop without a wall.
@@ -199,14 +200,16 @@ def cut_arcs(
             nodes = np.array([0.5 * (a + b)])
             inner = evaluate_curve(loop, nodes)
         rising = np.sum(np.sign(inner.wronskian)) > 0
-        # A pair leaves the circle if (d beta/dw) Im F > 0 (V11, V12). Decide by the majority of the nodes, because the
-        # signs at single nodes near the ends of an arc may be rounding errors.
+        # As alpha increases past the arc at constant beta, a pole pair leaves the unit circle if (d beta/dw) Im F > 0,
+        # and enters it if this product is negative (V11, V12). Take the sign that each factor has at the majority of
+        # the nodes, because rounding errors may change the sign at single nodes near the ends of the arc.
         leaving = 2.0 if rising == (np.sum(np.sign(inner.im_f)) > 0) else -2.0
         first, last = (
             betas[end] if np.isfinite(betas[end]) else side * np.inf
             for end, side in ((a, -1.0 if rising else 1.0), (b, 1.0 if rising else -1.0))
         )
-        # The ends of an arc have no tabulated alpha, so walls next to them are compared with the exact crossing.
+        # Add both ends of the arc to its nodes, with alpha = NaN. Near an end, a wall is then compared with the exact
+        # crossing instead of an interpolated one.
         with np.errstate(all="ignore"):
             slope = inner.wronskian / inner.im_f**2
         parts = [nodes, inner.beta, inner.alpha, inner.alpha_slope, slope, inner.size]
@@ -214,7 +217,7 @@ def cut_arcs(
         parts = [np.concatenate([[end[0]], part, [end[1]]]) for part, end in zip(parts, edges, strict=True)]
         if not rising:
             parts = [part[::-1] for part in parts]
-        # Drop nodes whose beta is out of order by rounding errors, near limits and extrema.
+        # Drop nodes at which rounding errors break the monotone order of beta. Such nodes lie near the ends of the arc.
         beta = parts[1]
         ordered = np.maximum.accumulate(beta) == beta
         ordered &= np.minimum.accumulate(beta[::-1])[::-1] == beta
@@ -231,7 +234,7 @@ LOSSLESS_ANGLE = 1e-2  # rad; at smaller angles, rounding errors of poles at z =
 
 
 def find_lossless(loop: LoopRoots, w: np.ndarray, curve: CurvePoints, damping: float) -> float:
-    """Return the damping at which the loop is lossless, or NaN.
+    """Return the damping beta at which the loop is lossless; NaN if no such damping exists.
 
     A loop is lossless if ``q - beta F`` is real on the whole unit circle. Then the reciprocal of every pole is also a
     pole, so no wall with this damping is stable. Example: an undamped joint in semi-implicit Euler, at beta = 0.
@@ -246,7 +249,8 @@ def find_lossless(loop: LoopRoots, w: np.ndarray, curve: CurvePoints, damping: f
     z_minus_1, curve = circle_points(w[tested]).z_minus_1[:, None], CurvePoints(*(values[tested] for values in curve))
     roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
     with np.errstate(all="ignore"):
-        # Conditioning: near a root, the relative error is proportional to 1/distance.
+        # Multiply the tolerance by the condition number, because near a root of q or F the relative rounding error
+        # grows like 1/distance.
         condition = 1.0 + (np.abs(roots) / np.abs(z_minus_1 + roots)).sum(1)
         for beta in (0.0, damping):
             residual = np.abs((curve.beta - beta) * curve.im_f) / (curve.size * condition)
@@ -256,7 +260,7 @@ def find_lossless(loop: LoopRoots, w: np.ndarray, curve: CurvePoints, damping: f
 
 
 def build_level_arc(w: np.ndarray, curve: CurvePoints, beta: float) -> Arc:
-    """Return the curve of a lossless loop: one arc of constant damping, which no line of constant B crosses."""
+    """Return the curve of a lossless loop as one arc of constant damping, which no line of constant B crosses."""
     blank, level = np.full(w.size + 2, np.nan), np.full(w.size + 2, beta)
     alpha = np.concatenate([[np.nan], curve.alpha, [np.nan]])
     return Arc(np.concatenate([[0.0], w, [np.pi]]), level, alpha, blank, blank, blank, 2.0)
@@ -267,7 +271,8 @@ def bound_interpolation(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a mask of the steps over which alpha may be interpolated linearly in beta, and bounds of its error.
 
-    On the other steps alpha is approximated by the mean of both ends, with the returned bound of the error.
+    A step is the interval between two neighboring nodes. Where the mask is False, alpha is approximated by the mean of
+    both ends, with the returned bound of the error.
 
     Args:
         w: angles of the nodes of all arcs, joined, shape (nodes,).
@@ -281,8 +286,9 @@ def bound_interpolation(
     """
     # Interpolate alpha linearly in beta if d beta/dw changes by less than a factor of 2 over the step. If alpha(w) and
     # beta(w) are quadratic, the error is at most the sum of two terms: step/8 times the change of d alpha/dw, because
-    # alpha(w) is curved, and |ratio - 1|/6 times the change of alpha, because beta(w) is curved. The bound is at least
-    # four times this sum. On other steps, the bound exceeds the difference of alpha between both nodes.
+    # alpha(w) is curved, and |ratio - 1|/6 times the change of alpha, because beta(w) is curved. The returned bound is
+    # at least four times this sum. If alpha is not interpolated, the bound exceeds the difference of alpha between both
+    # nodes.
     with np.errstate(all="ignore"):
         ratio = beta_slope / np.roll(beta_slope, 1)
         straight = (ratio > 0.5) & (ratio < 2.0)
@@ -293,7 +299,7 @@ def bound_interpolation(
 
 
 class JoinedArcs(NamedTuple):
-    """The nodes of all arcs, one arc after another; a step leads to each node from the previous one."""
+    """The nodes of all arcs in one sequence; the step of a node is the interval between the previous node and it."""
 
     w: np.ndarray
     beta: np.ndarray
@@ -311,7 +317,7 @@ class JoinedArcs(NamedTuple):
 
     @classmethod
     def join(cls, arcs: tuple[Arc, ...]) -> JoinedArcs:
-        """Join the arcs of a boundary."""
+        """Return the nodes of all arcs of a boundary in one sequence, with the tables for searches in them."""
         w, beta, *others = map(np.concatenate, zip(*(arc[:6] for arc in arcs), strict=True))
         sizes = [arc.w.size for arc in arcs]
         dampings, keys = np.unique(beta, return_inverse=True)
@@ -323,18 +329,18 @@ class JoinedArcs(NamedTuple):
         return cls(w, beta, others[0], *bound_interpolation(w, *others), keys, dampings, first, *ends, *by_arc)
 
     def sum_crossed(self, weights: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return the sum of the weights of the arcs that each line of constant B crosses.
+        """Return, for each line of constant B, the sum of the weights of the arcs that it crosses.
 
-        A line through an end of an arc counts as one just above it.
+        A line through an end of an arc is treated as if its beta were slightly larger.
         """
         sums = np.cumsum(np.concatenate([[0.0], np.concatenate([weights, -weights])[self.order]]))
         return sums[np.searchsorted(self.sorted_ends, beta, side="right")]
 
     def list_crossings(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return all crossings of arcs by lines of constant B: arc, index of the line, and first node after it."""
+        """Return the crossings of arcs by lines of constant B, each as indices of arc, line and next node."""
         arc, row = np.nonzero((beta >= self.ends[0][:, None]) & (beta < self.ends[1][:, None]))
         return arc, row, self.find_nodes(arc, np.searchsorted(self.dampings, beta)[row])
 
     def find_nodes(self, arc: np.ndarray, rank: np.ndarray) -> np.ndarray:
-        """Return the first node of each arc after its crossing; ``rank``: index of the line's beta in ``dampings``."""
+        """Return the first node of each arc after its crossing; ``rank`` is the index of the line in ``dampings``."""
         return np.maximum(np.searchsorted(self.keys, arc * self.dampings.size + rank), self.first[arc] + 1)

@@ -70,7 +70,7 @@ def compute_transition(A: Any, B: Any, time: Any) -> tuple[Any, Any]:
 
 
 def compute_chain_transition(chain: AnyChain, A: Any, B: Any, time: Any) -> tuple[Any, Any]:
-    """Return `compute_transition` for the matrices of a chain; for a sampled system, A - 1 and B at any time."""
+    """Return ``e^(A t) - 1`` and Gamma(t) of a chain; for a sampled system, A - 1 and B, independently of the time."""
     return (A - np.eye(len(B)), B) if chain.sampled else compute_transition(A, B, time)
 
 
@@ -83,7 +83,7 @@ class DiscreteChain(NamedTuple):
 
 
 def discretize_chain(chain: AnyChain) -> DiscreteChain | Plant:
-    """Discretize a chain: a rigid one in closed form, all others by the matrix exponential."""
+    """Return the discretized chain: for a rigid device in closed form, otherwise by the matrix exponential."""
     if not (isinstance(chain, Chain) and chain.rigid):
         return discretize_states(chain)
     fraction = chain.d - chain.n_delay
@@ -100,10 +100,10 @@ def discretize_states(chain: AnyChain) -> DiscreteChain:
 
 
 def evaluate_controller(chain: AnyChain, w: Any, discretized: DiscreteChain | Plant) -> Any:
-    """Evaluate ``q = -1/G`` at ``e^(jw)`` for one angle w, differentiably, because no root is computed."""
+    """Return q at ``e^(jw)`` for one angle w; it is differentiable in all parameters, because no root is computed."""
     points: CirclePoints = circle_points(w)
     if isinstance(discretized, Plant):
-        # N(z)/z = a2 z + a1 + a0/z, the numerator of G.
+        # Evaluate the numerator of G, divided by z: a2 z + a1 + a0/z.
         numerator = discretized.a2 * points.z + discretized.a1 + discretized.a0 / points.z
         return (
             -power_jet(points, chain.n_delay).value * points.z_minus_1 * (points.z_minus_1 + discretized.em) / numerator
@@ -118,7 +118,7 @@ def evaluate_controller(chain: AnyChain, w: Any, discretized: DiscreteChain | Pl
 
 
 def find_roots(chain: AnyChain) -> LoopRoots:
-    """Return the open loop of a chain, without a wall, by its zeros, poles and gain."""
+    """Return the zeros, poles and gain of the open loop of a chain, without a wall."""
     if isinstance(chain, Chain) and chain.rigid:
         return _factor_rigid_loop(chain)
     chain.check()
@@ -130,7 +130,7 @@ def find_roots(chain: AnyChain) -> LoopRoots:
             lead, zeros = find_sampled_zeros(chain.device, float(chain.period), float(chain.d) - chain.n_delay)
             gain = lead * float(chain.mass) / float(chain.period) ** 2
             poles = -np.expm1(chain.device.poles * float(chain.period))
-        # Poles at z = 0 are periods of delay, and zeros at z = 0 cancel them.
+        # Count poles at z = 0 as periods of delay (``lag``), of which zeros at z = 0 cancel one each.
         lag, at_origin = int(lag + np.sum(poles == 1)), int(np.sum(zeros == 1))
         zeros = np.append(zeros[zeros != 1], np.ones(max(at_origin - lag, 0)))
         return LoopRoots(gain, max(lag - at_origin, 0), zeros, poles[poles != 1], chain.estimate)
@@ -147,8 +147,8 @@ def find_roots(chain: AnyChain) -> LoopRoots:
         # For a delay just below an integer, one zero is so far from the unit circle that it has no effect there, and
         # Aberth's method would not find it.
         numerator = numerator[1:]
-    # The coefficients do not resolve zeros near the poles of a soft mode. Start these zeros from those of the
-    # continuous-time response, which they approximate.
+    # Rounding errors of the coefficients hide zeros near the poles of a slow mode. Start the iteration for these zeros
+    # from the zeros of the continuous-time response, which approximate them.
     with np.errstate(all="ignore"):
         slow = np.expm1(continuous_zeros)
     slow = slow[np.abs(slow) < SLOW_ZERO]
@@ -158,7 +158,7 @@ def find_roots(chain: AnyChain) -> LoopRoots:
     # Modes that decay within a period leave a cluster of zeros near z = 0. If the determinant does not separate them,
     # keep the roots of ``numerator`` there, which are accurate as a group.
     for is_refined in (np.full(zeros.shape, True), np.abs(1.0 + zeros) > CLUSTER_RADIUS):
-        # Start off the real axis, because Aberth's steps keep real approximations real, but two real zeros of the
+        # Move the initial values off the real axis. Aberth's steps would keep them real, but two real zeros of the
         # coefficients may be a complex pair of the determinant.
         off_axis = 1.0 + 1e-6j * (1.0 - 2.0 * (np.arange(zeros.size) % 2)) * is_refined
         refined = -_refine_zeros(discretized, zeros * off_axis, is_refined)
@@ -221,26 +221,26 @@ def _log_derivative(matrix: np.ndarray, change: np.ndarray) -> complex:
 
 
 def _factor_rigid_loop(chain: Chain) -> LoopRoots:
-    """Return the open loop of a rigid device in closed form."""
+    """Return the open loop of a rigid device by zeros, poles and gain, in closed form."""
     delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.n_delay)
     plant = discretize_mass(delta, fraction if fraction else None)
     if fraction:
         h, q = factor_numerator(plant)
         zeros = [1.0 + h / plant.a2, 1.0 + q]
     else:
-        # For delta = 0 the gap is 0, so the zero is at exactly z = -1.
+        # Use ``gap``, because it is exactly 0 for delta = 0, and the zero is then at exactly z = -1.
         zeros = [2.0 - plant.gap / plant.a2]
     roots = (np.array(offsets, complex) for offsets in (zeros, [0.0, plant.em]))
     return LoopRoots(float(plant.a2), chain.n_delay + len(zeros) - 1, *roots, estimate=chain.estimate)
 
 
 def realize_device(chain: AnyChain) -> StateSpace:
-    """Return G in state space; its last states are the delayed forces."""
+    """Return G of a chain as a state-space model, whose last states are the delayed forces."""
     return add_input_delay(discretize_states(chain), chain.n_delay)
 
 
 def add_input_delay(discretized: DiscreteChain, n: int) -> StateSpace:
-    """Return G in state space for a discretized device, or for several along leading axes, with integer delay n."""
+    """Return G in state space: a discretized device, or several along leading axes, after an integer delay n."""
     size, is_fractional = discretized.psi.shape[-1], discretized.late is not None
     newer = discretized.late if is_fractional else discretized.full
     count = n + is_fractional
@@ -260,13 +260,13 @@ def add_input_delay(discretized: DiscreteChain, n: int) -> StateSpace:
 
 
 def realize_open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
-    """Return ``L = (alpha + beta F) G`` in state space, from the input position of the wall to the sampled position."""
+    """Return ``L = (alpha + beta F) G`` in state space, from the position at the wall to the sampled position."""
     f = realize_estimate(chain.estimate)
     return connect_in_series(StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D), realize_device(chain))
 
 
 def realize_closed_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
-    """Return the closed loop with a wall, from an external force held on the device to the sampled position."""
+    """Return the closed loop with a wall in state space, from a held external force to the sampled position."""
     loop, filter_order = realize_open_loop(chain, alpha, beta), len(realize_estimate(chain.estimate).A)
     A, _, external = chain.realize()
     B = np.zeros((len(loop.A), 1))

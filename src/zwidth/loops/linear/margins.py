@@ -54,13 +54,13 @@ class OpenLoop(NamedTuple):
 
     @classmethod
     def tabulate(cls, loop: LoopRoots, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
-        """Tabulate L at the nodes of a loop, refined for a wall."""
+        """Return L with a wall, tabulated at the nodes of the loop and, near zeros of the controller, between them."""
         w = np.append(nodes[nodes < np.pi], np.pi)
         n_integrators = int(np.count_nonzero(np.abs(loop.poles) <= POLE_AT_ONE))
         first_gain = abs(alpha * loop.evaluate_response(circle_points(w[:1])).value[0])
         if n_integrators and 0.0 < first_gain < 1.0:
-            # For a device with poles at z = 1, |L| grows without limit as w -> 0. With a soft wall its crossover may be
-            # below all nodes, so add lower ones.
+            # If the device has poles at z = 1, |L| grows without limit as w -> 0. With a small stiffness, the gain
+            # crossover may lie below all nodes, so add nodes at lower angles.
             octaves = 1.0 - np.log2(first_gain) / n_integrators
             w = np.concatenate([w[0] * np.exp2(-np.linspace(octaves, 1.0, int(np.ceil(octaves)))), w])
         for _ in range(MAX_HALVINGS):
@@ -77,11 +77,11 @@ class OpenLoop(NamedTuple):
         return cls(loop, alpha, beta, w, open_loop_response(loop, alpha, beta, circle_points(w)))
 
     def evaluate(self, w: np.ndarray) -> Jet:
-        """Return L and its derivative in w."""
+        """Return L and its derivative in w at angles ``w``."""
         return open_loop_response(self.loop, self.alpha, self.beta, circle_points(w))
 
     def evaluate_at_one(self) -> float | None:
-        """Return ``L(1)``; None if it is infinite or 0."""
+        """Return L at z = 1; None if it is infinite or 0."""
         value = self.evaluate(np.zeros(1)).value[0]
         return float(value.real) if np.isfinite(value) and value.real != 0 else None
 
@@ -89,7 +89,7 @@ class OpenLoop(NamedTuple):
         """Return the angles at which ``|L| = 1``, ascending."""
 
         def log_gain(jet: Jet) -> tuple[np.ndarray, np.ndarray]:
-            """Return ``log|L|`` and its derivative."""
+            """Return ``log|L|`` and its derivative in w."""
             with np.errstate(all="ignore"):
                 return np.log(np.abs(jet.value)), (jet.slope / jet.value).real
 
@@ -99,21 +99,21 @@ class OpenLoop(NamedTuple):
         """Return the angles in (0, pi] at which L is real and negative, ascending."""
 
         def phase_sine(jet: Jet) -> tuple[np.ndarray, np.ndarray]:
-            """Return the sine of arg L and its derivative."""
+            """Return the sine of arg L and its derivative in w."""
             with np.errstate(all="ignore"):
                 unit = jet.value / np.abs(jet.value)
                 return unit.imag, unit.real * (jet.slope / jet.value).imag
 
-        # At pi, L is always real.
+        # Add the angle pi, because L is always real there.
         w = np.append(self._find_zeros(phase_sine, stop=-1), np.pi)
         L = self.evaluate(w)
-        # Exclude zeros of L, where the phase jumps: no factor of the gain puts a pole there.
+        # Exclude zeros of L, at which the phase jumps, because no factor of the gain puts a pole there.
         return w[(L.value.real < 0) & (np.abs(L.value) > ZERO_OF_L * w * np.abs(L.slope))]
 
     def _find_zeros(
         self, function: Callable[[Jet], tuple[np.ndarray, np.ndarray]], stop: int | None = None
     ) -> np.ndarray:
-        """Return all zeros of a real function of L.
+        """Return the angles at which a real function of L is zero.
 
         Args:
             function: maps L to values and derivatives in w.
@@ -135,21 +135,21 @@ class OpenLoop(NamedTuple):
         value: np.ndarray,
         slope: np.ndarray,
     ) -> np.ndarray:
-        """Return minima of |function| between nodes of equal sign whose tangents reach the other sign."""
+        """Return the angles of minima of |function| between nodes of equal sign whose tangents reach the other sign."""
         step, sign = np.diff(w), np.sign(value[:-1])
         approaching = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
         size, descent = np.abs(value), np.abs(slope)
-        # At the Nyquist frequency L may be 0; the tangent of its logarithm is then NaN.
+        # Ignore NaN, because L may be 0 at the Nyquist frequency, where the tangent of its logarithm is undefined.
         with np.errstate(invalid="ignore"):
             lowest = np.minimum(size[:-1] - descent[:-1] * step, size[1:] - descent[1:] * step)
         k = np.flatnonzero(approaching & (lowest < 0))
         return find_zeros_between(lambda angles: function(self.evaluate(angles))[1], w, slope, k)
 
     def find_least_distance(self) -> tuple[float, float]:
-        """Return the minimum of ``|1 + L|`` and its angle."""
+        """Return the modulus margin, that is, the minimum of ``|1 + L|``, and the angle at which it is reached."""
 
         def slope(jet: Jet) -> np.ndarray:
-            """Return half the derivative of ``|1 + L|^2``."""
+            """Return half the derivative of ``|1 + L|^2`` in w."""
             return ((1.0 + jet.value).conj() * jet.slope).real
 
         distance, rising = np.abs(1.0 + self.L.value), np.nan_to_num(slope(self.L))
@@ -165,11 +165,11 @@ class OpenLoop(NamedTuple):
 
 
 def open_loop_response(loop: LoopRoots, alpha: Array, beta: Array, points: CirclePoints) -> Jet:
-    """Return L and its derivative in w, for arrays that broadcast."""
+    """Return L of walls and its derivative in w at points of the unit circle, for arrays that broadcast."""
     with np.errstate(all="ignore"):
         f = loop.estimate.jet(points)
         L = Jet(alpha + beta * f.value, beta * f.slope).times(loop.evaluate_response(points))
-        # At pi, L is real; drop rounding errors of the imaginary part.
+        # Set the imaginary part of L at w = pi to 0, because L is real there and only a rounding error would remain.
         is_nyquist = points.w >= np.pi
         return Jet(np.where(is_nyquist, L.value.real + 0j, L.value), L.slope)
 
@@ -201,7 +201,7 @@ def compute_wall_margins(wall: OpenLoop, stable: bool, wanted: Container[str]) -
 
 
 def select_gain_margin(stable: bool, w: np.ndarray, gains: np.ndarray) -> tuple[float, float]:
-    """Return the gain margin and its phase crossover: the gain closest to 1, on a logarithmic scale.
+    """Return the gain margin, from the gain closest to 1 on a logarithmic scale, and the angle of its phase crossover.
 
     Args:
         stable: True if the closed loop is stable.
@@ -219,7 +219,7 @@ def select_gain_margin(stable: bool, w: np.ndarray, gains: np.ndarray) -> tuple[
 
 
 def select_phase_margin(stable: bool, w: np.ndarray, phases: Array) -> tuple[float, float]:
-    """Return the phase margin in degrees, negative for an unstable loop, and its gain crossover.
+    """Return the phase margin in degrees, negative for an unstable loop, and the angle of its gain crossover.
 
     Args:
         stable: True if the closed loop is stable.
@@ -239,10 +239,11 @@ def select_phase_margin(stable: bool, w: np.ndarray, phases: Array) -> tuple[flo
 
 # Delays at which crossovers are computed
 N_PARTS = 8  # per period
-# Largest error in the delay of a starting value, in parts of a period, if the number of crossovers changes there.
+# Largest error of a starting value of the delay, in units of 1/N_PARTS periods, if the number of crossovers changes
+# near it.
 START_ERROR = 1.5
-# Further delays below an integer, in time constants of the fastest pole: a strongly damped device tolerates less delay
-# within ln 2 time constants below the integer than at it.
+# Distances of additional delays below an integer delay, in time constants of the fastest pole. A strongly damped device
+# tolerates less delay within ln 2 time constants below the integer than at the integer itself.
 EARLY_DELAYS = np.array([1.0, 0.5, 0.25, 0.1])
 FAST_RATE = 2.0  # per period; the parts resolve slower poles
 
@@ -258,7 +259,7 @@ UNSTABLE_MULTIPLE = 1.0 + 1e-5  # the wall must be unstable
 
 
 def build_delayed_loops(chain: AnyChain) -> dict[float, tuple[LoopRoots, np.ndarray]]:
-    """Return loops and their nodes for delays up to one period longer than that of the chain, ascending."""
+    """Return loops and their nodes by delay in periods, ascending from the delay of the chain to one period more."""
     d = float(chain.d)
     fastest = -float(np.linalg.eigvals(chain.realize().A).real.min())
     early = 1.0 - EARLY_DELAYS / fastest if fastest > FAST_RATE else np.empty(0)
@@ -269,7 +270,7 @@ def build_delayed_loops(chain: AnyChain) -> dict[float, tuple[LoopRoots, np.ndar
 
 
 def change_delay(chain: AnyChain, delay: float) -> LoopRoots:
-    """Return the loop of a chain with another delay, in periods."""
+    """Return the loop of a chain after replacing its delay by ``delay``, in periods."""
     return find_roots(replace(chain, d=float(delay), n_delay=int(np.floor(delay))))
 
 
@@ -280,7 +281,7 @@ def find_delay_margin(
 
     Args:
         chain: the chain.
-        delayed: its `build_delayed_loops`.
+        delayed: result of `build_delayed_loops` for the chain.
         alpha: normalized stiffness.
         beta: normalized damping.
 
@@ -294,14 +295,14 @@ def find_delay_margin(
     limits = [_solve_delay(chain, wall, w, delay) for w, delay in _list_starts(delays, crossovers, phases)]
 
     def evaluate_at_nyquist(delay: float) -> float:
-        """Return L(-1) with a delay."""
+        """Return L at z = -1, which is real, for a delay in periods."""
         return open_loop_response(change_delay(chain, delay), *wall, circle_points(np.array([np.pi]))).value[0].real
 
     at_nyquist = np.array([each.L.value[-1].real for each in loops])
     above = np.abs(at_nyquist) - 1.0
     k = np.flatnonzero((above[1:] > 0) != (above[:-1] > 0))
     real = find_zeros_between(lambda each: np.abs([*map(evaluate_at_nyquist, each)]) - 1.0, np.array(delays), above, k)
-    # If L(-1) = 1, one more period of delay makes it -1.
+    # Add one period of delay if L(-1) = 1, because this changes the sign of L(-1).
     limits += (real + np.where(at_nyquist[k] < 0, 0.0, 1.0)).tolist()
     limits = [limit - float(chain.d) for limit in limits if limit > chain.d]
     if not limits:
@@ -312,20 +313,21 @@ def find_delay_margin(
 def _list_starts(
     delays: list[float], crossovers: list[np.ndarray], phases: list[np.ndarray]
 ) -> Iterator[tuple[float, float]]:
-    """Yield angles and delays near which a pole is on the unit circle.
+    """Yield pairs of angle and delay near which a pole is on the unit circle, as starts of Newton's method.
 
     Args:
         delays: delays of the loops.
         crossovers: gain crossovers of each loop.
         phases: arg(-L) at these crossovers, in [0, 2 pi).
     """
-    # After m = phase/w more periods L is -1 at the crossover, and integer m do not change |L|. So look between two
-    # delays for each integer that m passes, and next to a local minimum of m for the integer below it.
+    # After m = phase/w more periods of delay, L would be -1 at the crossover, and an integer m does not change |L|. So
+    # a solution exists near each integer that m passes between two tabulated delays. Near a local minimum of m, the
+    # integer below may also be reached.
     more = [phase / w for phase, w in zip(phases, crossovers, strict=True)]
     for k, (w, after) in enumerate(pairwise(crossovers)):
         if w.size != after.size:
-            # Two crossovers have merged between these delays, and one may have passed L = -1 before. Take all
-            # crossovers of both loops whose m is nearly an integer.
+            # Two crossovers appear or merge between these delays, and one of them may have an integer m there. Start
+            # from all crossovers of both loops whose m is nearly an integer.
             for i, turn in product((k, k + 1), (0.0, 2.0 * np.pi)):
                 m = (phases[i] - turn) / crossovers[i]
                 integer = np.round(m)
@@ -348,7 +350,7 @@ def _list_starts(
 
 
 def _solve_delay(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) -> float:
-    """Return the delay near a start at which a pole is on the unit circle, by Newton's method on log(-L); else NaN."""
+    """Return the delay in periods that puts a pole on the unit circle, by Newton's method on log(-L); else NaN."""
     residual = np.inf
     for _ in range(MAX_STEPS):
         if not (0.0 < w < np.pi and delay >= 0.0):
@@ -357,20 +359,21 @@ def _solve_delay(chain: AnyChain, wall: tuple[float, float], w: float, delay: fl
         L, shifted = (open_loop_response(change_delay(chain, delay + h), *wall, points) for h in (0.0, step))
         residual, d_w = np.log(-L.value[0]), L.slope[0] / L.value[0]
         d_delay = np.log(shifted.value[0] / L.value[0]) / step
-        # If L does not depend on the delay in some range, because the device has come to rest before, the step is NaN.
+        # Ignore division by zero: L does not depend on the delay if the device comes to rest within a period, and the
+        # step is then NaN.
         with np.errstate(all="ignore"):
             w_step, delay_step = np.imag([d_delay * residual.conj(), residual * d_w.conj()]) / np.imag(
                 d_delay * d_w.conj()
             )
         w, delay = w - w_step, delay - delay_step
-        # Check the delay only, because on the flank of a narrow resonance the rounding error of w keeps w changing.
+        # Test convergence of the delay only, because near a narrow resonance rounding errors of w keep changing w.
         if abs(delay_step) <= 1e-14 * (1.0 + delay):
             break
     return delay if abs(residual) < LOG_TOLERANCE else np.nan
 
 
 def _is_first_loss(chain: AnyChain, alpha: float, beta: float, margin: float) -> bool:
-    """Return whether the wall is stable with several delays below the margin and unstable just above, by its poles."""
+    """Return whether the spectral radius is below 1 at delays below the margin and above 1 just above the margin."""
     wall = np.array([alpha]), np.array([beta])
     delays = [float(chain.d) + multiple * margin for multiple in (*STABLE_MULTIPLES, UNSTABLE_MULTIPLE)]
     logs = [compute_log_radius(change_delay(chain, delay), *wall)[0] for delay in delays]
@@ -395,7 +398,7 @@ def compute_margins(
     stable = label_walls(boundary, alpha, beta)
     in_range = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
     delayed: dict[float, tuple[LoopRoots, np.ndarray]] = {}
-    # A sampled system does not define its response between samples, so fractional delays are impossible.
+    # Omit the delay margin of a sampled system, which does not define its response at fractional delays.
     with_delay = "delay_margin" in wanted and not chain.sampled
     out = np.full((len(Margins._fields), *alpha.shape), np.nan)
     for index in np.ndindex(alpha.shape):

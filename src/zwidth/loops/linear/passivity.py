@@ -33,7 +33,7 @@ SHARES = np.arange(1, N_PARTS)[:, None] / N_PARTS  # inner points of a divided i
 CERTIFIED_ERROR = 1e-13  # relative error of the maximum
 
 
-# Fields of a device for which the condition is unknown: description, and reason with remedy.
+# Fields of a device for which no passivity condition is available, each with a description, a reason and a remedy.
 UNSUPPORTED = {
     "response": (
         "a measured response",
@@ -77,7 +77,7 @@ def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
 
 @dataclass(frozen=True)
 class PassivityCondition:
-    """The condition for a velocity estimate and a delay."""
+    """Colgate's condition of passivity for one velocity estimate and one delay."""
 
     quotient: Estimate  # E
     spring: float  # F(1)
@@ -86,11 +86,11 @@ class PassivityCondition:
 
     @classmethod
     def derive(cls, estimate: Estimate, d: float) -> PassivityCondition:
-        """Return the condition for an estimate and a delay in periods."""
+        """Return the passivity condition for a velocity estimate and a delay d in periods."""
         n = int(np.floor(d))
         if estimate.window:
             return cls(estimate, 0.0, n, float(d - n))
-        # Polynomials in zeta = z - 1, lowest power first.
+        # Represent polynomials by their coefficients in zeta = z - 1, lowest power first.
         polynomial = np.polynomial.polynomial
         lag = max(estimate.lag, 0)
         numerator = (
@@ -98,14 +98,15 @@ class PassivityCondition:
         )
         denominator = polynomial.polyfromroots([*-estimate.poles, *[-1.0] * lag]).real
         spring = numerator[0] / denominator[0]
-        # The numerator of E = (F - F(1))/(z - 1): drop the constant coefficient, which is 0; a constant F leaves none.
+        # Divide the numerator of F - F(1) by zeta to get that of E: drop the constant coefficient, which is 0. If F is
+        # constant, no coefficient remains.
         quotient = np.trim_zeros(polynomial.polysub(numerator, spring * denominator)[1:], "b")
         quotient = quotient if quotient.size else np.zeros(1)
         E = Estimate(0, quotient[-1], lag, -polynomial.polyroots(quotient) + 0j, estimate.poles)
         return cls(E, float(spring), n, float(d - n))
 
     def _evaluate_quotient(self, w: np.ndarray) -> np.ndarray:
-        """Return E; for a windowed difference it contains the mean of z^-1 to z^-window."""
+        """Return E at angles w; for a windowed difference, E has the mean of z^-1 to z^-window as a factor."""
         n, value = self.quotient.window, replace(self.quotient, window=0).jet(circle_points(w)).value
         if n:
             s = np.sin(0.5 * w)
@@ -114,7 +115,7 @@ class PassivityCondition:
         return value
 
     def require_damping(self, alpha: float, beta: float, w: np.ndarray) -> np.ndarray:
-        """Return the required damping N at angles in [0, pi], for alpha >= 0 that includes ``beta F(1)``."""
+        """Return the required damping N at angles in [0, pi]; ``alpha`` >= 0 includes the stiffness ``beta F(1)``."""
         n, f = self.integer_delay, self.fractional_delay
         s = np.sin(0.5 * w)
         kernel = np.where(s == 0, 2.0 * n + 1.0, np.sin((n + 0.5) * w) / np.where(s == 0, 1.0, s))
@@ -135,11 +136,12 @@ class PassivityCondition:
         bound = alpha * n * (n + 1) * (2 * n + 1) / 3.0 + 2.0 * abs(beta) * damper[2]
         late = _multiply_bounds(_multiply_bounds(damper, difference), _bound_power(1, low))[2]
         bound = bound + 2.0 * f * (alpha * (n + 1) ** 2 + abs(beta) * late)
-        # The factor z^-n in ``wall`` only increases it, so beta ``wall`` also bounds |C''|.
+        # ``wall`` bounds the second derivative of z^-n (z - 1) E. Use it for that of C/beta, too, because the factor
+        # z^-n only increases the bound.
         return 0.5 * (bound + np.sqrt(f * (1.0 - f)) * abs(beta) * wall)
 
     def _bound_quotient(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return bounds of E and its first two derivatives."""
+        """Return bounds of |E| and of its first two derivatives in w on each interval of angles [low, high]."""
         f = self.quotient
         value = _multiply_bounds((abs(f.gain) + 0.0 * low, 0.0 * low, 0.0 * low), _bound_power(abs(f.lag), low))
         if f.window:
@@ -152,7 +154,7 @@ class PassivityCondition:
         for pole in f.poles:
             middle = 0.5 * (low + high)
             distance = np.abs(circle_points(middle).z_minus_1 + pole) - 0.5 * (high - low)
-            # No point of the unit circle is closer to the pole than 1 - |pole|.
+            # Use at least 1 - |pole|, because no point of the unit circle is closer to the pole.
             depth = 1.0 - abs(1.0 - pole)
             distance = np.maximum(distance, depth)
             value = _multiply_bounds(value, (1.0 / distance, 1.0 / distance**2, 2.0 / distance**3 + 1.0 / distance**2))
@@ -160,7 +162,7 @@ class PassivityCondition:
 
 
 def _multiply_bounds(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """Return bounds of a product and its first two derivatives, from those of its factors."""
+    """Return bounds of a product and its first two derivatives, from those of both factors."""
     return (
         one[0] * other[0],
         one[1] * other[0] + one[0] * other[1],
@@ -169,24 +171,24 @@ def _multiply_bounds(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...])
 
 
 def _bound_power(exponent: int, like: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return bounds of ``z^exponent`` or its inverse and the first two derivatives, in the shape of ``like``."""
+    """Return bounds of z^exponent or z^-exponent and its first two derivatives in w, in the shape of ``like``."""
     return 1.0 + 0.0 * like, exponent + 0.0 * like, float(exponent) ** 2 + 0.0 * like
 
 
 def _bound_difference(low: np.ndarray, high: np.ndarray, offset: complex) -> tuple[np.ndarray, ...]:
-    """Return bounds of ``z - root`` and its first two derivatives; ``offset`` is 1 - root."""
+    """Return bounds of ``z - root`` and its first two derivatives in w; ``offset`` is 1 - root."""
     middle, one = 0.5 * (low + high), 1.0 + 0.0 * low
     return np.abs(circle_points(middle).z_minus_1 + offset) + 0.5 * (high - low), one, one
 
 
 def find_needed_damping(condition: PassivityCondition, alpha: float, beta: float) -> float:
-    """Return the largest damping required at any frequency, certified to a relative 1e-13; NaN for non-finite input."""
+    """Return the maximum of N over all frequencies with a relative error below 1e-13; NaN for non-finite input."""
     if not (np.isfinite(alpha) and np.isfinite(beta)):
         return np.nan
     stiffness = max(alpha + beta * condition.spring, 0.0)
     w = np.concatenate([[0.0], np.geomspace(1e-6, 1e-2, 24), np.linspace(1e-2, np.pi, N_NODES)[1:]])
     values = condition.require_damping(stiffness, beta, w)
-    # Both ends of each interval of angles, and the damping required at each end.
+    # Store the two ends of each interval of angles, and the required damping at each end, along the first axis.
     ends, needs = np.stack([w[:-1], w[1:]]), np.stack([values[:-1], values[1:]])
     best, upper = float(values.max()), values
     for _ in range(MAX_ROUNDS):
@@ -195,7 +197,7 @@ def find_needed_damping(condition: PassivityCondition, alpha: float, beta: float
         if not undecided.any():
             return best
         if undecided.sum() > MAX_INTERVALS:
-            # The function is flat on too many intervals, so return their upper bound, which is conservative.
+            # Return the upper bound, which is conservative, because N is so flat that too many intervals remain.
             break
         (low, high), needs = ends[:, undecided], needs[:, undecided]
         angles = low + (high - low) * SHARES

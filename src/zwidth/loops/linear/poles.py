@@ -51,7 +51,7 @@ class FactoredValue(NamedTuple):
 
 
 def _product(zeta: Array, offsets: Array, factor: float = 1.0) -> Jet:
-    """Return ``factor prod(zeta + offset)`` and its derivative."""
+    """Return ``factor prod(zeta + offset)`` and its derivative in zeta."""
     product = Jet(np.full_like(zeta, factor), np.zeros_like(zeta))
     for offset in offsets:
         product = product.times(Jet(zeta + offset, 1.0))
@@ -59,17 +59,17 @@ def _product(zeta: Array, offsets: Array, factor: float = 1.0) -> Jet:
 
 
 def _power(zeta: Array, exponent: int) -> Jet:
-    """Return ``z^exponent`` and its derivative."""
+    """Return ``z^exponent`` and its derivative in z."""
     lower = (1.0 + zeta) ** (exponent - 1) if exponent else np.ones_like(zeta)
     return Jet(lower * (1.0 + zeta) if exponent else lower, exponent * lower)
 
 
 def _difference(zeta: Array, window: int) -> Jet:
-    """Return ``(z^window - 1)/window`` and its derivative."""
+    """Return ``(z^window - 1)/window`` and its derivative in z."""
     power, slope = _power(zeta, window)
     log_z = 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -0.999))
     exponent = window * (log_z + 1j * np.arctan2(zeta.imag, 1.0 + zeta.real))
-    # Near z = 1 the subtraction of 1 would cancel, so use expm1 of window log(z).
+    # Near z = 1 use expm1 of window log(z), because the subtraction of 1 from z^window would lose significant digits.
     near = np.abs(exponent) < 1.0
     small = np.where(near, exponent, 0.0)
     return Jet(np.where(near, np.expm1(small), power - 1.0) / window, slope / window)
@@ -82,7 +82,7 @@ def log_modulus(zeta: Array) -> Array:
 
 
 def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> FactoredValue:
-    """Evaluate P and its derivative in the factored form, for arrays that broadcast."""
+    """Return P, its derivative in zeta and the scale of its rounding error, for arrays that broadcast."""
     f = loop.estimate
     delay = f.window + f.lag
     g_denominator = _product(zeta, loop.poles).times(_power(zeta, loop.lag))
@@ -99,13 +99,14 @@ def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array)
 
 
 def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
-    """Return zeta of all poles of walls of shape (walls,), as an array of shape (walls, order)."""
+    """Return zeta of all poles of each wall by Aberth's method, as an array of shape (walls, order)."""
     D, N1, N2 = affine_polynomial(loop)
     monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
     zeta = np.linalg.eigvals(companion(monic)) - 1.0 + 0j
     _refine_poles(loop, alpha, beta, zeta, np.arange(len(zeta)))
-    # Aberth's steps keep real approximations real and complex pairs complex. If the eigenvalues of a nearly double pole
-    # are of the wrong kind, the steps do not converge. Move these approximations off their line and repeat.
+    # Aberth's steps keep real approximations real and complex pairs complex. They do not converge if rounding errors
+    # split a nearly double real pole into a complex pair of eigenvalues, or vice versa. Perturb unconverged
+    # approximations by complex factors and repeat.
     for restart in range(MAX_RESTARTS):
         P = evaluate_polynomial(loop, alpha[:, None], beta[:, None], zeta)
         with np.errstate(all="ignore"):
@@ -120,7 +121,7 @@ def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
 
 
 def _refine_poles(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array, walls: Array) -> None:
-    """Apply Aberth's steps, in place, to the poles of the walls with these indices until all have converged."""
+    """Refine the poles ``zeta`` of the walls with the indices ``walls`` in place, until Aberth's steps converge."""
     for _ in range(MAX_STEPS):
         if not walls.size:
             break
@@ -128,7 +129,7 @@ def _refine_poles(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array, walls
         P = evaluate_polynomial(loop, alpha[walls, None], beta[walls, None], current)
         with np.errstate(all="ignore"):
             step = compute_aberth_step(current, P.slope / P.value)
-        # If |P| is below its own rounding error, the step would be noise.
+        # Skip the step of a pole at which |P| is below its rounding error, because such a step would be random.
         is_significant = np.isfinite(step) & (np.abs(P.value) > 1e-16 * P.size)
         step = np.where(is_significant, step, 0.0)
         step *= LONGEST_STEP / np.maximum(np.abs(step), LONGEST_STEP)
@@ -165,14 +166,14 @@ def compute_poles_minus_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array
         for k in range(0, walls.size, block):
             part = walls[k : k + block]
             out[part] = _find_poles(loop, alpha[part], beta[part]) if damped else _find_spring_poles(loop, alpha[part])
-    # Aberth's steps leave rounding errors in the imaginary parts of real poles. A complex pair that has just left the
-    # real axis has larger ones, about 1e-8.
+    # Set imaginary parts to 0 where they are rounding errors of real poles. A complex pair that has just left the real
+    # axis has larger imaginary parts, about 1e-8.
     out = np.where(np.abs(np.imag(out)) <= REAL_TOLERANCE * np.abs(out), np.real(out) + 0j, out)
     return out.reshape(*shape, order)
 
 
 def _find_spring_poles(loop: LoopRoots, alpha: Array) -> Array:
-    """Return the poles of walls without damping.
+    """Return zeta of all poles of walls with beta = 0.
 
     The velocity estimate then has no effect on the force, and its own poles are poles of the closed loop.
     """
@@ -182,7 +183,7 @@ def _find_spring_poles(loop: LoopRoots, alpha: Array) -> Array:
     return np.concatenate([zeta, np.broadcast_to(filter_poles, (alpha.size, filter_poles.size))], 1)
 
 
-# Relative size of a difference of two float64 values below which it is only their rounding error.
+# A difference of two float64 values is treated as their rounding error below this fraction of their magnitudes.
 CANCELLATION = 1e-14
 
 
@@ -194,8 +195,8 @@ def is_marginal(loop: LoopRoots, alpha: float, beta: float) -> bool:
     wall = np.array([alpha]), np.array([beta])
     P = evaluate_polynomial(loop, *wall, np.zeros(1, complex))
     undamped = evaluate_polynomial(loop, wall[0], 0.0 * wall[1], np.zeros(1, complex))
-    # If the negative damping of the wall cancels the damping of the device, P'(1) is a rounding error of 0, and the
-    # pole at z = 1 is double.
+    # Treat P'(1) as 0 if it is a rounding error, because the negative damping of the wall may cancel that of the
+    # device, and then the pole at z = 1 is double.
     terms = np.abs(undamped.slope[0]) + np.abs(P.slope[0] - undamped.slope[0])
     if P.value[0] != 0 or np.abs(P.slope[0]) <= CANCELLATION * terms:
         return False
@@ -203,8 +204,8 @@ def is_marginal(loop: LoopRoots, alpha: float, beta: float) -> bool:
     return bool(np.all(log_modulus(np.delete(zeta, np.argmin(np.abs(zeta)))) < 0))
 
 
-# Loops with more poles are counted in circles, which is then faster than computing all poles. A long window adds so
-# many zeros that counting is slower.
+# With more poles than this, counting them in circles is faster than computing all of them. With a window above
+# MAX_COUNTED_WINDOW samples counting is slower, because the window adds as many zeros.
 MAX_COMPUTED_POLES = 150
 MAX_COUNTED_WINDOW = 40
 
@@ -214,19 +215,20 @@ MAX_ROUNDS = 24
 BRACKET_WIDTH = 4e-16  # target width, relative to max(1, |log radius|)
 MAX_BRACKET_WIDTH = 1e-6  # a wider final bracket, caused by inconclusive counts, means NaN
 
-# Largest |log radius| that may contradict the verdict on stability; for a larger one either may be wrong.
+# Largest |log radius| that may contradict the verdict on stability. Beyond it the result is NaN, because either the
+# radius or the verdict may be wrong.
 VERDICT_TOLERANCE = 1e-7
 
 
 def compute_log_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Return ``log max|z|`` over the poles of walls of shape (walls,); NaN if it cannot be computed."""
+    """Return ``log max|z|`` over the poles of each wall, shape (walls,); NaN if it cannot be computed."""
     if loop.order <= MAX_COMPUTED_POLES or loop.estimate.window > MAX_COUNTED_WINDOW:
         return log_modulus(compute_poles_minus_one(loop, alpha, beta)).max(-1)
     return np.array([_bracket_log_radius(loop, a, b) for a, b in zip(alpha.tolist(), beta.tolist(), strict=True)])
 
 
 def spectral_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, stable: np.ndarray) -> np.ndarray:
-    """Return ``max|z|`` over the poles of walls, below 1 if and only if ``stable``.
+    """Return the spectral radius ``max|z|`` of each wall, which is below 1 if and only if ``stable`` is True.
 
     Within rounding errors of the stability boundary the computed radius may contradict the verdict; it is then 1, or
     the next smaller float64 for a stable wall.
@@ -247,14 +249,14 @@ def spectral_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, stable
 
 
 def _bracket_log_radius(loop: LoopRoots, alpha: float, beta: float) -> float:
-    """Return the log radius of one wall by narrowing a bracket with pole counts."""
+    """Return ``log max|z|`` of one wall, by narrowing a bracket with counts of the poles in circles."""
     if not (np.isfinite(alpha) and np.isfinite(beta)):
         return np.nan
     zeros, poles, gain, lag = factor_open_loop(loop, alpha, beta)
     order = poles.size + lag
     low, high = -1.0, 1.0
     for round_ in range(MAX_ROUNDS):
-        # The first rounds include both ends, because the bracket may have to be enlarged.
+        # In the first rounds, also count the poles at both ends of the bracket, because it may have to be enlarged.
         logs = np.linspace(low, high, N_CIRCLES + 2)[0 if round_ < 3 else 1 : None if round_ < 3 else -1]
         with np.errstate(all="ignore"):
             counts = count_poles(zeros, poles, gain, lag, np.exp(logs))

@@ -42,10 +42,11 @@ MAX_STEPS = 4  # Newton steps
 CONVERGED_STEP = 1e-15  # relative to beta
 
 ON_LOSSLESS = 1e-9  # tolerance of the lossless damping, relative to the width of the stable set in beta
-# Relative excess of alpha on a line of constant B over the ridge, above which the two contradict each other.
+# Relative excess in alpha of a stable wall over the ridge, above which the ridge is rejected; smaller ones are rounding
+# errors.
 CONTRADICTION = 1e-7
 
-# Test of a maximum on neighboring lines of constant B
+# Test of a maximum on lines of constant B at these offsets, relative to the width of the stable set plus |beta|.
 NEIGHBOR_OFFSETS = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3])  # in beta, relative to its scale
 REACHED_FRACTION = 0.99  # of alpha, up to which one of these lines must be stable
 
@@ -72,12 +73,12 @@ class RidgeSolution(NamedTuple):
 
     @property
     def omega(self) -> float:
-        """The angle at which the loop oscillates with this wall; at a corner, the higher of the two."""
+        """The angle of the poles on the unit circle with this wall; at a corner, the higher of the two angles."""
         return max(self.w1, self.w2) if self.second <= Condition.PLUS_ONE else self.w1
 
     @property
     def kind(self) -> RidgeKind:
-        """The kind of maximum: smooth, a corner, or at the limit beta = 0."""
+        """The kind of the maximum: smooth, a corner, or at the limit beta = 0 of the allowed dampings."""
         if self.second == Condition.NO_DAMPING:
             return RidgeKind.NO_DAMPING
         smooth = self.first == Condition.PAIR and self.second == Condition.STATIONARY
@@ -98,19 +99,20 @@ def find_ridge(stable_set: StableSet, negative_damping: bool) -> RidgeSolution |
         ArithmeticError: if lines of constant B contradict the result, or a corner was not resolved.
     """
     least = -np.inf if negative_damping else 0.0
-    # On an edge that does not depend on B, corners differ in alpha only by rounding errors: prefer the largest beta,
-    # then the crossing on a line of constant B, because the end of an edge has no angle.
+    # Compare alpha with 13 digits, because on an edge of constant alpha both corners differ by rounding errors. Among
+    # equal maxima prefer the largest beta, then the crossing on a line of constant B, because the end of an edge has no
+    # angle.
     maxima = sorted(
         _list_maxima(stable_set, least), key=lambda top: (-float(f"{top.alpha:.12e}"), -top.beta, math.isnan(top.w))
     )
-    # Near an asymptote of the curve, rounding errors may turn a part of it into a spurious edge. Such an edge bounds no
-    # interval of a line of constant B.
+    # Skip maxima on spurious edges, which rounding errors create near an asymptote of the curve. Such an edge bounds no
+    # stable interval of a line of constant B.
     top = next((top for top in maxima if _is_reached(stable_set, top, least)), None)
     ridge = None if top is None else _identify_conditions(stable_set, top, least)
     lossless = stable_set.boundary.lossless
     if ridge is not None and abs(ridge.beta - lossless) <= ON_LOSSLESS * stable_set.width:
-        # No wall is asymptotically stable at exactly this damping. Remove the rounding error of the corner, with which
-        # some walls would appear to be.
+        # Set beta to the lossless damping, at which no wall is asymptotically stable. With the rounding error of the
+        # corner some walls would appear stable.
         ridge = ridge._replace(beta=lossless)
     highest = stable_set.find_highest(least)
     if highest > (0.0 if ridge is None else ridge.alpha) * (1.0 + CONTRADICTION):
@@ -137,7 +139,7 @@ def _list_maxima(stable_set: StableSet, least: float) -> Iterator[_Maximum]:
         for k in np.flatnonzero((alpha >= padded[:-2]) & (alpha >= padded[2:]) & (alpha > 0)):
             yield _Maximum(float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), edge.column, bool(0 < k < last))
     if np.isfinite(least):
-        # The crossings of the edges with the line beta = least.
+        # Add the crossings of the edges with the line beta = least, where the allowed range of beta ends.
         row = stable_set.boundary.find_crossings(np.array([least]))
         for edge in edges:
             high, w = float(row.alpha[0, edge.column]), float(row.w[0, edge.column])
@@ -146,7 +148,7 @@ def _list_maxima(stable_set: StableSet, least: float) -> Iterator[_Maximum]:
 
 
 def _is_reached(stable_set: StableSet, top: _Maximum, least: float) -> bool:
-    """Return whether a line of constant B next to a maximum is stable nearly up to it."""
+    """Return whether a stable interval on a line of constant B next to a maximum reaches nearly the same alpha."""
     scale = stable_set.width + abs(top.beta)
     intervals = find_stable_intervals(stable_set.boundary, np.maximum(top.beta + scale * NEIGHBOR_OFFSETS, least))
     bounded = (intervals.above == top.column) | (intervals.below == top.column)
@@ -154,7 +156,7 @@ def _is_reached(stable_set: StableSet, top: _Maximum, least: float) -> bool:
 
 
 def _identify_conditions(stable_set: StableSet, top: _Maximum, least: float) -> RidgeSolution:
-    """Return a maximum with its active constraints."""
+    """Return the `RidgeSolution` of a local maximum, with its two active constraints."""
     alpha, beta, w = top[:3]
     if beta == least:
         return RidgeSolution(alpha, beta, w, w, _classify_angle(w), Condition.NO_DAMPING)
@@ -164,16 +166,16 @@ def _identify_conditions(stable_set: StableSet, top: _Maximum, least: float) -> 
 
 
 def _classify_angle(w: float) -> Condition:
-    """Return the condition of a pole at an angle."""
+    """Return the active constraint of poles at the angle w: a pole pair, or a real pole at z = 1 or z = -1."""
     if w == 0.0:
         return Condition.PLUS_ONE
     return Condition.MINUS_ONE if w == np.pi else Condition.PAIR
 
 
 def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> RidgeSolution:
-    """Compute the corner next to a wall, and its two active constraints."""
-    # Newton's method on the difference of two crossings of a line of constant B, because near an undamped mode the end
-    # of an edge is only as accurate as the last digit of its angle.
+    """Compute the corner close to a wall by Newton's method, and its two active constraints."""
+    # Solve for the beta at which two crossings have the same alpha. Do not use the end of an edge, because near an
+    # undamped mode it is only as accurate as the last digit of its angle.
     (w, other), heights, slopes, step = _find_nearest_two(stable_set.boundary, alpha, beta)
     for _ in range(MAX_STEPS):
         if not CONVERGED_STEP * abs(beta) < abs(step) <= NEAR_CORNER * abs(beta):
@@ -181,7 +183,8 @@ def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> RidgeSolu
         alpha, beta = heights[0] + slopes[0] * step, beta + step
         (w, other), heights, slopes, step = _find_nearest_two(stable_set.boundary, alpha, beta)
     w, other = sorted((w, other))
-    # An error in beta changes alpha of the corner only by the smaller of the two derivatives.
+    # Weight the remaining gap in alpha by ``flatness``, because an error in beta changes alpha of the corner only by
+    # the smaller of the two derivatives d alpha/d beta.
     difference, gap = abs(slopes[0] - slopes[1]), abs(heights[1] - heights[0]) / abs(alpha)
     flatness = min(1.0, min(map(abs, slopes)) / difference) if difference > 0 else 1.0
     if (
@@ -190,8 +193,8 @@ def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> RidgeSolu
         and other - w > 1e-6
     ):
         return RidgeSolution(alpha, beta, w, other, _classify_angle(w), _classify_angle(other))
-    # The corner is a double pole at z = -1, or at z = 1 for a device with negative static gain. There, the end of the
-    # boundary curve lies on the crossing line.
+    # Otherwise the corner is a double pole at z = -1, or at z = 1 for a device with negative static gain, where an end
+    # of the boundary curve lies on the crossing line.
     for w in (np.pi, 0.0):
         limit, damping = stable_set.boundary.limits[w]
         if abs(limit - alpha) <= NEAR_CORNER * abs(alpha):
@@ -200,7 +203,7 @@ def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> RidgeSolu
 
 
 def _find_nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[float], list[float], list[float], float]:
-    """Return the two crossings of the line of constant B that are nearest to a wall.
+    """Return the two crossings nearest to a wall on its line of constant B.
 
     Returns:
         Their angles, alphas, and derivatives d alpha/d beta; and the Newton step in beta to where their alphas agree.
@@ -219,7 +222,7 @@ def _find_nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[floa
 
 
 def _differentiate_conditions(loop: LoopRoots, ridge: RidgeSolution) -> tuple[np.ndarray, list[int]]:
-    """Return the Jacobian of the active constraints in the free unknowns.
+    """Return the Jacobian of the active constraints with respect to the free unknowns.
 
     The five possible equations are Re r and Im r at w1, the same at w2, and Im dr/dw at w1; the unknowns are alpha,
     beta, w1 and w2. An angle is free only if it belongs to a pole pair. At a smooth maximum w1 may stay fixed, because
@@ -250,16 +253,17 @@ def _differentiate_conditions(loop: LoopRoots, ridge: RidgeSolution) -> tuple[np
 
 
 def _stack_equations(value: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the five equations for r and dr/dw at two angles, or their derivatives for those of r and dr/dw."""
+    """Return the five equations, or their derivatives, for given r and dr/dw (or their derivatives) at two angles."""
     return np.array([value[0].real, value[0].imag, value[1].real, value[1].imag, slope[0].imag])
 
 
 DIFFERENCE_STEP = 1e-3  # relative to the parameter; its sixth power is the truncation error
 COMPLEX_STEP = 1e-30  # imaginary step; its square is negligible
-# A parameter below this fraction of its unit takes steps relative to the unit instead. Steps relative to such a small
-# value caused errors of the derivative of up to 3e-6, by rounding.
+# Below this fraction of its unit, a parameter takes steps relative to the unit. Steps relative to such a small value
+# caused errors of the derivative of up to 3e-6 by rounding.
 SMALL_PARAMETER = 1e-5
-# Sixth-order finite differences: offsets in steps and weights of a central difference, weights of a one-sided one.
+# Sixth-order finite differences: pairs of offset (in steps) and weight of the central difference, and the weights of
+# the one-sided difference at 0, 1, ... 6 steps.
 CENTRAL_DIFFERENCE = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
 ONE_SIDED_DIFFERENCE = [-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6]
 RESPONSE_TOLERANCE = 1e-8  # largest relative difference of G by the matrices of the chain and by its roots
@@ -275,7 +279,7 @@ class SceneSensitivities(NamedTuple):
 
 
 def compute_sensitivities(scene: Any, ridge: RidgeSolution | None, status: Status) -> SceneSensitivities:
-    """Return the derivatives of the maximum stiffness in all parameters; NaN if ``ridge`` is None."""
+    """Return K_max and its derivatives in all parameters of a scene; NaN if ``ridge`` is None."""
     paths = list_ridge_parameters(scene)
     if ridge is None:
         return SceneSensitivities(np.float64(math.nan), dict.fromkeys(paths, math.nan), np.int32(status))
@@ -285,7 +289,7 @@ def compute_sensitivities(scene: Any, ridge: RidgeSolution | None, status: Statu
 
 
 def list_ridge_parameters(scene: Any) -> tuple[str, ...]:
-    """Return the dotted paths of the real parameters of a scene that K_max depends on."""
+    """Return the dotted paths of the real-valued parameters of a scene on which K_max depends."""
     paths = [path for path, value in scene.parameters().items() if not isinstance(value, int | np.integer)]
     rigid = scene.operator is not None and scene.operator.rigid
     excluded = (*WALL, "operator.coupling_damping") if rigid else WALL
@@ -296,8 +300,8 @@ def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> floa
     """Return the derivative of K_max in one parameter, with the same active constraints (V21); NaN if inaccurate."""
     matrix, equations = _differentiate_conditions(scene.loop.roots, ridge)
     points = circle_points(np.array([ridge.w1, ridge.w2]))
-    # A longer period shortens a delay measured in periods. If the delay is an integer, it becomes a fractional delay
-    # with an integer part that is smaller by one.
+    # Reduce the integer delay by one if the period changes and the delay is an integer: a longer period shortens a
+    # delay measured in periods, so the delay becomes a fractional one with a smaller integer part.
     n = scene.integer_delay - (path == "period" and scene.d == scene.integer_delay > 0)
     for weights in _list_differences(scene, path):
         try:
@@ -306,7 +310,7 @@ def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> floa
                 for value, weight in weights
             ]
         except InputError:
-            # The parameter is at the end of its range: try a difference toward the other side.
+            # Try the next difference, toward the other side, because the parameter is at the end of its range.
             continue
         d_unit, d_delay, d_A, d_B, d_f, d_f_slope = (np.sum(part, axis=0) for part in zip(*states, strict=True))
         q, q_slope = _differentiate_controller(scene, n, points, d_A, d_B, d_delay)
@@ -320,11 +324,11 @@ def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> floa
 
 
 def _collect_dependencies(scene: Any, n: int, points: CirclePoints) -> tuple[Any, ...]:
-    """Return the quantities that determine K_max: unit of stiffness, delay, A, B, F and dF/dw."""
+    """Return the quantities that determine K_max: unit of stiffness, delay, A, B, and F and dF/dw at two angles."""
     delay = scene.timing.delay / scene.timing.period
     chain = build_chain(scene, (delay, n))
     if chain.sampled:
-        # Refuse a period that differs from that of the sampled system.
+        # Raise an error if the period differs from that of the sampled system.
         chain.check()
     return (scene.units.stiffness, delay, *chain.realize()[:2], *chain.estimate.jet(points))
 
@@ -332,7 +336,7 @@ def _collect_dependencies(scene: Any, n: int, points: CirclePoints) -> tuple[Any
 def _differentiate_controller(
     scene: Any, n: int, points: CirclePoints, d_A: np.ndarray, d_B: np.ndarray, d_delay: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of ``q = -1/G`` and of dq/dw in a parameter, by the chain rule.
+    """Return the derivatives of q and dq/dw with respect to a parameter, by the chain rule.
 
     Args:
         scene: the scene.
@@ -347,7 +351,7 @@ def _differentiate_controller(
         rounding errors then dominate.
     """
     chain = scene.loop.chain
-    # The discretization is differentiated by the complex-step method, which has no cancellation.
+    # Differentiate the discretization by the complex-step method, because it has no cancellation.
     A, B = (value + 1j * COMPLEX_STEP * d for value, d in zip(chain.realize(), (d_A, d_B), strict=False))
     fraction = chain.d - n + 1j * COMPLEX_STEP * d_delay
     steps = (
@@ -365,8 +369,8 @@ def _differentiate_controller(
                 inverse = np.linalg.inv(zeta * np.eye(len(psi)) - psi)
             except np.linalg.LinAlgError:
                 continue
-            # The state x = (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1)), with derivatives in w, in the parameter p,
-            # and in both.
+            # Compute the state x = (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1)), and its derivatives in w, in the
+            # parameter p, and in both.
             x = inverse @ (zeta * late + full)
             x_w = inverse @ (zeta_slope * late - zeta_slope * x)
             x_p = inverse @ (d_psi @ x + zeta * d_late + d_full)
@@ -379,7 +383,7 @@ def _differentiate_controller(
 
 
 def _list_differences(scene: Any, path: str) -> Iterator[list[tuple[float, float]]]:
-    """Yield sixth-order finite differences in a parameter: a central one, one above its value, and one below.
+    """Yield sixth-order finite differences for a parameter: central, above its value, and below its value.
 
     Each is a list of values of the parameter and their weights.
     """
@@ -387,8 +391,8 @@ def _list_differences(scene: Any, path: str) -> Iterator[list[tuple[float, float
     period = float(scene.timing.period)
     units = {"mass": scene.mass, "damping": scene.mass / period, "stiffness": scene.mass / period**2, "delay": period}
     unit = float(next((unit for name, unit in units.items() if path.endswith(name)), 0.0))
-    # A and B are linear in dampings and stiffnesses, and smooth in the delay, over the scale of the unit; but a light
-    # mass has its own scale.
+    # A step of the scale of the unit is accurate, because A and B are linear in dampings and stiffnesses, and smooth in
+    # the delay. Only a mass varies on the scale of its value, even if this is small.
     least = 0.0 if path.endswith("mass") else SMALL_PARAMETER * unit
     step = DIFFERENCE_STEP * (abs(value) if abs(value) > least else unit)
     yield from ([[(value + k * step, weight / step) for k, weight in CENTRAL_DIFFERENCE]] if value > 3.0 * step else [])

@@ -46,12 +46,12 @@ class LoopRoots:
     estimate: Estimate
 
     def evaluate_controller(self, points: CirclePoints) -> Jet:
-        """Evaluate the critical controller ``q = -1/G`` and its derivative in w."""
+        """Return the critical controller ``q = -1/G`` and its derivative in w at points of the unit circle."""
         quotient = product_jet(points, self.poles, -1.0).over(product_jet(points, self.zeros, self.gain))
         return quotient.times(power_jet(points, self.lag))
 
     def evaluate_response(self, points: CirclePoints) -> Jet:
-        """Evaluate the response G and its derivative in w."""
+        """Return the response G and its derivative in w at points of the unit circle."""
         quotient = product_jet(points, self.zeros, self.gain).over(product_jet(points, self.poles, 1.0))
         return quotient.times(power_jet(points, -self.lag))
 
@@ -67,18 +67,19 @@ class LoopRoots:
         return bool(np.any((distances_inside(self.poles) < 0) & ~are_on_circle(self.poles)))
 
     def as_damper(self) -> LoopRoots | None:
-        """Return the loop at K = 0 with the damping B as its gain in place of K.
+        """Return the loop of walls with K = 0, in which the damping B takes the place of K as the loop gain.
 
-        A pole of the device at z = 1 cancels against the zero of the velocity estimate there. Return None if either
-        does not exist.
+        The zero of the velocity estimate at z = 1 cancels a pole of the device there. Return None if the zero or the
+        pole does not exist.
         """
         f = self.estimate
         device_poles, estimate_zeros = np.flatnonzero(self.poles == 0), np.flatnonzero(f.zeros == 0)
         if not device_poles.size or not (f.window or estimate_zeros.size):
             return None
-        # Zeros of F/(z - 1) for a window of n samples: the n-th roots of 1 without 1 itself, as offsets 1 - z.
+        # Compute the zeros of F/(z - 1) as offsets 1 - z. For a window of n samples they are the n-th roots of 1, but
+        # not 1 itself.
         angles = 2.0 * np.pi * np.arange(1, f.window) / max(f.window, 1)
-        # For z = -1 the offset is exactly 2, as for a device with a zero at exactly z = -1.
+        # Set the offset of z = -1 to exactly 2, so that it equals the offset of a zero of the device at z = -1.
         window = np.where(angles == np.pi, 2.0, -2j * np.sin(0.5 * angles) * np.exp(0.5j * angles))
         lag = self.lag + f.lag + f.window
         velocity = f.zeros if f.window else np.delete(f.zeros, estimate_zeros[0])
@@ -87,7 +88,7 @@ class LoopRoots:
         return LoopRoots(self.gain * float(f.gain) / max(f.window, 1), max(lag, 0), zeros, poles, Estimate())
 
     def contract_powers(self) -> tuple[LoopRoots, int]:
-        """Find the largest k for which G and F are functions of z^k, and return them with z^k replaced by z.
+        """Return the loop with z^k replaced by z, for the largest k for which G and F are functions of z^k, and this k.
 
         Returns:
             The loop whose poles are the k-th powers of the poles of this one, and k. For most loops k is 1.
@@ -105,19 +106,19 @@ class LoopRoots:
         return replace(self, lag=lags[0], zeros=roots[0], poles=roots[1], estimate=slow), k
 
     def bound_variation(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """Return a bound on the relative derivatives in w of q and F, for angles within ``reach`` of w."""
+        """Return a bound of the relative derivatives of q and F in w, over the angles within ``reach`` of w."""
         z_minus_1 = circle_points(w).z_minus_1[..., None]
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         distance = np.abs(z_minus_1 + roots) - reach[..., None]
-        # The factor z - root of a root on the circle has a phase that hardly varies there (V16); only its modulus
-        # varies. Therefore limit the resolution near such a root.
+        # Limit the resolution near a root on the unit circle. The phase of its factor z - root hardly varies near the
+        # root (V16), and only the modulus needs to be resolved.
         floor = np.where(are_on_circle(roots), np.where(roots == 0, 1e-9, 1e-5), 0.5 * np.abs(distances_inside(roots)))
         by_roots = (1.0 / np.maximum(distance, floor)).sum(-1)
         return by_roots + self.lag + self.estimate.window + abs(self.estimate.lag) + 1.0
 
 
 def compute_aberth_step(roots: Array, rate: Array) -> Array:
-    """Compute Aberth's step for approximations of all roots of P along the last axis.
+    """Return Aberth's steps for approximations of all roots of P, along the last axis.
 
     The step is Newton's, corrected for the other roots, so that no two approximations converge to the same root.
 
@@ -133,7 +134,7 @@ def compute_aberth_step(roots: Array, rate: Array) -> Array:
 
 
 def _expand(*offsets: np.ndarray) -> np.ndarray:
-    """Return the coefficients of the monic polynomial with the given offsets; real, because roots come in pairs."""
+    """Return the coefficients of the monic polynomial with the given offsets; real, because roots occur in pairs."""
     return np.atleast_1d(np.poly(1.0 - np.concatenate(offsets))).real
 
 
@@ -150,7 +151,7 @@ def expand_estimate(loop: LoopRoots) -> tuple[np.ndarray, np.ndarray]:
 
 
 def affine_polynomial(loop: LoopRoots) -> Affine:
-    """Return D, N1 and N2 of the characteristic polynomial."""
+    """Return the coefficients of D, N1 and N2, from which P follows for any wall."""
     f_numerator, f_denominator = expand_estimate(loop)
     denominator, numerator = np.pad(_expand(loop.poles), (0, loop.lag)), loop.gain * _expand(loop.zeros)
     parts = [

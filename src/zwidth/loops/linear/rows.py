@@ -20,7 +20,7 @@ from zwidth.loops.linear.poles import compute_poles_minus_one, log_modulus
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.showing import compact_repr
 
-# Batches, whose arrays fit in the cache
+# Sizes of batches, chosen so that their arrays fit in the cache.
 BATCH_LINES = 1 << 12  # lines of constant B per batch
 BATCH_PAIRS = 1 << 16  # pairs of lines and arcs per batch, which allows more lines if there are few arcs
 # Walls per line of constant B below which counting the poles of each wall is faster than solving for all crossings.
@@ -48,7 +48,7 @@ def find_stable_intervals(boundary: Boundary, beta: np.ndarray) -> StableInterva
 
 
 def collect_by_line(find: Callable[..., tuple[np.ndarray, ...]], batch: int, *lines: np.ndarray) -> np.ndarray:
-    """Apply a search to lines in batches, and arrange its results by line.
+    """Call a search with batches of lines, and arrange its results in one array by line.
 
     Args:
         find: maps the values of some lines to columns of results, one result after another. The first column is the
@@ -82,19 +82,19 @@ def _list_intervals(boundary: Boundary, beta: np.ndarray) -> tuple[np.ndarray, .
     w = np.pad(np.take_along_axis(crossings.w, order, 1), sides, constant_values=np.nan)
     below = np.broadcast_to(boundary.count_below(beta), beta.shape)[:, None]
     outside = below + np.concatenate([np.zeros((beta.size, 1)), np.cumsum(leaving, 1)], 1)
-    # Two crossings closer than the smallest alpha in range are one: at beta = 0 of an undamped device, both are 0 but
-    # for rounding errors.
+    # Treat two crossings as one if they are closer than the smallest alpha in range. For example, at beta = 0 of an
+    # undamped device both are 0 up to rounding errors.
     wide = ends[:, 1:] > ends[:, :-1] + WALL_RANGE[0]
     usable = np.isfinite(beta) & crossings.consistent & ~boundary.are_lossless(beta)
     stable = (np.round(outside) == 0) & wide & usable[:, None]
-    # Neighboring intervals with a common end, where one pole leaves as another enters, are not joined, because the wall
-    # at this end is on the boundary.
+    # Do not join neighboring intervals with a common end, at which one pole leaves the circle and another enters it,
+    # because the wall at this end is on the stability boundary.
     row, gap = np.nonzero(stable)
     return row, *(part[row, gap] for both in (ends, w, columns) for part in (both[:, :-1], both[:, 1:]))
 
 
 def arrange_by_line(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Arrange the values of all lines in an array with one row per line.
+    """Return the values of all lines in one array, with one row per line.
 
     Args:
         lines: number of lines.
@@ -111,7 +111,7 @@ def arrange_by_line(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndar
 
 
 def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Return whether each wall is stable, for arrays that broadcast; crossings of equal dampings are solved once."""
+    """Return True for each stable wall, for arrays that broadcast; crossings of equal dampings are solved once."""
     shape = np.broadcast_shapes(alpha.shape, beta.shape)
     dampings, row = np.unique(beta, return_inverse=True)
     scattered = dampings.size * FEW_WALLS > np.prod(shape)
@@ -128,9 +128,9 @@ def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.n
 
 
 def _count_poles(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Return whether each wall is stable by counting its poles, for arrays of one shape.
+    """Return True for each wall with no pole outside the unit circle, by counting, for arrays of one shape.
 
-    Most walls are far from all crossings, which then need not be solved.
+    Most walls are so far from all crossings that the count does not require the exact crossings.
     """
     shape = alpha.shape
     columns, finite = (alpha.reshape(-1), beta.reshape(-1)), np.isfinite(alpha + beta).reshape(-1)
@@ -140,7 +140,7 @@ def _count_poles(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.
         part = slice(start, start + size)
         alpha, beta = (np.where(finite[part], column[part], 0.0) for column in columns)
         outside = boundary.count_outside(alpha, beta)
-        # If the crossings of a line are inconsistent, compute all poles of its walls.
+        # Compute all poles of walls on lines with inconsistent crossings, because counting by crossings failed there.
         left = np.flatnonzero(outside < 0)
         if left.size:
             outside[left] = (log_modulus(compute_poles_minus_one(boundary.loop, alpha[left], beta[left])) >= 0).sum(1)
@@ -148,17 +148,17 @@ def _count_poles(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.
     return stable.reshape(shape)
 
 
-# Relative distance from an end of an interval of beta within which labels must change. Labels have rounding errors in
-# alpha along lines of constant B. Where the boundary is nearly parallel to the line of constant K, such an error in
-# alpha corresponds to a larger one in beta.
+# The labels of walls must change within this relative distance from each end of an interval of beta. It exceeds the
+# rounding errors of labels, which are errors in alpha: where the boundary is nearly parallel to the line of constant K,
+# they correspond to larger errors in beta.
 END_TOLERANCE = 1e-7
 
 
 def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     """Return the stable intervals of beta on a line of constant K, ascending, as an array of shape (intervals, 2)."""
-    # All intersections with the boundary are found, because the nodes include the extrema of alpha along the curve, so
-    # alpha is monotone between nodes. All walls between two intersections have the label of the wall in the middle. An
-    # end next to which the labels contradict this is computed by bisection of labels instead.
+    # Compute the intersections of the line with the boundary. All of them are found, because the nodes include the
+    # extrema of alpha along the curve, so alpha is monotone between nodes. Between two intersections, all walls have
+    # the label of the middle one. If labels next to an end contradict this, compute the end by bisection of labels.
     on_lines = np.array([(line.q - alpha) / line.f for line in boundary.lines if line.f != 0.0])
     w, node_alpha = boundary.alpha_nodes
     above = node_alpha - alpha
@@ -172,7 +172,7 @@ def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
         return np.zeros((0, 2))
 
     def label(beta: np.ndarray) -> np.ndarray:
-        """Return whether the walls with this alpha are stable."""
+        """Return the labels of the walls with this alpha and the given beta: True if stable."""
         return label_walls(boundary, np.full(beta.size, alpha), beta)
 
     reach = np.ptp(crossed) + np.abs(crossed).max() + 1.0
@@ -182,10 +182,10 @@ def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     room = np.minimum(crossed[k] - middle[k], middle[k + 1] - crossed[k])
     offset = np.minimum(END_TOLERANCE * np.abs(crossed[k]), 0.5 * room)
     wrong = (label(crossed[k] - offset) != stable[k]) | (label(crossed[k] + offset) != stable[k + 1])
-    # The lossless damping is exact and needs no refinement.
+    # Do not refine an end at the lossless damping, because this damping is exact.
     wrong &= crossed[k] != boundary.lossless
     k, low, high = k[wrong], middle[:-1][k[wrong]], middle[1:][k[wrong]]
-    # Bisect twice: the first bracket may be so wide that its resolution is too coarse for an end near 0.
+    # Bisect twice, because the first bracket may be so wide that its resolution is too coarse for an end near 0.
     for _ in range(2 if k.size else 0):
         crossed[k] = bisect(lambda beta: label(beta) == stable[k], low, high)
         low, high = crossed[k] - 1e-12 * (high - low), crossed[k] + 1e-12 * (high - low)
@@ -200,13 +200,13 @@ CONNECTED_START = 1e-6
 
 
 def are_connected(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return whether stable intervals of alpha, or of K, start at K = 0 or below, up to rounding errors."""
+    """Return a mask of the stable intervals of alpha (or K) that start at K = 0 or below, up to rounding errors."""
     return (low <= CONNECTED_START * high) & (high > 0)
 
 
 @compact_repr()
 class Island(NamedTuple):
-    """A piece of the stable set that is not connected to K = 0: the ranges of stiffness and damping that it spans."""
+    """A piece of the stable set that is not connected to K = 0, described by its ranges of stiffness and damping."""
 
     stiffness: tuple[float, float]
     virtual_damping: tuple[float, float]

@@ -19,7 +19,7 @@ from zwidth.parts.exact_polynomials import DIGITS, EXPONENT, Complex, Polynomial
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.words.errors import InputError
 
-# Largest relative difference between the results of two precisions, a tenth of float64's resolution.
+# Largest relative difference between the results of two precisions that agree: a tenth of the resolution of float64.
 PRECISION_TOLERANCE = 1e-17
 # With n decimal digits, leading coefficients below 10^(-2n/NEGLIGIBLE_DIGITS) of the largest are rounding errors of 0.
 NEGLIGIBLE_DIGITS = 3
@@ -49,7 +49,7 @@ def find_sampled_zeros(device: LinearDevice, period: float, fraction: float) -> 
 
 
 def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> bool:
-    """Return whether gain and zeros of two precisions differ by at most `PRECISION_TOLERANCE`."""
+    """Return whether the gains and the zeros of two precisions differ by at most `PRECISION_TOLERANCE`."""
     (gain, zeros), (gain2, zeros2) = one, other
     if len(zeros) != len(zeros2) or abs(gain - gain2) > Decimal(PRECISION_TOLERANCE) * abs(gain2):
         return False
@@ -64,7 +64,7 @@ def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> 
 
 
 def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits: int) -> Any:
-    """Return leading coefficient and zeros with ``digits`` digits; None if all coefficients are rounding errors."""
+    """Return leading coefficient and zeros with ``digits`` digits; None if all coefficients are 0 by rounding."""
     denominator, numerator = (_as_decimals(part) for part in (device.system.denominator, device.system.numerator))
     rest = 1 - Decimal(fraction)
     transition, full, output = _discretize(denominator, numerator, Decimal(period))
@@ -82,13 +82,13 @@ def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits:
         response = response[1:]
     if not response:
         return None
-    # The polynomial in x = 1 - z.
+    # Substitute z = 1 - x, so that the roots x are the offsets of the zeros.
     order = len(response) - 1
     shifted = [
         (-1) ** power * sum(response[order - k] * comb(k, power) for k in range(power, order + 1))
         for power in range(order, -1, -1)
     ]
-    # A zero at s = 0 (no static response to a constant force) becomes a zero at exactly z = 1.
+    # Set the zero to exactly z = 1 if the system has a zero at s = 0, that is, no static response to a constant force.
     has_zero_at_one = device.system.numerator[-1] == 0
     if has_zero_at_one:
         shifted = shifted[:-1]
@@ -104,19 +104,19 @@ def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits:
 
 
 def _as_decimals(polynomial: Polynomial) -> list[Decimal]:
-    """Convert rational coefficients to the precision of the decimal context."""
+    """Return rational coefficients as Decimals, rounded to the precision of the decimal context."""
     return [_as_decimal(value) for value in polynomial]
 
 
 def _as_decimal(value: Fraction) -> Decimal:
-    """Convert a rational number to the precision of the decimal context."""
+    """Return a rational number as a Decimal, rounded to the precision of the decimal context."""
     return Decimal(value.numerator) / Decimal(value.denominator)
 
 
 def _discretize(
     denominator: list[Decimal], numerator: list[Decimal], time: Decimal
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the transition matrix, the state after a unit force held for ``time`` from rest, and the output row."""
+    """Return the transition matrix, the state after a unit force held for ``time`` from rest, and the output vector."""
     order = len(denominator) - 1
     monic = [value / denominator[0] for value in denominator]
     # Scale time so that all coefficients of the denominator are at most 1.
@@ -128,7 +128,7 @@ def _discretize(
     block[order - 1, :order] = [-monic[order - k] / unit ** (order - k) for k in range(order)]
     block[order - 1, order] = Decimal(1)
     exponential = _exponentiate(block, time * unit)
-    # State x_k: the k-th derivative of the response of 1/denominator, times unit^(order - k).
+    # The state x_k is the k-th derivative of the response of 1/denominator, times unit^(order - k).
     padded = [Decimal(0)] * (order - len(numerator)) + numerator
     output = np.array([padded[order - 1 - k] / denominator[0] * unit**k / unit**order for k in range(order)], object)
     return exponential[:order, :order], exponential[:order, order], output

@@ -32,12 +32,12 @@ from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.xp import is_traced, nan_with_nan_derivatives
 
-# Finite placeholder for batch entries without a ridge: alpha, beta, w1, w2, both conditions and the kind of ridge.
+# Finite values for batch entries without a ridge: alpha, beta, w1, w2, both conditions and the kind of ridge.
 PLACEHOLDER = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.NONE))
 
 
 class Structure(NamedTuple):
-    """The static part of a scene with traced parameters; one program is compiled per structure."""
+    """The static part of a scene with traced parameters, for each of which one program is compiled."""
 
     template: Any  # the scene, with placeholders for the traced parameters
     paths: tuple[str, ...]  # of the traced parameters
@@ -46,7 +46,7 @@ class Structure(NamedTuple):
 
 
 def build_structure(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
-    """Return the static part of a scene.
+    """Return the static part of a scene: placeholders for its traced parameters, and its delay in periods.
 
     Args:
         scene: the scene.
@@ -72,7 +72,7 @@ def trace_stiffest(scene: Any, negative: bool) -> RidgePoint:
     values = scene.parameters()
     paths = tuple(path for path in list_ridge_parameters(scene) if is_traced(values[path]))
     if not paths:
-        # Only the wall is traced, and the ridge does not depend on it. Pass any parameter, because the compiled
+        # If only the wall is traced, on which the ridge does not depend, pass any parameter, because the compiled
         # function needs one.
         paths = ("mass",)
     structure = build_structure(scene, paths, negative)
@@ -81,7 +81,7 @@ def trace_stiffest(scene: Any, negative: bool) -> RidgePoint:
 
 @partial(jax.jit, static_argnums=0)
 def compute_ridge(structure: Structure, *values: Array) -> RidgePoint:
-    """Return the stiffest wall for values of the traced parameters."""
+    """Return the stiffest stable wall for given values of the traced parameters, with implicit derivatives."""
     dtype = values[0].dtype
     # Pass values to the callback and back as bits, because the thread of the callback may use JAX's default precision,
     # which would round them to float32.
@@ -106,7 +106,7 @@ def compute_ridge(structure: Structure, *values: Array) -> RidgePoint:
 
 
 def _search_on_host(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> np.ndarray:
-    """Search the ridge in NumPy; return the fields of `PLACEHOLDER` and the status, as bits."""
+    """Compute the ridge in NumPy; return the quantities listed at `PLACEHOLDER` and the status, as bits."""
     values = np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()
     try:
         ridge, status = _fill_template(structure, values).loop.ridge(structure.negative)
@@ -118,14 +118,14 @@ def _search_on_host(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> 
 
 
 def _fill_template(structure: Structure, values: Iterable[Any]) -> Any:
-    """Return the scene with these values in place of the placeholders."""
+    """Return the scene of the template with values in place of the placeholders."""
     return replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
 
 
 def _solve_conditions(
     structure: Structure, scene: Any, start: Array, conditions: Array, exists: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Solve the two active conditions by Newton's method.
+    """Solve the two active conditions for alpha, beta, w1 and w2 by Newton's method.
 
     Args:
         structure: the static part of the scene.
@@ -150,13 +150,14 @@ def _solve_conditions(
     begin = start / scales
     args = (jax.tree.map(jnp.asarray, discretize_chain(chain)), traced, start, conditions, scales)
     end = polish_root(partial(_residual, chain), begin, args, exists)
-    # Newton's method must not converge to a different solution. A double root is accurate to half of the digits.
+    # Report if the solution is close to the start, because Newton's method may converge to a different solution. Half
+    # of the digits must agree, because a double root is not more accurate.
     close = jnp.all(jnp.abs(end - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
     return *(end * scales), close
 
 
 def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
-    """Return the four equations, scaled to order one.
+    """Return the residuals of the four equations of the two active conditions, scaled to order one.
 
     Args:
         chain: the chain, for its static fields.
@@ -168,24 +169,24 @@ def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
     estimate = replace(chain.estimate, **traced)
 
     def evaluate_r(w: Array) -> tuple[Array, Array]:
-        """Return ``r = alpha + beta F - q``, relative to the magnitude of q, and F."""
+        """Return the pair (r/|q|, F) at the angle w, with ``r = alpha + beta F - q``."""
         q, f = evaluate_controller(chain, w, discretized), estimate.jet(circle_points(w)).value
         size = jax.lax.stop_gradient(jnp.abs(q))
         return (alpha + beta * f - q) / jnp.where(size > 0, size, 1.0), f
 
     def evaluate_both(w: Array) -> tuple[Array, Array]:
-        """Return r, and the quantity that is 0 if alpha is stationary along the curve."""
+        """Return r at the angle w, and the quantity that is 0 if alpha is stationary along the curve."""
         (r, f), (slope, _) = jax.jvp(evaluate_r, (w,), (jnp.ones_like(w),))
         stationary = (jnp.conj(f) * slope).imag
         size = jax.lax.stop_gradient(jnp.abs(f) * jnp.abs(slope))
         stationary = stationary / jnp.where(size > 0, size, 1.0)
-        # At z = -1, F is real and may be 0, so use Im dr/dw itself.
+        # For a real pole at z = -1 use Im dr/dw itself, because F is real there and may be 0.
         return r, jnp.where(conditions[0] == Condition.PAIR, stationary, slope.imag)
 
     # Evaluate both angles in one vmap, so that the function is compiled only once.
     r, stationary = jax.vmap(evaluate_both)(jnp.stack([w1, w2]))
     fixed = unknowns[2:] - start[2:] / scales[2:]
-    # A pole pair at w has r = 0; a real pole has Re r = 0 and a fixed w.
+    # Require r = 0 for a pole pair, and Re r = 0 and a fixed w for a real pole.
     poles = jnp.stack([r.real, jnp.where(conditions == Condition.PAIR, r.imag, fixed)], -1)
     index = jnp.maximum(conditions[1] - Condition.PLUS_ONE, 0)
     second = jnp.stack([poles[1], jnp.stack([stationary[0], fixed[1]]), jnp.stack([unknowns[1], fixed[1]])])[index]

@@ -72,27 +72,28 @@ def _make_slider(parameter: Parameter, system: UnitSystem) -> Slider:
     unit, per_si = _SHOWN.get(parameter.unit, (parameter.unit.removeprefix("1"), 1.0))
     low, high = parameter.slider or (0.0, 0.0)
     if system.rotary and parameter.unit in _ROTARY_UNITS:
-        # Show walls in SI units, because the chart on which walls are set has SI units.
+        # Keep the parameters of the wall in SI units, because the chart on which walls are set has SI units.
         unit, per_si = (ROTARY[parameter.unit], 1.0) if parameter.name in _WALL else _ROTARY_UNITS[parameter.unit]
         low, high = low * _SMALLER[parameter.unit], high * _SMALLER[parameter.unit]
     name = f"{parameter.words_in(system)} {parameter.symbol_in(system).lstrip(chr(92))}"
     return Slider(name, unit, per_si, low * per_si, high * per_si, parameter.whole)
 
 
-# Units of the page that differ from SI units, and their number per SI unit.
+# Units of the page that differ from SI units, each with the number of these units per SI unit.
 _SHOWN = {"kg": ("g", 1e3), "s": ("ms", 1e3)}
-# Further units for rotary devices, by the unit of linear devices.
+# Units of the page for rotary devices, by the SI unit of linear devices.
 _ROTARY_UNITS = {"kg": ("g cm^2", 1e7), "N s/m": ("mN m s/rad", 1e3), "N/m": ("N m/rad", 1.0)}
 # Typical ratios of rotary to linear parameters in SI units, for masses at a radius of about 3 cm.
 _SMALLER = {"kg": 1e-3, "N s/m": 1e-3, "N/m": 1e-3}
 _BARE = ("device", "timing", "wall")  # parts whose parameters have no prefix in a path
 _DEVICE = ("mass", "damping", "period", "delay", "delta", "d")
 _WALL = ("stiffness", "virtual_damping", "alpha", "beta")
-# Parameters with a slider, by path in a scene. The page scales ranges from 0 cubically, others logarithmically.
+# Parameters with a slider, by path in a scene. On the page, ranges that start at 0 have a cubic scale, all others a
+# logarithmic one.
 _WITH_SLIDER = [name for name in (*_DEVICE, *_WALL, *OF_PARTS) if PARAMETERS[name].slider]
 SLIDERS = {name: _make_slider(PARAMETERS[name], LINEAR) for name in _WITH_SLIDER}
 ROTARY_SLIDERS = {name: _make_slider(PARAMETERS[name], ROTARY) for name in _WITH_SLIDER}
-# Parameters of a scene with m = 1 and T = 1 that equal the normalized ones.
+# Parameters of a scene with m = 1 and T = 1, by the normalized parameter that they equal.
 _NORMALIZED = {"delta": "damping", "d": "delay", "alpha": "stiffness", "beta": "virtual_damping"}
 CHOICES = {
     "mode": {"physical": "physical", "normalized": "normalized"},
@@ -119,8 +120,8 @@ class Controls:
 
     scene: Scene = _SMALL_DEVICE
     normalized: bool = False
-    # Mass, period and kind (True if rotary) of the scene before its normalization. With these values, `_convert`
-    # converts a normalized scene back to SI units.
+    # Mass in kg, period in s and kind (True if rotary) of the scene before its normalization. `_convert` uses these
+    # values to convert a normalized scene back to SI units.
     scale: tuple[float, float, bool] = (0.1, 1e-3, False)
 
     @property
@@ -134,7 +135,7 @@ class Controls:
 
     @property
     def sliders(self) -> dict[str, Slider]:
-        """The sliders for this kind of device, linear or rotary."""
+        """The sliders of all parameters for this kind of device, linear or rotary, by path."""
         return ROTARY_SLIDERS if self.rotary else SLIDERS
 
     def shown(self) -> dict[str, Any]:
@@ -145,18 +146,18 @@ class Controls:
         forms = {name: _find_form(part) for name, part in find_parts(scene).items() if name in PARTS}
         numbers = {name: value * self.sliders[name].per_si for name, value in values.items() if name in SLIDERS}
         for part, form in forms.items():
-            # Hide parameters without effect in this form: without a spring, a parallel damper has no effect.
+            # Hide parameters that have no effect in this form of the part. Example: a parallel damper without a spring.
             idle = {f"{part}.{item.name}" for item in fields(PARTS[part]) if item.name not in PARTS[part].usual[form]}
             numbers = {name: value for name, value in numbers.items() if name not in idle}
         choices = {"mode": "physical", "motion": "rotary" if self.rotary else "linear"}
         choices |= {"velocity": type(scene.velocity).__name__}
         if isinstance(scene.device, LinearDevice):
-            # Offer no hand, coupling or actuator, because the linear system already contains them.
+            # Return no choices of hand, coupling or actuator, because the linear system already contains these parts.
             return numbers | choices
         return numbers | choices | {name: forms.get(name, "none") for name in PARTS}
 
     def change(self, shown: Mapping[str, Any]) -> Controls:
-        """Return new controls with changed values in the units of the page; raise `InputError` for other names."""
+        """Return the controls after changes of values in the units of the page; raise `InputError` for other names."""
         new = self
         for name, value in shown.items():
             if name in CHOICES:
@@ -169,7 +170,7 @@ class Controls:
                     new = change()
                 continue
             if name not in new.shown():
-                # The slider was just hidden by a choice, or never existed.
+                # Reject the change, because the slider was just hidden by a choice, or never existed.
                 raise InputError(f"{str(name)[:40]!r}: the page has no such parameter now")
             if isinstance(value, bool) or not isinstance(value, int | float) or not -_LARGEST <= value <= _LARGEST:
                 raise InputError(f"{new.sliders[name].label}: got {str(value)[:40]!r}; a finite number is needed")
@@ -181,7 +182,7 @@ class Controls:
 
     def check(self) -> Controls:
         """Return the controls; raise `InputError` if the loop has too many poles for the page."""
-        # Building the loop also checks combinations of parts, such as a cutoff above the Nyquist frequency.
+        # Build the loop, which also checks combinations of parts, such as a cutoff above the Nyquist frequency.
         order = self.scene.loop.roots.order
         if order > _MOST_POLES:
             raise InputError(
@@ -196,13 +197,13 @@ class Controls:
             raise InputError(f"{name}: not available, because the device is a linear system that contains all parts")
 
     def _change_motion(self) -> Controls:
-        """Return a default device of the other kind, linear or rotary, with the same rate and delay."""
+        """Return the controls with a default device of the other kind, linear or rotary, at the same rate and delay."""
         self._refuse_change("motion")
         other = _SMALL_DEVICE if self.rotary else _SMALL_ROTARY
         return Controls(replace(other, timing=self.scene.timing))
 
     def _choose_part(self, name: str, kind: str) -> Controls:
-        """Return the controls with another part in one of its usual forms, or another velocity estimate."""
+        """Return the controls after choosing a usual form of a part, or a class of the velocity estimate."""
         scene = self.scene
         if name in PARTS:
             self._refuse_change(name)
@@ -225,7 +226,7 @@ class Controls:
         return PARTS[name](**given)
 
     def _convert(self) -> Controls:
-        """Return the controls in normalized or in SI units; normalization keeps only the rigid device."""
+        """Return the controls converted to normalized or to SI units; normalization keeps only the rigid device."""
         self._refuse_change("mode")
         scene, (mass, period, rotary) = self.scene, self.scale
         if not self.normalized:
@@ -247,12 +248,12 @@ def _check_range(name: str, slider: Slider, value: float) -> None:
 
 
 def _round(value: float, digits: int) -> float:
-    """Round to significant digits, which removes rounding errors of unit conversions."""
+    """Return a value rounded to significant digits, which removes rounding errors of unit conversions."""
     return float(f"{value:.{digits}g}")
 
 
 def _find_form(part: Any) -> str:
-    """Return the usual form of a part: the one with equal values of all fields that are not floating-point numbers."""
+    """Return the name of the usual form of a part: the one with the same values in all fields that are not floats."""
 
     def shape(part: Any) -> dict[str, Any]:
         values = {item.name: getattr(part, item.name) for item in fields(part)}
@@ -262,7 +263,7 @@ def _find_form(part: Any) -> str:
 
 
 def normalized_controls(alpha: float, beta: float, delta: float, d: float) -> Controls:
-    """Return the controls of a normalized scene."""
+    """Return the controls of a scene with m = 1 and T = 1 and the given normalized parameters."""
     scene = Scene(Device(1.0, float(delta)), Timing(1.0, float(d)), VirtualWall(float(alpha), float(beta)))
     return Controls(scene, normalized=True)
 
@@ -278,7 +279,7 @@ def read_controls(path: Path | None) -> Controls:
 
 
 def _in_seconds(scene: Scene) -> Scene:
-    """Return the scene with its delay in seconds, because the slider uses seconds."""
+    """Return the scene with its delay converted to seconds, because the slider uses seconds."""
     return scene.replace(delay=float(scene.timing.delay)) if scene.timing.in_periods else scene
 
 
@@ -321,21 +322,21 @@ def read_link(link: str) -> Controls:
 
 
 def _read_value(text: str) -> Any:
-    """Parse a value as JSON; return other texts unchanged."""
+    """Return the value of a text in JSON; return texts that are not JSON unchanged."""
     with suppress(json.JSONDecodeError):
         return json.loads(text)
     return text
 
 
 def _spell_section(controls: Controls) -> dict[str, Any]:
-    """Return the section ``scene`` of a configuration; quantities have units."""
+    """Return the section ``scene`` of a configuration as a dict, with units in all quantities."""
     if controls.normalized:
         return {name: value for name, value in controls.shown().items() if name != "mode"}
     return _add_units(spell_scene(controls.scene), controls.scene.unit_system)
 
 
 def _add_units(value: Any, system: UnitSystem, path: str = "") -> Any:
-    """Return a section with each quantity as a text with its unit, which follows from its path."""
+    """Return a section of a configuration with each quantity as a text with its unit, derived from its path."""
     if isinstance(value, dict):
         return {name: _add_units(part, system, f"{path}.{name}".lstrip(".")) for name, part in value.items()}
     if isinstance(value, list | tuple):

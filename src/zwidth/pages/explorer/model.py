@@ -32,12 +32,12 @@ from zwidth.words.formatting import format_interval, plain, round_conservatively
 
 Curve = tuple[np.ndarray, np.ndarray]
 Range = tuple[float, float]
-# Columns of a data source, or a text of the page, by the name of the source or text.
+# Results for the page: by name, the columns of a data source or a text.
 Update = dict[str, Any]
 
 LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)  # spectral radii of the contours
-# Pairs: largest number of poles per wall, and points of the grid in K and in B. Grids are small enough for NumPy,
-# because compiling with JAX would take seconds (`arrays.evaluate.FEW`).
+# Grids of K and B for the contours: for each largest number of poles, the points in K and in B. The grids are small
+# enough for NumPy, because compiling with JAX would take seconds (`arrays.evaluate.FEW`).
 _GRIDS = ((1, (72, 56)), (12, (48, 40)), (inf, (36, 30)))
 _DIRECTIONS = 181  # points on the boundary of the passive walls
 _RIDGE_POINTS = 61  # points on the ridge
@@ -49,7 +49,7 @@ _APPROACH = 5.0  # sampling periods of motion before contact
 
 
 def show_outlines(scene: Scene) -> Update:
-    """Return the closed outlines of the stable region, as one line and as one area with holes, and names of islands."""
+    """Return the outlines of the stable region as data of a line and of an area with holes, and labels of islands."""
     pieces = scene.stable_region()
     lines = [piece.stiffness for piece in pieces], [piece.virtual_damping for piece in pieces]
     xs, ys = ([np.append(line, line[:1]) for line in each] for each in lines)
@@ -58,7 +58,7 @@ def show_outlines(scene: Scene) -> Update:
 
 
 def choose_ranges(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
-    """Return rounded axis ranges that contain a curve, and the wall if it is within two curve sizes."""
+    """Return rounded axis ranges that contain a curve, and the wall unless it is beyond two sizes of the curve."""
     ranges = []
     for axis in (0, 1):
         values = np.append(curve[axis][np.isfinite(curve[axis])], 0.0)
@@ -67,26 +67,26 @@ def choose_ranges(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range
         step = 10.0 ** floor(log10(size)) / 4.0
         low, high = step * floor(low / step - 0.2), step * ceil(high / step + 0.2)
         if low - 2.0 * size <= value <= high + 2.0 * size:
-            # Leave room for the marker of the wall.
+            # Extend the range beyond the wall, because its marker must be visible.
             low, high = min(low, step * floor(value / step - 0.2)), max(high, step * ceil(value / step + 0.2))
         ranges.append((low, high))
     return ranges[0], ranges[1]
 
 
 def place_arrow(wall: tuple[float, float], across: Range, up: Range) -> dict[str, list[Any]]:
-    """Return an arrow at the border of a chart that points to a wall outside; empty columns if the wall is inside."""
+    """Return the data of an arrow at the border of a chart that points to a wall outside; empty if it is inside."""
     sides = [int(value > high) - int(value < low) for value, (low, high) in zip(wall, (across, up), strict=True)]
     if not any(sides):
         return {"x": [], "y": [], "angle": [], "text": [], "align": []}
     ends = [(low + 0.03 * (high - low), high - 0.03 * (high - low)) for low, high in (across, up)]
     place = [min(max(value, low), high) for value, (low, high) in zip(wall, ends, strict=True)]
-    # Subtract a quarter turn, because Bokeh's triangle points upwards at angle 0.
+    # Subtract a right angle from the direction, because Bokeh's triangle points upwards at angle 0.
     turn, align = atan2(sides[1], sides[0]) - 0.5 * pi, "left" if place[0] < 0.5 * sum(across) else "right"
     return {"x": [place[0]], "y": [place[1]], "angle": [turn], "text": ["your wall"], "align": [align]}
 
 
 def name_islands(scene: Scene) -> dict[str, list[Any]]:
-    """Return a label above each island of stable walls, numbered as in the notes of the verdict."""
+    """Return the data of labels above the islands of stable walls, numbered as in the notes of the verdict."""
     islands = scene.islands()
     names = [f"island {k}" if len(islands) > 1 else "island" for k, _ in enumerate(islands, start=1)]
     x, y = [0.5 * sum(one.stiffness) for one in islands], [one.virtual_damping[1] for one in islands]
@@ -94,17 +94,17 @@ def name_islands(scene: Scene) -> dict[str, list[Any]]:
 
 
 def compute_open_loop(scene: Scene, verdict: Assessment) -> dict[str, dict[str, Any]]:
-    """Return the open loop L up to the Nyquist frequency, as Nyquist curve and Bode plot, with both crossovers."""
+    """Return L up to the Nyquist frequency as data of Nyquist curve and Bode plot, with both crossovers."""
     gain_crossover, phase_crossover = verdict.gain_crossover, verdict.phase_crossover
     marked = np.array([gain_crossover, phase_crossover])
-    # A fine grid is needed, because the phase of L changes rapidly near a resonance.
+    # Use a fine grid of frequencies, because the phase of L changes rapidly near a resonance.
     frequency = np.union1d(np.geomspace(1e-4, 1.0, 600) * 0.5 / scene.timing.period, marked[marked > 0])
     curve, crossing = scene.frequency_response(frequency=frequency), frequency == gain_crossover
     # Remove the phase of the delay before unwrapping, because a long delay changes the phase by more than pi between
-    # two grid points; subtract it again afterwards.
+    # two grid points. Subtract this phase again afterwards.
     delayed = 2.0 * np.pi * frequency * scene.timing.delay
     phase = np.unwrap(np.angle(curve * np.exp(1j * delayed))) - delayed
-    # Shift the phase by full turns, so that it lies between -270 and 90 degrees at the lowest frequency.
+    # Shift the phase by a multiple of 360 degrees, so that it lies between -270 and 90 degrees at the lowest frequency.
     phase = np.degrees(phase - 2.0 * np.pi * np.floor((phase[0] / np.pi + 1.5) / 2.0))
     with np.errstate(divide="ignore"):
         gain = 20.0 * np.log10(np.abs(curve))
@@ -132,23 +132,23 @@ def compute_step_response(scene: Scene, periods: int) -> Curve:
 
 
 def find_passive_boundary(scene: Scene) -> Curve | None:
-    """Return the boundary of the passive walls, empty if there are none; None if no condition is known."""
+    """Return points on the boundary of the passive walls; none if no wall is passive, None without a condition."""
     if find_unsupported_reason(**vars(scene.device)):
         return None
     return trace_passivity_boundary(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
 
 
 def compute_ridge(scene: Scene) -> Curve:
-    """Return the stiffest stable walls for dampings of the device from 0 to four times the present value."""
+    """Return the stiffest stable walls as the damping of the device rises from 0 to four times its current value."""
     most = _MOST_DAMPING * (float(scene.device.damping) or 0.25 * scene.units.virtual_damping)
     dampings = np.linspace(0.0, most, min(_RIDGE_POINTS, 1 + scene.loop.draws // 25))
     return scene.loop.vary({"damping": dampings}).stiffest()
 
 
 def simulate_hit(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
-    """Return times, positions and wall forces of a simulated hit, and its asymptotic behavior in words."""
-    # Start five periods of motion before contact, or at half the distance in which the damping of the device would stop
-    # it, if that is shorter.
+    """Return times, positions and wall forces of a simulated hit, and a phrase on its final behavior."""
+    # Start the hit five periods of motion before contact, or at half of the distance in which the damping of the device
+    # would stop it if this is shorter.
     start = -_APPROACH * _IMPACT * scene.timing.period / max(1.0, 2.0 * _APPROACH * float(scene.delta))
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
     return hit.time, hit.position, hit.wall_force, f"({describe_ending(hit)})"
@@ -166,12 +166,12 @@ def find_contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]
     for k, level in enumerate(LEVELS):
         lines: Any = generator.lines(level)
         for line in sorted(lines, key=len, reverse=True):
-            # Label only the longest contour line of a level, at a point with large K and small B: the point with the
-            # largest K minus weighted B, both relative to the ranges of the axes. The weight decreases with the level,
-            # which moves the labels of higher levels toward larger K and so separates the labels of different levels.
+            # Label only the longest contour line of a level, at its point with large K and small B: the largest K minus
+            # weighted B, both relative to the ranges of the axes. The weight decreases with the level, which moves the
+            # labels of higher levels toward larger K and so separates them.
             named = line[np.argmax(line[:, 0] / np.ptp(across) - (2.0 - 0.35 * k) * line[:, 1] / np.ptp(up))]
             text = f"{level:g}" if line is max(lines, key=len) else ""
-            # Drop unlabeled pieces smaller than two cells of the grid, because the grid does not resolve them.
+            # Drop unlabeled lines smaller than two cells of the grid, because the grid does not resolve them.
             if not text and all(np.ptp(line, axis=0) < (2.0 * (x[1] - x[0]), 2.0 * (y[1] - y[0]))):
                 continue
             for name, value in zip(columns, (line[:, 0], line[:, 1], *named, text), strict=True):
@@ -180,7 +180,7 @@ def find_contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]
 
 
 def caption_poles(poles: np.ndarray, word: str) -> str:
-    """Return the caption of the poles: their number inside, on or outside the unit circle."""
+    """Return the caption of the figure of poles: their numbers inside, on and outside the unit circle."""
     outside, count = int((np.abs(poles) > 1.0).sum()), poles.size
     if word == "stable":
         return f"Stable: all {count} lie inside the circle."
@@ -214,7 +214,7 @@ def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
 
 
 def format_normalized_verdict(verdict: Assessment) -> list[str]:
-    """Return the lines of the verdict on a normalized wall, in units of the sampling period and the mass."""
+    """Return the printed lines of the verdict on a normalized wall, whose units are sampling period and mass."""
     span = " to ".join(format_interval(verdict.virtual_damping_lower, verdict.virtual_damping_upper))
     gain, phase, delay, modulus = (
         plain(round_margin(f"{name}_margin", verdict, verdict.stable)) for name in ("gain", "phase", "delay", "modulus")
@@ -235,14 +235,15 @@ def format_normalized_verdict(verdict: Assessment) -> list[str]:
     return [format_row(*each) for each in rows.items()]
 
 
-# Lock of the import of JAX, because another thread that imports it at the same time would get a partial module.
+# Lock held during the import of JAX, because another thread that imports it at the same time would get a partial
+# module.
 IMPORTING = Lock()
 
 
 def compute_details(
     scene: Scene, across: Range, up: Range, *, normalized: bool, of_device: bool, contact: bool
 ) -> Iterator[Update]:
-    """Yield the results that are too slow to follow a dragged slider; the caller may stop after each of them.
+    """Yield, one after another, the results that are too slow to follow a dragged slider.
 
     Args:
         scene: scene with its wall.
@@ -270,7 +271,7 @@ def compute_details(
         yield {"passive": {"x": x, "y": y}, "contours": find_contours(scene, across, up)}
     if not normalized_text:
         yield {"verdict": write_check(scene, verdict, limits_of(scene))}
-    # Omit ridge and hit for a linear system: its damping is not a parameter, and it has no body with a velocity.
+    # Omit ridge and hit for a linear system, because its damping is not a parameter and it has no body with a velocity.
     bodies = isinstance(scene.device, Device)
     if of_device:
         x, y = compute_ridge(scene) if bodies else (np.empty(0), np.empty(0))

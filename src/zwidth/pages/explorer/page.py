@@ -34,15 +34,15 @@ from zwidth.scenes.scene import Scene
 from zwidth.words.errors import ZwidthError
 
 _LONGEST_MESSAGE = 16_000  # characters; a message contains some dozen numbers, or an address
-# Properties of a glyph that name a column of its data source, unless they are "center".
+# Properties of a glyph whose values are names of columns of its data source, except the value "center".
 _FROM_SOURCE = ("x", "y", "xs", "ys", "text", "angle", "text_align")
-# Sources of slow results that depend only on the device; emptied at once if the device changes.
+# Data sources of slow results that depend only on the device. They are emptied at once if the device changes.
 _OF_DEVICE = ("contours", "passive", "ridge", "best")
-# Color roles of the figures, and their colors on light and dark pages.
+# Roles of colors in the figures, followed by the colors of these roles on light and on dark pages.
 _INKS = ("paper", "ink", "faint", "edge", "passive", "ridge")
 _LIGHT = dict(zip(_INKS, ("#FFFFFF", style.BLACK, "#565656", style.BLUE, "#00735A", style.VERMILION), strict=True))
 _DARK = dict(zip(_INKS, ("#1E2328", "#F2F2F2", "#A6A6A6", style.SKY, "#2FC79C", style.ORANGE), strict=True))
-# Names of the curves in CSV files, if they differ from the names of the data sources.
+# Names of the curves in CSV files that differ from the names of their data sources.
 _NAMES = {"edge": "stable", "ridge": "stiffest as b grows", "best": "stiffest", "wall": "your wall", "bode": "L"}
 _NAMES |= {"nyquist": "L", "crossover": "|L| = 1", "turned": "phase -180 degrees"}
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, 361)
@@ -63,7 +63,8 @@ class Page:
         self.answer = ColumnDataSource({"json": []}, name="answer")
         self.inputs.on_change("data", lambda _, __, data: self.receive(data))
         self.inks: list[tuple[Any, str, str]] = []
-        # Curves of each figure: name of the data source, and its columns for the horizontal and the vertical axis.
+        # Store the curves of each figure: name of the data source, and its columns for the horizontal and the vertical
+        # axis.
         self.curves: dict[figure, list[tuple[str, str, str]]] = {}
         self.frame: tuple[model.Range, model.Range] | None = None
         self.plots = {
@@ -77,7 +78,7 @@ class Page:
             "force": self._draw_motion("contact", "force"),
         }
         self.plots["plane"].tags = [self.inputs, self.answer]
-        # Listen to three events, because Bokeh reports a second click within 0.3 s and a long click separately.
+        # Handle three events of a click, because Bokeh reports a second click within 0.3 s and a long click separately.
         for click in (Tap, DoubleTap, PressUp):
             self.plots["plane"].on_event(click, self._tap)
         for axis in (self.plots["plane"].x_range, self.plots["plane"].y_range):
@@ -117,7 +118,7 @@ class Page:
     def _draw_plane(self) -> figure:
         """Return the chart of walls: stable and passive region, contours, ridge, and the wall of the user."""
         plot = self._new(460, x_range=(0, 1), y_range=(0, 1))
-        # Fill areas only faintly, because the lines carry the meaning.
+        # Fill areas with low opacity, because the lines carry the meaning.
         area = {"line_color": None, "fill_alpha": 0.13}
         self._add(plot, "multi_polygons", "area", "edge", parts="fill", xs="xs", ys="ys", legend_label="stable", **area)
         self._add(plot, "multi_line", "contours", "faint", xs="xs", ys="ys", legend_label="spectral radius")
@@ -131,7 +132,7 @@ class Page:
         mark = {"x": "x", "y": "y", "fill_color": None, "line_width": 2}
         self._add(plot, "scatter", "best", "ridge", marker="diamond", size=13, legend_label="stiffest", **mark)
         self._add(plot, "scatter", "wall", "ink", marker="circle_cross", size=17, legend_label="your wall", **mark)
-        # Arrow to a wall outside the chart, and the labels of islands.
+        # Add the arrow to a wall outside the chart, and the labels of islands.
         arrow = {"marker": "triangle", "angle": "angle", "size": 15, "parts": "line fill"}
         self._add(plot, "scatter", "away", "ink", x="x", y="y", **arrow)
         words = {"x": "x", "y": "y", "text": "text", "parts": "text"}
@@ -146,7 +147,7 @@ class Page:
         return plot
 
     def _draw_circle(self, sources: list[str]) -> figure:
-        """Return a complex plane with the unit circle; the ranges contain the data of ``sources``."""
+        """Return a figure of the complex plane with the unit circle, whose ranges contain the data of ``sources``."""
         plot = self._new(330, match_aspect=True)
         circle = plot.line(np.cos(_ANGLES), np.sin(_ANGLES), line_width=1.5)
         self.inks.append((circle.glyph, "line_color", "faint"))
@@ -155,7 +156,7 @@ class Page:
         return plot
 
     def _draw_poles(self) -> figure:
-        """Return the figure of the poles in the complex plane."""
+        """Return the figure of the closed-loop poles in the complex plane."""
         plot = self._draw_circle(["poles"])
         poles = self._add(plot, "scatter", "poles", "edge", x="x", y="y", marker="x", size=11, line_width=2.5)
         for axis in (plot.x_range, plot.y_range):
@@ -164,7 +165,7 @@ class Page:
         return plot
 
     def _draw_nyquist(self) -> figure:
-        """Return the Nyquist curve with its gain crossover and the critical point -1."""
+        """Return the figure of the Nyquist curve with its gain crossover and the critical point -1."""
         plot = self._draw_circle(["crossover"])
         self._add(plot, "line", "nyquist", "edge", x="x", y="y", line_width=2)
         critical = plot.scatter([-1.0], [0.0], marker="cross", size=13, line_width=2.5)
@@ -175,7 +176,7 @@ class Page:
         return plot
 
     def _draw_bode(self, column: str, critical: float) -> figure:
-        """Return magnitude or phase of the open loop over frequency, with a line at the critical value."""
+        """Return the figure of magnitude or phase of L over frequency, with a line at the critical value."""
         plot = self._new(170, x_axis_type="log")
         self._add(plot, "line", "bode", "edge", x="x", y=column, line_width=2)
         line = Span(location=critical, dimension="width", line_dash=[4, 4], line_width=1.5)
@@ -188,13 +189,13 @@ class Page:
         return plot
 
     def _draw_motion(self, source: str, column: str) -> figure:
-        """Return a column of a motion over time."""
+        """Return the figure of a motion: one column of the data source ``source`` over time."""
         plot = self._new(220)
         self._add(plot, "line", source, "edge", x="x", y=column, line_width=2)
         return plot
 
     def _paint(self) -> None:
-        """Set all colors of the figures for the light or dark theme."""
+        """Set the colors of all figures to those of the light or dark theme."""
         # Leave the background transparent until the browser has reported its theme.
         inks = (_DARK if self.dark else _LIGHT) | ({"paper": None} if self.dark is None else {})
         for glyph, name, ink in self.inks:
@@ -208,7 +209,7 @@ class Page:
         self.plots["plane"].legend.label_text_color = inks["ink"]
 
     def _name_axes(self) -> None:
-        """Set the labels of all axes, with the units of the scene."""
+        """Set the labels of all axes, which contain the units of the scene."""
         units = self.controls.scene.unit_system
         spring, damper = units["N/m"], units["N s/m"]
         hertz, time, walls = "frequency in Hz", "time in s", (f"stiffness K in {spring}", f"damping B in {damper}")
@@ -230,7 +231,7 @@ class Page:
             self.plots[name].xaxis.axis_label, self.plots[name].yaxis.axis_label = x, y
 
     def receive(self, data: Any) -> None:
-        """Process a message of the browser: changed values, end of a drag, theme, or request for a CSV file."""
+        """Process a message from the browser: changed values, end of a drag, theme, or request for a CSV file."""
         try:
             (text,) = data["json"]
             message = json.loads(text) if isinstance(text, str) and len(text) <= _LONGEST_MESSAGE else None
@@ -257,7 +258,7 @@ class Page:
         self.update(dict(zip(names, place, strict=True)), rest=True)
 
     def update(self, changes: dict[str, Any], *, rest: bool, link: str | None = None) -> None:
-        """Show fast results of changed controls; if the slider rests, also start the computation of the others.
+        """Show the fast results of changed controls; if the slider rests, start the computation of the slow ones.
 
         ``link`` is the fragment of the page's address; "" is that of the first visit.
         """
@@ -269,7 +270,7 @@ class Page:
         except Exception as error:
             self.send({"error": _explain(error), "state": self.controls.shown(), "busy": False})
             return
-        # Cancel older computations only now, because a refused change keeps the state for which they run.
+        # Cancel older computations after the checks above, because a refused change keeps the state for which they run.
         self.generation += 1
         if rest:
             assert self.frame is not None, "it has just been shown"
@@ -277,7 +278,7 @@ class Page:
             self.executor.submit(self._compute, self.generation, controls.scene, *self.frame, **wanted)
 
     def _show_at_once(self, controls: Controls, rest: bool) -> None:
-        """Compute and show the fast results; export texts only if the slider rests."""
+        """Compute and show the fast results, and if the slider rests also the texts that reproduce the scene."""
         scene = controls.scene
         stable, poles = bool(scene.decide_stability(method="companion").stable), scene.poles()
         device = replace(scene, wall=VirtualWall(0.0)), controls.normalized
@@ -313,7 +314,7 @@ class Page:
             self._fill({"away": arrow})
 
     def table(self, name: str) -> str:
-        """Return the points of a figure as CSV: curve, number of its piece, and coordinates with 8 digits."""
+        """Return the points of a figure as CSV text: curve, number of the piece of the curve, and coordinates."""
         plot, buffer = self.plots[name], io.StringIO()
         writer = csv.writer(buffer, lineterminator="\n")
         writer.writerow(["curve", "piece", plot.xaxis.axis_label, plot.yaxis.axis_label])
@@ -328,7 +329,7 @@ class Page:
         return buffer.getvalue()
 
     def _fill(self, update: Update) -> None:
-        """Set the columns of data sources, by name of the source."""
+        """Replace the columns of the data sources in ``update``, a dict by the name of the source."""
         for name, columns in update.items():
             self.sources[name].data = columns
 
@@ -337,7 +338,7 @@ class Page:
         self.answer.data = {"json": [json.dumps({"serial": self.serial, **texts})]}
 
     def _compute(self, generation: int, scene: Scene, *frame: model.Range, **wanted: bool) -> None:
-        """Compute part by part, in the worker's thread, until a newer change cancels the computation."""
+        """Compute the slow results one by one in the worker's thread, until a newer change cancels the computation."""
         try:
             for update in compute_details(scene, *frame, **wanted):
                 if generation != self.generation:
@@ -345,7 +346,7 @@ class Page:
                 self._schedule_update(generation, update)
             self._schedule_update(generation, {"busy": False})
         except Exception as error:
-            # Clear the verdict, which belongs to the previous wall.
+            # Clear the verdict, because it belongs to the previous wall.
             self._schedule_update(generation, {"error": _explain(error), "verdict": "", "busy": False})
 
     def close(self) -> None:
@@ -353,7 +354,7 @@ class Page:
         self.generation += 1
 
     def _schedule_update(self, generation: int, update: Update) -> None:
-        """Apply an update of the worker in the thread of the document."""
+        """Schedule an update from the worker for the thread of the document, which alone may change the page."""
         self.document.add_next_tick_callback(lambda: self._apply_update(generation, update))
 
     def _apply_update(self, generation: int, update: Update) -> None:
@@ -362,14 +363,14 @@ class Page:
             return
         self._fill({name: columns for name, columns in update.items() if name in self.sources})
         texts = {name: text for name, text in update.items() if name not in self.sources}
-        # The sensitivities are the last of the results that depend only on the device.
+        # Note that the results of the device are complete, because the sensitivities are the last of them.
         self.drawn = self.drawn or "slopes" in update
         if texts:
             self.send(texts)
 
 
 def _explain(error: Exception) -> str:
-    """Return the message of the page for any exception, because the page stays open after every error."""
+    """Return the message that the page shows for an exception of any type, because the page stays open after errors."""
     if isinstance(error, ZwidthError):
         return str(error)
     return f"the computation failed ({type(error).__name__}: {error}); change a number, or reload the page"

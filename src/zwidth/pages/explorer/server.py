@@ -40,7 +40,8 @@ _ASSETS = Path(__file__).parent / "assets"
 _MOST_PAGES = 16  # largest number of open pages
 _LONGEST_MESSAGE = 1 << 18  # bytes of a message from the browser
 _UNUSED = 10  # seconds until a session without a connection is discarded
-# First parts of the served paths: page, websocket, scripts of Bokeh, files in assets/. Bokeh would serve more.
+# First parts of the served paths: page, websocket, scripts of Bokeh, files in assets/. All others are refused, because
+# Bokeh would serve more.
 _SERVED = ("", "ws", "static", "assets")
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
@@ -76,20 +77,22 @@ class GuardedServer(BokehTornado):
         self.add_handlers(".*", pages)
 
     def find_handler(self, request: HTTPServerRequest, **keywords: Any) -> Any:
-        """Return the handler of a request; the handler of status 403 if token, path, host or origin is wrong."""
+        """Return the handler of a request: one that answers with status 403 if token, path, host or origin is wrong."""
         first, _, rest = request.path.lstrip("/").partition("/")
         valid = hmac.compare_digest(first.encode("utf-8", "replace"), self.token.encode())
-        # Paths with unprintable characters are never ours. The token without a slash is redirected to the page.
+        # Refuse paths with unprintable characters, which the page never requests. The token without a slash is valid,
+        # because it is redirected to the page.
         valid = valid and rest.partition("/")[0] in _SERVED and unquote(rest).isprintable()
         origin = request.headers.get("Origin", f"http://{self.host}")
-        # Compare the host too: another host name that resolves to this address is a different origin (DNS rebinding).
+        # Compare the host, too, because another host name that resolves to this address is a different origin (DNS
+        # rebinding).
         if not valid or request.host != self.host or origin != f"http://{self.host}":
             return self.get_handler_delegate(request, ErrorHandler, {"status_code": 403})
         return super().find_handler(request, **keywords)
 
 
 class _SecureHandler(RequestHandler):
-    """Response headers for security and caching, sent with every file of the explorer."""
+    """Request handler that sends headers for security and caching with every file of the explorer."""
 
     def set_default_headers(self) -> None:
         self.set_header("Content-Security-Policy", _POLICY.format(host=self.application.host))  # pyright: ignore[reportAttributeAccessIssue]
@@ -103,7 +106,7 @@ class AssetHandler(_SecureHandler, StaticFileHandler):
 
 
 class PageHandler(_SecureHandler, SessionHandler):
-    """Handler of the page: its static HTML, and a Bokeh session with its figures."""
+    """Handler of the page, which returns its static HTML and a Bokeh session with its figures."""
 
     async def get(self) -> None:
         """Send a new page; status 503 if too many pages are open."""
@@ -131,7 +134,7 @@ class PageHandler(_SecureHandler, SessionHandler):
 
 
 class Explorer:
-    """Server that listens on a port; `run` serves until SIGINT or SIGTERM."""
+    """Server of the explorer on a port of this machine; `run` serves until SIGINT or SIGTERM."""
 
     def __init__(self, controls: Controls, port: int = 0) -> None:
         try:
@@ -140,7 +143,8 @@ class Explorer:
             raise InputError(
                 f"--port: {port} is not available ({error.strerror}); choose another port, or 0 for any free one"
             ) from error
-        # Silence the logs: refused requests are of no interest, and the page itself shows its errors.
+        # Silence the logs of Bokeh and Tornado, because refused requests need no attention, and the page shows its
+        # errors.
         for name in ("bokeh", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         listening.setblocking(False)
