@@ -315,7 +315,8 @@ class DecidedWalls:
     def _count_windings(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
         """Return the winding number of X around 0 for each of several decided walls; a wall is stable if it is 0.
 
-        The winding number is the argument of X at z = -1 divided by 2 pi, continued along the curve from its asymptote at z = 1 (M1).
+        The winding number is the argument of X at z = -1 divided by 2 pi, continued along the curve from its asymptote
+        at z = 1 (M1).
         """
         c = self.curve
         X = c.u + (alpha[:, None] + beta[:, None] * c.F) * c.S

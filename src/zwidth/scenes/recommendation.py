@@ -199,7 +199,7 @@ class Recommendation:
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
-        # Compute the stable range of B at the printed K, because a negative lower end is sensitive to the rounding of K.
+        # Compute the stable range of B at the printed K, because a negative lower end depends strongly on K.
         intervals = tuple(map(tuple, self.scene.stable_damping(self.read[0]).tolist()))
         lower, upper = format_interval(
             *find_nearest_interval(intervals, self.virtual_damping), self.unit_system["N s/m"], self.read[2]

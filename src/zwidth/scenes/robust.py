@@ -244,7 +244,7 @@ def _find_lowest(cost: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high
 
 
 def _place_devices(shares: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the devices at relative positions ``shares`` in a box; 0 and 1 yield exactly the ends ``low`` and ``high``."""
+    """Return the devices at the relative positions ``shares`` in a box; 0 yields exactly ``low``, 1 ``high``."""
     inside = np.clip(low + shares * (high - low), low, high)
     return np.where(shares == 0.0, low, np.where(shares == 1.0, high, inside))
 
@@ -264,7 +264,7 @@ def _find_weakest_device(low: np.ndarray, high: np.ndarray) -> tuple:
 
 
 def _find_common_limit(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
-    """Return the limit in K of walls that are stable on all ``devices``, and a function that returns the best B for a K."""
+    """Return the limit of the walls that are stable on all devices, and a function from K to their middle B."""
 
     def common(stiffness: float) -> tuple[float, float]:
         """Return the ends of the interval of B that is stable on all devices at one K; reversed if it is empty."""
