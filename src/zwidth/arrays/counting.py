@@ -8,7 +8,8 @@ By the argument principle, the count follows from the *crossovers*, the points a
 arg B there (docs/theory/one-crossover.md, S19 to S21). With ``z = r (1 + j t)/(1 - j t)``, t = tan(w/2), the difference
 ``|T|^2 - |B|^2`` is a real polynomial in t, divided by a power of 1 + t^2. Its zeros are enclosed in disks; the real
 *intervals* that these disks cut out contain all crossovers. A count is returned only if it is the same for every
-position of the crossovers in their intervals and every rounding error.
+position of the crossovers in their intervals and every rounding error. In the functions below, eps is the rounding unit
+of the floating-point type, and xp is NumPy or jax.numpy.
 """
 
 from __future__ import annotations
@@ -161,9 +162,9 @@ def _align_coefficients(arrays: list[Array], xp: Any) -> list[Array]:
 
 
 class _CircleParts(NamedTuple):
-    """T and B on the circle z = r (1 + j t)/(1 - j t), scaled; the last axes are the part (0: T, 1: B) and the factor.
+    """Scaled factors of T and B on the circle z = r (1 + j t)/(1 - j t); last axes: part (0: T, 1: B) and factor.
 
-    A factor is ``z - a = (u + j t v)/(1 - j t)``, up to its scale r + |a|.
+    For a root a, a factor is ``z - a = (u + j t v)/(1 - j t)``, up to its scale r + |a|.
     """
 
     u: Array  # (r - a)/(r + |a|)
@@ -292,13 +293,14 @@ def _get_smallest(xp: Any, like: Array) -> float:
 
 
 def _enclose_crossovers(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array, Array, Array, Array]:
-    """Enclose all crossovers in intervals of t.
+    """Compute intervals of t that together contain all crossovers.
 
     Returns:
         The sorted lower and upper ends of the intervals, infinite for unused ones; the leading coefficient of
         ``|T|^2 - |B|^2``; and whether the enclosure is proved.
     """
-    # Compute the coefficients, lowest power first, as products of |u + jtv|^2 = |u|^2 + 2 t Im(u conj v) + t^2 |v|^2.
+    # Compute the coefficients of |T|^2 - |B|^2, lowest power first, from products of the factors
+    # |u + jtv|^2 = |u|^2 + 2 t Im(u conj v) + t^2 |v|^2.
     a0, a1, a2 = xp.abs(loop.u) ** 2, 2.0 * (loop.u * xp.conj(loop.v)).imag, xp.abs(loop.v) ** 2
     size = a0.shape[-1]
     count = 2 * size
@@ -355,7 +357,7 @@ def _compute_corrections(loop: _CircleParts, guess: Array, leading: Array, eps: 
 
 
 def _count_turns(loop: _CircleParts, low: Array, high: Array, eps: float, xp: Any) -> tuple[Array, Array]:
-    """Return m = round((arg T - arg B)/(2 pi)) on every interval, and whether it is provably constant there."""
+    """Return m = round((arg T - arg B)/(2 pi)) on each interval of t, and whether m is provably constant on it."""
     u, v, inside = (value[..., None, :, :] for value in (loop.u, loop.v, loop.inside))
     size = xp.abs(u)
     # Between 0 and t, the argument of a factor changes by arg((u + jtv)/u). The change is continuous unless the line
@@ -387,7 +389,7 @@ def _count_turns(loop: _CircleParts, low: Array, high: Array, eps: float, xp: An
 def _compare_parts(
     loop: _CircleParts, roots: Array, low: Array, high: Array, leading: Array, m: Array, eps: float, xp: Any
 ) -> tuple[Array, Array, Array, Array]:
-    """Compare |B| with |T| outside the intervals of the crossovers.
+    """Determine whether |B| or |T| is larger before, between and after the intervals of the crossovers.
 
     Returns:
         Whether B is the larger part at z = -r, before every interval, and after every interval; and whether every

@@ -193,7 +193,8 @@ def discretize_plant(delta: Array, d: Array, kind: DelayClasses = ANY) -> Discre
     phi = phi_functions(delta)
     phi_t = phi_functions(delta * (1.0 - f)) if kind.fractional else phi
     plant = discretize_mass(delta, f if kind.fractional else None, phi=phi, phi_t=phi_t)
-    # (-1)^n P(-1) = 2 (1 + c) - (-1)^n N(-1) (alpha + 2 beta) is positive if the loop is stable.
+    # With a wall (alpha, beta), the characteristic polynomial P of a stable loop satisfies
+    # (-1)^n P(-1) = 2 (1 + c) - (-1)^n N(-1) (alpha + 2 beta) > 0.
     minus_one_coefficient = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
     return DiscretePlant(
         *(delta, whole, f, plant.c, plant.em, phi.phi1, phi.phi2, phi.psi, phi_t.phi1, phi_t.psi),

@@ -22,11 +22,11 @@ Sloped = Callable[[Array], tuple[Array, Array]]
 HALVINGS = 60  # bisection to the last digit of float64, also of the logarithm of a range of 32 decades
 CONVERGED_STEP = 1e-11  # relative step after which the error of Newton's method is rounding, also near a double zero
 ZERO_VALUE = 1e-15  # largest |value| of a zero in `false_position`: rounding error of a phase in rad, its main use
-MAX_NEWTON_STEPS = 16  # of optimistix
+MAX_NEWTON_STEPS = 16  # largest number of Newton steps in `polish_root`
 
 
 def bisect(holds: Function, low: Array, high: Array) -> Array:
-    """Find by bisection the point between ``low`` and ``high`` at which the condition ``holds`` changes to False."""
+    """Find by bisection the point between ``low`` and ``high`` above which the condition ``holds`` is False."""
     xp = namespace(low, high)
 
     def halve(ends: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -111,7 +111,7 @@ def minimize_golden_section(
 
 # Search for the global minimum
 N_MINIMA = 3  # lowest local minima of the samples that are refined
-MAX_GOLDEN_STEPS = 52
+MAX_GOLDEN_STEPS = 52  # largest number of steps of the golden-section search
 SMALL_SHARE = 1e-9  # argument next to 0, relative to the first sample, that shows if the function rises from 0
 
 
@@ -228,7 +228,7 @@ def false_position(
 
 
 # Search for zeros between nodes
-MAX_BETWEEN_STEPS = 120
+MAX_BETWEEN_STEPS = 120  # largest number of steps of false position
 BETWEEN_WIDTH = 4e-16  # relative width of the final bracket
 
 

@@ -96,7 +96,7 @@ _NUMBERS = [field.name for field in fields(Assessment) if field.name != "unit_sy
 
 @wrap_function
 def assess(scene: SceneOptima) -> Assessment:
-    """Assess the wall of a scene.
+    """Compute stability, margins, passivity and dominant pole of the wall of a scene, and limits of its stiffness.
 
     Args:
         scene: device, timing, wall and other parts.
@@ -264,7 +264,7 @@ class Limit(NamedTuple):
 
 
 class Improvement(NamedTuple):
-    """A scene with one part or parameter improved."""
+    """An improved copy of a scene, with the part or parameter that was improved and a description."""
 
     name: str  # name of the part or parameter
     words: str  # the improvement in words

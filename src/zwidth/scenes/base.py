@@ -194,7 +194,7 @@ class SceneParts(Part):
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The units of the device, linear or rotary."""
+        """Unit system of the device, linear or rotary."""
         return self.device.unit_system
 
     @cached_property
@@ -205,7 +205,7 @@ class SceneParts(Part):
         return with_units(WallSI(mass / period / period, mass / period), self.unit_system)
 
     def parameters(self) -> dict[str, Any]:
-        """Return all numerical parameters of all parts by dotted path.
+        """Return a dictionary of the numerical parameters of all parts, keyed by dotted path.
 
         Returns:
             For example ``{"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 0.0, "velocity.cutoff": 100.0, ...}``;

@@ -19,10 +19,10 @@ from zwidth.words.formatting import format_wall, plain, with_unit
 from zwidth.words.status import Status
 
 # Limits of acceptable walls. A recommended wall that violates one of these limits has a caution.
-LEAST_PHASE_MARGIN = 10.0  # degrees
-LEAST_GAIN_MARGIN = 1.3  # factor on K and B together
-LEAST_DELAY_MARGIN = 0.1  # sampling periods
-LONGEST_TIME_CONSTANT = 1.0  # s
+LEAST_PHASE_MARGIN = 10.0  # smallest phase margin, in degrees
+LEAST_GAIN_MARGIN = 1.3  # smallest gain margin, a factor on K and B together
+LEAST_DELAY_MARGIN = 0.1  # smallest delay margin, in sampling periods
+LONGEST_TIME_CONSTANT = 1.0  # largest time constant of the decay, in s
 
 
 def find_thin(verdict: Assessment, period: float) -> list[str]:

@@ -47,7 +47,7 @@ FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in 
 )
 @dataclass(frozen=True)
 class Diagnosis:
-    """Cause of the sustained oscillation of a wall, from `diagnose`.
+    """Result of `diagnose`: the cause of the sustained oscillation of a wall, and the remedies.
 
     Attributes:
         cause: cause of the oscillation. "instability": the linear loop is unstable. "quantization": the steps of the
@@ -240,8 +240,7 @@ def _find_cause(experiment: Experiment, worst: SustainedMotion, dominant: Any) -
         return "instability"
     limited = min(hardware.max_force, hardware.max_rate) < math.inf
     if not limited and hardware.resolution == 0:
-        # With an ideal encoder and motor, a loop that is stable without friction comes to rest with friction as well,
-        # because friction only dissipates energy.
+        # With an ideal encoder and motor, decide by the linear loop alone, because friction only dissipates energy.
         return "none"
     if not worst.at_rest[0] and experiment.decay < SETTLED:
         return "undecided"

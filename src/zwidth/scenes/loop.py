@@ -213,7 +213,7 @@ class LinearLoop:
         return ""
 
     def find_connected_beta(self, alpha: float, least: float) -> list[tuple[float, float]]:
-        """Return the stable intervals of beta >= ``least`` for one alpha whose walls are connected to K = 0."""
+        """Return for one alpha the intervals of beta >= ``least`` of stable walls that are connected to K = 0."""
         intervals = np.maximum(self.find_stable_beta(alpha), least).tolist()
         return [(low, high) for low, high in intervals if low < high and self.is_connected(alpha, 0.5 * (low + high))]
 
@@ -326,7 +326,8 @@ class RigidLoop(LinearLoop):
     def find_dominant(self, alpha: float, beta: float) -> DominantPole:
         with np.errstate(all="ignore"):
             dominant = find_dominant_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
-        # If walls with slightly larger K are stable, a wall with K = 0 has one pole at z = 1 and no pole outside.
+        # A wall with K = 0 has a pole at z = 1. If walls with slightly larger K are stable, it has no pole outside the
+        # unit circle, i.e. it is marginal.
         return DominantPole(alpha == 0 and bool(self.find_stable_alpha(np.array([beta])).size), *dominant)
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:

@@ -35,21 +35,21 @@ from zwidth.parts.circle import circle_points
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 
-# Interpolation between lines (M5, M6)
+# Constants of the interpolation between lines (docs/theory/measured.md, M5 and M6)
 LEAST_DAMPING_RATIO = 0.005  # smallest damping ratio zeta of a resonance between two lines (assumption A1)
 # Factor in the bound of a resonance between two lines: if its frequency f is in the middle of the interval of length d,
 # and it changes the second difference of S by D, the height of its peak in S is D d/(16/3 zeta f).
 RESONANCE_FACTOR = 16.0 / 3.0
 SMOOTH_FACTOR = 0.25  # error of a chord of a smooth curve over its second difference: 1/8, doubled for safety
 MAX_TURN = 0.5  # rad; if the phase changes by more between two lines, S may be anywhere between both
-MAX_STEP = 0.005  # relative change of the curve between two interpolated points
-MAX_POINTS = 32  # interpolated points between two lines
+MAX_STEP = 0.005  # largest relative change of S, or of w^2, between two interpolated points
+MAX_POINTS = 32  # largest number of interpolated points between two lines
 
-# Extrapolation below the first and above the last line (M7, M8)
-PHASE_TOLERANCE = 0.8  # rad; deviation of the phase of the first line from that of a mass, a damper or a spring
-N_FIRST = 4  # lines from which the low-frequency asymptote is identified, at least
-EXTRAPOLATION_FACTOR = 2.0  # bound of |G| above the last line, over its root mean square at the last lines
-LAST_SHARE = 0.8  # the last lines start at this share of the highest frequency
+# Constants of the bounds below the first and above the last line (docs/theory/measured.md, M7 and M8)
+PHASE_TOLERANCE = 0.8  # rad; largest deviation of the first line's phase from that of a mass, damper or spring
+N_FIRST = 4  # smallest number of lines from which the low-frequency asymptote is identified
+EXTRAPOLATION_FACTOR = 2.0  # ratio of the bound of |G| above the last line to the root mean square of |G| below it
+LAST_SHARE = 0.8  # lines above this fraction of the highest frequency are called the last lines
 # Largest increase of |S| over the last lines, as a factor. If |S| increases more, a resonance may follow above the last
 # line, so that |G| has no bound there.
 MAX_RISE = 1.2
@@ -204,8 +204,8 @@ def _bound_gaps(w: np.ndarray, S: np.ndarray) -> np.ndarray:
 
 RADIUS_FACTOR = 1.02  # factor on rho^2 |H|^2, which covers the change of rho |H| between two points of the curve
 MIN_WIDTH = 1e-9  # decided intervals shorter than this, relative to their upper end, are dropped as rounding errors
-TINY = 1e-300  # replaces zero denominators
-BATCH_SIZE = 1 << 15  # lines of constant alpha or beta per batch, times points of the curve; bounds the memory
+TINY = 1e-300  # value that replaces zero denominators, to avoid division by 0
+BATCH_SIZE = 1 << 15  # number of lines in a batch times the number of points of the curve; bounds the memory
 
 
 class DecidedIntervals(NamedTuple):

@@ -29,7 +29,7 @@ from zwidth.words.results import Margins, RidgePoint, Stability
 from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array
 
-# Search for the stiffest wall over beta
+# Settings of the search for the stiffest wall, on lines of constant beta
 N_SIDE = 60  # values of beta on each side of beta = 0
 DENSITY = 5.0  # argument of sinh at the largest beta; larger values place more of them close to beta = 0
 N_REFINED = 49  # further values of beta in the range with stable walls
@@ -189,7 +189,7 @@ class MeasuredLoop(LinearLoop):
         )
         minimum = minimize_golden_section(lambda beta: -self._find_tops(beta), low, middle, high, cost, SEARCH_STEPS)
         middle, value = float(minimum[0][0]), -float(minimum[1][0])
-        # Stay below the end of the open interval, because the end itself is undecided.
+        # Reduce alpha slightly below the end of its interval, because the wall at the end itself is undecided.
         value *= 1.0 - INSIDE
         omega = self.walls.curve.w[self.walls.find_critical_point(value, middle)]
         return RidgePoint(np.float64(value), np.float64(middle), np.float64(omega), kind, np.int32(Status.OK))

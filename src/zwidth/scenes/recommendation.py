@@ -121,7 +121,7 @@ class Recommendation:
             wall = rounded(digits)
             if not (self.scene.is_stable(*wall) and all(spare >= 0 for spare in slack(*wall).values())):
                 return False
-            # The printed B must lie in the printed range of stable B, whose ends are rounded inwards.
+            # Require that the printed B lies in the printed range of stable B, whose ends are rounded inwards.
             low, high = ends
             inside = (
                 round_conservatively(low, "above", digits) <= wall[1] <= round_conservatively(high, "below", digits)

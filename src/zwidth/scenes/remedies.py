@@ -62,7 +62,7 @@ class _Candidates(NamedTuple):
 
 
 def search_remedies(experiment: Experiment, cause: Literal["quantization", "saturation"]) -> list[Remedy]:
-    """Return one remedy per parameter whose change stops the oscillation, from the smallest such change on."""
+    """Return for each parameter whose change stops the oscillation a range that starts at the smallest change."""
     hardware = experiment.hardware
     periods = min(experiment.periods, LONGEST_TRIAL)
     experiment = experiment._replace(periods=periods, decay=experiment.decay * periods / experiment.periods)

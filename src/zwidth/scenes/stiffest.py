@@ -89,7 +89,7 @@ SAME_VALUE = 1e-9  # relative distance from the current value below which it rep
 CONFIRMATION_DISTANCES = (1e-11, 1e-9, 1e-7, 1e-5)
 # Options of the bounded minimizer of SciPy; ``xatol`` is the absolute tolerance of the logarithm of the parameter.
 EXTREMUM_OPTIONS = {"xatol": 1e-6}
-NO_STIFFNESS = 60.0  # negative of the surplus if no wall is stable; K_max then counts as exp(-60) times the required K
+NO_STIFFNESS = 60.0  # negative of the surplus if no wall is stable, which corresponds to K_max = exp(-60) K
 
 Side = Literal["above", "below", "everywhere", "nowhere"]
 
@@ -139,7 +139,8 @@ def _choose_range(
         timing = scene.timing
         if not now > 0:
             raise InputError(f"within: {parameter} is 0 now; pass the range to search, such as within=(0.1, 10)")
-        # The run time increases with the square of the delay in periods; a cutoff is below the Nyquist frequency.
+        # Limit the range, because the run time increases with the square of the delay in periods, and because a cutoff
+        # must be below the Nyquist frequency.
         fixed = 0.0 if timing.in_periods else timing.delay
         longest = max(float(timing.delay / timing.period), MAX_PERIODS)
         ends = {
@@ -252,7 +253,7 @@ class SceneOptima(SceneAnalysis):
         alpha, beta, omega, kind, status = self.loop.stiffest(allows_negative(self, negative_damping))
         mass, period = (value if is_traced(value) else float(value) for value in (self.mass, self.timing.period))
         rate = mass / period
-        # Multiply in the same order as `zwidth.max_stiffness`, so that both results agree to the last digit.
+        # Multiply the factors in the same order as `zwidth.max_stiffness`, so that both results are equal.
         values = (alpha * rate / period, beta * rate, omega / (2.0 * math.pi * period), kind, status)
         return StiffestWall(*(value if is_jax(value) else np.asarray(value)[()] for value in values))
 
@@ -363,15 +364,15 @@ class SceneOptima(SceneAnalysis):
         best = min(confirmed, key=lambda crossing: abs(math.log(crossing.value / middle)))
         ends = sorted((middle, best.value))
         if any(ends[0] <= value <= ends[1] and math.isnan(surpluses[value]) for value in grid):
-            # Report no value if K_max could not be computed between the current value and the crossing, because a closer
-            # crossing may exist there.
+            # Report no value if K_max could not be computed between the current value and the crossing, because a
+            # closer crossing may exist there.
             return RequiredValue(math.nan, "nowhere", confirmed, (low, high), Status.NOT_CONVERGED)
         return RequiredValue(best.value, best.enough, confirmed, (low, high), Status.OK)
 
     def best_damping(
         self, stiffness: float | str | None = None, *, goal: Goal = "fast", negative_damping: bool | None = None
     ) -> BestDamping:
-        """Return the optimal virtual damping for one stiffness.
+        """Find the damping B at which a wall with the given stiffness settles fastest or is most robust.
 
         Args:
             stiffness: K in N/m, > 0; by default that of the wall of the scene.

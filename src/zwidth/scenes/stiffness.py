@@ -143,7 +143,7 @@ def _sensitivities_kernel(mass, damping, period, delay, delta, d, kind) -> Sensi
     # If JAX traces the quantities, compile this part separately, so that the derivatives in delta and d are computed
     # once and not again for each quantity.
     slopes = slopes_kernel(delta, d, kind) if xp is np else compile_traced(slopes_kernel, (kind,))(delta, d)
-    # Entries of arrays that are out of range are NaN in delta or d; their status follows from the quantities.
+    # Compute the status of entries out of range from the quantities in SI units, because delta or d is NaN there.
     input_status = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
     status = xp.where(input_status == Status.OK, slopes.point.status, input_status).astype(np.int32)
     return Sensitivities(*stiffness_slopes(slopes, mass, period, delta, d), status)

@@ -120,8 +120,8 @@ class Experiment(NamedTuple):
         )
         if np.any(motion.outcome == MotionKind.INVALID):
             raise InputError("coulomb: friction stops and restarts the device too often within one period; lower it")
-        # A response that decays like the linear loop has the trend exp(-decay/8), because each half of the tail lasts an
-        # eighth of the simulation. Require at least the square root of this trend for a sustained oscillation.
+        # A response that decays like the linear loop has the trend exp(-decay/8), because each half of the tail lasts
+        # an eighth of the simulation. Require at least the square root of this trend for a sustained oscillation.
         least_trend = max(SUSTAINED, math.exp(-self.decay / 16.0) if self.decay > 0 else 0.0)
         # Treat a growing response as unbounded only if the linear loop is unstable and the motor has no limits, because
         # other growing responses approach a limit cycle.
@@ -147,7 +147,8 @@ def list_starts(scene: Any, hardware: Hardware) -> Starts:
     halves[: len(half_steps)] = half_steps
     starts = np.array(position), velocity, np.zeros(len(position)), halves, np.arange(len(position)) < scaled
     if isinstance(scene.device, LinearDevice):
-        # A linear system always starts at rest at 0, so a constant external force displaces its equilibrium instead.
+        # Displace the equilibrium of a linear system by a constant external force, because its simulation always starts
+        # at rest at 0.
         push = np.minimum(K * starts[0], LARGEST_PUSH * hardware.max_force)
         return Starts(np.zeros(len(push)), np.zeros(len(push)), push, *starts[3:])
     return Starts(*starts)

@@ -38,7 +38,7 @@ class Variants:
         (self.count,) = {values.size for values in drawn.values()}
 
     def scenes(self) -> Iterator[Any]:
-        """Yield each variant as a scene."""
+        """Yield the variants one after the other, each as a scene with its parameter values."""
         for k in range(self.count):
             yield self.scene.replace(**{name: float(values[k]) for name, values in self.drawn.items()})
 

@@ -26,9 +26,9 @@ from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.status import Status
 from zwidth.words.units import to_float
 
-# Default requirements if the user gives none. Reasons: docs/guides/my-device.md.
-DEFAULT_PHASE_MARGIN = 30.0  # degrees
-DEFAULT_GAIN_MARGIN = 2.0  # factor on K and B together, 6 dB
+# Requirements that apply if the user gives none; docs/guides/my-device.md gives the reasons for these values.
+DEFAULT_PHASE_MARGIN = 30.0  # smallest phase margin, in degrees
+DEFAULT_GAIN_MARGIN = 2.0  # smallest gain margin, a factor on K and B together; equals 6 dB
 
 SAMPLES = 18  # values of B per stiffness; a weakly damped device is passive only in a small part of its stable range
 NEAR = 5.0  # ratio of the tolerance of the best B to that of K; B may be less accurate, because its optimum is flat
