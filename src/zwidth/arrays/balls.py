@@ -1,10 +1,10 @@
-"""Settings for ball arithmetic with error bounds by python-flint, an optional package."""
+"""Settings of ball arithmetic, i.e. arithmetic with rigorous error bounds, by the optional package python-flint."""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
 
-# Working precisions in bits, tried in this order until a result is certain.
+# Working precisions in bits; a computation tries them in this order until its error bound certifies the result.
 BITS = tuple(128 << k for k in range(7))
 
 

@@ -1,4 +1,8 @@
-"""Evaluation of functions on columns of points, block by block and on all processors."""
+"""Evaluation of functions at many points, in blocks of equal size and on all processors.
+
+A *column* is a one-dimensional array that holds one argument of the function at all points, or an array of length 1 if
+all points share its value.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ import numpy as np
 from zwidth.arrays.threads import run_in_threads
 from zwidth.words.xp import compute_concretely, tree_map
 
-LEAST = 1 << 4  # points of the smallest block, because XLA rounds differently in shorter arrays
+LEAST = 1 << 4  # number of points of the smallest block, because XLA rounds differently in shorter arrays
 
 
 def map_blocks(
@@ -21,18 +25,18 @@ def map_blocks(
     within: Callable[[], Any] = compute_concretely,
     exact: bool = False,
 ) -> Any:
-    """Apply a function to columns block by block, on all processors.
+    """Apply a function to columns of points in blocks of equal size, on all processors, and join the results.
 
-    Blocks keep the intermediate arrays in the cache: one array of a million points takes 2.5 times as long for the
-    ridge (benchmarks/bench_xla.py).
+    The intermediate arrays of a block fit in the cache. In a single block of a million points, the ridge takes 2.5
+    times as long (benchmarks/bench_xla.py).
 
     Args:
-        function: maps columns to an array or tree of arrays, with one row per point.
+        function: maps columns to an array or a tree of arrays, whose first axis is that of the points.
         columns: arrays of one length, or of length 1 for a value that all points share.
         block: largest number of points per call.
         threads: number of threads; one per processor if left out.
-        within: returns the context manager of each call.
-        exact: pad a short batch to ``block`` points; otherwise to a power of 2.
+        within: function that returns the context manager in which each call runs.
+        exact: True to pad a short batch to ``block`` points, False to pad it to a power of 2.
 
     Returns:
         The results for all points, as writable NumPy arrays.
@@ -48,7 +52,7 @@ def map_blocks(
             return tree_map(np.asarray, function(*parts))
 
     first = run(0)
-    # Copy the results, because arrays of JAX are read-only.
+    # Copy the results of all blocks to new NumPy arrays, because JAX arrays are read-only.
     whole = tree_map(lambda leaf: np.empty((count, *leaf.shape[1:]), leaf.dtype), first)
 
     def store(start: int, result: Any) -> None:
@@ -56,22 +60,22 @@ def map_blocks(
         tree_map(lambda to, leaf: np.copyto(to[start:stop], leaf[: stop - start]), whole, result)
 
     store(0, first)
-    # The first block has compiled the function; threads run the others in parallel, because JAX releases the
-    # interpreter lock.
+    # Evaluate the first block alone, because it compiles the function. Threads evaluate the others in parallel, because
+    # JAX releases the interpreter lock.
     run_in_threads(lambda start: store(start, run(start)), range(size, count, size), threads)
     return whole
 
 
 def count_points(columns: Sequence[np.ndarray]) -> int:
-    """Return the number of points of columns of one length or of length 1."""
+    """Return the number of points of columns, each of which has this length or length 1."""
     return np.broadcast_shapes(*(column.shape for column in columns))[0]
 
 
 def _cut_block(column: np.ndarray, start: int, size: int) -> np.ndarray:
-    """Return one block of a column, padded to the full size."""
+    """Return the ``size`` elements of a column from index ``start`` on; repeat the last one if fewer remain."""
     part = column[start : start + size]
     missing = size - part.size
     if not missing:
         return part
-    # Repeat the last point, because no other value is valid for every kernel.
+    # Pad with the last element, because no constant is a valid argument of every kernel.
     return np.concatenate([part, np.full(missing, part[-1] if part.size else 0.0)])

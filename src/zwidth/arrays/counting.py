@@ -8,7 +8,8 @@ By the argument principle, the count follows from the *crossovers*, the points a
 arg B there (docs/theory/one-crossover.md, S19 to S21). With ``z = r (1 + j t)/(1 - j t)``, t = tan(w/2), the difference
 ``|T|^2 - |B|^2`` is a real polynomial in t, divided by a power of 1 + t^2. Its zeros are enclosed in disks; the real
 *intervals* that these disks cut out contain all crossovers. A count is returned only if it is the same for every
-position of the crossovers in their intervals and every rounding error.
+position of the crossovers in their intervals and every rounding error. In the functions below, eps is the rounding unit
+of the floating-point type, and xp is NumPy or jax.numpy.
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ from zwidth.words.errors import InputError
 from zwidth.words.types import Array, ArrayLike, Counts, RootsLike
 from zwidth.words.xp import is_traced, namespace
 
-# Loops per block of a concrete batch; the intermediate arrays of a block fit in the cache.
+# Number of loops that one NumPy call evaluates, chosen so that the intermediate arrays fit in the cache.
 BLOCK_SIZE = 1 << 9
-# Rounding errors of one factor, one sum and one logarithm, in units of eps; twice the result of counting operations.
+# Bound of the rounding error of one factor, one sum and one logarithm, in units of eps: twice the count of operations.
 ROUNDINGS = 8.0
-# Relative distance of r^2 from |root|^2, in units of eps, below which a complex root may be inside or outside.
+# Relative difference of r^2 and |root|^2, in units of eps, below which rounding errors leave open whether a complex
+# root lies inside the circle.
 ON_CIRCLE = 16.0
 
 
@@ -103,7 +105,7 @@ def count_poles(zeros: RootsLike, poles: RootsLike, gain: ArrayLike, lag: ArrayL
 
 
 def _iterate_members(value: ArrayLike) -> Iterator[Any]:
-    """Yield a value, or the members of nested lists, because a list may mix traced and plain numbers."""
+    """Yield a single value, or each number of nested lists, because a list may mix traced and plain numbers."""
     if isinstance(value, list | tuple):
         for item in value:
             yield from _iterate_members(item)
@@ -112,12 +114,12 @@ def _iterate_members(value: ArrayLike) -> Iterator[Any]:
 
 
 def _get_type(name: str) -> type:
-    """Return the type of an argument's numbers."""
+    """Return the number type of an argument of `count_poles`: complex for zeros and poles, otherwise float."""
     return complex if name in ("zeros", "poles") else float
 
 
 def _check_coefficients(name: str, value: ArrayLike) -> np.ndarray:
-    """Convert a concrete argument to an array, or raise InputError."""
+    """Convert an argument of `count_poles` that is not traced to an array; raise `InputError` if it is not allowed."""
     kind = _get_type(name)
     description = "real or complex" if kind is complex else "real"
     try:
@@ -142,7 +144,7 @@ def _check_coefficients(name: str, value: ArrayLike) -> np.ndarray:
 
 
 def _is_in_range(name: str, value: Array, xp: Any) -> Array:
-    """Return whether values of an argument are in range, elementwise."""
+    """Return a boolean array that is True where the values of the argument ``name`` of `count_poles` are in range."""
     good = xp.isfinite(value)
     if name == "radius":
         return good & (value > 0)
@@ -152,7 +154,7 @@ def _is_in_range(name: str, value: Array, xp: Any) -> Array:
 
 
 def _align_coefficients(arrays: list[Array], xp: Any) -> list[Array]:
-    """Broadcast all arguments to a common leading shape."""
+    """Broadcast zeros, poles, gain, lag and radius to a common leading shape; zeros and poles keep their last axis."""
     heads = [array.shape[:-1] for array in arrays[:2]] + [array.shape for array in arrays[2:]]
     shape = join_shapes(zip(("zeros", "poles", "gain", "lag", "radius"), heads, strict=True), "leading shapes")
     roots = [xp.broadcast_to(array, (*shape, array.shape[-1])) for array in arrays[:2]]
@@ -160,9 +162,9 @@ def _align_coefficients(arrays: list[Array], xp: Any) -> list[Array]:
 
 
 class _CircleParts(NamedTuple):
-    """T and B on the circle z = r (1 + j t)/(1 - j t), scaled; the last axes are the part (0: T, 1: B) and the factor.
+    """Scaled factors of T and B on the circle z = r (1 + j t)/(1 - j t); last axes: part (0: T, 1: B) and factor.
 
-    A factor is ``z - a = (u + j t v)/(1 - j t)``, up to its scale r + |a|.
+    For a root a, a factor is ``z - a = (u + j t v)/(1 - j t)``, up to its scale r + |a|.
     """
 
     u: Array  # (r - a)/(r + |a|)
@@ -175,13 +177,18 @@ class _CircleParts(NamedTuple):
 
 
 def _count(columns: list[Array], xp: Any) -> Array:
-    """Count the poles for zeros, poles, gain, lag and radius of one leading shape."""
+    """Return the number of closed-loop poles inside the circle, or -1 if it cannot be certified.
+
+    Args:
+        columns: zeros, poles, gain, lag and radius, with equal leading shapes.
+        xp: NumPy or jax.numpy.
+    """
     zeros, poles, gain, lag, radius = columns
     eps = float(xp.finfo(gain.dtype).eps)
     good = _is_in_range("gain", gain, xp) & _is_in_range("lag", lag, xp) & _is_in_range("radius", radius, xp)
     good = good & xp.isfinite(zeros).all(-1) & xp.isfinite(poles).all(-1)
     gain, lag, radius = xp.where(good, gain, 0.0), xp.where(good, lag, 0.0), xp.where(good, radius, 1.0)
-    # Give both products the same number of factors: multiply the shorter one by powers of z.
+    # Give both products the same number of factors: multiply the shorter product by a power of z (roots at 0).
     size = max(poles.shape[-1], zeros.shape[-1])
     missing = size - poles.shape[-1], size - zeros.shape[-1]
     roots = xp.stack([_pad_roots(poles, missing[0], xp), _pad_roots(zeros, missing[1], xp)], axis=-2)
@@ -204,14 +211,16 @@ def _count(columns: list[Array], xp: Any) -> Array:
 
 
 def _pad_roots(roots: Array, missing: int, xp: Any) -> Array:
-    """Append ``missing`` roots at z = 0."""
+    """Return the roots with ``missing`` further roots at z = 0 along the last axis."""
     return xp.concatenate([roots, xp.zeros((*roots.shape[:-1], missing), roots.dtype)], axis=-1)
 
 
 def _scale_parts(
     roots: Array, gain: Array, exponent: Array, radius: Array, xp: Any
 ) -> tuple[_CircleParts, Array, Array]:
-    """Scale T and B, and rotate the plane by a multiple of 90 degrees.
+    """Scale T and B to avoid overflow, and rotate the z plane by a multiple of 90 degrees.
+
+    After the rotation ``|T|`` and ``|B|`` differ at z = -r, where t is infinite.
 
     Returns:
         The scaled parts, the rotated roots, and whether a weight was clipped because it over- or underflows.
@@ -220,8 +229,8 @@ def _scale_parts(
     scale = r + xp.abs(roots)
     logs = xp.log(scale)
     log_gain, log_power = xp.log(xp.where(gain == 0, 1.0, xp.abs(gain))), exponent * xp.log(radius)
-    # ln |B/T|^2 without the factors. If it is clipped, only a count without crossovers is used: one part then is larger
-    # on the whole circle with the clipped weight, and all the more with the true one.
+    # Compute ln |B/T|^2 without the scaled factors. If this logarithm is clipped, use only a count without crossovers:
+    # a part that is larger on the whole circle with the clipped weight is also larger with the true weight.
     excess = 2.0 * (log_gain - log_power + (logs[..., 1, :] - logs[..., 0, :]).sum(-1))
     limit = 0.8 * math.log(xp.finfo(gain.dtype).max)
     clipped = (gain == 0) | (xp.abs(excess) > limit)
@@ -253,7 +262,7 @@ def _find_dominant(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array, Arra
     size = xp.abs(loop.inside)  # (r - |a|)/(r + |a|), the ratio of the least and the largest |z - a| on the circle
     error = ROUNDINGS * eps * (loop.uncertainty + (1.0 / (size + eps)).sum((-2, -1)))
     least = xp.abs(loop.weight) * (size * size).prod(-1)
-    # An error above a tenth means that a root is on the circle to within rounding errors.
+    # Reject an error bound above 0.1, because a root then lies on the circle to within rounding errors.
     first, second = (
         least[..., 0] > (1.0 + error) * -loop.weight[..., 1],
         least[..., 1] > (1.0 + error) * loop.weight[..., 0],
@@ -262,7 +271,10 @@ def _find_dominant(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array, Arra
 
 
 def _evaluate_difference(loop: _CircleParts, t: Array, eps: float, xp: Any) -> tuple[Array, Array]:
-    """Return ``|T|^2 - |B|^2`` at points t, divided by (1 + |t|)^(2 size), and a bound of its rounding error."""
+    """Return ``|T|^2 - |B|^2`` at points t, scaled to avoid overflow, and a bound of the rounding error.
+
+    The scale is ``(1 + |t|)^(2 size)`` with the number ``size`` of factors of T or B.
+    """
     t = t[..., None, None]
     u, v, jtv = loop.u[..., None, :, :], loop.v[..., None, :, :], 1j * t * loop.v[..., None, :, :]
     scale = 1.0 + xp.abs(t)
@@ -276,18 +288,19 @@ def _evaluate_difference(loop: _CircleParts, t: Array, eps: float, xp: Any) -> t
 
 
 def _get_smallest(xp: Any, like: Array) -> float:
-    """Return a positive number, negligible next to all others, that avoids 0/0 in quotients."""
+    """Return a tiny positive number, in the precision of ``like``, to be added to terms of quotients to avoid 0/0."""
     return math.sqrt(xp.finfo(like.dtype).tiny)
 
 
 def _enclose_crossovers(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array, Array, Array, Array]:
-    """Enclose all crossovers in intervals of t.
+    """Compute intervals of t that together contain all crossovers.
 
     Returns:
         The sorted lower and upper ends of the intervals, infinite for unused ones; the leading coefficient of
         ``|T|^2 - |B|^2``; and whether the enclosure is proved.
     """
-    # The coefficients, lowest power first: products of |u + jtv|^2 = |u|^2 + 2 t Im(u conj v) + t^2 |v|^2.
+    # Compute the coefficients of |T|^2 - |B|^2, lowest power first, from products of the factors
+    # |u + jtv|^2 = |u|^2 + 2 t Im(u conj v) + t^2 |v|^2.
     a0, a1, a2 = xp.abs(loop.u) ** 2, 2.0 * (loop.u * xp.conj(loop.v)).imag, xp.abs(loop.v) ** 2
     size = a0.shape[-1]
     count = 2 * size
@@ -306,7 +319,8 @@ def _enclose_crossovers(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array,
     monic = coefficients[..., :-1] / xp.where(proved, leading, 1.0)[..., None]
     proved = proved & xp.isfinite(monic).all(-1)
     monic = xp.where(proved[..., None], monic, 1.0)
-    # This order of the rows, large coefficients first, keeps the relative accuracy of small zeros next to large ones.
+    # Arrange the coefficients in the companion matrix by descending powers, because this order keeps the relative
+    # accuracy of small zeros next to large ones.
     shift = xp.broadcast_to(xp.eye(count, count - 1, dtype=monic.dtype), (*monic.shape, count - 1))
     guess = xp.linalg.eigvals(xp.concatenate([-monic[..., ::-1, None], shift], axis=-1)) + 0j
     # Separate equal eigenvalues by as much as rounding errors separate a double zero, because the correction divides by
@@ -318,7 +332,7 @@ def _enclose_crossovers(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array,
     correction, _ = _compute_corrections(loop, guess, leading, eps, xp)
     guess = xp.where(xp.isfinite(correction), guess - correction, guess)
     correction, noise = _compute_corrections(loop, guess, leading, eps, xp)
-    # The factor 1.01 covers the rounding errors of the disks themselves.
+    # Enlarge the disks by a factor of 1.01, because their radii have rounding errors.
     safe = 1.01 * count * xp.abs(leading) / (xp.abs(leading) - error)
     disk = safe[..., None] * (xp.abs(correction) + noise)
     proved = proved & xp.isfinite(disk).all(-1)
@@ -343,11 +357,11 @@ def _compute_corrections(loop: _CircleParts, guess: Array, leading: Array, eps: 
 
 
 def _count_turns(loop: _CircleParts, low: Array, high: Array, eps: float, xp: Any) -> tuple[Array, Array]:
-    """Return m = round((arg T - arg B)/(2 pi)) on every interval, and whether it is provably constant there."""
+    """Return m = round((arg T - arg B)/(2 pi)) on each interval of t, and whether m is provably constant on it."""
     u, v, inside = (value[..., None, :, :] for value in (loop.u, loop.v, loop.inside))
     size = xp.abs(u)
-    # From t = 0 on, the argument of a factor changes by arg((u + jtv)/u), without a jump, because the line u + jtv
-    # contains 0 only if the root is on the circle; then use the limit for roots inside.
+    # Between 0 and t, the argument of a factor changes by arg((u + jtv)/u). The change is continuous unless the line
+    # u + jtv contains 0, which requires a root on the circle; in this case use the limit for roots inside the circle.
     zero = size == 0
     rise = xp.where(zero, 1.0, inside / xp.where(zero, 1.0, size))
     slant = (u * xp.conj(v)).imag / xp.where(zero, 1.0, size)
@@ -361,7 +375,8 @@ def _count_turns(loop: _CircleParts, low: Array, high: Array, eps: float, xp: An
     rounding = ROUNDINGS * eps * (condition + xp.abs(power_angle) + 8.0 * u.shape[-1] + 8.0)
     n = low.shape[-1]
     rounding = xp.maximum(rounding[..., :n], rounding[..., n:])
-    # The argument of each factor is monotone in t, so its values at both ends bound it, and their sums bound the sum.
+    # Bound arg T - arg B on each interval by the sums of the bounds of all factors. The argument of each factor is
+    # monotone in t, so its values at both ends of the interval bound it.
     edges = []
     for pick, other, side in ((xp.minimum, xp.maximum, -rounding), (xp.maximum, xp.minimum, rounding)):
         sums = pick(angle[..., :n, :, :], angle[..., n:, :, :]).sum(-1)[..., 0]
@@ -374,7 +389,7 @@ def _count_turns(loop: _CircleParts, low: Array, high: Array, eps: float, xp: An
 def _compare_parts(
     loop: _CircleParts, roots: Array, low: Array, high: Array, leading: Array, m: Array, eps: float, xp: Any
 ) -> tuple[Array, Array, Array, Array]:
-    """Compare |B| with |T| outside the intervals of the crossovers.
+    """Determine whether |B| or |T| is larger before, between and after the intervals of the crossovers.
 
     Returns:
         Whether B is the larger part at z = -r, before every interval, and after every interval; and whether every
@@ -384,8 +399,9 @@ def _compare_parts(
     n = low.shape[-1]
     gaps = xp.isfinite(low[..., 1:])
     middle = xp.where(gaps, 0.5 * high[..., :-1] + 0.5 * low[..., 1:], 0.0)
-    # A root on the circle, to within rounding errors, may count as inside or outside. This has no effect if its own
-    # part is the smaller one there, so compare at these roots as well.
+    # A root on the circle, to within rounding errors, may be counted as inside or outside. The choice does not affect
+    # the result if the part to which the root belongs (T or B) is the smaller one at this root. Therefore compare the
+    # parts at these roots as well.
     on_circle = (xp.abs(loop.inside) <= ON_CIRCLE * eps) & (roots.imag != 0)
     length = xp.abs(roots)
     near = xp.where(roots.real >= 0, roots.imag / (length + roots.real), (length - roots.real) / roots.imag)
@@ -394,9 +410,9 @@ def _compare_parts(
     value, noise = _evaluate_difference(loop, points, eps, xp)
     value, split = value.real, middle.shape[-1]
     clear = xp.abs(value) > noise
-    # Between two intervals with the same m the larger part has no effect.
+    # Between two intervals with equal m the comparison need not be certain, because it does not affect the count.
     certain = (clear[..., :split] | ~gaps | (m[..., :-1] == m[..., 1:])).all(-1)
-    # After the gaps, the first half of the points belongs to roots of T, the second to roots of B.
+    # The points after those of the gaps are the roots on the circle, first those of T, then those of B.
     half = split + near.shape[-1]
     certain = certain & (~on_circle[..., 0, :] | (clear[..., split:half] & (value[..., split:half] < 0))).all(-1)
     certain = certain & (~on_circle[..., 1, :] | (clear[..., half:] & (value[..., half:] > 0))).all(-1)

@@ -1,9 +1,11 @@
-"""Evaluation of kernels on arrays.
+"""Evaluation of kernels on arrays, by NumPy or by code that JAX compiles.
 
-A kernel is a formula for one point, applied elementwise, with the same source code for NumPy and JAX. Plain numbers and
-few concrete points are evaluated by NumPy in float64, regardless of JAX's configuration and without importing JAX. For
-many points JAX compiles the kernel and evaluates it in blocks of one size. Inside a transformation of the caller, as
-`jit` or `grad`, the compiled kernel uses the ambient precision.
+A *kernel* is a function that applies a formula to each point of its arguments, with the same source code for NumPy and
+JAX. NumPy evaluates plain numbers and few points in float64, regardless of the configuration of JAX and without
+importing it. For many points JAX compiles the kernel and evaluates it in blocks of equal size. Inside a transformation
+of the caller, such as `jit` or `grad`, values are *traced*, and the compiled kernel uses the default precision of JAX.
+A *column* is a one-dimensional array that holds one argument at all points. A *tree* is an array or a named tuple of
+arrays, its leaves.
 """
 
 from __future__ import annotations
@@ -25,24 +27,28 @@ from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
 from zwidth.words.xp import WIDE, compute_concretely, filter_options, is_jax, is_traced, materialize, tree_map
 
-# Types whose conversion needs no check; bool and 0-d arrays are checked.
+# Types of plain numbers, whose conversion to float64 needs no check; bool and 0-d arrays are checked.
 _PLAIN = frozenset({float, int, np.float64})
 _NUMBERS = (int, float, np.floating, np.integer)
 
 
 def are_numbers(*values: ArrayLike) -> bool:
-    """Return whether all values are plain numbers, whose conversion needs no check."""
+    """Return whether all values are plain numbers, which convert to float64 without a check."""
     return _PLAIN.issuperset(map(type, values))
 
 
 def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
-    """Raise `InputError` for a plain number out of the range of its name; NaN, negatives and arrays get a status."""
+    """Raise `InputError` if a plain number is larger or smaller in magnitude than the limits of its name in `SIZES`.
+
+    Other invalid numbers and arrays pass, because results report them by a status.
+    """
     for name, value in arguments.items():
         if name not in SIZES or not isinstance(value, _NUMBERS):
             continue
-        # Infinite and negative values have a status instead of an error.
+        # Infinite values, and negative ones of quantities that must not be negative, pass without an error, because
+        # results report them by a status.
         least, most = SIZES[name]
-        # Convert to float64, because the limits would overflow in float32.
+        # Convert NumPy numbers to Python numbers, because the limits would overflow in float32.
         number = value.item() if isinstance(value, np.generic) else value
         size = abs(number) if least else number
         if 0 < size < least or most < size < math.inf:
@@ -51,11 +57,11 @@ def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
 
 
 def as_float64(name: str, value: ArrayLike) -> np.ndarray:
-    """Convert one concrete argument to float64; raise `InputError` if it is not numeric."""
-    # Masked arrays exist only if their module is loaded.
+    """Convert one argument to a float64 array; raise `InputError` if it is traced or not numeric."""
+    # Reject masked arrays. Look up their module without importing it: without the module no masked array can exist.
     if isinstance(value, getattr(sys.modules.get("numpy.ma"), "MaskedArray", ())):
         raise InputError(f"{name}: got a masked array, whose mask would be lost; fill it, with NaN say, first")
-    # Broadcasting by position would combine axes of different names.
+    # Reject arrays of xarray, because broadcasting by position may combine axes with different names.
     if getattr(value, "dims", ()):
         raise InputError(
             f"{name}: got a DataArray, whose names of axes would be lost; call through xarray.apply_ufunc, or give its "
@@ -64,9 +70,9 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     if is_traced(value):
         raise InputError(f"{name}: got a value that JAX traces; give numbers, outside of jit, vmap and grad")
     try:
-        # Convert integers first, because NumPy makes objects of large ones.
+        # Convert Python integers to float first, because NumPy converts large ones to arrays of objects.
         array = np.asarray(float(value) if isinstance(value, int) else value)
-        # Types such as bfloat16 have the kind V of NumPy, but not the type void.
+        # Reject the type void but not the kind "V", because number types such as bfloat16 have this kind as well.
         if array.dtype.kind in "OSUcmM" or array.dtype.type is np.void:
             raise TypeError(array.dtype)
         return array.astype(np.float64, copy=False)
@@ -91,14 +97,14 @@ def as_number(name: str, value: Any, least: float = -math.inf) -> float:
 
 
 def broadcast(arguments: Mapping[str, ArrayLike]) -> list[np.ndarray]:
-    """Convert concrete arguments to float64 arrays of one common shape."""
+    """Convert arguments that are not traced to float64 arrays, broadcast to a common shape."""
     arrays = {name: as_float64(name, value) for name, value in arguments.items()}
     join_shapes((name, array.shape) for name, array in arrays.items())
     return list(np.broadcast_arrays(*arrays.values()))
 
 
 def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], what: str = "shapes") -> tuple[int, ...]:
-    """Return the shape that all shapes broadcast to; raise `InputError` if they do not broadcast."""
+    """Return the common shape to which named shapes broadcast; raise `InputError` if they do not broadcast."""
     named = list(named)
     try:
         return np.broadcast_shapes(*(shape for _, shape in named))
@@ -108,18 +114,18 @@ def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], what: str = "shape
 
 
 def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:
-    """Convert results to JAX arrays if an argument is a JAX array, otherwise to NumPy arrays or scalars."""
+    """Convert results to JAX arrays if one of the arguments ``values`` is a JAX array, otherwise to NumPy arrays."""
     if any(map(is_jax, values)):
         import jax.numpy as jnp
 
-        # Convert in float64, because JAX's default precision would lose half of the digits.
+        # Keep float64 in the conversion, because the default precision of JAX, float32, has half of the digits.
         with compute_concretely():
             return tree_map(jnp.asarray, result)
     return tree_map(lambda leaf: np.asarray(leaf)[()], result)
 
 
 def broadcast_traced(arguments: Mapping[str, ArrayLike]) -> list[Any]:
-    """Convert the arguments of a traced call to arrays of one shape in JAX's default float type.
+    """Convert arguments, some of them traced by JAX, to arrays of a common shape in JAX's default float type.
 
     Arguments that are not traced may have the same types as in a direct call, and are checked in the same way.
     """
@@ -134,13 +140,13 @@ def broadcast_traced(arguments: Mapping[str, ArrayLike]) -> list[Any]:
 
 
 def _as_ambient(name: str, value: ArrayLike, dtype: Any) -> Any:
-    """Convert one argument to ``dtype``, with NumPy unless it is a JAX array."""
+    """Convert one argument to the number type ``dtype``, and return a NumPy array unless ``value`` is a JAX array."""
     if not is_jax(value):
         with np.errstate(over="ignore"):
             return as_float64(name, value).astype(dtype, copy=False)
     if value.dtype.kind == "c":
         raise InputError(f"{name}: got complex numbers; real numbers are needed")
-    # Convert only if the type differs, because outside jit JAX compiles a program for each operation.
+    # Convert only if the type differs, because outside jit JAX compiles a separate program for each operation.
     return value if value.dtype == dtype else value.astype(dtype)
 
 
@@ -167,15 +173,16 @@ def _stack_level() -> int:
     return level
 
 
-# "auto": NumPy for few points; "numpy": NumPy for all points; "jax": always compiled, if the kernel has no NumPy code
-# or values must not depend on the number of points (both routes may differ in the last place).
+# Method of evaluation. "auto": NumPy for few points, JAX for many; "numpy": NumPy for all points; "jax": always
+# compiled by JAX, for kernels without NumPy code and for results that must not depend on the number of points, because
+# NumPy and JAX may differ in the last digit.
 Route: TypeAlias = Literal["auto", "numpy", "jax"]
 
-# Function that returns the values of a kernel at concrete points, and their derivatives in each argument.
+# Type of a function that computes, in NumPy, the values of a kernel and their derivatives in each argument.
 Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
 
-# Number of points up to which NumPy, with some tenths of a second, is faster than a compiler, which takes seconds. A
-# compiler pays off at ten times as many points; later calls of NumPy take two to five times as long as compiled ones.
+# Largest number of points that NumPy evaluates. It takes some tenths of a second for them, a compilation takes seconds.
+# With ten times as many points a compilation saves time, because compiled calls are two to five times as fast.
 FEW = 1 << 18
 _AT_ONCE = 1 << 15  # points per NumPy call, so that arrays stay in caches
 BLOCK = 1 << 16  # points per compiled call: one compilation, bounded memory, work for every processor
@@ -189,12 +196,12 @@ def evaluate(
     route: Route = "auto",
     slopes: Slopes | None = None,
 ) -> Any:
-    """Apply a kernel to arguments that broadcast.
+    """Evaluate a kernel for arguments that broadcast, by NumPy or JAX.
 
     Args:
         kernel: function of arrays and ``static``.
-        arguments: arguments by name; plain numbers out of the range of their name are an `InputError`.
-        *static: further arguments of the kernel, constants of the compilation.
+        arguments: arguments by name; raises `InputError` for plain numbers out of the range of their name.
+        *static: further arguments of the kernel, which are constants at compilation.
         weight: time and memory of a point relative to a simple kernel; larger for kernels that sample each point.
         route: evaluation by NumPy or JAX.
         slopes: derivatives of the kernel in NumPy, so that gradients of few points need no compilation.
@@ -224,7 +231,10 @@ def evaluate(
 def evaluate_columns(
     kernel: Callable[..., Any], columns: Sequence[np.ndarray], *static: Any, weight: int = 1, route: Route = "auto"
 ) -> Any:
-    """Evaluate a kernel on concrete columns of one length; pass a column of length 1 as a number."""
+    """Evaluate a kernel at points given by columns; the kernel receives a column of length 1 as a number.
+
+    The arguments are those of `evaluate`, except that ``columns`` holds one array per argument of the kernel.
+    """
     count = count_points(columns)
     if route == "jax" or (route == "auto" and count > max(1, FEW // weight)):
         return map_blocks(compile_columns(kernel, static), columns, BLOCK // weight)
@@ -232,7 +242,8 @@ def evaluate_columns(
     def at_once(*parts: np.ndarray) -> Any:
         with np.errstate(all="ignore"):
             result = kernel(*(part[0] if part.size == 1 else part for part in parts), *static)
-        # Copy, because views of an argument or of a single value are read-only. Add the axis of a single point.
+        # Copy the results, because a view of an argument or of a broadcast value may be read-only. If there is only one
+        # point, add its axis.
         shape = (count_points(parts),)
         if shape == (1,):
             return tree_map(lambda leaf: np.array(leaf)[None], result)
@@ -243,7 +254,7 @@ def evaluate_columns(
 
 
 def _plain(leaf: Any) -> Any:
-    """Return the result at a single point as a NumPy scalar."""
+    """Convert one leaf of the result at a single point to a NumPy scalar."""
     return leaf if isinstance(leaf, np.generic) else np.asarray(leaf)[()]
 
 
@@ -251,18 +262,24 @@ def _plain(leaf: Any) -> Any:
 def compile_traced(
     kernel: Callable[..., Any], static: tuple[Any, ...], slopes: Slopes | None = None
 ) -> Callable[..., Any]:
-    """Return a kernel compiled for traced values, whose derivative is one product per argument."""
-    # A point depends on itself alone: all there is to differentiate is a few numbers a point. Left to itself,
-    # `jax.grad` outside `jit` would compile a program that hands out every intermediate result: for the ridge 1.2 to
-    # 1.5 times as long (benchmarks/bench_xla.py). There the values are concrete: where ``slopes`` are known, nothing is
-    # compiled.
+    """Return a kernel compiled for traced values, with a rule that computes its derivatives elementwise.
+
+    Args:
+        kernel: function of arrays and ``static``.
+        static: further arguments of the kernel, which are constants at compilation.
+        slopes: derivatives of the kernel in NumPy; if given, gradients of few points outside jit need no compilation.
+    """
+    # Define the derivatives by a rule, because the result at a point depends only on the arguments at this point: its
+    # tangent is a sum of one product per argument. Without the rule, `jax.grad` outside `jit` would compile a program
+    # that returns every intermediate result, which takes 1.2 to 1.5 times as long for the ridge
+    # (benchmarks/bench_xla.py).
     import jax
 
     def plain(*arrays: Any) -> Any:
         return kernel(*arrays, *static)
 
     def by_argument(active: tuple[bool, ...], *arrays: Any) -> tuple[Any, Any]:
-        """The values, and along a new first axis the derivatives in the arguments that move."""
+        """Return the values of the kernel, and their derivatives in the active arguments along a new first axis."""
         moving = [k for k, moves in enumerate(active) if moves]
 
         def of_moving(*values: Any) -> Any:
@@ -277,7 +294,8 @@ def compile_traced(
         sides = tuple(
             side.reshape(-1, *(1,) * ones.ndim) * ones[None] for side in np.eye(len(moving), dtype=ones.dtype)
         )
-        # The values are computed once for all sides, and a side once for all that is made of it.
+        # Compute the values once, not once per direction of differentiation, and materialize the derivatives, because
+        # several products use them.
         value, slopes = jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
         return value, tree_map(
             lambda leaf: leaf if leaf.dtype == jax.dtypes.float0 else materialize(leaf, leaf), slopes
@@ -287,9 +305,9 @@ def compile_traced(
 
     @cache
     def sloped(active: tuple[bool, ...]) -> Callable[..., Any]:
-        """`by_argument`, compiled."""
-        # Of a compiled function `jax.grad` parts every equation into what is linear in the tangents and what is not;
-        # one with a rule of its own it takes as a whole, in half of the time.
+        """Return `by_argument`, compiled for a choice of active arguments."""
+        # Give the compiled function a derivative rule of its own. Without this rule `jax.grad` splits each equation of
+        # the function into a part that is linear in the tangents and the rest, which takes twice as long.
         compiled = jax.jit(partial(by_argument, active))
         whole = jax.custom_jvp(compiled)
         whole.defjvp(lambda primals, tangents: jax.jvp(compiled, primals, tangents))
@@ -314,7 +332,7 @@ def compile_traced(
         def change(leaf: Any, by: Any) -> Any:
             if not jax.numpy.issubdtype(leaf.dtype, np.inexact):
                 return _no_change(leaf)
-            # Not jax.numpy's product, which compiles a program for what of it does not move: nothing.
+            # Use the product of jax.lax, because that of jax.numpy compiles a program even if an argument is constant.
             parts = [jax.lax.mul(by[k], tangent) for k, tangent in enumerate(moving)]
             return sum(parts[1:], parts[0])
 
@@ -325,16 +343,16 @@ def compile_traced(
 
 
 def _as_precise(leaf: Any, argument: Any) -> Any:
-    """A result of NumPy for JAX: real numbers are as precise as the argument."""
+    """Convert a NumPy result to a JAX array; real numbers take the precision of the argument."""
     import jax
 
-    # Converted by NumPy: by JAX it would be a program to compile.
+    # Convert the precision with NumPy, because JAX would compile a program for the conversion.
     kind = argument.dtype if np.issubdtype(leaf.dtype, np.inexact) else leaf.dtype
     return jax.numpy.asarray(np.asarray(leaf, kind))
 
 
 def _no_change(leaf: Any) -> Any:
-    """The tangent of what is constant or no real number."""
+    """Return the zero tangent of a result that is constant, or whose type has no derivative."""
     import jax
 
     if jax.numpy.issubdtype(leaf.dtype, np.inexact):
@@ -344,7 +362,7 @@ def _no_change(leaf: Any) -> Any:
 
 @cache
 def compile_columns(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
-    """Return a kernel, compiled for blocks of columns."""
+    """Return a function of columns that evaluates the kernel in code compiled by JAX."""
     import jax
 
     def whole(*columns: Any) -> Any:

@@ -39,7 +39,7 @@ GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(SERIES_TERMS)]
 
 
 class PhiFunctions(NamedTuple):
-    """The phi-functions at one argument, which share the exponential and the series."""
+    """Values of c, phi1, phi2, psi and gap at one argument x, computed together from one exponential."""
 
     c: Array
     phi1: Array
@@ -49,7 +49,7 @@ class PhiFunctions(NamedTuple):
 
 
 def phi_functions(x: Array) -> PhiFunctions:
-    """Return c, phi1, phi2, psi and gap at x >= 0.
+    """Compute the functions c, phi1, phi2, psi and gap of the module docstring at x >= 0.
 
     Their relative errors are below 30 units of 2^-53 if that of ``xp.exp`` is below 8 units.
     """
@@ -57,11 +57,13 @@ def phi_functions(x: Array) -> PhiFunctions:
     small = x < SERIES_BELOW
     factor = xp.exp(-0.5 * x)
     c = factor * factor
-    # Use a valid argument in the branch that is not selected, because NaN would spoil the derivatives of the other.
+    # Give each branch a valid argument also where it is not selected, because its NaN would make the derivatives of the
+    # selected branch NaN as well.
     half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, SERIES_BELOW, x)
     half_squared = half * half
     low1, low_gap = factor * horner(half_squared, PHI1), factor * (2.0 * half) * horner(half_squared, GAP)
-    # Above `SERIES_BELOW`, 1 - c does not cancel. Its derivative has a small relative error, unlike that of expm1.
+    # Compute 1 - c as a difference, because it does not cancel above `SERIES_BELOW`. Its derivative has a small
+    # relative error, unlike that of expm1.
     inverse = 1.0 / high
     high1 = (1.0 - c) * inverse
     return PhiFunctions(
@@ -73,12 +75,12 @@ def phi_functions(x: Array) -> PhiFunctions:
     )
 
 
-# Maps x to `PhiFunctions`, in any arithmetic.
+# Type of a function that maps x to the values of `PhiFunctions`, in floating-point, traced or ball arithmetic.
 Functions = Callable[[Any], Any]
 
 
 class Plant(NamedTuple):
-    """The discretized device: coefficients of its numerator N(z), and its pole c."""
+    """Coefficients of the discretized device: those of its numerator N(z), and its pole c."""
 
     c: Array  # e^-delta, the pole besides z = 1
     em: Array  # 1 - c, without cancellation
@@ -91,12 +93,12 @@ class Plant(NamedTuple):
 def discretize_mass(
     delta: Any, fraction: Any = None, functions: Functions = phi_functions, phi: Any = None, phi_t: Any = None
 ) -> Plant:
-    """Discretize a mass with damping and a fractional delay, in any arithmetic.
+    """Compute the discrete transfer function of a damped mass with a fractional delay, in any arithmetic.
 
     Args:
         delta: normalized damping.
         fraction: fractional part f of the delay, in [0, 1); None for an integer delay, with a0 = 0.
-        functions: evaluates the phi-functions in this arithmetic.
+        functions: function that evaluates the phi-functions in the arithmetic of ``delta``.
         phi: phi-functions at delta, if already computed.
         phi_t: phi-functions at delta (1 - f), if already computed.
     """
@@ -126,13 +128,16 @@ def factor_numerator(plant: Plant) -> tuple[Array, Array]:
 
 
 def split_delay(d: Array) -> tuple[Array, Array]:
-    """Return n and f of the delay ``d = n + f``; f has no rounding error, and derivatives are those from the right."""
+    """Split the delay d into its integer part n and its fractional part f, which has no rounding error.
+
+    At integer d the derivatives are those from the right.
+    """
     whole = namespace(d).floor(d)
     return whole, d - whole
 
 
 class DelayClasses(NamedTuple):
-    """The classes of delays that occur among the points of a kernel. Code for other classes is not executed."""
+    """Flags that state which classes of delays occur among the points of a kernel, so that it omits all other code."""
 
     short: bool  # below one period
     long: bool  # of one period or more
@@ -145,7 +150,7 @@ ANY = DelayClasses(True, True, True)
 
 
 def classify_delays(d: Any) -> DelayClasses:
-    """Return the classes of an array of delays; `ANY` if it is traced. NaN and negative values count as short."""
+    """Return the classes of delays in an array, or `ANY` if JAX traces it; NaN and negative values count as short."""
     if isinstance(d, float | int):
         return DelayClasses(not d >= 1, d >= 1, isinstance(d, float) and not d.is_integer())
     if is_traced(d):
@@ -176,7 +181,7 @@ class DiscretePlant(NamedTuple):
 
 
 def discretize_plant(delta: Array, d: Array, kind: DelayClasses = ANY) -> DiscretePlant:
-    """Discretize the device for arrays of delta and d of one shape, or for scalars.
+    """Compute the discretized device and its phi-functions for arrays of delta and d of one shape, or for scalars.
 
     Args:
         delta: normalized damping.
@@ -188,7 +193,8 @@ def discretize_plant(delta: Array, d: Array, kind: DelayClasses = ANY) -> Discre
     phi = phi_functions(delta)
     phi_t = phi_functions(delta * (1.0 - f)) if kind.fractional else phi
     plant = discretize_mass(delta, f if kind.fractional else None, phi=phi, phi_t=phi_t)
-    # (-1)^n P(-1) = 2 (1 + c) - (-1)^n N(-1) (alpha + 2 beta) is positive if the loop is stable.
+    # With a wall (alpha, beta), the characteristic polynomial P of a stable loop satisfies
+    # (-1)^n P(-1) = 2 (1 + c) - (-1)^n N(-1) (alpha + 2 beta) > 0.
     minus_one_coefficient = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
     return DiscretePlant(
         *(delta, whole, f, plant.c, plant.em, phi.phi1, phi.phi2, phi.psi, phi_t.phi1, phi_t.psi),
@@ -197,5 +203,5 @@ def discretize_plant(delta: Array, d: Array, kind: DelayClasses = ANY) -> Discre
 
 
 def is_valid_device(delta: Array, d: Array) -> Array:
-    """Return whether delta and d are in range, elementwise; False for NaN."""
+    """Return a boolean array that is True where delta and d are both in range; False for NaN."""
     return (delta >= 0) & (delta <= LARGEST_DAMPING) & (d >= 0) & (d <= LONGEST_DELAY)

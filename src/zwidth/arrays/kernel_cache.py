@@ -11,7 +11,7 @@ FOLDER_VARIABLE = "JAX_COMPILATION_CACHE_DIR"  # environment variable of JAX
 
 
 class KernelCache(NamedTuple):
-    """The folder of the cache and its size."""
+    """Folder of the cache of compiled kernels, and its size in bytes."""
 
     folder: Path
     nbytes: int  # total size of its files
@@ -43,7 +43,7 @@ def use_compilation_cache(folder: str | Path | None = None) -> KernelCache:
         # Also store kernels that compile fast, because together these take most of the time of a first call.
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-        # JAX reads its environment variables only when it is imported.
+        # If JAX is already imported, also set its options, because it reads environment variables only at import.
         if "jax" in sys.modules:
             import jax
 
@@ -55,6 +55,6 @@ def use_compilation_cache(folder: str | Path | None = None) -> KernelCache:
 
 
 def _get_default_folder() -> Path:
-    """Return the folder of zwidth in the user's cache directory."""
+    """Return the default folder of the cache: ``zwidth/jax`` in the user's cache directory."""
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "zwidth" / "jax"

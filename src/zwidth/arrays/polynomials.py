@@ -1,4 +1,4 @@
-"""Represent polynomials by their coefficients, highest power first, and compute their companion matrices."""
+"""Polynomials, represented by their coefficients (highest power first), and their companion matrices."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Affine(NamedTuple):
 
 
 def companion(monic: Coefficients) -> Matrices:
-    """Return companion matrices, whose eigenvalues are the zeros of monic polynomials.
+    """Return the companion matrices of monic polynomials, whose eigenvalues are the zeros of the polynomials.
 
     Args:
         monic: coefficients, highest power first, shape (..., degree + 1).
@@ -35,5 +35,5 @@ def companion(monic: Coefficients) -> Matrices:
 
 
 def abs2(x: Any) -> Array:
-    """Return ``|x|^2``."""
+    """Return the squared magnitude ``|x|^2`` of real or complex numbers, without a square root."""
     return x.real * x.real + x.imag * x.imag

@@ -1,7 +1,8 @@
-"""Find zeros and minima of functions of one unknown, and integrate them, elementwise in NumPy and JAX.
+"""Zeros, minima and integrals of functions of one variable, computed elementwise in NumPy and JAX.
 
-The same source code runs in both. The number of steps is fixed for JAX; NumPy stops when all points have converged. The
-result of a point does not depend on the other points of its batch. Only `polish` solves for several unknowns, in JAX.
+The same source code runs in NumPy and JAX. JAX takes a fixed number of steps, except in `false_position`; NumPy stops
+when all points have converged. The result of a point does not depend on the other points of its batch. Only
+`polish_root` solves for several unknowns; it requires JAX.
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ import numpy as np
 from zwidth.words.types import Array
 from zwidth.words.xp import expand_along, iterate, namespace, stop_gradient
 
-# Maps points to values; or to values and derivatives.
+# Types of functions that map points to values, and of functions that map points to values and derivatives.
 Function = Callable[[Array], Array]
 Sloped = Callable[[Array], tuple[Array, Array]]
 
 HALVINGS = 60  # bisection to the last digit of float64, also of the logarithm of a range of 32 decades
 CONVERGED_STEP = 1e-11  # relative step after which the error of Newton's method is rounding, also near a double zero
 ZERO_VALUE = 1e-15  # largest |value| of a zero in `false_position`: rounding error of a phase in rad, its main use
-MAX_NEWTON_STEPS = 16  # of optimistix
+MAX_NEWTON_STEPS = 16  # largest number of Newton steps in `polish_root`
 
 
 def bisect(holds: Function, low: Array, high: Array) -> Array:
-    """Return the point between ``low`` and ``high`` up to which a condition holds, by bisection."""
+    """Find by bisection the point between ``low`` and ``high`` above which the condition ``holds`` is False."""
     xp = namespace(low, high)
 
     def halve(ends: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -38,7 +39,7 @@ def bisect(holds: Function, low: Array, high: Array) -> Array:
 
 
 def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) -> tuple[Array, Array]:
-    """Find a zero by Newton's method within a bracket; a step that leaves the bracket is replaced by a bisection.
+    """Find the zero of a function in a bracket by Newton's method; a bisection replaces a step that leaves the bracket.
 
     Args:
         function: returns value and derivative; the value is negative below the zero and positive above it.
@@ -74,19 +75,19 @@ GOLDEN_SECTION = 0.3819660112501051  # (3 - sqrt(5))/2, the position of a trial 
 def minimize_golden_section(
     cost: Function, left: Array, middle: Array, right: Array, value: Array, steps: int, close: float = 0.0
 ) -> tuple[Array, Array]:
-    """Find local minima by golden-section search.
+    """Find a local minimum of a function in each of several brackets by golden-section search.
 
     Args:
-        cost: the function.
+        cost: the function to minimize.
         left: left ends of the brackets.
         middle: points inside with a value not above that of either end.
         right: right ends of the brackets.
         value: values at ``middle``.
         steps: number of steps; NumPy stops earlier if all brackets are narrower than ``close``.
-        close: width of a bracket, relative to its middle.
+        close: width of a bracket, relative to its middle, at which the search stops in NumPy.
 
     Returns:
-        The minima, and the values there.
+        The arguments of the minima, and the values of the function there.
     """
     xp = namespace(left, value)
 
@@ -95,7 +96,7 @@ def minimize_golden_section(
         is_right_longer = right - middle > middle - left
         trial = middle + GOLDEN_SECTION * xp.where(is_right_longer, right - middle, left - middle)
         trial_value = cost(trial)
-        # The lower of the trial point and the middle becomes the new middle, and the other one becomes an end.
+        # The point with the lower value, trial point or middle, becomes the new middle; the other one becomes an end.
         better = trial_value < value
         end, is_right = xp.where(better, middle, trial), better ^ (trial > middle)
         left, right = xp.where(is_right, left, end), xp.where(is_right, end, right)
@@ -110,24 +111,24 @@ def minimize_golden_section(
 
 # Search for the global minimum
 N_MINIMA = 3  # lowest local minima of the samples that are refined
-MAX_GOLDEN_STEPS = 52
+MAX_GOLDEN_STEPS = 52  # largest number of steps of the golden-section search
 SMALL_SHARE = 1e-9  # argument next to 0, relative to the first sample, that shows if the function rises from 0
 
 
 def find_global_minimum(
     cost: Function, low: float, high: float, samples: int, close: float = 0.0
 ) -> tuple[float, float]:
-    """Find the global minimum of a function with kinks and several local minima, in NumPy.
+    """Find the global minimum of a function that may have kinks and several local minima, by samples and refinement.
 
     The function is sampled, and the lowest samples are refined by golden-section search. The ends of the range count as
     minima only if ``low`` is 0 and the function increases from there.
 
     Args:
-        cost: the function.
+        cost: the function to minimize, which maps NumPy arrays to NumPy arrays.
         low: lower end of the range.
         high: upper end of the range.
         samples: number of samples.
-        close: accuracy of the argument, relative to it.
+        close: relative accuracy of the argument at the minimum.
 
     Returns:
         The smallest value, and its argument.
@@ -150,7 +151,7 @@ def find_global_minimum(
 
 
 class _Bracket(NamedTuple):
-    """State of `false_position`: the brackets, and the best point of each."""
+    """State of the iteration in `false_position`: the brackets, and in each the point with the smallest |value|."""
 
     low: Any
     high: Any
@@ -164,7 +165,7 @@ class _Bracket(NamedTuple):
 def false_position(
     function: Function, low: Array, high: Array, at_low: Array, at_high: Array, steps: int, width: Array | float
 ) -> Array:
-    """Find a sign change by the Illinois variant of false position.
+    """Find a sign change of a function in each bracket by the Illinois variant of the method of false position.
 
     The value at an end that stays twice in a row is halved, every sixth step is a bisection, and each step is at least
     ``width`` away from both ends, because otherwise the end far from the zero might never move.
@@ -195,13 +196,13 @@ def false_position(
         trial = old.low + (old.high - old.low) * (old.at_low / xp.where(gap > 0, gap, 1.0))
         trial = xp.minimum(xp.maximum(trial, old.low + width), old.high - width)
         inside = (trial > old.low) & (trial < old.high) & (k % 6 != 5)
-        # ``[()]`` makes a NumPy scalar of a zero-dimensional array, which is five times as fast.
+        # Convert a zero-dimensional array to a NumPy scalar by ``[()]``, because scalars are five times as fast.
         trial = xp.where(inside, trial, 0.5 * (old.low + old.high))[()]
         value = function(trial)
         above = value > 0
         low, high = xp.where(above, trial, old.low), xp.where(above, old.high, trial)
-        # Also replace the best point if it has left the bracket, as at a jump. A converged point keeps its result,
-        # which would otherwise depend on the other points of the batch.
+        # Also replace the best point if it lies outside the new bracket, as happens at a discontinuity. Do not change a
+        # converged point, because its result would otherwise depend on the other points of the batch.
         better = ((xp.abs(value) < xp.abs(old.value)) | (old.best < low) | (old.best > high)) & ~have_converged(old)
         return k + 1, _Bracket(
             low,
@@ -226,17 +227,17 @@ def false_position(
     return state[1].best
 
 
-# Zeros between nodes
-MAX_BETWEEN_STEPS = 120
+# Search for zeros between nodes
+MAX_BETWEEN_STEPS = 120  # largest number of steps of false position
 BETWEEN_WIDTH = 4e-16  # relative width of the final bracket
 
 
 def find_zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Find zeros of a function between nodes, in NumPy.
+    """Find the zeros of a function between sampled arguments (nodes) with values of opposite sign, by false position.
 
     Args:
-        function: the function.
-        nodes: ascending arguments, shape (nodes,).
+        function: the function, in NumPy.
+        nodes: sampled arguments in ascending order, shape (nodes,).
         values: values at the nodes.
         k: indices of the nodes after which the sign changes, shape (zeros,).
 
@@ -260,16 +261,17 @@ def attach_root_derivatives(
     *parameters: Any,
     slope: Callable[..., Array] | None = None,
 ) -> Array:
-    """Return a root of ``function(x, *parameters)`` that is differentiable in the parameters to any order, in JAX.
+    """Return ``root`` unchanged, with the derivatives of the implicit function theorem attached for JAX.
 
-    The derivatives are those of the implicit function, so the search for the root is not differentiated. NumPy returns
-    the root itself.
+    The root x of ``f(x, p) = 0`` was computed before, for the parameters p. JAX differentiates the returned value to
+    any order by ``dx/dp = -(df/dp)/(df/dx)``, and not the search that computed the root. A NumPy array is returned
+    without derivatives.
 
     Args:
-        function: the function.
-        root: its root.
-        usable: maps root, derivative of the function and next Newton step to True where the derivatives are valid; they
-            are 0 elsewhere.
+        function: the function f of x and the parameters.
+        root: its root, for these parameters.
+        usable: maps the root, df/dx and the next Newton step to a boolean array that is True where the derivatives are
+            valid; elsewhere they are set to 0.
         *parameters: arrays or trees of arrays.
         slope: derivative of the function in x; computed by automatic differentiation if left out.
     """
@@ -283,7 +285,7 @@ def attach_root_derivatives(
 
     @jax.custom_jvp
     def attach(root: Array, *parameters: Any) -> Array:
-        """Return the root; its derivatives follow from ``rule``."""
+        """Return the root unchanged; JAX takes its derivatives from ``rule``."""
         return root
 
     def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
@@ -291,7 +293,7 @@ def attach_root_derivatives(
         x, parameters = attach(*primals), primals[1:]
         leaves, tree = jax.tree.flatten(parameters)
         changes = jax.tree.leaves(tangents[1:])
-        # Differentiate only in the parameters with a nonzero tangent.
+        # Differentiate only with respect to parameters with a nonzero tangent, to avoid useless computation.
         varied = [k for k, each in enumerate(changes) if not isinstance(each, jax.custom_derivatives.SymbolicZero)]
 
         def evaluate_varied(*values: Any) -> Array:
@@ -308,10 +310,10 @@ def attach_root_derivatives(
 
 
 def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes: Sequence[int]) -> Array:
-    """Integrate a function by Gauss-Legendre quadrature.
+    """Integrate a function over adjacent intervals by Gauss-Legendre quadrature.
 
     Args:
-        function: evaluated at points along a new last axis.
+        function: the integrand, evaluated at points along a new last axis.
         edges: ends of the intervals of integration, one array per end.
         nodes: number of nodes in each interval.
 
@@ -328,20 +330,20 @@ def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes:
 
 
 def polish_root(residual: Callable[[Array, Any], Array], start: Array, args: Any, usable: Array) -> Array:
-    """Solve real equations from a nearby start by the Newton method of optimistix, differentiably in ``args``.
+    """Solve a system of real equations by the Newton method of optimistix, differentiably with respect to ``args``.
 
     Args:
         residual: maps unknowns and ``args`` to the residuals of the equations, as many as unknowns.
-        start: starting values.
+        start: starting values of the unknowns, close to the solution.
         args: parameters of the equations.
-        usable: False for starts that are to be returned unchanged.
+        usable: False to return the starting values unchanged, e.g. if they are not finite.
     """
     import jax.numpy as jnp
     import optimistix
 
     def equations(unknowns: Array, parameters: Any) -> Array:
-        # An unusable start solves trivial equations, because nonfinite values or a singular Jacobian would stop the
-        # solver for all entries of a batch.
+        # For an unusable start, solve equations that the start satisfies, because nonfinite values or a singular
+        # Jacobian would stop the solver for all entries of a batch.
         args, usable, start = parameters
         return jnp.where(usable, residual(unknowns, args), unknowns - start)
 

@@ -17,11 +17,11 @@ def count_processors() -> int:
 
 
 def run_in_threads(function: Callable[[Any], Any], items: Sequence[Any], threads: int | None = None) -> list[Any]:
-    """Return the results of a function for all items, in their order.
+    """Call a function once per item in parallel threads, and return the results as a list in the order of the items.
 
     Args:
-        function: called in several threads at once.
-        items: its arguments.
+        function: function of one item; it must be thread-safe.
+        items: arguments of the calls.
         threads: number of threads; one per processor if left out.
     """
     threads = min(threads or count_processors(), len(items))

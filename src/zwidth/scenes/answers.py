@@ -32,7 +32,8 @@ from zwidth.words.xp import is_traced, namespace
 if TYPE_CHECKING:
     import control
 
-# K or B of walls, or of one wall; a text has a unit. None stands for the value of the wall of the scene.
+# Types of the arguments K and B, for several walls and for one wall. A text states its unit, such as "10 kN/m". None
+# selects the value of the wall of the scene.
 Walls: TypeAlias = ArrayLike | None
 Wall: TypeAlias = float | str | None
 
@@ -41,18 +42,18 @@ Wall: TypeAlias = float | str | None
     phase_margin="degrees", delay_margin="s", phase_crossover="Hz", gain_crossover="Hz", modulus_frequency="Hz"
 )
 class SceneMargins(Margins):
-    """`zwidth.Margins` of walls of a scene, with the delay margin in s and the frequencies in Hz."""
+    """Stability margins of walls as in `zwidth.Margins`, with the delay margin in s and the frequencies in Hz."""
 
 
 class SceneAnalysis(SceneParts):
-    """The methods of `zwidth.Scene` that evaluate walls.
+    """Base class of `zwidth.Scene` with the methods that evaluate walls.
 
     Without a stiffness and a damping, each method evaluates the wall of the scene (`zwidth.parts.wall.resolve_wall`). A
     quantity may be a text with a unit, such as "10 kN/m".
     """
 
     def normalize_walls(self, stiffness: Walls = None, virtual_damping: Walls = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return alpha and beta of walls in SI units, as arrays that broadcast; by default of the wall of the scene."""
+        """Convert K in N/m and B in N s/m to alpha and beta, as arrays that broadcast; default: the scene's wall."""
         units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping, self.unit_system)
         if are_numbers(*both):
             both = np.float64(both[0]), np.float64(both[1])
@@ -65,13 +66,13 @@ class SceneAnalysis(SceneParts):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 
     def _broadcast_walls(self, stiffness: Walls, virtual_damping: Walls) -> Sequence[Array]:
-        """Return alpha and beta of walls given in SI units, broadcast to a common shape."""
+        """Convert K in N/m and B in N s/m to arrays alpha and beta of a common shape."""
         walls = self.normalize_walls(stiffness, virtual_damping)
         self._check_traceable(*walls)
         return namespace(*walls).broadcast_arrays(*walls)
 
     def _check_traceable(self, *values: Any) -> None:
-        """Raise `InputError` if JAX traces a value and the loop is not traceable."""
+        """Raise `InputError` if JAX traces a value, but the methods of `loop` do not support traced values."""
         if is_traced(*values) and not self.loop.traceable:
             raise InputError(
                 f"{self.traced_path or 'stiffness, virtual_damping'}: got a value traced by JAX, allowed only for a "
@@ -79,19 +80,20 @@ class SceneAnalysis(SceneParts):
             )
 
     def poles(self, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
-        """Return all poles of the closed loop, along a new last axis in no particular order; NaN if out of range.
+        """Return all poles of the closed loop, along a new last axis in no particular order.
 
-        The eigenvalues of the companion matrix are refined by Aberth's iteration on the factored polynomial, expanded
-        around z = 1. The error is about 1e-15 times the condition number for a simple pole and 1e-16^(1/k) for a k-fold
-        one. The run time per wall is O(degree^3).
+        Walls out of range have NaN. The eigenvalues of the companion matrix are refined by Aberth's iteration on the
+        factored polynomial, expanded around z = 1. The error is about 1e-15 times the condition number for a simple
+        pole and 1e-16^(1/k) for a k-fold one. The run time per wall is O(degree^3).
         """
         return self.loop.poles(*self._broadcast_walls(stiffness, virtual_damping))
 
     def spectral_radius(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
-        """Return the largest pole magnitude of walls; NaN if out of range or if the device is a measured response.
+        """Return the largest magnitude of the closed-loop poles of each wall.
 
-        It is below 1 if and only if `is_stable` is true. Up to 150 poles, all are computed; for more poles the method
-        counts the poles inside circles, and its run time does not increase with the delay.
+        The result is below 1 if and only if the wall is stable, and NaN for walls out of range and for a device given
+        by a measured response. If the loop has at most 150 poles, all are computed; otherwise the method counts the
+        poles inside circles, with a run time that does not increase with the delay.
         """
         return self.loop.radius(*self._broadcast_walls(stiffness, virtual_damping))
 
@@ -120,16 +122,17 @@ class SceneAnalysis(SceneParts):
         return [Island(*(tuple(pair.tolist()) for pair in np.array(one) * units)) for one in islands]
 
     def state_space(self, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
-        """Return the closed loop with one wall, from an external force on the device (N) to the sensed position (m).
+        """Return a state-space model of the closed loop with one wall, from external force to sensed position.
 
-        The force is constant within each period (zero-order hold), and the discretization is exact. The states include
-        those of the velocity estimate and the delayed forces. The result has A, B, C, D and the period dt.
+        The input is the force on the device in N, the output the position in m. The force is constant within each
+        period (zero-order hold), and the discretization is exact. The states include those of the velocity estimate and
+        the delayed forces. The result has A, B, C, D and the period dt.
         """
         compliance = self.timing.period**2 / float(self.mass)
         return _realize(self, realize_closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
 
     def open_loop(self, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
-        """Return the open loop L with one wall in the form of `state_space`; negative feedback closes the loop."""
+        """Return a state-space model of the open loop L with one wall; negative feedback closes the loop."""
         return _realize(self, realize_open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
 
     def frequency_response(
@@ -137,7 +140,8 @@ class SceneAnalysis(SceneParts):
     ) -> Array:
         """Return the complex open loop ``L = (K + B F) G`` at frequencies in Hz up to the Nyquist frequency.
 
-        All arguments broadcast. NaN for frequencies out of range. The winding number of L around -1 decides stability.
+        All arguments broadcast. The result is NaN for frequencies out of range. The winding number of L around -1
+        decides stability.
         """
         if frequency is None:
             raise InputError("frequency: missing; pass frequencies in Hz, up to half the sampling rate")
@@ -181,7 +185,7 @@ class SceneAnalysis(SceneParts):
         return self.loop.labels(*walls)
 
     def stable_stiffness(self, virtual_damping: ArrayLike | None = None) -> np.ndarray:
-        """Return all stable intervals of the stiffness at a damping.
+        """Return all intervals of the stiffness K in which the walls with a given damping B are stable.
 
         Args:
             virtual_damping: B in N s/m, a number or an array; by default that of the wall of the scene, or 0 without a
@@ -198,7 +202,7 @@ class SceneAnalysis(SceneParts):
         return intervals.reshape(*beta.shape, *intervals.shape[1:])
 
     def stable_damping(self, stiffness: Wall = None) -> np.ndarray:
-        """Return all stable intervals of the virtual damping at one stiffness.
+        """Return all intervals of the virtual damping B in which the walls with one stiffness K are stable.
 
         Args:
             stiffness: K in N/m; by default that of the wall of the scene.
@@ -231,11 +235,11 @@ class SceneAnalysis(SceneParts):
     def decide_stability(
         self, stiffness: Walls = None, virtual_damping: Walls = None, *, method: StabilityMethod = "auto"
     ) -> Stability:
-        """Return the label, status and method of each wall, as `zwidth.decide_stability` does.
+        """Return for each wall whether it is stable, a status code, and the method that decided its stability.
 
-        "auto" and "crossover" sum the signed crossings of each line of constant B; "companion" computes all poles;
-        "certified" decides in ball arithmetic of python-flint for exactly the given parameters, or returns UNDECIDED
-        or ON_BOUNDARY.
+        `zwidth.decide_stability` returns the same type. "auto" and "crossover" sum the signed crossings on each line of
+        constant B; "companion" computes all poles; "certified" decides in ball arithmetic of python-flint for exactly
+        the given parameters, or returns UNDECIDED or ON_BOUNDARY.
         """
         check_choice("method", method, STABILITY_METHODS)
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
@@ -246,20 +250,20 @@ class SceneAnalysis(SceneParts):
         return self.loop.decide(alpha, beta, method, (K, B))
 
     def explain_undecided(self, stiffness: Walls = None, virtual_damping: Walls = None) -> list[str]:
-        """Return the reasons why one wall is UNDECIDED, each with the frequencies to measure.
+        """Return texts with the reasons why the stability of one wall is undecided and the frequencies to measure.
 
         Only a measured response can leave a wall undecided. The list is empty if the wall is decided.
         """
         return self.loop.explain(*read_single_wall(*self.normalize_walls(stiffness, virtual_damping)))
 
     def passivity_margin(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
-        """Return the damping of the device minus that required for a passive wall, in N s/m; NaN if out of range.
+        """Return the damping of the device minus the damping that a passive wall requires, in N s/m.
 
-        This is Colgate's condition for any velocity estimate and delay; the required damping is the certified maximum
-        over all frequencies (`loops.linear.passivity`). For a rigid device the condition is necessary and sufficient
-        for any operator. With a coupling and the sensor at the motor it uses the damping of the motor and is only
-        sufficient. No condition is known for a sensor at the tip, an actuator or modes (`InputError`). For K < 0 the
-        margin is at most K T, because such a wall supplies energy without limit.
+        The margin is NaN for walls out of range. This is Colgate's condition for any velocity estimate and delay; the
+        required damping is the certified maximum over all frequencies (`loops.linear.passivity`). For a rigid device
+        the condition is necessary and sufficient for any operator. With a coupling and the sensor at the motor it uses
+        the damping of the motor and is only sufficient. No condition is known for a sensor at the tip, an actuator or
+        modes (`InputError`). For K < 0 the margin is at most K T, because such a wall supplies energy without limit.
         """
         if obstacle := find_unsupported_reason(**vars(self.device)):
             raise InputError(f"passivity {obstacle}")
@@ -295,11 +299,11 @@ class SceneAnalysis(SceneParts):
 
 
 def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
-    """Return whether walls with B < 0 count.
+    """Return whether searches for the stiffest wall and for islands include walls with B < 0.
 
-    By default they count for a `zwidth.Device` whose velocity is a positive multiple of the difference of two samples.
-    They do not count for a device given as a whole system: its true damping is unknown, so a wall with B < 0 would
-    cancel modeled damping that may not exist.
+    By default they are included for a `zwidth.Device` whose velocity is a positive multiple of the difference of two
+    samples. They are excluded for a device given as a whole system: its true damping is unknown, so a wall with B < 0
+    would cancel modeled damping that may not exist.
     """
     if negative_damping is None and isinstance(scene.device, ResponseDevice):
         return False
@@ -312,12 +316,12 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
 
 
 def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, alpha: Any, beta: Any) -> StateSpace:
-    """Return a loop with one wall, its states converted from normalized units to m, m/s and N.
+    """Return a state-space model of the open or closed loop with one wall, with states in m, m/s and N.
 
     Args:
         scene: the scene.
-        build: function that builds the normalized loop from the chain, alpha and beta.
-        unit: SI unit of the ratio of output to input.
+        build: function that returns the model in normalized units for a chain of masses, alpha and beta.
+        unit: SI value of one normalized unit of the ratio of output to input.
         alpha: normalized stiffness of the wall.
         beta: normalized damping of the wall.
     """
@@ -327,7 +331,7 @@ def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, a
     device = np.array(chain.state_units(1.0 / period, force))
     n_delayed = realize_device(chain).A.shape[0] - device.size
     n_filter = loop.A.shape[0] - device.size - n_delayed
-    # The states are those of the velocity estimate, of the device, and the delayed forces.
+    # Units of the states in their order: states of the velocity estimate, states of the device, delayed forces.
     scale = np.concatenate([np.ones(n_filter), device, np.full(n_delayed, force)])
     A, B = loop.A * scale[:, None] / scale, loop.B * scale[:, None] * unit
     return StateSpace(A, B, loop.C / scale, loop.D * unit, period)

@@ -30,7 +30,7 @@ from zwidth.words.unit_system import LINEAR, UnitSystem
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
 
-# Units of the fields of `Assessment`, and reasons for a missing value; both for printing.
+# Units in which the fields of `Assessment` are printed, and texts that are printed in place of missing values.
 _UNITS: dict[str, Any] = {
     **dict.fromkeys(("stable_stiffness", "stiffness_limit", "stiffness_max"), "N/m"),
     **dict.fromkeys(("stable_damping", "virtual_damping_lower", "virtual_damping_upper"), "N s/m"),
@@ -87,7 +87,7 @@ class Assessment:
     unit_system: UnitSystem = LINEAR
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields except the unit system as JSON values, with None in place of NaN and infinity."""
+        """Return a dictionary of the fields except the unit system, as JSON values with None for NaN and infinity."""
         return to_json({name: getattr(self, name) for name in _NUMBERS})
 
 
@@ -96,7 +96,7 @@ _NUMBERS = [field.name for field in fields(Assessment) if field.name != "unit_sy
 
 @wrap_function
 def assess(scene: SceneOptima) -> Assessment:
-    """Assess the wall of a scene.
+    """Compute stability, margins, passivity and dominant pole of the wall of a scene, and limits of its stiffness.
 
     Args:
         scene: device, timing, wall and other parts.
@@ -118,7 +118,7 @@ def assess(scene: SceneOptima) -> Assessment:
         >>> verdict.stable, verdict.passive
         (True, False)
     """
-    # Compute the dominant pole first, because this raises an error if the loop has too many poles.
+    # Compute the dominant pole first, because this step raises an error if the loop has too many poles.
     dominant, period = scene.loop.find_dominant(float(scene.alpha), float(scene.beta)), scene.timing.period
     margins, best, has_condition = (
         scene.margins(),
@@ -159,32 +159,33 @@ def assess(scene: SceneOptima) -> Assessment:
 
 
 def name_kind(wall: StiffestWall) -> str:
-    """Return the kind of a stiffest wall in lower case, such as "smooth"; "none" if no wall is stable."""
+    """Return the `RidgeKind` of a stiffest wall in lower case, such as "smooth"; "none" if no wall is stable."""
     return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
 
 
 def round_margin(
     name: str, margins: Assessment | Margins, stable: bool | None, digits: int = 4, *, decibel: bool = False
 ) -> float:
-    """Return a margin in few digits, rounded conservatively.
+    """Return a stability margin, rounded to a few digits in the safe direction.
 
-    A change by the rounded margin leaves a stable wall stable, and makes an unstable wall stable.
+    A change of the loop by the rounded margin leaves a stable wall stable, or makes an unstable wall stable.
 
     Args:
-        name: field of the margin.
+        name: field with the margin, such as "gain_margin".
         margins: object with this field.
-        stable: stability of the wall.
-        digits: significant digits.
+        stable: True if the wall is stable.
+        digits: number of significant digits.
         decibel: True to return a gain margin in dB.
     """
     value = float(getattr(margins, name))
-    # A stable wall may also have a gain margin below 1, if a reduction of the gain makes it unstable.
+    # Round up the gain margin of an unstable wall if it exceeds 1, and of a stable wall if it is below 1, i.e. if a
+    # reduction of the gain destabilizes this wall.
     outward = name == "gain_margin" and (value > 1.0) != bool(stable)
     return round_conservatively(20.0 * math.log10(value) if decibel else value, "above" if outward else "below", digits)
 
 
 def find_nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:
-    """Return the interval that contains a value or is nearest to it; NaN if there are no intervals."""
+    """Return both ends of the interval that contains a value or is nearest to it; NaN if the list is empty."""
     away = [max(low - value, value - high, 0.0) for low, high in intervals]
     return intervals[away.index(min(away))] if away else (math.nan, math.nan)
 
@@ -219,7 +220,7 @@ def assess_many(scenes: Iterable[SceneOptima] | Mapping[str, SceneOptima]) -> li
 
 
 def _build_record(name: str | int, scene: SceneOptima) -> dict[str, Any]:
-    """Assess one scene for `assess_many`: name, status, parameters and results."""
+    """Return the dictionary of `assess_many` for one scene: its name, status, message, parameters and results."""
     head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
     try:
         if not isinstance(scene, SceneOptima):
@@ -231,7 +232,8 @@ def _build_record(name: str | int, scene: SceneOptima) -> dict[str, Any]:
     return head | values | verdict
 
 
-# Improvements that are available in practice, by the path of the parameter: the factor on its value, and a description.
+# Improvements that are available in practice. Each entry maps the dotted path of a parameter to the factor by which its
+# value is multiplied, and to a description.
 IMPROVEMENTS = {
     "delay": (0.5, "half the delay"),
     "damping": (1.1, "10 % more damping of the device"),
@@ -246,23 +248,23 @@ IMPROVEMENTS = {
 
 @compact_repr()
 class Limit(NamedTuple):
-    """An improvement of a scene and the stiffness gained by it."""
+    """An improvement of a scene, the stiffness of the improved scene, and its ratio to the current stiffness."""
 
     name: str  # name of the part or parameter
     words: str  # the improvement in words, such as "half the delay"
     stiffness: float  # in N/m: K_max, or K recommended under the same requirements, of the improved scene
-    gain: float  # ratio of that stiffness to the present one
+    gain: float  # ratio of that stiffness to the current one
     note: str = ""  # quantity that stays constant, such as "the delay stays 1 ms"
 
     def spell(self) -> str:
-        """Describe the improvement and the increase of the stiffness that it brings."""
+        """Return a text with the improvement, the stiffness that results from it, and the gain."""
         K = with_unit(round_conservatively(self.stiffness, "below"), find_unit(self, "N/m"))
         note = f"; {self.note}" if self.note else ""
         return f"{self.words}: {K} (x {plain(self.gain, 3)}{note})"
 
 
 class Improvement(NamedTuple):
-    """A scene with one part or parameter improved."""
+    """An improved copy of a scene, with the part or parameter that was improved and a description."""
 
     name: str  # name of the part or parameter
     words: str  # the improvement in words
@@ -302,7 +304,13 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
 
 def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima], float]) -> list[Limit]:
-    """Return all improvements, sorted by their gain in the stiffness from ``measure``: largest first, NaN last."""
+    """Return one `Limit` per improvement of a scene, sorted by gain: the largest first, NaN last.
+
+    Args:
+        scene: the scene to improve.
+        now: stiffness of the scene without improvements, in N/m.
+        measure: function that returns the stiffness of an improved scene in N/m, such as its K_max.
+    """
     limits = []
     for name, words, improved, note in list_improvements(scene):
         stiffness = measure(improved)
@@ -312,7 +320,7 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
 
 
 def describe_islands(scene: SceneOptima) -> list[str]:
-    """Return one line for each island, and one line if the device is unstable without a wall."""
+    """Return one line of text per island of stable walls, and another if the device is unstable without a wall."""
     lines, system = [], scene.unit_system
     least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
     if least is not None:
@@ -330,12 +338,12 @@ def _compute_max_stiffness(scene: SceneOptima) -> float:
     try:
         return float(scene.max_stiffness().stiffness)
     except InputError:
-        # At twice the rate a long delay may have more periods than the model supports.
+        # An improved scene may be invalid: at twice the rate a long delay may exceed the largest number of periods.
         return math.nan
 
 
 def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
-    """Yield the scene with one part or parameter improved, for each that it has."""
+    """Yield one improved copy of the scene for each part or parameter that can be improved."""
     timing = scene.timing
     slower = {"period": scene}
     if timing.delay and not timing.in_periods:
@@ -365,7 +373,11 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
 
 
 def _can_sample_faster(scene: SceneOptima) -> bool:
-    """Return whether the scene is defined at twice the rate; a model given in z holds for one rate only."""
+    """Return whether the scene can be evaluated at twice the sampling rate.
+
+    A filter or device given in powers of z is valid for one rate only, and the number of periods in the velocity window
+    and the delay is limited.
+    """
     if isinstance(scene.velocity, VelocityFilter) or getattr(scene.device, "dt", None) is not None:
         return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
@@ -374,7 +386,10 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
 
 
 def _double_rate(scene: SceneOptima) -> SceneOptima:
-    """Return the scene at twice the rate: filter and window constant in seconds, the delay in its given unit."""
+    """Return a copy of the scene with half the sampling period.
+
+    Filter and velocity window stay constant in seconds, and the delay in the unit in which it was given.
+    """
     changes: dict[str, float] = {"period": scene.timing.period / 2}
     if isinstance(scene.velocity, WindowedDifference):
         changes["velocity.samples"] = scene.velocity.samples * 2
@@ -384,12 +399,15 @@ def _double_rate(scene: SceneOptima) -> SceneOptima:
 
 
 def trace_passivity_boundary(scene: SceneOptima, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
-    """Return K and B on the boundary of the passive walls with K >= 0, by increasing B; empty if undamped."""
+    """Return arrays of K and B along the boundary of the set of passive walls with K >= 0, in order of increasing B.
+
+    The arrays have ``directions`` elements; they are empty for a device without damping.
+    """
     # The damping required for passivity is proportional to the distance of (K, B) from the origin. Therefore compute it
     # for one wall in each direction, and scale the wall until the required damping equals that of the device.
     device_damping, units = float(scene.device.damping), scene.units
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, directions)
-    # Clip the cosines, because rounding errors may make them negative at the ends.
+    # Clip the cosines at 0, because rounding errors may make them negative at angles of -90 and 90 degrees.
     stiffness, damping = np.maximum(np.cos(angle), 0.0) * units.stiffness, np.sin(angle) * units.virtual_damping
     needed = device_damping - np.asarray(scene.passivity_margin(stiffness, damping))
     if device_damping == 0:

@@ -44,7 +44,7 @@ Owner = TypeVar("Owner", bound="SceneParts")
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-# Allowed types of each part, and an example for messages.
+# Allowed types of each part of a scene, and an example of a valid part for error messages.
 _KINDS = {
     "device": (Device | LinearDevice | MeasuredDevice, "zwidth.Device(mass=0.1, damping=10)"),
     "timing": (Timing, "zwidth.Timing(period=1e-3, delay=1e-3)"),
@@ -57,7 +57,7 @@ _KINDS = {
 
 @compact_repr()
 class WallSI(NamedTuple):
-    """Walls by stiffness in N/m and damping in N s/m."""
+    """Stiffness K in N/m and damping B in N s/m of one wall or of several walls."""
 
     stiffness: Array
     virtual_damping: Array
@@ -65,7 +65,7 @@ class WallSI(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class SceneParts(Part):
-    """Parts of a `zwidth.Scene`, and quantities derived from them."""
+    """Base class of `zwidth.Scene`: its parts, and the normalized quantities derived from them."""
 
     device: Device | LinearDevice | MeasuredDevice
     timing: Timing
@@ -75,7 +75,7 @@ class SceneParts(Part):
     safe_limit: SafeLimit | None = None
 
     def __post_init__(self) -> None:
-        """Check the types and units of the parts, and the operator; raise `InputError` if they do not fit together."""
+        """Raise `InputError` if a part has a wrong type or unit, or if the device does not allow an operator."""
         if isinstance(self.wall, Velocity):
             self._shift_parts()
         for name, (kind, example) in _KINDS.items():
@@ -90,7 +90,7 @@ class SceneParts(Part):
             )
 
     def _shift_parts(self) -> None:
-        """Assign positional arguments passed without a wall: velocity estimate third, operator fourth."""
+        """Correct the fields if positional arguments omit the wall: velocity estimate third, operator fourth."""
         estimate, fourth, hand = self.wall, self.velocity, self.operator
         if isinstance(fourth, Operator) and hand is None:
             hand = fourth
@@ -102,7 +102,7 @@ class SceneParts(Part):
 
     @cached_property
     def parts_beyond(self) -> tuple[str, ...]:
-        """Names of the parts that a rigid mass with the backward difference lacks; `RigidLoop` requires none."""
+        """Names of the parts that `RigidLoop` does not support; none for a rigid mass with backward difference."""
         hand = self.operator
         grasp = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
         basic = {"velocity": is_plain(self.velocity, self.timing.period), "operator": grasp}
@@ -111,33 +111,37 @@ class SceneParts(Part):
 
     @cached_property
     def loop(self) -> LinearLoop:
-        """The normalized loop, with the fastest implementation that supports these parts."""
+        """Normalized loop of the scene, in the fastest implementation that supports its parts."""
         if isinstance(self.device, MeasuredDevice):
             return MeasuredLoop(self)
         return LinearLoop(make_plain(self)) if self.parts_beyond else RigidLoop(self)
 
     def check_parts(self) -> None:
-        """Raise `InputError` for parts that are valid only separately, such as a cutoff above the Nyquist frequency."""
+        """Raise `InputError` for an invalid combination of parts, such as a cutoff above the Nyquist frequency."""
         _ = self.loop.walls if isinstance(self.loop, MeasuredLoop) else self.loop.roots
 
     @cached_property
     def mass(self) -> Any:
-        """The mass in kg that the force of the wall acts on, with that of a rigidly coupled operator."""
+        """Mass in kg that the force of the wall acts on, including the mass of a rigidly coupled operator."""
         return self._add_rigid_operator("mass")
 
     @cached_property
     def damping(self) -> Any:
-        """The damping to ground of `mass`, in N s/m, with that of a rigidly coupled operator."""
+        """Damping in N s/m between `mass` and ground, including the damping of a rigidly coupled operator."""
         return self._add_rigid_operator("damping")
 
     def _add_rigid_operator(self, name: str) -> Any:
-        """Return a parameter of the device, plus that of an operator coupled rigidly to a device without coupling."""
+        """Return the parameter ``name`` (mass or damping) of the device, plus that of a rigidly coupled operator.
+
+        The operator adds nothing to a device with a coupling, because it holds the body at the other end of the
+        coupling.
+        """
         is_rigid = self.operator is not None and self.operator.rigid and self.device.coupling is None
         return getattr(self.device, name) + (getattr(self.operator, name) if is_rigid else 0.0)
 
     @cached_property
     def normalized(self) -> Normalized:
-        """The normalized parameters ``alpha``, ``beta``, ``delta``, ``d`` of this scene and its wall."""
+        """Normalized parameters ``alpha``, ``beta``, ``delta`` and ``d`` of the scene with its wall."""
         return normalize(
             mass=self.mass,
             damping=self.damping,
@@ -164,12 +168,12 @@ class SceneParts(Part):
 
     @cached_property
     def delta(self) -> float:
-        """Normalized damping of the device, with that of a rigidly coupled operator."""
+        """Normalized damping of the device, including the damping of a rigidly coupled operator."""
         return self.normalized.delta
 
     @property
     def device_delta(self) -> float:
-        """Normalized damping of the device without the operator, used for passivity, which holds for any operator."""
+        """Normalized damping of the device without its operator, because passivity must hold for any operator."""
         return self.delta if self.operator is None else self.device.damping / self.units.virtual_damping
 
     @cached_property
@@ -183,25 +187,25 @@ class SceneParts(Part):
         return int(np.floor(self.d))
 
     def to_si(self, *, alpha: ArrayLike = 0.0, beta: ArrayLike = 0.0) -> Physical:
-        """Return stiffness in N/m and damping in N s/m of a normalized wall on this device."""
+        """Convert the normalized stiffness alpha and damping beta of walls on this device to SI units."""
         return denormalize(
             mass=self.mass, period=self.timing.period, alpha=alpha, beta=beta, delta=self.delta, d=self.d
         )
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The units of the device, linear or rotary."""
+        """Unit system of the device, linear or rotary."""
         return self.device.unit_system
 
     @cached_property
     def units(self) -> WallSI:
-        """The stiffness of alpha = 1 in N/m and the damping of beta = 1 in N s/m."""
-        # Convert to Python floats, because concrete JAX numbers may have single precision.
+        """Units of alpha and beta: the stiffness m/T^2 in N/m, and the damping m/T in N s/m."""
+        # Convert numbers that are not traced to Python floats, because JAX numbers may have single precision.
         mass, period = (value if is_traced(value) else float(value) for value in (self.mass, self.timing.period))
         return with_units(WallSI(mass / period / period, mass / period), self.unit_system)
 
     def parameters(self) -> dict[str, Any]:
-        """Return all numerical parameters of all parts by dotted path.
+        """Return a dictionary of the numerical parameters of all parts, keyed by dotted path.
 
         Returns:
             For example ``{"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 0.0, "velocity.cutoff": 100.0, ...}``;
@@ -254,7 +258,7 @@ class SceneParts(Part):
 def wrap_function(
     function: Callable[Concatenate[Owner, Parameters], Result],
 ) -> Callable[Concatenate[Owner, Parameters], Result]:
-    """Wrap a function of a scene so that it checks the scene and its result prints in the units of the device."""
+    """Wrap a function of a scene so that it checks the scene, and its result prints in the units of the device."""
 
     @wraps(function)
     def checked(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
@@ -265,10 +269,10 @@ def wrap_function(
 
 
 def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Collection[str]) -> None:
-    """Wrap the public methods of a scene class, except those in ``but``.
+    """Wrap the public methods of a scene class, except those named in ``but``, to check arguments and set units.
 
-    Their results print in the units of the device. Methods that are not ``traceable`` raise `InputError` for traced
-    values.
+    The results of a wrapped method print in the units of the device. A wrapped method that is not named in
+    ``traceable`` raises `InputError` for values traced by JAX.
     """
     for name in dir(kind):
         method = inspect.getattr_static(kind, name)
@@ -277,7 +281,7 @@ def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Col
 
 
 def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], traceable: bool) -> Callable[..., Result]:
-    """Wrap one method for `wrap_methods`."""
+    """Wrap one method so that its result prints in the device's units; unless traceable, it refuses traced values."""
 
     @wraps(method)
     def wrapped(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
@@ -289,7 +293,13 @@ def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], trace
 
 
 def refuse_traced(method: str, scene: SceneParts, arguments: Mapping[str, Any]) -> None:
-    """Raise `InputError` if JAX traces a parameter of the scene or an argument of the method ``method``."""
+    """Raise `InputError` if JAX traces a parameter of the scene or one of the arguments of a method.
+
+    Args:
+        method: name of the method, for the message.
+        scene: the scene.
+        arguments: arguments of the method by name.
+    """
     traced = scene.traced_path or next((name for name, value in arguments.items() if is_traced(value)), None)
     if traced is not None:
         raise InputError(

@@ -1,7 +1,7 @@
 """Cautions about a recommended wall: small margins, slow decay and destabilizing grasps, each with its remedy.
 
-A remedy is an option of ``zwidth recommend``, i.e. another requirement, whose wall has no such problem. It is printed
-with this wall and its cost in stiffness.
+A remedy is an option of ``zwidth recommend``, i.e. a different requirement, for which the recommended wall has no such
+problem. Its text states this wall and the loss of stiffness.
 """
 
 from __future__ import annotations
@@ -18,15 +18,20 @@ from zwidth.scenes.wall_search import COARSE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE
 from zwidth.words.formatting import format_wall, plain, with_unit
 from zwidth.words.status import Status
 
-# Limits of acceptable walls; a wall that violates one of them gets a caution.
-LEAST_PHASE_MARGIN = 10.0  # degrees
-LEAST_GAIN_MARGIN = 1.3  # factor on K and B together
-LEAST_DELAY_MARGIN = 0.1  # sampling periods
-LONGEST_TIME_CONSTANT = 1.0  # s
+# Limits of acceptable walls. A recommended wall that violates one of these limits has a caution.
+LEAST_PHASE_MARGIN = 10.0  # smallest phase margin, in degrees
+LEAST_GAIN_MARGIN = 1.3  # smallest gain margin, a factor on K and B together
+LEAST_DELAY_MARGIN = 0.1  # smallest delay margin, in sampling periods
+LONGEST_TIME_CONSTANT = 1.0  # largest time constant of the decay, in s
 
 
 def find_thin(verdict: Assessment, period: float) -> list[str]:
-    """Return in words the margins of a stable wall that are too small, and its time constant if too long."""
+    """Return texts that state the margins of a stable wall that are too small, and its time constant if too long.
+
+    Args:
+        verdict: assessment of the wall.
+        period: sampling period in s, the unit of the limit of the delay margin.
+    """
     gain, phase, late = (round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay"))
     constant = verdict.time_constant
     thin = {
@@ -39,7 +44,7 @@ def find_thin(verdict: Assessment, period: float) -> list[str]:
 
 
 def list_cautions(recommendation: Any) -> tuple[str, ...]:
-    """Return the cautions about the wall of a `Recommendation`."""
+    """Return the cautions about the wall of a `Recommendation`, one sentence each; empty if there are none."""
     scene, verdict, wanted, cautions = recommendation.scene, recommendation.verdict, recommendation.wanted, []
     if thin := find_thin(verdict, scene.timing.period):
         rings = thin[0].startswith("phase") and verdict.frequency > 0 and math.isfinite(verdict.time_constant)
@@ -66,7 +71,7 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
 
 
 def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
-    """Return requirements that may enlarge the margins, by the options that select them."""
+    """Return other requirements that may yield larger margins; the keys are the command-line options for them."""
     phase = max(DEFAULT_PHASE_MARGIN, wanted.phase_margin or 0.0)
     gain = max(DEFAULT_GAIN_MARGIN, wanted.gain_margin or 0.0)
     by_phase, by_gain = f"--phase-margin {phase:g}", f"--gain-margin {gain:g}"
@@ -79,7 +84,14 @@ def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
 
 
 def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[Any], bool], otherwise: str) -> str:
-    """Return the first of the options whose wall is accepted, with this wall and its cost; ``otherwise`` if none is."""
+    """Return a text with the first option that solves a problem of the wall, the new wall and its loss of stiffness.
+
+    Args:
+        recommendation: the recommendation whose wall has the problem.
+        options: requirements to try, by the text of the option.
+        accepts: function that returns True if the wall of a scene does not have the problem.
+        otherwise: text to return if no option solves the problem.
+    """
     for words, wanted in options.items():
         scene = recommendation.scene
         wall = choose_wall(scene, wanted, recommendation.stiffest, recommendation.stiffness, COARSE)
@@ -92,7 +104,7 @@ def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[
 
 
 def judge_grasps(scene: Any) -> dict[str, bool]:
-    """Return whether a wall is stable in each reference grasp, by the name of the grasp.
+    """Return a dictionary that maps each reference grasp to True if the wall of the scene is stable in it.
 
     If the scene has an operator, the entry "released" is the stability without the operator.
     """

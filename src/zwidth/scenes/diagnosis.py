@@ -1,4 +1,9 @@
-"""Time-domain diagnosis of a wall: the cause of a sustained oscillation and the changes that stop it."""
+"""Time-domain diagnosis of a wall: the cause of a sustained oscillation and the changes that stop it.
+
+The *linear loop* ignores encoder steps, friction and motor limits. `diagnose` decides its stability, and then simulates
+the wall with these effects from several initial conditions (`zwidth.scenes.trials`). A simulated *motion* is sustained
+if it neither comes to rest nor decays. K and B are the stiffness and damping of the wall.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +47,7 @@ FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in 
 )
 @dataclass(frozen=True)
 class Diagnosis:
-    """Cause of the sustained oscillation of a wall, from `diagnose`.
+    """Result of `diagnose`: the cause of the sustained oscillation of a wall, and the remedies.
 
     Attributes:
         cause: cause of the oscillation. "instability": the linear loop is unstable. "quantization": the steps of the
@@ -77,13 +82,13 @@ class Diagnosis:
 
     @property
     def word(self) -> str:
-        """The diagnosis as the capitalized label that commands print."""
+        """Diagnosis as a label in capitals, such as "LIMIT CYCLE", which commands print."""
         if self.cause in ("quantization", "saturation"):
             return "LIMIT CYCLE" if math.isfinite(self.amplitude) else "UNBOUNDED"
         return {"none": "AT REST", "instability": "UNSTABLE"}.get(self.cause, "UNDECIDED")
 
     def explain(self) -> str:
-        """Return the cause in one sentence."""
+        """Return the cause of the oscillation as a sentence, with its amplitude and frequency."""
         units = self.unit_system
         size = with_unit(self.amplitude, units["m"], 2)
         swing = f"{size} at {with_unit(self.frequency, 'Hz', 2)}" if math.isfinite(self.amplitude) else "without bound"
@@ -113,7 +118,7 @@ class Diagnosis:
         return f"no sustained oscillation; {linear}"
 
     def advise(self) -> str:
-        """Return the remedies in one sentence; "" if none is needed."""
+        """Return the changes that stop the oscillation as a sentence; "" if no change is needed."""
         if self.cause in ("none", "undecided"):
             return ""
         simulated = self.cause != "instability"
@@ -124,12 +129,13 @@ class Diagnosis:
             parts = [changes, CONFIRMED if simulated else WITHOUT_MARGINS]
         else:
             parts = ["no remedy by a change of one parameter was found"]
-        # Without friction the loop scales with the encoder step, and between two force steps no equilibrium exists.
+        # Without friction a finer encoder does not stop the oscillation: no equilibrium exists between two steps of the
+        # force, and the amplitude is proportional to the encoder step.
         parts += [FRICTIONLESS] if self.cause == "quantization" and not self.hardware.static else []
         return "; ".join(parts)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields as JSON values, with None in place of NaN and infinity."""
+        """Return a dictionary of the fields as JSON values, with None in place of NaN and infinity."""
         values = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "unit_system"}
         values |= {"hardware": self.hardware._asdict(), "outcome": self.outcome.name}
         remedies = None if self.remedies is None else [remedy._asdict() for remedy in self.remedies]
@@ -217,18 +223,24 @@ def diagnose(
 
 
 def _find_dominant(scene: Any) -> Any:
-    """Return the dominant pole of the loop of a scene with its wall."""
+    """Return the dominant pole of the linear closed loop with the wall of a scene."""
     return scene.loop.find_dominant(float(scene.alpha), float(scene.beta))
 
 
 def _find_cause(experiment: Experiment, worst: SustainedMotion, dominant: Any) -> Cause:
-    """Return the cause of the largest sustained motion."""
+    """Return the cause of the largest sustained motion as a label, such as "quantization".
+
+    Args:
+        experiment: the simulations, with the scene and its hardware.
+        worst: the largest sustained motion in the simulations.
+        dominant: dominant pole of the linear loop.
+    """
     scene, hardware = experiment.scene, experiment.hardware
     if not dominant.marginal and not scene.is_stable():
         return "instability"
     limited = min(hardware.max_force, hardware.max_rate) < math.inf
     if not limited and hardware.resolution == 0:
-        # The verdict of the linear loop decides, because friction only dissipates energy.
+        # With an ideal encoder and motor, decide by the linear loop alone, because friction only dissipates energy.
         return "none"
     if not worst.at_rest[0] and experiment.decay < SETTLED:
         return "undecided"
@@ -236,7 +248,7 @@ def _find_cause(experiment: Experiment, worst: SustainedMotion, dominant: Any) -
         return "none"
     if limited and hardware.resolution > 0:
         unlimited = experiment.measure(max_force=np.inf, max_rate=np.inf)
-        # A motion sustained by saturation is larger than the quantization limit cycle that remains once the force
-        # limits are removed.
+        # Attribute the motion to saturation if it is more than twice as large as the limit cycle that the encoder steps
+        # alone cause, simulated without motor limits.
         limited = bool(worst.amplitude[0] > 2.0 * unlimited.amplitude[0])
     return "saturation" if limited else "quantization"

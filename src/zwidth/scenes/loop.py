@@ -60,13 +60,13 @@ from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array
 from zwidth.words.xp import is_jax, is_traced, namespace, nan_beyond
 
-# Largest log|z| of poles that count as on the unit circle, in a lossless loop. A rounding error of 1e-16 moves a double
-# pole by its square root, about 1e-8.
+# Largest log|z| of poles of a lossless loop that are treated as poles on the unit circle. It exceeds 1e-8, because a
+# rounding error of 1e-16 moves a double pole by its square root.
 ON_CIRCLE = 1e-7
 
 
 class DominantPole(NamedTuple):
-    """The dominant pole of a loop with one wall."""
+    """Dominant pole (pole of largest magnitude) of the closed loop with one wall."""
 
     marginal: bool  # poles on the unit circle, none outside: one at z = 1, or all poles of an undamped plant
     radius: float  # spectral radius
@@ -76,22 +76,22 @@ class DominantPole(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LinearLoop:
-    """Loop of any scene with a model; alpha and beta are arrays of equal shape unless stated otherwise."""
+    """Analyses of a scene whose device has a model; alpha and beta are arrays of equal shape unless stated."""
 
     scene: Any
-    # Cache of the ridge, by whether negative damping is allowed.
+    # Cache of computed ridges; the key is True if negative damping is allowed.
     _ridges: dict[bool, RidgeSolution | None] = field(default_factory=dict, init=False, repr=False)
 
-    # Default number of random devices for tolerances; the maximum stiffness of one device takes 10 to 50 ms.
+    # Default number of random devices in tolerance estimates; small, because K_max of one device takes 10 to 50 ms.
     draws: ClassVar[int] = 200
-    # True if the methods that take walls work inside jit, vmap and grad.
+    # True if the methods with arguments alpha and beta work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
-    # Largest window and delay that other modules search, in periods; the run time increases with their square.
+    # Largest velocity window and delay, in periods, that other modules try; the run time increases with their square.
     most_periods: ClassVar[float] = 128
 
     @cached_property
     def chain(self) -> AnyChain:
-        """The masses, springs and dampers of the loop, or its linear system."""
+        """Mechanical model of the device: masses, springs and dampers, or a linear system."""
         # Raise an error with the name of a traced parameter, because the analyses need plain numbers.
         for path, value in list_parameters(self.scene).items():
             as_float64(path, value)
@@ -104,12 +104,12 @@ class LinearLoop:
 
     @cached_property
     def boundary(self) -> Boundary:
-        """The stability boundary, traced once."""
+        """Stability boundary in the plane of alpha and beta, traced at first use."""
         return Boundary.trace(self.roots)
 
     @cached_property
     def _contracted(self) -> tuple[LoopRoots, int]:
-        """The loop whose poles are the k-th powers of the poles of this loop, and the largest such k; usually k = 1.
+        """Loop whose poles are the k-th powers of the poles of this loop, and the largest possible k; usually k = 1.
 
         If k > 1, groups of k poles of this loop reach the unit circle together, so k edges of its stable set would
         coincide. The stable set is therefore computed from the loop in z^k.
@@ -118,24 +118,31 @@ class LinearLoop:
 
     @cached_property
     def stable_set(self) -> StableSet:
-        """The stable set, by its pieces and their edges."""
+        """Set of the stable walls, as connected pieces bounded by edges."""
         roots, k = self._contracted
         return StableSet(self.boundary if k == 1 else Boundary.trace(roots))
 
     @cached_property
     def poles_sought(self) -> int:
-        """Number of poles from which a spectral radius is computed."""
+        """Number of poles to compute for one spectral radius."""
         return self.roots.order
 
     def labels(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """Return whether walls are stable; alpha and beta may broadcast."""
+        """Return a boolean array that is True for stable walls; alpha and beta may broadcast."""
         check_scalars({"alpha": alpha, "beta": beta})
         return label_walls(self.boundary, *nan_beyond(WALL_RANGE, alpha, beta))[()]
 
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod, exact: tuple[np.ndarray, np.ndarray]
     ) -> Stability:
-        """Return label, status and method of each wall; ``exact`` is (K, B) in SI units, for the certified method."""
+        """Return for each wall whether it is stable, a status code, and the method used.
+
+        Args:
+            alpha: normalized stiffness of the walls.
+            beta: normalized damping of the walls.
+            method: "auto", "crossover", "companion" or "certified".
+            exact: K and B in SI units, which the method "certified" uses instead of the rounded alpha and beta.
+        """
         # Pass zeros for delta and d, because the parts of the scene were checked when they were created.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
@@ -156,18 +163,18 @@ class LinearLoop:
         return Stability(stable[()], status[()], np.full(stable.shape, used, np.int32)[()])
 
     def poles(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return all poles, along a new last axis."""
+        """Return all closed-loop poles of each wall, along a new last axis."""
         return 1.0 + compute_poles_minus_one(self.roots, alpha, beta)
 
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """Return the spectral radius, which is below 1 if and only if a wall is stable; NaN if out of range."""
+        """Return the spectral radius of each wall, below 1 if and only if the wall is stable; NaN if out of range."""
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         stable = label_walls(self.boundary, alpha, beta).reshape(-1)
         radius = linear_radius(self.roots, alpha.reshape(-1), beta.reshape(-1), stable)
         return radius.reshape(alpha.shape)[()]
 
     def find_dominant(self, alpha: float, beta: float) -> DominantPole:
-        """Return the dominant pole of the loop with one wall."""
+        """Return the dominant pole of the closed loop with one wall."""
         if is_marginal(self.roots, alpha, beta):
             return DominantPole(True, 1.0, 0.0, 0.0)
         wall = np.array([alpha]), np.array([beta])
@@ -198,15 +205,15 @@ class LinearLoop:
         return np.stack([intervals.low[0], intervals.high[0]], -1)
 
     def explain(self, alpha: float, beta: float) -> list[str]:
-        """Return the reasons for an undecided wall: none, because the stability of a model is always decided."""
+        """Return the reasons why a wall is undecided: an empty list, because a model decides every wall."""
         return []
 
     def explain_limit(self) -> str:
-        """Return the reason for an undecided stiffest wall: "", because the stability of a model is always decided."""
+        """Return the reason why the stiffest wall is undecided: "", because a model decides every wall."""
         return ""
 
     def find_connected_beta(self, alpha: float, least: float) -> list[tuple[float, float]]:
-        """Return the stable intervals of beta >= ``least`` for one alpha whose walls are connected to K = 0."""
+        """Return for one alpha the intervals of beta >= ``least`` of stable walls that are connected to K = 0."""
         intervals = np.maximum(self.find_stable_beta(alpha), least).tolist()
         return [(low, high) for low, high in intervals if low < high and self.is_connected(alpha, 0.5 * (low + high))]
 
@@ -224,16 +231,19 @@ class LinearLoop:
         return curve.alpha, curve.beta
 
     def least_stiffness(self, least: float) -> float | None:
-        """Return the alpha below which no wall is stable, for a device unstable without a wall; None for others."""
+        """Return the smallest alpha of the stable walls with beta >= ``least``.
+
+        The result is None if walls close to alpha = 0 are stable, i.e. unless the device is unstable without a wall.
+        """
         softest = self.stable_set.find_softest(least) if self.roots.device_is_unstable else 0.0
         return softest if softest > 0 else None
 
     def outlines(self) -> list[Outline]:
-        """Return closed outlines of the stable set, the largest first."""
+        """Return the closed boundary curves of the pieces of the stable set, the largest first."""
         return self.stable_set.outlines()
 
     def stiffest(self, negative: bool) -> RidgePoint:
-        """Return the stiffest stable wall, with beta >= 0 unless ``negative``."""
+        """Return the stiffest stable wall connected to K = 0; ``negative`` allows beta < 0."""
         if is_traced(*list_parameters(self.scene).values()):
             from zwidth.loops.linear.traced_ridge import trace_stiffest
 
@@ -246,12 +256,12 @@ class LinearLoop:
         return RidgePoint(alpha, beta, omega, np.int32(ridge.kind), np.int32(status))
 
     def ridge(self, negative: bool) -> tuple[RidgeSolution | None, Status]:
-        """Return the stiffest wall with its active constraints, None if there is none, and a status; not traceable."""
+        """Return the stiffest wall with its active constraints, or None, and a status; JAX cannot trace this method."""
         stable_set = self.stable_set
         if negative not in self._ridges:
             try:
                 ridge, k = find_ridge(stable_set, negative), self._contracted[1]
-                # Convert angles of the loop in z^k to angles in z.
+                # Divide the angles by k, because an angle of the loop in z^k is k times that of the loop in z.
                 self._ridges[negative] = ridge and ridge._replace(w1=ridge.w1 / k, w2=ridge.w2 / k)
             except (ArithmeticError, ZwidthError):
                 return None, Status.NOT_CONVERGED
@@ -259,7 +269,7 @@ class LinearLoop:
         return ridge, Status.NO_BOUNDARY if ridge is None else Status.OK
 
     def sensitivities(self, negative: bool) -> SceneSensitivities:
-        """Return the derivative of K_max with respect to each parameter of the scene, in SI units."""
+        """Return the derivatives of K_max with respect to the parameters of the scene, in SI units."""
         return compute_sensitivities(self.scene, *self.ridge(negative))
 
     def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> Array:
@@ -267,17 +277,20 @@ class LinearLoop:
         return open_loop_response(self.roots, alpha, beta, circle_points(w)).value
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
-        """Return the margins, with times in periods and angles in rad per period; unwanted ones may be NaN."""
+        """Return the stability margins of walls, with times in periods and frequencies in rad per period.
+
+        Margins not named in ``wanted`` may be NaN.
+        """
         return compute_margins(self.chain, self.boundary, alpha, beta, wanted)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """Return the damping of the device in excess of what passivity of the wall requires, in units of m/T."""
+        """Return the damping of the device minus the damping that passive walls require, in units of m/T."""
         condition = PassivityCondition.derive(self.chain.estimate, self.scene.d)
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         return compute_passivity_margins(condition, alpha, beta, self.scene.device_delta)[()]
 
     def vary(self, drawn: dict[str, np.ndarray]) -> Variants:
-        """Return variants of the scene, one for each of the values in ``drawn``, given by dotted path."""
+        """Return variants of the scene; ``drawn`` maps dotted paths to arrays with one parameter value per variant."""
         return Variants(self.scene, drawn)
 
 
@@ -313,7 +326,8 @@ class RigidLoop(LinearLoop):
     def find_dominant(self, alpha: float, beta: float) -> DominantPole:
         with np.errstate(all="ignore"):
             dominant = find_dominant_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
-        # If walls with slightly larger K are stable, a wall with K = 0 has one pole at z = 1 and no pole outside.
+        # A wall with K = 0 has a pole at z = 1. If walls with slightly larger K are stable, it has no pole outside the
+        # unit circle, i.e. it is marginal.
         return DominantPole(alpha == 0 and bool(self.find_stable_alpha(np.array([beta])).size), *dominant)
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
@@ -375,14 +389,17 @@ class RigidLoop(LinearLoop):
 
 
 def make_plain(scene: AnyScene) -> AnyScene:
-    """Return the scene with JAX numbers that are not traced converted to floats."""
+    """Return a copy of the scene in which JAX numbers are converted to floats, unless JAX traces them."""
     numbers = list_parameters(scene).items()
     floats = {path: float(value) for path, value in numbers if is_jax(value) and not is_traced(value)}
     return replace_parameters(scene, floats) if floats else scene
 
 
 def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None:
-    """Return the sensitivities of a rigid device in closed form; None if its ridge needs a negative damping."""
+    """Return the derivatives of K_max of a rigid device in closed form.
+
+    The result is None if the stiffest wall has a negative damping, but ``negative`` is False.
+    """
     values = scene.delta, scene.d
     slopes = evaluate(slopes_kernel, {"delta": scene.delta, "d": scene.d}, classify_delays(scene.d))
     if not negative and slopes.point.beta < 0:
@@ -391,13 +408,13 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
         stiffness, *derivatives = stiffness_slopes(slopes, scene.mass, scene.timing.period, *values)
     per = dict(zip(("mass", "damping", "period", "delay"), derivatives, strict=True))
     if scene.timing.in_periods and scene.timing.d:
-        # If the delay is given in periods, t_d = d T increases with T. By the chain rule, dK/dT at constant d is dK/dT
-        # at constant t_d plus d dK/dt_d.
+        # If the delay is given in periods, t_d = d T increases with T. By the chain rule, the derivative of K_max in T
+        # at constant d is that at constant t_d, plus d times the derivative in t_d.
         per["period"] = per["period"] + scene.timing.d * per["delay"]
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
-        # The derivative in the stiffness of the operator has no closed form, so differentiate the conditions at the
-        # ridge implicitly.
+        # Differentiate the active constraints of the stiffest wall implicitly, because the derivative of K_max in the
+        # stiffness of the operator has no closed form.
         ridge = scene.loop.ridge(negative)[0]
         per["operator.stiffness"] = (
             math.nan if ridge is None else differentiate_stiffness(scene, ridge, "operator.stiffness")

@@ -29,7 +29,7 @@ from zwidth.words.results import Margins, RidgePoint, Stability
 from zwidth.words.status import Method, RidgeKind, Status
 from zwidth.words.types import Array
 
-# Search for the stiffest wall over beta
+# Settings of the search for the stiffest wall, on lines of constant beta
 N_SIDE = 60  # values of beta on each side of beta = 0
 DENSITY = 5.0  # argument of sinh at the largest beta; larger values place more of them close to beta = 0
 N_REFINED = 49  # further values of beta in the range with stable walls
@@ -39,13 +39,13 @@ INSIDE = 1e-9  # relative distance of the stiffest wall below the end of its dec
 
 @dataclass(frozen=True, eq=False)
 class MeasuredLoop(LinearLoop):
-    """Loop of a measured device; results hold for every response within the error bounds."""
+    """Analyses of a scene with a measured device; results hold for every response within the error bounds."""
 
     most_periods = 0.0  # prevents searches over the rate, because the response is valid for one rate only
 
     @cached_property
     def chain(self) -> AnyChain:
-        """Not available: raises `InputError`, also for all analyses that need poles or state-space matrices."""
+        """Mechanical model of the device, which a measured response lacks: always raises `InputError`."""
         raise InputError(
             "device: poles, responses in time, passivity and sensitivities need a model instead of a measured "
             "response; fit one with zwidth.fit_log"
@@ -53,7 +53,7 @@ class MeasuredLoop(LinearLoop):
 
     @cached_property
     def walls(self) -> DecidedWalls:
-        """The walls that the measured response decides."""
+        """Decision of the stability of walls from the measured response with its error bounds."""
         timing, device = self.scene.timing, self.scene.device
         if timing.delay != 0:
             raise InputError(
@@ -65,14 +65,14 @@ class MeasuredLoop(LinearLoop):
 
     @cached_property
     def nominal(self) -> MeasuredLoop:
-        """The loop of the measured response without the errors of its lines."""
+        """Loop of the measured response if the errors of its lines are assumed to be 0."""
         loop = MeasuredLoop(self.scene)
         curve = self.walls.curve
         vars(loop)["walls"] = DecidedWalls(replace(curve, band=0.0 * curve.band))
         return loop
 
     def labels(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """Return whether walls are stable for every response within the error bounds."""
+        """Return a boolean array that is True for walls that are stable for every response within the error bounds."""
         return self.decide(alpha, beta, "auto", (alpha, beta)).stable
 
     def decide(
@@ -80,8 +80,8 @@ class MeasuredLoop(LinearLoop):
     ) -> Stability:
         """Return for each wall whether it is stable, and whether the measured response is sufficient to decide this.
 
-        The status is UNDECIDED if the lines are too far apart or have too large errors, or
-        if the range of measured frequencies is too narrow. The argument ``exact`` of the base class is ignored.
+        The status is UNDECIDED if the lines are too far apart, if their errors are too large, or if the range of
+        measured frequencies is too narrow. ``exact`` is an argument of the base class and ignored.
         """
         if method not in ("auto", "crossover"):
             raise InputError(f"method: got {method!r}, which needs a model; use 'crossover' for a measured response")
@@ -92,7 +92,7 @@ class MeasuredLoop(LinearLoop):
         status[finite] = Status.UNDECIDED
         a, b = a[finite], b[finite]
         (betas, beta_index), (alphas, alpha_index) = (np.unique(values, return_inverse=True) for values in (b, a))
-        # Use lines of constant beta or of constant alpha, whichever are fewer.
+        # Evaluate lines of constant beta or of constant alpha, whichever are fewer, to save time.
         along_alpha = betas.size <= alphas.size
         decided, line = (
             (self.walls.decide_alpha(betas), beta_index)
@@ -109,42 +109,42 @@ class MeasuredLoop(LinearLoop):
         return Stability(stable.reshape(shape)[()], status.reshape(shape)[()], used[()])
 
     def find_dominant(self, alpha: float, beta: float) -> DominantPole:
-        """Return NaN, because a measured response does not contain the poles."""
+        """Return NaN in all numbers, because a measured response does not determine the poles."""
         return DominantPole(False, np.nan, np.nan, np.nan)
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
-        """Return the certainly stable intervals of alpha, shape (n, intervals, 2); NaN if a beta has fewer."""
+        """Return the intervals of certainly stable alpha for each beta, shape (n, intervals, 2); NaN if fewer."""
         return _select_stable(self.walls.decide_alpha(beta), True)
 
     def find_stable_beta(self, alpha: float) -> np.ndarray:
-        """Return the certainly stable intervals of beta for one alpha, shape (intervals, 2)."""
+        """Return the intervals of certainly stable beta for one alpha, shape (intervals, 2)."""
         return _select_stable(self.walls.decide_beta(np.array([alpha])), True)[0]
 
     def _find_connected_alpha(self, beta: np.ndarray) -> np.ndarray:
-        """Return the stable intervals of alpha below all certainly unstable walls of the same beta.
+        """Return the intervals of certainly stable alpha that lie below all certainly unstable alpha of the same beta.
 
-        The shape is that of `find_stable_alpha`.
+        The result has the shape (n, intervals, 2), with NaN if a beta has fewer intervals.
         """
         intervals = self.walls.decide_alpha(beta)
         unstable = np.min(intervals.low, 1, where=~(intervals.stable | np.isnan(intervals.low)), initial=np.inf)
         return _select_stable(intervals, intervals.low < unstable[:, None])
 
     def is_connected(self, alpha: float, beta: float) -> bool:
-        """Return whether a wall is certainly stable and no softer wall of the same beta is certainly unstable."""
+        """Return whether a wall is certainly stable, and no softer wall with the same beta is certainly unstable."""
         ends = self._find_connected_alpha(np.array([beta]))[0]
         return bool(np.any((ends[:, 0] < alpha) & (alpha < ends[:, 1])))
 
     def islands(self, least: float) -> list[Island]:
-        """Return an empty list: undecided walls may connect the pieces of the stable set to K = 0."""
+        """Return an empty list, because undecided walls may connect every piece of the stable set to K = 0."""
         return []
 
     def least_stiffness(self, least: float) -> None:
-        """Return None: a measured response without a model does not contain the poles of the device."""
+        """Return None, because a measured response does not show if the device is unstable without a wall."""
 
     @cached_property
     def _tops(self) -> tuple[np.ndarray, np.ndarray]:
-        """Values of beta, and the largest alpha of the stable walls connected to K = 0 for each; 0 if none exists."""
-        # For larger |beta| no wall is decided.
+        """Grid of beta, and for each beta the largest alpha of a stable wall connected to K = 0; 0 if none exists."""
+        # Limit the grid to |beta| <= most, because no wall with a larger |beta| is decided.
         low, high = self.walls.bound_alpha(0.0)
         most = max((high - low) / (self.walls.curve.max_F_below + self.walls.curve.max_F_above), 1e-300)
         side = most * np.sinh(DENSITY * np.arange(1, N_SIDE + 1) / N_SIDE) / np.sinh(DENSITY)
@@ -160,13 +160,14 @@ class MeasuredLoop(LinearLoop):
         return beta, top
 
     def _find_tops(self, beta: np.ndarray) -> np.ndarray:
-        """Return the largest alpha of the stable walls connected to K = 0 for each beta; 0 if none exists."""
+        """Return for each beta the largest alpha of a stable wall connected to K = 0; 0 if none exists."""
         return np.nanmax(self._find_connected_alpha(beta)[:, :, 1], 1, initial=0.0)
 
     def outlines(self) -> list[Outline]:
         """Return one closed outline of the stable walls connected to K = 0, for figures; none if no wall is stable.
 
-        It joins the softest and the stiffest stable wall of each beta; undecided walls between them are inside it.
+        The outline joins the softest and the stiffest of these walls at each beta. Undecided walls between them lie
+        inside the outline.
         """
         beta, top = self._tops
         beta, top = beta[top > 0], top[top > 0]
@@ -175,7 +176,7 @@ class MeasuredLoop(LinearLoop):
         return [Outline(*walls, False, False)] if beta.size else []
 
     def stiffest(self, negative: bool) -> RidgePoint:
-        """Return the stiffest wall that `is_connected`, with beta >= 0 unless ``negative``."""
+        """Return the stiffest certainly stable wall connected to K = 0; ``negative`` allows beta < 0."""
         beta, top = self._tops
         top = np.where((beta < 0) & (not negative), 0.0, top)
         best = int(np.argmax(top))
@@ -188,13 +189,13 @@ class MeasuredLoop(LinearLoop):
         )
         minimum = minimize_golden_section(lambda beta: -self._find_tops(beta), low, middle, high, cost, SEARCH_STEPS)
         middle, value = float(minimum[0][0]), -float(minimum[1][0])
-        # Stay below the end of the open interval, because the end itself is undecided.
+        # Reduce alpha slightly below the end of its interval, because the wall at the end itself is undecided.
         value *= 1.0 - INSIDE
         omega = self.walls.curve.w[self.walls.find_critical_point(value, middle)]
         return RidgePoint(np.float64(value), np.float64(middle), np.float64(omega), kind, np.int32(Status.OK))
 
     def explain(self, alpha: float, beta: float) -> list[str]:
-        """Return the reasons for an undecided wall, each with the frequencies to measure; empty if it is decided."""
+        """Return texts with the reasons why a wall is undecided and the frequencies to measure; empty if decided."""
         wall = np.array([alpha]), np.array([beta])
         if self.decide(*wall, "auto", wall).status[0] == Status.OK:
             return []
@@ -224,7 +225,7 @@ class MeasuredLoop(LinearLoop):
         return reasons
 
     def explain_limit(self) -> str:
-        """Return the reason why no wall is decided, from the wall with the fewest undecided frequencies."""
+        """Return a text with the reasons why no wall is decided, for the wall undecided at the fewest points."""
         rows = [(*self.walls.bound_alpha(beta), beta) for beta in self._tops[0].tolist()]
         walls = [(0.5 * (low + high), beta) for low, high, beta in rows if low < high]
         count = f"the {self.scene.device.frequency.size} frequencies of the response decide the stability of no wall"
@@ -239,11 +240,11 @@ class MeasuredLoop(LinearLoop):
         return (alpha + beta * F) * S / (4.0 * np.sin(0.5 * w) ** 2)
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
-        """Return the margins on the measured curve, in periods and rad per period; NaN for undecided walls.
+        """Return the stability margins of walls from the measured curve; NaN for undecided walls.
 
-        The delay margin is the smallest phase over frequency at a gain crossover. If the measured range contains no
-        phase crossover that limits an increase of the gain, the gain margin is a lower bound: up to this factor none
-        exists above the range.
+        Times are in periods, frequencies in rad per period. The delay margin is the smallest ratio of phase to
+        frequency at a gain crossover. If no phase crossover in the measured range limits an increase of the gain, the
+        gain margin is a lower bound: for factors up to it no crossover exists above the range.
         """
         decided = self.decide(alpha, beta, "auto", (alpha, beta))
         out = np.full((len(Margins._fields), *np.shape(alpha)), np.nan)
@@ -262,8 +263,8 @@ class MeasuredLoop(LinearLoop):
             w, real = c.w[k] + share * np.diff(c.w)[k], L.real[k] + share * np.diff(L.real)[k]
             crossovers, sizes = w[real < 0], -real[real < 0]
             if stable and not np.any(sizes < 1.0):
-                # No phase crossover with |L| < 1 was measured. Above the last line |L| is at most ``most``, so a factor
-                # below 1/most moves no pole onto the unit circle there.
+                # If no phase crossover with |L| < 1 was measured, use the bound ``most`` of |L| above the last line: a
+                # factor below 1/most on the gain cannot move a pole onto the unit circle there.
                 most = c.max_G * (abs(alpha) + abs(beta) * c.max_F_above)
                 crossovers, sizes = np.append(crossovers, c.w[-1]), np.append(sizes, most)
             k, share = _find_zeros(np.log(np.abs(L)))
@@ -277,12 +278,12 @@ class MeasuredLoop(LinearLoop):
 
 
 def _select_stable(intervals: DecidedIntervals, mask: np.ndarray | bool) -> np.ndarray:
-    """Return the intervals that are stable and selected by a mask: shape (lines, intervals, 2); NaN if fewer."""
+    """Return the stable intervals that a mask selects, shape (lines, intervals, 2); NaN if a line has fewer."""
     line, k = np.nonzero(intervals.stable & mask)
     return arrange_by_line(len(intervals.low), line, np.stack([intervals.low[line, k], intervals.high[line, k]], -1))
 
 
 def _find_zeros(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of the values before each sign change, and the position of the zero in the step, 0 to 1."""
+    """Return the index of the value before each sign change, and the position of the zero after it, from 0 to 1."""
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
     return k, values[k] / (values[k] - values[k + 1])

@@ -53,7 +53,7 @@ from zwidth.words.unit_system import UnitSystem
 
 _UNITS = {"stiffness": "N/m", "damping": "N s/m", "virtual_damping": "N s/m"}
 _UNITS |= {"mass": "kg", "time": "s", "frequency": "Hz"}
-# Fields of `Assessment` repeated in the recommendation's dictionary.
+# Fields of `Assessment` that `Recommendation.as_dict` repeats in its entry "recommended".
 _JUDGED = (
     *("alpha", "beta", "virtual_damping_lower", "virtual_damping_upper", "spectral_radius", "passive"),
     *("passivity_margin", "time_constant", "frequency", "gain_margin", "phase_margin", "delay_margin"),
@@ -63,7 +63,7 @@ _JUDGED = (
 @compact_repr(("stiffness", "virtual_damping", "limited_by", "status", "reason", "notes"))
 @dataclass(frozen=True)
 class Recommendation:
-    """Wall recommended for a device, from `zwidth.Scene.recommend`.
+    """Recommended wall of a device, or the reason why none exists, from `zwidth.Scene.recommend`.
 
     Attributes:
         scene: the device with the recommended wall, for `zwidth.assess`, `zwidth.simulate` and figures.
@@ -86,25 +86,25 @@ class Recommendation:
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The units of the device."""
+        """Unit system of the device, linear or rotary."""
         return self.scene.unit_system
 
     @property
     def stiffness(self) -> float:
-        """K in N/m; NaN if no wall is recommended."""
+        """Stiffness K of the wall in N/m; NaN if no wall is recommended."""
         return float(self.scene.wall.stiffness) if self.status == Status.OK else math.nan
 
     @property
     def virtual_damping(self) -> float:
-        """B in N s/m; NaN if no wall is recommended."""
+        """Virtual damping B of the wall in N s/m; NaN if no wall is recommended."""
         return float(self.scene.wall.virtual_damping) if self.status == Status.OK else math.nan
 
     @cached_property
     def read(self) -> tuple[float, float, int]:
-        """K and B as printed, and their number of significant digits.
+        """K and B of the wall, rounded for printing, and their number of significant digits.
 
-        The digits are the fewest, at least 4, with which the rounded wall still satisfies the requirements. K is
-        rounded down. More than 4 digits are needed if only a narrow range of B satisfies them.
+        The number of digits is the smallest, at least 4, with which the rounded wall satisfies the requirements. K is
+        rounded down. If only a narrow range of B satisfies the requirements, more than 4 digits are needed.
         """
         grasped = list_grasped_scenes(self.scene, self.wanted)
         slack, verdict = measure_slack(self.scene, self.wanted, grasped), self.verdict
@@ -113,15 +113,15 @@ class Recommendation:
             ends = verdict.virtual_damping_lower, verdict.virtual_damping_upper
 
         def rounded(digits: int) -> tuple[float, float]:
-            """Return K rounded down and B rounded."""
+            """Return K rounded down and B rounded to nearest, with this number of significant digits."""
             return round_conservatively(self.stiffness, "below", digits), float(f"{self.virtual_damping:.{digits}g}")
 
         def holds(digits: int) -> bool:
-            """Return whether the wall with this number of digits is stable and satisfies the requirements."""
+            """Return whether the wall rounded to this number of digits is stable and satisfies the requirements."""
             wall = rounded(digits)
             if not (self.scene.is_stable(*wall) and all(spare >= 0 for spare in slack(*wall).values())):
                 return False
-            # The printed B must lie in the printed range of stable B, whose ends are rounded inwards.
+            # Require that the printed B lies in the printed range of stable B, whose ends are rounded inwards.
             low, high = ends
             inside = (
                 round_conservatively(low, "above", digits) <= wall[1] <= round_conservatively(high, "below", digits)
@@ -133,15 +133,16 @@ class Recommendation:
 
     @cached_property
     def verdict(self) -> Assessment | None:
-        """The result of `zwidth.assess` for the wall; None if no wall is recommended."""
+        """Assessment of the wall by `zwidth.assess`; None if no wall is recommended."""
         return assess(self.scene) if self.status == Status.OK else None
 
     @cached_property
     def steps(self) -> list[Limit]:
-        """The improvements of `zwidth.limits_of` that allow a stiffer wall under the same requirements, best first.
+        """Improvements of the device that allow a stiffer wall under the same requirements, the largest gain first.
 
-        The stiffness of each is that of the wall recommended for the improved device, accurate to about 0.2 %. The list
-        is empty if the safe limit is active, because then only a new measurement allows a stiffer wall.
+        The improvements are those of `zwidth.limits_of`. The stiffness of each entry is that of the wall recommended
+        for the improved device, accurate to about 0.2 %. The list is empty if the safe limit is active, because then
+        only a new measurement allows a stiffer wall.
         """
         if self.status != Status.OK or self.is_at_safe_limit:
             return []
@@ -155,7 +156,7 @@ class Recommendation:
             near = self.stiffness * float(top.stiffness) / float(self.stiffest.stiffness)
             return choose_wall(improved, self.wanted, top, near, COARSE).stiffness
         except InputError:
-            # At twice the rate a long delay may have more periods than the model supports.
+            # An improved scene may be invalid: at twice the rate a long delay may exceed the largest number of periods.
             return math.nan
 
     @cached_property
@@ -165,10 +166,10 @@ class Recommendation:
 
     @cached_property
     def grasps(self) -> dict[str, bool]:
-        """Stability of the wall in each of `zwidth.reference_grasps`, by name; empty unless the device is a `Device`.
+        """Dictionary that maps each of `zwidth.reference_grasps` to True if the wall is stable in this grasp.
 
-        The grasps hold a rotary device at radii of 10 to 100 mm. If the scene has an operator, the entry "released" is
-        the stability without the operator.
+        It is empty unless the device is a `Device`. The grasps hold a rotary device at radii of 10 to 100 mm. If the
+        scene has an operator, the entry "released" is the stability without the operator.
         """
         return {} if self.status != Status.OK else judge_grasps(self.scene)
 
@@ -194,11 +195,11 @@ class Recommendation:
         return write_wall(self.scene, language, self.cautions, limit)
 
     def lines(self) -> tuple[str, ...]:
-        """Return lines with the wall, its margins and its cautions, or the reason why no wall is recommended."""
+        """Return lines of text on the wall, its margins and its cautions, or the reason why no wall is recommended."""
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
-        # Compute the range for the printed K, because a negative lower end is sensitive to the rounding of K.
+        # Compute the stable range of B at the printed K, because a negative lower end depends strongly on K.
         intervals = tuple(map(tuple, self.scene.stable_damping(self.read[0]).tolist()))
         lower, upper = format_interval(
             *find_nearest_interval(intervals, self.virtual_damping), self.unit_system["N s/m"], self.read[2]
@@ -210,18 +211,18 @@ class Recommendation:
         return f"{self.spell_wall()}: {self.spell_limit()}", margins, *hands, *cautions
 
     def spell_wall(self) -> str:
-        """Return the recommended wall in words."""
+        """Return a text with K and B of the recommended wall, such as "K = 8 kN/m, B = 33 N s/m"."""
         (K, B, digits), units = self.read, self.unit_system
         return f"K = {format_stiffness(K, units, digits)}, B = {with_unit(B, units['N s/m'], digits)}"
 
     def spell_limit(self) -> str:
-        """Return, in words, the stiffness as a share of K_max and the active requirement."""
+        """Return a text with the stiffness of the wall as a percentage of K_max, and with the active requirement."""
         largest = float(self.stiffest.stiffness)
         share = f"{100.0 * self.stiffness / largest:.3g} % of K_max = {format_stiffness(largest, self.unit_system)}"
         return share if self.limited_by == "stiffness_fraction" else f"{share}; {self.spell_requirement()}"
 
     def spell_requirement(self) -> str:
-        """Return, in words, the active requirement, which limits the stiffness."""
+        """Return a text that names the active requirement, such as "limited by gain margin 2"."""
         bounded = (
             ", with B limited by the safe limit" if self.limited_by != "safe_limit" and self.is_at_safe_limit else ""
         )
@@ -229,14 +230,14 @@ class Recommendation:
 
     @property
     def is_at_safe_limit(self) -> bool:
-        """True if the safe limit is active: K or B of the wall lies on it."""
+        """True if the safe limit is active, i.e. K or B of the wall equals its bound."""
         limit = None if self.wanted.beyond_safe else self.scene.safe_limit
         ends = None if limit is None else limit.dampings(self.stiffness)
         at_end = ends is not None and any(math.isclose(self.virtual_damping, end, rel_tol=1e-3) for end in ends)
         return at_end or self.limited_by == "safe_limit"
 
     def spell_margins(self) -> str:
-        """Return the margins of the wall in words, each rounded conservatively."""
+        """Return a text with gain, phase and delay margin of the wall, each rounded to the safe side."""
         verdict = self.verdict
         if verdict is None:
             return "none"
@@ -245,7 +246,7 @@ class Recommendation:
         return f"gain {plain(gain, 3)}, phase {plain(phase, 3)} deg, delay {delay}"
 
     def spell_hands(self) -> str:
-        """Return the stability of the wall in the reference grasps in words; "" if there are none."""
+        """Return a text with the number of reference grasps in which the wall is stable; "" if none was evaluated."""
         labels = {name: stable for name, stable in self.grasps.items() if name != "released"}
         if not labels:
             return ""
@@ -255,7 +256,7 @@ class Recommendation:
         return f"stable in {count} reference grasps{radii}"
 
     def spell_passive(self) -> str:
-        """Return the passivity of the wall in words."""
+        """Return "yes" or "no" if the wall is passive or not; otherwise a text on why its passivity is not known."""
         passive = None if self.verdict is None else self.verdict.passive
         if passive and self.verdict is not None and self.verdict.passivity_margin < reserve_damping(self.scene):
             return "uncertain, because the fitted damping is"
@@ -263,7 +264,7 @@ class Recommendation:
         return {True: "yes", False: "no", None: f"not known {obstacle}".rstrip()}[passive]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all results as JSON values in SI units, with normalized values as well; None for unknown values."""
+        """Return a nested dictionary of all results as JSON values, in SI units and normalized; None if unknown."""
         scene, verdict, top = self.scene, self.verdict, self.stiffest
         judged = {} if verdict is None else verdict.as_dict()
         device = {name: value for name, value in scene.parameters().items() if name not in WALL}
@@ -286,12 +287,12 @@ class Recommendation:
                 "limited_by": self.limited_by,
                 "stiffness": self.stiffness,
                 "virtual_damping": self.virtual_damping,
-                # The number of significant digits with which K and B are printed.
+                # Number of significant digits with which K and B are printed.
                 "digits": None if verdict is None else self.read[2],
                 **{name: judged.get(name) for name in _JUDGED},
                 "stable": verdict is not None and verdict.stable,
                 "decay_time": float(decay_time(1.0 / np.float64(constant))),
-                # Filled in by the recommend study if it computes a step response.
+                # The recommend study sets this value if it computes a step response.
                 "settling_time": None,
             },
             "steps": [step._asdict() for step in self.steps],
@@ -301,21 +302,27 @@ class Recommendation:
             "notes": list(self.notes),
         }
         if self.limited_by == "stiffness_fraction":
-            # Repeat the value received, because the quotient may differ from it in the last digit.
+            # Replace the computed fraction by the value that the user gave, because both may differ in the last digit.
             result["recommended"]["stiffness_fraction"] = self.wanted.stiffness_fraction
         return to_json(result)
 
 
 def _describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -> list[str]:
-    """Return the notes on a safe limit: one on the limit with its reason, and one for each warning."""
+    """Return notes on the safe limit as a list of texts: its values and reason, then its warnings.
+
+    Args:
+        limit: the safe limit of the scene; None for none.
+        ignored: True if the recommendation ignores the limit.
+        units: unit system of the texts.
+    """
     if limit is None or (limit.forbids_all and not ignored):
-        # No note if the limit forbids all walls, because the recommendation's reason already states it.
+        # Return no note if the limit forbids all walls, because the reason of the recommendation states this.
         return []
     return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]
 
 
 class SceneAdvice(SceneOptima):
-    """Scene with the method `recommend`."""
+    """Base class of `zwidth.Scene` with the method `recommend`."""
 
     def recommend(
         self,

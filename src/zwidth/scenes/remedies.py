@@ -1,6 +1,8 @@
-"""Remedies for a limit cycle: changes of a single parameter that end it, found by simulation.
+"""Remedies for a limit cycle: changes of a single parameter that stop the oscillation, found by simulation.
 
-Symbols: K and B of the wall, Q the step of the encoder.
+A *trial* simulates the wall with one set of parameter values from several initial conditions; it comes to rest if every
+simulated response does (`zwidth.scenes.trials`). The search tries coarse values of each parameter, then fine values
+near the smallest change that succeeds. K and B are the stiffness and damping of the wall, Q is the step of the encoder.
 """
 
 from __future__ import annotations
@@ -19,9 +21,9 @@ from zwidth.words.unit_system import UnitSystem
 
 SPAN = 64.0  # largest factor by which a remedy changes its parameter
 COARSE = 12  # values of a parameter simulated over the whole span
-FINE = 16  # values simulated between the last oscillating value and the third coarse value after it
+FINE = 16  # values simulated between the last coarse value that oscillates and the third coarse value after it
 LONGEST_TRIAL = 20_000  # sampling periods per simulation of the search, to limit its run time
-RESERVE = 3  # of these values skipped after the first at rest, because the outcome is not monotone close to it
+RESERVE = 3  # fine values skipped after the first one at rest, because values close to it may oscillate again
 
 
 class _Candidates(NamedTuple):
@@ -32,17 +34,23 @@ class _Candidates(NamedTuple):
     increasing: bool
 
     def select(self, at_rest: np.ndarray) -> int:
-        """Return the index of the first value from which all trials come to rest; ``len(at_rest)`` if none does."""
+        """Return the smallest index from which on all trials come to rest; ``len(at_rest)`` if the last does not."""
         return len(at_rest) - int(np.argmin(np.append(at_rest[::-1], False)))
 
     def refine(self, index: int, present: float) -> _Candidates:
-        """Return values from the last oscillating one, excluded, through the selected one to the second after it."""
+        """Return finer values near the selected one.
+
+        Args:
+            index: index of the selected value; the finer values start after the value before it, which oscillates, and
+                end at the second value after it.
+            present: current value of the parameter, which precedes the first value.
+        """
         before = self.values[index - 1] if index else present or self.values[0] / 2
         values = np.geomspace(before, self.values[min(index + 2, len(self.values) - 1)], FINE + 1)[1:]
         return self._replace(values=values)
 
     def round(self, system: UnitSystem) -> _Candidates:
-        """Return the values to three significant digits, each rounded away from the parameter's current value."""
+        """Return the candidates with each value rounded to three significant digits, away from the current value."""
         values = [
             round_conservatively(value, "above" if self.increasing else "below", 3) for value in self.values.tolist()
         ]
@@ -54,7 +62,7 @@ class _Candidates(NamedTuple):
 
 
 def search_remedies(experiment: Experiment, cause: Literal["quantization", "saturation"]) -> list[Remedy]:
-    """Return, for each parameter, the smallest change after which every simulated response comes to rest."""
+    """Return for each parameter whose change stops the oscillation a range that starts at the smallest change."""
     hardware = experiment.hardware
     periods = min(experiment.periods, LONGEST_TRIAL)
     experiment = experiment._replace(periods=periods, decay=experiment.decay * periods / experiment.periods)
@@ -78,18 +86,19 @@ def search_remedies(experiment: Experiment, cause: Literal["quantization", "satu
 
 
 def _list_candidates(experiment: Experiment, cause: str) -> list[_Candidates]:
-    """Return the values to try of every parameter that may stop the oscillation."""
+    """Return the values to try, for each parameter whose change may stop the oscillation."""
     scene, hardware = experiment.scene, experiment.hardware
     K, B, Q = float(scene.wall.stiffness), float(scene.wall.virtual_damping), hardware.resolution
     factors = np.geomspace(1.0, SPAN, COARSE + 1)[1:]
     candidates = []
-    # Without friction a finer encoder does not help, because the limit cycle shrinks with Q but persists.
+    # Try a finer encoder only with friction: without friction the limit cycle becomes smaller with Q but persists.
     if cause == "quantization" and hardware.static > 0:
         candidates.append(_Candidates("resolution", Q / factors, False))
     if not isinstance(scene.device, LinearDevice):
         least = hardware.coulomb or (K * Q if cause == "quantization" else hardware.max_force) / SPAN
         candidates.append(_Candidates("coulomb", least * factors, True))
-    # Without friction no K or B helps, because under an external force of K Q/2 the encoder reading never settles.
+    # Do not try K and B without friction, because an external force of K Q/2 then sustains an oscillation for each
+    # K and B.
     if cause == "quantization" and not hardware.static:
         return [each.round(scene.unit_system) for each in candidates]
     if K > 0:
@@ -102,7 +111,7 @@ def _list_candidates(experiment: Experiment, cause: str) -> list[_Candidates]:
 
 
 def _try(experiment: Experiment, candidates: list[_Candidates]) -> list[np.ndarray]:
-    """Return, for each list of candidates, a boolean array that marks the values whose trials come to rest."""
+    """Run one trial per candidate value; return one boolean array per parameter, True if a trial comes to rest."""
     if not candidates:
         return []
     hardware, sizes = experiment.hardware, [len(each.values) for each in candidates]
@@ -111,7 +120,7 @@ def _try(experiment: Experiment, candidates: list[_Candidates]) -> list[np.ndarr
     ends = np.cumsum(sizes)
     for each, end in zip(candidates, ends, strict=True):
         table[each.parameter][end - len(each.values) : end] = each.values
-    # A trial with more Coulomb friction keeps the device's ratio of static to Coulomb friction.
+    # In trials with more Coulomb friction, increase the static friction in the same ratio, as in a real device.
     ratio = hardware.static / hardware.coulomb if hardware.coulomb else 1.0
     table["static"] = np.maximum(table["static"], ratio * table["coulomb"])
     return np.split(experiment.measure(**table).amplitude == 0, ends[:-1])

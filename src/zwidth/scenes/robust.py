@@ -1,9 +1,10 @@
 """Maximum stiffness and the stiffest wall for all rigid devices with parameters in given intervals.
 
-A device has the parameters m, b, T, t_d: mass, damping, sampling period and delay. The intervals of the four parameters
-form a box of devices. The *limit* of a device is its maximum stiffness K_max or, for a wall with damping B, the largest
-stable stiffness at this B. A pattern search over the box finds the weakest device, which has the smallest limit. It
-starts from the weakest device of a grid that contains all vertices of the box.
+A device has the parameters m, b, T, t_d: mass, damping, sampling period and delay. A wall has the stiffness K and the
+damping B. Normalized quantities are alpha = K T^2/m, beta = B T/m, delta = b T/m and d = t_d/T. The intervals of the
+four parameters form a box of devices. The *limit* of a device is its maximum stiffness K_max or, for a wall with
+damping B, the largest stable stiffness at this B. A pattern search over the box finds the weakest device, which has the
+smallest limit. It starts from the weakest device of a grid that contains all vertices of the box.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ Uncertain: TypeAlias = Interval | ArrayLike
 
 @compact_repr(attained="N/m", mass="kg", damping="N s/m", period="s", delay="s")
 class RobustStiffness(NamedTuple):
-    """The stiffness that every device of a box can render, and the weakest device found."""
+    """Largest stiffness that every device of a box can render, and the weakest device found, which limits it."""
 
     stiffness: Array
     attained: Array
@@ -61,7 +62,7 @@ class RobustStiffness(NamedTuple):
 
 @compact_repr(limit="N/m")
 class RobustWall(NamedTuple):
-    """One wall for all devices of a box, in N/m and N s/m, and the limit of such walls."""
+    """Wall that is stable on all devices of a box, in N/m and N s/m, and a stiffness that no such wall reaches."""
 
     stiffness: Array
     virtual_damping: Array
@@ -142,10 +143,10 @@ def robust_wall(*, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain,
 def _solve_boxes(
     solve: Callable[[np.ndarray, np.ndarray], tuple], names: tuple[str, ...], parameters: tuple[Uncertain, ...]
 ) -> list[np.ndarray]:
-    """Check the intervals, and solve each box.
+    """Check the intervals of the parameters, and compute the results of each box of devices.
 
     Args:
-        solve: maps the lower and upper ends of the parameters of one box, shape (4,) each, to a tuple of results.
+        solve: function that maps the lower and the upper ends of the four intervals of one box to a tuple of results.
         names: names of the results.
         parameters: mass, damping, period and delay: intervals or exact values, which broadcast.
 
@@ -179,32 +180,32 @@ def _solve_boxes(
             status = _check_box(low, high)
             results.append(solve(low, high) if status == Status.OK else (*[np.nan] * (len(names) - 1), status))
     columns = zip(*results, strict=True) if results else [()] * len(names)
-    # NaN in ``is_vertex`` means that the box is invalid.
+    # Convert NaN in ``is_vertex``, which marks an invalid box, to False.
     types = {"is_vertex": lambda values: np.equal(values, True), "status": lambda values: np.array(values, np.int32)}
     arrays = (types.get(name, np.array)(values) for name, values in zip(names, columns, strict=True))
     return [np.asarray(array).reshape(shape)[()] for array in arrays]
 
 
 def _check_box(low: np.ndarray, high: np.ndarray) -> Status:
-    """Return the status of a box: the lowest code of its errors, or OK."""
+    """Return the status code of a box given by the ends of its intervals: the lowest error code, or OK."""
     codes = quantity_status(**dict(zip(_NAMES, np.stack([low, high], -1), strict=True)))
     return Status(min(codes[codes > 0].tolist(), default=0)) if np.all(low <= high) else Status.INVALID_INPUT
 
 
 def _normalize_devices(devices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the unit of alpha in N/m, delta and d of devices, whose rows are (m, b, T, t_d)."""
+    """Return m/T^2 (the unit of alpha), delta and d of each device; the rows of ``devices`` are (m, b, T, t_d)."""
     mass, damping, period, delay = devices.T
     return mass / period / period, damping * period / mass, delay / period
 
 
 def _compute_max_stiffness(devices: np.ndarray) -> np.ndarray:
-    """Return K_max of each device."""
+    """Return K_max in N/m of each device; the rows of ``devices`` are (m, b, T, t_d)."""
     mass, damping, period, delay = devices.T
     return np.asarray(max_stiffness(mass=mass, damping=damping, period=period, delay=delay))
 
 
 def _stable_dampings(stiffness: float, devices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper end of the stable B at one K; NaN if no B is stable."""
+    """Return for each device the lower and the upper end of the stable interval of B at one K; NaN if none exists."""
     spring, delta, d = _normalize_devices(devices)
     alpha, damper = stiffness / spring, spring * devices[:, 2]
     lower, upper = (boundary_point(delta, d, alpha=alpha, side=side).beta for side in ("lower", "upper"))
@@ -212,17 +213,18 @@ def _stable_dampings(stiffness: float, devices: np.ndarray) -> tuple[np.ndarray,
 
 
 def _find_lowest(cost: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the device with the lowest cost (its limit) that a pattern search finds in a box, shape (1, 4).
+    """Find the device with the lowest cost in a box by a pattern search; return its parameters, shape (1, 4).
 
-    A pattern is a center and its neighbors, one step away along any of the uncertain parameters. It moves to the
-    neighbor with the lowest cost; if no neighbor improves on the center, the step is halved.
+    The cost of a device is its limit. A pattern consists of a center and its neighbors, one step away in any of the
+    uncertain parameters. It moves to the neighbor with the lowest cost; if no neighbor improves on the center, the step
+    is halved.
     """
     free = np.flatnonzero(high > low)
     moves = np.zeros((3**free.size, low.size))
     moves[:, free] = np.array(list(product((-1.0, 0.0, 1.0), repeat=free.size)))
 
     def values(shares: np.ndarray) -> np.ndarray:
-        """Return the costs of devices at relative positions in the box; infinite for NaN."""
+        """Return the costs of the devices at relative positions in the box, with infinity in place of NaN."""
         costs = cost(_place_devices(shares, low, high))
         return np.where(np.isnan(costs), np.inf, costs)
 
@@ -242,19 +244,19 @@ def _find_lowest(cost: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high
 
 
 def _place_devices(shares: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the devices at relative positions in a box; 0 and 1 are exactly its ends."""
+    """Return the devices at the relative positions ``shares`` in a box; 0 yields exactly ``low``, 1 ``high``."""
     inside = np.clip(low + shares * (high - low), low, high)
     return np.where(shares == 0.0, low, np.where(shares == 1.0, high, inside))
 
 
 def _build_grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
-    """Return a grid of relative positions with ``count`` values for each uncertain parameter."""
+    """Return all combinations of ``count`` relative positions, from 0 to 1, of each uncertain parameter of a box."""
     axes = [np.linspace(0.0, 1.0, count) if b > a else np.zeros(1) for a, b in zip(low, high, strict=True)]
     return np.array(list(product(*axes)))
 
 
 def _find_weakest_device(low: np.ndarray, high: np.ndarray) -> tuple:
-    """Return the fields of `robust_max_stiffness` for one box."""
+    """Return the fields of `RobustStiffness` for one box, given by the lower and the upper ends of its intervals."""
     device = _find_lowest(_compute_max_stiffness, low, high)
     attained = float(_compute_max_stiffness(device)[0])
     is_vertex = bool(np.all((device == low) | (device == high)))
@@ -262,30 +264,30 @@ def _find_weakest_device(low: np.ndarray, high: np.ndarray) -> tuple:
 
 
 def _find_common_limit(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
-    """Return the limit of walls that are stable on all of ``devices``, and a function from K to the B to set."""
+    """Return the limit of the walls that are stable on all devices, and a function from K to their middle B."""
 
     def common(stiffness: float) -> tuple[float, float]:
-        """Return the ends of the interval of B that is stable on all devices at one K; empty if they are reversed."""
+        """Return the ends of the interval of B that is stable on all devices at one K; reversed if it is empty."""
         lower, upper = _stable_dampings(stiffness, devices)
         return float(np.max(lower)), float(np.min(upper))
 
     def suits(stiffness: np.ndarray) -> np.ndarray:
-        """Return whether some B is stable on all devices."""
+        """Return whether at this K some B is stable on all devices."""
         lower, upper = common(float(stiffness))
         return np.asarray(lower < upper)
 
-    # Round up, because no wall reaches the limit.
+    # Round the limit up, because it must be a stiffness that no wall reaches.
     limit = float(np.nextafter(bisect(suits, np.float64(0.0), np.min(_compute_max_stiffness(devices))), np.inf))
     return limit, lambda stiffness: 0.5 * float(np.add(*common(stiffness)))
 
 
 def _find_wall(low: np.ndarray, high: np.ndarray) -> tuple:
-    """Return the fields of `robust_wall` for one box."""
+    """Return the fields of `RobustWall` for one box, given by the lower and the upper ends of its intervals."""
     devices = _place_devices(_build_grid(low, high, 2), low, high)
     limit, middle = _find_common_limit(devices)
     for _ in range(ROUNDS):
         stiffness = limit * (1.0 - BELOW)
-        # Search with the rounded damping, because this is the one that users set.
+        # Round the damping before the search for the weakest device, because users set the rounded value.
         damping = float(f"{middle(stiffness):.{DIGITS}g}")
 
         def find_limits(candidates: np.ndarray, damping: float = damping) -> np.ndarray:

@@ -65,7 +65,7 @@ class Scene(SceneAdvice):
         return WallSI(*(namespace(inside, part).where(inside, part, np.nan)[()] for part in walls))
 
     def stable_region(self) -> list[Outline]:
-        """Return closed outlines of the stable set, the largest first.
+        """Return the closed boundary curves (outlines) of the set of stable walls, the largest first.
 
         Returns:
             A list of outlines with ``stiffness`` in N/m and ``virtual_damping`` in N s/m; ``hole`` is True if unstable
@@ -97,5 +97,6 @@ TRACEABLE = (
     "spectral_radius",
     "to_si",
 )
-# Both exceptions are traceable and return numbers without units; a wrapper would slow down tests of single walls.
+# Do not wrap the two methods in ``but``: both are traceable and return numbers without units, so a wrapper has no
+# effect but would slow down calls for single walls.
 wrap_methods(Scene, traceable=TRACEABLE, but=("is_stable", "normalize_walls"))

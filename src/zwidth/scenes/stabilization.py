@@ -1,9 +1,9 @@
 """Remedies: ranges of single parameters in which the wall of a scene is stable, or in which an oscillation stops.
 
 `stabilize` returns the ranges of a scene with an unstable wall; K and B are its stiffness and damping. The stable
-intervals of K and B are exact. Other parameters are tried at values from the present one to the end of a search range,
-in the direction that usually stabilizes; the ends of the stable range are then found by bisection. Ranges in which a
-limit cycle stops are found by simulation in `zwidth.scenes.remedies`.
+intervals of K and B are exact. Other parameters are tried at values from the current one to the end of a search range,
+in the direction that usually stabilizes; bisection then finds the ends of the stable range. `zwidth.scenes.remedies`
+finds ranges in which a limit cycle stops, by simulation.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from zwidth.words.formatting import count_digits, format_interval, round_conserv
 from zwidth.words.quantities import FIELDS
 from zwidth.words.showing import compact_repr, find_unit
 
-# Parameters with their direction of search, 1 (increase) or -1 (decrease), and the largest factor of the change.
+# Parameters to search, by dotted path, each with its direction, 1 (increase) or -1 (decrease), and the largest factor
+# of the change.
 DIRECTIONS = {
     "delay": (-1, 1e3),
     "rate": (1, 10.0),
@@ -34,7 +35,7 @@ DIRECTIONS = {
     "actuator.time_constant": (-1, 1e3),
     "coupling.stiffness": (1, 1e3),
 }
-POINTS = 14  # values of a parameter tried, from the present one to the end of the search range
+POINTS = 14  # values of a parameter tried, from the current one to the end of the search range
 HALVINGS = 14  # bisection steps between two tried values
 
 NAMES = {
@@ -66,7 +67,7 @@ class Remedy(NamedTuple):
     note: str = ""  # quantity that stays constant, such as "the delay stays 1 ms"
 
     def spell(self, digits: int = 4) -> str:
-        """Return the range in words, both ends rounded into the range."""
+        """Return a text with the parameter and its range, whose ends are rounded towards the inside of the range."""
         name, unit = NAMES.get(self.parameter, self.parameter), find_unit(self, FIELDS[self.parameter].unit)
         note = f" ({self.note})" if self.note else ""
         if self.parameter == "velocity.samples":
@@ -81,7 +82,7 @@ class Remedy(NamedTuple):
 
 
 def count_steps(resolution: float) -> int:
-    """Return the counts per turn of an encoder with this step in rad."""
+    """Return the number of counts per revolution of an encoder whose steps are at most ``resolution``, in rad."""
     return math.ceil(2.0 * math.pi / resolution - 1e-6)
 
 
@@ -89,7 +90,7 @@ def count_steps(resolution: float) -> int:
 def stabilize(scene: SceneOptima) -> list[Remedy]:
     """Return the ranges of single parameters in which the wall of a scene is stable.
 
-    The list starts with stiffness and virtual damping, each with the stable interval nearest to its present value.
+    The list starts with stiffness and virtual damping, each with the stable interval nearest to its current value.
     Delay, rate, physical damping, velocity filter, actuator and coupling follow; each is searched in the direction that
     usually stabilizes and omitted if no value in the searched range is stable.
     """
@@ -109,17 +110,28 @@ def stabilize(scene: SceneOptima) -> list[Remedy]:
 
 
 def _round_inwards(low: float, high: float) -> tuple[float, float]:
-    """Return the ends of an open stable interval, rounded to stable values with the fewest digits, at least 4."""
+    """Return the ends of an open stable interval, rounded into it to as few digits as possible, at least 4."""
 
     def shorten(digits: int) -> tuple[float, float]:
-        """Round both ends into the interval."""
+        """Round both ends to this number of digits, towards the inside of the interval."""
         return round_conservatively(low, "above", digits), round_conservatively(high, "below", digits)
 
     return shorten(count_digits(lambda digits: shorten(digits)[0] < shorten(digits)[1]))
 
 
 def _search(scene: SceneOptima, path: str, present: float, direction: int, factor: float) -> list[Remedy]:
-    """Return the stable range nearest to the present value in one direction; an empty list if there is none."""
+    """Find the stable range of a parameter that is nearest to its current value in one direction.
+
+    Args:
+        scene: the scene.
+        path: dotted path of the parameter.
+        present: current value of the parameter.
+        direction: 1 to search larger values, -1 to search smaller ones.
+        factor: largest factor of the change.
+
+    Returns:
+        A list with one remedy, or an empty list if no stable value was found.
+    """
 
     def holds(value: float) -> bool | None:
         """Return whether the wall is stable; None for an invalid value (a cutoff above the Nyquist frequency)."""
@@ -149,7 +161,7 @@ def _search(scene: SceneOptima, path: str, present: float, direction: int, facto
 
 
 def _bisect(holds: Callable[[float], bool | None], inside: float, outside: float) -> float:
-    """Return the stable value closest to the end of a stable range, by bisection."""
+    """Find by bisection the end of a stable range between a stable and another value; return its last stable value."""
     for _ in range(HALVINGS):
         middle = 0.5 * (inside + outside)
         inside, outside = (middle, outside) if holds(middle) else (inside, middle)

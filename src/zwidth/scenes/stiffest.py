@@ -39,7 +39,7 @@ STIFFNESS_TOLERANCE = 1e-6
 
 @compact_repr(frequency="Hz", kind=RidgeKind)
 class StiffestWall(NamedTuple):
-    """The stiffest stable wall in SI units, with codes of `zwidth.RidgeKind` and `zwidth.Status`."""
+    """The stiffest stable wall in SI units, with the kind of its optimum (`zwidth.RidgeKind`) and a `zwidth.Status`."""
 
     stiffness: Array
     virtual_damping: Array
@@ -49,7 +49,7 @@ class StiffestWall(NamedTuple):
 
 
 def explain_missing(scene: SceneAnalysis, status: Any) -> str:
-    """Return the reason why a scene has no stiffest wall, from the status of the search."""
+    """Return a text with the reason why a scene has no stiffest wall, from the status code of the search."""
     if status == Status.NO_BOUNDARY:
         return "no stiffness is stable at any damping"
     explained = scene.loop.explain_limit() if status == Status.UNDECIDED else ""
@@ -74,22 +74,22 @@ def choose_damping(scene: SceneAnalysis, top: StiffestWall, stiffness: float) ->
 def find_connected_dampings(
     scene: SceneAnalysis, stiffness: float, negative_damping: bool | None = None
 ) -> list[tuple[float, float]]:
-    """Return the intervals of beta in which walls of a stiffness in N/m are stable and connected to K = 0."""
+    """Return the intervals of beta in which walls with the given K in N/m are stable and connected to K = 0."""
     least = -math.inf if allows_negative(scene, negative_damping) else 0.0
     return scene.loop.find_connected_beta(stiffness / scene.units.stiffness, least)
 
 
-# Search of `SceneOptima.required` for the parameter value at which K_max reaches a stiffness
-REACH = 30.0  # default range: from the present value divided by this factor to the present value times it
+# Settings of `SceneOptima.required`, which finds the parameter value at which K_max equals a required stiffness
+REACH = 30.0  # default range: from the current value divided by this factor to the current value times it
 N_POINTS = 25  # grid points in the range, geometrically spaced
-MAX_PERIODS = 1000.0  # longest delay of the default range, in periods, unless the present delay is longer
-SAME_VALUE = 1e-9  # relative distance from the present value below which a grid point is dropped in favor of that value
-# Relative distances from a crossing at which the surplus is evaluated. The smallest distance with different signs on
-# both sides confirms the crossing.
+MAX_PERIODS = 1000.0  # longest delay of the default range, in periods, unless the current delay is longer
+SAME_VALUE = 1e-9  # relative distance from the current value below which it replaces a grid point
+# Relative distances from a crossing at which the surplus is evaluated on both sides. The smallest distance at which
+# both values have different signs confirms the crossing.
 CONFIRMATION_DISTANCES = (1e-11, 1e-9, 1e-7, 1e-5)
-# Options of the minimizer of SciPy: absolute tolerance of the logarithm of the parameter at an extremum.
+# Options of the bounded minimizer of SciPy; ``xatol`` is the absolute tolerance of the logarithm of the parameter.
 EXTREMUM_OPTIONS = {"xatol": 1e-6}
-NO_STIFFNESS = 60.0  # negative of the surplus if no wall is stable; K_max then counts as exp(-60) times the required K
+NO_STIFFNESS = 60.0  # negative of the surplus if no wall is stable, which corresponds to K_max = exp(-60) K
 
 Side = Literal["above", "below", "everywhere", "nowhere"]
 
@@ -113,7 +113,7 @@ class RequiredValue(NamedTuple):
 
 
 def _read_stiffness(value: Any, unit: str) -> float:
-    """Return a required stiffness in its SI unit."""
+    """Convert a stiffness, a number or a text with a unit, to a float in the SI unit; raise `InputError` if <= 0."""
     stiffness = read_texts("stiffness", value, unit)
     if not (isinstance(stiffness, int | float | np.number) and math.isfinite(to_float(stiffness)) and stiffness > 0):
         raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in {unit})")
@@ -121,7 +121,7 @@ def _read_stiffness(value: Any, unit: str) -> float:
 
 
 def _get_present_value(scene: SceneAnalysis, parameter: str) -> float:
-    """Return the present value of a parameter; raise `InputError` if it cannot be varied continuously."""
+    """Return the current value of a parameter; raise `InputError` if the parameter cannot be varied continuously."""
     values = {path: value for path, value in scene.parameters().items() if path not in WALL}
     values["rate"] = 1.0 / values["period"]
     if not isinstance(parameter, str) or parameter not in values:
@@ -134,12 +134,13 @@ def _get_present_value(scene: SceneAnalysis, parameter: str) -> float:
 def _choose_range(
     scene: SceneAnalysis, parameter: str, now: float, within: tuple[Any, Any] | None
 ) -> tuple[float, float]:
-    """Return the range of a parameter to search: ``within`` if given, otherwise around the present value ``now``."""
+    """Return the range in which to search a parameter: ``within``, or by default around its current value ``now``."""
     if within is None:
         timing = scene.timing
         if not now > 0:
             raise InputError(f"within: {parameter} is 0 now; pass the range to search, such as within=(0.1, 10)")
-        # The run time increases with the square of the delay in periods; a cutoff is below the Nyquist frequency.
+        # Limit the range, because the run time increases with the square of the delay in periods, and because a cutoff
+        # must be below the Nyquist frequency.
         fixed = 0.0 if timing.in_periods else timing.delay
         longest = max(float(timing.delay / timing.period), MAX_PERIODS)
         ends = {
@@ -157,9 +158,10 @@ def _choose_range(
 
 
 def _find_extrema(surplus: Callable[[float], float], grid: list[float], values: list[float]) -> list[float]:
-    """Return the local maxima of negative surplus and the local minima of nonnegative surplus, between grid points.
+    """Return the parameter values of local extrema of the surplus at which its sign may differ from that on the grid.
 
-    At such an extremum the surplus may change its sign, which the grid points around it do not show.
+    These are maxima close to grid points with negative surplus, and minima close to those with nonnegative surplus.
+    ``values`` holds the surplus at the parameter values ``grid``.
     """
     from scipy.optimize import minimize_scalar
 
@@ -179,13 +181,13 @@ def _find_extrema(surplus: Callable[[float], float], grid: list[float], values: 
 
 
 def _find_crossing(surplus: Callable[[float], float], low: float, high: float) -> Crossing | None:
-    """Return the crossing between two values, confirmed by the sign of the surplus on both sides; None if it fails."""
+    """Find the crossing between two values by Brent's method; None unless the signs on both sides confirm it."""
     from scipy.optimize import brentq
 
     try:
         root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
     except ValueError:
-        # Brent's method evaluated a value at which K_max cannot be computed.
+        # Brent's method failed at a value at which K_max cannot be computed.
         return None
     value = math.exp(cast("float", root))
     for distance in CONFIRMATION_DISTANCES:
@@ -203,7 +205,7 @@ N_SAMPLES = 66  # values of B at which `best_damping` evaluates each stable inte
 
 @compact_repr()
 class BestDamping(NamedTuple):
-    """An optimal virtual damping in N s/m, with spectral radius, modulus margin and the code of `zwidth.Status`."""
+    """Optimal virtual damping in N s/m, with its spectral radius and modulus margin, and a code of `zwidth.Status`."""
 
     virtual_damping: float
     spectral_radius: float
@@ -212,7 +214,7 @@ class BestDamping(NamedTuple):
 
 
 class SceneOptima(SceneAnalysis):
-    """The methods of `zwidth.Scene` that search for a wall, or for a parameter value that a wall requires."""
+    """Base class of `zwidth.Scene` with methods that search for optimal walls and for required parameter values."""
 
     def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
         """Return the stiffest stable wall connected to K = 0, and the kind of its optimum.
@@ -220,7 +222,7 @@ class SceneOptima(SceneAnalysis):
         K_max is ``sup {K : some B is stable}`` over the pieces of the stable set that are connected to K = 0 by paths
         of stable walls. All other pieces are `islands`. If the device is unstable without a wall, no piece may be
         connected to K = 0; then the piece with the softest stable walls counts. With filters or flexible parts, the
-        stable set may be inclined near its tip, so that no softer wall is stable at the damping of the stiffest;
+        stable set may be inclined near the stiffest wall, so that no softer wall with the same damping is stable;
         `recommend` returns a wall for use.
 
         Args:
@@ -251,7 +253,7 @@ class SceneOptima(SceneAnalysis):
         alpha, beta, omega, kind, status = self.loop.stiffest(allows_negative(self, negative_damping))
         mass, period = (value if is_traced(value) else float(value) for value in (self.mass, self.timing.period))
         rate = mass / period
-        # Multiply in the same order as `zwidth.max_stiffness`, so that both results agree to the last digit.
+        # Multiply the factors in the same order as `zwidth.max_stiffness`, so that both results are equal.
         values = (alpha * rate / period, beta * rate, omega / (2.0 * math.pi * period), kind, status)
         return StiffestWall(*(value if is_jax(value) else np.asarray(value)[()] for value in values))
 
@@ -294,19 +296,19 @@ class SceneOptima(SceneAnalysis):
         Args:
             parameter: dotted path, such as "damping", "velocity.cutoff" or "rate".
             stiffness: required K_max in N/m, > 0.
-            within: range to search, 0 < low < high. By default from 1/30 to 30 times the present value, limited to
-                delays of at most 1,000 periods or the present delay.
+            within: range to search, 0 < low < high. By default from 1/30 to 30 times the current value, limited to
+                delays of at most 1,000 periods or the current delay.
             negative_damping: as for `max_stiffness`.
 
         Returns:
-            ``value``, the sufficient value closest to the present one; ``enough``, the side of it on which K_max is
-            sufficient ("above" or "below"), "everywhere" if it is in the whole range (``value`` is then the present
+            ``value``, the sufficient value closest to the current one; ``enough``, the side of it on which K_max is
+            sufficient ("above" or "below"), "everywhere" if it is in the whole range (``value`` is then the current
             value, or the closest end of the range), or "nowhere"; ``crossings``, all crossings found, each confirmed by
             K_max on both sides; ``range``, the range searched; ``status``, UNREACHABLE with NaN if K_max is below the
             required stiffness in the whole range.
 
         Numerics:
-            K_max is computed at the present value, at 25 values across the range, and at extrema between them that may
+            K_max is computed at the current value, at 25 values across the range, and at extrema between them that may
             reach the stiffness. Crossings are then found to a relative error of 1e-11. Peaks and dips narrower than the
             distance of these values may be missed.
 
@@ -322,7 +324,7 @@ class SceneOptima(SceneAnalysis):
         low, high = _choose_range(self, parameter, now, within)
 
         def surplus(value: float) -> float:
-            """Return the logarithm of K_max over the required stiffness; NaN if K_max cannot be computed."""
+            """Return the logarithm of the ratio of K_max to the required stiffness; NaN if K_max cannot be computed."""
             wall = self.replace(**{parameter: value}).max_stiffness(negative_damping=negative_damping)
             if wall.status == Status.NO_BOUNDARY:
                 return -NO_STIFFNESS
@@ -362,14 +364,15 @@ class SceneOptima(SceneAnalysis):
         best = min(confirmed, key=lambda crossing: abs(math.log(crossing.value / middle)))
         ends = sorted((middle, best.value))
         if any(ends[0] <= value <= ends[1] and math.isnan(surpluses[value]) for value in grid):
-            # K_max could not be computed between the present value and the crossing, so a closer one may exist.
+            # Report no value if K_max could not be computed between the current value and the crossing, because a
+            # closer crossing may exist there.
             return RequiredValue(math.nan, "nowhere", confirmed, (low, high), Status.NOT_CONVERGED)
         return RequiredValue(best.value, best.enough, confirmed, (low, high), Status.OK)
 
     def best_damping(
         self, stiffness: float | str | None = None, *, goal: Goal = "fast", negative_damping: bool | None = None
     ) -> BestDamping:
-        """Return the optimal virtual damping for one stiffness.
+        """Find the damping B at which a wall with the given stiffness settles fastest or is most robust.
 
         Args:
             stiffness: K in N/m, > 0; by default that of the wall of the scene.

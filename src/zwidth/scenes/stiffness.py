@@ -7,8 +7,8 @@ damping ``delta = b T/m``, the delay ``d = t_d/T`` in periods, and the largest s
     dK/dm = (a - delta a_delta)/T^2                     dK/db = a_delta/T
     dK/dT = (delta a_delta - d a_d - 2 a) m/T^3         dK/dt_d = a_d m/T^3
 
-with a_delta and a_d the partial derivatives of a. `zwidth.Scene` has the same for one scene with any parts, and
-searches for the parameter that a required stiffness needs.
+with a_delta and a_d the partial derivatives of a. `zwidth.Scene` computes the same for one scene with any parts, and
+finds the parameter value at which K_max equals a required stiffness.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from zwidth.words.xp import namespace
 
 
 def normalize_device(**quantities: ArrayLike) -> Normalized:
-    """Return the normalized device; raise `InputError` if a quantity, or a scalar delta or d, is out of range."""
+    """Convert mass, damping, period and delay to delta and d; raise `InputError` if a scalar is out of range."""
     device = normalize(**quantities)
     check_scalars({"delta": device.delta, "d": device.d})
     return device
@@ -67,14 +67,14 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
 
 
 def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
-    """Compute K_max from mass and period in SI units and the normalized damping and delay, for one class of delays."""
+    """Compute K_max in N/m from mass and period in SI units, delta and d; ``kind`` lists the classes of delays in d."""
     return ridge_kernel(delta, d, kind).alpha * (mass / period) / period
 
 
 def differentiate_max_stiffness(
     mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses
 ) -> tuple[Array, tuple[Array, ...]]:
-    """Return `max_stiffness_kernel` and its derivatives with respect to mass, period, delta and d."""
+    """Return K_max in N/m, and a tuple of its partial derivatives with respect to mass, period, delta and d."""
     slopes = slopes_kernel(delta, d, kind)
     scale = (mass / period) / period
     value = slopes.point.alpha * scale
@@ -138,12 +138,12 @@ def sensitivities(
 
 
 def _sensitivities_kernel(mass, damping, period, delay, delta, d, kind) -> Sensitivities:
-    """Compute the fields of `sensitivities` for one class of delays."""
+    """Compute K_max and its derivatives from parameters in SI units, delta and d; ``kind``: classes of delays in d."""
     xp = namespace(mass, delta, d)
     # If JAX traces the quantities, compile this part separately, so that the derivatives in delta and d are computed
     # once and not again for each quantity.
     slopes = slopes_kernel(delta, d, kind) if xp is np else compile_traced(slopes_kernel, (kind,))(delta, d)
-    # Entries of arrays that are out of range are NaN in delta or d; their status follows from the quantities.
+    # Compute the status of entries out of range from the quantities in SI units, because delta or d is NaN there.
     input_status = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
     status = xp.where(input_status == Status.OK, slopes.point.status, input_status).astype(np.int32)
     return Sensitivities(*stiffness_slopes(slopes, mass, period, delta, d), status)

@@ -1,7 +1,9 @@
-"""Estimate the share of devices on which a wall is stable, from parameters drawn within their tolerances (any loop).
+"""Monte Carlo estimate of the share of devices on which a wall is stable, for parameters with tolerances.
 
-If the wall must be stable on every device, use `zwidth.robust_wall`, which searches the whole box of devices. The share
-and its confidence interval are more useful if the vertices of the box hardly ever occur.
+`simulate_tolerances` draws the parameters of many devices at random within their tolerances, and decides on each device
+whether the wall of a scene is stable. All combinations of parameters within the tolerances form a box, whose vertices
+hardly ever occur in practice; if the wall must nevertheless be stable on every device of the box, use
+`zwidth.robust_wall`.
 """
 
 from __future__ import annotations
@@ -23,10 +25,10 @@ MAX_SAMPLES = 1_000_000  # largest number of drawn devices; bounds the memory
 
 
 class Tolerance(NamedTuple):
-    """Tolerance of a parameter, relative to its nominal value.
+    """Random distribution of a parameter around its nominal value.
 
-    Uniform: between ``(1 - share)`` and ``(1 + share)`` times the nominal value. Normal: ``share`` is the standard
-    deviation.
+    A uniform distribution extends from ``(1 - share)`` to ``(1 + share)`` times the nominal value; a normal
+    distribution has a standard deviation of ``share`` times the nominal value.
     """
 
     share: float
@@ -38,7 +40,7 @@ class Tolerance(NamedTuple):
 )
 @dataclass(frozen=True)
 class ToleranceEstimate:
-    """Results of `simulate_tolerances`."""
+    """Results of `simulate_tolerances`: the share of devices on which the wall is stable, and stiffness limits."""
 
     samples: int  # number of drawn devices
     stable: float  # share of drawn devices on which the wall of the scene is stable
@@ -109,7 +111,10 @@ def simulate_tolerances(
 
 
 def _draw(scene: Scene, tolerances: dict[str, Any], count: int, seed: int) -> dict[str, np.ndarray]:
-    """Check the tolerances, and return ``count`` random values of each parameter with a tolerance."""
+    """Draw ``count`` random values of each parameter with a tolerance, and return them as arrays by dotted path.
+
+    Raises `InputError` for an invalid tolerance.
+    """
     parameters = scene.parameters()
     nominal = {name: value for name, value in parameters.items() if isinstance(value, float) and name not in WALL}
     generator = np.random.default_rng(seed)
@@ -131,30 +136,51 @@ def _draw(scene: Scene, tolerances: dict[str, Any], count: int, seed: int) -> di
 
 
 def _draw_factors(generator: np.random.Generator, share: float, distribution: str, count: int) -> np.ndarray:
-    """Return ``count`` random factors on the nominal value of a parameter, all positive."""
+    """Draw random positive factors by which the nominal value of a parameter is multiplied.
+
+    Args:
+        generator: generator of random numbers.
+        share: half-width of a uniform distribution around 1, or standard deviation of a normal one.
+        distribution: "uniform" or "normal".
+        count: number of factors.
+    """
     if distribution == "uniform":
         return generator.uniform(1.0 - share, 1.0 + share, count)
     factors = generator.normal(1.0, share, count)
     while np.any(bad := factors <= 0):
-        # Draw again values at least three standard deviations below the mean, because parameters must be positive.
+        # Draw new values for factors <= 0, at least three standard deviations below 1, because parameters must be
+        # positive.
         factors[bad] = generator.normal(1.0, share, np.count_nonzero(bad))
     return factors
 
 
 def compute_stiffness_quantile(limits: np.ndarray, share: float) -> float:
-    """Return the stiffness up to which at least ``share`` of the devices is stable; 0 if too few are stable.
+    """Return the largest stiffness at which walls are stable on at least a given share of the devices.
+
+    The result is 0 if on too few devices any wall is stable.
 
     Args:
-        limits: largest stable stiffness of each device; NaN if none is stable.
-        share: required share of stable devices.
+        limits: largest stiffness of a stable wall on each device; NaN if no wall is stable on it.
+        share: required share of devices, between 0 and 1.
     """
     ordered = np.sort(np.where(np.isnan(limits), 0.0, limits))
-    # Add 1e-9 before rounding down, because e.g. (1 - 0.9) 10 is slightly below 1 in floating point.
+    # Add 1e-9 before rounding down, because rounding errors make a product such as (1 - 0.9) 10 slightly less than 1.
     return float(ordered[int(np.floor((1.0 - share) * ordered.size + 1e-9))])
 
 
 def _compute_confidence_interval(stable: int, count: int) -> tuple[float, float]:
-    """Return the Clopper-Pearson confidence interval of the share of stable devices."""
+    """Return a confidence interval for the share of all devices on which the wall is stable, from a random sample.
+
+    The interval is that of Clopper and Pearson (1934) with the level `CONFIDENCE`. Its ends are quantiles of beta
+    distributions.
+
+    Args:
+        stable: number of drawn devices on which the wall is stable.
+        count: number of drawn devices.
+
+    Returns:
+        Lower and upper end of the interval, between 0 and 1.
+    """
     from scipy.special import betaincinv
 
     rest = (1.0 - CONFIDENCE) / 2.0

@@ -1,9 +1,9 @@
-"""Variants of a scene with some parameters changed, for tolerances and uncertain devices: stability and limits of each.
+"""Stability and stiffness limits of many variants of a scene, for tolerances and uncertain devices.
 
-`Variants` evaluates any scene, one variant after the other. `RigidVariants` evaluates all variants of a rigid mass with
-the backward difference at once, by closed forms on arrays. Results have one entry per variant. K and B are the
-stiffness and damping of a wall in SI units; ``rate`` is m/T, ``delta = b T/m``, and d is the delay in periods T, with
-the mass m and damping b of the device.
+A *variant* is the scene with other values of some parameters. `Variants` evaluates any scene, one variant after the
+other. `RigidVariants` evaluates all variants of a rigid mass with the backward difference at once, by closed forms on
+arrays. Results have one entry per variant. K and B are the stiffness and damping of a wall in SI units; ``rate`` is
+m/T, ``delta = b T/m``, and d is the delay in periods T, with the mass m and damping b of the device.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.verdict import is_stable
 
 RIGID_PARAMETERS = ("mass", "damping", "period", "delay")
-MAX_PIECES = 6  # largest number of pieces that NumPy evaluates faster than the compiled function; more are compiled
+MAX_PIECES = 6  # largest number of pieces of arrays that NumPy evaluates faster than a function compiled by JAX
 
 
 class Variants:
@@ -38,18 +38,19 @@ class Variants:
         (self.count,) = {values.size for values in drawn.values()}
 
     def scenes(self) -> Iterator[Any]:
-        """Yield each variant as a scene."""
+        """Yield the variants one after the other, each as a scene with its parameter values."""
         for k in range(self.count):
             yield self.scene.replace(**{name: float(values[k]) for name, values in self.drawn.items()})
 
     def labels(self, stiffness: float, damping: float) -> np.ndarray:
-        """Return whether a wall is stable on each variant."""
+        """Return a boolean array that states for each variant whether a wall is stable."""
         return np.array([bool(scene.is_stable(stiffness, damping)) for scene in self.scenes()])
 
     def find_stiffness_limits(self, damping: np.ndarray) -> np.ndarray:
-        """Return the largest K up to which walls are stable, for each variant and each B; 0 if no wall is stable.
+        """Return the upper end of the stable interval of K for each variant and each B; 0 if no wall is stable.
 
-        The stable interval starts at K = 0, or is the softest one with K > 0 if the device is unstable without a wall.
+        The interval is the one that starts at K = 0. If the device is unstable without a wall, it is the interval with
+        the softest walls of K > 0.
         """
         intervals = (np.moveaxis(scene.stable_stiffness(damping), -1, 0) for scene in self.scenes())
         if self.scene.loop.least_stiffness(-np.inf) is not None:
@@ -71,7 +72,8 @@ class RigidVariants(Variants):
 
     def __init__(self, scene: Any, drawn: dict[str, np.ndarray]) -> None:
         super().__init__(scene, drawn)
-        # The operator is coupled rigidly; its mass and damping do not vary with the device.
+        # Add the mass and damping of a rigidly coupled operator after drawing those of the device, because the operator
+        # does not vary.
         operator = {"mass": scene.mass - scene.device.mass, "damping": scene.damping - scene.device.damping}
         nominal = scene.parameters()
         mass, damping, self.period, delay = (
@@ -81,7 +83,7 @@ class RigidVariants(Variants):
         with np.errstate(all="ignore"):
             self.rate = mass / self.period
             self.delta = damping / self.rate
-            # d depends on the period only if the delay was given in seconds.
+            # Vary d with the period only if the delay was given in seconds.
             relevant = {"delay"} if scene.timing.in_periods else {"delay", "period"}
             self.d = delay / self.period if relevant & set(drawn) else np.full(self.count, float(scene.d))
 
@@ -97,7 +99,7 @@ class RigidVariants(Variants):
 
     @np.errstate(all="ignore")
     def find_damping_limits(self, stiffness: float, side: str) -> np.ndarray:
-        """Return the smallest ("lower" side) or largest ("upper") stable B of each variant at one K; NaN if none."""
+        """Return the smallest ("lower" side) or largest ("upper" side) stable B of each variant at K; NaN if none."""
         alpha = stiffness * self.period / self.rate
         point = self.evaluate(
             lambda *args: boundary_point(*args[:2], alpha=args[2], side=side).beta, self.delta, self.d, alpha
@@ -111,7 +113,7 @@ class RigidVariants(Variants):
 
     @staticmethod
     def evaluate(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
-        """Evaluate a function of arrays, split into pieces if NumPy is then faster than the compiled function.
+        """Evaluate a function of arrays, in pieces if NumPy is then faster than code compiled by JAX.
 
         A function called with at most ``FEW`` elements runs in NumPy; with more elements JAX compiles it.
         """

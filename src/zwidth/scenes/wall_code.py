@@ -28,12 +28,13 @@ from zwidth.words.formatting import format_wall, with_unit
 from zwidth.words.unit_system import UnitSystem
 
 _COLUMNS = 100  # characters per line of a comment
-# Largest imaginary part of a real root, relative to its modulus; covers rounding errors.
+# Largest ratio of imaginary part to modulus at which a root is treated as real, because rounding errors cause a small
+# imaginary part.
 REAL_TOLERANCE = 1e-13
 
 
 def _describe_call(system: UnitSystem) -> tuple[str, str]:
-    """Return two lines that describe argument and result of the function that a control loop calls."""
+    """Return two lines of comment on the argument and the result of the generated function."""
     position, force = ("angle in rad", "torque") if system.rotary else ("position in m", "force")
     return (
         f"x is the {position}, 0 at the surface of the wall and positive inside of it; the {force} on the device is",
@@ -42,35 +43,36 @@ def _describe_call(system: UnitSystem) -> tuple[str, str]:
 
 
 def _describe_cautions(scene: SceneParts, cautions: Sequence[str]) -> list[str]:
-    """Return the lines on the safe limit and the cautions in the comment at the head of a program."""
+    """Return the lines of comment on the safe limit and the cautions for the head of a program."""
     limit, texts = scene.safe_limit, [f"CAUTION: {caution}" for caution in cautions]
     if limit is not None:
         texts += [f"Safe limit: {limit.describe(scene.unit_system)}", *(f"Warning: {text}" for text in limit.warnings)]
         if not limit.allows(float(scene.wall.stiffness), float(scene.wall.virtual_damping)):
             texts.insert(0, "WARNING: this wall exceeds the safe limit; it may be unstable.")
-    # Replace character sequences that would end the comment or start an escape, because the texts come from a file.
+    # Replace character sequences that would end the comment or start an escape sequence, because the texts may contain
+    # arbitrary characters from a file.
     plain_texts = (text.replace("*/", "* /").replace('"', "'").replace("\\", "/") for text in texts)
     return [line for text in plain_texts for line in textwrap.wrap(text, _COLUMNS)]
 
 
 def find_sections(estimate: Estimate) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Return the sections after the difference over the window.
+    """Return the sections of a velocity estimate, which follow its difference over a window.
 
     Returns:
         Numerator and denominator of each section in powers of zeta, highest power first, both of the same length 2
         (first order) or 3. The denominator starts with 1.
     """
-    # Factors at z = 0 have the offset 1 from z = 1.
+    # Include the roots at z = 0 as offsets ``1 - z = 1``.
     at_zero = [1.0] * abs(estimate.lag)
     zeros = _find_factors(np.append(estimate.zeros, at_zero if estimate.lag < 0 else []))
     poles = _find_factors(np.append(estimate.poles, at_zero if estimate.lag > 0 else []))
     if any(len(factor) == 3 for factor in (*zeros, *poles)):
         zeros, poles = _pair(zeros), _pair(poles)
     poles.sort(key=len, reverse=True)
-    # Zeros at z = 1 come first, so that the input of the following sections stays small.
+    # Order the zeros so that those at z = 1 come first, because the input of the following sections then stays small.
     zeros.sort(key=lambda factor: (-len(factor), abs(factor[-1])))
-    # There are at most as many zeros as poles, so each numerator has a denominator of the same length. Missing
-    # numerators are 1.
+    # Fill up the numerators with 1, because an estimate has at most as many zeros as poles. Each numerator then has a
+    # denominator of at least its length.
     zeros += [(1.0,)] * (len(poles) - len(zeros))
     return [
         ((0.0,) * (len(denominator) - len(numerator)) + numerator, denominator)
@@ -79,9 +81,9 @@ def find_sections(estimate: Estimate) -> list[tuple[tuple[float, ...], tuple[flo
 
 
 def _find_factors(roots: np.ndarray) -> list[tuple[float, ...]]:
-    """Return the real factors of a polynomial in zeta, by the offsets ``1 - z`` of its roots.
+    """Return the coefficients of the real factors of a polynomial in zeta, from the offsets ``1 - z`` of its roots z.
 
-    A real root yields ``zeta + offset``, a complex pair a polynomial of second order.
+    A real root yields the factor ``zeta + offset``, a complex pair a factor of second order.
     """
     offsets: list[complex] = roots.tolist()
     pairs = [offset for offset in offsets if offset.imag > REAL_TOLERANCE * abs(offset)]
@@ -90,14 +92,14 @@ def _find_factors(roots: np.ndarray) -> list[tuple[float, ...]]:
 
 
 def _pair(factors: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
-    """Multiply factors of first order in pairs; one remains if their number is odd."""
+    """Return factors in which those of first order are multiplied in pairs; one remains if their number is odd."""
     single = sorted((factor for factor in factors if len(factor) == 2), key=lambda factor: abs(factor[1]))
     products = [tuple(np.polymul(*two).tolist()) for two in zip(single[::2], single[1::2], strict=False)]
     return [factor for factor in factors if len(factor) == 3] + products + single[2 * len(products) :]
 
 
 class WallProgram(NamedTuple):
-    """Program of a wall as statements that are valid in C and Python, except for the mark ``@`` before states."""
+    """Program of a wall as statements that are valid in C and Python once the mark ``@`` before states is replaced."""
 
     head: str  # comment at the head of the program
     window: int  # length of the difference in periods; 0 for none
@@ -112,14 +114,21 @@ class WallProgram(NamedTuple):
 def write_wall(
     scene: SceneParts, language: str = "c", cautions: Sequence[str] = (), max_force: float = math.inf
 ) -> str:
-    """Return a wall as source code (`zwidth.scenes.recommendation.Recommendation.code`)."""
+    """Return the source code of the wall of a scene and its velocity estimate.
+
+    Args:
+        scene: the scene with the wall.
+        language: "c" or "python".
+        cautions: sentences to include in the comment at the head.
+        max_force: largest force of the motor in N, to which the code limits the force.
+    """
     check_choice("language", language, ("c", "python"))
     program = build_program(scene, cautions, max_force)
     return _write_c(program) if language == "c" else _write_python(program)
 
 
 def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: float = math.inf) -> WallProgram:
-    """Return the wall of a scene and its velocity estimate as statements."""
+    """Build the statements that compute the force of the wall of a scene; the arguments are those of `write_wall`."""
     period = float(scene.timing.period)
     estimate = scene.velocity.estimate(period)
     count, gain = estimate.window, float(estimate.gain) / period
@@ -127,7 +136,8 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
         force = [f"u = (x - @past[@next]) / {count}", "@past[@next] = x", f"@next = (@next + 1) % {count}"]
     else:
         force = ["u = x - @x" if count else "u = x", "@x = x"]
-    # At rest a difference is 0, and so are all states after it. Without a difference the input is u = x.
+    # Start at rest. The output of a difference is then 0, and so are the states of all sections after it. Without a
+    # difference the first section has the constant input u = x.
     sections = find_sections(estimate)
     start, states = [] if count or not sections else ["u = x"], []
     for number, (numerator, denominator) in enumerate(sections):
@@ -136,7 +146,7 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
         start += [f"{name} = 0.0" for name in inner] + [f"{last} = " + ("0.0" if count else f"u / {denominator[-1]!r}")]
         start += [] if count or number == len(sections) - 1 else [f"u = {numerator[-1]!r} * {last}"]
         if numerator == (1.0, 1.0) and denominator[-1] != 0:
-            # The section has a zero at z = 0: use the usual form of a first-order low-pass.
+            # If the section has a zero at z = 0, write it as q += a0 (u - q), the usual form of a first-order low-pass.
             force += [f"{last} += {denominator[-1]!r} * (u - {last})", f"u = {last}"]
             start = [line if line != f"{last} = u / {denominator[-1]!r}" else f"{last} = u" for line in start]
             gain /= denominator[-1]
@@ -154,7 +164,7 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
 
 
 def _write_c(program: WallProgram) -> str:
-    """Return the program in C99."""
+    """Return the source code of a program in C99, with a struct for its states and two functions."""
     count = program.window
     members = [f"double past[{count}]", "int next"] if count > 1 else ["double x"]
     begin = [f"for (int k = 0; k < {count}; k++) wall->past[k] = x", "wall->next = 0"] if count > 1 else ["wall->x = x"]
@@ -183,7 +193,7 @@ def _write_c(program: WallProgram) -> str:
 
 
 def _write_python(program: WallProgram) -> str:
-    """Return the program as a class in Python."""
+    """Return the source code of a program as a Python class with the method ``force``."""
     count = program.window
     begin = [f"@past = [x] * {count}", "@next = 0"] if count > 1 else ["@x = x"]
     limit, law = program.max_force, program.law

@@ -26,9 +26,9 @@ from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
 from zwidth.words.status import Status
 from zwidth.words.units import to_float
 
-# Default requirements if the user gives none. Reasons: docs/guides/my-device.md.
-DEFAULT_PHASE_MARGIN = 30.0  # degrees
-DEFAULT_GAIN_MARGIN = 2.0  # factor on K and B together, 6 dB
+# Requirements that apply if the user gives none; docs/guides/my-device.md gives the reasons for these values.
+DEFAULT_PHASE_MARGIN = 30.0  # smallest phase margin, in degrees
+DEFAULT_GAIN_MARGIN = 2.0  # smallest gain margin, a factor on K and B together; equals 6 dB
 
 SAMPLES = 18  # values of B per stiffness; a weakly damped device is passive only in a small part of its stable range
 NEAR = 5.0  # ratio of the tolerance of the best B to that of K; B may be less accurate, because its optimum is flat
@@ -70,7 +70,7 @@ class Wanted(NamedTuple):
         beyond_safe: bool = False,
         grasps: Grasps | None = None,
     ) -> Wanted:
-        """Return the requirements, with defaults if none is given; raise `InputError` for an invalid value."""
+        """Return the requirements after a check of the arguments of `recommend`, with defaults if none is given."""
         ranges = {"stiffness_fraction": FRACTION, **RANGES}
         limits = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
         for name, value in limits.items():
@@ -94,7 +94,7 @@ class Wanted(NamedTuple):
         )
 
     def spell(self, name: str) -> str:
-        """Return a requirement in words."""
+        """Return a text that describes the requirement ``name``, a field of `Wanted` or "safe_limit"."""
         return {
             "stiffness_fraction": f"{100.0 * (self.stiffness_fraction or 1.0):.4g} % of K_max",
             "gain_margin": f"gain margin {self.gain_margin:g}" if self.gain_margin else "",
@@ -111,7 +111,7 @@ class Wanted(NamedTuple):
 
 
 class WallChoice(NamedTuple):
-    """The stiffest wall with the required margins, or the reason why none exists."""
+    """The stiffest wall that satisfies the requirements, or the reason why none exists."""
 
     stiffness: float  # in N/m; NaN if no wall exists
     damping: float  # virtual damping in N s/m; NaN if no wall exists
@@ -122,7 +122,7 @@ class WallChoice(NamedTuple):
 
 
 def list_grasped_scenes(scene: SceneOptima, wanted: Wanted) -> list[SceneOptima]:
-    """Return the scene in each required grasp, and without its operator if grasps are required and it has one."""
+    """Return copies of the scene in each required grasp; if the scene has an operator, also one without operator."""
     if not isinstance(scene.device, Device) or wanted.grasps == "none":
         return []
     pairs = list_grasps(scene.unit_system.rotary)
@@ -131,10 +131,11 @@ def list_grasped_scenes(scene: SceneOptima, wanted: Wanted) -> list[SceneOptima]
 
 
 def measure_slack(scene: SceneOptima, wanted: Wanted, grasped: Sequence[SceneOptima] = ()) -> Slack:
-    """Return a function of K in N/m and B in N s/m that returns the slack of each requirement on margins.
+    """Return a function that computes the slack of each requirement for walls with K in N/m and B in N s/m.
 
-    The wall must also be stable in every scene of ``grasped``. The slack of this requirement is the modulus margin of
-    the wall, so that a search for the largest slack prefers well-damped walls.
+    The requirements are those on margins and passivity in ``wanted``, and stability in every scene of ``grasped``. The
+    slack of the latter is the modulus margin of the wall, so that a search for the largest slack prefers well-damped
+    walls.
     """
     device_damping = float(scene.device.damping)
     reserve = 0.0 if wanted.beyond_safe else reserve_damping(scene)
@@ -142,7 +143,7 @@ def measure_slack(scene: SceneOptima, wanted: Wanted, grasped: Sequence[SceneOpt
     needed_margins += ["modulus_margin"] if grasped else []
 
     def slack(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
-        """Return the slack of each requirement for walls of one stiffness."""
+        """Return the slack of each requirement by name, for walls with one stiffness and several dampings."""
         alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, damping))
         stable, slacks = scene.loop.labels(alpha, beta), {}
         margins: Any = None
@@ -166,7 +167,7 @@ def measure_slack(scene: SceneOptima, wanted: Wanted, grasped: Sequence[SceneOpt
 
 
 def _is_stable_in_grasp(grasped: SceneOptima, stiffness: float, damping: Any) -> Any:
-    """Return whether walls are stable in a grasp, both with K and B and with ``GRASP_GAIN`` times K and B."""
+    """Return whether walls with K and B, and walls with both multiplied by ``GRASP_GAIN``, are stable in a grasp."""
     return np.all([grasped.is_stable(gain * stiffness, gain * damping) for gain in (1.0, GRASP_GAIN)], axis=0)
 
 
@@ -178,7 +179,7 @@ def find_stiffest(
     width: float = WIDTH,
     safe: SafeLimit | None = None,
 ) -> tuple[float, float]:
-    """Return K and B of the stiffest wall whose slack is nonnegative; NaN if no wall was found.
+    """Find the stiffest wall whose slack is nonnegative, and return its K and B; NaN if no such wall is found.
 
     Args:
         scene: the scene.
@@ -191,11 +192,11 @@ def find_stiffest(
     unit, dampings = scene.units.virtual_damping, {}
 
     def best_slack(log_stiffness: float) -> float:
-        """Return the slack of a stiffness with its best damping, at most 1."""
+        """Return the slack of a stiffness with the best damping, limited to the range from -1 to 1."""
         stiffness = math.exp(log_stiffness)
 
         def cost(beta: Any) -> np.ndarray:
-            """Return the negative of the smallest slack."""
+            """Return the negative of the smallest slack of all requirements, which the best damping minimizes."""
             return -np.min(list(slack(stiffness, beta * unit).values()), axis=0)
 
         intervals = find_connected_dampings(scene, stiffness)
@@ -208,7 +209,8 @@ def find_stiffest(
         lowest, beta = min(dips, default=(1.0, math.nan))
         if lowest <= 0:
             dampings[log_stiffness] = beta * unit
-        # Keep the sign and limit the size, because false_position ends at values close to 0.
+        # Keep the sign of the slack, but keep its magnitude above 1e-12, because `false_position` stops at values close
+        # to 0.
         return min(max(-lowest, 1e-12), 1.0) if lowest <= 0 else max(min(-lowest, -1e-12), -1.0)
 
     top, softest = math.log(most), scene.loop.least_stiffness(-math.inf)
@@ -235,13 +237,13 @@ def find_stiffest(
     wall = most if log_stiffness == top else math.exp(log_stiffness), dampings[log_stiffness]
     if wall[0] == most:
         return wall
-    # Round to six digits, which are easier to type, if the rounded wall satisfies the requirements.
+    # Round K and B to six digits, which are easier to type, if the rounded wall satisfies the requirements.
     short = float(f"{wall[0]:.6g}"), float(f"{wall[1]:.6g}")
     return short if min(map(float, slack(*short).values())) >= 0 else wall
 
 
 def _clip(intervals: list[tuple[float, float]], low: float, high: float) -> list[tuple[float, float]]:
-    """Return the intersections of intervals with [low, high]."""
+    """Return the nonempty intersections of intervals with the interval from ``low`` to ``high``."""
     clipped = [(max(start, low), min(end, high)) for start, end in intervals]
     return [(start, end) for start, end in clipped if start <= end]
 
@@ -249,10 +251,18 @@ def _clip(intervals: list[tuple[float, float]], low: float, high: float) -> list
 def choose_wall(
     scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None = None, width: float = WIDTH
 ) -> WallChoice:
-    """Choose the stiffest wall of a scene that satisfies the requirements; ``top`` is its stiffest stable wall."""
+    """Choose the stiffest wall of a scene that satisfies the requirements.
+
+    Args:
+        scene: the scene.
+        wanted: the requirements.
+        top: the stiffest stable wall of the scene.
+        near: initial guess of K in N/m.
+        width: relative tolerance of K.
+    """
     grasps, active = list_grasped_scenes(scene, wanted), list[SceneOptima]()
     free = choice = _choose_free(scene, wanted, top, near, width, active)
-    # Require only the grasps that destabilize a chosen wall, because each grasp makes the search slower.
+    # Require stability only in grasps that destabilize a chosen wall, because each grasp makes the search slower.
     while choice.status == Status.OK and (
         unstable := [
             grasped for grasped in grasps if not _is_stable_in_grasp(grasped, choice.stiffness, choice.damping)
@@ -273,7 +283,10 @@ def _choose_free(
     width: float,
     grasped: Sequence[SceneOptima],
 ) -> WallChoice:
-    """Choose the wall by all requirements, but require stability only in the grasps of ``grasped``."""
+    """Choose the stiffest wall that satisfies all requirements, with stability only in the grasps of ``grasped``.
+
+    The other arguments are those of `choose_wall`.
+    """
     nan = math.nan
     if top.status != Status.OK:
         return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))
@@ -283,7 +296,7 @@ def _choose_free(
         if safe.forbids_all:
             why = "; ".join(safe.warnings) or safe.reason or "the safe limit is 0"
             return WallChoice(nan, nan, "", Status.UNREACHABLE, f"no wall is safe: {why}")
-        # Apply the same fraction to the safe limit as to K_max, because both need the same reserve.
+        # Limit K to the same fraction of the safe limit as of K_max, because both limits need the same reserve.
         share = wanted.safe_share * safe.stiffness
         most, active = (share, "safe_limit") if share < most else (most, active)
     usual, slack = choose_damping(scene, top, most), measure_slack(scene, wanted, grasped)
