@@ -129,7 +129,7 @@ def _list_starts(best: FittedModel, bank: PoleBank) -> Iterator[tuple[int, int, 
                 yield 2, modes, np.r_[start, _DAMPING_RATIO, theta[3:]]
     elif lag == 1:
         yield 2, modes, np.r_[theta[:4], _DAMPING_RATIO, theta[4:]]
-    # Start with mass ratio 0 and zero free response of the new mode, so that the modeled positions are those of ``best``.
+    # Start with mass ratio 0 and zero free response of the new mode, so that the model reproduces ``best`` exactly.
     rigid_states, states = np.split(theta[first:-2], [2 * logs])
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
     complex_poles = bank.select(bank.ratio < 1.0)

@@ -375,7 +375,7 @@ def read_step(resolution: Any) -> tuple[float, bool | None]:
 
 
 def join_logs(motions: Sequence[LoggedMotion], period: float | None) -> dict[str, Any]:
-    """Combine several logs of one axis into keyword arguments of `zwidth.fit_log`; the period replaces missing times."""
+    """Combine logs of one axis into keyword arguments of `zwidth.fit_log`; the period replaces missing times."""
     if len({motion.rotary for motion in motions}) > 1:
         raise InputError("logs: some have angles, others lengths; fit them separately")
     steps = {motion.resolution for motion in motions}

@@ -230,7 +230,7 @@ class DeviceEstimate:
         return None
 
     def bound_measured_stiffness(self, confidence: float) -> float:
-        """Return the lower confidence limit, in N/m, of the onset of instability at the largest measured B; 0 for a log.
+        """Return the lower confidence limit of the K measured at the largest measured B, in N/m; 0 for a log.
 
         Args:
             confidence: probability that the true onset K is above the limit.
