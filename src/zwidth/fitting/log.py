@@ -265,9 +265,9 @@ def _convert_force(best: FittedModel, k: int) -> tuple[float, float]:
 def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[list[float], list[str]]:
     """List the candidates for the encoder step, coarsest first, and warnings about a step that the user specified.
 
-    If the positions are near integer multiples of a step, this need not be an encoder step: under a constant force, the
-    positions of a sensor without steps may have the same property. Only the residuals distinguish the two cases.
-    Therefore the rounding step of the column is a second candidate.
+    Positions near integer multiples of a step need not be those of an encoder: under a constant force, the positions of
+    a sensor without steps may have this property, too. Only the residuals distinguish the two cases. 0 is the candidate
+    for a sensor without steps.
 
     Args:
         resolution: encoder step as specified by the user; None to determine it from the positions.
@@ -305,7 +305,7 @@ def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[
 
 
 def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:
-    """Raise `InputError` if the commanded force explains too little of the motion, or if the fitted mass is negative."""
+    """Raise `InputError` if the commanded force explains too little of the motion, or the fitted mass is negative."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
     # Fit the positions by a free motion from the initial states alone, without any force. The reduction of its
     # residuals is the effect of the forces.

@@ -150,9 +150,9 @@ def _integrate_with_friction(
     The arguments are those of `_integrate_without_friction`; ``friction`` is the deceleration c.
     """
     count, slow, rates = acceleration.size, phi.c.tolist(), (spans * phi.phi1).tolist()
-    # Number the parts k in the order of time; t_k and v_k are time and velocity at the end of part k - 1. Let G_k be
-    # s v_k of a mass that starts at rest and always moves in the direction s. Because the motion between two stops is
-    # linear, a mass with velocity v_m at t_m has s v_k = G_k + (s v_m - G_m) e^(-delta (t_k - t_m)) later.
+    # Number all parts k in the order of time; part k starts at time t_k with velocity v_k. Let G_k be s v_k of a mass
+    # that starts at rest and always moves in the direction s. Because the motion between two stops is linear, a mass
+    # with velocity v_m at t_m then has s v_k = G_k + (s v_m - G_m) e^(-delta (t_k - t_m)).
     by_forces, by_friction = (
         np.append(0.0, _integrate_without_friction(each, spans, phi, delta, 0.0, 0.0).end.T)
         for each in (acceleration, np.full(acceleration.shape, friction))
