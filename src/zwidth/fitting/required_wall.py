@@ -11,8 +11,9 @@ sampling periods. With zeta = z - 1:
 
     h = (zeta (e^((1 - f) p) - 1) + e^p - 1)/(p (zeta + 1 - e^p) z^(n + 1))
 
-A line of constant B ends at its first crossing: the smallest K > 0 that puts a pole on the unit circle, if the walls
-with K -> 0+ are stable. These are stable for all B > 0 below the smallest B that puts a pole on the circle at K = 0.
+On a line of constant B, the stability limit is the smallest K > 0 with a pole on the unit circle (the first crossing),
+provided that the walls with K -> 0+ are stable. They are stable for all B > 0 below the smallest B with a pole on the
+circle at K = 0.
 """
 
 from __future__ import annotations

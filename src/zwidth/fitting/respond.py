@@ -311,7 +311,7 @@ def _average_periods(
 
 
 def _smooth(values: np.ndarray, reach: int) -> np.ndarray:
-    """Return the running mean of each value and its ``reach`` neighbors on each side; at the ends of fewer neighbors."""
+    """Return the running mean of each value and its ``reach`` neighbors on each side; fewer neighbors at the ends."""
     window = np.ones(2 * reach + 1)
     total, count = (np.convolve(each, window)[reach : reach + values.size] for each in (values, np.ones(values.size)))
     return total / count
