@@ -23,7 +23,7 @@ AS_GOOD = 5.99
 EXACT = 1e-12  # lower limit of the estimated relative noise, to avoid division by 0 if the walls are exact
 BOUNDARY_STEP = 1e-6  # relative change of K, up and down, with which a wall is tested for the stability boundary
 DELTAS = np.geomspace(1e-4, 30.0, 45)  # initial values of delta; lower ones are added for low frequencies
-STARTS = 6  # largest number of initial values
+STARTS = 6  # largest number of initial values of theta from which the minimization starts
 MAX_CONDITION = 1e6  # condition number of the derivatives above which theta is not identifiable
 NEARLY = 1e-4  # relative tolerance of the first minimization from each initial value
 CONVERGED = 1e-12  # relative tolerance of the final minimization
@@ -32,12 +32,12 @@ NAMES = ("mass", "damping", "delay")
 
 
 class Candidate(NamedTuple):
-    """A local minimum of the weighted sum of squares."""
+    """A local minimum of the weighted sum of squared residuals, with the theta at which it is reached."""
 
-    theta: np.ndarray  # (ln m, delta, d)
+    theta: np.ndarray  # parameters (ln m, delta, d) at the minimum
     squares: float
-    residuals: np.ndarray  # weighted, shape (walls, 2)
-    fixed: tuple[str, ...]  # names of the parameters fixed at 0
+    residuals: np.ndarray  # weighted residuals of K and f, shape (walls, 2)
+    fixed: tuple[str, ...]  # names of the parameters that were fixed at 0
     is_complete: bool  # True if an onset of instability was computed at each measured B
 
 
@@ -51,7 +51,7 @@ def weight_derivatives(derivatives: np.ndarray, weights: np.ndarray) -> np.ndarr
 
 
 def is_rank_deficient(derivatives: np.ndarray) -> bool:
-    """Return whether the sensitivity matrix is rank-deficient (parameters not identifiable)."""
+    """Return whether a matrix of derivatives is rank-deficient, so that the parameters are not identifiable."""
     sizes = np.linalg.norm(derivatives, axis=0)
     return not np.all(sizes > 0) or bool(np.linalg.cond(derivatives / sizes) > MAX_CONDITION)
 
@@ -103,7 +103,7 @@ def _solve(
     solution = least_squares(
         lambda x: evaluate(tuple(x))[1].ravel(),
         theta[free],
-        differentiate,  # pyright: ignore[reportArgumentType]  (a function or a name)
+        differentiate,  # pyright: ignore[reportArgumentType]  (SciPy also accepts a function)
         method="lm",
         x_scale="jac",
         xtol=tolerance,

@@ -26,7 +26,7 @@ from zwidth.parts.velocity import Estimate, Velocity
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
 # Newton iteration that solves the imaginary part of the equation for the frequency w, in rad per sample.
-STEPS = 25  # largest number of iterations
+STEPS = 25  # largest number of Newton steps
 LONGEST = 0.15  # largest Newton step, relative to w, so that the iteration stays close to the measured frequency
 CONVERGED = 1e-9  # relative Newton step at which the iteration ends; the convergence is quadratic, so w is then exact
 SOLVED = 1e-6  # largest relative size of the last Newton step with which a result is accepted as converged

@@ -20,7 +20,7 @@ from zwidth.fitting.output_error import FittedModel
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.unit_system import UnitSystem
 
-# Regression on the weak form.
+# Constants of the regression on the weak form (`explain_motion`).
 # Lengths of the test functions, in samples. Longer ones reduce the effect of position errors, by 1/length^2.
 _WINDOWS = (32, 128)
 _MIN_WINDOWS = 12  # least number of half-overlapping test functions that fit into a log
@@ -29,7 +29,7 @@ _SIGN = 0.3
 # A spring or gravity is reported if including it reduces the residual sum of squares below this share.
 _EXPLAINED = 0.25
 
-# Test of the residuals of a fit.
+# Constants of the test of residuals (`explain_residuals`).
 _SHARE = 0.5  # a force is reported as the cause if it explains more than this share of the residual sum of squares
 # Share of the residual sum of squares above which rounding errors of the force are reported as the cause. It is smaller
 # than `_SHARE`, because the size of rounding errors is computed and not fitted.
@@ -98,7 +98,8 @@ def _integrate(log: Recording, window: int) -> np.ndarray | None:
     if count < (_MIN_WINDOWS + 1) * window // 2:
         return None
     phase = np.pi * (np.arange(window + 1) / window)
-    # sin^4 and its first derivative vanish at the ends, so that the integration by parts has no boundary terms.
+    # Use sin^4 as test function, because it and its first derivative vanish at the ends, so that the integration by
+    # parts has no boundary terms.
     function = np.sin(phase) ** 4
     derivative = 4.0 * np.sin(phase) ** 3 * np.cos(phase) * np.pi / window
     second_derivative = (12.0 * np.sin(phase) ** 2 * np.cos(phase) ** 2 - 4.0 * np.sin(phase) ** 4) * (

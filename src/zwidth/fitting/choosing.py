@@ -30,7 +30,7 @@ EXACT = 1e-9  # RMS residual, relative to the range of positions, below which re
 _BY_CHANCE = 5.99
 # Initial values of the parameters of an actuator lag.
 _TIME_CONSTANTS = (0.3, 1.5)  # time constants, in sampling periods
-_DAMPING_RATIO = 0.7  # damping ratio of a second-order lag
+_DAMPING_RATIO = 0.7  # initial damping ratio of a second-order lag
 # Initial values of the frequency of a resonance.
 _N_FREQUENCIES = 2  # number of frequencies: those of the highest scores
 _FREQUENCY_SPACING = float(np.exp(0.2))  # least ratio of two initial frequencies, so that they are different peaks

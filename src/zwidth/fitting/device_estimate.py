@@ -120,7 +120,7 @@ def compute_reach(freedom: int | None, upper: float = UPPER) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceEstimate:
-    """An estimate of a device with its uncertainty; the attributes are described in `zwidth.DeviceFit`."""
+    """An estimated device with the covariance of its parameters; `zwidth.DeviceFit` describes the attributes."""
 
     nominal: Scene  # scene with the fitted parameters
     covariance: np.ndarray  # covariance of the parameters, in SI units
@@ -130,7 +130,7 @@ class DeviceEstimate:
     damping_tried: float | None = None  # largest B of the measured walls, N s/m; None for a log
     stiffness_tried: float | None = None  # K measured at the largest B, N/m; None for a log
 
-    # Attributes of the fitted scene.
+    # Shortcuts to attributes of the scene with the fitted parameters.
     mass = property(attrgetter("nominal.device.mass"))
     damping = property(attrgetter("nominal.device.damping"))
     delay = property(attrgetter("nominal.timing.delay"))
@@ -152,7 +152,7 @@ class DeviceEstimate:
 
     @cached_property
     def estimates(self) -> np.ndarray:
-        """The values of the fitted parameters, in the order of ``numbers``."""
+        """The values of the fitted parameters in SI units, in the order of ``numbers``."""
         parameters = self.nominal.parameters()
         return np.array([parameters[name] for name in self.numbers])
 

@@ -50,7 +50,7 @@ class ErrorBar(NamedTuple):
 class FurtherExperiment(NamedTuple):
     """The proposed next measurement: raise K at the given B until the wall becomes unstable."""
 
-    virtual_damping: float  # B, N s/m
+    virtual_damping: float  # B at which to raise K, N s/m
     stiffness: float  # expected K at the onset of instability, N/m
     frequency: float  # expected frequency of the oscillation, Hz
     error_afterwards: float  # expected standard error of K_max after this measurement, N/m; NaN if K_max is NaN
@@ -167,7 +167,7 @@ class DeviceFit(DeviceEstimate):
 
     @property
     def stiffness_max(self) -> float:
-        """K_max of the estimated device, in N/m; NaN if it is not determined."""
+        """K_max of the estimated device, in N/m; NaN if the measurements do not determine it."""
         return self._stiffest[0]
 
     @property

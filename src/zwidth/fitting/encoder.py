@@ -21,10 +21,10 @@ from functools import cached_property
 
 import numpy as np
 
-# Fourier series of the covariance.
+# Truncation of the Fourier series of the covariance.
 _WAVES = 40  # number of terms h; the omitted ones, about 1.5 % of q^2/12, are treated as white noise
 _MIN_WEIGHT = 1e-6  # smallest w_h that is included, relative to the variance of a sample
-# Detection of the step, of which all positions are integer multiples except for a common offset.
+# Detection of the encoder step: all positions are integer multiples of it, plus a common offset.
 _MAX_OFFSET = 0.02  # largest distance of a position from an integer multiple of the encoder step, in steps
 # The same for the rounding step of a column, which is smaller because only rounding errors of float64 contribute.
 _MAX_ROUNDING_OFFSET = 1e-4
@@ -103,7 +103,7 @@ class MeasurementNoise:
 
     position: np.ndarray  # position x of each sample
     variance: float  # variance of the error of one sample, sigma^2 + q^2/12
-    resolution: float  # encoder step q; 0 for white noise only
+    resolution: float  # encoder step q; 0 if the noise is only white noise
 
     @cached_property
     def _rests(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -24,8 +24,8 @@ _DRAWS = 1000  # largest number of random devices from which the confidence band
 _ROWS = 121  # number of values of B from 0 to the largest stable one; a tenth more values lie above it
 _BEYOND = 1.1  # largest tabulated B, relative to the largest stable one
 # Largest lag of the autocorrelation. The smaller of the two limits applies.
-_LAGS = 60  # in samples
-_SHARE = 0.25  # relative to the number of samples of the log
+_LAGS = 60  # largest lag in samples
+_SHARE = 0.25  # largest lag relative to the number of samples of the log
 
 
 def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = ()) -> dict[str, dict[str, Any]]:

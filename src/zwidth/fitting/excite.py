@@ -1,4 +1,4 @@
-"""Design of a multisine force for the measurement of a frequency response with `zwidth.respond`.
+"""Design a multisine force with which `zwidth.respond` can measure the frequency response of a device.
 
 At frequencies at which the response decides the stability of walls, the frequencies are dense and the amplitudes large.
 The record consists of five *stretches*, whose sines have different phases. A stretch is three equal periods of the
@@ -50,7 +50,7 @@ _FEWEST_SAMPLES = 600  # least number of samples per period of the force
 
 @dataclass(frozen=True)
 class Excitation:
-    """A force to command sample by sample, and the expected accuracy of the measured response.
+    """A designed multisine force, and the expected accuracy of a frequency response measured with it.
 
     For a rotary device, forces are torques in N m, and rad replaces m.
 
@@ -80,7 +80,7 @@ class Excitation:
         return SYSTEMS[self.rotary]
 
     def save(self, file: str | Path) -> None:
-        """Write a CSV file with a row per sample: the time in s, and the force in N or the torque in N m."""
+        """Write the force to a CSV file, one row per sample with the time in s and the force in N or torque in N m."""
         rows = [f"{k * self.period:.9g},{value:.7g}" for k, value in enumerate(self.force.tolist())]
         write_atomically(
             Path(file),
@@ -99,7 +99,7 @@ def excite(
     seed: int = 0,
     rotary: bool | None = None,
 ) -> Excitation:
-    """Design the force to command for `zwidth.respond`.
+    """Design a multisine force with which `zwidth.respond` can measure the frequency response of a device.
 
     Args:
         period: sampling period of the controller in s.

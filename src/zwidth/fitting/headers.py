@@ -37,7 +37,7 @@ _COMMANDED = ("cmd", "command", "commanded", "des", "desired", "ref", "reference
 _MEASURED = ("meas", "measured", "actual", "sensed", "sensor", "est", "estimated", "ist")
 # Words for derivatives, errors and temperatures. A header with such a word identifies neither a position nor a force.
 _DERIVED = ("error", "err", "vel", "velocity", "speed", "dot", "acc", "rate", "temp")
-# Words that imply a rotary axis, and words that imply a linear axis.
+# Words of headers that imply a rotary axis, and words that imply a linear axis.
 _ROTARY_WORDS = ("angle", "phi", "theta", "winkel", "torque", "tau", "moment", "drehmoment", "sollmoment")
 _LINEAR_WORDS = ("force", "f", "kraft", "sollkraft", "weg")
 # Names of columns that can replace a missing position (a velocity) or force (a current), and the unit that is assumed

@@ -59,7 +59,7 @@ BOUNDED_RATIOS = (LEAST_DAMPING_RATIO, 0.03)  # damping ratios of the undetected
 # share of its norm.
 ABSORBED_NORM = 1e-6
 
-# Detection of a missing pole.
+# Constants of the detection of a missing pole.
 # Number of poles with the highest scores that are tested for autocorrelated encoder errors as well. It is more than
 # one, because these errors can raise the score of a wrong pole above that of the missing one.
 N_CANDIDATES = 3
@@ -67,7 +67,7 @@ CANDIDATE_SPACING = 1.1  # least ratio of the frequencies of two tested poles, s
 MAX_SAMPLES = 20_000  # number of leading samples of each log that are tested, to limit the time
 BATCH_SIZE = 400_000  # number of values per batch of filtered forces, to limit the memory
 
-# Upper bound of an undetected mode.
+# Constants of the upper bound of an undetected mode.
 BOUND_ERRORS = 4.0  # number of standard errors that are added to the estimated amplitude of the mode
 N_NEIGHBORS = 15  # number of poles on each side whose scores determine the local standard error
 
@@ -114,7 +114,7 @@ class PoleBank(NamedTuple):
     frequency: np.ndarray  # natural frequency of each pole, relative to the sampling rate
     score: np.ndarray  # reduction of the sum of squares, in noise variances; chi-square if no pole is missing
     signature_size: np.ndarray  # norm of the signature of the unit mode, in standard errors
-    projection: np.ndarray  # residuals projected onto that signature, in standard errors
+    projection: np.ndarray  # projection of the residuals onto the signature of the unit mode, in standard errors
     error_inflation: np.ndarray  # standard error for autocorrelated encoder errors, relative to white noise; >= 1
     absorbed: np.ndarray  # bias of the fitted theta caused by omitting the unit mode; one column per parameter
 
@@ -166,7 +166,8 @@ def detect_missing_pole(fit: FittedModel) -> tuple[HiddenPole | None, PoleBank]:
         covariance = fit.noise.spread(fit.model.weigh(directions))
         autocorrelated = float(amplitudes @ np.linalg.solve(covariance, amplitudes))
         white = fit.count * np.log(squares / (squares - reduction)) if reduction < squares else np.inf
-        # Both noise models must reject the hypothesis that no pole is missing.
+        # Require that both noise models, white noise and autocorrelated encoder errors, reject the hypothesis that no
+        # pole is missing.
         if min(autocorrelated, white) > amplitudes.size * threshold_per_amplitude:
             return HiddenPole(float(frequency), ratio < 1.0), bank
     return None, bank

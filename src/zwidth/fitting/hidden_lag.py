@@ -41,12 +41,12 @@ class LagTest(NamedTuple):
 
     lag: np.ndarray  # time constants, in periods
     signature_size: np.ndarray  # norm of the signature of each lag, in standard errors
-    projection: np.ndarray  # residuals projected onto that signature, in standard errors
-    theta: np.ndarray  # parameters refitted (to first order) with each lag; one column per lag
+    projection: np.ndarray  # projection of the residuals onto the signature of each lag, in standard errors
+    theta: np.ndarray  # theta refitted with each lag, to first order in the change; one column per lag
 
 
 def score_lags(fit: FittedModel) -> LagTest:
-    """Compute the score test of first-order actuator lags that replace part of the fitted delay."""
+    """Test the residuals of a fit for first-order actuator lags that the fitted delay has absorbed (score test)."""
     fit = truncate_logs(fit)
     lags = np.geomspace(MIN_LAG, max(MIN_LONGEST_LAG, min(MAX_LAG, fit.theta[2])), N_LAGS)
     # Compute the change of the positions by the lag for the rigid mass alone, because a lag hardly changes the
@@ -70,7 +70,7 @@ def score_lags(fit: FittedModel) -> LagTest:
 
 
 def bound_lag(fit: FittedModel, test: LagTest | None, scene: Scene, reach: float) -> HiddenLag | None:
-    """Return the longest actuator lag that the residuals do not exclude.
+    """Compute the longest first-order actuator lag that the residuals do not exclude, and K_max with this lag.
 
     Args:
         fit: The fitted model.
@@ -86,7 +86,7 @@ def bound_lag(fit: FittedModel, test: LagTest | None, scene: Scene, reach: float
         return None
     # Exclude a lag also if the damping or delay refitted with this lag is negative.
     possible = (test.signature_size - test.projection <= reach) & (test.theta[1:3] >= 0).all(0)
-    count = int(np.argmin(np.append(possible, False)))  # number of lags below the first excluded one
+    count = int(np.argmin(np.append(possible, False)))  # number of time constants below the first excluded one
     if not count:
         return None
     lag = float(test.lag[count - 1] * scene.timing.period)

@@ -1,4 +1,4 @@
-"""Exact response of a damped mass with Coulomb friction to a logged force with delay and zero-order hold.
+"""Compute the exact response of a damped mass with Coulomb friction to a delayed logged force with zero-order hold.
 
 In sampling periods, with g = T^2/m, the velocity v of a mass that moves in the direction s = sign(v) obeys
 
@@ -179,7 +179,7 @@ def _integrate_with_friction(
             changes.append((m, s))
         # Search for the next part at whose end s v <= 0, in windows of increasing size, because most stops follow soon.
         gain, decay, first, size = gained[s], decays[m % 2], m + 1, 128
-        ahead = s * v - gain.item(m)  # s v_m - G_m
+        ahead = s * v - gain.item(m)  # the term s v_m - G_m of the formula above
         while first <= count:
             last = min(first + size, count + 1)
             stopped = gain[first:last] + ahead * decay[first - m : last - m] <= 0.0

@@ -1,4 +1,4 @@
-"""Least-squares fit of a device model to logged positions, by the output-error method (Ljung 1999, section 4.2).
+"""Fit a device model to logged positions by least squares, with the output-error method (Ljung 1999, section 4.2).
 
 The parameter vector theta of `fitting.structure.Recordings` contains g = T^2/m, delta = b T/m, the delay d, the
 parameters of an actuator lag and of resonances (*modes*), the initial position x0 and velocity v0 of each log, and the
@@ -51,7 +51,7 @@ _CONVERGED = 1e-14  # tolerance of the final fit
 # squares also counts as converged if it satisfies this tolerance.
 NEARLY = 1e-6
 # Levenberg-Marquardt method. The damping is the number that is added to the diagonal of the normalized equations.
-_MAX_STEPS = 100  # largest number of steps
+_MAX_STEPS = 100  # largest number of steps by default
 _INITIAL_DAMPING = 1e-4  # damping of the first step
 _NEGLIGIBLE_DAMPING = 1e-6  # value below which a decreasing damping is set to 0
 _MAX_DAMPING = 1e12  # damping above which the search ends
@@ -64,7 +64,7 @@ _NEARLY_FRICTIONLESS = 900.0
 _EXCLUDED = 25.0  # difference in misfit from the best fit from which on a rival does not enlarge the covariance
 # An initial motion counts as invisible if its length is below this number of standard deviations of the noise.
 _INVISIBLE_DISTANCE = 3.0
-# Numerical limits.
+# Numerical limits and levels.
 _MAX_CONDITION = 1e7  # condition number of the derivatives above which some parameters are not determined
 _ROUNDING = 1e-13  # relative rounding error of a sum of squares, and of the positions
 _SIGNIFICANCE = 1e-3  # significance level of the chi-square test for the excess
@@ -90,7 +90,7 @@ class FittedModel:
 
     model: Recordings
     theta: np.ndarray
-    squares: float  # weighted sum of the squared residuals
+    squares: float  # sum of the squared weighted residuals
     converged: bool
     rivals: tuple[FittedModel, ...] = ()
 
@@ -111,7 +111,7 @@ class FittedModel:
 
     @property
     def variance(self) -> float:
-        """The estimated variance of the noise of a position."""
+        """The variance of the noise of one position, estimated from the residuals."""
         return self.squares / max(1, self.count - self.theta.size)
 
     @cached_property
@@ -436,7 +436,8 @@ def minimize_squares(
             # End the search, because no step decreases the sum of squares, as at a kink or at the rounding error.
             break
         theta, response, residuals, squares, before = trial, trial_response, trial_residuals, trial_squares, squares
-        # Decrease the damping if the reduction was about as predicted; increase it below half of that (Nielsen 1999).
+        # Decrease the damping if the sum of squares decreased about as predicted, and increase it if the reduction was
+        # less than half of the prediction (Nielsen 1999).
         ratio = (before - squares) / predicted if predicted > 0 else 0.0
         factor = max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
         damping = 0.0 if damping < _NEGLIGIBLE_DAMPING and factor < 1.0 else factor * damping

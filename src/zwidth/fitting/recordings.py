@@ -47,7 +47,7 @@ class ReadLogs(NamedTuple):
 def read_logs(
     time: Any, position: Any, force: Any, system: UnitSystem, resample: bool = False, resolution: Any = None
 ) -> ReadLogs:
-    """Read and repair logs; raise `InputError` if no device can be fitted to them.
+    """Read logs from arrays and repair them; raise `InputError` if no device can be fitted to them.
 
     Args:
         time: times in s, or the sampling period; a list for several logs.

@@ -39,21 +39,23 @@ _TWICE = 0.01  # share of rows with a repeated time up to which these rows are o
 _PAIRED = 0.45
 _UNPAIRED = 0.02  # share of positions without a force within this time up to which the log is accepted
 
-# Glitches of the position.
+# Detection of glitches of the position.
 _WILD = 0.02  # share of positions omitted as glitches up to which a log is accepted
 _REACH = 3  # largest length of a glitch, and half-width of the running median, in samples
 # Least distance of a glitch from the line through its neighbors: the sum of two terms.
-_FAR = 10.0  # in typical second differences (their 90 % quantile)
-_STEPS = 4.0  # in smallest second differences, which are encoder steps
+_FAR = 10.0  # first term, in typical second differences (their 90 % quantile)
+_STEPS = 4.0  # second term, in smallest second differences, which are encoder steps
 _RETURN = 0.2  # largest distance from this line of the first position after a glitch, relative to the glitch
 
 # Wraps of the position. A wrap is accepted if the second differences next to it, after unwrapping, are below one of two
 # limits.
-_SMOOTH = 8.0  # in typical second differences (their 99 % quantile)
-_NEAR_WRAP = 0.05  # relative to the modulus; also the relative tolerance within which jumps count as equal
+_SMOOTH = 8.0  # first limit, in typical second differences (their 99 % quantile)
+_NEAR_WRAP = (
+    0.05  # second limit, relative to the modulus; also the relative tolerance within which jumps count as equal
+)
 _SPAN = 0.5  # least jump that counts as a wrap if the modulus is unknown, relative to the range of the positions
 
-# Times rounded to ticks of a coarse clock.
+# Detection of times that a coarse clock has rounded to its ticks.
 _FEW_ODD = 5  # least number of time steps unequal to the median step with which times are recognized as rounded
 # Number of such steps from which on the errors of the times may have a range of 1.1 instead of 1.02 ticks, because
 # jitter adds to the rounding.

@@ -35,7 +35,7 @@ from zwidth.words.unit_system import SYSTEMS, UnitSystem
 # of which has half of the variance. With this factor the true response is within the deviation at all of some thousand
 # lines.
 SURE = 4.5 / np.sqrt(2.0)
-# Periodic forces.
+# Constants of the analysis of periodic forces.
 # Largest difference between forces one period apart that count as equal, relative to the range of the force.
 _SAME = 1e-5
 _EXCITED = 1e-3  # least amplitude of the force at a line that is used, relative to the largest amplitude
@@ -45,7 +45,7 @@ _REPEATED = 0.3  # share of the samples of a log that must repeat for a period o
 # half-widths, in lines:
 _NARROW = 4
 _WIDE = 24
-# Forces that do not repeat.
+# Constants of the analysis of forces that do not repeat.
 _PIECES = 8  # least number of segments over which spectra are averaged
 _LONGEST = 1 << 13  # largest number of samples per segment
 _COHERENT = 0.1  # least coherence at a line that bounds the range of usable lines
@@ -57,7 +57,7 @@ _LONGEST_GAP = 4  # longest time between two samples that is interpolated, in sa
 
 @dataclass(frozen=True)
 class ResponseEstimate:
-    """A measured frequency response and its quality.
+    """A measured frequency response, with quantities that describe its quality.
 
     Attributes:
         device: the response with its deviation, a `zwidth.MeasuredDevice`.
@@ -272,7 +272,7 @@ def _remove_drift(position: np.ndarray) -> np.ndarray:
 def _average_periods(
     stretches: list[tuple[np.ndarray, np.ndarray]], count: int, period: float, step: float, warnings: list[str]
 ) -> ResponseEstimate:
-    """Estimate the response to a periodic force.
+    """Estimate the response from the periods of a periodic force.
 
     Args:
         stretches: force and position of each stretch, shape (periods, count).

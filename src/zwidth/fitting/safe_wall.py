@@ -63,8 +63,8 @@ class SafeWall(NamedTuple):
     All numbers are NaN if the status is not OK.
     """
 
-    stiffness: float  # K in N/m
-    virtual_damping: float  # B in N s/m
+    stiffness: float  # stiffness K of the wall, N/m
+    virtual_damping: float  # damping B of the wall, N s/m
     share: float  # proportion of the random devices on which the wall is stable
     status: int  # code of `zwidth.Status`
     resonance: float = np.nan  # frequency in Hz of the undetected resonance that limits the wall; NaN if none does
@@ -153,7 +153,11 @@ class _RigidDevices(RigidVariants):
     """Random rigid devices with the backward difference, whose stability limits have closed forms."""
 
     def find(self, reliability: float, most: float) -> tuple[float, float]:
-        """Return K and B of the stiffest wall with B <= ``most``; both 0 if no wall is stable on enough devices."""
+        """Search for the stiffest wall with B <= ``most`` that is safe on the required proportion of devices.
+
+        Returns:
+            K and B; both 0 if no wall is stable on enough devices.
+        """
         low, high, damping = 0.0, compute_stiffness_quantile(self.stiffest()[0], reliability), 0.0
         least = _NEGLIGIBLE * high
         while high > max((1.0 + _ACCURACY) * low, least):
@@ -221,7 +225,11 @@ class _SearchedDevices:
             self.limits = GridLimits(critical, velocity)
 
     def find(self, reliability: float, most: float) -> tuple[float, float]:
-        """Return K and B of the stiffest wall with B <= ``most``; both 0 if no wall is stable on enough devices."""
+        """Search for the stiffest wall with B <= ``most`` that is safe on the required proportion of devices.
+
+        Returns:
+            K and B; both 0 if no wall is stable on enough devices.
+        """
         ends = self.limits.damping_limits
         top = self._take_quantile(ends, reliability)
         if not np.isfinite(top):

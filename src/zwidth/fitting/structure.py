@@ -1,4 +1,4 @@
-"""Exact response of a mass with friction, an actuator lag and resonances to a logged force with zero-order hold.
+"""Simulate a mass with friction, an actuator lag and resonances under a logged force with zero-order hold.
 
 The actuator lag A(s) and the resonances (*modes*) are linear. They therefore add to the response of the rigid mass
 (`zwidth.fitting.moving`) a sum over their poles p of ``r E_p``. The *filtered force* E_p satisfies
