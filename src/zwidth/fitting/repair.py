@@ -50,9 +50,7 @@ _RETURN = 0.2  # largest distance from this line of the first position after a g
 # Wraps of the position. A wrap is accepted if the second differences next to it, after unwrapping, are below one of two
 # limits.
 _SMOOTH = 8.0  # first limit, in typical second differences (their 99 % quantile)
-_NEAR_WRAP = (
-    0.05  # second limit, relative to the modulus; also the relative tolerance within which jumps count as equal
-)
+_NEAR_WRAP = 0.05  # second limit, relative to the modulus; also the relative tolerance of jumps of equal size
 _SPAN = 0.5  # least jump that counts as a wrap if the modulus is unknown, relative to the range of the positions
 
 # Detection of times that a coarse clock has rounded to its ticks.
