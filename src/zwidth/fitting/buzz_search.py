@@ -58,7 +58,8 @@ def is_rank_deficient(derivatives: np.ndarray) -> bool:
 
 def _list_dampings(onsets: Onsets) -> np.ndarray:
     """Return the grid of initial values of delta: `DELTAS`, extended downward if a measured frequency is low."""
-    # At B = 0 a device becomes unstable near the frequency w with w^2 = delta/(d + 1/2).
+    # Extend the grid to values of delta at which the lowest measured frequency w can occur, because at B = 0 a device
+    # becomes unstable near w^2 = delta/(d + 1/2).
     ratio = DELTAS[1] / DELTAS[0]
     more = np.ceil(np.log(DELTAS[0] / (0.1 * float(onsets.w.min()) ** 2)) / np.log(ratio))
     return np.concatenate([[0.0], DELTAS[0] * ratio ** np.arange(-more, 0.0), DELTAS])

@@ -14,9 +14,9 @@ effect. K_max is the maximum stiffness of a wall. The steps are explained in doc
    pole are added to the model (Rao 1948). It is a chi-square variable if no pole is missing.
 2. Detection: `detect_missing_pole` returns the pole of the highest score if it satisfies Schwarz's criterion (BIC,
    Schwarz 1978) for white noise and for the autocorrelated errors of the encoder.
-3. Bound: without a detection, |r| is at most ``(sqrt(score) + 4)/size``, with ``size = |s|/sigma`` of the unit mode.
-   `bound_response` adds the largest such mode to the response of the device; that radius limits the safe walls.
-4. Averaging: with ``t = s'e/(sigma^2 size)``, the likelihood ratio of one more mode to none is
+3. Bound: if no pole is detected, |r| is at most ``(sqrt(score) + 4)/size``, with ``size = |s|/sigma`` of the unit mode.
+   `bound_response` computes the largest change of the response by such a mode, a radius that limits the safe walls.
+4. Averaging: with ``t = s'e/(sigma^2 size)``, the likelihood ratio of a device with one more mode to one without it is
    ``exp(t r size - (r size)^2/2)``. Its mean over the prior is the posterior odds; `sample_resonances` draws modes from
    the posterior and computes K_max with each (Bayesian model averaging, Hoeting et al. 1999).
 5. Lags: `bound_lag` returns the longest first-order actuator lag that the data cannot distinguish from pure delay.
@@ -74,9 +74,8 @@ N_NEIGHBORS = 15  # number of poles on each side whose scores determine the loca
 # Frequency grid of the response, relative to the sampling rate.
 MIN_RESPONSE_FREQUENCY = 2e-4  # lowest frequency of the grid
 N_BELOW_BANK = 40  # number of grid frequencies below the lowest frequency of the bank
-# Largest phase change by the delay between neighboring frequencies, in rad: in `bound_response`, and in
-# `sample_resonances`, whose linear interpolation between frequencies requires a finer grid.
-BAND_PHASE_STEP = 0.3
+BAND_PHASE_STEP = 0.3  # rad; largest phase change by the delay between neighboring frequencies in `bound_response`
+# The same in `sample_resonances`, whose linear interpolation between frequencies requires a finer grid, in rad.
 INTERPOLATION_PHASE_STEP = 0.06
 # Distances of the additional grid points from a resonance frequency, in half-widths of the resonance.
 RESONANCE_OFFSETS = np.sinh(np.linspace(-4.0, 4.0, 61))

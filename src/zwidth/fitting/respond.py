@@ -41,10 +41,9 @@ _SAME = 1e-5
 _EXCITED = 1e-3  # least amplitude of the force at a line that is used, relative to the largest amplitude
 _SHORTEST = 16  # least number of samples per period, and least number of usable lines of a force that does not repeat
 _REPEATED = 0.3  # share of the samples of a log that must repeat for a period of the force to be accepted
-# The squared standard error is smoothed by two running means over the lines, and the larger mean is used. Their
-# half-widths, in lines:
-_NARROW = 4
-_WIDE = 24
+# The squared standard error is smoothed by two running means over the lines, and the larger mean is used.
+_NARROW = 4  # half-width of the first running mean, in lines
+_WIDE = 24  # half-width of the second running mean, in lines
 # Constants of the analysis of forces that do not repeat.
 _PIECES = 8  # least number of segments over which spectra are averaged
 _LONGEST = 1 << 13  # largest number of samples per segment
