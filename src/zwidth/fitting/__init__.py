@@ -1,1 +1,1 @@
-"""A device's mass, damping and delay from what can be recorded of it."""
+"""Identification of a device from logs of its motion, or from walls at the onset of instability."""

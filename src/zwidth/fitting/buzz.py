@@ -1,7 +1,8 @@
-"""Fit a rigid device to walls at the onset of instability, given by their stiffness, damping and frequency.
+"""Fit a rigid device to walls at the onset of instability, each measured by its stiffness K, damping B and frequency f.
 
-`fitting.buzz_search` finds the device by least squares; this module checks the walls and the fit, and proposes the most
-informative next measurement. ``theta = (ln m, delta, d)`` are the unknowns of `fitting.buzzing`.
+`fitting.buzz_search` finds the device by least squares; this module checks the measured walls and the fit, and proposes
+the wall to measure next. The unknowns are ``theta = (ln m, delta, d)``: the logarithm of the mass m, the damping
+delta = b T/m, and the delay d = t_d/T, with the sampling period T (`fitting.buzzing`). K_max is the largest stable K.
 """
 
 from __future__ import annotations
@@ -43,19 +44,19 @@ from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 from zwidth.words.units import read_share
 
-CHANCE = 0.003  # probability that the walls of a rigid device are refused because of their noise
-ROUGH = 0.1  # largest standard deviation of K and f if the noise is not given
-ANGLES = 240  # frequencies on the boundary that are candidates for the next experiment
-SAME = 1e-6  # dampings with a smaller relative difference count as one
+CHANCE = 0.003  # significance level of the chi-square test that refuses walls as not those of a rigid device
+ROUGH = 0.1  # largest accepted relative standard deviation of K and f if it is estimated from the residuals
+ANGLES = 240  # number of frequencies on the stability boundary that are candidates for the next measurement
+SAME = 1e-6  # relative difference of two values of B below which they count as equal
 
 
 class BuzzPoint(NamedTuple):
     """A wall at the onset of instability.
 
     Args:
-        stiffness: K in N/m, raised at this damping until the wall becomes unstable.
+        stiffness: K in N/m at the onset of instability, reached by raising K at this B.
         virtual_damping: B in N s/m.
-        frequency: frequency of the oscillation in Hz, heard or measured.
+        frequency: frequency f of the oscillation at the onset, in Hz.
     """
 
     stiffness: float
@@ -75,10 +76,10 @@ def fit_buzz(
 
     At ``z = e^(j 2 pi f T)`` each wall gives two real equations, ``K + B F(z)/T = (m/T^2) q(z)`` with ``q = -1/G``, the
     closed form of `zwidth.boundary`. Two walls of different damping determine m, b and t_d. More walls are fitted by
-    least squares of the relative errors of K and f, with B exact. Residuals larger than the noise mean that the device
-    is not rigid: the walls are then refused, and `zwidth.fit_log` fits an actuator lag and resonances. A lag or a
-    resonance within the noise hardly changes walls between the measured ones, but it may change K_max at a larger B.
-    Therefore no safe wall has a larger B than the measured ones.
+    least squares of the relative errors of K and f; B is assumed exact. If the residuals exceed the noise, the device
+    is not rigid and the walls are refused; `zwidth.fit_log` can then fit an actuator lag and resonances. A lag or a
+    resonance with an effect below the noise hardly changes the onset at the measured values of B, but it may change
+    K_max at a larger B. Therefore the B of a safe wall never exceeds the largest measured B.
 
     Args:
         points: walls, each (K in N/m, B in N s/m, f in Hz) or a `zwidth.BuzzPoint`; K > 0, 0 < f < 1/(2 T). At least
@@ -163,7 +164,8 @@ def fit_buzz(
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
     distinct = [best.theta]
     for other in equals[1:] if status == Status.OK else ():
-        # Skip devices that differ from a listed one only along poorly determined directions.
+        # Skip a device if the walls cannot distinguish it from one already listed: the squared difference of the two
+        # theta, in standard errors, is then at most AS_GOOD.
         if all((step := other.theta - one) @ information @ step > AS_GOOD for one in distinct):
             distinct.append(other.theta)
     rivals = tuple(_describe_rival(rigid_fit.scene(theta)) for theta in distinct[1:])
@@ -206,7 +208,13 @@ def fit_buzz(
 def _read_points(
     points: Iterable[Any], period: float, copies_count_once: bool, system: UnitSystem
 ) -> tuple[np.ndarray, list[str]]:
-    """Return the walls as an array of shape (walls, 3), and warnings.
+    """Convert the walls to an array of shape (walls, 3) with the columns K, B and f, and list warnings about them.
+
+    Args:
+        points: walls, as in `fit_buzz`.
+        period: sampling period in s.
+        copies_count_once: remove walls that are identical to others, with a warning.
+        system: units of K and B.
 
     Raises:
         InputError: a wall is invalid, or all walls have the same damping.
@@ -241,7 +249,7 @@ def _read_points(
         )
         rows = kept
     table = np.array(rows)
-    # Typical size of a virtual damping, K/w, for the comparison of the dampings.
+    # Compare differences of B with K/w, the typical size of B, because all measured B may be 0 or close to 0.
     unit = table[0, 0] / (2 * np.pi * table[0, 2])
     if np.ptp(table[:, 1]) <= SAME * max(unit, np.abs(table[:, 1]).max()):
         count = "one wall does" if len(table) == 1 else f"{len(table)} walls of one damping do"
@@ -253,7 +261,7 @@ def _read_points(
 
 
 def _read_noise(noise: Any) -> tuple[float, float] | None:
-    """Return the relative noise of K and of f, None if it is not given; raise `InputError` if it is invalid."""
+    """Return the relative standard deviations of K and f; None if ``noise`` is None. Raise `InputError` if invalid."""
     if noise is None:
         return None
     try:
@@ -267,12 +275,17 @@ def _read_noise(noise: Any) -> tuple[float, float] | None:
 
 
 def _describe_rival(scene: Scene) -> RivalDevice:
-    """Return the parameters and K_max of another device that fits equally well."""
+    """Return mass, damping, delay and K_max of the device of a scene, as an alternative that fits equally well."""
     return RivalDevice(scene.mass, scene.damping, scene.timing.delay, float(scene.max_stiffness().stiffness))
 
 
 def _estimate_delay_step(derivatives: np.ndarray, best: Candidate) -> float:
-    """Return the least-squares delay of a fit whose delay is fixed at 0, in standard errors for unit noise."""
+    """Return the delay that least squares would choose if it were not fixed at 0, in standard errors.
+
+    Args:
+        derivatives: weighted derivatives of the residuals in theta, one row per residual.
+        best: fit with the delay fixed at 0; its residuals are assumed to have variance 1.
+    """
     inverse = np.linalg.pinv(derivatives)[2]
     return float(inverse @ best.residuals.ravel() / np.linalg.norm(inverse))
 
@@ -283,11 +296,11 @@ def _require_identifiability(
     """Raise `InputError` if the walls do not determine mass, damping and delay.
 
     Args:
-        derivatives: weighted derivatives of the residuals in theta.
+        derivatives: weighted derivatives of the residuals in theta, one row per residual.
         theta: parameters of the best device.
-        table: walls, shape (walls, 3).
-        on_boundary: the walls are on the stability boundary of that device.
-        system: units of the walls.
+        table: walls, shape (walls, 3), with the columns K, B and f.
+        on_boundary: True if the walls are on the stability boundary of the best device.
+        system: units of K and B.
     """
     if is_rank_deficient(derivatives):
         dampings = ", ".join(f"{value:g}" for value in np.unique(table[:, 1]))
@@ -306,11 +319,13 @@ def _require_identifiability(
 def _propose_measurement(
     rigid_fit: RigidFit, stiffness_max: float, information: np.ndarray, wanted: np.ndarray, precision: np.ndarray
 ) -> FurtherExperiment | None:
-    """Return the wall with B >= 0 on the boundary of the device that reduces the error of K_max most; None without one.
+    """Return the further wall whose measurement would reduce the standard error of K_max most; None if none exists.
+
+    The candidates are on the stability boundary of the fitted device, with B >= 0.
 
     Args:
-        rigid_fit: the fit.
-        stiffness_max: K_max.
+        rigid_fit: the fit to the measured walls.
+        stiffness_max: K_max of the fitted device in N/m.
         information: information matrix of theta from the measured walls.
         wanted: derivatives of K_max in theta.
         precision: inverse variances of ln K and ln f.
@@ -318,10 +333,10 @@ def _propose_measurement(
     onsets, theta = rigid_fit.onsets, rigid_fit.best.theta
     scene, period = rigid_fit.scene(theta), onsets.period
     w = np.linspace(0.0, np.pi, ANGLES + 2)[1:-1]
-    # The boundary of slow loops is at low frequencies.
+    # Add low frequencies, because the stability boundary of a slow loop extends to them.
     w = np.concatenate([np.geomspace(1e-4, w[0], 60)[:-1], w])
     stiffness, damping = scene.boundary(w / period)
-    # Walls softer than a tenth of K_max are hard to measure.
+    # Exclude walls softer than a tenth of K_max, because their onset of instability is hard to measure.
     valid = (damping >= 0) & (stiffness > 0.1 * stiffness_max)
     valid[valid] = are_on_boundary(scene, stiffness[valid], damping[valid])
     if not valid.any():

@@ -1,8 +1,10 @@
 """Search for the rigid device whose stability boundary contains the measured walls, by least squares.
 
-The residuals are the relative errors of K and f at the measured B (`zwidth.fitting.buzzing`), in units of their noise.
-The unknowns are ``theta = (ln m, delta, d)`` with delta = b T/m and the delay d in periods. SciPy's Levenberg-Marquardt
-method starts from the local minima of a cost on a grid; damping and delay that would be negative are fixed at 0.
+The residuals are the relative errors of the stiffness K and the frequency f of each wall at its measured damping B
+(`zwidth.fitting.buzzing`), divided by the standard deviation of their noise. The unknowns are
+``theta = (ln m, delta, d)``: the mass m, the damping delta = b T/m and the delay d in sampling periods T. SciPy's
+Levenberg-Marquardt method starts from the local minima of a cost on a grid; if the minimum has a negative damping or
+delay, this parameter is fixed at 0.
 """
 
 from __future__ import annotations
@@ -15,42 +17,49 @@ import numpy as np
 from zwidth.fitting.buzzing import Onsets, PredictedWalls
 from zwidth.scenes.scene import Scene
 
-AS_GOOD = 5.99  # largest difference of the sums of squares, in noise variances, of devices that fit equally well
-EXACT = 1e-12  # lower limit of the estimated relative noise, below that of any measurement; for exact walls
-BOUNDARY_STEP = 1e-6  # relative change of K on both sides of the boundary at which stability is checked
-DELTAS = np.geomspace(1e-4, 30.0, 45)  # initial values of b T/m; lower ones are added for low frequencies
-STARTS = 6  # largest number of initial values
-MAX_CONDITION = 1e6  # condition number above which the parameters are not identifiable
-NEARLY = 1e-4  # relative tolerance of the first search from an initial value
-CONVERGED = 1e-12  # relative tolerance of the final search
-MAX_EVALUATIONS = (100, 40)  # largest number of function evaluations of a final and of a first search
+# Largest difference between the sums of squares of two devices that count as equally good fits, in noise variances: the
+# 95 % quantile of chi-square with two degrees of freedom.
+AS_GOOD = 5.99
+EXACT = 1e-12  # lower limit of the estimated relative noise, to avoid division by 0 if the walls are exact
+BOUNDARY_STEP = 1e-6  # relative change of K, up and down, with which a wall is tested for the stability boundary
+DELTAS = np.geomspace(1e-4, 30.0, 45)  # initial values of delta; lower ones are added for low frequencies
+STARTS = 6  # largest number of initial values of theta from which the minimization starts
+MAX_CONDITION = 1e6  # condition number of the derivatives above which theta is not identifiable
+NEARLY = 1e-4  # relative tolerance of the first minimization from each initial value
+CONVERGED = 1e-12  # relative tolerance of the final minimization
+MAX_EVALUATIONS = (100, 40)  # largest number of function evaluations: of the final minimization, and of the first one
 NAMES = ("mass", "damping", "delay")
 
 
 class Candidate(NamedTuple):
-    """A local minimum of the weighted sum of squares."""
+    """A local minimum of the weighted sum of squared residuals, with the theta at which it is reached."""
 
-    theta: np.ndarray  # (ln m, delta, d)
+    theta: np.ndarray  # parameters (ln m, delta, d) at the minimum
     squares: float
-    residuals: np.ndarray  # weighted, shape (walls, 2)
-    fixed: tuple[str, ...]  # names of the parameters fixed at 0
-    is_complete: bool  # the device has a wall for each measured one
+    residuals: np.ndarray  # weighted residuals of K and f, shape (walls, 2)
+    fixed: tuple[str, ...]  # names of the parameters that were fixed at 0
+    is_complete: bool  # True if an onset of instability was computed at each measured B
 
 
 def weight_derivatives(derivatives: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the derivatives of all residuals, one row each, in units of their noise."""
+    """Multiply the derivatives of ln K and ln w, shape (walls, 2, 3), by the weights of the residuals.
+
+    Returns:
+        An array with one row per residual and one column per parameter of theta.
+    """
     return (derivatives * weights[:, None]).reshape(-1, derivatives.shape[-1])
 
 
 def is_rank_deficient(derivatives: np.ndarray) -> bool:
-    """Return whether the sensitivity matrix is rank-deficient (parameters not identifiable)."""
+    """Return whether a matrix of derivatives is rank-deficient, so that the parameters are not identifiable."""
     sizes = np.linalg.norm(derivatives, axis=0)
     return not np.all(sizes > 0) or bool(np.linalg.cond(derivatives / sizes) > MAX_CONDITION)
 
 
 def _list_dampings(onsets: Onsets) -> np.ndarray:
-    """Return initial values of delta, including low ones for low frequencies."""
-    # At B = 0 the onset is near w^2 = delta/(d + 1/2).
+    """Return the grid of initial values of delta: `DELTAS`, extended downward if a measured frequency is low."""
+    # Extend the grid to values of delta at which the lowest measured frequency w can occur, because at B = 0 a device
+    # becomes unstable near w^2 = delta/(d + 1/2).
     ratio = DELTAS[1] / DELTAS[0]
     more = np.ceil(np.log(DELTAS[0] / (0.1 * float(onsets.w.min()) ** 2)) / np.log(ratio))
     return np.concatenate([[0.0], DELTAS[0] * ratio ** np.arange(-more, 0.0), DELTAS])
@@ -59,14 +68,22 @@ def _list_dampings(onsets: Onsets) -> np.ndarray:
 def _solve(
     onsets: Onsets, weights: np.ndarray, start: np.ndarray, fixed: tuple[int, ...], tolerance: float = CONVERGED
 ) -> Candidate:
-    """Return the local minimum near an initial value, with the parameters at the indices ``fixed`` set to 0."""
+    """Minimize the weighted sum of squares from one initial value by the Levenberg-Marquardt method.
+
+    Args:
+        onsets: the measured walls.
+        weights: reciprocals of the relative noise of K and f.
+        start: initial theta.
+        fixed: indices of the parameters in theta that are set to 0.
+        tolerance: relative tolerance at which the minimization ends.
+    """
     from scipy.optimize import least_squares
 
     free = [k for k in range(3) if k not in fixed]
     theta = start.copy()
     theta[list(fixed)] = 0.0
 
-    @lru_cache(maxsize=1)  # The solver requests values and derivatives separately.
+    @lru_cache(maxsize=1)  # Cache one evaluation, because the solver requests values and derivatives separately.
     @np.errstate(all="ignore")
     def evaluate(values: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, PredictedWalls, np.ndarray]:
         trial = theta.copy()
@@ -74,7 +91,7 @@ def _solve(
         walls = onsets.predict_walls(trial)
         ratios = np.stack([np.log(walls.kappa / onsets.kappa), np.log(walls.w / onsets.w)], -1)
         valid = walls.converged & np.all(np.isfinite(ratios), -1)
-        # Assign a large constant residual to a measured wall for which the device has none.
+        # If the device has no onset of instability at a measured B, assign a large constant to the residuals there.
         return trial, np.where(valid[:, None], ratios, 10.0) * weights, walls, valid
 
     @np.errstate(all="ignore")
@@ -87,7 +104,7 @@ def _solve(
     solution = least_squares(
         lambda x: evaluate(tuple(x))[1].ravel(),
         theta[free],
-        differentiate,  # pyright: ignore[reportArgumentType]  (a function or a name)
+        differentiate,  # pyright: ignore[reportArgumentType]  (SciPy also accepts a function)
         method="lm",
         x_scale="jac",
         xtol=tolerance,
@@ -101,7 +118,18 @@ def _solve(
 
 
 def _refine(onsets: Onsets, weights: np.ndarray, first: Candidate, start: np.ndarray) -> list[Candidate]:
-    """Return the minimum near ``first``, or with a negative damping or delay the minima with one or both fixed at 0."""
+    """Return the minima of the final search that have a nonnegative damping and delay.
+
+    Args:
+        onsets: the measured walls.
+        weights: reciprocals of the relative noise of K and f.
+        first: result of the first search.
+        start: initial theta of the first search.
+
+    Returns:
+        The minimum near ``first``. If its damping or delay is negative, up to three minima from ``start`` instead:
+        with the damping, the delay or both fixed at 0.
+    """
     if first.is_complete:
         free = _solve(onsets, weights, first.theta, ())
         if min(free.theta[1:3]) >= 0:
@@ -111,7 +139,10 @@ def _refine(onsets: Onsets, weights: np.ndarray, first: Candidate, start: np.nda
 
 
 class RigidFit(NamedTuple):
-    """The best rigid device, and all that fit equally well: none if no device has the walls on its boundary."""
+    """The best rigid device, and the list ``equals`` of devices that fit equally well, including the best one.
+
+    ``equals`` is empty if no device has all measured walls on its stability boundary.
+    """
 
     onsets: Onsets
     best: Candidate
@@ -120,22 +151,28 @@ class RigidFit(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """Noise variance of the weighted residuals: 1 if the noise is given; otherwise estimated."""
+        """Noise variance of the weighted residuals: 1 if the noise is given; otherwise their estimated variance."""
         return 1.0 if self.known_noise else max(self.best.squares / self.freedom, EXACT**2)
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom: equations minus unknowns."""
+        """Degrees of freedom of the fit: two residuals per wall minus three unknowns."""
         return 2 * self.onsets.w.size - 3
 
     def scene(self, theta: np.ndarray) -> Scene:
-        """Return the loop of a device theta."""
+        """Return the scene of the rigid device with the parameters theta, without a wall."""
         return self.onsets.normalize(theta).to_scene(self.onsets.period, self.onsets.velocity, self.onsets.system)
 
 
 def find_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> RigidFit:
-    """Return the best rigid device, and all others that fit equally well."""
-    # In a stable loop the delay changes the phase by at most pi; add 20 % for noise.
+    """Fit the rigid device by least squares, and find all other devices that fit equally well.
+
+    Args:
+        onsets: the measured walls.
+        weights: reciprocals of the relative noise of K and f.
+        known_noise: True if the noise is given; False if it is estimated from the residuals.
+    """
+    # Limit the delay d so that it changes the phase d w by at most pi, as in every stable loop, plus 20 % for noise.
     longest = 1.2 * np.pi / float(onsets.w.max())
     starts = onsets.list_starts(_list_dampings(onsets), longest, STARTS)
     first_fits = ((_solve(onsets, weights, start, (), NEARLY), start) for start in starts)
@@ -160,7 +197,11 @@ def find_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> Rigid
 
 @np.errstate(all="ignore")
 def _is_onset(fit: RigidFit, candidate: Candidate) -> bool:
-    """Return whether stability ends at the fitted walls; the boundary curve also runs through the unstable region."""
+    """Return whether the fitted walls are at the onset of instability.
+
+    The walls of a candidate have a pole on the unit circle. That is not sufficient, because another pole may already be
+    unstable.
+    """
     onsets = fit.onsets
     kappa, period = onsets.predict_walls(candidate.theta).kappa, onsets.period
     if not np.all(kappa > 0):
@@ -169,6 +210,6 @@ def _is_onset(fit: RigidFit, candidate: Candidate) -> bool:
 
 
 def are_on_boundary(scene: Scene, stiffness: np.ndarray, virtual_damping: np.ndarray) -> np.ndarray:
-    """Return a mask of the walls that are stable if slightly softer and unstable if slightly stiffer."""
+    """Return a mask of the walls that become stable with a slightly smaller K and unstable with a slightly larger K."""
     softer = scene.is_stable(stiffness * (1 - BOUNDARY_STEP), virtual_damping)
     return softer & ~scene.is_stable(stiffness * (1 + BOUNDARY_STEP), virtual_damping)

@@ -1,12 +1,13 @@
-"""Walls at the onset of instability, as functions of the device parameters.
+"""Compute the walls at the onset of instability as functions of the device parameters.
 
 With z = e^(jw), w = 2 pi f T, a pole pair is on the unit circle if and only if
 
     K T^2 + B T F(z) = m q(z),     q = -1/G,
 
-two real equations per wall (docs/theory/scenes.md), with the response G of the device and the velocity estimate F. For
-a given B they determine w and K. The unknowns are ``theta = (ln m, delta, d)``: the mass m, the damping delta = b T/m
-and the delay d in sampling periods.
+which are two real equations per wall (docs/theory/scenes.md). G is the response of the device, F the velocity estimate,
+T the sampling period and f the frequency in Hz. For a given B the equations determine w and K; kappa = K T^2. The
+unknowns of the fit are ``theta = (ln m, delta, d)``: the mass m, the damping delta = b T/m and the delay d in sampling
+periods.
 """
 
 from __future__ import annotations
@@ -25,45 +26,48 @@ from zwidth.parts.velocity import Estimate, Velocity
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
 # Newton iteration that solves the imaginary part of the equation for the frequency w, in rad per sample.
-STEPS = 25  # largest number of iterations
-LONGEST = 0.15  # largest step, relative to w, so that the iteration stays close to the measured frequency
-CONVERGED = 1e-9  # relative step at which the iteration ends; because convergence is quadratic, w is then exact
-SOLVED = 1e-6  # largest relative last step of a solution
+STEPS = 25  # largest number of Newton steps
+LONGEST = 0.15  # largest Newton step, relative to w, so that the iteration stays close to the measured frequency
+CONVERGED = 1e-9  # relative Newton step at which the iteration ends; the convergence is quadratic, so w is then exact
+SOLVED = 1e-6  # largest relative size of the last Newton step with which a result is accepted as converged
 
 
 class PredictedWalls(NamedTuple):
-    """Walls of a device at the measured dampings."""
+    """Walls at the onset of instability that a device has at the measured values of B."""
 
-    kappa: np.ndarray  # K T^2, kg
-    w: np.ndarray  # rad per sample
+    kappa: np.ndarray  # stiffness K T^2 of each wall, kg
+    w: np.ndarray  # frequency of each wall, rad per sample
     converged: np.ndarray  # mask of the walls for which the iteration converged
     differentiate: Callable[
         [], np.ndarray
-    ]  # returns the derivatives of ln kappa and ln w in theta, shape (walls, 2, 3)
+    ]  # function that returns the derivatives of ln kappa and ln w in theta, shape (walls, 2, 3)
 
 
 @dataclass(frozen=True)
 class Onsets:
-    """Measured walls, and the velocity estimate and period of their loop."""
+    """Measured walls at the onset of instability, with the velocity estimate and the sampling period of the loop."""
 
-    kappa: np.ndarray  # K T^2, kg
-    scaled_damping: np.ndarray  # B T, kg
-    w: np.ndarray  # rad per sample
+    kappa: np.ndarray  # measured stiffness K T^2 of each wall, kg
+    scaled_damping: np.ndarray  # measured damping B T of each wall, kg
+    w: np.ndarray  # measured frequency of each wall, rad per sample
     velocity: Velocity
-    period: float  # s
+    period: float  # sampling period T, s
     system: UnitSystem = LINEAR
 
     @cached_property
     def _estimate(self) -> Estimate:
-        """The velocity estimate at this period."""
+        """The velocity estimate, discretized with the sampling period."""
         return self.velocity.estimate(self.period)
 
     def normalize(self, theta: np.ndarray) -> DimensionlessDevice:
-        """Return the device with the parameters theta."""
+        """Convert theta to a rigid device in units of its mass and of the sampling period."""
         return DimensionlessDevice(np.exp(theta[0]), *theta[1:3])
 
     def predict_walls(self, theta: np.ndarray) -> PredictedWalls:
-        """Return the walls of the device theta at the measured dampings, with w nearest to the measured one."""
+        """Compute the walls at the onset of instability of the device theta, at the measured values of B.
+
+        The frequency w of each wall is computed by Newton's method from the measured frequency.
+        """
         mass, controller, estimate, w = np.exp(theta[0]), CriticalController(*theta[1:3]), self._estimate, self.w
         step = np.full(w.shape, np.inf)
         for _ in range(STEPS):
@@ -75,7 +79,7 @@ class Onsets:
             )
             step = np.clip(-residual / slope, -LONGEST * w, LONGEST * w)
             w = np.minimum(w + step, 0.5 * (w + np.pi))
-            # Do not iterate on walls whose step is NaN, because it stays NaN.
+            # A wall whose Newton step is NaN does not prolong the iteration, because its step stays NaN.
             if not np.any(np.abs(step) > CONVERGED * w):
                 break
         points = circle_points(w)
@@ -83,7 +87,8 @@ class Onsets:
         kappa = (mass * q.value - self.scaled_damping * f.value).real
 
         def differentiate() -> np.ndarray:
-            # d kappa + e_w dw = m dq - B T dF, with e_w = B T F' - m q'.
+            # Differentiating kappa + B T F = m q gives d kappa + (B T F' - m q') dw = d(m q), with d(m q) at fixed w.
+            # The imaginary part of this equation determines dw, and the real part d kappa.
             moved = mass * np.stack([q.value, *controller.differentiate(points, q.value)], -1)
             by_w = (self.scaled_damping * f.slope - mass * q.slope)[:, None]
             dw = moved.imag / by_w.imag
@@ -92,14 +97,16 @@ class Onsets:
         return PredictedWalls(kappa, w, np.abs(step) <= SOLVED * w, differentiate)
 
     def list_starts(self, deltas: np.ndarray, longest: float, count: int) -> list[np.ndarray]:
-        """Return initial values of theta: the lowest local minima of the squared errors of the complex equation.
+        """Return initial values of theta, sorted by cost: the best local minima on a grid of delta and d.
+
+        The cost is the sum over the walls of ``|ln((kappa + B T F)/(m q))|^2``.
 
         Args:
-            deltas: grid of delta.
-            longest: largest d of the grid of delays.
+            deltas: values of delta in the grid.
+            longest: largest delay d in the grid.
             count: largest number of initial values.
         """
-        # For each delta and d, the least squares of the logarithmic errors determine ln m: the mean of the real parts.
+        # At fixed delta and d, the cost is quadratic in ln m, so that the mean of the real parts is the optimal ln m.
         from scipy.ndimage import minimum_filter
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)

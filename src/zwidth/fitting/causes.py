@@ -1,11 +1,11 @@
-"""Identify causes of motion missing from a fitted model: gravity, a spring, a wrong sign, a rounded force column.
+"""Identify causes of motion that a fitted model lacks: gravity, a spring, a wrong sign, a rounded force column.
 
-Two tests, for two kinds of logs:
+Two functions test for these causes:
 
-- `explain_motion`, for logs whose fit fails: a linear regression on the weak form of the equation of motion, which
-  needs no fit.
-- `explain_residuals`, for logs whose residuals are not white noise: the share of the residual sum of squares that the
-  response to one further force explains.
+- `explain_motion` treats logs to which no device can be fitted. It multiplies the equation of motion by test functions,
+  integrates by parts (weak form), and determines its coefficients by linear regression.
+- `explain_residuals` treats fits whose residuals are not white noise. It computes the share of the residual sum of
+  squares that the response to one further force explains.
 """
 
 from __future__ import annotations
@@ -20,36 +20,44 @@ from zwidth.fitting.output_error import FittedModel
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.unit_system import UnitSystem
 
-# Regression on the weak form.
-_WINDOWS = (32, 128)  # lengths of the test functions, in samples; position errors count in proportion to 1/length^2
-_MIN_WINDOWS = 12  # least number of half-overlapping windows that a log contains
-_SIGN = 0.3  # a wrong sign is the cause if it leaves less than this share of the sum of squares
-_EXPLAINED = 0.25  # a further force is the cause if it leaves less than this share of the residual sum of squares
+# Constants of the regression on the weak form (`explain_motion`).
+# Lengths of the test functions, in samples. Longer ones reduce the effect of position errors, by 1/length^2.
+_WINDOWS = (32, 128)
+_MIN_WINDOWS = 12  # least number of half-overlapping test functions that fit into a log
+# A wrong sign is reported if the model with a negative mass leaves less than this share of the sum of squares.
+_SIGN = 0.3
+# A spring or gravity is reported if including it reduces the residual sum of squares below this share.
+_EXPLAINED = 0.25
 
-# Test of the residuals.
-_SHARE = 0.5  # a force is the cause if it explains more than this share of the residual sum of squares
-# Least share that rounding errors of the force must explain: lower than `_SHARE`, because the size of these errors is
-# computed and not fitted.
+# Constants of the test of residuals (`explain_residuals`).
+_SHARE = 0.5  # a force is reported as the cause if it explains more than this share of the residual sum of squares
+# Share of the residual sum of squares above which rounding errors of the force are reported as the cause. It is smaller
+# than `_SHARE`, because the size of rounding errors is computed and not fitted.
 _ROUNDING_SHARE = 0.2
-_TRIALS = 4  # random draws of the rounding errors
-_MIN_LEVELS = 8  # least number of distinct forces for which a common step is attributed to rounding
-_MIN_STEP = 2e-4  # least rounding step, relative to the largest force
+_TRIALS = 4  # number of random draws of the rounding errors, over which their effect is averaged
+_MIN_LEVELS = 8  # least number of distinct forces; fewer may be set points and are not attributed to rounding
+_MIN_STEP = 2e-4  # least rounding step that is tested, relative to the largest force
 
 
 class Cause(NamedTuple):
-    """A cause of motion that the logged force does not explain."""
+    """The identified cause of a motion that the logged force does not explain."""
 
-    text: str  # clause for a message; "" if no cause was identified
-    reversed: bool = False  # the force, or the position, has the wrong sign
+    text: str  # the cause as a clause for a message; "" if no cause was identified
+    reversed: bool = False  # True if the force or the position has the wrong sign
 
 
 def explain_motion(logs: tuple[Recording, ...], period: float, system: UnitSystem) -> Cause:
-    """Return the cause of a motion that the force does not explain; ``text`` is empty if no cause is identified.
+    """Identify the cause of a motion that the logged force F does not explain, by linear regression on the weak form.
 
-    The equation of motion ``x'' = g F - delta x' + o + e(x)``, in sampling periods, is multiplied by smooth test
-    functions and integrated by parts. The result is linear in the coefficients g, delta and o and in those of e, the
-    spring or gravity, and contains no derivative of a measured position. The delay is neglected because it is short
-    compared with the test functions.
+    In sampling periods, the equation of motion is ``x'' = g F - delta x' + o + e(x)`` with the position x, the
+    reciprocal mass g, the damping delta, the acceleration o by a constant force and the acceleration e(x) by a spring
+    or gravity. Integration by parts removes the derivatives of the measured x. The delay is neglected, because it is
+    short compared with the test functions.
+
+    Args:
+        logs: the logs of one device.
+        period: sampling period in s.
+        system: units of position and force.
     """
     best = Cause("")
     lowest = np.inf
@@ -79,17 +87,19 @@ def explain_motion(logs: tuple[Recording, ...], period: float, system: UnitSyste
 
 
 def _integrate(log: Recording, window: int) -> np.ndarray | None:
-    """Return the terms of the equation of motion, integrated with test functions; None if the log is too short.
+    """Integrate each term of the equation of motion, multiplied by test functions of length ``window``, over a log.
 
     Returns:
-        An array with a row per term (acceleration, force, velocity, constant, position, and sine and cosine of the
-        position) and a column per test function. The test functions are a quarter of the window apart.
+        An array with one row per term (acceleration, force, velocity, constant, position, sine of the position, cosine
+        of the position) and one column per test function. Successive test functions start a quarter of the window
+        apart. None if the log is too short.
     """
     count = log.position.size
     if count < (_MIN_WINDOWS + 1) * window // 2:
         return None
     phase = np.pi * (np.arange(window + 1) / window)
-    # sin^4 and its first derivative vanish at the ends, so that the integration by parts has no boundary terms.
+    # Use sin^4 as test function, because it and its first derivative vanish at the ends, so that the integration by
+    # parts has no boundary terms.
     function = np.sin(phase) ** 4
     derivative = 4.0 * np.sin(phase) ** 3 * np.cos(phase) * np.pi / window
     second_derivative = (12.0 * np.sin(phase) ** 2 * np.cos(phase) ** 2 - 4.0 * np.sin(phase) ** 4) * (
@@ -102,7 +112,7 @@ def _integrate(log: Recording, window: int) -> np.ndarray | None:
 
 
 def _fit_columns(wanted: np.ndarray, columns: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Return the least-squares coefficients and the residual sum of squares."""
+    """Fit a vector by a linear combination of columns; return the coefficients and the residual sum of squares."""
     matrix = np.array(columns).T
     sizes = np.linalg.norm(matrix, axis=0)
     sizes = np.where(sizes > 0, sizes, 1.0)
@@ -112,7 +122,7 @@ def _fit_columns(wanted: np.ndarray, columns: list[np.ndarray]) -> tuple[np.ndar
 
 
 def explain_residuals(best: FittedModel, system: UnitSystem) -> str:
-    """Return the cause of residuals that are not white noise as a clause; "" if no cause is identified."""
+    """Identify the cause of residuals that are not white noise; return a clause, "" if no cause is identified."""
     derivatives = best.response.derivatives
     basis = np.linalg.qr(derivatives / np.maximum(np.linalg.norm(derivatives, axis=0), 1e-300))[0]
     left = best.residuals - basis @ (basis.T @ best.residuals)
@@ -122,7 +132,7 @@ def explain_residuals(best: FittedModel, system: UnitSystem) -> str:
         return rounded
 
     def explain(*accelerations: list[np.ndarray]) -> float:
-        """Return the share of the residual sum of squares that the responses to further accelerations explain."""
+        """Return the share of the residual sum of squares explained by the responses to the given accelerations."""
         columns = np.array([_simulate_accelerations(best, each) for each in accelerations]).T
         columns = columns - basis @ (basis.T @ columns)
         return 1.0 - _fit_columns(left, list(columns.T))[1] / squares
@@ -133,18 +143,22 @@ def explain_residuals(best: FittedModel, system: UnitSystem) -> str:
         gravity = explain(*([function(log.position) for log in best.model.logs] for function in (np.sin, np.cos)))
         if gravity > _SHARE and gravity > spring + 0.1:
             return "they depend on the angle, as gravity would cause"
-    # The stiffness is not estimated, because the fitted friction absorbs a part of the spring force.
+    # The message contains no stiffness, because its estimate would be biased: the fitted friction has already absorbed
+    # a part of the spring force.
     if spring > _SHARE:
         return "they depend on the position, as a weak spring, a cable or gravity would cause"
     return ""
 
 
 def _simulate_accelerations(best: FittedModel, accelerations: list[np.ndarray]) -> np.ndarray:
-    """Return the position response to further accelerations, without friction, of all logs in one array.
+    """Simulate the positions of a mass without friction that starts at rest and moves under given accelerations.
 
     Args:
-        best: fitted model, which supplies the damping.
-        accelerations: accelerations of each log in m per squared sampling period, one per position.
+        best: fitted model; only its damping and its logs are used.
+        accelerations: for each log an array of accelerations in m per squared sampling period, one per position.
+
+    Returns:
+        The positions of all logs, joined into one array.
     """
     delta = float(best.theta[1])
     moved = []
@@ -155,12 +169,18 @@ def _simulate_accelerations(best: FittedModel, accelerations: list[np.ndarray]) 
 
 
 def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float, system: UnitSystem) -> str:
-    """Return a clause on the rounding of the force column if it explains residuals of this size, "" otherwise.
+    """Test whether the rounding of the force column explains the residuals.
+
+    The expected effect of the rounding is the mean over random rounding errors, simulated with the fitted mass.
 
     Args:
         best: fitted model.
-        basis: orthonormal directions that the fitted parameters absorb.
+        basis: orthonormal basis of the position changes that a change of the fitted parameters can produce.
         squares: residual sum of squares.
+        system: units of the force.
+
+    Returns:
+        A clause for a message if the rounding explains residuals of this size, "" otherwise.
     """
     forces = np.concatenate([log.force for log in best.model.logs])
     step, largest = find_steps(forces)[1], best.model.largest_force
@@ -171,7 +191,7 @@ def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float, syst
         accelerations = []
         for log in best.model.logs:
             force = log.force[log.skip :][: log.position.size]
-            # Samples of equal force have the same rounding error.
+            # Draw one rounding error for each run of equal forces, because equal forces are rounded equally.
             run = np.append(0, np.cumsum(np.diff(force) != 0))
             accelerations.append(best.theta[0] * rng.uniform(-0.5 * step, 0.5 * step, run[-1] + 1)[run])
         moved = _simulate_accelerations(best, accelerations)

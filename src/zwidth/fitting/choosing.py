@@ -1,10 +1,10 @@
 """Select the structure of a device by Schwarz's criterion: a rigid mass, or one with an actuator lag and resonances.
 
-The model is extended step by step. As long as a score test of the residuals (`zwidth.fitting.hidden`, `hidden_lag`)
-detects a missing pole or lag, every model with one *part* more is fitted: a lag of the next order, or a resonance at
-the frequencies of the highest scores. Schwarz's criterion (BIC, Schwarz 1978) prefers the model of the lowest sum of
-the *misfit*, -2 log(likelihood), and log(N) per parameter for N positions. ``theta`` is the parameter vector of
-`zwidth.fitting.structure.Recordings`.
+Starting from the rigid mass, a score test of the residuals (`zwidth.fitting.hidden`, `hidden_lag`) decides whether the
+model lacks a pole or a lag. If so, all models with one *part* more are fitted: an actuator lag of the next order, or
+a resonance (*mode*) at one of the frequencies with the highest scores. Schwarz's criterion (BIC, Schwarz 1978) selects
+the model with the lowest sum of the *misfit*, -2 log(likelihood), and log(N) per parameter, for N positions. Then the
+residuals are tested again. ``theta`` is the parameter vector of `zwidth.fitting.structure.Recordings`.
 """
 
 from __future__ import annotations
@@ -20,32 +20,34 @@ from zwidth.fitting.hidden_lag import LagTest, score_lags
 from zwidth.fitting.output_error import CLOSELY, NEARLY, FittedModel, fit_nonnegative, minimize_squares
 from zwidth.fitting.structure import Recordings
 
-_MAX_PARTS = 4  # largest number of parts that are added: orders of the actuator lag, and resonances
-_N_COMPARED = 2500  # positions of each log with which the candidates are compared
-_FIRST_STEPS = 20  # iterations from each initial value
-_FURTHER_STEPS = 40  # further iterations of the best candidate of each structure
-ALIKE = 1.5  # largest excess (`FittedModel.excess`) of residuals that count as white noise
-EXACT = 1e-9  # residuals below this size, relative to the range of positions, are rounding errors
-_BY_CHANCE = 5.99  # reduction of the misfit by two superfluous parameters, exceeded with probability 5 %
-# Initial values of actuator lags.
-_TIME_CONSTANTS = (0.3, 1.5)  # time constants, in periods
-_DAMPING_RATIO = 0.7  # damping ratio of a second-order lag
-# Initial values of resonances.
-_N_FREQUENCIES = 2  # number of initial frequencies
-_FREQUENCY_SPACING = float(np.exp(0.2))  # least ratio of two initial frequencies
+_MAX_PARTS = 4  # largest number of parts added to the rigid mass; each order of the actuator lag counts as one
+_N_COMPARED = 2500  # number of leading positions of each log on which the candidate models are compared, to save time
+_FIRST_STEPS = 20  # largest number of Levenberg-Marquardt steps from each initial value
+_FURTHER_STEPS = 40  # largest number of further steps, from the best result for each structure
+ALIKE = 1.5  # largest autocorrelation measure `FittedModel.excess` of residuals that count as white noise
+EXACT = 1e-9  # RMS residual, relative to the range of positions, below which residuals are rounding errors
+# Reduction of the misfit that two superfluous parameters exceed with a probability of 5 % (chi-square).
+_BY_CHANCE = 5.99
+# Initial values of the parameters of an actuator lag.
+_TIME_CONSTANTS = (0.3, 1.5)  # time constants, in sampling periods
+_DAMPING_RATIO = 0.7  # initial damping ratio of a second-order lag
+# Initial values of the frequency of a resonance.
+_N_FREQUENCIES = 2  # number of frequencies: those of the highest scores
+_FREQUENCY_SPACING = float(np.exp(0.2))  # least ratio of two initial frequencies, so that they are different peaks
 
 Choice = tuple[FittedModel, HiddenPole | None, PoleBank | None, LagTest | None]
 
 
 def choose_structure(best: FittedModel) -> Choice:
-    """Add actuator lags and resonances to a rigid device as long as the residuals require them.
+    """Extend the model of a rigid device by actuator lags and resonances until its residuals are white noise.
 
-    If the residuals of the final model are not white noise, the rigid device is returned.
+    If no extended model leaves white noise, the rigid device is returned.
 
     Returns:
-        The selected model; a pole that it still lacks, or a resonance that it may have instead of its lag, or None; the
-        scores of all poles; and the test for lags. The scores are None if the residuals are rounding errors, the test
-        for lags also if a pole is missing or the model has a lag.
+        A tuple of four: the selected model; the pole that the model lacks, or the resonance that may replace its lag,
+        None if there is neither; the scores of all candidate poles; and the test for lags. The scores are None if the
+        residuals are rounding errors. The test for lags is None in this case too, and if a pole is missing or the model
+        has a lag.
     """
     span = max(float(np.ptp(log.position)) for log in best.model.logs)
     if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * span**2:
@@ -53,7 +55,8 @@ def choose_structure(best: FittedModel) -> Choice:
     rigid = best, pole, bank, lags = _test_residuals(best)
     rival = None
     for _ in range(_MAX_PARTS):
-        # The signature of a lag has a known amplitude, so its test can detect a lag that the score of a pole does not.
+        # Use the test for lags as well, because it detects lags that the score of a pole does not: the amplitude of
+        # their effect is known and need not be estimated.
         has_lag = lags is not None and lags.projection.max() ** 2 > 2.0 * np.log(best.count)
         if bank is None or rival or (pole is None and not has_lag):
             break
@@ -69,16 +72,23 @@ def choose_structure(best: FittedModel) -> Choice:
 
 
 def _test_residuals(best: FittedModel) -> Choice:
-    """Test the residuals for a missing pole; if none is missing and the model has no lag, test for lags, too."""
+    """Test the residuals of a model for a missing pole and, if the model lacks neither pole nor lag, for lags.
+
+    Returns:
+        The model, the missing pole, the scores of all poles, and the test for lags, as in `choose_structure`.
+    """
     pole, bank = detect_missing_pole(best)
     return best, pole, bank, None if pole or best.model.lag else score_lags(best)
 
 
 def _add_part(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, HiddenPole | None]:
-    """Return the best model with one part more, and a resonance that may replace its lag.
+    """Fit all models with one part more than ``best``, and return the one that Schwarz's criterion selects.
 
-    The model is None if Schwarz's criterion prefers the present one. A weak resonance resembles a lag, which has fewer
-    parameters, but a very different K_max. Therefore the resonance is returned if it fits significantly better.
+    A weak resonance has nearly the same effect on the positions as a lag, which has fewer parameters, but its K_max is
+    very different. Therefore a resonance that fits significantly better than the selected lag is returned as well.
+
+    Returns:
+        The selected model, None if ``best`` itself satisfies the criterion better; and the resonance, or None.
     """
     first_fits: dict[tuple[int, int], tuple[float, Recordings, np.ndarray]] = {}
     for lag, modes, start in _list_starts(best, bank):
@@ -105,7 +115,10 @@ def _add_part(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, Hi
 
 
 def _list_starts(best: FittedModel, bank: PoleBank) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Yield models with one part more: the order of the lag, the number of modes, and the initial theta."""
+    """Yield initial values for all models with one part more than ``best``.
+
+    Each item contains the order of the lag, the number of modes, and the initial theta.
+    """
     model, theta = best.model, best.theta
     lag, modes, logs, first = model.lag, model.modes, len(model.logs), model.parts.stop
     if lag == 0:
@@ -116,7 +129,7 @@ def _list_starts(best: FittedModel, bank: PoleBank) -> Iterator[tuple[int, int, 
                 yield 2, modes, np.r_[start, _DAMPING_RATIO, theta[3:]]
     elif lag == 1:
         yield 2, modes, np.r_[theta[:4], _DAMPING_RATIO, theta[4:]]
-    # A further mode starts with mass ratio 0 and without a free response.
+    # Start with mass ratio 0 and zero free response of the new mode, so that the model reproduces ``best`` exactly.
     rigid_states, states = np.split(theta[first:-2], [2 * logs])
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
     complex_poles = bank.select(bank.ratio < 1.0)

@@ -1,7 +1,8 @@
 """Read logs from files: identify the columns, convert them to SI units, and fit them.
 
-`words.tables` reads the table and `fitting.headers` identifies its columns and their units. A velocity is integrated to
-a position, and a motor current is converted to a force by the motor constant.
+`words.tables` reads a file as a table, and `fitting.headers` identifies the columns of the *quantities* time, position
+and force and their units. If the log has a velocity in place of a position, the velocity is integrated; a motor current
+in place of a force is multiplied by the motor constant.
 """
 
 from __future__ import annotations
@@ -35,30 +36,28 @@ from zwidth.words.units import (
 
 _AMPERES = {"A": 1.0, "mA": 1e-3}
 _PER_AMPERE = re.compile(r"(.*?)\s*/\s*A\s*")
-_MANY_COUNTS = 50.0  # least difference of maximum and minimum of whole numbers that are read as encoder counts
-_ROUNDING = 1e-9  # largest relative difference of two equal units, for rounding errors
-_SAME_PERIOD = 1e-3  # largest relative difference of the period of the times and the specified one
-_OTHER = 0.1  # relative difference above which two periods contradict each other
-# Units of mass that scales and load cells display for a force, and the unit of the corresponding weight.
+_MANY_COUNTS = 50.0  # least range (maximum minus minimum) of integer positions that are read as encoder counts
+_ROUNDING = 1e-9  # relative difference of two conversion factors below which they count as equal (rounding errors)
+_SAME_PERIOD = 1e-3  # largest relative difference between the specified period and that of the logged times
+_OTHER = 0.1  # relative difference from the logged times above which the period specified in their place is refused
+# Units of mass that scales and load cells display for a force: for each one the unit of the corresponding weight.
 _WEIGHTS = {"kg": "kgf", "g": "gf", "lb": "lbf", "oz": "ozf"}
-_EPOCH = 1e9  # s, in 2001; times without a unit that exceed this value are times since 1970
-_EPOCH_UNITS = (("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3))  # tried in this order for times since 1970
-_COARSEST = 1.1  # rad or m, largest encoder step (6 steps per turn); a larger resolution is a number of counts
+_EPOCH = 1e9  # s since 1970 (the year 2001); larger times without a unit are assumed to be times since 1970
+_EPOCH_UNITS = (("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3))  # possible units of times since 1970, in the order of trial
+_COARSEST = 1.1  # rad or m; largest accepted encoder step (6 steps per turn), because a larger value is a count
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedMotion:
-    """Columns of one log in SI units.
+    """Time, position and force of one log in SI units, one array entry per row; NaN for a cell without a number.
 
     Attributes:
-        time: in s; None if no times were read.
-        position: in m, or in rad of a rotary axis.
-        force: in N, or in N m of a rotary axis.
-        resolution: step of the encoder in m or rad; None if it is unknown.
-        rotary: whether the axis turns.
-        notes: interpretations of the columns that the user should check, one clause each.
-
-    Cells without a number are NaN.
+        time: times in s; None if the period replaces them.
+        position: positions in m; for a rotary axis in rad.
+        force: forces in N; for a rotary axis torques in N m.
+        resolution: encoder step in m or rad; None if it is unknown.
+        rotary: True for a rotary axis.
+        notes: assumptions about columns and units that the user should check, one clause each.
     """
 
     time: np.ndarray | None
@@ -69,7 +68,7 @@ class LoggedMotion:
     notes: tuple[str, ...] = ()
 
     def __eq__(self, other: object) -> bool:
-        """Return whether all values are equal. NaN is compared as 0."""
+        """Return whether all values of two logs are equal; NaN counts as 0, because NaN does not equal itself."""
         return isinstance(other, LoggedMotion) and all(
             np.array_equal(*(np.nan_to_num(getattr(each, part.name)) for each in (self, other)))
             if isinstance(getattr(self, part.name), np.ndarray) and isinstance(getattr(other, part.name), np.ndarray)
@@ -88,21 +87,21 @@ def read_log(
     usual_period: float | None = None,
     motor_constant: str | None = None,
 ) -> LoggedMotion:
-    """Read the time, the position and the force of a log.
+    """Read the times, positions and forces of a log from a file, and convert them to SI units.
 
     Args:
         file: a text file, also compressed by gzip: columns separated by commas, semicolons, tabs or blanks, in UTF-8,
             UTF-16 or Latin-1, with or without a preamble and a line of units; a NumPy file, .npz or .npy; or a MATLAB
             file, .mat up to version 7.
-        columns: the columns of ``time``, ``position`` and ``force``: the header, with or without its unit, or the
-            number of the column if the file has no headers. ``COLUMN:unit`` replaces the unit of the header. Omitted
+        columns: the columns of ``time``, ``position`` and ``force``, each by its header with or without the unit, or by
+            its number if the file has no headers. ``COLUMN:unit`` replaces the unit of the header. Omitted
             columns are recognized by their headers. Times may be dates in ISO 8601. A column in m/s, rad/s or counts/s
             is summed to a position; it must be the unfiltered difference of successive positions.
-        resolution: encoder step, a length or an angle with its unit per count; a number is in m, or in rad with a
-            torque.
-        period: sampling period in s; the times are not read.
-        usual_period: sampling period in s, used if no column of times is recognized.
-        motor_constant: factor from a current in A or mA to a force, as "5 N/A" or "0.03 N m/A".
+        resolution: encoder step per count, a length or an angle with its unit; a number without a unit is in m, or in
+            rad if the force is a torque.
+        period: sampling period in s, which replaces the times; these are then not read.
+        usual_period: sampling period in s that replaces the times if no column of times is recognized.
+        motor_constant: force or torque per current, such as "5 N/A" or "0.03 N m/A", for a current in A or mA.
 
     Raises:
         InputError: a column is missing or ambiguous, a unit is unknown, a cell is not a number, a length is combined
@@ -129,7 +128,7 @@ def read_log(
             raise InputError(f"{file}: column {heads[index]!r} contains no number; specify another column")
     is_counts = _look_like_counts(cells[sources["position"].indices[0]])
     given, notes = _name_units(heads, sources, resolution, is_counts)
-    # The unit of the position if the column is a velocity.
+    # If the position column contains a velocity, determine the unit of the integrated position.
     integrated = _integrate_unit(given["position"])
     units = {**given, "position": integrated or given["position"]}
     constant = 1.0
@@ -160,7 +159,7 @@ def read_log(
 
 
 def _look_like_counts(position: np.ndarray) -> bool:
-    """Return whether positions look like encoder counts: whole numbers over a range too large for m or rad."""
+    """Return whether all positions are integers with a range of at least `_MANY_COUNTS`, as encoder counts are."""
     finite = position[np.isfinite(position)]
     return bool(np.all(finite == np.round(finite))) and float(np.ptp(finite)) >= _MANY_COUNTS
 
@@ -168,13 +167,16 @@ def _look_like_counts(position: np.ndarray) -> bool:
 def _name_units(
     heads: Sequence[str], sources: Mapping[str, Column], resolution: Any, is_counts: bool
 ) -> tuple[dict[str, str], list[str]]:
-    """Return the unit of each quantity, and notes on the interpretations that the user should check.
+    """Determine the unit of each quantity, from its header or by assumption.
 
     Args:
         heads: headers of the table.
         sources: column of each quantity.
-        resolution: encoder resolution as specified; an angle implies a rotary axis.
-        is_counts: whether the positions look like encoder counts; if so, positions without a unit are read in counts.
+        resolution: encoder step as specified by the user; an angle implies a rotary axis.
+        is_counts: True if the positions are probably encoder counts; without a unit they are then read in counts.
+
+    Returns:
+        The unit of each quantity, and notes on assumptions that the user should check.
     """
     units = {name: column.units[0] for name, column in sources.items()}
     notes = []
@@ -202,7 +204,7 @@ def _name_units(
 
 
 def _is_rotary(units: Mapping[str, str], sources: Mapping[str, Column], resolution: Any) -> bool:
-    """Return whether the axis is rotary: by the units, by the resolution, or by the headers, in this order."""
+    """Return whether the axis is rotary, according to the units, else to the resolution, else to the headers."""
     for name in ("force", "position"):
         linear, angular = DIMENSIONS[name]
         base = _integrate_unit(units[name]) or units[name]
@@ -215,9 +217,9 @@ def _is_rotary(units: Mapping[str, str], sources: Mapping[str, Column], resoluti
 
 
 def _measure(name: str, unit: str) -> float | None:
-    """Return the factor that converts a unit of position or force to SI; None if the unit belongs to neither.
+    """Return the factor that converts a quantity (position or force) from a unit to SI; None if the unit does not fit.
 
-    Units of mass are converted to the weight.
+    A unit of mass stands for the corresponding weight.
     """
     for dimension in (*DIMENSIONS[name], MASS):
         size = dimension.in_base("1", 0, unit) if unit else None
@@ -227,12 +229,12 @@ def _measure(name: str, unit: str) -> float | None:
 
 
 def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[str]) -> np.ndarray:
-    """Return the times in s, from one column, or from two columns of seconds and fractions of a second.
+    """Return the times in s, read from one column, or added up from two: seconds and fractions of a second.
 
     Args:
-        column: the column or columns of the time.
-        numbers: cells by column index.
-        notes: receives a note if the unit is assumed.
+        column: the column or the two columns of the time.
+        numbers: values of the cells, by column index.
+        notes: list to which a note is appended if the unit is assumed.
     """
     total: Any = 0.0
     for index, unit in zip(column.indices, column.units, strict=True):
@@ -240,18 +242,18 @@ def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[s
         size = _read_unit("time", unit)[0]
         first = float(values[np.isfinite(values)][0])
         if not unit:
-            # The magnitude of a time since 1970 determines its unit.
+            # Derive the unit of a time since 1970 from its magnitude, because no other unit results in a recent date.
             name, size = next(((name, size) for name, size in _EPOCH_UNITS if first * size >= _EPOCH), ("s", 1.0))
             if name != "s":
                 notes.append(f"the time has no unit and is read in {name} since 1970, according to its magnitude")
-        # Subtract the first of the whole seconds, because the rounding error of seconds since 1970 would exceed the
-        # resolution of the other column.
+        # Subtract the first value from the column of seconds, because the rounding error of a time since 1970 would
+        # exceed the resolution of the column of fractions.
         total = total + (values - first if len(column.indices) > 1 and size == 1.0 else values) * size
     return total
 
 
 def _integrate_unit(unit: str) -> str | None:
-    """Return the unit of length, angle or counts of a unit of velocity; None if the unit is not one of velocity."""
+    """Return the unit of position that belongs to a unit of velocity, as "m" to "m/s"; None for any other unit."""
     if unit == "rpm":
         return "turns"
     base, per, second = unit.rpartition("/")
@@ -259,11 +261,11 @@ def _integrate_unit(unit: str) -> str | None:
 
 
 def _read_constant(constant: str | None, unit: str) -> tuple[float, str]:
-    """Return the force or torque of one unit of current in SI units, and its unit, "N" or "N m".
+    """Return the force or torque in SI units that one unit of current produces, and its unit, "N" or "N m".
 
     Args:
-        constant: the motor constant as specified, such as "5 N/A"; None if it is not specified.
-        unit: unit of the current.
+        constant: motor constant as specified by the user, such as "5 N/A"; None if the user specified none.
+        unit: unit of the current, "A" or "mA".
     """
     match = _PER_AMPERE.fullmatch(constant or "")
     for dimension in (FORCE, TORQUE):
@@ -279,7 +281,7 @@ def _read_constant(constant: str | None, unit: str) -> tuple[float, str]:
 
 
 def _compare_period(file: str | Path, table: NamedColumns, period: float) -> None:
-    """Raise `InputError` if a column of times, with a unit, contradicts the specified period by more than `_OTHER`."""
+    """Raise `InputError` if the times of the log have a unit and contradict the period that the user specified."""
     try:
         column = find_columns(file, table.heads, {}, ["time"])["time"]
         if not all(column.units):
@@ -288,7 +290,7 @@ def _compare_period(file: str | Path, table: NamedColumns, period: float) -> Non
         time = _join_times(column, dict(zip(column.indices, values, strict=True)), [])
         time = time[np.isfinite(time)]
     except InputError:
-        # Ignore times that cannot be read, because they may be the reason why the period is specified.
+        # Ignore times that cannot be read, because they may be the reason why the user specified the period.
         return
     step = float(time[-1] - time[0]) / max(1, time.size - 1)
     if not abs(step - period) <= _OTHER * period:
@@ -299,9 +301,9 @@ def _compare_period(file: str | Path, table: NamedColumns, period: float) -> Non
 
 
 def _read_unit(name: str, unit: str) -> tuple[float, Dimension | None]:
-    """Return the factor that converts a unit of a quantity to SI, and its dimension, None for counts.
+    """Return the factor that converts a quantity from a unit to SI, and the dimension of the unit (None for counts).
 
-    Without a unit, the factor is 1 and the dimension that of a linear axis.
+    For an empty unit, the factor is 1 and the dimension is that of a linear axis.
     """
     if name == "position" and unit.lower() in COUNTS:
         return 1.0, None
@@ -318,12 +320,18 @@ def _read_unit(name: str, unit: str) -> tuple[float, Dimension | None]:
 
 
 def _check_pairs(units: Mapping[str, str], dimensions: Mapping[str, Dimension | None], resolution: Any) -> float | None:
-    """Return the encoder step in SI units; raise `InputError` if linear and rotary quantities are combined.
+    """Check that position, force and resolution are all linear or all rotary, and return the encoder step in SI units.
 
     Args:
-        units: unit of each quantity, "" for none.
+        units: unit of each quantity, "" if it has none.
         dimensions: dimension of position and force, None for counts.
-        resolution: encoder resolution as specified.
+        resolution: encoder step as specified by the user.
+
+    Returns:
+        The encoder step, None if the user specified none.
+
+    Raises:
+        InputError: linear and rotary quantities are combined.
     """
     is_rotary = dimensions["force"] is TORQUE
     force = f"a {'torque' if is_rotary else 'force'} in {units['force'] or 'N (no unit)'}"
@@ -342,7 +350,11 @@ def _check_pairs(units: Mapping[str, str], dimensions: Mapping[str, Dimension | 
 
 
 def read_step(resolution: Any) -> tuple[float, bool | None]:
-    """Return the encoder step in SI units, and whether it is an angle (None for a number without a unit)."""
+    """Convert a user-specified encoder step to SI units.
+
+    Returns:
+        The step in m or rad; and True for an angle, False for a length, None for a number without a unit.
+    """
     number = not isinstance(resolution, str) or looks_like_number(resolution)
     value = float(resolution) if isinstance(resolution, str) and number else resolution
     if number and isinstance(value, int | float) and value > _COARSEST:
@@ -363,7 +375,7 @@ def read_step(resolution: Any) -> tuple[float, bool | None]:
 
 
 def join_logs(motions: Sequence[LoggedMotion], period: float | None) -> dict[str, Any]:
-    """Return the arguments of `zwidth.fit_log` for several logs of one axis; the period replaces missing times."""
+    """Combine logs of one axis into keyword arguments of `zwidth.fit_log`; the period replaces missing times."""
     if len({motion.rotary for motion in motions}) > 1:
         raise InputError("logs: some have angles, others lengths; fit them separately")
     steps = {motion.resolution for motion in motions}
@@ -375,7 +387,7 @@ def join_logs(motions: Sequence[LoggedMotion], period: float | None) -> dict[str
 
 
 def check_period(period: float | None, logged: float) -> None:
-    """Raise `InputError` if the sampling period found in the times of logs differs from the specified one."""
+    """Raise `InputError` if the sampling period of the logged times differs from the one that the user specified."""
     if period is not None and abs(logged - period) > _SAME_PERIOD * period:
         raise InputError(
             f"period: got {with_unit(period, 's')}, but the samples of the log are {with_unit(logged, 's')} apart; "
@@ -384,7 +396,7 @@ def check_period(period: float | None, logged: float) -> None:
 
 
 def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None, **options: Any) -> DeviceFit:
-    """Fit logs that were read from files with `zwidth.fit_log`, and add the notes on their columns to the fit."""
+    """Fit a device with `zwidth.fit_log` to logs read from files, and add the notes on their columns to the result."""
     fit = fit_log(**join_logs(motions, period), **options)
     check_period(period, fit.period)
     notes = dict.fromkeys(note for motion in motions for note in motion.notes)

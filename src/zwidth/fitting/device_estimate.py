@@ -1,8 +1,10 @@
-"""Estimate of a device from records: its parameters with their covariance, as a scene, and random devices around it.
+"""Represent an estimated device: its parameters with their covariance, random devices around it, and its response.
 
-The parameters are mass, damping and delay, those of an actuator lag, and those of resonances (*modes*), in SI units. A
-fit with d degrees of freedom has parameters with Student's t distribution; with known noise they are normal. The
-response of the estimated device with a radius around it describes all devices that agree with the records.
+The parameters are the mass m, the damping b, the delay, those of an actuator lag, and those of resonances (*modes*), in
+SI units; T is the sampling period. If the noise was estimated with a number of degrees of freedom, the errors of the
+parameters have Student's t distribution; if it is known, they are normal. For a log, the estimate also contains the
+frequency response with a radius at each frequency: the responses of all devices that agree with the log are within it.
+K_max is the largest stable wall stiffness, B the virtual damping of a wall.
 """
 
 from __future__ import annotations
@@ -24,24 +26,24 @@ from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
 from zwidth.words.unit_system import LINEAR, UnitSystem
 
-UPPER = 0.975  # probability below the upper end of a 95 % interval
-_STEP = 0.1  # step of central differences, in standard deviations
-_TINY = 1e-40  # complex step of derivatives; its square is below the rounding error
-RELIABILITY = 0.99  # default of the proportion of devices on which a safe wall is stable
-_ROUNDS = 50  # rounds of random draws, after which an estimate with mostly impossible devices is given up
+UPPER = 0.975  # probability that the true value is below the upper end of a 95 % confidence interval
+_STEP = 0.1  # step of finite differences in the parameters, in standard errors
+_TINY = 1e-40  # step of complex-step differentiation; its square is below the rounding error
+RELIABILITY = 0.99  # proportion of devices on which a safe wall is stable, by default
+_ROUNDS = 50  # largest number of rounds of random draws; if too few valid devices result, no devices are returned
 
 
 class DimensionlessDevice(NamedTuple):
-    """A device in units of its mass and of the sampling period; the fields are numbers or arrays that broadcast."""
+    """A device in units of its mass m and of the sampling period T; the fields are numbers or arrays that broadcast."""
 
-    mass: Any  # m, kg
-    delta: Any  # b T/m
-    d: Any  # delay, in periods
-    lag: Any = ()  # time constant of the actuator in periods and, for second order, its damping ratio
+    mass: Any  # mass m, kg
+    delta: Any  # damping b T/m
+    d: Any  # delay, in sampling periods
+    lag: Any = ()  # time constant of the actuator in sampling periods and, for second order, its damping ratio
     modes: Any = ()  # for each mode the frequency in rad per sample, the damping ratio and the mass ratio m/m_i
 
     def to_parameters(self, period: Any) -> np.ndarray:
-        """Return the parameters in SI units, in the order of `name_parameters`, along the first axis."""
+        """Convert to an array of parameters in SI units, along its first axis in the order of `name_parameters`."""
         mass, units = self.mass, [period, 1.0]
         values = [mass, self.delta * mass / period, self.d * period]
         values += [part * unit for part, unit in zip(self.lag, units, strict=False)]
@@ -51,14 +53,20 @@ class DimensionlessDevice(NamedTuple):
 
     @classmethod
     def from_parameters(cls, values: np.ndarray, period: float, lag: int) -> DimensionlessDevice:
-        """Return the device with the parameters along the first axis of ``values``; ``lag`` is the order of its lag."""
+        """Convert parameters in SI units to a dimensionless device.
+
+        Args:
+            values: parameters along the first axis, in the order of `name_parameters`.
+            period: sampling period in s.
+            lag: order of the actuator lag, 0 for none.
+        """
         mass, modes = values[0], values[3 + lag :].reshape(-1, 3, *values.shape[1:])
         scaled = [(2.0 * np.pi * period * hertz, ratio, mass / modal_mass) for hertz, ratio, modal_mass in modes]
         delays = [part / unit for part, unit in zip(values[3 : 3 + lag], [period, 1.0], strict=False)]
         return cls(mass, values[1] / (mass / period), values[2] / period, delays, scaled)
 
     def to_scene(self, period: float, velocity: Velocity, system: UnitSystem = LINEAR) -> Scene:
-        """Return the loop of the device, without a wall."""
+        """Return the scene of the device with its delay and velocity estimate, without a wall."""
         lag, (mass, damping, delay, *parts) = len(self.lag), map(float, self.to_parameters(period))
         constant, *ratio = parts[:lag] or [None]
         actuator = Actuator(None, constant, lag, *ratio) if lag else None
@@ -68,15 +76,23 @@ class DimensionlessDevice(NamedTuple):
 
 
 def differentiate(function: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
-    """Return the derivatives of an analytic function, one column per argument, exact to rounding error.
+    """Differentiate an analytic function by complex steps, which have no cancellation error (Squire, Trapp 1998).
 
-    Complex steps have no cancellation (Squire, Trapp 1998).
+    Args:
+        function: function of an array of parameters.
+        values: the parameters at which it is differentiated.
+
+    Returns:
+        The derivatives with an additional last axis over the parameters.
     """
     return np.stack([np.imag(function(values + 1j * _TINY * unit)) / _TINY for unit in np.eye(values.size)], -1)
 
 
 def name_parameters(scene: Scene) -> tuple[str, ...]:
-    """Return the paths of the fitted parameters: mass, damping, delay, and those of actuator lag and modes."""
+    """List the paths of the fitted parameters of a scene, such as "mass" and "modes.0.frequency".
+
+    The order is mass, damping, delay, parameters of the actuator lag, parameters of the modes.
+    """
     actuator, modes = scene.device.actuator, range(len(scene.device.modes))
     lag = () if actuator is None else ("time_constant", *(["damping_ratio"] if actuator.order == 2 else []))
     of_mode = ("frequency", "damping_ratio", "mass")
@@ -85,17 +101,17 @@ def name_parameters(scene: Scene) -> tuple[str, ...]:
 
 
 def differentiate_stiffness_max(scene: Scene) -> tuple[float, np.ndarray]:
-    """Return K_max of a scene and its derivatives in the parameters of `name_parameters`."""
+    """Return K_max of a scene, and an array of its derivatives in the parameters that `name_parameters` lists."""
     sensitivities = scene.sensitivities()
     return float(sensitivities.stiffness), np.array([sensitivities.per[path] for path in name_parameters(scene)])
 
 
 def compute_reach(freedom: int | None, upper: float = UPPER) -> float:
-    """Return the half-width of a confidence interval, in standard errors.
+    """Return the half-width of a confidence interval in standard errors, a quantile of the t or normal distribution.
 
     Args:
-        freedom: degrees of freedom with which the noise was estimated; None if it is known.
-        upper: probability below the upper end of the interval.
+        freedom: degrees of freedom with which the noise was estimated; None if the noise is known.
+        upper: probability that the true value is below the upper end of the interval.
     """
     from scipy.special import ndtri, stdtrit
 
@@ -104,17 +120,17 @@ def compute_reach(freedom: int | None, upper: float = UPPER) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceEstimate:
-    """An estimate of a device with its uncertainty; the attributes are described in `zwidth.DeviceFit`."""
+    """An estimated device with the covariance of its parameters; `zwidth.DeviceFit` describes the attributes."""
 
-    nominal: Scene  # the fitted loop
-    covariance: np.ndarray  # of the parameters, in SI units
-    noise: float | tuple[float, float]  # of the position in m; for walls the relative noise of K and f
-    freedom: int | None = None  # degrees of freedom with which the noise was estimated; None if it is given
-    response: MeasuredDevice | None = None  # of the device, with a radius for an undetected resonance
-    damping_tried: float | None = None  # largest B of the measured walls, N s/m
-    stiffness_tried: float | None = None  # K measured at this B, N/m
+    nominal: Scene  # scene with the fitted parameters
+    covariance: np.ndarray  # covariance of the parameters, in SI units
+    noise: float | tuple[float, float]  # standard deviation of the position in m; for walls that of K and f, relative
+    freedom: int | None = None  # degrees of freedom with which the noise was estimated; None if the noise is given
+    response: MeasuredDevice | None = None  # response; its radius covers the largest undetected resonance
+    damping_tried: float | None = None  # largest B of the measured walls, N s/m; None for a log
+    stiffness_tried: float | None = None  # K measured at the largest B, N/m; None for a log
 
-    # Attributes of the fitted scene.
+    # Shortcuts to attributes of the scene with the fitted parameters.
     mass = property(attrgetter("nominal.device.mass"))
     damping = property(attrgetter("nominal.device.damping"))
     delay = property(attrgetter("nominal.timing.delay"))
@@ -136,7 +152,7 @@ class DeviceEstimate:
 
     @cached_property
     def estimates(self) -> np.ndarray:
-        """The values of the fitted parameters, in the order of ``numbers``."""
+        """The values of the fitted parameters in SI units, in the order of ``numbers``."""
         parameters = self.nominal.parameters()
         return np.array([parameters[name] for name in self.numbers])
 
@@ -146,23 +162,25 @@ class DeviceEstimate:
         return compute_reach(self.freedom)
 
     def normalize(self, drawn: np.ndarray) -> DimensionlessDevice:
-        """Return devices with other parameters, given in the order of ``numbers``, one row per device."""
+        """Convert parameters of random devices, one row per device in the order of ``numbers``, to one batch."""
         lag = 0 if self.actuator is None else self.actuator.order
         return DimensionlessDevice.from_parameters(np.moveaxis(drawn, 1, 0), self.period, lag)
 
     def propagate_errors(self, evaluate: Callable[[Scene], Any]) -> np.ndarray:
-        """Return the linearized change of a quantity by one standard deviation along each axis of the covariance.
+        """Propagate the covariance of the parameters to a quantity computed from the scene, by finite differences.
 
         Args:
             evaluate: function that computes the quantity, a number or an array, from a scene.
 
         Returns:
-            One row per axis. The sum of their squares is the variance of the quantity.
+            The linearized change of the quantity by one standard deviation along each principal axis of the covariance,
+            one row per axis. The sum of the squared rows is the variance of the quantity.
         """
         values, middle, rows = self.estimates, evaluate(self.nominal), []
         for axis in _find_axes(self.covariance).T:
             step = _STEP * axis
-            # Use a one-sided difference if a parameter would change its sign on the other side.
+            # Use a one-sided difference if a parameter would change its sign on one side, because most parameters must
+            # not be negative.
             sides = [side for side in (-1.0, 1.0) if np.all((values + side * step) * np.where(values < 0, -1, 1) >= 0)]
             moved = [dict(zip(self.numbers, (values + side * step).tolist(), strict=True)) for side in sides]
             ends = [evaluate(self.nominal.replace(**each)) for each in moved]
@@ -173,7 +191,7 @@ class DeviceEstimate:
         return np.array(rows)
 
     def draw(self, count: int) -> np.ndarray | None:
-        """Draw parameters of random devices around the estimate, in the order of ``numbers``, one row per device.
+        """Draw parameters of random devices from the distribution of the estimate.
 
         The logarithm of the mass and the reciprocals of modal masses are drawn, because measurements determine the mass
         to a relative error and the response of a mode is proportional to the reciprocal of its modal mass. Devices with
@@ -183,12 +201,13 @@ class DeviceEstimate:
             count: number of devices.
 
         Returns:
-            The parameters; None if the covariance is not finite or almost all devices are impossible.
+            The parameters, one row per device, in the order of ``numbers``. None if the covariance is not finite, or if
+            almost all drawn devices have negative parameters.
         """
         values = self.estimates
         if not np.all(np.isfinite(self.covariance)):
             return None
-        # Modal masses may have any sign.
+        # Modal masses are drawn as reciprocals and may have either sign.
         inverse = np.array([name.endswith(".mass") for name in self.numbers])
         center, slopes = values.copy(), np.ones(values.size)
         center[inverse], slopes[inverse] = 1.0 / values[inverse], -1.0 / values[inverse] ** 2
@@ -211,31 +230,31 @@ class DeviceEstimate:
         return None
 
     def bound_measured_stiffness(self, confidence: float) -> float:
-        """Return the lower confidence limit of the K measured at the largest B, in N/m; 0 for a log.
+        """Return the lower confidence limit of the K measured at the largest measured B, in N/m; 0 for a log.
 
         Args:
-            confidence: probability that the true K is above the limit.
+            confidence: probability that the true onset K is above the limit.
         """
         noise = self.noise[0] if isinstance(self.noise, tuple) else 0.0
         return max(0.0, (self.stiffness_tried or 0.0) * (1.0 - compute_reach(self.freedom, confidence) * noise))
 
     @cached_property
     def response_scene(self) -> Scene | None:
-        """The scene of `build_response_scene` with undetected resonances, at the default reliability."""
+        """The result of `build_response_scene` that includes undetected resonances, at the default reliability."""
         return self.build_response_scene(RELIABILITY, True)
 
     def build_response_scene(self, reliability: float, hidden: bool) -> Scene | None:
-        """Build the loop with the response of the device and its radius, in place of the fitted parameters.
+        """Build a scene that describes the device by its response with a radius, in place of the fitted parameters.
 
-        A wall that is stable for all responses within the radius is stable on all devices that these describe.
+        A wall that is stable for all responses within the radius is stable on every device with such a response.
 
         Args:
-            reliability: proportion of devices whose response the radius covers, for a device with a lag or modes; the
-                parameters of a rigid device do not enter the radius.
-            hidden: include one undetected resonance in the radius.
+            reliability: proportion of the devices that agree with the fitted parameters and their covariance whose
+                response is within the radius. For a rigid device, the covariance does not contribute to the radius.
+            hidden: True if the radius also covers one undetected resonance.
 
         Returns:
-            The scene; None without a response, or if the parameters are too uncertain for a finite radius.
+            The scene; None if the estimate has no response, or if the radius is not finite.
         """
         from scipy.special import fdtri
 
@@ -245,8 +264,8 @@ class DeviceEstimate:
         radius = fitted.deviation if hidden else 0.0 * fitted.deviation
         if self.is_structured:
             changes = self.propagate_errors(lambda scene: scene.frequency_response(1.0, 0.0, fitted.frequency))
-            # To first order, the confidence region of the response at a frequency is an ellipse in the complex plane;
-            # add its longer half-axis.
+            # To first order, the confidence region of the response at one frequency is an ellipse in the complex plane.
+            # Add its longer half-axis to the radius, so that the disk contains the ellipse.
             square, across = np.sum(np.abs(changes) ** 2, 0), np.abs(np.sum(changes**2, 0))
             count = len(self.numbers)
             reach = count * fdtri(count, self.freedom, reliability)
@@ -258,8 +277,9 @@ class DeviceEstimate:
 
 
 def _find_axes(covariance: np.ndarray) -> np.ndarray:
-    """Return one standard deviation along each axis of a covariance, one column per axis."""
-    # Use the correlations, because the parameters have very different units. Exact parameters have no error.
+    """Return a square root of a covariance: its principal axes scaled to one standard deviation, one per column."""
+    # Decompose the correlation matrix, because the parameters have very different units. Leave exact parameters, whose
+    # standard error is 0, unscaled.
     errors = np.sqrt(np.diag(covariance))
     errors = np.where(errors > 0, errors, 1.0)
     sizes, axes = np.linalg.eigh(covariance / np.outer(errors, errors))

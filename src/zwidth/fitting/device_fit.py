@@ -1,8 +1,9 @@
-"""Result of a fit: the estimated device, confidence intervals, and the maximum stiffness and walls that follow.
+"""Result of a fit: the estimated device with confidence intervals, its maximum stiffness K_max, and safe walls.
 
-Confidence intervals have 95 %. The interval of K_max is computed for its logarithm, to first order in the parameters.
-For a log it also covers undetected resonances, by Bayesian model averaging, and an undetected actuator lag
-(`zwidth.fitting.hidden`, docs/theory/hidden.md).
+K and B are the stiffness and damping of a wall. All confidence intervals have the level 95 %. The interval of K_max is
+computed for ln K_max, to first order in the errors of the parameters. For a log, it also includes the effects of
+undetected resonances, by Bayesian model averaging, and of an undetected actuator lag (`zwidth.fitting.hidden`,
+docs/theory/hidden.md).
 """
 
 from __future__ import annotations
@@ -25,46 +26,49 @@ from zwidth.words.formatting import to_json, with_unit
 from zwidth.words.showing import compact_repr
 from zwidth.words.status import Status
 
-_FAR = 1e3  # half-width, in standard errors, of the bracket in which quantiles are searched
-VAGUE = 0.5  # relative standard error above which a parameter causes a warning
-BEYOND = 3.0  # standard errors below 0 from which on a negative delay causes a warning; small ones are noise
+_FAR = 1e3  # half-width of the initial bracket in the root search for a quantile of ln K_max, in standard errors
+VAGUE = 0.5  # relative standard error of a parameter above which a warning is issued
+# A delay is restricted to nonnegative values. If its unrestricted estimate is this many standard errors below 0, a
+# warning is issued, because noise does not explain it.
+BEYOND = 3.0
 
-# Range of sampling periods in s; a period outside causes a warning about its unit.
+# Usual range of sampling periods in s. A period outside this range causes a warning, because its unit may be wrong.
 _SHORTEST_PERIOD = 5e-6
 _LONGEST_PERIOD = 0.02
-# Remedy if the log does not decide between two structures of the device.
+# Remedy for warnings that the log does not distinguish two structures of the device, such as a lag and a resonance.
 SEE_MORE = "record a force of zwidth.excite, use a larger force, or a finer encoder"
 MASS_OPEN = "the mass is hardly determined: its standard error is more than half of its value"
 
 
 class ErrorBar(NamedTuple):
-    """An interval that holds the true value with 95 % confidence."""
+    """A 95 % confidence interval of a parameter or of K_max."""
 
     low: float
     high: float
 
 
 class FurtherExperiment(NamedTuple):
-    """The most informative next measurement: raise K at this B until the wall becomes unstable."""
+    """The proposed next measurement: raise K at the given B until the wall becomes unstable."""
 
-    virtual_damping: float  # B, N s/m
+    virtual_damping: float  # B at which to raise K, N s/m
     stiffness: float  # expected K at the onset of instability, N/m
     frequency: float  # expected frequency of the oscillation, Hz
-    error_afterwards: float  # expected standard error of K_max with the further wall, N/m; NaN if K_max is
+    error_afterwards: float  # expected standard error of K_max after this measurement, N/m; NaN if K_max is NaN
 
 
 class FittedMotion(NamedTuple):
-    """A log and its fitted positions, arrays with one entry per sample."""
+    """A log together with the positions of the fitted model, as arrays with one entry per sample."""
 
-    time: np.ndarray  # s
-    force: np.ndarray  # N
-    position: np.ndarray  # measured, m
-    # Fitted positions in m; NaN if past forces are unknown, at the start and after gaps, and after 200,000 samples.
+    time: np.ndarray  # time of each sample, s
+    force: np.ndarray  # commanded force, N
+    position: np.ndarray  # measured position, m
+    # Modeled position in m. It is NaN at the start and after gaps, because past forces are unknown there, and after
+    # 200,000 samples.
     modelled: np.ndarray
 
 
 class RivalDevice(NamedTuple):
-    """Another device that fits equally well: parameters in kg, N s/m and s, and its K_max in N/m."""
+    """Another device that fits equally well: its mass in kg, damping in N s/m, delay in s, and K_max in N/m."""
 
     mass: float
     damping: float
@@ -92,15 +96,15 @@ class DeviceFit(DeviceEstimate):
         mass, damping, delay: estimates in kg, N s/m, s.
         actuator, modes: the actuator lag and the resonances that the measurements require: a `zwidth.Actuator` or None,
             and `zwidth.Mode`. A negative modal mass means that actuator and sensor are on opposite sides of a node.
-        errors: standard errors of the three, by name, and of the other parameters by their paths, such as
-            "actuator.time_constant" and "modes.0.frequency".
+        errors: standard errors by name: of mass, damping and delay, and of the other parameters by their paths, such
+            as "actuator.time_constant" and "modes.0.frequency".
         numbers: paths of the fitted parameters.
         covariance: covariance of the parameters in the order of ``numbers``, in SI units.
         stiffness_max: K_max in N/m of the estimated device, `zwidth.Scene.max_stiffness`; NaN if the status is not OK,
             except for UNDECIDED if the rivals have the same K_max within its error.
-        stiffness_error: standard error of K_max, from its gradient.
-        noise: for walls, the relative noise of K and f; for a log, the noise of the position in m. Given, or estimated
-            from the residuals.
+        stiffness_error: standard error of K_max, from its gradient in the parameters.
+        noise: standard deviation of the noise, given or estimated from the residuals: for walls those of K and of the
+            frequency f, relative; for a log that of the position in m.
         residuals: measured minus fitted values: for walls an array (n, 2) in units of the noise of K and f; for a log
             in m, NaN for samples that are not fitted.
         doubts: warnings about the measurements or the estimate, one sentence each. With a warning there is no safe
@@ -108,25 +112,25 @@ class DeviceFit(DeviceEstimate):
         notes: interpretations of the columns of a log and repairs of its rows, one clause each.
         status: code of `zwidth.Status`; UNDECIDED if another device fits equally well, or if the residuals of a log are
             not white noise.
-        rivals: those devices, `zwidth.RivalDevice`.
+        rivals: other devices that fit equally well, each a `zwidth.RivalDevice`.
         next: for walls, the further measurement that reduces the error of K_max most; otherwise None.
         offset, friction: for a log, constant force in addition to the commanded one, and Coulomb friction, in N. Their
-            errors, in ``errors_of_log`` and ``errors``, are NaN if the log does not distinguish them.
-        resolution: encoder step in m with which a log was fitted; 0 for none, and for walls.
+            errors, in ``errors_of_log`` and ``errors``, are NaN if the log does not distinguish the two forces.
+        resolution: encoder step in m with which a log was fitted; 0 without an encoder step, and for walls.
         motions: for a log, the measured and fitted positions, `zwidth.FittedMotion`.
-        scene: the fitted loop, a `zwidth.Scene` with the safe limit of its walls. Its parameters are rounded to a
+        scene: `zwidth.Scene` of the fitted device, with the safe limit of its walls. Its parameters are rounded to a
             thousandth of their standard errors, as `zwidth fit --yaml` writes them.
-        nominal, period, velocity: the fitted loop before rounding and without the safe limit, its sampling period in s
-            and its velocity estimate.
-        response: for a log, a `zwidth.MeasuredDevice`: the response of the estimated device. Its deviation covers every
-            resonance with a damping ratio of at least 0.005 that may be undetected in the log. None for walls, for a
-            log without noise, and if the residuals cause a warning.
+        nominal, period, velocity: the scene before rounding and without the safe limit, its sampling period in s and
+            its velocity estimate.
+        response: for a log, the frequency response of the estimated device, a `zwidth.MeasuredDevice`. Its deviation
+            covers every resonance with a damping ratio of at least 0.005 that may be undetected in the log. None for
+            walls, for a log without noise, and if the residuals cause a warning.
         lag: for a log, ``(time_constant, delay, stiffness_max)`` in s and N/m for the longest actuator lag that the log
-            does not distinguish from a delay. The interval of K_max extends to that K_max. None as for ``response``,
-            and if the log excludes every lag.
+            does not distinguish from a delay. The interval of K_max extends to the K_max with this lag. None if
+            ``response`` is None, or if the log excludes every lag.
         hidden: for a log, ``(odds, stiffness_max)``: the posterior odds of one undetected resonance against none, and
             equally likely values of K_max with such a resonance, relative to K_max without. The interval of K_max
-            averages over them. None as for ``response``.
+            averages over these values. None if ``response`` is None.
         damping_tried, stiffness_tried: for walls, the largest measured B in N s/m, and the K in N/m measured there;
             None for a log.
         freedom: degrees of freedom with which the noise was estimated; None if the noise is given.
@@ -148,13 +152,13 @@ class DeviceFit(DeviceEstimate):
 
     @cached_property
     def errors(self) -> dict[str, float]:
-        """The standard errors by name."""
+        """The standard error of each fitted parameter and force, by name or path."""
         errors = np.sqrt(np.diag(self.covariance)).tolist()
         return dict(zip(self.numbers, errors, strict=True)) | self.errors_of_log
 
     @cached_property
     def _stiffest(self) -> tuple[float, float]:
-        """K_max and its standard error; NaN if another device with another K_max fits equally well."""
+        """K_max and its standard error; both NaN if an equally well fitting device has a clearly different K_max."""
         value, gradient = differentiate_stiffness_max(self.nominal)
         error = float(np.sqrt(gradient @ self.covariance @ gradient))
         agreed = bool(self.rivals) and all(abs(rival.stiffness_max - value) <= error for rival in self.rivals)
@@ -163,7 +167,7 @@ class DeviceFit(DeviceEstimate):
 
     @property
     def stiffness_max(self) -> float:
-        """K_max of the estimated device, in N/m; NaN if it is not determined."""
+        """K_max of the estimated device, in N/m; NaN if the measurements do not determine it."""
         return self._stiffest[0]
 
     @property
@@ -173,7 +177,7 @@ class DeviceFit(DeviceEstimate):
 
     @property
     def is_doubted(self) -> bool:
-        """True if the fit has a warning or its status is not OK: then no wall is recommended.
+        """True if the fit has a warning or its status is not OK; then no wall is recommended.
 
         In simulations, dynamics that the model lacks changed K_max by a factor of up to 2.8, mostly in fits with
         warnings.
@@ -192,31 +196,31 @@ class DeviceFit(DeviceEstimate):
 
     @cached_property
     def virtual_damping(self) -> float:
-        """B in N s/m of the stiffest stable wall; NaN if ``stiffness_max`` is."""
+        """B in N s/m of the stiffest stable wall; NaN if ``stiffness_max`` is NaN."""
         return float(self.nominal.max_stiffness().virtual_damping) if self.stiffness_max > 0 else np.nan
 
     @cached_property
     def virtual_damping_error(self) -> float:
-        """The standard error of ``virtual_damping``, by differences along the axes of the covariance."""
+        """The standard error of ``virtual_damping`` in N s/m, propagated from the parameters by finite differences."""
         if not np.isfinite(self.virtual_damping + self.covariance.sum()):
             return np.nan
         return float(np.sqrt(np.sum(self.propagate_errors(lambda scene: scene.max_stiffness().virtual_damping) ** 2)))
 
     def value_of(self, name: str) -> float:
-        """Return a value that ``errors`` names: an attribute of the fit, or a parameter of a part by its path."""
+        """Return the value of a key of ``errors``: an attribute of the fit, or the parameter with this path."""
         return float(self.nominal.parameters()[name] if "." in name else getattr(self, name))
 
     @cached_property
     def intervals(self) -> dict[str, ErrorBar]:
-        """The 95 % intervals by name, of all values in ``errors`` and of "stiffness_max".
+        """The 95 % confidence intervals by name: of all values in ``errors`` and of "stiffness_max".
 
-        The interval of K_max includes ``hidden`` and ``lag``. If K_max has a larger B than all measured walls, the
-        interval also includes the K measured at the largest B.
+        The interval of K_max includes the effects of ``hidden`` and ``lag``. If the B at K_max exceeds all measured B,
+        the interval also includes the K measured at the largest B.
         """
         widths = {name: (self.value_of(name), self.reach * error) for name, error in self.errors.items()}
-        # A constant force and a modal mass may be negative.
+        # Cut the intervals off at 0, except those of constant forces and modal masses, because these may be negative.
         signed = [name for name in widths if name == "offset" or (name.startswith("modes") and name.endswith("mass"))]
-        # np.maximum keeps NaN.
+        # Use np.maximum instead of max, because it returns NaN if the width is NaN.
         bars = {
             name: ErrorBar(float(value - width if name in signed else np.maximum(0.0, value - width)), value + width)
             for name, (value, width) in widths.items()
@@ -228,20 +232,24 @@ class DeviceFit(DeviceEstimate):
             ends = np.array([-self.reach, self.reach]) * error
             if self.hidden is not None and error > 0:
                 ends = self._average_models(error, *self.hidden)
-            # Include the estimate itself, even if most devices with an undetected resonance have another K_max.
+            # Extend the interval to the estimate itself, which lies outside if most devices with an undetected
+            # resonance have another K_max.
             low, high = (stiffness * np.exp([min(ends[0], 0.0), max(ends[1], 0.0)])).tolist()
         if self.damping_tried is not None and self.virtual_damping > self.damping_tried:
-            # K_max is extrapolated beyond the measured B, but it is at least the measured K.
+            # K_max is extrapolated to a B beyond the measured ones. The only certain statement is that it is at least
+            # the measured K, so extend the interval down to the lower confidence limit of this K.
             low = min(low, self.bound_measured_stiffness(UPPER))
         if self.lag is not None:
             high += max(self.lag.stiffness_max - stiffness, 0.0)
         return bars | {"stiffness_max": ErrorBar(low, high)}
 
     def _average_models(self, error: float, odds: float, ratios: np.ndarray) -> list[float]:
-        """Return the interval of ln K_max relative to the estimate, averaged over devices with and without a resonance.
+        """Compute the 95 % interval of ln(K_max/estimate) by Bayesian averaging of models with and without a resonance.
+
+        The distribution is a mixture of t distributions, one for each sampled resonance and one without a resonance.
 
         Args:
-            error: standard error of ln K_max of each device.
+            error: standard error of ln K_max, equal for all models.
             odds: posterior odds of an undetected resonance.
             ratios: K_max with a resonance, relative to K_max without.
         """
@@ -263,22 +271,22 @@ class DeviceFit(DeviceEstimate):
     def safe_wall(self, reliability: float = RELIABILITY, *, rigid: bool = False) -> SafeWall:
         """Find the stiffest wall that is stable on nearly all devices that agree with the records.
 
-        The devices are random, distributed around the estimate. The wall and all softer walls with the same B are
-        stable on the required proportion of them, because users raise K from below. For a log, the wall is also stable
-        with every single resonance that may be undetected. For walls at the onset of instability, B is at most the
-        largest measured one, because undetected resonances may destabilize any wall of larger B.
+        Random devices are drawn from the distribution of the estimate. On the required proportion of them the wall is
+        stable, and so are all softer walls with the same B, because users raise K from below. For a log, the wall is
+        also stable with every single resonance that may be undetected. For a fit to walls at the onset of instability,
+        B is at most the largest measured B, because undetected resonances may destabilize any wall with a larger B.
 
         Args:
             reliability: required proportion of devices, at least 0.5 and below 1.
             rigid: assume that the device has no undetected resonances. Many devices have resonances of 50 to 300 Hz,
-                and a wall that such a resonance makes unstable may be far softer than K_max of the rigid mass.
+                which can make walls unstable that are far softer than K_max of the rigid mass.
 
         Returns:
             SafeWall: ``stiffness`` K in N/m and ``virtual_damping`` B in N s/m, both 0 if no wall is stable on enough
-            devices; ``share``, the proportion of the random devices on which the wall is stable by their poles;
-            ``status``: that of the fit, or UNDECIDED if the fit has warnings, the poles do not confirm the wall, or
-            almost no random device is possible; all numbers are NaN unless it is OK; ``resonance``, the frequency in Hz
-            of the undetected resonance that limits the wall, NaN if none does.
+            devices; ``share``, the proportion of the random devices on which the wall is stable according to the poles;
+            ``status``: that of the fit, or UNDECIDED if the fit has warnings, if the poles do not confirm the wall, or
+            if almost all random devices have negative parameters; all numbers are NaN unless the status is OK;
+            ``resonance``, the frequency in Hz of the undetected resonance that limits the wall, NaN if none does.
 
         Raises:
             InputError: an invalid reliability.
@@ -315,11 +323,11 @@ class DeviceFit(DeviceEstimate):
 
     @cached_property
     def _safe_walls(self) -> dict[tuple[float, bool], SafeWall]:
-        """The computed safe walls by reliability and ``rigid``."""
+        """Cache of the safe walls already computed, with the arguments of ``safe_wall`` as keys."""
         return {}
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the result as plain numbers and texts for JSON; NaN becomes None."""
+        """Return the result as a dictionary of plain numbers and texts for JSON, with None in place of NaN."""
         numbers = {
             **dict(zip(self.numbers, self.estimates.tolist(), strict=True)),
             "stiffness_max": self.stiffness_max,
@@ -341,7 +349,7 @@ class DeviceFit(DeviceEstimate):
         return to_json(numbers)
 
     def _spell_recommended(self) -> dict[str, Any]:
-        """Return the recommended wall as numbers and texts for JSON."""
+        """Return the recommended wall as a dictionary of plain numbers and texts for JSON."""
         recommended = self.recommended
         margins = ("gain_margin", "phase_margin", "delay_margin")
         return {
@@ -353,7 +361,7 @@ class DeviceFit(DeviceEstimate):
 
 
 def check_period_unit(period: float) -> list[str]:
-    """Return a warning about the unit of the sampling period if it is unusual."""
+    """Return a list with a warning that the unit may be wrong if the sampling period is unusual; else an empty list."""
     if _SHORTEST_PERIOD <= period <= _LONGEST_PERIOD:
         return []
     unit = "in ms or us" if period > _LONGEST_PERIOD else "in s"

@@ -1,15 +1,16 @@
-"""Errors of encoder positions, and the covariance of estimates from such positions.
+"""Model the errors of encoder positions, and compute the covariance of estimates from such positions.
 
 An encoder with step q returns q round(y/q) with y = x + n, the position x and noise n of standard deviation sigma. Its
-error e is a sawtooth function of y. Averaged over the unknown zero of the encoder, two samples have the covariance
+error e is a sawtooth function of y. Averaged over the unknown zero of the encoder, samples i and k have the covariance
 
     E[e_i e_k] = sum_h w_h cos(2 pi h (x_i - x_k)/q),    w_h = q^2/(2 pi^2 h^2) exp(-(2 pi h sigma/q)^2),
 
-so the errors of a slow motion are autocorrelated. Averaged over the zero, e is not correlated with n; therefore the
+so the errors of a slow motion are autocorrelated. In the same average, e is not correlated with n; therefore the
 variance of one sample is sigma^2 + q^2/12.
 
-At rest, all samples have the same error. Least squares with independent errors would fit this error. Therefore the mean
-of each stretch within one step is weighted by its own variance.
+At rest, all samples have the same error, and ordinary least squares would fit this error as if it were motion.
+Therefore the positions are divided into *stretches* whose motion is shorter than one encoder step, and the mean of
+each stretch is weighted according to its variance.
 """
 
 from __future__ import annotations
@@ -20,57 +21,59 @@ from functools import cached_property
 
 import numpy as np
 
-# Fourier series of the covariance.
-_WAVES = 40  # terms h that are computed; the rest, about 1.5 % of q^2/12, counts as white noise
-_MIN_WEIGHT = 1e-6  # smallest weight w_h, relative to the variance of a sample; the series ends there
-# Detection of the step, of which all positions are integer multiples except for a common offset.
-_MAX_OFFSET = 0.02  # largest distance of a position from a multiple, in steps
-_MAX_ROUNDING_OFFSET = 1e-4  # the same for the rounding step of a column, with rounding errors of float64 only
-_ROUNDINGS = 5.0  # least encoder step, in rounding steps of the column; finer ones are not distinguished from these
-_MAX_STEPS = 1e7  # largest range of positions, in steps
-_CHANCE = 1e-6  # largest probability that random positions are as close to multiples
-_PICKS = 100  # positions that refine the estimate of a step
+# Truncation of the Fourier series of the covariance.
+_WAVES = 40  # number of terms h; the omitted ones, about 1.5 % of q^2/12, are treated as white noise
+_MIN_WEIGHT = 1e-6  # smallest w_h that is included, relative to the variance of a sample
+# Detection of the encoder step: all positions are integer multiples of it, plus a common offset.
+_MAX_OFFSET = 0.02  # largest distance of a position from an integer multiple of the encoder step, in steps
+# The same for the rounding step of a column, which is smaller because only rounding errors of float64 contribute.
+_MAX_ROUNDING_OFFSET = 1e-4
+# Least encoder step that is detected, in rounding steps of the column, because smaller ones are hidden by the rounding.
+_ROUNDINGS = 5.0
+_MAX_STEPS = 1e7  # largest range of the positions for which a step is accepted, in steps
+_CHANCE = 1e-6  # largest probability, for an accepted step, that random positions are as close to its multiples
+_PICKS = 100  # number of positions with which the estimate of a step is refined
 
 
 def find_steps(position: np.ndarray) -> tuple[float, float]:
-    """Return the encoder step and the rounding step of the column; 0 for a step that does not exist.
+    """Detect the encoder step of logged positions and the rounding step of their column; 0 for a step not detected.
 
-    An angle printed in degrees with three decimals has the rounding step 0.001 deg. Both steps are equal if the column
-    contains encoder counts.
+    For example, a column of angles printed in degrees with three decimals has the rounding step 0.001 deg. If the
+    column contains encoder counts, both steps are equal.
     """
     values = np.unique(position)
-    # Subtracting a common offset leaves errors of the size of the spacing of float64.
+    # Tolerate rounding errors of this size, because the subtraction of a common offset causes them.
     error = 16.0 * float(np.spacing(np.abs(values).max()))
     column = _find_lattice(values, _MAX_ROUNDING_OFFSET, error)
     return _find_lattice(values, _MAX_OFFSET, max(column, error)) or column, column
 
 
 def find_resolution(position: np.ndarray) -> float:
-    """Return the encoder step, of which all positions are integer multiples except for a common offset; 0 if none."""
+    """Detect the encoder step: the largest step of which all positions are multiples plus an offset; 0 if none."""
     return find_steps(position)[0]
 
 
 def _find_lattice(values: np.ndarray, off: float, slack: float) -> float:
-    """Return the largest step of which all values are integer multiples, except for a common offset; 0 if none.
+    """Return the largest step of which all values are integer multiples plus a common offset; 0 if there is none.
 
-    Applies Euclid's algorithm to the differences of neighboring values, with tolerances.
+    The method is Euclid's algorithm with tolerances, applied to the differences of neighboring values.
 
     Args:
         values: sorted positions without duplicates.
-        off: largest distance of a value from a multiple, in steps.
-        slack: largest distance in SI units, if larger than ``off`` steps. Steps below ``_ROUNDINGS * slack`` are not
-            searched for.
+        off: largest allowed distance of a value from a multiple, in steps.
+        slack: largest allowed distance in SI units, used if it is larger than ``off`` steps. Steps below
+            ``_ROUNDINGS * slack`` are not searched for.
     """
     gaps = np.diff(values)
     if gaps.size < 2:
         return float(gaps.sum())
-    gaps = gaps[gaps > 2.0 * slack]  # smaller gaps are rounding errors of equal positions
+    gaps = gaps[gaps > 2.0 * slack]  # omit smaller differences, because they are rounding errors of equal positions
     span, rest = float(np.ptp(values)), gaps
     picks = (values - values[0])[np.unique(np.geomspace(1, values.size - 1, _PICKS).astype(int))]
     while rest.size and span <= _MAX_STEPS * (least := float(rest.min())) and least >= (_ROUNDINGS - 1.0) * slack:
         step = smallest = float(np.mean(rest[rest <= least + 2.0 * slack]))
-        # Refine the step from distances of n steps in ascending order: their rounding error is divided by n, but n is
-        # known only if the step is accurate enough.
+        # Refine the step by distances of n steps: the error of distance/n decreases with n. Use the distances in
+        # ascending order, because n can only be determined if the step is already accurate enough.
         for distance in picks.tolist():
             step = distance / max(1.0, np.round(distance / step))
         chance = (2.0 * max(off, slack / step)) ** (values.size - 1)
@@ -82,25 +85,32 @@ def _find_lattice(values: np.ndarray, off: float, slack: float) -> float:
 
 
 def fits_steps(position: np.ndarray, step: float, off: float = _MAX_OFFSET, slack: float = 0.0) -> bool:
-    """Return whether positions are integer multiples of a step, except for a common offset."""
+    """Return whether all positions are integer multiples of a step plus a common offset, within a tolerance.
+
+    Args:
+        position: the positions.
+        step: step to test, in the same unit.
+        off: tolerance in steps.
+        slack: tolerance in the unit of the positions, used if it is larger.
+    """
     ratios = (position - position[0]) / step
     return bool(np.all(np.abs(ratios - np.round(ratios)) <= max(off, slack / step)))
 
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """Noise of logged positions: white noise plus the quantization error of an encoder."""
+    """Model of the noise of logged positions: white noise plus the quantization error of an encoder."""
 
-    position: np.ndarray  # x of each sample
-    variance: float  # of a sample, sigma^2 + q^2/12
-    resolution: float  # encoder step q; 0 for white noise only
+    position: np.ndarray  # position x of each sample
+    variance: float  # variance of the error of one sample, sigma^2 + q^2/12
+    resolution: float  # encoder step q; 0 if the noise is only white noise
 
     @cached_property
     def _rests(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The stretches within one encoder step whose mean has a larger variance than that of white noise.
+        """The stretches within one encoder step whose mean has a larger variance than it would have with white noise.
 
-        Four arrays: indices of the samples of all these stretches; and for each stretch its offset in that array, its
-        number of samples, and the variance of its mean divided by that of white noise.
+        The four arrays are: the sample indices of all these stretches, joined; and for each stretch the offset in the
+        first array, the number of samples, and the variance of its mean divided by that with white noise.
         """
         starts, first = [], np.inf
         for k, place in enumerate(self.position.tolist()):
@@ -121,11 +131,14 @@ class MeasurementNoise:
 
     @property
     def count(self) -> int:
-        """Number of samples of white noise with the same expected sum of squares as the weighted samples."""
+        """The effective number of samples: the expected sum of squares of the weighted errors, divided by variance."""
         return int(self.position.size + np.sum(1.0 - self._rests[-1]))
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns over samples, with the mean of each stretch of `_rests` scaled to white noise."""
+        """Weight columns with one row per sample: scale the mean of each stretch of `_rests` to white-noise variance.
+
+        Deviations from the mean of a stretch do not change.
+        """
         rows, starts, sizes, inflation = self._rests
         if not rows.size:
             return columns
@@ -134,7 +147,11 @@ class MeasurementNoise:
         return weighed
 
     def spread(self, columns: np.ndarray) -> np.ndarray:
-        """Return ``J^T C J`` for columns J, with the covariance C of the samples."""
+        """Return the covariance ``J^T C J`` of linear combinations of the errors; C is the covariance of the samples.
+
+        Args:
+            columns: the matrix J, one row per sample and one column per linear combination.
+        """
         white = columns.T @ columns
         total = self.variance * white
         for wave, weight in self._waves():
@@ -143,16 +160,22 @@ class MeasurementNoise:
         return total
 
     def spread_each(self, columns: np.ndarray) -> np.ndarray:
-        """Return the diagonal of `spread`."""
+        """Return the variances of linear combinations of the errors: the diagonal of the matrix of `spread`."""
         white = np.sum(columns**2, 0)
         total = self.variance * white
         for wave, weight in self._waves():
-            # Use real and imaginary parts, because a complex product would convert the columns to complex numbers.
+            # Multiply by the real and imaginary parts separately, because a complex product would copy the real columns
+            # to a complex array of twice the size.
             total = total + weight * (np.sum((columns.T @ wave.view(float).reshape(-1, 2)) ** 2, 1) - white)
         return total
 
     def spread_of_sums(self, count: int, weights: MeasurementNoise) -> float:
-        """Return the mean square of sums of ``count`` neighboring samples, after they are weighted by ``weights``."""
+        """Return the expected square of the sum of ``count`` successive errors, averaged over a log.
+
+        Args:
+            count: number of errors per sum.
+            weights: noise model whose `weigh` weights the errors before they are added.
+        """
         starts = np.arange(0, self.position.size - count + 1, count)
         total = self.variance * count
         for wave, weight in self._waves():
@@ -161,7 +184,10 @@ class MeasurementNoise:
         return total
 
     def _waves(self) -> Iterator[tuple[np.ndarray, float]]:
-        """Yield ``e^(2 pi j h x/q)`` and w_h for h = 1, 2, ... until w_h is negligible."""
+        """Yield the terms of the Fourier series of the covariance: ``e^(2 pi j h x/q)`` and w_h.
+
+        The terms are h = 1, 2, ... until w_h is negligible.
+        """
         if not self.resolution:
             return
         sigma = np.sqrt(max(0.0, self.variance / self.resolution**2 - 1.0 / 12.0))

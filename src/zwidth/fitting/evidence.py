@@ -1,7 +1,8 @@
-"""Tabulate the evidence for a fit, to draw and to save.
+"""Tabulate the data that support a fit, for plots and for files.
 
-For a log: measured and fitted positions, residuals and their autocorrelation. For every fit: the stability boundary of
-the device with its confidence band, and the stiffest, recommended and measured walls.
+For a log, the tables contain the measured and fitted positions, and the residuals with their autocorrelation. For every
+fit, they contain the stability boundary (the largest stable stiffness over the damping B) with its confidence band,
+and the stiffest, recommended and measured walls. A table is a dictionary of columns by header.
 """
 
 from __future__ import annotations
@@ -19,16 +20,22 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import header
 from zwidth.words.status import Status
 
-_DRAWS = 1000  # largest number of random devices for the confidence band
-_ROWS = 121  # number of dampings from 0 to the largest stable one; a tenth more lie above it
-_BEYOND = 1.1  # end of the dampings, relative to the largest stable one
-# Number of lags of the autocorrelation: the smaller of both limits.
-_LAGS = 60
-_SHARE = 0.25  # relative to the number of samples
+_DRAWS = 1000  # largest number of random devices from which the confidence band is computed
+_ROWS = 121  # number of values of B from 0 to the largest stable one; a tenth more values lie above it
+_BEYOND = 1.1  # largest tabulated B, relative to the largest stable one
+# Largest lag of the autocorrelation. The smaller of the two limits applies.
+_LAGS = 60  # largest lag in samples
+_SHARE = 0.25  # largest lag relative to the number of samples of the log
 
 
 def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = ()) -> dict[str, dict[str, Any]]:
-    """Return all tables of a fit, in the form that `zwidth.figures.draw_device_fit` requires."""
+    """Return all tables of a fit by name, in the form that `zwidth.figures.draw_device_fit` requires.
+
+    Args:
+        fit: the fit.
+        source: name of the log, or number of walls, for the first column of the tables of the boundary and the walls.
+        points: the measured walls of a fit to walls.
+    """
     tables: dict[str, dict[str, Any]] = {}
     for name, table in (("boundary", trace_boundary(fit)), ("walls", tabulate_walls(fit, points))):
         rows = next(iter(table.values())).size
@@ -39,7 +46,7 @@ def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = (
 
 
 def tabulate_motions(fit: DeviceFit) -> dict[str, np.ndarray]:
-    """Return the measured position, the modeled position and the residual of every sample."""
+    """Return a table of the measured position, the modeled position and the residual of every sample."""
     logs = [np.full(motion.time.size, k, int) for k, motion in enumerate(fit.motions, start=1)]
     names = {"force": "force", "position": "position", "modelled": "position"}
     units = {"time": "s"} | {name: unit_of(quantity, fit.unit_system) for name, quantity in names.items()}
@@ -50,7 +57,10 @@ def tabulate_motions(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 
 def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
-    """Return the autocorrelation of the residuals of all logs over the lag, with the 95 % band of white noise."""
+    """Return a table of the residual autocorrelation over the lag, averaged over all logs, with the 95 % band.
+
+    At each lag, the autocorrelation of white noise is within the band with a probability of 95 %.
+    """
     residuals = [motion.position - motion.modelled for motion in fit.motions]
     residuals = [each[np.isfinite(each)] for each in residuals]
     most = int(min(_LAGS, *(_SHARE * each.size for each in residuals)))
@@ -65,10 +75,10 @@ def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 
 def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
-    """Return the largest stable stiffness at each damping B >= 0, with its pointwise 95 % interval.
+    """Return a table of the largest stable stiffness on a grid of B >= 0, with its pointwise 95 % interval.
 
-    The interval is computed from random devices around the estimate; NaN if the records do not determine the device. A
-    device without a stable wall at a damping counts as stiffness 0.
+    The interval is computed from random devices drawn from the estimate; it is NaN if the records do not determine the
+    device. For a device without a stable wall at some B, the largest stable stiffness is set to 0 there.
     """
     outlines = fit.nominal.stable_region()
     if not outlines:
@@ -90,12 +100,21 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return the stiffness up to which all walls are stable, a row per device, a column per damping; 0 if none."""
+    """Return the stiffness up to which all walls are stable, 0 if none is, for random devices and values of B.
+
+    Args:
+        fit: the fit.
+        devices: parameters of the devices, shape (devices, parameters).
+        damping: values of B in N s/m.
+
+    Returns:
+        An array with one row per device and one column per value of B.
+    """
     return fit.nominal.loop.vary(dict(zip(fit.numbers, devices.T, strict=True))).find_stiffness_limits(damping)
 
 
 def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str, np.ndarray]:
-    """Return the stiffest, the recommended and the measured walls, with errors, frequencies and residuals.
+    """Return a table of the stiffest, the recommended and the measured walls, with errors, frequencies and residuals.
 
     The residuals of stiffness and frequency are in units of their noise.
     """

@@ -1,8 +1,9 @@
-"""Design of a multisine force for the measurement of a frequency response with `zwidth.respond`.
+"""Design a multisine force with which `zwidth.respond` can measure the frequency response of a device.
 
-The frequencies are dense, and the amplitudes large, where the response decides the stability of walls. The record has
-five stretches with different phases. Each consists of three equal periods, of which the first contains the transient.
-The differences between the stretches yield the standard errors.
+At frequencies at which the response decides the stability of walls, the frequencies are dense and the amplitudes large.
+The record consists of five *stretches*, whose sines have different phases. A stretch is three equal periods of the
+force, the first of which contains the transient. The standard errors of the response are computed from the differences
+between the stretches. A frequency is called *line* if it is counted in cycles per period of the force.
 """
 
 from __future__ import annotations
@@ -27,27 +28,29 @@ from zwidth.words.quantities import POSITIVE
 from zwidth.words.status import Status
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
-_STRETCHES = 5  # stretches with different phases
-_PERIODS = 3  # periods per stretch
-# Frequency grid.
-_SPACING = 0.006  # spacing relative to the frequency, without a response
-_HIGHEST = 0.98  # highest frequency, relative to the Nyquist frequency
-_LOWEST = 1.0  # Hz; lowest frequency
-_FIRST = 3  # lower limit of the lowest frequency, in cycles per period
-_SOFT = 20.0  # Hz; amplitudes below this frequency are reduced to limit the motion
-# Second record, designed from a response.
-_GAP = 0.03  # largest uncertainty between two frequencies, relative to the distance from instability
-_WEAKEST = 0.01  # smallest amplitude, relative to the largest
-_SHARES = np.linspace(0.3, 0.9, 7)  # stiffnesses of the walls for which it is designed, relative to the largest
-# Reduction of the peaks of the force.
-_CLIPS = 60  # iterations
-_CUT = 0.75  # clipping level, relative to the peak
-_FEWEST_SAMPLES = 600  # least number of samples per period
+_STRETCHES = 5  # number of stretches in the record
+_PERIODS = 3  # number of periods of the force per stretch
+# Frequency grid of the force.
+_SPACING = 0.006  # distance of neighboring frequencies relative to the frequency, if no response is given
+_HIGHEST = 0.98  # highest frequency of the force, relative to the Nyquist frequency
+_LOWEST = 1.0  # Hz; lowest frequency of the force
+_FIRST = 3  # least value of the lowest frequency, in cycles per period of the force
+_SOFT = 20.0  # Hz; below this frequency the amplitudes decrease in proportion to the frequency, to limit the motion
+# Second record, designed from the response measured with a first one.
+# Largest uncertainty of the response between two frequencies, relative to its distance from the onset of instability.
+_GAP = 0.03
+_WEAKEST = 0.01  # smallest amplitude of a sine, relative to the largest
+# Stiffnesses of the walls whose stability the record is designed to decide, relative to the stiffest wall.
+_SHARES = np.linspace(0.3, 0.9, 7)
+# Reduction of the peaks of the force by repeated clipping.
+_CLIPS = 60  # number of iterations
+_CUT = 0.75  # clipping level, relative to the peak of the force
+_FEWEST_SAMPLES = 600  # least number of samples per period of the force
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """A force to command sample by sample, and the expected accuracy of the measured response.
+    """A designed multisine force, and the expected accuracy of a frequency response measured with it.
 
     For a rotary device, forces are torques in N m, and rad replaces m.
 
@@ -56,9 +59,9 @@ class Excitation:
         period: sampling period in s.
         cycle: period of the force within a stretch, in s.
         frequency, amplitude: frequencies in Hz and amplitudes in N of the sines.
-        deviation: expected deviation of the response at each frequency, in m/N.
-        expected: expected safe wall of the new record, a `StiffestWall`; None without a response.
-        limit: stiffest wall of the given response; None without one.
+        deviation: expected deviation (`zwidth.MeasuredDevice`) of the response at each frequency, in m/N.
+        expected: safe wall that this record is expected to yield, a `StiffestWall`; None if no response is given.
+        limit: stiffest stable wall for the given response; None if no response is given.
     """
 
     force: np.ndarray
@@ -73,11 +76,11 @@ class Excitation:
 
     @property
     def unit_system(self) -> UnitSystem:
-        """The units of the force and of the device."""
+        """The unit system: N and m for a linear device, N m and rad for a rotary one."""
         return SYSTEMS[self.rotary]
 
     def save(self, file: str | Path) -> None:
-        """Write a CSV file with a row per sample: the time in s, and the force in N or the torque in N m."""
+        """Write the force to a CSV file, one row per sample with the time in s and the force in N or torque in N m."""
         rows = [f"{k * self.period:.9g},{value:.7g}" for k, value in enumerate(self.force.tolist())]
         write_atomically(
             Path(file),
@@ -96,24 +99,24 @@ def excite(
     seed: int = 0,
     rotary: bool | None = None,
 ) -> Excitation:
-    """Design the force to command for `zwidth.respond`.
+    """Design a multisine force with which `zwidth.respond` can measure the frequency response of a device.
 
     Args:
         period: sampling period of the controller in s.
         force: largest force to command, in N.
         resolution: encoder step in m, from which the expected deviation is computed.
         duration: duration of the whole record in s.
-        response: response of a first record. The frequencies are then dense where it changes fast, and the amplitudes
-            large where walls close to the stiffest are nearly unstable. Without it, frequencies from 1 Hz to almost the
-            Nyquist frequency have equal amplitudes.
+        response: response measured with a first record. The frequencies are then dense where the response changes
+            fast, and the amplitudes large where walls close to the stiffest are nearly unstable. By default, the
+            frequencies extend from 1 Hz to almost the Nyquist frequency, with equal amplitudes from 20 Hz on.
         velocity: velocity estimate of the intended walls; the backward difference by default.
         seed: seed of the random phases.
         rotary: True if the force is a torque in N m and the resolution an angle in rad. By default, the response or
             the units of force and resolution decide; numbers without units are those of a linear device.
 
     Returns:
-        Excitation: ``force`` for each sample, its ``cycle``, the frequencies with the expected ``deviation``; with a
-        response also ``expected``, the expected safe wall, and ``limit``, the stiffest wall of that response.
+        Excitation: ``force`` at each sample, its ``cycle``, and the frequencies with the expected ``deviation``; if a
+        response is given, also ``expected``, the expected safe wall, and ``limit``, its stiffest wall.
 
     Raises:
         InputError: the record is too short for the sampling rate, or a number is out of range.
@@ -151,7 +154,7 @@ def _design(
     seed: int,
     system: UnitSystem,
 ) -> Excitation:
-    """Design the force as in `excite`, in a unit system."""
+    """Design the force as `excite` does, for arguments in the given unit system."""
     period, most = check_number("period", period), check_number("force", force, system["N"], POSITIVE)
     step, length = (
         check_number("resolution", resolution, system["m"]),
@@ -174,8 +177,8 @@ def _design(
     scale = most / max(float(np.abs(stretch).max()) for stretch in stretches)
     commanded = scale * np.concatenate([np.tile(stretch, _PERIODS) for stretch in stretches])
     amplitude = scale * shape
-    # In n samples, white noise of standard deviation sigma has amplitudes of 2 sigma/sqrt(n) at a line. The equal
-    # periods of a stretch count as one, because their quantization errors are equal.
+    # White noise of standard deviation sigma in n samples has the amplitude 2 sigma/sqrt(n) at a line. Count the equal
+    # periods of a stretch only once in n, because their quantization errors are equal and are not averaged out.
     deviation = SURE * step / np.sqrt(12.0) * 2.0 / np.sqrt(_STRETCHES * count) / amplitude
     hertz, expected = lines / (count * period), None
     if scene is not None and response is not None:
@@ -186,7 +189,13 @@ def _design(
 
 
 def _build_frequency_grid(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
-    """Return the frequencies in cycles per period; ``spacing`` is relative, one value per frequency."""
+    """Build the grid of lines of the force, in cycles per period of the force.
+
+    Args:
+        count: number of samples per period of the force.
+        period: sampling period in s.
+        spacing: distance to the next line, relative to the line; one value for each possible line.
+    """
     line, lines = max(_FIRST, int(np.ceil(_LOWEST * count * period))), []
     while line < _HIGHEST * count / 2:
         lines.append(line)
@@ -195,7 +204,11 @@ def _build_frequency_grid(count: int, period: float, spacing: np.ndarray) -> np.
 
 
 def _interpolate_response(scene: Scene, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the interpolated response in m/N, the velocity estimate and the interpolation error in m/N."""
+    """Interpolate the measured response of a scene to the frequencies ``w`` in rad per sample.
+
+    Returns:
+        The response in m/N, the velocity estimate F, and a bound of the interpolation error in m/N.
+    """
     c = cast("MeasuredLoop", scene.loop).walls.curve
     S, F = c.evaluate(np.clip(w, c.w[0], c.w[-1]))
     unit = scene.units.stiffness * 4.0 * np.sin(0.5 * w) ** 2
@@ -203,14 +216,23 @@ def _interpolate_response(scene: Scene, w: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _design_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies and relative amplitudes of a second record, for walls close to the stiffest one."""
+    """Choose the frequencies and amplitudes of a second record that decides the stability of walls near the stiffest.
+
+    Args:
+        scene: scene with the response measured with the first record.
+        limit: stiffest stable wall for this response.
+        count: number of samples per period of the force.
+
+    Returns:
+        The lines in cycles per period of the force, and their amplitudes relative to the largest one.
+    """
     period, units = scene.timing.period, scene.units
     all_lines = np.arange(1, count // 2)
     response, F, gap = _interpolate_response(scene, 2.0 * np.pi * all_lines / count)
     wall = limit.stiffness + limit.virtual_damping * units.stiffness / units.virtual_damping * F
     distance = np.min([np.abs(1.0 / (share * wall) + response) for share in _SHARES], axis=0)
     spacing = _SPACING * np.minimum(1.0, np.sqrt(_GAP * distance / np.maximum(gap, 1e-300)))
-    # Limit the ratio of neighboring spacings to 2.
+    # Limit the ratio of neighboring spacings to 2, so that the grid becomes dense before it reaches a narrow feature.
     spacing = np.minimum(spacing, np.minimum(np.roll(spacing, 1), np.roll(spacing, -1)) * 2.0)
     lines = _build_frequency_grid(count, period, np.append(spacing[:1], spacing))
     shape = distance.min() / distance[lines - 1]
@@ -218,7 +240,14 @@ def _design_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.nd
 
 
 def _make_period(lines: np.ndarray, shape: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return one period of a multisine with small peaks, shifted so that a mass at rest does not drift."""
+    """Synthesize one period of a multisine force with small peaks, under which a mass initially at rest does not drift.
+
+    Args:
+        lines: frequencies in cycles per period.
+        shape: amplitudes of the sines.
+        count: number of samples per period.
+        rng: random generator of the initial phases.
+    """
     spectrum = np.zeros(count // 2 + 1, complex)
     phase = np.exp(2j * np.pi * rng.random(lines.size))
     for _ in range(_CLIPS):
@@ -229,6 +258,7 @@ def _make_period(lines: np.ndarray, shape: np.ndarray, count: int, rng: np.rando
         phase = cut / np.abs(cut)
     spectrum[lines] = 0.5 * count * shape * phase
     wave = np.fft.irfft(spectrum, count)
-    # A mass at rest does not drift if the force begins where its periodic velocity is 0.
+    # Shift the start of the period to a sample at which the velocity in periodic motion is 0, because a mass that
+    # starts there at rest does not drift.
     speed = np.cumsum(wave)
     return np.roll(wave, -1 - int(np.argmin(np.abs(speed - speed.mean()))))

@@ -1,7 +1,7 @@
 """Identify the time, position and force columns of a log, and their units, by the headers.
 
-A header is first compared as a whole, then word by word. For example, ``tau_cmd_mNm`` is a commanded torque in mN m,
-and ``__time`` is a time.
+The *quantities* are time, position and force. A header is first compared with the names of a quantity as a whole, then
+word by word. For example, ``tau_cmd_mNm`` is identified as a commanded torque in mN m, and ``__time`` as a time.
 """
 
 from __future__ import annotations
@@ -15,64 +15,68 @@ from zwidth.words.formatting import suggestion
 from zwidth.words.units import ANGLE, COUNTS, FORCE, LENGTH, TIME, TORQUE, Dimension, split_head, split_title
 
 QUANTITIES = ("time", "position", "force")
-# Admissible dimensions of each quantity: the first is that of a linear axis, the second that of a rotary axis.
+# Dimensions that each quantity may have: first that for a linear axis, then that for a rotary axis.
 DIMENSIONS: dict[str, tuple[Dimension, ...]] = {"time": (TIME,), "position": (LENGTH, ANGLE), "force": (FORCE, TORQUE)}
-# Headers in lower case that name a quantity as a whole.
+# Names of each quantity in lower case. A header that equals such a name identifies the quantity.
 _NAMES = {
     "time": ("time", "t", "clock", "timestamp", "stamp", "zeit"),
     "position": ("position", "pos", "x", "encoder", "angle", "phi", "theta", "q"),
     "force": ("force", "f", "torque", "tau"),
 }
-# Words in lower case that name a quantity within a longer header.
+# Words in lower case that identify a quantity if they occur in a longer header.
 _WORDS = {
     "time": (*_NAMES["time"], "millis", "micros", "nanos", "elapsed", "uhrzeit"),
     "position": ("position", "pos", "encoder", "enc", "angle", "phi", "theta", "winkel", "weg"),
     "force": ("force", "torque", "tau", "effort", "kraft", "moment"),
 }
-# Endings of compound words, as in the German "Sollmoment".
+# Endings of compound words that identify a quantity, as in the German "Sollmoment".
 _ENDINGS = {"time": (), "position": ("winkel", "position"), "force": ("moment", "kraft")}
-# A commanded force is preferred to other forces, and measured forces are excluded. The reverse holds for positions.
+# Words for commanded and for measured values. Columns of commanded forces are preferred and those of measured forces
+# excluded, because the fit requires the commanded force; for positions, measured ones are preferred.
 _COMMANDED = ("cmd", "command", "commanded", "des", "desired", "ref", "reference", "target", "setpoint", "soll", "goal")
 _MEASURED = ("meas", "measured", "actual", "sensed", "sensor", "est", "estimated", "ist")
-# Words for derivatives, errors and temperatures. Columns with these words are neither positions nor forces.
+# Words for derivatives, errors and temperatures. A header with such a word identifies neither a position nor a force.
 _DERIVED = ("error", "err", "vel", "velocity", "speed", "dot", "acc", "rate", "temp")
-# Words that imply a rotary axis, and words that imply a linear axis.
+# Words of headers that imply a rotary axis, and words that imply a linear axis.
 _ROTARY_WORDS = ("angle", "phi", "theta", "winkel", "torque", "tau", "moment", "drehmoment", "sollmoment")
 _LINEAR_WORDS = ("force", "f", "kraft", "sollkraft", "weg")
-# Headers of columns that replace a missing position or force, and their unit if the header has none.
+# Names of columns that can replace a missing position (a velocity) or force (a current), and the unit that is assumed
+# if the header has none.
 _INSTEAD = {
     "position": (("velocity", "vel", "speed"), "m/s"),
     "force": (("current", "iq", "i_q"), "A"),
 }
-# Words of headers that name a unit of time.
+# Words in a header that stand for a unit of time.
 _UNIT_WORDS = {"millis": "ms", "micros": "us", "nanos": "ns", "secs": "s", "seconds": "s"}
-# A time in two columns. Last words of the header of the column with fractions of a second, and the unit.
+# A time may be split into two columns: whole seconds and fractions. The header of the column of fractions ends with one
+# of these words; the values are its unit.
 _PARTS: dict[str, str] = dict.fromkeys(("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds", "ns"), "ns")
 _PARTS |= dict.fromkeys(("usec", "usecs", "microsec", "microseconds", "us"), "us")
-# Last words of the header of the column with whole seconds.
+# Words with which the header of the column of whole seconds may end.
 _WHOLE = ("sec", "secs", "seconds", "s")
 
 
 class Column(NamedTuple):
     """The column of a table that contains a quantity, or the two columns of a time split into seconds and fractions."""
 
-    indices: tuple[int, ...]  # column indices, counted from 0
-    units: tuple[str, ...]  # unit of each column, "" if none is specified
-    is_rotary: bool | None  # True: the header implies a rotary axis; False: a linear axis; None: neither
-    guessed: bool = False  # True if the header contains more than the name of the quantity, or only a unit
-    header_unit: str = ""  # unit in the header if the user specified a unit as well
+    indices: tuple[int, ...]  # indices of the column or columns in the table, counted from 0
+    units: tuple[str, ...]  # unit of each column, "" if neither the user nor the header specifies one
+    is_rotary: bool | None  # axis that the header implies: True for rotary, False for linear, None for neither
+    guessed: bool = False  # True if the header is not exactly a name of the quantity, so that the user should check it
+    header_unit: str = ""  # unit in the header, if the user specified a unit as well; for a note on the difference
 
 
 def find_columns(
     file: object, heads: Sequence[str], specified: Mapping[str, str | None], wanted: Sequence[str]
 ) -> dict[str, Column]:
-    """Return the column of each quantity.
+    """Find the column of each quantity, as specified by the user or else by the headers.
 
     Args:
         file: path of the table, for messages.
         heads: headers of the table.
-        specified: columns specified by the user, by quantity, as "NAME" or "NAME:unit"; None to use the headers.
-        wanted: the quantities to return.
+        specified: for each quantity the column specified by the user, as "NAME" or "NAME:unit"; None to identify the
+            column by the headers.
+        wanted: the quantities whose columns are returned.
 
     Raises:
         InputError: a column is missing or ambiguous. One message lists all missing columns.
@@ -107,7 +111,7 @@ def has_column(heads: Sequence[str], name: str) -> bool:
 
 
 def _refuse_missing(file: object, heads: Sequence[str], missing: list[str]) -> None:
-    """Raise `InputError` for quantities without a column, with the headers of the table and the remedy."""
+    """Raise `InputError` with a message that lists the quantities without a column, the headers and the remedy."""
     names = " and ".join((", ".join(missing[:-1]), missing[-1])) if len(missing) > 1 else missing[0]
     if "frequency" in {split_head(head)[0].lower() for head in heads}:
         raise InputError(
@@ -119,7 +123,12 @@ def _refuse_missing(file: object, heads: Sequence[str], missing: list[str]) -> N
 
 
 def _find_by_name(heads: Sequence[str], name: str) -> tuple[Column | None, list[int]]:
-    """Return the column of a quantity identified by its header, or None and the indices of all candidates."""
+    """Identify the column of a quantity by the headers.
+
+    Returns:
+        The column and an empty list; or, if the headers do not identify exactly one column, None and the indices of
+        all candidates.
+    """
     if name == "time" and (pair := _find_parts(heads)) is not None:
         return pair, []
     titles = [split_head(head) for head in heads]
@@ -146,11 +155,11 @@ def _find_by_name(heads: Sequence[str], name: str) -> tuple[Column | None, list[
     ), []
 
 
-_UNIT_ONLY = 3  # rank of a header that is only a unit
+_UNIT_ONLY = 3  # rank (`_rank`) of a header that consists only of a unit
 
 
 def _rank(name: str, head: str, title: str) -> int | None:
-    """Return the rank of a header as the name of a quantity; 0 is the best.
+    """Return a number that measures how well a header names a quantity; 0 is the best.
 
     Args:
         name: the quantity.
@@ -158,9 +167,9 @@ def _rank(name: str, head: str, title: str) -> int | None:
         title: the header without its unit.
 
     Returns:
-        0 if the title is a name of the quantity; 1 if it contains such a name, together with words for the preferred
-        column (see ``_COMMANDED``) or only with words for commanded or measured values; 2 if it contains such a name
-        among other words; 3 if the header is only a unit of the quantity. None if the header names something else.
+        0 if the title equals a name of the quantity; 1 if it contains such a name, and either a word for the preferred
+        kind (commanded force, measured position) or no words but those for commanded or measured values; 2 if it
+        contains such a name and other words; 3 if the header is only a unit of the quantity. None otherwise.
     """
     if title.lower().strip("_") in _NAMES[name]:
         return 0
@@ -183,7 +192,7 @@ def _rank(name: str, head: str, title: str) -> int | None:
 
 
 def _split_words(title: str) -> list[str]:
-    """Return the words of a header in lower case, without trailing digits."""
+    """Split a header into its words, in lower case and without trailing digits."""
     spaced = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", title)
     return [re.sub(r"[0-9]+$", "", word).lower() for word in re.split(r"[\W_]+", spaced) if word]
 
@@ -196,7 +205,7 @@ def _classify_axis(words: Sequence[str]) -> bool | None:
 
 
 def _find_parts(heads: Sequence[str]) -> Column | None:
-    """Return the two columns of a time split into seconds and nano- or microseconds; None if there is no such pair."""
+    """Find the two columns of a time split into seconds and nano- or microseconds; None if there is no such pair."""
     words = [_split_words(head) for head in heads]
     pairs = [
         (i, j)
@@ -211,13 +220,13 @@ def _find_parts(heads: Sequence[str]) -> Column | None:
 
 
 def _find_asked(file: object, heads: Sequence[str], name: str, wanted: str) -> Column:
-    """Return the user-specified column of a quantity.
+    """Find the column of a quantity that the user specified.
 
     Args:
         file: path of the table, for messages.
         heads: headers of the table.
         name: the quantity.
-        wanted: the column as "NAME" or "NAME:unit"; for a time in two columns "NAME:s+NAME:ns".
+        wanted: specification of the column, as "NAME" or "NAME:unit"; for a time in two columns "NAME:s+NAME:ns".
 
     Raises:
         InputError: no column, or more than one, has this name.
@@ -249,13 +258,13 @@ def _find_asked(file: object, heads: Sequence[str], name: str, wanted: str) -> C
 
 
 def _match_title(heads: Sequence[str], title: str) -> list[int]:
-    """Return the indices of the headers equal to a title; if there are none, of those equal to it without the unit."""
+    """Return the indices of the headers that equal a title; if none does, of those that equal it without their unit."""
     whole = [k for k, head in enumerate(heads) if head == title]
     whole = whole or [k for k, head in enumerate(heads) if title and split_head(head)[0] == title]
     return whole or [k for k, head in enumerate(heads) if title and split_title(head)[0] == title]
 
 
 def list_heads(heads: Iterable[str]) -> str:
-    """Return the first 12 headers in quotes, for messages."""
+    """Format the first 12 headers for a message: each in quotes, separated by commas."""
     names = [repr(head) for head in heads if head]
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")

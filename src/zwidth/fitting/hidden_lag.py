@@ -1,8 +1,9 @@
-"""Test for first-order actuator lags that a fit has included in the delay, and bound the time constant.
+"""Test whether a part of the fitted delay is a first-order actuator lag, and bound the time constant of such a lag.
 
 At low frequencies a first-order lag with time constant ``tau`` is equivalent to a pure delay ``tau``. The test replaces
-part of the fitted delay by an equal time constant. The signature of this lag is the part of the change of the positions
-that no change of the other parameters reproduces; the residuals are projected onto it. Terms and symbols are those of
+part of the fitted delay by an equal time constant. The *signature* of this lag is the part of the resulting change of
+the positions that no change of the other parameters reproduces; the residuals are projected onto it. ``theta`` is the
+parameter vector of `fitting.structure.Recordings`, K_max the maximum stiffness of a wall. Further terms are those of
 `zwidth.fitting.hidden` and docs/theory/hidden.md. Times are in sampling periods unless stated otherwise.
 """
 
@@ -19,36 +20,37 @@ from zwidth.fitting.structure import Recordings
 from zwidth.parts.actuator import Actuator
 from zwidth.scenes.scene import Scene
 
-# Logarithmic grid of time constants, in sampling periods. The longest one is the fitted delay, within limits.
-MIN_LAG = 0.03  # shortest time constant
-MIN_LONGEST_LAG = 0.05  # lower limit of the longest time constant
-MAX_LAG = 3.0  # upper limit of the longest time constant
-N_LAGS = 40  # number of time constants
+# Logarithmic grid of time constants, in sampling periods. It ends at the fitted delay, but not below `MIN_LONGEST_LAG`
+# and not above `MAX_LAG`.
+MIN_LAG = 0.03  # shortest time constant of the grid
+MIN_LONGEST_LAG = 0.05  # least end of the grid
+MAX_LAG = 3.0  # largest end of the grid
+N_LAGS = 40  # number of time constants in the grid
 
 
 class HiddenLag(NamedTuple):
-    """The longest actuator lag that a log cannot distinguish from pure delay, and the maximum stiffness with it."""
+    """The longest actuator lag that a log cannot distinguish from pure delay, and K_max of the device with this lag."""
 
-    time_constant: float  # s
-    delay: float  # remaining pure delay, s
-    stiffness_max: float  # K_max, N/m
+    time_constant: float  # time constant of the lag, s
+    delay: float  # pure delay that remains in addition to the lag, s
+    stiffness_max: float  # K_max with this lag and delay, N/m
 
 
 class LagTest(NamedTuple):
-    """Score test of the residuals for first-order actuator lags, one array entry per time constant."""
+    """Results of the score test for first-order actuator lags, as arrays with one entry per time constant."""
 
     lag: np.ndarray  # time constants, in periods
     signature_size: np.ndarray  # norm of the signature of each lag, in standard errors
-    projection: np.ndarray  # residuals projected onto that signature, in standard errors
-    theta: np.ndarray  # parameters refitted (to first order) with each lag; one column per lag
+    projection: np.ndarray  # projection of the residuals onto the signature of each lag, in standard errors
+    theta: np.ndarray  # theta refitted with each lag, to first order in the change; one column per lag
 
 
 def score_lags(fit: FittedModel) -> LagTest:
-    """Compute the score test of first-order actuator lags that replace part of the fitted delay."""
+    """Test the residuals of a fit for first-order actuator lags that the fitted delay has absorbed (score test)."""
     fit = truncate_logs(fit)
     lags = np.geomspace(MIN_LAG, max(MIN_LONGEST_LAG, min(MAX_LAG, fit.theta[2])), N_LAGS)
-    # Compute the change of the positions for the rigid mass only, because the lag hardly changes the effect of
-    # resonances.
+    # Compute the change of the positions by the lag for the rigid mass alone, because a lag hardly changes the
+    # response of the resonances.
     (g, delta, d), model = fit.theta[:3], Recordings(fit.model.logs, lag=1)
     thetas = [np.pad([g, delta, d - lag, lag], (0, model.size - 4)) for lag in lags]
     changes = [
@@ -58,7 +60,8 @@ def score_lags(fit: FittedModel) -> LagTest:
     absorbed = fit.inverse.matrix @ changes
     signatures, residuals = changes - fit.columns[0] @ absorbed, fit.model.weigh(fit.residuals)
     norms = np.linalg.norm(signatures, axis=0)
-    # Use the larger variance of the projection: that with the autocorrelated errors of the encoder, or of white noise.
+    # Use the larger of two variances of the projection: that for the autocorrelated errors of the encoder, and that for
+    # white noise.
     variance = fit.noise.spread_each(fit.model.weigh(signatures)) / norms**2
     error = np.sqrt(np.maximum(variance, fit.variance) * fit.excess)
     theta = fit.theta[:, None] - absorbed / fit.columns[1][:, None]
@@ -67,26 +70,27 @@ def score_lags(fit: FittedModel) -> LagTest:
 
 
 def bound_lag(fit: FittedModel, test: LagTest | None, scene: Scene, reach: float) -> HiddenLag | None:
-    """Return the longest actuator lag that the residuals do not exclude.
+    """Compute the longest first-order actuator lag that the residuals do not exclude, and K_max with this lag.
 
     Args:
         fit: The fitted model.
-        test: The score test of `score_lags`, or None if lags were not tested.
-        scene: The loop of the fitted device.
+        test: The result of `score_lags`, None if lags were not tested.
+        scene: The scene of the fitted device.
         reach: Half-width of the confidence interval, in standard errors.
 
     Returns:
-        The lag, the remaining delay and K_max with both; None if the residuals exclude even the shortest lag.
+        The lag, the remaining delay and K_max with both; None if lags were not tested, or if the residuals exclude even
+        the shortest lag.
     """
     if test is None:
         return None
-    # Damping and delay must also stay nonnegative with the lag.
+    # Exclude a lag also if the damping or delay refitted with this lag is negative.
     possible = (test.signature_size - test.projection <= reach) & (test.theta[1:3] >= 0).all(0)
-    count = int(np.argmin(np.append(possible, False)))  # number of lags below the first excluded one
+    count = int(np.argmin(np.append(possible, False)))  # number of time constants below the first excluded one
     if not count:
         return None
     lag = float(test.lag[count - 1] * scene.timing.period)
-    # The linearized change of theta may leave the bounds of the parameters of resonances by a small amount.
+    # Clip theta to the bounds, because its linearized change may move parameters of resonances slightly out of them.
     theta = np.clip(test.theta[:, count - 1], *fit.model.bounds())
     lagged = fit.model.normalize(theta, scene.timing.period).to_scene(
         scene.timing.period, scene.velocity, scene.unit_system

@@ -1,8 +1,11 @@
 """Fit a device to a log of its free motion under a commanded force.
 
-The steps: read and repair the logs (`fitting.recordings`); fit the positions by least squares (`fitting.output_error`)
-with the structure that Schwarz's criterion selects (`fitting.choosing`); refuse fits that the force does not explain;
-test the residuals for white noise; and bound undetected resonances and lags (`fitting.hidden`, `fitting.hidden_lag`).
+The steps are: read and repair the logs (`fitting.recordings`); fit the positions by least squares
+(`fitting.output_error`) with the model structure that Schwarz's criterion selects (`fitting.choosing`); refuse logs
+whose motion the force does not explain; test the residuals for white noise; and bound undetected resonances and
+actuator lags (`fitting.hidden`, `fitting.hidden_lag`). ``theta`` is the parameter vector of `fitting.structure`. A
+*stretch* is a part of a log without missing samples. The *excess* of the residuals measures their autocorrelation
+(`FittedModel.excess`).
 """
 
 from __future__ import annotations
@@ -32,19 +35,20 @@ from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
-_LONGEST = 20  # default of the largest delay, in periods
-# Smallest and largest mass, largest range of positions and largest force, in SI units, by "is rotary". A value outside
-# causes a warning about its unit.
+_LONGEST = 20  # largest delay of the search by default, in sampling periods
+# Usual values in SI units, for linear devices (False) and rotary ones (True): smallest mass, largest mass, largest
+# range of the positions, largest force. Other values cause a warning, because their unit may be wrong.
 _USUAL = {False: (2e-3, 10.0, 3.0, 1e3), True: (1e-8, 10.0, 100.0, 300.0)}
-_FEWEST = 20  # least number of fitted positions per stretch; the positions before them only provide past forces
-_FEW = 60  # fewer fitted positions cause a warning, because very different devices may fit equally well
-_MOST = 200_000  # largest number of fitted positions of all logs; more need gigabytes and only reduce the errors
-_FINER = 0.3  # an encoder step is excluded if the residuals are below this share of its quantization noise
-_SEEN = 5.0  # least effect of the force on the positions, in standard errors
-# A fit is refused if both limits are exceeded.
-_UNEXPLAINED = 0.01  # residual sum of squares, relative to that of the motion without a force
-_SMOOTH = 5.0  # excess of the residuals over white noise (`FittedModel.excess`)
-# Remedy for residuals with dynamics that the model lacks.
+_FEWEST = 20  # least number of fitted positions per stretch; shorter stretches are omitted
+_FEW = 60  # number of fitted positions below which a warning is issued, because very different devices may fit them
+# Largest number of fitted positions of all logs. More would need gigabytes of memory and only reduce the errors.
+_MOST = 200_000
+_FINER = 0.3  # an encoder step is excluded if the residuals are smaller than its quantization noise by this factor
+_SEEN = 5.0  # least effect of the force on the positions, in standard errors; smaller effects are refused
+# A log is refused if its residuals exceed both of the following limits.
+_UNEXPLAINED = 0.01  # residual sum of squares, relative to that of a model without forces
+_SMOOTH = 5.0  # excess of the residuals
+# Remedy in warnings about dynamics that the model lacks.
 _RECORD_NEXT = "measure the response instead (zwidth.excite, zwidth.respond), which needs no model"
 
 
@@ -62,44 +66,47 @@ def fit_log(
     """Fit mass, damping and delay of a device to a log of its free motion under commanded forces.
 
     The model is ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, with zero-order hold of the force; the positions
-    are fitted by least squares. The constant force f0 and the friction F_c are always fitted, which increases the
-    errors of the other parameters. Omitting them if the log hardly shows them would bias the others by many standard
-    errors. An actuator lag of first or second order and resonances are added if Schwarz's criterion requires them.
+    are fitted by least squares. The constant force f0 and the friction F_c are always fitted. This increases the errors
+    of the other parameters, but omitting f0 or F_c when they are hardly visible could bias the other parameters by many
+    standard errors. An actuator lag of first or second order and resonances are added if Schwarz's criterion requires
+    them.
 
     Args:
         time: times of the samples in s, evenly spaced, or only the sampling period. The parts before and after missing
-            samples are fitted as two logs. Lists of arrays for time, position and force are several logs of one device.
+            samples are fitted as two logs. For several logs of one device, time, position and force are lists of
+            arrays.
         position: sampled positions in m.
         force: commanded forces at the same samples in N, positive in the direction of increasing positions.
         velocity: velocity estimate of the loop for which K_max is computed; the backward difference by default.
         max_delay: largest delay of the search in s; 20 periods by default. The positions within this time from the
             start are not fitted, because past forces are unknown. At most 200,000 samples of all logs are fitted.
-        resolution: encoder step in m; by default determined from the positions; 0 for none.
+        resolution: encoder step in m, 0 for a sensor without steps; by default determined from the positions.
         resample: accept timestamp jitter of up to a quarter of the period instead of 5 %. The samples are treated as
             evenly spaced, with the period that fits all times.
         rotary: True if the position is an angle in rad and the force a torque in N m. The mass is then an inertia in
             kg m², the damping in N m s/rad, and so on.
 
     Returns:
-        DeviceFit: the errors of ``friction`` and ``offset`` are NaN if the log does not distinguish them, as for motion
-        in one direction only; ``doubts``: warnings, as about a unit or residuals that are not white noise; with a
-        warning there is no safe wall; ``status``: UNREACHABLE if the delay is at the end of the search range;
-        NOT_CONVERGED; UNDECIDED, with K_max NaN, if the residuals are not white noise; ``response`` bounds the safe
-        wall.
+        DeviceFit: ``friction`` and ``offset`` have errors NaN if the log does not distinguish the two forces, as for
+        motion in one direction only. ``doubts`` are warnings, for example about a unit; with a warning there is no safe
+        wall. ``status`` is UNREACHABLE if the delay is at the end of the search range; NOT_CONVERGED if the search did
+        not converge; UNDECIDED, with K_max NaN, if the residuals are not white noise. ``response`` limits the safe wall
+        for a device with undetected resonances.
 
     Raises:
         InputError: times are uneven, the force or the position never changes, the fitted mass is negative, another
             force causes most of the motion, or the log does not determine mass, damping and delay.
 
     Numerics:
-        Closed forms between samples, including reversals and sticking; exact derivatives; Levenberg-Marquardt steps in
-        NumPy. A log of 3,000 samples takes about half a second, without compilation. Friction causes local minima, one
-        for each missed reversal or rest. Therefore fits begin with no friction and with 0.3 to 35 % of the largest
-        force, for the first 300 samples, and continue with more and more samples. If a fit without friction is almost
-        as good, the errors include it. They account for the autocorrelated errors of the encoder; all samples of a rest
-        count as one. The prior odds of one more resonance are 1: the interval of K_max is that of 200 devices with such
-        a resonance, weighted by their likelihood, and of the device without it (docs/theory/hidden.md).
-        docs/fitting.md lists how often the intervals contain the true values.
+        The motion between samples is computed in closed form, including reversals and sticking, with exact derivatives;
+        the least-squares method is Levenberg-Marquardt in NumPy. A log of 3,000 samples takes about half a second,
+        without compilation. Friction causes local minima, one for each missed reversal or rest. Therefore several fits
+        start, with frictions of 0 and of 0.3 to 35 % of the largest force, from the first 300 samples, and the best
+        ones continue with more and more samples. If a fit without friction is almost as good, the standard errors
+        include the difference. The standard errors account for the autocorrelated errors of the encoder; all samples
+        of a rest count as one. The interval of K_max averages over 200 devices with one more resonance, drawn from its
+        posterior distribution, and the device without it, at prior odds of 1 (docs/theory/hidden.md). docs/fitting.md
+        lists how often the intervals contain the true values.
 
     References:
         Ljung 1999, System Identification, section 4.2 (output error). Leeb, Poetscher 2005, Econometric Theory 21,
@@ -130,7 +137,15 @@ def _fit(
     resolution: Any,
     system: UnitSystem,
 ) -> DeviceFit:
-    """Return the fit of logs that were read and repaired."""
+    """Fit a device to logs that are read and repaired.
+
+    Args:
+        read: the logs.
+        velocity: velocity estimate of the scene of the fitted device.
+        max_delay: largest delay as specified by the user; None for the default.
+        resolution: encoder step as specified by the user; None to determine it.
+        system: units of the logs.
+    """
     logs, places, period, period_error, notes, _ = read
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
@@ -169,7 +184,8 @@ def _fit(
     unexplained = _find_unexplained(best, pole, period, system) if bank else []
     warnings = step_warnings + warnings + _list_warnings(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
     status = Status.OK if best.converged else Status.NOT_CONVERGED
-    # If the residuals are not white noise, the true device may have quite another K_max.
+    # Report the fit as undecided if the residuals are not white noise, because the K_max of the true device may then be
+    # very different.
     status = Status.UNDECIDED if status == Status.OK and unexplained else status
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
@@ -201,7 +217,17 @@ def _fit(
 
 
 def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float, system: UnitSystem) -> list[str]:
-    """Return a warning with cause and remedy if the residuals are not white noise, or if the lag may be a resonance."""
+    """Return a warning if the residuals are not white noise, or if the fitted lag may be a resonance.
+
+    Args:
+        best: the fitted model.
+        pole: pole that the model lacks, or resonance that may replace its lag; None if there is neither.
+        period: sampling period in s.
+        system: units of the logs.
+
+    Returns:
+        A list with the warning, which states the cause and the remedy; an empty list if no warning is necessary.
+    """
     cause = explain_residuals(best, system) if pole is not None or best.excess > ALIKE else ""
     if cause:
         remedy = "log the force with more digits" if "rounded" in cause else _RECORD_NEXT
@@ -222,21 +248,31 @@ def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float,
 
 
 def _convert_force(best: FittedModel, k: int) -> tuple[float, float]:
-    """Return a constant force or friction in N, with its standard error; ``k`` is its index in theta."""
+    """Convert the acceleration at index ``k`` of theta, by the constant force or by friction, to a force in N.
+
+    Returns:
+        The force and its standard error.
+    """
     g = best.theta[0]
     value, indices = best.theta[k] / g, [0, k]
     slope = np.array([-value / g, 1.0 / g])
     error = float(np.sqrt(slope @ best.covariance[np.ix_(indices, indices)] @ slope))
-    # A friction at the lower bound of the search means no friction.
+    # Report a friction at the lower bound of the search as 0, because the search does not reach 0 itself.
     is_zero = k == -1 and value <= 2.0 * MIN_FRICTION * best.model.largest_force
     return 0.0 if is_zero else float(value), error
 
 
 def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[list[float], list[str]]:
-    """Return the candidates for the encoder step, coarsest first, and warnings about a given step.
+    """List the candidates for the encoder step, coarsest first, and warnings about a step that the user specified.
 
-    Positions of an ideal sensor have only the rounding step of the column. Under a constant force they may nevertheless
-    be near integer multiples of a much larger step. Only the residuals distinguish this step from an encoder step.
+    Positions near integer multiples of a step need not be those of an encoder: under a constant force, the positions of
+    a sensor without steps may have this property, too. Only the residuals distinguish the two cases. 0 is the candidate
+    for a sensor without steps.
+
+    Args:
+        resolution: encoder step as specified by the user; None to determine it from the positions.
+        read: the logs.
+        system: units of the logs.
     """
     if resolution is None:
         columns = zip(*read.steps, strict=True)
@@ -252,7 +288,16 @@ def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[li
 
 
 def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[float]) -> tuple[float, Choice]:
-    """Return the coarsest encoder step that the residuals do not exclude, and the model fitted with it."""
+    """Fit the device with one encoder step after another, until the residuals do not exclude the step.
+
+    Args:
+        recordings: the logs.
+        longest: largest delay of the search, in sampling periods.
+        steps: candidates for the encoder step, coarsest first.
+
+    Returns:
+        The encoder step, and the result of `choose_structure` with this step.
+    """
     step, *finer = steps
     choice = choose_structure(fit_model(Recordings(recordings, longest=longest, resolution=step)))
     excluded = choice[0].variance <= (_FINER * step) ** 2 / 12.0
@@ -260,9 +305,10 @@ def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[
 
 
 def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:
-    """Raise `InputError` if the force explains too little of the motion, or if the fitted mass is negative."""
+    """Raise `InputError` if the commanded force explains too little of the motion, or the fitted mass is negative."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
-    # Residuals of the motion without any force, friction included.
+    # Fit the positions by a free motion from the initial states alone, without any force. The reduction of its
+    # residuals is the effect of the forces.
     alone = model.simulate(np.append(theta[:-2], [0.0, 0.0])).derivatives[:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
@@ -299,7 +345,14 @@ def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> Non
 
 
 def _list_warnings(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tuple[Recording, ...]) -> list[str]:
-    """Return warnings about units, and about parameters that the log hardly determines."""
+    """List warnings about values that suggest a wrong unit, and about parameters that the log hardly determines.
+
+    Args:
+        scene: scene of the fitted device.
+        errors: standard errors of the parameters of `name_parameters`.
+        best: the fitted model.
+        logs: the logs.
+    """
     mass, damping, delay = scene.device.mass, scene.device.damping, scene.timing.delay
     warnings, residuals, units = [], best.residuals, scene.unit_system
     lightest, heaviest, farthest, strongest = _USUAL[units.rotary]
@@ -326,7 +379,7 @@ def _list_warnings(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tu
         )
     size = float(residuals @ residuals)
     if size <= EXACT**2 * residuals.size * span**2:
-        # The residuals are rounding errors.
+        # Residuals that are only rounding errors require no further warnings.
         return warnings
     if damping == 0:
         warnings.append(
@@ -354,7 +407,18 @@ def _build_motions(
     skip: int,
     period: float,
 ) -> tuple[FittedMotion, ...]:
-    """Return each log with its fitted positions, NaN for samples that are not fitted (first ones, and after gaps)."""
+    """Combine each log with the positions of the fitted model.
+
+    The modeled positions are NaN for samples that are not fitted: the first ones of each stretch, and short stretches.
+
+    Args:
+        best: the fitted model.
+        logs: the logs.
+        places: for each log the times of its samples, in sampling periods.
+        stretches: for each log its fitted stretches.
+        skip: number of samples at the start of a stretch that only provide past forces.
+        period: sampling period in s.
+    """
     motions, parts = [], iter(best.model.split(best.response.position))
     for log, place, slices in zip(logs, places, stretches, strict=True):
         modelled = np.full(log.force.size, np.nan)

@@ -1,17 +1,18 @@
-"""Least-squares fit of a device model to logged positions, by the output-error method (Ljung 1999, section 4.2).
+"""Fit a device model to logged positions by least squares, with the output-error method (Ljung 1999, section 4.2).
 
-The parameters are theta of `fitting.structure.Recordings`: g = T^2/m, delta = b T/m, the delay d, those of an actuator
-lag and of modes, the initial states, and the accelerations o and c by a constant force and by friction. The sum of the
-squared residuals, measured minus modeled positions, is minimized by Levenberg-Marquardt steps with exact derivatives.
-Friction causes local minima, one for each missed stop of the mass. Therefore several initial values, with different
-frictions, are followed through more and more positions of the logs.
+The parameter vector theta of `fitting.structure.Recordings` contains g = T^2/m, delta = b T/m, the delay d, the
+parameters of an actuator lag and of resonances (*modes*), the initial position x0 and velocity v0 of each log, and the
+accelerations o and c by a constant force and by friction. The sum of the squared residuals, measured minus modeled
+positions, is minimized by Levenberg-Marquardt steps with exact derivatives. Friction causes local minima, one for each
+missed stop of the mass. Therefore the search starts from several initial values with different frictions, and refines
+the best ones on more and more positions of the logs.
 
 The constant force and the friction are always fitted. A fit without them has smaller standard errors, but these are
-valid only if both forces are 0. When a selection criterion omitted them, the damping was wrong by up to 179 of its
-standard errors.
+valid only if both forces are 0. In a test in which a selection criterion omitted the forces, the damping was wrong by
+up to 179 of its standard errors.
 
-A *rival* is another minimum that fits about as well. One more symbol: -2 log(likelihood) of N positions with white
-noise of unknown variance is N log(sum of squares), up to a constant; it is called the misfit.
+A *rival* is a second minimum of the sum of squares, with about the same value. The *misfit* is -2 log(likelihood); for
+N positions with white noise of unknown variance, it is N log(sum of squares), up to a constant.
 """
 
 from __future__ import annotations
@@ -27,96 +28,107 @@ from zwidth.fitting.encoder import MeasurementNoise
 from zwidth.fitting.moving import ModelResponse, Recording
 from zwidth.fitting.structure import Recordings
 
-# Initial values.
-_DELTAS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0)  # damping b T/m
-_FRICTIONS = np.array([0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.35])  # friction, relative to the largest force
-MIN_FRICTION = 1e-12  # least friction of the search, relative to the largest force; at 0 the derivative vanishes
-_N_LEADING = 600  # leading positions of each log that determine the initial values
-_BATCH_SIZE = 32  # delays per batch; bounds the memory
-# Selection of an initial value.
-_ROUNDS = ((300, 4), (600, 3), (1200, 2), (2500, 1))  # leading positions, and number of initial values that are kept
-_STEPS_PER_ROUND = 12  # largest number of steps from each initial value per round
+# Grid of initial values.
+_DELTAS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0)  # damping delta = b T/m
+# Friction, relative to the largest force.
+_FRICTIONS = np.array([0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.35])
+# Least friction of the search, relative to the largest force. It is not 0, because the derivative in the friction
+# vanishes there.
+MIN_FRICTION = 1e-12
+_N_LEADING = 600  # number of leading positions of each log from which the initial values are computed
+_BATCH_SIZE = 32  # number of delays per batch, to limit the memory
+# Selection of the best initial value in several rounds. Each round has a number of leading positions of each log, and a
+# number of initial values that are kept for the next round.
+_ROUNDS = ((300, 4), (600, 3), (1200, 2), (2500, 1))
+_STEPS_PER_ROUND = 12  # largest number of Levenberg-Marquardt steps from each initial value per round
 
-# Tolerances of the search: predicted reduction of the sum of squares by the next step, relative to this sum.
-_NEAR = 1e-3  # in the selection of an initial value
-CLOSELY = 2e-5  # in the comparison of device structures
-_CONVERGED = 1e-14  # of the final fit
-NEARLY = 1e-6  # if only the noise is estimated; also accepted as converged if no step decreases the sum of squares
-# Levenberg-Marquardt steps.
-_MAX_STEPS = 100  # largest number of steps
-_INITIAL_DAMPING = 1e-4  # initial damping of the steps
-_NEGLIGIBLE_DAMPING = 1e-6  # a decreasing damping below this value is set to 0
-_MAX_DAMPING = 1e12  # largest damping, at which the search ends
+# Tolerances of the search: it ends if the predicted reduction of the sum of squares by the next step, relative to this
+# sum, is smaller.
+_NEAR = 1e-3  # tolerance in the selection of an initial value
+CLOSELY = 2e-5  # tolerance in the comparison of device structures
+_CONVERGED = 1e-14  # tolerance of the final fit
+# Tolerance of fits from which only the noise is estimated. A search that ends because no step decreases the sum of
+# squares also counts as converged if it satisfies this tolerance.
+NEARLY = 1e-6
+# Levenberg-Marquardt method. The damping is the number that is added to the diagonal of the normalized equations.
+_MAX_STEPS = 100  # largest number of steps by default
+_INITIAL_DAMPING = 1e-4  # damping of the first step
+_NEGLIGIBLE_DAMPING = 1e-6  # value below which a decreasing damping is set to 0
+_MAX_DAMPING = 1e12  # damping above which the search ends
 
-# Ambiguity of friction.
-_BACKWARD_SHARE = 0.1  # a motion is in one direction if its way back is shorter than this share of all motion
-_NEARLY_FRICTIONLESS = 900.0  # squared standard errors of the friction, below which a fit without friction is tried
-_EXCLUDED = 25.0  # squared standard errors from which on a rival does not enlarge the covariance
-_INVISIBLE_DISTANCE = 3.0  # an initial motion shorter than this many standard deviations of the noise is not visible
-# Numerical limits.
-_MAX_CONDITION = 1e7  # condition number of the columns above which parameters are not determined
+# Ambiguity of friction and constant force.
+# A motion counts as one in a single direction if its path backward is shorter than this share of the whole path.
+_BACKWARD_SHARE = 0.1
+# A fit without friction is tried as a rival if the squared ratio of the friction to its standard error is smaller.
+_NEARLY_FRICTIONLESS = 900.0
+_EXCLUDED = 25.0  # difference in misfit from the best fit from which on a rival does not enlarge the covariance
+# An initial motion counts as invisible if its length is below this number of standard deviations of the noise.
+_INVISIBLE_DISTANCE = 3.0
+# Numerical limits and levels.
+_MAX_CONDITION = 1e7  # condition number of the derivatives above which some parameters are not determined
 _ROUNDING = 1e-13  # relative rounding error of a sum of squares, and of the positions
-_SIGNIFICANCE = 1e-3  # significance level of the excess of sums of residuals
+_SIGNIFICANCE = 1e-3  # significance level of the chi-square test for the excess
 _Fixed = tuple[int, ...]  # indices of the parameters in theta that keep their initial values
 
 
 class ColumnsInverse(NamedTuple):
-    """Pseudo-inverse of the normalized derivatives of the positions, with the parameters that are not determined."""
+    """Pseudo-inverse of the normalized derivatives of the positions in theta, with results of the decomposition."""
 
-    matrix: np.ndarray  # pseudo-inverse
+    matrix: np.ndarray  # pseudo-inverse, one row per parameter
     undetermined: np.ndarray  # mask of the parameters that the positions do not determine
-    basis: np.ndarray  # orthonormal basis of the columns, without directions below numerical resolution
+    basis: np.ndarray  # orthonormal basis of the column space of the derivatives, up to the numerical resolution
 
     @property
     def rank(self) -> int:
-        """The number of independent directions of theta that the positions determine."""
+        """The number of independent linear combinations of parameters that the positions determine."""
         return self.basis.shape[1]
 
 
 @dataclass(frozen=True)
 class FittedModel:
-    """A model at the minimum of its sum of squares."""
+    """A device model with the theta at which its sum of squares is minimal, and quantities derived from the fit."""
 
     model: Recordings
     theta: np.ndarray
-    squares: float  # weighted sum of the squared residuals
+    squares: float  # sum of the squared weighted residuals
     converged: bool
     rivals: tuple[FittedModel, ...] = ()
 
     @property
     def count(self) -> int:
-        """The number of fitted positions; with weights, that of white noise (`MeasurementNoise.count`)."""
+        """The number of fitted positions; if they are weighted, the effective number `MeasurementNoise.count`."""
         return self.model.measured.size if self.model.noise is None else self.model.noise.count
 
     @cached_property
     def response(self) -> ModelResponse:
-        """The modeled positions and their derivatives in theta."""
+        """The modeled positions of all logs and their derivatives in theta."""
         return self.model.simulate(self.theta)
 
     @cached_property
     def residuals(self) -> np.ndarray:
-        """The measured minus the modeled positions."""
+        """The residuals of all logs, measured minus modeled positions, in one array."""
         return self.model.measured - self.response.position
 
     @property
     def variance(self) -> float:
-        """The estimated variance of the noise of a position."""
+        """The variance of the noise of one position, estimated from the residuals."""
         return self.squares / max(1, self.count - self.theta.size)
 
     @cached_property
     def noise(self) -> MeasurementNoise:
-        """The noise of the positions, of at least the variance of the quantization error.
+        """The noise model of the positions.
 
-        The residuals may have a smaller variance, because x0 absorbs the error of the encoder at rest.
+        Its variance is at least that of the quantization error. The variance of the residuals may be smaller, because
+        x0 absorbs the error of the encoder at rest.
         """
         step = self.model.resolution
         return MeasurementNoise(self.response.position, max(self.variance, step**2 / 12.0), step)
 
     @cached_property
     def columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """The weighted derivatives of the positions, normalized, and their norms.
+        """The weighted derivatives of the positions in theta, each column divided by its norm, and these norms.
 
-        A derivative that vanishes, as that in v0 of a mass that sticks, stays 0 and has the norm 1.
+        A column that is zero, such as the derivative in v0 of a sticking mass, is divided by 1 instead.
         """
         columns = self.model.weigh(self.response.derivatives)
         sizes = np.linalg.norm(columns, axis=0)
@@ -125,14 +137,14 @@ class FittedModel:
 
     @cached_property
     def inverse(self) -> ColumnsInverse:
-        """The pseudo-inverse of ``columns``, by singular values."""
+        """The pseudo-inverse of the normalized derivatives, by singular value decomposition."""
         left, values, right = np.linalg.svd(self.columns[0], full_matrices=False)
         blind = values * _MAX_CONDITION < values[0]
         inverse = right[~blind].T / values[~blind] @ left[:, ~blind].T
         return ColumnsInverse(inverse, np.any(np.abs(right[blind]) > _MAX_CONDITION**-0.5, axis=0), left[:, ~blind])
 
     def estimate_step(self, k: int) -> float:
-        """Return the step to the unconstrained minimum of a parameter fixed at its bound, in standard errors.
+        """Estimate the step from a parameter fixed at its bound to its unconstrained optimum, in standard errors.
 
         Args:
             k: index of the parameter in theta.
@@ -141,19 +153,25 @@ class FittedModel:
         return float(step / np.sqrt(self.covariance[k, k]))
 
     def compare_misfit(self, other: FittedModel) -> float:
-        """Return the misfit, -2 log(likelihood), minus that of another model; rounding errors count as equal."""
+        """Return the misfit minus that of another model of the same logs.
+
+        Sums of squares below the rounding error of the positions are replaced by this error.
+        """
         floor = self.count * (_ROUNDING * float(np.abs(self.model.measured).max())) ** 2
         ratio = max(self.squares, floor) / max(other.squares, floor)
         return self.count * np.log(ratio)
 
     def fits_as_well_as(self, other: FittedModel) -> bool:
-        """Return whether Schwarz's criterion (BIC) prefers this model to another one with more parameters."""
+        """Return whether Schwarz's criterion (BIC) prefers this model to ``other``, which has more parameters."""
         return self.compare_misfit(other) < max(1, other.inverse.rank - self.inverse.rank) * np.log(self.count)
 
     @cached_property
     def excess(self) -> float:
-        """The mean square of sums of neighboring residuals, relative to that of the noise; 1 if not significant."""
-        # Each sum adds 2 N^(1/3) of the N residuals. This is a usual bandwidth for errors of unknown autocorrelation
+        """The autocorrelation of the residuals, as a factor of variance; 1 for white noise or if not significant.
+
+        The value is the mean square of sums of successive residuals, divided by that expected from the noise model.
+        """
+        # Add 2 N^(1/3) of the N residuals per sum, which is a usual bandwidth for errors of unknown autocorrelation
         # (Newey, West 1987).
         from scipy.special import chdtri
 
@@ -171,10 +189,10 @@ class FittedModel:
     def covariance(self) -> np.ndarray:
         """The covariance of theta, NaN for parameters that are not determined.
 
-        It contains the autocorrelated errors of the encoder, the excess of the residuals, and the rivals.
+        It accounts for the autocorrelated errors of the encoder, for the excess of the residuals, and for rivals.
         """
         (columns, sizes), weigh = self.columns, self.model.weigh
-        # Use the pseudo-inverse, because products of columns lose half of the digits.
+        # Use the pseudo-inverse instead of products of the derivatives, because these lose half of the digits.
         inverse, undetermined, _ = self.inverse
         gram_inverse = inverse @ inverse.T
         covariance = self.excess * (gram_inverse @ self.noise.spread(weigh(columns)) @ gram_inverse)
@@ -188,29 +206,29 @@ class FittedModel:
             correlation = covariance[block] / np.outer(scales, scales)
             predicted = float(steps @ np.linalg.lstsq(correlation, steps, rcond=None)[0])
             actual = max(rival.compare_misfit(self) / self.excess, 1.0)
-            # If the misfit increases less toward the rival than the derivatives predict, as beyond a kink of the sum of
-            # squares, enlarge the covariance in this direction until both agree.
+            # The misfit may increase less between the minimum and the rival than the derivatives predict, because the
+            # sum of squares has a kink between them. Then enlarge the covariance in this direction until both agree.
             if actual < min(predicted, _EXCLUDED):
                 covariance[block] += (1.0 / actual - 1.0 / predicted) * np.outer(away, away)
         return covariance
 
 
 def fit_model(model: Recordings) -> FittedModel:
-    """Return the least-squares fit of a model, with its rivals; the model must not have a lag or modes."""
+    """Fit a model without lag and modes by least squares, and find its rivals."""
     start = _select_start(model, _list_starts(model))
     best = _fit(model, start, (), NEARLY if model.resolution else _CONVERGED)
     if model.resolution:
-        # Weight the samples, because at rest all of them have the same error of the encoder.
+        # Fit again with weights from the estimated noise, because all samples at rest have the same encoder error.
         model = replace(model, noise=best.noise)
         best = _fit(model, best.theta)
-    # If the mass moves in one direction only, and rests before or after, the log determines only the sum of constant
-    # force and friction. Then one of them is set to 0. Compare with such a fit also if the best one moves back by
-    # little, because noise can cause that.
+    # If the mass moves in one direction only, and rests before or after, the log determines only the sum of the
+    # constant force and the friction. Then set one of them to 0. Try such a fit also if the mass moves backward a
+    # little, because the noise may cause this motion.
     steps = np.diff(best.response.position)
     direction = float(np.sign(steps.sum()))
     if -np.sum(steps, where=direction * steps < 0) * direction < _BACKWARD_SHARE * np.abs(steps).sum():
         g, total = best.theta[0], best.theta[-2] - direction * best.theta[-1]
-        # A total in the direction of motion is a constant force, one against it friction.
+        # Attribute the sum to the constant force if it acts in the direction of motion, and to friction otherwise.
         if direction * total > 0:
             parts, omitted = (total, MIN_FRICTION * abs(g) * model.largest_force), -1
         else:
@@ -219,8 +237,9 @@ def fit_model(model: Recordings) -> FittedModel:
         rival = _fit(model, start, (omitted,))
         if rival.inverse.undetermined[-2:].all() and rival.fits_as_well_as(best):
             return rival
-    # Without friction the mass never rests. There the sum of squares has a kink, beyond which it may increase less than
-    # the derivatives predict; therefore compare with a fit without friction.
+    # Compare with a fit without friction, because the standard error of a small friction may be wrong: at friction 0,
+    # where the mass ceases to rest, the sum of squares has a kink, and it may increase less there than the derivatives
+    # predict.
     if best.theta[-1] ** 2 < _NEARLY_FRICTIONLESS * best.covariance[-1, -1]:
         start = best.theta - np.nan_to_num(best.covariance[:, -1]) * best.theta[-1] / best.covariance[-1, -1]
         start[-1] = MIN_FRICTION * abs(start[0]) * model.largest_force
@@ -232,12 +251,14 @@ def fit_model(model: Recordings) -> FittedModel:
 
 
 def _list_starts(model: Recordings) -> list[np.ndarray]:
-    """Return initial values of theta: one without friction, and the best one for each friction of a grid.
+    """Compute initial values of theta: one without friction, and one for each friction of `_FRICTIONS`.
 
-    For each friction, damping and delay are those of least squares on a grid, for the first `_N_LEADING` positions.
+    For each friction, the damping and the delay are those with the least sum of squares on a grid, evaluated on the
+    first `_N_LEADING` positions of each log.
     """
-    # At fixed damping, delay, and velocities and accelerations relative to g, the positions are linear in all other
-    # parameters. One response per damping serves all integer delays: it begins earlier and is shifted.
+    # At fixed damping, delay and friction relative to g, the positions are linear in the other parameters, which linear
+    # least squares determines. Simulate each damping only once: the response begins earlier than the log, and shifting
+    # it by whole samples yields the responses for all integer delays.
     model = model.truncate(_N_LEADING)
     base, most = np.zeros(model.size), int(model.longest)
     early = Recordings(
@@ -249,7 +270,7 @@ def _list_starts(model: Recordings) -> list[np.ndarray]:
     )
 
     def search(deltas: tuple[float, ...]) -> tuple[float, int]:
-        """Return the damping and the delay of the least sum of squares."""
+        """Return the damping of ``deltas`` and the integer delay with the least sum of squares."""
         tried = []
         for delta, some in product(deltas, np.array_split(np.arange(most + 1), 1 + most // _BATCH_SIZE)):
             rows = np.swapaxes(_simulate_rows(early, delta, 0.0, base)[:, samples - some[:, None]], 0, 1)
@@ -258,39 +279,47 @@ def _list_starts(model: Recordings) -> list[np.ndarray]:
         return min(tried)[1:]
 
     def start(delta: float, d: float) -> np.ndarray:
-        """Return theta with the linear parameters of least squares."""
+        """Return theta for a damping and a delay, with the other parameters from linear least squares."""
         values = _combine_rows(_simulate_rows(model, delta, d, base), model.measured)[0]
         return np.array([values[0], delta, d, *(values[0] * base[3:-1] + values[1:]), abs(values[0]) * base[-1]])
 
     delta, d = search(_DELTAS)
     starts = [minimize_squares(model, start(delta, d), (-1,), tolerance=_NEAR)[0]]
-    # Linearize the other initial values at the constant force of the first one.
+    # Linearize the positions at the constant force of the first initial value, to compute the other initial values.
     base[-2] = starts[0][-2] / starts[0][0]
     for friction in _FRICTIONS * model.largest_force:
         base[-1] = friction
-        # A larger friction explains more of the losses, so the damping can only be smaller; allow one grid step more.
+        # Omit dampings above the last one, because a larger friction explains more of the energy loss. Allow one grid
+        # step more as a margin.
         delta, d = search(_DELTAS[: _DELTAS.index(delta) + 2])
         starts.append(minimize_squares(model, start(delta, d), (-1,), tolerance=_NEAR)[0])
     return starts
 
 
 def _simulate_rows(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.ndarray:
-    """Return the positions for g = 1 and their derivatives in x0, v0 of all logs and o, one per row.
+    """Simulate the basis functions of the linear least squares: positions for g = 1, and their linear derivatives.
 
     Args:
-        model: the logs.
+        model: the logs, with a model without lag and modes.
         delta: damping b T/m.
-        d: delay.
-        base: a theta with the initial states, o and c, relative to g.
+        d: delay in sampling periods.
+        base: a theta that contains the initial states, o and c, divided by g.
+
+    Returns:
+        An array with one sample per column. The rows are the positions, their derivatives in x0 and v0 of each log, and
+        that in o.
     """
     response = model.simulate(np.array([1.0, delta, d, *base[3:]]))
     return np.vstack([response.position, response.derivatives[:, 3:-1].T])
 
 
 def _combine_rows(rows: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least-squares coefficients of rows, and the sums of squares of the residuals.
+    """Fit positions by linear combinations of rows, by least squares; leading axes of ``rows`` are a batch.
 
-    The normal equations have half of the digits of float64, which are enough for initial values.
+    The normal equations are solved. Their accuracy, half of the digits of float64, suffices for initial values.
+
+    Returns:
+        The coefficients, and the sums of squares of the residuals.
     """
     square = rows @ np.swapaxes(rows, -1, -2)
     sizes = np.sqrt(np.diagonal(square, axis1=-2, axis2=-1))
@@ -302,9 +331,9 @@ def _combine_rows(rows: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _select_start(model: Recordings, starts: list[np.ndarray]) -> np.ndarray:
-    """Refine the initial values on more and more positions, and return the best one.
+    """Refine initial values on more and more leading positions, dropping the worse ones, and return the best one.
 
-    Short logs have few stops of the mass, and therefore hardly any local minima.
+    The first positions contain few stops of the mass. Therefore their sum of squares has hardly any local minima.
     """
     for count, kept in _ROUNDS:
         part = model.truncate(count)
@@ -314,12 +343,20 @@ def _select_start(model: Recordings, starts: list[np.ndarray]) -> np.ndarray:
 
 
 def _fit(model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: float = _CONVERGED) -> FittedModel:
-    """Return the least-squares fit from an initial value, with the mass initially at rest if that fits as well."""
-    # If friction stops the mass within the noise, its initial velocity hardly changes the positions. The derivative in
-    # this velocity is then almost 0, and the search converges slowly.
+    """Fit a model from one initial value, with initial velocities of exactly 0 if that fits as well.
+
+    Args:
+        model: the logs and the structure of the model.
+        start: initial theta.
+        fixed: indices of the parameters that keep their initial values.
+        tolerance: tolerance of the search, as in `minimize_squares`.
+    """
+    # Treat initial motions that friction stops within the noise separately: the derivative of the positions in such an
+    # initial velocity is almost 0, so that the search converges slowly.
     best = fit_nonnegative(model, start, fixed, tolerance)
     speed, (_, delta, *_, friction) = np.abs(best.theta[model.velocity_indices]), best.theta
-    # The distance to the stop, interpolated: v^2/(2 c) without damping, v/delta without friction.
+    # Approximate the distance to the stop by a formula that is exact without damping, v^2/(2 c), and without friction,
+    # v/delta.
     distance = speed**2 / (2.0 * friction + delta * speed)
     invisible = (distance > 0) & (distance < _INVISIBLE_DISTANCE * np.sqrt(best.variance))
     if invisible.any():
@@ -334,7 +371,7 @@ def _fit(model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: fl
 def fit_nonnegative(
     model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: float = _CONVERGED
 ) -> FittedModel:
-    """Return the fit of `minimize_squares` with nonnegative damping and delay: a negative one is fixed at 0."""
+    """Fit a model by `minimize_squares`; if the damping or the delay becomes negative, fix it at 0 and fit again."""
     best = minimize_squares(model, start, fixed, tolerance=tolerance)
     while negative := tuple(k for k in (1, 2) if best[0][k] < 0):
         best[0][list(negative)] = 0.0
@@ -372,21 +409,23 @@ def minimize_squares(
     for _ in range(most):
         derivatives = model.weigh(response.derivatives)
         sizes = np.linalg.norm(derivatives, axis=0)
-        # Change only parameters that change the positions, and none across its bound.
+        # Change only parameters that have an effect on the positions and would not leave their bounds.
         descent = derivatives.T @ residuals
         free = (sizes > 0) & ((theta > low) | (descent > 0)) & ((theta < high) | (descent < 0))
         sizes = sizes[free]
         columns = derivatives[:, free] / sizes
         square, descent = columns.T @ columns, descent[free] / sizes
         while True:
-            # The normal equations keep half of the digits. That suffices for a step, because the residuals keep all.
+            # Solve the normal equations. Their lower accuracy suffices for a step, because the residuals, which decide
+            # the convergence, are computed with full accuracy.
             step = np.linalg.lstsq(square + damping * np.eye(sizes.size), descent, rcond=None)[0]
             predicted = float(step @ (2.0 * descent - square @ step))
             trial = theta.copy()
             trial[free] += step / sizes
             trial = np.clip(trial, low, high)
             trial_response, trial_residuals, trial_squares = evaluate(trial)
-            # Accept steps whose effect is below the rounding error of the sum of squares, as the last ones are.
+            # Also accept steps whose effect is below the rounding error of the sum of squares, because the last steps
+            # before convergence are so small.
             better = trial_squares < squares or max(predicted, trial_squares - squares) <= _ROUNDING * squares
             if better or damping > _MAX_DAMPING:
                 break
@@ -394,10 +433,11 @@ def minimize_squares(
                 return theta, squares, True
             damping = max(10.0 * damping, _INITIAL_DAMPING)
         if not better:
-            # No step along the derivatives decreases the sum of squares, because of a kink or rounding errors.
+            # End the search, because no step decreases the sum of squares, as at a kink or at the rounding error.
             break
         theta, response, residuals, squares, before = trial, trial_response, trial_residuals, trial_squares, squares
-        # Decrease the damping if the reduction was about as predicted; increase it below half of that (Nielsen 1999).
+        # Decrease the damping if the sum of squares decreased about as predicted, and increase it if the reduction was
+        # less than half of the prediction (Nielsen 1999).
         ratio = (before - squares) / predicted if predicted > 0 else 0.0
         factor = max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
         damping = 0.0 if damping < _NEGLIGIBLE_DAMPING and factor < 1.0 else factor * damping

@@ -1,7 +1,8 @@
 """Read logs from arrays, repair them, and refuse those to which no device can be fitted.
 
-Samples are assigned to whole sampling periods by a line through all times, with the slope of the period. Times may
-differ from this line by timestamp jitter within limits, or by the ticks of a coarse clock (`fitting.repair`).
+Each sample gets an integer index, its time in sampling periods after the first sample. A straight line is fitted to the
+times over these indices; its slope is the sampling period. The times may deviate from the line by limited timestamp
+jitter, or by the rounding of a coarse clock to its ticks (`fitting.repair`).
 """
 
 from __future__ import annotations
@@ -19,31 +20,34 @@ from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, SI_RANGE
 from zwidth.words.unit_system import UnitSystem
 
-# Largest distance of a time from an evenly spaced one, in periods.
-_UNEVEN = 0.05  # without timestamp jitter
-_JITTER = 0.25  # with timestamp jitter; less than the distance that a missing sample causes
-_SAME = 1e-5  # largest relative difference of the periods of two logs, in addition to their errors
-_SURE = 5.0  # standard errors of a period that its difference from another may have
-_STUCK = 25  # least duration in samples of a constant maximum or minimum that causes a warning
-_MANY = 0.1  # a force varies if the ratio of its values below the maximum to the samples at the maximum is larger
-_MISSING = 1.5  # least ratio of a time step to the median step at which samples are missing
+# Largest accepted deviation of a time from the fitted line, in sampling periods.
+_UNEVEN = 0.05  # deviation that is always accepted
+_JITTER = 0.25  # deviation accepted if the user allows timestamp jitter; smaller than a missing sample causes
+# Largest difference between the sampling periods of two logs: relative to the period, plus a number of standard errors.
+_SAME = 1e-5  # relative to the period
+_SURE = 5.0  # number of standard errors
+# A warning is issued if position or force is constant at its maximum or minimum for this number of samples.
+_STUCK = 25
+# A force counts as varying if the number of its values inside the range exceeds this share of those at the maximum.
+_MANY = 0.1
+_MISSING = 1.5  # ratio of a time step to the median time step above which samples are missing
 
 
 class ReadLogs(NamedTuple):
-    """Logs at even times, after repair."""
+    """Repaired logs with evenly spaced samples, which may have gaps."""
 
     logs: tuple[Recording, ...]
-    places: tuple[np.ndarray, ...]  # for each log, the times of its samples in whole periods after the first
-    period: float  # s
-    period_error: float  # relative standard error of the period
-    notes: tuple[str, ...]  # the repairs, one clause each
-    steps: tuple[tuple[float, float], ...]  # encoder step and column step of each log, from `find_steps`
+    places: tuple[np.ndarray, ...]  # for each log, the times of its samples in sampling periods after the first sample
+    period: float  # sampling period, s
+    period_error: float  # relative standard error of the period; 0 if the user specified the period
+    notes: tuple[str, ...]  # descriptions of the repairs, one clause each
+    steps: tuple[tuple[float, float], ...]  # encoder step and rounding step of each position column, from `find_steps`
 
 
 def read_logs(
     time: Any, position: Any, force: Any, system: UnitSystem, resample: bool = False, resolution: Any = None
 ) -> ReadLogs:
-    """Read and repair logs; raise `InputError` if no device can be fitted to them.
+    """Read logs from arrays and repair them; raise `InputError` if no device can be fitted to them.
 
     Args:
         time: times in s, or the sampling period; a list for several logs.
@@ -77,7 +81,19 @@ def read_logs(
 def _read(
     time: Any, position: Any, force: Any, resample: bool, step: float, system: UnitSystem
 ) -> tuple[Recording, np.ndarray, float, float, list[str], tuple[float, float]]:
-    """Read one log; return its part of each field of `ReadLogs`. ``step`` is the encoder step, 0 if unknown."""
+    """Read and repair one log.
+
+    Args:
+        time: times in s, or the sampling period.
+        position: positions in SI units, NaN where missing.
+        force: forces in SI units, NaN where missing.
+        resample: allow timestamp jitter up to a quarter of the period.
+        step: encoder step in SI units, 0 if unknown.
+        system: units of position and force.
+
+    Returns:
+        The entries of this log for the fields of `ReadLogs`, in their order.
+    """
     x, f = as_float64("position", position), as_float64("force", force)
     clock = None if isinstance(time, str) or np.ndim(time) == 0 else as_float64("time", time)
     given = {"position": x, "force": f} | ({} if clock is None else {"time": clock})
@@ -114,12 +130,15 @@ def _read(
 
 
 def _assign_periods(clock: np.ndarray, jitter: bool, notes: list[str]) -> tuple[np.ndarray, float, float]:
-    """Return the index of each sample in periods, the period in s and its relative standard error.
+    """Assign the samples to sampling periods, and estimate the period by a line through all times.
 
     Args:
         clock: times in s.
         jitter: allow timestamp jitter up to ``_JITTER`` periods.
-        notes: receives a note on times that are rounded to ticks.
+        notes: list to which a note is appended if the times are rounded to ticks.
+
+    Returns:
+        The index of each sample in sampling periods, the period in s, and its relative standard error.
     """
     steps = np.diff(clock)
     usual = float(np.median(steps))
@@ -129,16 +148,16 @@ def _assign_periods(clock: np.ndarray, jitter: bool, notes: list[str]) -> tuple[
         notes.append(coarse.note)
     elif steps.min() <= 0:
         refuse_repeated(clock)
-    # Do not search for missing samples with timestamp jitter, because their number would be ambiguous.
+    # Assume that no samples are missing if timestamp jitter is allowed, because their number would be ambiguous.
     passed = np.where((steps > _MISSING * usual) & (not jitter), np.round(steps / usual), 1.0)
     place = np.concatenate([[0.0], np.cumsum(passed)]) if coarse is None else coarse.place
     count = place - place.mean()
     square = float(count @ count)
-    # The slope of the line through all times, with as many digits as times usually have.
+    # Compute the slope of the line through all times, rounded to the number of digits that times usually have.
     period = float(f"{count @ clock / square:.12g}")
     late = clock - clock.mean() - period * count
     error = float(np.sqrt(late @ late / max(1, clock.size - 2) / square))
-    # Measure deviations from the middle of their range, because the first sample may be the one that is late.
+    # Center the range of the deviations at 0, because a single late sample would otherwise shift all deviations.
     late = late - 0.5 * (late.max() + late.min())
     worst = int(np.argmax(np.abs(late)))
     if coarse is None and abs(late[worst]) > (_JITTER if jitter else _UNEVEN) * period:
@@ -158,13 +177,21 @@ def _assign_periods(clock: np.ndarray, jitter: bool, notes: list[str]) -> tuple[
 
 
 def find_even(place: np.ndarray, least: int) -> list[slice]:
-    """Return the stretches of a log without missing samples that have at least ``least`` samples."""
+    """Divide a log at its gaps, and return the stretches with at least ``least`` samples as slices.
+
+    Args:
+        place: index of each sample in sampling periods.
+        least: least number of samples per stretch.
+    """
     runs = find_runs(np.diff(place) == 1).tolist()
     return [slice(first, last + 1) for first, last in runs if last + 1 - first >= least]
 
 
 def find_stretches(log: Recording, system: UnitSystem) -> list[str]:
-    """Return warnings about an end stop, a saturated sensor or a saturated motor."""
+    """Return warnings about positions or forces that stay at an extreme value.
+
+    They indicate an end stop, a saturated sensor or a saturated motor.
+    """
     warnings = []
     for end, direction in ((log.position.max(), 1.0), (log.position.min(), -1.0)):
         first, last = _find_longest_run((log.position == end) & (log.force * direction > 0))
@@ -186,11 +213,15 @@ def find_stretches(log: Recording, system: UnitSystem) -> list[str]:
 
 
 def find_runs(marked: np.ndarray) -> np.ndarray:
-    """Return the first index and one past the last index of each run of marked samples, one row per run."""
+    """Find the runs of successive True entries in a mask.
+
+    Returns:
+        An array with one row per run: its first index, and its last index plus 1.
+    """
     return np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]]))).reshape(-1, 2)
 
 
 def _find_longest_run(marked: np.ndarray) -> tuple[int, int]:
-    """Return the longest of the runs of `find_runs`, (0, 0) if no sample is marked."""
+    """Return the first index and the last index plus 1 of the longest run in a mask; (0, 0) if there is none."""
     first, last = max(find_runs(marked).tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
     return first, last

@@ -1,7 +1,9 @@
 """Repair the usual faults of logs: missing numbers, clock rollover, coarse times, wrapped positions, isolated glitches.
 
-A note reports every repair and its number of rows. No value is invented: a faulty row is left out, and the rows before
-and after it are fitted as two logs. Samples and rows are counted from 0.
+A position *wraps* if it jumps by a constant *modulus* at the end of the range of the counter. A *glitch* is a run of a
+few wrong positions. A *second difference* is the difference of two successive differences of the positions. A note
+reports every repair and its number of rows. No value is invented: a faulty row is omitted, and the rows before and
+after it are fitted as two logs. Samples and rows are counted from 0.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.unit_system import UnitSystem
 
-# Times in s after which common clocks and counters roll over.
+# Times in s after which common clocks and counters roll over, by description.
 _ROLLOVERS = {
     "a 32-bit counter of microseconds": 2.0**32 * 1e-6,
     "a 32-bit counter of milliseconds": 2.0**32 * 1e-3,
@@ -29,44 +31,51 @@ _ROLLOVERS = {
     "a clock that restarts every hour": 3600.0,
     "a clock that restarts every day": 86400.0,
 }
-_GAP = 50  # longest step across a rollover, in usual steps; some samples may be missing there
-_TWICE = 0.01  # largest share of rows with a repeated time that are left out
-_PAIRED = 0.45  # largest distance in time of a position and its force, in periods; below half, so that pairs are unique
-_UNPAIRED = 0.02  # largest share of positions without a force at this distance
+# Largest time step across a rollover, in median time steps. It exceeds 1, because samples may be missing at a rollover.
+_GAP = 50
+_TWICE = 0.01  # share of rows with a repeated time up to which these rows are omitted as faulty
+# Largest time between a position and the force that is paired with it, in periods. It is below 0.5, so that no force is
+# paired with two positions.
+_PAIRED = 0.45
+_UNPAIRED = 0.02  # share of positions without a force within this time up to which the log is accepted
 
-# Glitches of the position.
-_WILD = 0.02  # largest share of positions that are left out as glitches
-_REACH = 3  # maximum length of a glitch, and half-width of the running median, in samples
-_FAR = 10.0  # least distance of a glitch from the line through its neighbors, in typical second differences
-_STEPS = 4.0  # added to this distance, in smallest second differences, i.e. encoder steps
-_RETURN = 0.2  # largest distance from the line after a glitch, relative to the glitch
+# Detection of glitches of the position.
+_WILD = 0.02  # share of positions omitted as glitches up to which a log is accepted
+_REACH = 3  # largest length of a glitch, and half-width of the running median, in samples
+# Least distance of a glitch from the line through its neighbors: the sum of two terms.
+_FAR = 10.0  # first term, in typical second differences (their 90 % quantile)
+_STEPS = 4.0  # second term, in smallest second differences, which are encoder steps
+_RETURN = 0.2  # largest distance from this line of the first position after a glitch, relative to the glitch
 
-# Wraps of the position. A wrap is accepted if the second differences around it, once unwrapped, are below either limit.
-_SMOOTH = 8.0  # in typical second differences (their 99 % quantile)
-_NEAR_WRAP = 0.05  # relative to the modulus; also the tolerance of jumps of equal size, relative to their median
-_SPAN = 0.5  # least jump of a wrap at an unknown modulus, relative to the span of the positions
+# Wraps of the position. A wrap is accepted if the second differences next to it, after unwrapping, are below one of two
+# limits.
+_SMOOTH = 8.0  # first limit, in typical second differences (their 99 % quantile)
+_NEAR_WRAP = 0.05  # second limit, relative to the modulus; also the relative tolerance of jumps of equal size
+_SPAN = 0.5  # least jump that counts as a wrap if the modulus is unknown, relative to the range of the positions
 
-# Times rounded to ticks of a coarse clock.
-_FEW_ODD = 5  # least number of steps that differ from the usual one by a tick
-_MANY_ODD = 20  # from this number on the rounding errors may spread over 1.1 instead of 1.02 ticks, for jitter
-_COARSEST = 10.0  # longest clock tick that is repaired, in sampling periods
+# Detection of times that a coarse clock has rounded to its ticks.
+_FEW_ODD = 5  # least number of time steps unequal to the median step with which times are recognized as rounded
+# Number of such steps from which on the errors of the times may have a range of 1.1 instead of 1.02 ticks, because
+# jitter adds to the rounding.
+_MANY_ODD = 20
+_COARSEST = 10.0  # largest tick of a clock whose times are repaired, in sampling periods
 
 
 class RepairedLog(NamedTuple):
-    """The valid rows of a log, and notes on the repairs."""
+    """The valid rows of a log after repair, one array entry per row, and notes on the repairs."""
 
-    clock: np.ndarray | None  # times in s; None if only the period is given
-    row: np.ndarray  # row numbers in the log, counted from 0
-    position: np.ndarray  # m or rad, unwrapped
-    force: np.ndarray  # N or N m
-    notes: list[str]  # one clause per repair
-    steps: tuple[float, float]  # encoder step and column step of the logged positions, from `find_steps`
+    clock: np.ndarray | None  # times in s; None if only the sampling period is given
+    row: np.ndarray  # index of each row in the original log
+    position: np.ndarray  # unwrapped positions, m or rad
+    force: np.ndarray  # commanded forces, N or N m
+    notes: list[str]  # description of each repair, one clause
+    steps: tuple[float, float]  # encoder step and rounding step of the logged positions, from `find_steps`
 
 
 def repair_log(
     clock: np.ndarray | None, position: np.ndarray, force: np.ndarray, step: float, system: UnitSystem
 ) -> RepairedLog:
-    """Return the valid rows of a log, with continuous times and unwrapped positions.
+    """Repair a log: remove rollovers of the clock, omit faulty rows, and unwrap the positions.
 
     Args:
         clock: times in s, NaN where missing; None if only the period is given.
@@ -107,10 +116,10 @@ def repair_log(
         notes.append(f"left out {_count(bad.size, 'position glitch', 'es')}, the first at sample {row[bad[0]]}")
         clock = None if clock is None else clock[kept]
         row, position, force = row[kept], position[kept], force[kept]
-    # Find the steps before unwrapping, because the modulus need not be a multiple of a rounding step.
+    # Detect the encoder step before unwrapping, because the modulus need not be a multiple of the rounding step.
     steps = find_steps(position)
     if modulus:
-        # Count wraps after the removal of glitches, because a glitch may hide a wrap.
+        # Count the wraps for the note after the removal of glitches, because a glitch may hide a wrap.
         count = int(np.count_nonzero(np.round(np.diff(position) / modulus)))
         turns = modulus / (2 * np.pi) if system.rotary else 1.0
         turn = "360 deg, " if system.rotary else ""
@@ -122,18 +131,26 @@ def repair_log(
 
 
 def _count(number: int, noun: str, ending: str = "s") -> str:
-    """Return a number with its noun in the singular or plural."""
+    """Format a number and its noun, in the singular or plural, for a note."""
     return f"{number:,} {noun}{'' if number == 1 else ending}"
 
 
 def _first_gap(row: np.ndarray) -> int:
-    """Return the number of the first row that is missing among the sorted rows."""
+    """Return the index of the first row that is missing in a sorted array of row indices."""
     late = np.flatnonzero(row != np.arange(row.size))
     return int(late[0]) if late.size else row.size
 
 
 def _unroll(clock: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Return the times without the rollovers of the clock; raise `InputError` if the times decrease otherwise."""
+    """Remove the rollovers of a clock from its times.
+
+    Args:
+        clock: times in s, NaN where missing.
+        notes: list to which a note on the rollovers is appended.
+
+    Raises:
+        InputError: the times decrease, and no common clock rolls over in this way.
+    """
     timed = np.flatnonzero(np.isfinite(clock))
     steps = np.diff(clock[timed])
     falls = np.flatnonzero(steps < 0)
@@ -152,20 +169,28 @@ def _unroll(clock: np.ndarray, notes: list[str]) -> np.ndarray:
             f"time: the time decreases by {with_unit(-float(jumps[0]), 's')} after sample {timed[k]}; sort the rows, "
             "or save each record to a separate file"
         )
-    # Choose the rollover after which the step is closest to the usual one.
+    # Choose the clock with which the time step across the rollover is closest to the median time step.
     name, span = min(fitting.items(), key=lambda item: abs(float(np.median(jumps)) + item[1] - usual))
     unrolled = clock.copy()
-    # Missing times stay NaN.
+    # Correct only the rows with a time, so that missing times stay NaN.
     unrolled[timed[1:]] += span * np.cumsum(steps < 0)
     notes.append(f"the time rolls over ({_count(falls.size, 'time')}) like {name} and was unwrapped")
     return unrolled
 
 
 def _pair(clock: np.ndarray, position: np.ndarray, force: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Return the forces at the times of the positions if the log has separate rows for positions and forces.
+    """Assign forces to the rows of the positions if the log has separate rows for positions and forces.
 
-    Each position is paired with the nearest force in time. If most rows have both numbers, the forces are returned
-    unchanged.
+    Each position is paired with the force nearest in time. If most rows have both numbers, nothing is changed.
+
+    Args:
+        clock: times in s, NaN where missing.
+        position: positions, NaN where missing.
+        force: forces, NaN where missing.
+        notes: list to which a note on the pairing is appended.
+
+    Returns:
+        The forces in the rows of the positions, NaN in all other rows.
 
     Raises:
         InputError: too many positions have no force within ``_PAIRED`` periods.
@@ -197,9 +222,15 @@ def _pair(clock: np.ndarray, position: np.ndarray, force: np.ndarray, notes: lis
 
 
 def _drop_repeated(clock: np.ndarray, position: np.ndarray, force: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Return a mask of the rows to keep: the first row of each time, or all rows if the clock is coarse.
+    """Return a mask of the rows to keep, without those that repeat the time of the previous row.
 
-    The clock is coarse if more than a share ``_TWICE`` of the rows repeat the previous time.
+    If more than a share ``_TWICE`` of the rows repeat a time, the clock is probably coarse, and all rows are kept.
+
+    Args:
+        clock: times in s.
+        position: positions, which are compared for the note.
+        force: forces, which are compared for the note.
+        notes: list to which a note on the omitted rows is appended.
     """
     again = np.append(False, np.diff(clock) == 0)
     same = again & np.append(False, (np.diff(position) == 0) & (np.diff(force) == 0))
@@ -212,19 +243,25 @@ def _drop_repeated(clock: np.ndarray, position: np.ndarray, force: np.ndarray, n
 
 
 def find_modulus(position: np.ndarray, step: float, system: UnitSystem) -> float:
-    """Return the modulus at which the positions wrap, 0 if they do not.
+    """Return the modulus at which the positions wrap, 0 if they do not wrap.
 
-    A modulus is accepted if the unwrapped positions are smooth at more than half of the wraps.
+    Several candidates are tested. A candidate is accepted if the unwrapped positions are smooth at more than half of
+    the wraps.
+
+    Args:
+        position: positions in SI units.
+        step: encoder step in SI units, 0 if unknown.
+        system: units of the positions.
     """
     for modulus in _list_moduli(position, step, system):
-        # Exclude glitches, because their jumps are not wraps.
+        # Omit glitches first, because their jumps are not wraps.
         places = position[~find_glitches(unwrap(position, modulus), modulus)]
         events = np.flatnonzero(np.round(np.diff(places) / modulus))
         if not events.size:
             continue
         bends = np.abs(np.diff(unwrap(places, modulus), 2))
         typical = float(np.quantile(bends, 0.99)) if bends.size else 0.0
-        # The larger second difference before or after each wrap.
+        # Compute the larger one of the two second differences that contain the step across each wrap.
         around = np.maximum(*(np.append(bends, 0.0)[np.clip(events - k, 0, bends.size)] for k in (0, 1)))
         smooth = around <= np.maximum(_SMOOTH * typical, _NEAR_WRAP * modulus)
         if smooth.mean() > 0.5:
@@ -233,17 +270,17 @@ def find_modulus(position: np.ndarray, step: float, system: UnitSystem) -> float
 
 
 def unwrap(position: np.ndarray, modulus: float) -> np.ndarray:
-    """Return the unwrapped positions, in which every step is shorter than half the modulus."""
+    """Add multiples of the modulus to the positions, so that no two successive ones differ by more than half of it."""
     return position - modulus * np.append(0.0, np.cumsum(np.round(np.diff(position) / modulus)))
 
 
 def _list_moduli(position: np.ndarray, step: float, system: UnitSystem) -> Iterator[float]:
-    """Yield candidates for the modulus at which the positions wrap, most plausible first.
+    """Yield candidates for the modulus of the positions, the most plausible one first.
 
-    The candidates are one turn of a rotary axis, the smallest power of two of encoder steps that covers the span (at
-    least 2^8), and the modulus measured from the jumps.
+    The candidates are one revolution of a rotary axis; 2^n encoder steps, with the smallest n >= 8 for which the range
+    of the positions is smaller; and the modulus measured from the jumps of the positions.
     """
-    # The median removes isolated glitches from the span.
+    # Compute the range after median filtering, which removes isolated glitches.
     places = _filter_median(position, _REACH)
     span, largest = float(np.ptp(places)), float(np.abs(np.diff(position)).max(initial=0.0))
     moduli = [2.0 * np.pi] if system.rotary and span <= 2.0 * np.pi * (1.0 + 1e-9) + step else []
@@ -256,7 +293,7 @@ def _list_moduli(position: np.ndarray, step: float, system: UnitSystem) -> Itera
 
 
 def _measure_modulus(moves: np.ndarray, span: float, step: float, system: UnitSystem) -> float:
-    """Return the modulus of a counter with an arbitrary range, measured from its jumps; 0 if they differ in size.
+    """Measure the modulus of a counter with an arbitrary range by the size of its jumps; 0 if their sizes differ.
 
     Args:
         moves: differences of successive positions.
@@ -268,7 +305,7 @@ def _measure_modulus(moves: np.ndarray, span: float, step: float, system: UnitSy
         InputError: the jumps have the same size, but do not determine the modulus to a whole number of encoder steps.
     """
     inner = np.flatnonzero(np.abs(moves[1:-1]) > _SPAN * span) + 1 if span else np.zeros(0, int)
-    # Keep only jumps between small steps, because two successive jumps are a glitch.
+    # Use only jumps whose neighboring steps are small, because two successive jumps indicate a glitch.
     inner = inner[(np.abs(moves[inner - 1]) < _NEAR_WRAP * span) & (np.abs(moves[inner + 1]) < _NEAR_WRAP * span)]
     if inner.size < 2:
         return 0.0
@@ -286,12 +323,12 @@ def _measure_modulus(moves: np.ndarray, span: float, step: float, system: UnitSy
 
 
 def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
-    """Return a mask of glitches: up to 3 successive positions off the line through their neighbors.
+    """Return a mask of glitches: runs of up to 3 positions that are far from the line through their neighbors.
 
     Args:
         position: positions, possibly unwrapped.
-        modulus: the modulus that was used for unwrapping, 0 for none. After a glitch the unwrapped positions may be off
-            by multiples of the modulus.
+        modulus: modulus by which the positions were unwrapped, 0 if they were not. After a glitch, unwrapped positions
+            may be wrong by multiples of the modulus; this is tolerated.
     """
     moves = np.diff(position)
     bends = np.abs(np.diff(moves))
@@ -299,9 +336,9 @@ def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
     wild = np.zeros(position.size, bool)
     if position.size < 4 * _REACH or not moving.size:
         return wild
-    # Add encoder steps, because in slow motion they cause most of the second differences.
+    # Add some encoder steps to the limit, because these cause most second differences in slow motion.
     limit = _FAR * float(np.quantile(moving, 0.9)) + _STEPS * float(moving.min())
-    # The median excludes the moves into, within and out of a glitch.
+    # Estimate the usual difference of successive positions by a running median, on which glitches have no effect.
     usual = _filter_median(moves, _REACH + 1)
     for before in np.flatnonzero(np.abs(moves - usual) > limit):
         for length in range(1, min(_REACH, position.size - before - 2) + 1):
@@ -314,26 +351,27 @@ def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
 
 
 def _filter_median(values: np.ndarray, reach: int) -> np.ndarray:
-    """Return the running median over ``reach`` samples on each side."""
+    """Return the running median of each value and its ``reach`` neighbors on each side, with repeated end values."""
     padded = np.pad(values, reach, mode="edge")
     return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1), axis=-1)
 
 
 class EvenTimes(NamedTuple):
-    """Evenly spaced samples whose timestamps were rounded to the ticks of a coarse clock."""
+    """Evenly spaced times, reconstructed from times that a coarse clock has rounded to its ticks."""
 
-    place: np.ndarray  # time of each sample, in periods after the first sample
-    tick: float  # s
-    note: str  # for the user
+    place: np.ndarray  # time of each sample, in sampling periods after the first sample
+    tick: float  # tick of the clock, s
+    note: str  # note on the repair, one clause
 
 
 def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
-    """Return the evenly spaced times that a coarse clock has rounded to its ticks, e.g. to 1 ms.
+    """Reconstruct evenly spaced times that a coarse clock has rounded to its ticks, such as 1 ms.
 
-    Return None if the timestamps are not rounded, or if the times before rounding were not evenly spaced.
+    Returns:
+        The times; None if the timestamps are not rounded, or if the times before rounding were not evenly spaced.
 
     Raises:
-        InputError: the ticks are the periods of a loop that logs only some of its samples.
+        InputError: the tick is the sampling period of a loop that logs only some of its samples.
     """
     steps = np.diff(clock)
     mean = float(np.median(steps))
@@ -343,7 +381,7 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
         return None
     window = min(64, clock.size - 1)
     period = float(np.median((clock[window:] - clock[:-window]) / window))
-    # A step longer than one period plus one tick is a gap.
+    # Divide the log at gaps: time steps longer than one sampling period plus one tick, which rounding cannot cause.
     begins = np.append(0, np.flatnonzero(steps > period + 1.01 * tick) + 1)
     ends = np.append(begins[1:], clock.size)
     longest = int(np.argmax(ends - begins))
@@ -359,7 +397,7 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
         middle = float(np.mean(clock[first:last] - period * offset))
         place[first:last] = offset + (np.round((middle - start) / period) if first != begins[longest] else 0.0)
         late[first:last] = clock[first:last] - period * place[first:last]
-    # Require several unusual steps, because a few may be missing samples.
+    # Count the steps that differ from the median. Several are required, because missing samples cause some, too.
     usual = np.median(steps)
     odd = int(np.sum(np.abs(steps - usual) > 0.5 * tick))
     allowed = 1.0 + (0.1 if odd >= _MANY_ODD else 0.02)
@@ -367,7 +405,8 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
         if odd >= _FEW_ODD and period > 1.5 * tick:
             _refuse_left_out(steps, tick)
         return None
-    # Clocks are rounded to a power of ten. Any other tick is the period of the loop.
+    # Interpret a tick that is no power of ten as the sampling period of the loop, because clocks are rounded to powers
+    # of ten.
     if not np.isclose(np.log10(tick), np.round(np.log10(tick)), rtol=0, atol=1e-3) and period > 1.5 * tick:
         _refuse_left_out(steps, tick)
     ticks, apart = with_unit(tick, "s", 3), with_unit(period, "s")
@@ -376,7 +415,12 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
 
 
 def _refuse_left_out(steps: np.ndarray, tick: float) -> None:
-    """Raise `InputError` if all steps are 1 to 20 ticks: the times of a loop that logs only some of its samples."""
+    """Raise `InputError` if all time steps are 1 to 20 ticks, because the loop then logs only some of its samples.
+
+    Args:
+        steps: time steps in s.
+        tick: tick in s, assumed to be the sampling period of the loop.
+    """
     counts = np.round(steps / tick)
     if counts.min() >= 1 and counts.max() <= 20 and np.allclose(steps / tick, counts, atol=0.02):
         low, high = (plain(float(end), 1) for end in (counts.min(), counts.max()))
@@ -387,7 +431,7 @@ def _refuse_left_out(steps: np.ndarray, tick: float) -> None:
 
 
 def refuse_repeated(clock: np.ndarray) -> NoReturn:
-    """Raise `InputError` for repeated times, with the likely cause."""
+    """Raise `InputError` with a message about repeated times that states their likely cause and the remedy."""
     steps = np.diff(clock)
     k = int(np.argmin(steps))
     if np.mean(steps == 0) > 0.5:

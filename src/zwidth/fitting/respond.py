@@ -1,11 +1,12 @@
 """Estimate a frequency response with its deviation from records of commanded force and sampled position.
 
-For a periodic force with spectra U, the response is ``G = sum Y conj(U)/sum |U|^2`` at each frequency of the force (a
-*line*). The sums are over records with equal or different phases; Y are the spectra of the positions, without drift.
-The residuals Y - G U of the records give the standard error, which contains the errors of encoder, friction and noise
-(Pintelon, Schoukens 2012). A record is one *stretch*, two or more periods of the same force, averaged; or, if there is
-only one stretch, each of its periods. Any other force is analyzed by spectra averaged over overlapping segments (Welch
-1967).
+A *stretch* is a part of a log in which the same period of the force repeats at least twice. A *record* is the mean over
+the periods of one stretch; if there is only one stretch, each of its periods is a record. Let U be the spectrum of the
+force of a record, and Y that of its position without drift. At each frequency of the force (a *line*), the response is
+``G = sum Y conj(U)/sum |U|^2``, with sums over the records. Its standard error is estimated from the residuals Y - G U;
+it therefore contains the errors of encoder, friction and noise (Pintelon, Schoukens 2012). The *deviation* of the
+response is a multiple of the standard error. A force that does not repeat is analyzed by spectra averaged over
+overlapping segments (Welch 1967). w is the frequency in rad per sample.
 """
 
 from __future__ import annotations
@@ -30,35 +31,37 @@ from zwidth.words.quantities import POSITIVE
 from zwidth.words.types import ArrayLike
 from zwidth.words.unit_system import SYSTEMS, UnitSystem
 
-# Deviation in standard errors of the complex response. It is 4.5 standard errors of the real and of the imaginary part,
-# each of which has half of the variance; all of some thousand lines are within it.
+# Deviation, in standard errors of the complex response: 4.5 standard errors of the real or of the imaginary part, each
+# of which has half of the variance. With this factor the true response is within the deviation at all of some thousand
+# lines.
 SURE = 4.5 / np.sqrt(2.0)
-# Periodic forces.
-_SAME = 1e-5  # largest difference of the force between two periods, relative to its range
-_EXCITED = 1e-3  # least amplitude of a line, relative to the largest
-_SHORTEST = 16  # least number of samples per period, and of usable lines of a force that does not repeat
-_REPEATED = 0.3  # least share of a record that must repeat for a period to be accepted
-# Half-widths, in lines, of the two running means of the squared error; the larger mean is used.
-_NARROW = 4
-_WIDE = 24
-# Forces that do not repeat.
-_PIECES = 8  # least number of segments
+# Constants of the analysis of periodic forces.
+# Largest difference between forces one period apart that count as equal, relative to the range of the force.
+_SAME = 1e-5
+_EXCITED = 1e-3  # least amplitude of the force at a line that is used, relative to the largest amplitude
+_SHORTEST = 16  # least number of samples per period, and least number of usable lines of a force that does not repeat
+_REPEATED = 0.3  # share of the samples of a log that must repeat for a period of the force to be accepted
+# The squared standard error is smoothed by two running means over the lines, and the larger mean is used.
+_NARROW = 4  # half-width of the first running mean, in lines
+_WIDE = 24  # half-width of the second running mean, in lines
+# Constants of the analysis of forces that do not repeat.
+_PIECES = 8  # least number of segments over which spectra are averaged
 _LONGEST = 1 << 13  # largest number of samples per segment
-_COHERENT = 0.1  # least coherence of the first and last usable line
-_OVERLAP = 1.06  # variance with half-overlapping Hann windows, relative to that of as many independent segments
-_STEPS = 20  # a motion over fewer encoder steps causes a warning
-_FILLED = 0.002  # largest share of missing samples that are interpolated
-_LONGEST_GAP = 4  # longest step across missing samples, in samples
+_COHERENT = 0.1  # least coherence at a line that bounds the range of usable lines
+_OVERLAP = 1.06  # variance for half-overlapping Hann windows, relative to that for the same number of independent ones
+_STEPS = 20  # range of the positions, in encoder steps, below which a warning is issued
+_FILLED = 0.002  # share of missing samples up to which they are interpolated; more are refused
+_LONGEST_GAP = 4  # longest time between two samples that is interpolated, in sampling periods
 
 
 @dataclass(frozen=True)
 class ResponseEstimate:
-    """A measured frequency response and its quality.
+    """A measured frequency response, with quantities that describe its quality.
 
     Attributes:
         device: the response with its deviation, a `zwidth.MeasuredDevice`.
         period: sampling period in s.
-        coherence: proportion of the power of the motion that follows the force, 0 to 1, at each frequency.
+        coherence: proportion of the power of the motion that is linearly related to the force, 0 to 1, per frequency.
         cycle: period of the force in s; None for a force that is not periodic.
         records: number of stretches of periodic force, or number of segments of a force that is not periodic.
         noise: standard deviation of a sampled position in m, for a periodic force.
@@ -88,8 +91,8 @@ def respond(
     """Estimate the frequency response of a device, with its deviation, from commanded forces and sampled positions.
 
     Args:
-        time: times of the samples in s, evenly spaced, or only the sampling period. Lists of arrays for time, position
-            and force are several logs.
+        time: times of the samples in s, evenly spaced, or only the sampling period. For several logs, time, position
+            and force are lists of arrays.
         position: sampled positions in m.
         force: forces in N commanded at the same samples, such as those of `zwidth.excite`.
         cycle: period of the force in s; by default determined from a force that repeats exactly.
@@ -106,9 +109,9 @@ def respond(
 
     Numerics:
         The first period of each stretch is omitted, because it contains the transient. Standard errors are computed
-        from the differences between stretches with different phases, or else between periods, and averaged over
-        neighboring frequencies. If the same force is repeated, the encoder errors are the same in each period;
-        therefore the full quantization error is added.
+        from the differences between stretches or, with a single stretch, between its periods, and averaged over
+        neighboring frequencies. If the same force repeats, each period has the same encoder errors, which the
+        differences do not show; therefore the full quantization error is added.
 
     References:
         Pintelon, Schoukens 2012, sections 2.5 and 4.3 (averages over periods and phases). Welch 1967, IEEE Trans. Audio
@@ -130,7 +133,7 @@ def respond(
 def _respond(
     time: ArrayLike, position: ArrayLike, force: ArrayLike, cycle: Any, resolution: Any, system: UnitSystem
 ) -> ResponseEstimate:
-    """Estimate the response as in `respond`, with a unit system."""
+    """Estimate the response as `respond` does, for arguments in the given unit system."""
     read = read_logs(time, position, force, system, resolution=resolution)
     period, notes = read.period, list(read.notes)
     logs = tuple(_fill(log, place, k, notes) for k, (log, place) in enumerate(zip(*read[:2], strict=True), start=1))
@@ -156,13 +159,13 @@ def _respond(
 
 
 def _fill(log: Recording, place: np.ndarray, number: int, notes: list[str]) -> Recording:
-    """Return a log without gaps: a few missing samples are interpolated.
+    """Interpolate the missing samples of a log, if they are few.
 
     Args:
-        log: the log, without its missing samples.
-        place: index of each sample, in sampling periods after the first one.
+        log: the log, whose arrays do not contain the missing samples.
+        place: time of each sample, in sampling periods after the first one.
         number: number of the log, for messages.
-        notes: receives a note on the interpolated samples.
+        notes: list to which a note on the interpolated samples is appended.
 
     Raises:
         InputError: more than a share ``_FILLED`` of the samples is missing, or a gap is too long.
@@ -177,7 +180,7 @@ def _fill(log: Recording, place: np.ndarray, number: int, notes: list[str]) -> R
             "sample, or pass the parts before and after the gap as two logs"
         )
     every = np.arange(place[-1] + 1)
-    # The force of the previous sample stands in for that of a missing sample.
+    # Use the force of the previous sample for a missing sample, and interpolate the position by a cubic spline.
     force = log.force[np.searchsorted(place, every, side="right") - 1]
     from scipy.interpolate import CubicSpline
 
@@ -186,7 +189,7 @@ def _fill(log: Recording, place: np.ndarray, number: int, notes: list[str]) -> R
 
 
 def respond_to_logs(motions: Sequence[LoggedMotion], period: float | None, cycle: Any = None) -> ResponseEstimate:
-    """Estimate the response with `respond` from logs that were read from files, and add the notes on their columns."""
+    """Estimate the response with `respond` from logs read from files, and add the notes on their columns."""
     estimate = respond(**join_logs(motions, period), cycle=cycle)
     check_period(period, estimate.period)
     notes = dict.fromkeys(note for motion in motions for note in motion.notes)
@@ -194,14 +197,14 @@ def respond_to_logs(motions: Sequence[LoggedMotion], period: float | None, cycle
 
 
 def find_nominal_limit(scene: Scene) -> StiffestWall:
-    """Return the stiffest wall for the measured response without its deviation."""
+    """Return the stiffest stable wall of a scene for its measured response alone, with the deviation set to 0."""
     nominal, loop = replace(scene), cast("MeasuredLoop", scene.loop)
     vars(nominal)["loop"] = loop.nominal
     return nominal.max_stiffness()
 
 
 def _find_period(force: np.ndarray) -> int | None:
-    """Return the period of the force in samples, from the peaks of its autocorrelation; None if it does not repeat."""
+    """Detect the period of the force in samples from the peaks of its autocorrelation; None if it does not repeat."""
     centered, size = force - force.mean(), 1 << int(np.ceil(np.log2(2 * force.size)))
     spectrum = np.fft.rfft(centered, size)
     correlation = np.fft.irfft(np.abs(spectrum) ** 2, size)[: force.size // 2 + 1]
@@ -215,22 +218,31 @@ def _find_period(force: np.ndarray) -> int | None:
 
 
 def _find_repeats(force: np.ndarray, count: int) -> list[tuple[int, int]]:
-    """Return first and one past the last sample of each stretch of at least two periods of ``count`` samples."""
+    """Find the stretches of the force in which a period of ``count`` samples occurs at least twice.
+
+    Returns:
+        For each stretch the index of its first sample, and that of its last sample plus 1.
+    """
     runs = find_runs(np.abs(force[count:] - force[:-count]) <= _SAME * np.ptp(force)).tolist()
     return [(first, last + count) for first, last in runs if last - first >= count]
 
 
 def _split_stretches(log: Recording, count: int, trusted: bool) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return force and position of all stretches with at least two periods of one force, of shape (periods, count).
+    """Divide the stretches of a log into periods.
 
     Args:
         log: a log without gaps.
         count: samples per period.
-        trusted: the user specified the period. If no stretch repeats exactly, the whole log is then one stretch.
+        trusted: True if the user specified the period. If the force repeats nowhere exactly, the whole log is then
+            treated as one stretch.
+
+    Returns:
+        For each stretch the forces and the positions, arrays of shape (periods, count).
     """
     runs = _find_repeats(log.force, count)
     if trusted and not runs and log.force.size >= 2 * count:
-        # A loop that holds the device in place adds to the force, which then repeats only on average.
+        # Accept a force that repeats only on average, because a controller that holds the device in place may add its
+        # force to the periodic one.
         runs = [(0, log.force.size)]
     stretches = []
     for first, last in runs:
@@ -241,14 +253,15 @@ def _split_stretches(log: Recording, count: int, trusted: bool) -> list[tuple[np
 
 
 def _remove_drift(position: np.ndarray) -> np.ndarray:
-    """Subtract a parabola over time from positions of shape (periods, count), so that they become periodic.
+    """Subtract the drift from the positions of a stretch, shape (periods, count), so that they become periodic.
 
-    The parabola is fitted to the differences between the last three periods.
+    The drift is modeled as a parabola over time, fitted to the differences between the last three periods.
     """
     count = position.shape[1]
     steps = np.diff(position[-3:], axis=0).ravel()
     slope, start = np.polyfit(np.arange(steps.size), steps, 1).tolist()
-    # The parabola a t + b t^2 increases by a P + b (2 t P + P^2) within a period P.
+    # Compute the coefficients a (``rise``) and b (``bend``) of the parabola a t + b t^2 from its increase over one
+    # period P, which is a P + b (2 t P + P^2).
     bend = 0.5 * slope / count
     rise = (start - bend * count**2) / count
     t = np.arange(position.size) - (position.size - min(3, position.shape[0]) * count)
@@ -258,19 +271,19 @@ def _remove_drift(position: np.ndarray) -> np.ndarray:
 def _average_periods(
     stretches: list[tuple[np.ndarray, np.ndarray]], count: int, period: float, step: float, warnings: list[str]
 ) -> ResponseEstimate:
-    """Estimate the response to a periodic force.
+    """Estimate the response from the periods of a periodic force.
 
     Args:
         stretches: force and position of each stretch, shape (periods, count).
         count: samples per period.
         period: sampling period in s.
         step: encoder step, 0 for none.
-        warnings: receives a warning if there is only one record.
+        warnings: list to which a warning is appended if there is only one record.
     """
-    # The first period of each stretch contains the transient.
+    # Omit the first period of each stretch, because it contains the transient.
     kept = [(force[1:], _remove_drift(position)[1:]) for force, position in stretches]
     several = len(kept) > 1
-    # The records: the mean of each stretch, or the periods of a single stretch.
+    # Use the mean of each stretch as a record; if there is only one stretch, use each of its periods.
     parts = [(f.mean(0), x.mean(0)) for f, x in kept] if several else list(zip(*kept[0], strict=True))
     U, Y = (np.fft.rfft(np.array([part[k] for part in parts]))[:, 1 : (count + 1) // 2] for k in (0, 1))
     power = (np.abs(U) ** 2).sum(0)
@@ -283,7 +296,8 @@ def _average_periods(
     if records == 1:
         warnings.append("only one period follows the first one, so the errors cannot be estimated; record more periods")
     if not several:
-        # Equal periods have equal quantization errors, which neither the residuals show nor averaging reduces.
+        # Add the quantization error, because it is equal in equal periods: the residuals do not contain it, and
+        # averaging does not reduce it.
         error = error + records * count * step**2 / 12.0
     deviation = SURE * np.sqrt(error / power)
     total = (np.abs(Y) ** 2).sum(0)
@@ -296,7 +310,7 @@ def _average_periods(
 
 
 def _smooth(values: np.ndarray, reach: int) -> np.ndarray:
-    """Return the running mean over ``reach`` values on each side, fewer at the ends."""
+    """Return the running mean of each value and its ``reach`` neighbors on each side; fewer neighbors at the ends."""
     window = np.ones(2 * reach + 1)
     total, count = (np.convolve(each, window)[reach : reach + values.size] for each in (values, np.ones(values.size)))
     return total / count
@@ -310,7 +324,7 @@ def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list
     Args:
         logs: logs without gaps.
         period: sampling period in s.
-        warnings: receives a warning about the frequency resolution.
+        warnings: list to which a warning about the frequency resolution is appended.
     """
     from scipy.signal import csd, welch
 
@@ -322,7 +336,7 @@ def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list
     sums = [np.zeros(size // 2 + 1, complex) for _ in range(3)]
     pieces = 0
     for log in logs:
-        # The first sample has no difference.
+        # Omit the force of the first sample, because this sample has no difference from a previous one.
         f, x = log.force[1:], np.diff(log.position)
         segments = 2 * f.size // size - 1
         pieces += segments
@@ -334,8 +348,8 @@ def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list
     w = 2.0 * np.pi * np.arange(2, size // 2) / size
     G = both / forces / (1.0 - np.exp(-1j * w))
     error = np.abs(G) * np.sqrt((1.0 - np.minimum(coherence, 1.0)) / np.maximum(coherence, 1e-300) * _OVERLAP / pieces)
-    # The window averages over neighboring lines, with an error proportional to the second difference of the response
-    # of the acceleration, u G.
+    # Add the error of the averaging over neighboring lines by the window. It is proportional to the second difference
+    # of the response of the acceleration, u G, with u = |1 - e^(-jw)|^2.
     u = 4.0 * np.sin(0.5 * w) ** 2
     bend = np.abs(np.diff(u * G, 2))
     deviation = SURE * error + np.pad(bend, 1, mode="edge") / u
@@ -353,7 +367,7 @@ def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list
 
 
 def _refuse_unmoved(device: MeasuredDevice) -> None:
-    """Raise `InputError` if the response is within its deviation of 0 at all frequencies."""
+    """Raise `InputError` if the response is smaller than its deviation at all frequencies."""
     if np.all(np.abs(device.response) <= device.deviation):
         raise InputError(
             "force: its effect on the position is below the errors at all frequencies; check that both columns belong "

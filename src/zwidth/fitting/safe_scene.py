@@ -1,4 +1,7 @@
-"""Derive a scene from a fit: parameters rounded according to their standard errors, and the safe limit of the walls."""
+"""Derive a scene from a fit: round its parameters according to their standard errors, and add the safe limit of walls.
+
+The *safe limit* is the stiffest wall (K, B) that the measurements support, with the reason for the limit.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +20,11 @@ if TYPE_CHECKING:
     from zwidth.fitting.device_fit import DeviceFit
     from zwidth.fitting.safe_wall import SafeWall
 
-# Numbers of significant digits.
-EXACT_DIGITS = 12  # parameters without a standard error
-PERIOD_DIGITS = 7  # periods derived from timestamps; more than the accuracy of any clock
-LIMIT_DIGITS = 4  # the safe limit; as many as are printed for a wall
-# Descriptions of the status of a fit. The warnings of the fit contain the details.
+# Numbers of significant digits to which values are rounded.
+EXACT_DIGITS = 12  # digits of parameters without a standard error
+PERIOD_DIGITS = 7  # digits of sampling periods derived from timestamps, which no clock exceeds in accuracy
+LIMIT_DIGITS = 4  # digits of the safe limit, as many as are printed for a wall
+# Texts that describe the status of a fit. Its warnings contain the details.
 _STATUS_TEXTS = {
     Status.NOT_CONVERGED: "the search did not converge",
     Status.NO_BOUNDARY: "no device has all of these walls on its stability boundary",
@@ -31,7 +34,12 @@ _STATUS_TEXTS = {
 
 
 def round_parameter(fit: DeviceFit, name: str) -> float:
-    """Return a parameter rounded to a thousandth of its standard error; further digits depend on the machine."""
+    """Return a parameter rounded to a thousandth of its standard error, so that it is equal on all machines.
+
+    Args:
+        fit: the fit.
+        name: path of the parameter.
+    """
     value, error = fit.value_of(name), fit.errors[name]
     if not (error > 0 and value):
         return float(f"{value:.{EXACT_DIGITS}g}")
@@ -40,20 +48,21 @@ def round_parameter(fit: DeviceFit, name: str) -> float:
 
 
 def round_period(fit: DeviceFit) -> float:
-    """Return the period, rounded to ``PERIOD_DIGITS`` digits if it is derived from timestamps."""
+    """Return the sampling period of a fit, rounded to ``PERIOD_DIGITS`` digits if it is derived from timestamps."""
     return float(f"{fit.period:.{PERIOD_DIGITS}g}") if fit.motions else fit.period
 
 
 def round_scene(fit: DeviceFit) -> Scene:
-    """Return the fitted scene with rounded parameters, as `zwidth fit --yaml` writes them."""
+    """Return a copy of the fitted scene with rounded parameters, as `zwidth fit --yaml` writes it."""
     nominal = fit.nominal
-    # Replace the period before the delay, because a delay in periods changes with the period.
+    # Replace the sampling period before the delay, because a change of the period also changes a delay that is
+    # specified in periods.
     nominal = replace(nominal, timing=replace(nominal.timing, period=round_period(fit)))
     return nominal.replace(**{name: round_parameter(fit, name) for name in fit.numbers})
 
 
 def describe_status(fit: DeviceFit) -> str:
-    """Return a description of the status of a fit, "" if the status is OK."""
+    """Return a text that describes the status of a fit; "" if the status is OK."""
     status = Status(fit.status)
     if status == Status.UNDECIDED and not fit.rivals:
         return "the residuals are not white noise"
@@ -61,7 +70,7 @@ def describe_status(fit: DeviceFit) -> str:
 
 
 def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
-    """Return the safe limit of a fit: the stiffest wall that the measurements support, its reason and the warnings.
+    """Compute the safe limit of the walls of a fit: a wall with the reason for its limit and the warnings.
 
     Args:
         fit: the fit.
@@ -74,7 +83,7 @@ def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
     if wall.status != Status.OK or not wall.stiffness > 0:
         return SafeLimit(0.0, reason="the fitted parameters are too uncertain for any wall; record longer")
     stiffness = round_conservatively(wall.stiffness, "below", LIMIT_DIGITS)
-    # Round B toward 0, because at larger |B| the stiffness limit often decreases steeply.
+    # Round B toward 0, because the stability limit of K often decreases steeply with |B|.
     damping = math.copysign(
         round_conservatively(abs(wall.virtual_damping), "below", LIMIT_DIGITS), wall.virtual_damping
     )
@@ -87,7 +96,7 @@ def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
 
 
 def _explain_limit(fit: DeviceFit, wall: SafeWall) -> str:
-    """Return the reason of the safe limit, with the measurement that can raise it."""
+    """Return a text that states the reason for the safe limit, and the measurement that can raise the limit."""
     if math.isfinite(wall.resonance):
         near = with_unit(wall.resonance, "Hz", 3)
         hidden = f"a resonance near {near}, undetectable in the log, may make stiffer walls unstable"
@@ -104,7 +113,7 @@ def _explain_limit(fit: DeviceFit, wall: SafeWall) -> str:
 
 
 def advise_record(fit: DeviceFit) -> str:
-    """Return advice to record again, with the command that designs the force for the record."""
+    """Return a text that advises to record another log, with the command that designs the force for it."""
     force = max(float(np.abs(motion.force).max()) for motion in fit.motions)
     options = {
         "rate": with_unit(1.0 / round_period(fit), "Hz"),

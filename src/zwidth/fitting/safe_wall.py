@@ -1,16 +1,16 @@
 """Search for the stiffest wall that is stable on nearly all devices that agree with the records of one device.
 
-A wall (K, B) is safe on a device if it is stable and so are all softer walls with the same B, because users raise K
-from below.
-For a rigid device, the lines of constant K and of constant B intersect the stable set in intervals
-(docs/theory/one-lobe.md). The search bisects K; for each K, the ends of the stable intervals of B determine the B that
-is stable on most devices.
+A wall of stiffness K and damping B is *safe* on a device if this wall and all softer walls with the same B are stable,
+because users raise K from below. The devices are random, drawn from the distribution of the estimate. The *required
+proportion* (reliability) is the proportion of devices on which the wall must be safe. Three methods are used:
 
-With a velocity filter, the lines of constant B are computed on a grid of frequencies (`zwidth.fitting.required_wall`).
-Eigenvalues then decide the stability of the wall on every device.
-
-A log also bounds undetected resonances. The wall must be stable for all responses within the radius of the fitted
-response (docs/theory/measured.md).
+- For rigid devices with the backward difference, lines of constant K and of constant B intersect the stable set in
+  intervals (docs/theory/one-lobe.md). The search bisects K; for each K, the ends of the stable intervals of B determine
+  the B that is stable on most devices.
+- For rigid devices with a velocity filter, the stability limits are computed on a grid of frequencies
+  (`zwidth.fitting.required_wall`). The eigenvalues of the closed loop confirm the wall on every device.
+- For devices with a lag or resonances, and for undetected resonances, the wall must be stable for all responses within
+  the radius of the fitted response (docs/theory/measured.md).
 """
 
 from __future__ import annotations
@@ -35,28 +35,36 @@ from zwidth.words.showing import compact_repr
 from zwidth.words.status import Status
 
 _SAMPLES = 8000  # largest number of random devices
-_SEARCHED = 5  # number of random devices for a search, in multiples of ``LinearLoop.draws``
-_CONFIRMED = 2  # the same to confirm a wall
-_ACCURACY = 1e-3  # relative accuracy of K
-_NEGLIGIBLE = 1e-4  # K below this ratio to K_max of the devices counts as 0
-_BELOW = 1e-9  # relative distance of K below the limit of the active device
-# Frequency grid, in rad per sample.
-_SLOWEST = 1e-4  # lowest frequency
-_SLOW = 60  # number of low frequencies on a logarithmic grid, for slow loops
-_EVEN = 400  # number of frequencies on an even grid
-_EVEN_PER_PERIOD = 40  # further frequencies on this grid per period of delay
-_FARTHEST = (20.0, 1.5)  # largest delay of a device in periods: a constant, and a factor of the estimated delay
+# Number of random devices, in multiples of ``LinearLoop.draws``, which is smaller for loops that are slow to compute.
+_SEARCHED = 5  # if the devices are used to search for the wall
+_CONFIRMED = 2  # if the devices are only used to confirm a wall
+_ACCURACY = 1e-3  # relative accuracy of K at which the bisection ends
+_NEGLIGIBLE = 1e-4  # K relative to the K_max of the devices below which no wall is reported
+_BELOW = 1e-9  # relative reduction of K, so that the device that limits the wall is not exactly on its boundary
+# Frequency grid, in rad per sample: logarithmic at low frequencies, uniform above.
+_SLOWEST = 1e-4  # lowest frequency of the grid
+_SLOW = 60  # number of frequencies of the logarithmic part, which slow loops require
+_EVEN = 400  # number of frequencies of the uniform part
+_EVEN_PER_PERIOD = 40  # additional number of frequencies of the uniform part per sampling period of delay
+# Largest delay of a random device that is computed, in sampling periods: the first number plus the second one times the
+# estimated delay. Devices with larger delays count as unstable.
+_FARTHEST = (20.0, 1.5)
 # Confirmation of a wall by eigenvalues.
-_SOFTER = (1.0, 0.5, 0.1)  # checked stiffnesses, relative to K
-_MAX_CONTRADICTED = 2e-3  # largest share of devices for which eigenvalues may contradict the grid of frequencies
+_SOFTER = (1.0, 0.5, 0.1)  # stiffnesses of the checked walls, relative to K
+# Share of the devices by which the proportion confirmed by eigenvalues may be smaller than required, because the grid
+# of frequencies has errors.
+_MAX_CONTRADICTED = 2e-3
 
 
 @compact_repr(resonance="Hz")
 class SafeWall(NamedTuple):
-    """A wall that is stable on nearly all devices that agree with the records; NaN if the status is not OK."""
+    """A wall that is stable on nearly all devices that agree with the records.
 
-    stiffness: float  # K in N/m
-    virtual_damping: float  # B in N s/m
+    All numbers are NaN if the status is not OK.
+    """
+
+    stiffness: float  # stiffness K of the wall, N/m
+    virtual_damping: float  # damping B of the wall, N s/m
     share: float  # proportion of the random devices on which the wall is stable
     status: int  # code of `zwidth.Status`
     resonance: float = np.nan  # frequency in Hz of the undetected resonance that limits the wall; NaN if none does
@@ -66,7 +74,13 @@ _UNDECIDED = SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
 
 
 def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> SafeWall:
-    """Return the wall that `zwidth.DeviceFit.safe_wall` describes."""
+    """Search for the safe wall of an estimated device, as `zwidth.DeviceFit.safe_wall` describes.
+
+    Args:
+        fit: the estimate.
+        reliability: required proportion of devices.
+        rigid: assume that the device has no undetected resonances.
+    """
     scene, usual = fit.nominal, _CONFIRMED if fit.is_structured else _SEARCHED
     count = min(_SAMPLES, usual * scene.loop.draws)
     drawn = fit.draw(count)
@@ -81,10 +95,11 @@ def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> Safe
     most = np.inf if rigid or fit.damping_tried is None else fit.damping_tried
     (stiffness, virtual_damping), resonance = devices.find(reliability, most), np.nan
     if virtual_damping == most:
-        # A resonance may lower the stability limit near the largest measured B without changing the measured walls.
+        # Limit K to a lower confidence limit of the K measured at this B, because an undetected resonance may lower the
+        # stability limit next to the measured walls without changing the measured ones.
         stiffness = min(stiffness, fit.bound_measured_stiffness(reliability))
     if not rigid and fit.response_scene is not None and not is_stable_with_resonances(fit, stiffness, virtual_damping):
-        # The theory of measured responses guarantees nothing for walls with B < 0 beyond those with B = 0.
+        # Exclude B < 0, because walls with B < 0 are not certified by the theory of measured responses.
         top = fit.response_scene.max_stiffness(negative_damping=False)
         resonance, virtual_damping = float(top.frequency), float(top.virtual_damping)
         is_stable = top.status == Status.OK
@@ -99,13 +114,13 @@ def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> Safe
 
 
 def _find_structured_wall(fit: DeviceEstimate, reliability: float, rigid: bool, drawn: np.ndarray) -> SafeWall:
-    """Return the safe wall for a device with a lag or resonances.
+    """Search for the safe wall of a device with an actuator lag or resonances.
 
     The wall is stable for all responses within a radius that covers the uncertainty of the fitted parameters and,
     unless ``rigid``, one undetected resonance. The random devices confirm the wall by eigenvalues.
 
     Args:
-        fit: the fit.
+        fit: the estimate.
         reliability: required proportion of devices.
         rigid: assume that the device has no undetected resonances.
         drawn: parameters of random devices, one row per device.
@@ -124,7 +139,7 @@ def _find_structured_wall(fit: DeviceEstimate, reliability: float, rigid: bool, 
 
 
 def is_stable_with_resonances(fit: DeviceEstimate, stiffness: float, virtual_damping: float) -> bool:
-    """Return whether a wall, and every softer one with the same B, is stable for all undetected resonances."""
+    """Return whether a wall and all softer walls with the same B are stable with every undetected resonance."""
     if fit.damping_tried is not None and virtual_damping > fit.damping_tried:
         return False
     scene = fit.response_scene
@@ -135,10 +150,14 @@ def is_stable_with_resonances(fit: DeviceEstimate, stiffness: float, virtual_dam
 
 
 class _RigidDevices(RigidVariants):
-    """Random rigid devices with the backward difference: stability by closed forms."""
+    """Random rigid devices with the backward difference, whose stability limits have closed forms."""
 
     def find(self, reliability: float, most: float) -> tuple[float, float]:
-        """Return K and B of the stiffest wall with B <= ``most``; both 0 if no wall is stable on enough devices."""
+        """Search for the stiffest wall with B <= ``most`` that is safe on the required proportion of devices.
+
+        Returns:
+            K and B; both 0 if no wall is stable on enough devices.
+        """
         low, high, damping = 0.0, compute_stiffness_quantile(self.stiffest()[0], reliability), 0.0
         least = _NEGLIGIBLE * high
         while high > max((1.0 + _ACCURACY) * low, least):
@@ -154,38 +173,44 @@ class _RigidDevices(RigidVariants):
         return (low, damping) if low > least else (0.0, 0.0)
 
     def limit(self, virtual_damping: float, reliability: float) -> float:
-        """Return the K up to which all walls with this B are stable on the required proportion of devices."""
+        """Return the K up to which walls with the given B are safe on the required proportion of devices."""
         return compute_stiffness_quantile(self.find_stiffness_limits(np.array([virtual_damping]))[:, 0], reliability)
 
     def _find_best_damping(self, stiffness: float) -> float:
-        """Return the middle of the interval of B in which this stiffness is stable on most devices."""
+        """Return the middle of the interval of B in which walls of a given stiffness are stable on most devices."""
         sides = [self.find_damping_limits(stiffness, side) for side in ("lower", "upper")]
         valid = np.isfinite(sides[0]) & np.isfinite(sides[1])
         ends = np.concatenate([side[valid] for side in sides])
         if not ends.size:
             return 0.0
         order = np.argsort(ends, kind="stable")
-        # The number of stable devices increases at each lower end and decreases at each upper end.
+        # Count the stable devices along B: their number increases at each lower end of an interval of stable B, and
+        # decreases at each upper end.
         count = np.cumsum(np.repeat([1, -1], valid.sum())[order])
         first = int(np.argmax(count))
         return float(0.5 * (ends[order][first] + ends[order][first + 1]))
 
     def share(self, stiffness: float, virtual_damping: float) -> float:
-        """Return the proportion of devices on which the wall, and therefore every softer one, is stable."""
+        """Return the proportion of devices on which a wall is stable, and therefore safe."""
         return float(self.labels(stiffness, virtual_damping).mean())
 
 
 class _SearchedDevices:
-    """Random rigid devices with a velocity filter: stability from a grid of frequencies, for B >= 0."""
+    """Random rigid devices with a velocity filter, whose stability limits are computed on a frequency grid (B >= 0)."""
 
     def __init__(self, drawn: np.ndarray, fit: DeviceEstimate) -> None:
-        """Compute the critical controllers of the devices; ``drawn`` has their parameters, one row per device."""
+        """Compute the critical controllers of the devices on the frequency grid.
+
+        Args:
+            drawn: parameters of random devices, one row per device.
+            fit: the estimate.
+        """
         period, scene = fit.period, fit.nominal
         with np.errstate(all="ignore"):
             rate, d = drawn[:, 0] / period, drawn[:, 2] / period
             valid = device_status(drawn[:, 1] / rate, d) == Status.OK
         valid &= (drawn[:, 0] > SI_RANGE[0]) & (drawn[:, 0] < SI_RANGE[1]) & (d < _FARTHEST[0] + _FARTHEST[1] * scene.d)
-        # Devices out of range count as unstable.
+        # Count devices with parameters out of range as unstable, with a stability limit of 0.
         self.unstable_limits = np.zeros(np.count_nonzero(~valid))
         drawn, d, rate = drawn[valid], d[valid], rate[valid]
         self.fit, self.drawn = fit, drawn
@@ -195,12 +220,16 @@ class _SearchedDevices:
             velocity = scene.velocity.estimate(period).jet(points).value[None] / period
             controller = CriticalController(*fit.normalize(drawn[..., None])[1:3])
             critical = controller.evaluate_rigid(points).value * (rate / period)[:, None]
-            # Remove the rounding errors of the imaginary parts at z = -1.
+            # Set the imaginary parts at z = -1 to 0, because they are only rounding errors.
             critical[:, -1], velocity[:, -1] = np.real(critical[:, -1]), np.real(velocity[:, -1])
             self.limits = GridLimits(critical, velocity)
 
     def find(self, reliability: float, most: float) -> tuple[float, float]:
-        """Return K and B of the stiffest wall with B <= ``most``; both 0 if no wall is stable on enough devices."""
+        """Search for the stiffest wall with B <= ``most`` that is safe on the required proportion of devices.
+
+        Returns:
+            K and B; both 0 if no wall is stable on enough devices.
+        """
         ends = self.limits.damping_limits
         top = self._take_quantile(ends, reliability)
         if not np.isfinite(top):
@@ -210,21 +239,36 @@ class _SearchedDevices:
         return (float(limits[0]), float(dampings[0])) if limits[0] > 0 else (0.0, 0.0)
 
     def limit(self, virtual_damping: float, reliability: float) -> float:
-        """Return the K up to which all walls with this B are stable on the required proportion of devices."""
+        """Return the K up to which walls with the given B are safe on the required proportion of devices."""
         return self._take_quantile(self.limits.limit_stiffness(np.array([virtual_damping])), reliability)
 
     def share(self, stiffness: float, virtual_damping: float) -> float:
-        """Return the proportion of devices on which the wall and the checked softer ones are stable, by eigenvalues."""
+        """Return the proportion of devices on which a wall and two softer ones are stable, by eigenvalues."""
         stable = _are_stable(self.fit, self.drawn, stiffness, virtual_damping)
         return float(stable.sum()) / (stable.size + self.unstable_limits.size)
 
     def _take_quantile(self, limits: np.ndarray, reliability: float) -> float:
-        """Return the limit that the required proportion of all devices reaches, including those out of range."""
+        """Return the quantile of stability limits that the required proportion of devices reaches or exceeds.
+
+        Args:
+            limits: stability limits of the devices in range; those of the other devices are 0.
+            reliability: required proportion of devices.
+        """
         return compute_stiffness_quantile(np.concatenate([limits, self.unstable_limits]), reliability)
 
 
 def _are_stable(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtual_damping: float) -> np.ndarray:
-    """Return a mask of the devices on which a wall, and softer ones with the same B, are stable, by eigenvalues."""
+    """Test by the eigenvalues of the closed loop whether a wall and two softer ones are stable on random devices.
+
+    Args:
+        fit: the estimate.
+        drawn: parameters of the devices, one row per device.
+        stiffness: K in N/m; the factors of `_SOFTER` yield the softer walls.
+        virtual_damping: B in N s/m.
+
+    Returns:
+        A mask of the devices on which all these walls are stable.
+    """
     estimate, devices = fit.velocity.estimate(fit.period), fit.normalize(drawn)
     A, B, _ = (np.moveaxis(part, -1, 0) for part in _build_chain(devices, estimate).realize())
     n_delay, f = np.floor(devices.d).astype(int), realize_estimate(estimate)
@@ -233,7 +277,7 @@ def _are_stable(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtua
     moved = flow(rate, np.zeros((len(A), size + 1, size + 1)), times).change
     parts = moved[:, 0, :, :size], moved[:, 0, :, size], moved[:, 1, :, size]
     stable = np.zeros(len(drawn), bool)
-    # Devices with the same integer delay have closed loops of the same order.
+    # Group the devices by the integer delay, because only closed loops of the same order form a batch.
     for n in np.unique(n_delay):
         group = n_delay == n
         plant = add_input_delay(DiscreteChain(*(part[group] for part in parts)), int(n))
@@ -250,7 +294,7 @@ def _are_stable(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtua
 
 
 def _build_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
-    """Return the mass, the modes and the actuator lag of all devices, as arrays over the devices."""
+    """Convert devices to a batch of `Chain` models with unit mass, damping, modes, actuator lag, delay and estimate."""
     modes = tuple(Resonance(frequency, ratio, 1.0 / mass_ratio) for frequency, ratio, mass_ratio in devices.modes)
     lag = 1.0 / devices.lag[0] if devices.lag else None
     if len(devices.lag) == 2:

@@ -1,16 +1,17 @@
-"""Exact response of a mass with friction, an actuator lag and resonances to a logged force with zero-order hold.
+"""Simulate a mass with friction, an actuator lag and resonances under a logged force with zero-order hold.
 
 The actuator lag A(s) and the resonances (*modes*) are linear. They therefore add to the response of the rigid mass
-(`zwidth.fitting.moving`) a sum over their poles p of ``r E_p``, with ``E_p' = p E_p + F(t - d)`` and the residue r of
-the pole, called its weight. For a lag ``A = sum r_j/(s - p_j)`` partial fractions give, with delta = b T/m,
+(`zwidth.fitting.moving`) a sum over their poles p of ``r E_p``. The *filtered force* E_p satisfies
+``E_p' = p E_p + F(t - d)`` with the force F and the delay d; the *weight* r is the residue of the pole. For a lag
+``A = sum r_j/(s - p_j)``, the partial fractions are, with delta = b T/m,
 
     A(s)/(s (s + delta)) = 1/(s (s + delta)) + sum_j (r_j/p_j)/(p_j + delta) (1/(s - p_j) - 1/(s + delta)).
 
 The derivative of E_p in p is E_p filtered once more by the same pole; the derivative in the delay d is ``-E_p'``.
 
-Friction is not linear. The stops of the mass are those of a rigid mass whose delay is increased by the delay of the lag
-at low frequencies, -A'(0). The only error is that the lag also smooths the force within a stop. Times are in sampling
-periods; ``theta`` is the parameter vector defined by `Recordings`.
+Friction is not linear. The times at which friction stops the mass are approximated by those of a rigid mass whose delay
+is increased by the delay of the lag at low frequencies, -A'(0). This approximation neglects that the lag also smooths
+the force. Times are in sampling periods T; ``theta`` is the parameter vector defined by `Recordings`.
 """
 
 from __future__ import annotations
@@ -26,36 +27,38 @@ from zwidth.fitting.encoder import MeasurementNoise
 from zwidth.fitting.moving import ModelResponse, Recording, recur
 from zwidth.fitting.required_wall import expand_partial_fractions
 
-# Step of central differences: absolute in delta and in the pole of a filter, relative in all other parameters.
+# Step of central differences: absolute for delta and for the pole of a filter, relative for all other parameters.
 _STEP = 1e-6
-# Bounds of the parameters.
-LAG_RANGE = (0.02, 5.0)  # time constant of the actuator, in periods
+# Lower and upper bounds of the parameters.
+LAG_RANGE = (0.02, 5.0)  # time constant tau of the actuator lag, in sampling periods
 FREQUENCY_RANGE = (0.0125, 3.11)  # frequency of a mode, in rad per sample
-RATIO_RANGE = (1e-6, 4.0)  # damping ratio of a mode or of a second-order lag
-_DELAY_RANGE = 2.0 * RATIO_RANGE[0] * LAG_RANGE[0], 2.0 * LAG_RANGE[1]  # 2 zeta tau of a second-order lag, in periods
+RATIO_RANGE = (1e-6, 4.0)  # damping ratio zeta of a mode or of a second-order lag
+# Low-frequency delay 2 zeta tau of a second-order lag, in sampling periods.
+_DELAY_RANGE = 2.0 * RATIO_RANGE[0] * LAG_RANGE[0], 2.0 * LAG_RANGE[1]
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """Several logs of one device, with the structure of its model.
+    """Several logs of one device, together with the structure of the model that is fitted to them.
 
     The parameter vector theta contains, in this order:
 
     - g = T^2/m, delta = b T/m and the delay d;
-    - for a lag: its delay at low frequencies, which is tau for order 1 and 2 zeta tau for order 2, and for order 2 the
-      damping ratio zeta. The delay replaces tau because a log determines its sum with d much better than either of
-      them; in this form the optimizer can take long steps;
+    - for a lag: its delay at low frequencies, which is tau for order 1 and 2 zeta tau for order 2, and for order 2 also
+      the damping ratio zeta. The low-frequency delay is used in place of the time constant tau, because a log
+      determines the sum of this delay and d much better than either of them, so that the optimizer can take long steps;
     - for each mode: the frequency in rad per sample, the damping ratio, and T^2/m_i with the modal mass m_i;
-    - for each log: x0 and v0 of the mass; then, for each log and mode, two amplitudes of its free response;
+    - for each log: initial position x0 and velocity v0 of the mass;
+    - for each log and mode: two amplitudes of the free response of the mode;
     - o and c, the accelerations by the constant force and by the friction.
 
     Attributes:
         logs: the logs.
-        noise: noise of the positions, which weights them; None for equal weights.
+        noise: noise model that determines the weights of the positions; None for equal weights.
         lag: order of the actuator lag, 0 for none.
         modes: number of modes.
-        longest: largest delay of the search, in periods.
-        resolution: encoder step, 0 for none.
+        longest: largest delay of the search, in sampling periods.
+        resolution: encoder step, 0 for a sensor without steps.
     """
 
     logs: tuple[Recording, ...]
@@ -66,11 +69,11 @@ class Recordings:
     resolution: float = 0.0
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns over samples weighted by `MeasurementNoise.weigh`, or unchanged if the noise is unknown."""
+        """Weight columns with one row per sample by `MeasurementNoise.weigh`; without a noise model return them."""
         return columns if self.noise is None else self.noise.weigh(columns)
 
     def truncate(self, count: int) -> Recordings:
-        """Return the logs cut by `Recording.truncate`, with equal weights."""
+        """Return a copy with logs shortened to ``count`` positions by `Recording.truncate`, and with equal weights."""
         return replace(self, logs=tuple(log.truncate(count) for log in self.logs), noise=None)
 
     @property
@@ -79,7 +82,7 @@ class Recordings:
         return np.concatenate([log.position for log in self.logs])
 
     def split(self, column: np.ndarray) -> list[np.ndarray]:
-        """Split an array over the samples of all logs into one array per log."""
+        """Split an array with one entry per sample of all logs into a list with one array per log."""
         return np.split(column, np.cumsum([log.position.size for log in self.logs])[:-1])
 
     @property
@@ -89,7 +92,7 @@ class Recordings:
 
     @property
     def parts(self) -> slice:
-        """The slice of theta with the parameters of the lag and the modes; the device's parameters end with it."""
+        """The slice of theta that contains the parameters of the lag and of the modes."""
         return slice(3, 3 + self.lag + 3 * self.modes)
 
     @property
@@ -99,7 +102,7 @@ class Recordings:
 
     @property
     def largest_force(self) -> float:
-        """The largest magnitude of a commanded force."""
+        """The largest magnitude of the commanded forces in all logs."""
         return max(float(np.abs(log.force).max()) for log in self.logs)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -108,14 +111,17 @@ class Recordings:
         lag = [LAG_RANGE if self.lag == 1 else _DELAY_RANGE, RATIO_RANGE][: self.lag]
         ends = lag + self.modes * [FREQUENCY_RANGE, RATIO_RANGE, (-np.inf, np.inf)]
         low[self.parts], high[self.parts] = np.reshape(ends, (-1, 2)).T
-        # Allow slightly negative dampings and delays, so that an optimum at 0 is not at a bound. The damping stays
-        # below the rate of the fastest lag, because the partial fractions require distinct poles.
+        # Allow slightly negative dampings and delays, so that an optimum at 0 is not at a bound. Limit the damping to
+        # the rate of the fastest lag, because the partial fractions require distinct poles.
         count = max(log.force.size for log in self.logs)
         low[1:3], high[1:3] = (-5.0 / count, -1.0), (0.99 / LAG_RANGE[0], self.longest)
         return low, high
 
     def normalize(self, theta: np.ndarray, period: Any) -> DimensionlessDevice:
-        """Return the device with parameters theta; further axes of theta become axes of the device."""
+        """Convert theta to a device in units of its mass and of the sampling period.
+
+        Further axes of ``theta`` become axes of the fields of the device.
+        """
         modes = theta[self.parts][self.lag :].reshape(self.modes, 3, *theta.shape[1:]).copy()
         modes[:, 2] /= theta[0]
         lag = theta[3 : 3 + self.lag].copy()
@@ -123,16 +129,16 @@ class Recordings:
         return DimensionlessDevice(period**2 / theta[0], theta[1], theta[2], lag, modes)
 
     def simulate(self, theta: np.ndarray) -> ModelResponse:
-        """Return the positions in all logs, in one array, and their derivatives in theta."""
+        """Simulate the device with parameters theta under the forces of all logs; the positions are in one array."""
         each = [self.simulate_log(theta, k) for k in range(len(self.logs))]
         place = np.concatenate([response.position for response in each])
         return ModelResponse(place, lambda: np.concatenate([response.derivatives for response in each]))
 
     def simulate_log(self, theta: np.ndarray, k: int) -> ModelResponse:
-        """Return the positions in log ``k``, and their derivatives in theta."""
+        """Simulate the device with parameters theta under the forces of log ``k``."""
         late, by_late = _limit_lag_delay(theta, self.lag, self.logs[k])
         v0 = self.velocity_indices[k]
-        # Indices in theta of the parameters of `Recording.move`.
+        # List the indices in theta of the parameters of `Recording.move`, in their order.
         rigid_indices = np.array([0, 1, 2, v0 - 1, v0, -2, -1])
         rigid = self.logs[k].move(*(theta[rigid_indices] + late * np.eye(7)[2]).tolist())
         parts = self.simulate_parts(theta, k) if self.lag or self.modes else None
@@ -148,9 +154,9 @@ class Recordings:
         return ModelResponse(rigid.position if parts is None else rigid.position + parts.position, differentiate)
 
     def simulate_parts(self, theta: np.ndarray, k: int) -> ModelResponse:
-        """Return the contribution of lag and modes to the positions in log ``k``.
+        """Simulate the contribution of lag and modes to the positions in log ``k``.
 
-        The contribution is relative to the rigid mass of `simulate_log`, whose delay includes that of the lag.
+        The contribution is the difference from the rigid mass of `simulate_log`, whose delay includes that of the lag.
         """
         log, (g, delta, d) = self.logs[k], theta[:3].tolist()
         unit, samples, place = np.eye(theta.size), np.arange(log.position.size), np.zeros(log.position.size)
@@ -162,15 +168,15 @@ class Recordings:
             filtered[pole] = _filter_force(log, pole, d)
             place += (weight * filtered[pole].position).real
             if state >= 0:
-                # Free response of a mode: one amplitude for each of two real poles, or the real and the imaginary part
-                # of the amplitude of a complex one.
+                # Add the free response of the mode. Its two parameters are the amplitudes of two real poles, or the
+                # real and the imaginary part of the amplitude of a complex pole.
                 by_theta = unit[first + state] - 1j * unit[first + state + 1] if pole.imag else unit[first + state]
                 decay, amplitude = np.exp(pole * samples), by_theta @ theta
                 place += (decay * amplitude).real
                 free_responses.append((j, decay, by_theta, amplitude))
         if self.lag:
-            # The rigid mass has the delay d + late, as required for the friction. Exchange its linear response for that
-            # with the delay d, to which the partial fractions refer.
+            # Subtract the linear response of the rigid mass with the delay d + late, which `simulate_log` uses because
+            # of the friction, and add that with the delay d, which the partial fractions require.
             late, by_late = _limit_lag_delay(theta, self.lag, log)
             by_total = unit[2] + by_late @ unit[3 : 3 + self.lag]
             for gain, by_delay, delay in ((g, unit[2], d), (-g, by_total, d + late)):
@@ -180,8 +186,8 @@ class Recordings:
                 exchanged.append((gain, by_delay, velocity.position, displacement))
 
         def differentiate() -> np.ndarray:
-            # The derivatives are the real part of a sum of products: a row over samples times a factor over theta.
-            # The derivative of E_p in the delay is -E_p' = -p E_p - F.
+            # Each term of the derivatives is the real part of a product: an array over the samples times an array over
+            # theta. The derivative of E_p in the delay is -E_p' = -p E_p - F.
             force = log.recent_forces[0, log.skip - int(np.floor(d)) + samples]
             terms: list[tuple[Any, Any]] = [(force, -unit[2] * weights.sum())]
             poles_by_theta, weights_by_theta = self._differentiate_poles(theta)
@@ -201,27 +207,32 @@ class Recordings:
         return ModelResponse(place, differentiate)
 
     def _find_poles(self, thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the poles of lag and modes on and above the real axis.
+        """Compute the poles of lag and modes with nonnegative imaginary part, and their weights.
 
         Args:
             thetas: parameter vectors along the first axis, shape (size, count).
 
         Returns:
-            The poles and their weights, shape (poles, count); and for each pole the index of its amplitude among those
-            of the free responses of the modes, -1 for the poles of the lag.
+            The poles and their weights, arrays of shape (poles, count); and for each pole the index of its amplitude
+            among the amplitudes of the free responses in theta, -1 for the poles of the lag.
         """
         device = self.normalize(thetas, 1.0)
         poles, weights = (np.array(each) for each in expand_partial_fractions(device.delta, device.lag, device.modes))
         states, height = np.maximum(np.arange(-len(poles), 0) + 2 * self.modes, -1), np.imag(poles[:, 0])
-        # The upper pole of a complex pair represents both, with twice the weight, because only real parts are used.
+        # Omit the lower pole of each complex pair and double the weight of the upper one, because only the real parts
+        # of the responses are used, which are equal for both poles.
         weights = weights * thetas[0] * (1.0 + (height > 0))[:, None]
         return poles[height >= 0], weights[height >= 0], states[height >= 0]
 
     def _differentiate_poles(self, theta: np.ndarray) -> np.ndarray:
-        """Return the derivatives in theta of the poles and of their weights, shape (2, poles, size)."""
+        """Differentiate the poles and their weights in theta by central differences.
+
+        Returns:
+            An array of shape (2, poles, size): the derivatives of the poles, and those of their weights.
+        """
         moving = np.r_[0, 1, self.parts]
         steps, count = _STEP * np.abs(theta[moving]), moving.size
-        # delta and T^2/m_i may be 0: use a least absolute step, and the step of T^2/m.
+        # Use an absolute step for delta and the step of T^2/m for all T^2/m_i, because these parameters may be 0.
         steps[1], steps[4 + self.lag :: 3] = max(_STEP, steps[1]), steps[0]
         thetas = np.tile(theta[:, None], 1 + 2 * count)
         thetas[moving, 1 + np.arange(count)] += steps
@@ -233,9 +244,15 @@ class Recordings:
 
 
 def _limit_lag_delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.ndarray]:
-    """Return the delay of the lag at low frequencies and its derivatives in the parameters of the lag.
+    """Return the low-frequency delay of the lag, limited so that its sum with d does not require forces before the log.
 
-    The delay is limited so that the past forces of the log suffice.
+    Args:
+        theta: parameter vector.
+        order: order of the lag, 0 for none.
+        log: the log.
+
+    Returns:
+        The delay, and its derivatives in the parameters of the lag.
     """
     late, by = theta[3:4].sum() if order else 0.0, np.eye(2)[0, :order]
     most = log.skip - 1.5 - theta[2]
@@ -243,12 +260,21 @@ def _limit_lag_delay(theta: np.ndarray, order: int, log: Recording) -> tuple[flo
 
 
 def _filter_force(log: Recording, pole: complex, d: float) -> ModelResponse:
-    """Return E_p at the samples with positions, and its derivative in p; E_p is 0 at the first sample of the log."""
+    """Compute the filtered force E_p at the samples with positions; E_p is 0 at the first sample of the log.
+
+    Args:
+        log: the log.
+        pole: the pole p.
+        d: delay.
+
+    Returns:
+        E_p as positions, and its derivative in p as derivatives of the response.
+    """
     n_delay = int(np.floor(d))
     f, pole, first = d - n_delay, pole if pole.imag else pole.real, log.skip - n_delay
     with_positions = slice(first, first + log.position.size)
-    # Effects of the newer and of the older force of a period on the next sample, at p and, for the derivative, at p
-    # plus and minus a step.
+    # Compute the gains from the newer and from the older force of a period to E_p at the next sample: at p and, for the
+    # derivative, at p plus and minus a step.
     near = pole + _STEP * np.array([[0.0], [1.0], [-1.0]])
     near = np.where(near == 0, 1e-300, near)
     gains = np.expm1(np.array([1.0 - f, f]) * near) / near * np.exp([0.0, 1.0 - f] * near)
@@ -264,19 +290,22 @@ def _filter_force(log: Recording, pole: complex, d: float) -> ModelResponse:
 
 
 def _integrate_velocity(log: Recording, delta: float, d: float, velocity: ModelResponse) -> ModelResponse:
-    """Return the displacement of a mass without friction and with g = 1, and its derivative in delta.
+    """Integrate the velocity of a mass without friction and with T^2/m = 1 to its displacement.
 
     Args:
         log: the log; the displacement is relative to the first sample with a position.
         delta: damping b T/m.
         d: delay.
         velocity: velocity of the mass, E_p for p = -delta.
+
+    Returns:
+        The displacement, and its derivative in delta.
     """
     n_delay = int(np.floor(d))
     spans, now = np.array([d - n_delay, 1.0 - d + n_delay, 1.0]), log.skip - n_delay
     phi = phi_functions((delta + _STEP * np.array([[0.0], [1.0], [-1.0]])) * spans)
     by_velocity, by_force = (phi.phi1 * spans).T, (phi.phi2 * spans**2).T
-    # Displacement per period by the velocity at its start, the older force and the newer force.
+    # Compute the displacement per period caused by the velocity at its start, by the older and by the newer force.
     factors = np.array([by_velocity[2], by_force[0] + by_velocity[0] * by_velocity[1], by_force[1]])
     terms = np.vstack([velocity.position[:-1], log.recent_forces[::-1, now + 1 : now + log.position.size]])
 

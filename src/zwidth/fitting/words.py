@@ -1,7 +1,8 @@
-"""Format a fit as text: a summary with details for the terminal, and a configuration in YAML.
+"""Format a fit as text: a summary and details for the terminal, and a configuration of the fitted scene in YAML.
 
-A summary is a list of pairs of label and text. Values have units and as many digits as their confidence intervals
-require.
+Summary and details are lists of pairs (label, text), one pair per line. Values are printed with their units and with
+as many digits as their confidence intervals require. A *value of a fit* is a parameter of the device, given by its
+path, or another number of the fit, given by its name.
 """
 
 from __future__ import annotations
@@ -24,41 +25,49 @@ from zwidth.words.quantities import FIELDS
 from zwidth.words.status import Status
 from zwidth.words.unit_system import UnitSystem
 
-NEAR_ROUNDING = (0.5, 1.1)  # range of residuals as expected, in units of the encoder's quantization noise
+# Range of the RMS residuals that agree with the encoder step, relative to the quantization noise of the encoder.
+NEAR_ROUNDING = (0.5, 1.1)
 
-STIFFER = 1.005  # least ratio of the stiffnesses of two walls that are printed as different
+STIFFER = 1.005  # ratio of the stiffnesses of two walls above which the second wall is printed in addition
 _SYMBOLS = {"mass": "m", "damping": "b", "delay": "t_d", "stiffness_max": "K_max"}
-# SI units for a linear device, by the last part of the path of a parameter, and of further values of a fit.
+# SI units of the values of a fit for a linear device. The keys are names, or the last parts of the paths of parameters.
 _UNITS = {path.rpartition(".")[2]: field.unit.removeprefix("1") for path, field in FIELDS.items()}
 _UNITS |= {"stiffness_max": "N/m", "friction": "N", "offset": "N", "force": "N", "position": "m"}
 
 
 def unit_of(name: str, system: UnitSystem) -> str:
-    """Return the SI unit of a value of a fit, "" if it has none."""
+    """Return the SI unit of a value of a fit by its name or path; "" if the value has no unit."""
     return system[_UNITS.get(name.rpartition(".")[2], "")]
 
 
 def list_units(fit: DeviceFit) -> dict[str, str]:
-    """Return the units of the main quantities of a fit, by name."""
+    """Return a dictionary of the SI units of mass, damping, stiffness, force and position of a fit, by name."""
     return {name: unit_of(name, fit.unit_system) for name in ("mass", "damping", "stiffness", "force", "position")}
 
 
 def symbol_of(name: str, system: UnitSystem) -> str:
-    """Return the symbol of a fitted parameter; that of the inertia of a rotary device is J."""
+    """Return the printed symbol of a fitted parameter, such as "m" for the mass (for a rotary device "J")."""
     return "J" if name == "mass" and system.rotary else _SYMBOLS[name]
 
 
 def format_value(name: str, value: float, system: UnitSystem, digits: int = 4) -> str:
-    """Return a value of a fit with its unit."""
+    """Format a value of a fit with its unit.
+
+    Args:
+        name: name or path of the value.
+        value: the value in SI units.
+        system: unit system of the fit.
+        digits: number of significant digits.
+    """
     return with_unit(value, unit_of(name, system), digits)
 
 
 def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> list[tuple[str, str]]:
-    """Return the summary of a fit as pairs of label and text: the recommended wall with its reason, then the device.
+    """Summarize a fit as pairs (label, text): the recommended wall, its reason and margins, the device, the warnings.
 
     Args:
         fit: the fit.
-        checks: further pairs on the recommended wall, as from a simulation.
+        checks: further pairs about the recommended wall, such as the results of a simulation.
     """
     recommended = fit.recommended
     rows = [("NO WALL", recommended.reason)]
@@ -76,7 +85,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
     if recommended.status == Status.OK:
         rows.append(("margins", f"{recommended.spell_margins()}; passive: {recommended.spell_passive()}"))
         rows += [*checks, *(("CAUTION", caution) for caution in recommended.cautions)]
-    # The warnings of the fit describe every other status.
+    # Describe the status only if it is NOT_CONVERGED, because the warnings of the fit describe every other status.
     unconverged = [f"NOT_CONVERGED: {describe_status(fit)}"] if fit.status == Status.NOT_CONVERGED else []
     rows += [("WARNING", text) for text in (*unconverged, *fit.doubts)] or [("warnings", "none")]
     rows += [("note", note) for note in fit.notes]
@@ -89,13 +98,13 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
 
 
 def _assume_rigid(fit: DeviceFit) -> Recommendation | None:
-    """Return the recommended wall for a device without undetected resonances; None if it is not stiffer."""
+    """Return the wall recommended for a device without undetected resonances; None if this wall is not stiffer."""
     recommended = replace(fit.scene, safe_limit=limit_walls(fit, rigid=True)).recommend()
     return recommended if recommended.stiffness > STIFFER * fit.recommended.stiffness else None
 
 
 def _describe_device(fit: DeviceFit) -> list[tuple[str, str]]:
-    """Return pairs of label and text for the fitted parameters, with their 95 % confidence intervals."""
+    """Return pairs (label, text) that list the fitted parameters of the device with their 95 % confidence intervals."""
     texts = [f"{symbol_of(name, fit.unit_system)} = {_format_estimate(fit, name)}" for name in fit.numbers[:2]]
     texts.append(f"delay {_format_estimate(fit, 'delay')}")
     if "friction" in fit.errors:
@@ -107,14 +116,15 @@ def _describe_device(fit: DeviceFit) -> list[tuple[str, str]]:
         *owner, last = name.split(".")
         label = "actuator" if owner[0] == "actuator" else "resonance"
         text = f"{last.replace('_', ' ')} {_format_estimate(fit, name)}"
-        # Join the parameters of one part into one line. Each resonance starts with its frequency.
+        # Join the parameters of the actuator, or of one resonance, into one line. The frequency is the first parameter
+        # of a resonance and therefore starts a new line.
         new = rows[-1][0] != label or last == "frequency"
         rows = [*rows, (label, text)] if new else [*rows[:-1], (label, f"{rows[-1][1]}, {text}")]
     return rows
 
 
 def _format_estimate(fit: DeviceFit, name: str) -> str:
-    """Return a fitted value with its 95 % confidence interval."""
+    """Format a fitted value with its unit and its 95 % confidence interval."""
     if not math.isfinite(fit.value_of(name)):
         return "not determined"
     interval = fit.intervals[name]
@@ -129,7 +139,7 @@ def _format_estimate(fit: DeviceFit, name: str) -> str:
 
 
 def _describe_residuals(fit: DeviceFit) -> str:
-    """Return the size of the residuals, compared with the quantization noise of the encoder."""
+    """Return a text that states the size of the residuals, compared with the quantization noise of the encoder."""
     if isinstance(fit.noise, tuple):
         return f"noise of K and f {' and '.join(f'{plain(100 * share, 2)} %' for share in fit.noise)}"
     size = f"residuals of {format_value('position', fit.noise, fit.unit_system, 3)}"
@@ -141,7 +151,7 @@ def _describe_residuals(fit: DeviceFit) -> str:
 
 
 def _describe_next(fit: DeviceFit) -> str:
-    """Return the most informative next experiment with walls, and the expected standard error of K_max after it."""
+    """Return a text that describes the wall to measure next, and the expected standard error of K_max after that."""
     step, units = fit.next, fit.unit_system
     assert step is not None, "only fits to walls at the onset of instability propose a next experiment"
     B, K = format_value("damping", step.virtual_damping, units, 3), format_value("stiffness", step.stiffness, units, 3)
@@ -153,7 +163,7 @@ def _describe_next(fit: DeviceFit) -> str:
 
 
 def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
-    """Return the details that `summarize_fit` omits, as pairs of label and text.
+    """Return pairs (label, text) with the details of a fit that `summarize_fit` omits.
 
     Args:
         fit: the fit.
@@ -199,7 +209,7 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
 
 
 def format_rival(rival: RivalDevice, system: UnitSystem) -> str:
-    """Return the parameters of another device that fits equally well, in one line."""
+    """Format the parameters and K_max of another device that fits equally well, in one line."""
     names = ("mass", "damping", "delay")
     parts = {symbol_of(name, system): format_value(name, getattr(rival, name), system) for name in names}
     parts[symbol_of("stiffness_max", system)] = format_value("stiffness", rival.stiffness_max, system)
@@ -207,12 +217,12 @@ def format_rival(rival: RivalDevice, system: UnitSystem) -> str:
 
 
 def _format(fit: DeviceFit, name: str) -> str:
-    """Return a value with as many digits as its confidence interval requires."""
+    """Format a value of a fit with its unit, and with as many digits as its confidence interval requires."""
     return format_value(name, fit.value_of(name), fit.unit_system, _count_digits(fit, name))
 
 
 def _format_interval(fit: DeviceFit, name: str) -> str:
-    """Return the 95 % confidence interval of a value as text."""
+    """Format the 95 % confidence interval of a value of a fit, with units."""
     if not math.isfinite(sum(fit.intervals[name])):
         return "not determined"
     low, high = (format_value(name, end, fit.unit_system, _count_digits(fit, name)) for end in fit.intervals[name])
@@ -220,24 +230,27 @@ def _format_interval(fit: DeviceFit, name: str) -> str:
 
 
 def _count_digits(fit: DeviceFit, name: str) -> int:
-    """Return the number of digits of a value: two more than the interval confirms, but 4 to 9."""
+    """Return the number of significant digits with which a value is printed.
+
+    It is two more than the confidence interval determines, but at least 4 and at most 9.
+    """
     value, bar = abs(fit.value_of(name)), fit.intervals[name]
     ratio = value / (bar.high - bar.low) if bar.high > bar.low else 1.0
     return min(max(4, 2 + math.ceil(math.log10(ratio))), 9) if ratio > 0 and math.isfinite(ratio) else 4
 
 
 def _write_number(fit: DeviceFit, name: str) -> str:
-    """Return a parameter of the scene as a line of YAML."""
+    """Format a parameter of the fitted scene as a line of YAML, such as "mass: 0.1 kg"."""
     return f"{name.rpartition('.')[2]}: {round_parameter(fit, name)!r} {unit_of(name, fit.unit_system)}".rstrip()
 
 
 def _write_part(fit: DeviceFit, name: str) -> str:
-    """Return a parameter of the scene as a line of YAML, with its interval as a comment."""
+    """Format a parameter of the fitted scene as a line of YAML, with its 95 % confidence interval in a comment."""
     return f"{_write_number(fit, name)} # fitted, {_format_interval(fit, name)}"
 
 
 def _write_limit(fit: DeviceFit) -> list[str]:
-    """Return the safe limit as lines of YAML."""
+    """Format the safe limit of the fitted scene as lines of YAML."""
     limit = fit.scene.safe_limit
     assert limit is not None, "the scene of a fit has a safe limit"
     lines = [
@@ -256,13 +269,13 @@ def _write_limit(fit: DeviceFit) -> list[str]:
 def write_scene(
     fit: DeviceFit, source: str, *, period_given: bool = False, max_force: float | None = None
 ) -> list[str]:
-    """Return a configuration for `zwidth run`, as lines of YAML: the fitted scene with its safe limit.
+    """Format the fitted scene with its safe limit as a configuration for `zwidth run`, a list of lines of YAML.
 
     Args:
         fit: the fit.
         source: name of the log, or number of walls, for the first comment.
-        period_given: whether the user specified the period; otherwise a fit to a log derives it from the times.
-        max_force: largest force of the motor, in N.
+        period_given: True if the user specified the period; otherwise it is derived from the times of the log.
+        max_force: largest force of the motor, in N; None if unknown.
     """
     units = fit.unit_system
     origin = "as given" if period_given or not fit.motions else "from the times of the log"
@@ -294,13 +307,13 @@ def write_scene(
 
 
 def list_hardware(fit: DeviceFit) -> dict[str, float]:
-    """Return friction and encoder step as far as a fit determines them, as arguments of `zwidth.diagnose`."""
+    """Return the fitted friction and encoder step, if they are determined, as arguments of `zwidth.diagnose`."""
     friction = math.isfinite(fit.errors.get("friction", math.nan)) and round_parameter(fit, "friction")
     values = {"coulomb": friction, "resolution": float(f"{fit.resolution:.12g}")}
     return {name: value for name, value in values.items() if value}
 
 
 def _name_file(source: str) -> str:
-    """Return a name for a configuration: that of the first log, or the number of walls."""
+    """Return the name of the configuration of a fit, derived from the name of the first log or the number of walls."""
     title = Path(source.partition(" and ")[0]).name.partition(".")[0].lower()
     return f"fitted_{re.sub('[^a-z0-9_-]+', '_', title)}"[:64]
