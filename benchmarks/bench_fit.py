@@ -332,7 +332,7 @@ def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
         f"than 5 standard errors: {len(wrong)} of {len(sure)}.",
         f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}.",
         f"The median stiffness of a safe wall, divided by K_max of the true device, is {spread}.",
-        "Safe walls are softer than K_max, because the logs do not exclude resonances, which these devices do not have.",
+        "Safe walls are softer than K_max, because a log does not exclude all resonances. These devices have none.",
     ])  # fmt: skip
 
 
@@ -362,7 +362,7 @@ def report(count: int, parts: int, processes: int) -> str:
         "",
         "- to and fro: the force consists of steps, a chirp or random values;",
         "- single push: the device is pushed once;",
-        "- closed by a wall: the device also moves in a virtual wall, whose stiffness is 2 to 30 % of the maximum stiffness;",
+        "- closed by a wall: the device also moves in a virtual wall with 2 to 30 % of the maximum stiffness;",
         "- jittered stamps: the timestamps have a jitter of 1 to 40 % of a period.",
         "",
         "Every fit estimates friction and a constant force. The bound is the Cramér-Rao lower bound of the standard",
@@ -379,7 +379,7 @@ def report(count: int, parts: int, processes: int) -> str:
         "",
         tell_rest(noisy, fitted),
         "",
-        f"{len(silent):,} further logs have no noise except the quantization by the encoder, so their errors are autocorrelated:",
+        f"{len(silent):,} further logs have only the quantization error of the encoder. These errors are autocorrelated.",
         "",
         *tabulate(quiet),
         "",
@@ -390,8 +390,9 @@ def report(count: int, parts: int, processes: int) -> str:
         "and fro. The encoder steps are 1 to 40 µm, and the noise is as above. The table reports K_max for fits",
         "without a warning. Each fit includes the actuator lag and the resonances that the log shows. The interval",
         "of K_max also includes devices with one more resonance; before the log is considered, one more resonance",
-        "and none are equally likely. Interval width and stiffness are medians, relative to K_max of the true",
-        'device. "Stable safe walls" are the walls of `safe_wall()` that are stable on the true device. These walls',
+        "and none are equally likely. The interval width is a median, relative to the fitted K_max. The stiffness",
+        "is the median stiffness of the safe walls, relative to K_max of the true device.",
+        '"Stable safe walls" are the walls of `safe_wall()` that are stable on the true device. These walls',
         'are computed for devices that may have a resonance hidden in the log. "Rigid safe walls" are the walls of',
         "`safe_wall(rigid=True)` that are stable on the true device. These walls are computed without hidden",
         "resonances.",
