@@ -254,7 +254,7 @@ def judge_all(judge: Callable[[int], dict[str, Any]], count: int, processes: int
 
 def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
     """Coverage and errors, in Markdown."""
-    yield "| | 95 % interval holds it | error over the bound | median |"
+    yield "| | 95 % interval contains the true value | RMS error / bound | median error / bound |"
     yield "|---|--:|--:|--:|"
     for name in (*NAMES, "offset", "stiffness_max"):
         held = [row["held"][name] for row in rows if name in row["held"]]
@@ -267,7 +267,10 @@ def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 def tabulate_kinds(rows: list[dict[str, Any]]) -> Iterator[str]:
     """How each kind of log fared, in Markdown."""
-    yield "| kind | mass | damping | delay | friction | offset | K_max | friction open | doubted | safe walls |"
+    columns = (
+        "mass | damping | delay | friction | offset | K_max | friction not determined | with a warning | safe walls"
+    )
+    yield f"| kind | {columns} |"
     yield "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|"
     for kind in KINDS:
         those = [row for row in rows if row["kind"] == kind]
@@ -281,7 +284,8 @@ def tabulate_kinds(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 def tabulate_devices(rows: list[dict[str, Any]]) -> Iterator[str]:
     """How logs of devices with lags and resonances fared, in Markdown."""
-    yield "| device | logs | with K_max | it holds | its width | safe walls | their share of K_max | were it rigid |"
+    columns = "with K_max | interval contains K_max | interval width | stable safe walls | stiffness | rigid safe walls"
+    yield f"| device | logs | {columns} |"
     yield "|---|--:|--:|--:|--:|--:|--:|--:|"
     for kind in (*sorted({row["kind"] for row in rows}), "all"):
         those = [row for row in rows if kind in (row["kind"], "all")]
@@ -319,14 +323,16 @@ def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
     wrong = [row for row in sure if max(row["away"].values()) > 5]
     safe = [row["safe"] for row in fitted if row["safe"] is not None]
     low, middle, high = np.quantile([row["share"] for row in fitted if row["safe"] is not None], [0.1, 0.5, 0.9])
-    spread = f"{middle:.2f} of its K_max in the median, a tenth less than {low:.2f}, a tenth more than {high:.2f}"
+    spread = f"{middle:.2f}; it is less than {low:.2f} for one wall in ten and more than {high:.2f} for one in ten"
     doubted, troubled = sum(bool(row["doubts"]) for row in fitted), sum(row["status"] != 0 for row in fitted)
     return "\n".join([
-        f"Refused: {len(rows) - len(fitted)}; with a doubt: {doubted}; with a status that is not OK: {troubled}.",
-        spell_widths(fitted),
-        f"Without either, off by more than 5 standard errors in anything: {len(wrong)} of {len(sure)}.",
-        f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}. They have {spread}:",
-        "the logs do not show which resonances it has not.",
+        f"Logs that the fit refuses: {len(rows) - len(fitted)}. Fits with a warning: {doubted}.",
+        f"Fits with a status other than OK: {troubled}. {spell_widths(fitted)}",
+        "Fits without a warning and with the status OK in which an estimate differs from the true value by more",
+        f"than 5 standard errors: {len(wrong)} of {len(sure)}.",
+        f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}.",
+        f"The median stiffness of a safe wall, divided by K_max of the true device, is {spread}.",
+        "Safe walls are softer than K_max, because a log does not exclude all resonances. These devices have none.",
     ])  # fmt: skip
 
 
@@ -348,16 +354,24 @@ def report(count: int, parts: int, processes: int) -> str:
         "",
         "Written by `benchmarks/bench_fit.py --write docs/fitting.md`.",
         "",
-        f"{count:,} random logs of 1,000 to 5,000 samples: devices of 30 g to 1 kg, delays of 0 to 5 periods,",
-        "whole and not; 300 to 100,000 steps of the encoder over the way moved, noise of 0.15 to 3 steps;",
-        "friction of 0.2 to 30 % of the effective force in two thirds, a constant force in a fifth. A quarter",
-        "each are moved by steps, chirps or random forces; pushed a single time; moved inside a wall of 2 to",
-        "30 % of the stiffest one, whose force answers the readings; and timed by a clock that wavers by 1 to",
-        "40 % of a period. A constant force and friction are always sought. The bound is that of Cramer and",
-        "Rao for the model that is fitted, with the noise and the encoder's q²/12 as white. Errors over the",
-        "bound are root mean squares; their median is that of the sizes, in units of a normal error's.",
-        "Intervals of friction and of the constant force count where the log does not leave them open, safe walls",
-        "those that are stable on the true device.",
+        f"{count:,} random logs of 1,000 to 5,000 samples are fitted. The rigid devices have masses of 30 g to 1 kg",
+        "and integer or fractional delays of 0 to 5 periods. The range of motion is 300 to 100,000 encoder steps,",
+        "and the noise is 0.15 to 3 steps. Two thirds of the devices have friction of 0.2 to 30 % of the effective",
+        "force, and a fifth of them have a constant force. There are four kinds of logs, with a quarter of the logs",
+        "each:",
+        "",
+        "- to and fro: the force consists of steps, a chirp or random values;",
+        "- single push: the device is pushed once;",
+        "- closed by a wall: the device also moves in a virtual wall with 2 to 30 % of the maximum stiffness;",
+        "- jittered stamps: the timestamps have a jitter of 1 to 40 % of a period.",
+        "",
+        "Every fit estimates friction and a constant force. The bound is the Cramér-Rao lower bound of the standard",
+        "error for the fitted model. It treats the noise and the quantization error of the encoder (variance q²/12",
+        'for an encoder step q) as white noise. The columns "RMS error / bound" and "median error / bound" contain',
+        "errors divided by this bound. The median error is the median of the absolute errors, divided by 0.6745, so",
+        "that it equals the standard deviation for normal errors. Intervals of friction and of the constant force",
+        'are counted only if the log determines these two parameters. The column "safe walls" contains the number',
+        "of safe walls that are stable on the true device.",
         "",
         *tabulate(fitted),
         "",
@@ -365,18 +379,24 @@ def report(count: int, parts: int, processes: int) -> str:
         "",
         tell_rest(noisy, fitted),
         "",
-        f"{len(silent):,} logs of an encoder without any noise, whose errors are alike from sample to sample:",
+        f"{len(silent):,} further logs have only the quantization error of the encoder,",
+        "which is autocorrelated.",
         "",
         *tabulate(quiet),
         "",
         tell_rest(silent, quiet),
         "",
-        f"{parts:,} logs of devices that may have an amplifier's lag of 0.1 to 1 ms, and one or two resonances",
-        "of 30 to 400 Hz and 0.5 to 10 % damping, moved to and fro, read with 1 to 40 µm and noise as above.",
-        "K_max is given where nothing is doubted, with the lag and the resonances that the log asks for; its interval",
-        "counts a further resonance as likely as none, but for what the log says of it.",
-        "Widths and shares are medians, of K_max. `safe_wall()` bears what may hide in the log. The last column has",
-        "`safe_wall(rigid=True)`, which does not: how many of those walls are stable.",
+        f"{parts:,} further logs are from devices that can have an actuator lag of 0.1 to 1 ms, and one or two",
+        "resonances with frequencies of 30 to 400 Hz and damping ratios of 0.5 to 10 %. The devices are moved to",
+        "and fro. The encoder steps are 1 to 40 µm, and the noise is as above. The table reports K_max for fits",
+        "without a warning. Each fit includes the actuator lag and the resonances that the log shows. The interval",
+        "of K_max also includes devices with one more resonance; before the log is considered, one more resonance",
+        "and none are equally likely. The interval width is a median, relative to the fitted K_max. The stiffness",
+        "is the median stiffness of the safe walls, relative to K_max of the true device.",
+        '"Stable safe walls" are the walls of `safe_wall()` that are stable on the true device. These walls',
+        'are computed for devices that may have a resonance hidden in the log. "Rigid safe walls" are the walls of',
+        "`safe_wall(rigid=True)` that are stable on the true device. These walls are computed without hidden",
+        "resonances.",
         "",
         *tabulate_devices(devices),
         "",

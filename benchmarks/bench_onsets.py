@@ -36,16 +36,18 @@ INTRODUCTION = """\
 
 Written by `benchmarks/bench_onsets.py --write docs/onsets.md`.
 
-`zwidth.fit_buzz` fits a rigid device to walls at the onset of instability. The devices of this benchmark are random.
-Rigid devices have four measured walls. All others have an actuator lag of 0.1 to 1 ms, one or two resonances of 30 to
-400 Hz, or both, and four to six measured walls. The virtual dampings B of the walls of a device are equally spaced. The
-smallest is 0, the largest a random multiple, 0.7 to 1.2, of the damping of the stiffest wall. K and f have independent
-random errors with a relative standard deviation of 2 %; B is exact. Onsets and stability are computed from the
+`zwidth.fit_buzz` fits a rigid device to walls at the onset of instability. This benchmark simulates random devices.
+For each rigid device, four walls are measured. All other devices have an actuator lag of 0.1 to 1 ms, one or two
+resonances of 30 to 400 Hz, or both, and for each of them four to six walls are measured. The virtual dampings B of the
+walls of one device are equally spaced. The smallest B is 0. The largest B is the damping of the stiffest wall,
+multiplied by a random factor of 0.7 to 1.2. The measured K and the measured frequency f have independent random errors
+with a relative standard deviation of 2 %; B is exact. The onsets and the stability of walls are computed from the
 eigenvalues of the true device.
 
-Fits without K_max are those that refuse the walls or return a warning; they recommend no wall. Safe walls are computed
-for a reliability of 99 %. A safe wall counts as stable if softer walls with the same B are also stable. The interval
-width and the stiffness of the safe wall are medians, relative to K_max of the true device.
+The column "no K_max" contains the number of fits that end with an error or with a warning. These fits recommend no
+wall. Safe walls are computed for a reliability of 99 %. A safe wall counts as stable if this wall and softer walls with
+the same B are stable. The last column contains the median stiffness of the safe walls. This stiffness and the median
+interval width are relative to K_max of the true device.
 """
 
 
