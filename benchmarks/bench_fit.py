@@ -5,7 +5,7 @@
 
 Devices, delays, forces, encoders, noises and clocks are random, with friction in two thirds of them. Errors stand over
 the bound of Cramer and Rao, for noise and the encoder's q^2/12 as white. The logs are made by the closed forms that the
-fit uses, which tests/unit/fitting/test_moving.py compares with `zwidth.simulate`; those closed by a
+fit uses, which tests/unit/identification/test_friction_model.py compares with `zwidth.simulate`; those closed by a
 wall step by step. Those of devices with lags and resonances are of `tests/oracles/measured_devices.py`, by matrices.
 """
 
@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import zwidth
-from zwidth.fitting.moving import Recording
-from zwidth.fitting.structure import Recordings
+from zwidth.identification.extended_model import Recordings
+from zwidth.identification.friction_model import Recording
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 

@@ -23,7 +23,7 @@ import numpy as np
 
 import zwidth
 from device_counts import build_parser, count_devices
-from zwidth.fitting.words import write_scene
+from zwidth.identification.fit_report import write_scene
 from zwidth.studies.document import load_config, load_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))

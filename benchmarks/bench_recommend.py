@@ -26,7 +26,7 @@ import numpy as np
 
 import zwidth
 from device_counts import build_parser, count_devices
-from zwidth.scenes.cautions import LEAST_DELAY_MARGIN, LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN, LONGEST_TIME_CONSTANT
+from zwidth.analysis.cautions import LEAST_DELAY_MARGIN, LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN, LONGEST_TIME_CONSTANT
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
 
@@ -134,7 +134,7 @@ def judge_thin(scene: zwidth.Scene, stiffness: float, damping: float) -> bool | 
 def judge_grasps(scene: zwidth.Scene, stiffness: float, damping: float) -> dict[str, bool]:
     """Return whether a wall is stable in each reference grasp, by the name of the grasp."""
     found: dict[str, bool] = {}
-    for radius in zwidth.parts.grasps.RADII if scene.device.rotary else (None,):
+    for radius in zwidth.model.grasps.RADII if scene.device.rotary else (None,):
         for name, hand in zwidth.reference_grasps(radius).items():
             held = scene.replace(operator=hand)
             found[name] = found.get(name, True) and find_radius(held, stiffness, damping) < 1

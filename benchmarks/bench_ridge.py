@@ -25,8 +25,8 @@ import optimistix
 
 import zwidth
 from methods.clock import time_calls
-from zwidth.loops.rigid.polynomial import build_frequency_loop, find_boundary_wall
-from zwidth.loops.rigid.ridge import ridge_kernel
+from zwidth.stability.rigid.polynomial import build_frequency_loop, find_boundary_wall
+from zwidth.stability.rigid.ridge import ridge_kernel
 
 REFERENCE = Path(__file__).resolve().parents[1] / "tests" / "reference" / "ridge_extended.json"
 # On a busy machine the best of many short runs is closest to what the processor can do.

@@ -22,8 +22,8 @@ import numpy as np
 import zwidth
 from methods.clock import time_calls
 from methods.page import write_page
-from zwidth.arrays.polynomials import companion
-from zwidth.loops.linear.roots import affine_polynomial
+from zwidth.numerics.polynomials import companion
+from zwidth.stability.linear.roots import affine_polynomial
 
 MAP, SAMPLE, SCATTERED = 2000, 20_000, 100_000
 # Nearer to the circle than this eigenvalues cannot tell the side.

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure what each trick of `words.xp` gains: the same work with it and without, in turns, in one process.
+"""Measure what each trick of `core.xp` gains: the same work with it and without, in turns, in one process.
 
     python benchmarks/bench_xla.py [--points 65536] [--runs 15] [--only TEXT]
 
@@ -19,20 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from methods.clock import time_calls
-from zwidth.arrays import blocks, evaluate
-from zwidth.arrays.held_mass import ANY
-from zwidth.loops.rigid import (
-    circle,
-    crossover,
-    exact_points,
-    pole_step,
-    ridge,
-    ridge_newton,
-)
-from zwidth.loops.rigid import (
-    pole_search as radius,
-)
-from zwidth.words import xp
+from zwidth.core import xp
+from zwidth.numerics import blocks, evaluate
+from zwidth.numerics.held_mass import ANY
+from zwidth.stability.rigid import characteristic_function as pole_step
+from zwidth.stability.rigid import crossover, exact_points, ridge, ridge_newton
+from zwidth.stability.rigid import dominant_pole_search as radius
+from zwidth.stability.rigid import pole_count as circle
 
 Make = Callable[[], Callable[..., Any]]
 
@@ -143,7 +136,7 @@ def in_blocks(function: Callable[..., Any], size: int) -> Make:
 
 
 def slopes() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The first gradient outside `jit`, by the rule of `arrays.evaluate` and by JAX alone."""
+    """The first gradient outside `jit`, by the rule of `numerics.evaluate` and by JAX alone."""
     by_rule = evaluate.compile_traced.__wrapped__(ridge.ridge_kernel, (ANY,))
     alone = jax.jit(lambda *columns: ridge.ridge_kernel(*columns, ANY))  # pyright: ignore
     return tuple(jax.grad(lambda *c, f=f: f(*c).alpha.sum(), argnums=(0, 1)) for f in (by_rule, alone))  # type: ignore

@@ -9,7 +9,7 @@ import time
 import numpy as np
 from independent_scenes import KINDS, random_scene, random_walls
 
-from zwidth.words.status import Status
+from zwidth.core.status import Status
 
 _WALLS_OF_ONE = 500
 

@@ -19,8 +19,8 @@ import yaml
 
 from zwidth.cli import cli
 from zwidth.cli.help import GROUPS, OWN, find_group
-from zwidth.words.status import Status
-from zwidth.words.units import COUNTS, DIMENSIONS, PERIOD_WORDS
+from zwidth.core.status import Status
+from zwidth.units.parsing import COUNTS, DIMENSIONS, PERIOD_WORDS
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_NAMES = 8  # allowed values that a table lists; the description of the key names a longer set

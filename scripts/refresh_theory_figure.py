@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from zwidth.figures import style
+from zwidth.plotting import style
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "figures" / "one_lobe.svg"
 

@@ -46,7 +46,7 @@ settings.load_profile("zwidth")
 def pytest_configure(config: pytest.Config) -> None:
     """What holds for a run as a whole."""
     # Most tests inside transformations keep JAX's default precision on purpose.
-    config.addinivalue_line("filterwarnings", "ignore::zwidth.words.errors.PrecisionWarning")
+    config.addinivalue_line("filterwarnings", "ignore::zwidth.core.errors.PrecisionWarning")
     # Files begin in the order in which they are collected, the long ones of tests/contract and tests/e2e before those
     # of tests/unit: pytest-xdist would begin with those of the most tests, and a process would end with the longest.
     config.option.loadscopereorder = False
@@ -102,10 +102,10 @@ def fitted_once():
 @pytest.fixture
 def early_compiler(monkeypatch):
     """Of some thousand points a compiler is asked, as a user's are who has many more."""
-    from zwidth.arrays import evaluate
-    from zwidth.loops.rigid import folding, outermost_poles, passivity, row_limit
+    from zwidth.numerics import evaluate
+    from zwidth.stability.rigid import broadcasting, dominant_poles, passivity, stiffness_limit
 
-    for module in (evaluate, folding, outermost_poles, passivity, row_limit):
+    for module in (evaluate, broadcasting, dominant_poles, passivity, stiffness_limit):
         monkeypatch.setattr(module, "FEW", 1 << 11)
 
 

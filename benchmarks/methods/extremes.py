@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from methods.problems import Walls
-from zwidth.loops.rigid.boundary import boundary, sample_lobe
-from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.loops.rigid.verdict import StabilityMethod, decide_stability, is_stable
-from zwidth.words.status import Status
+from zwidth.core.status import Status
+from zwidth.stability.rigid.boundary import boundary, sample_lobe
+from zwidth.stability.rigid.ridge import alpha_max
+from zwidth.stability.rigid.verdict import StabilityMethod, decide_stability, is_stable
 
 DELTAS = (0.0, 5e-324, 1e-300, 1e-16, 1e-8, 1e-4, 1.0, 50.0, 700.0, 750.0, 1e4, 1e6, 1e12)
 DELAYS = (0.0, 5e-324, 0.5, float(np.nextafter(1.0, 0.0)), 1.0, 8.0, 50.0, 500.0, 1e4, 1e5)

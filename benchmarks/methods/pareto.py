@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
-from zwidth.figures import style
+from zwidth.plotting import style
 
 # Points from one name to the next.
 _LETTERS = 11.0

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.rigid import certified
-from zwidth.loops.rigid.boundary import boundary, sample_lobe
-from zwidth.loops.rigid.outermost_poles import compute_dominant_poles
-from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.loops.rigid.verdict import decide_stability
-from zwidth.words.status import Status
+from zwidth.core.status import Status
+from zwidth.stability.rigid import certified
+from zwidth.stability.rigid.boundary import boundary, sample_lobe
+from zwidth.stability.rigid.dominant_poles import compute_dominant_poles
+from zwidth.stability.rigid.ridge import alpha_max
+from zwidth.stability.rigid.verdict import decide_stability
 
 # The device of the speed problems; the cost of no method depends on it.
 MAP_DELTA = 0.5

@@ -15,8 +15,8 @@ import click
 
 from methods import pareto, suite
 from methods.suite import Row
-from zwidth.figures import style
-from zwidth.words.errors import InputError, ResourceError
+from zwidth.core.errors import InputError, ResourceError
+from zwidth.plotting import style
 
 _TITLES = {
     "stable": "Stable or not",

@@ -14,12 +14,12 @@ from methods import problems
 from methods.baselines import available
 from methods.clock import time_calls
 from methods.problems import Walls
-from zwidth.loops.rigid import certified
-from zwidth.loops.rigid.passivity import is_passive, passivity_margin
-from zwidth.loops.rigid.poles import poles
-from zwidth.loops.rigid.ridge import RidgeMethod, alpha_max
-from zwidth.loops.rigid.spectral_radius import spectral_radius
-from zwidth.loops.rigid.verdict import StabilityMethod, decide_stability, is_stable
+from zwidth.stability.rigid import certified
+from zwidth.stability.rigid.passivity import is_passive, passivity_margin
+from zwidth.stability.rigid.poles import poles
+from zwidth.stability.rigid.ridge import RidgeMethod, alpha_max
+from zwidth.stability.rigid.spectral_radius import spectral_radius
+from zwidth.stability.rigid.verdict import StabilityMethod, decide_stability, is_stable
 
 # A measurement is repeated until it has taken this long, and at least this often.
 _SECONDS = 0.4

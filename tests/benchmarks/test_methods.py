@@ -13,7 +13,7 @@ from methods import problems, report, suite
 from methods.baselines import available
 from methods.pareto import Mark, draw_pareto
 from zwidth.cli.commands import cli
-from zwidth.words.errors import InputError, ResourceError
+from zwidth.core.errors import InputError, ResourceError
 
 
 def test_labels_near_the_boundary_are_those_of_their_side():

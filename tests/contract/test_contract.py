@@ -15,8 +15,8 @@ import oracles
 import zwidth
 from contract.cases import CASES, OTHERS
 from contract.traced import ROWS, ask, batch, compiled, family_of, fixed_of, has_gradient, in_float32, in_float64
-from zwidth.words.errors import InputError, TracedDelayError
-from zwidth.words.status import Status
+from zwidth.core.errors import InputError, TracedDelayError
+from zwidth.core.status import Status
 
 ALL = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 OPTIONAL = {("boundary_point", "alpha"), ("boundary_point", "beta")}

@@ -6,7 +6,7 @@ import pytest
 
 import zwidth
 from contract.matrix import ALL, DIFFERENTIATED, EVERY_CASE, combinations, compute, directly, expected_slope, moving
-from zwidth.words.errors import InputError
+from zwidth.core.errors import InputError
 
 
 @pytest.mark.parametrize("case", EVERY_CASE, ids=lambda case: case.name)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.scenes.loop import LinearLoop, RigidLoop
+from zwidth.analysis.loop import LinearLoop, RigidLoop
 
 DELAYS = (0.0, 0.3, 1.0, 1.6, 2.0, 4.0, 8.5)
 

@@ -9,10 +9,10 @@ import pytest
 from unpainted import painting_nothing
 
 import zwidth
-from zwidth.figures import style
+from zwidth.core.errors import InputError
+from zwidth.plotting import style
 from zwidth.runs.draw import draw_stores
 from zwidth.sweep.dataset import to_csv, to_netcdf, verify
-from zwidth.words.errors import InputError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 # Runs say when and where they were; the record of a run and the attributes of stores alone hold that.
@@ -80,7 +80,7 @@ def test_a_shipped_configuration_opens_in_the_explorer(config, tmp_path):
     pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
     from open_pages import open_page, say
 
-    from zwidth.pages.explorer.controls import read_controls
+    from zwidth.app.explorer.controls import read_controls
 
     scene = zwidth.load_config(config).scene
     if scene is None or getattr(scene, "device", None) is not None:

@@ -1,7 +1,7 @@
 """Closed loop of any linear scene as one state matrix, and random scenes.
 
-The matrix shares no formula with `zwidth.loops.linear`. The bodies have absolute coordinates, with masses, dampers and
-springs. The filters are difference equations, and each delayed command is a state. The eigenvalues are the poles.
+The matrix shares no formula with `zwidth.stability.linear`. The bodies have absolute coordinates, with masses, dampers
+and springs. The filters are difference equations, and each delayed command is a state. The eigenvalues are the poles.
 `proved_loop` does the same in ball arithmetic, for labels that float64 does not resolve.
 """
 

@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import broadcast
-from zwidth.loops.rigid.folding import NAMES
-from zwidth.loops.rigid.normalization import wall_status
-from zwidth.loops.rigid.outermost_poles import compute_dominant_poles, find_poles
-from zwidth.words.status import Status
+from zwidth.core.status import Status
+from zwidth.numerics.evaluate import broadcast
+from zwidth.stability.rigid.broadcasting import NAMES
+from zwidth.stability.rigid.dominant_poles import compute_dominant_poles, find_poles
+from zwidth.stability.rigid.normalization import wall_status
 
 
 class Radius(NamedTuple):

@@ -11,7 +11,7 @@ import scipy.signal
 
 import zwidth
 from peers.scenes import Loop, closed_loop_matrix, continuous, held, random_loops
-from zwidth.loops.rigid.normalization import Normalized
+from zwidth.stability.rigid.normalization import Normalized
 
 LOOPS = random_loops()
 WHOLE = [loop for loop in LOOPS if loop.fraction < 1e-9]

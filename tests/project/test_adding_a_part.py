@@ -19,7 +19,7 @@ MOUNT = '''"""A spring and a damper between the motor's side of the device and t
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from zwidth.parts.checks import Part
+from zwidth.model.checks import Part
 
 
 @dataclass(frozen=True, repr=False)
@@ -32,30 +32,30 @@ class Mount(Part):
     stiffness: Any
     damping: Any = 0.0
 '''
-IMPORT = "from zwidth.parts.mount import Mount\n"
+IMPORT = "from zwidth.model.mount import Mount\n"
 # By file: texts, and what stands there in the copy.
 EDITS = {
-    "words/quantities.py": {
+    "units/quantities.py": {
         '    Parameter("stiffness", "stiffness K': (
             '    Parameter("mount.stiffness", "stiffness of the mount", "k_0", POSITIVE, "N/m", (1.0, 1e3)),\n'
             '    Parameter("mount.damping", "damping of the mount", "b_0", NOT_NEGATIVE, "N s/m", (0.0, 10.0)),\n'
             '    Parameter("stiffness", "stiffness K'
         )
     },
-    "parts/paths.py": {
+    "model/parameter_paths.py": {
         '"actuator": Actuator}': '"actuator": Actuator, "mount": Mount}',
-        "from zwidth.parts.operator": f"{IMPORT}from zwidth.parts.operator",
+        "from zwidth.model.operator": f"{IMPORT}from zwidth.model.operator",
     },
-    "scenes/base.py": {
+    "analysis/base.py": {
         "    operator: Operator | None = None\n": (
             "    operator: Operator | None = None\n    mount: Mount | None = None\n"
         ),
         '"zwidth.Operator(mass=0.5)"),\n': (
             '"zwidth.Operator(mass=0.5)"),\n    "mount": (Mount | None, "zwidth.Mount(stiffness=100)"),\n'
         ),
-        "from zwidth.parts.operator": f"{IMPORT}from zwidth.parts.operator",
+        "from zwidth.model.operator": f"{IMPORT}from zwidth.model.operator",
     },
-    "parts/chain.py": {
+    "model/mechanism.py": {
         "    links = []\n": (
             "    links = []\n"
             "    if (mount := scene.mount) is not None:\n"
@@ -79,8 +79,8 @@ PROGRAM = """
 import json, zwidth
 from click.testing import CliRunner
 from zwidth.cli import cli
-from zwidth.pages.explorer.controls import CHOICES, SLIDERS, Controls
-from zwidth.pages.explorer.controls import to_python, to_yaml
+from zwidth.app.explorer.controls import CHOICES, SLIDERS, Controls
+from zwidth.app.explorer.controls import to_python, to_yaml
 from zwidth.studies.document import config_json_schema
 
 def say(*arguments):

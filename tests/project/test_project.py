@@ -200,7 +200,7 @@ def test_figures_and_configurations_need_no_jax():
     output = run_python("""
 import sys
 
-import zwidth.figures
+import zwidth.plotting
 import zwidth.studies.document
 
 print("jax" in sys.modules)

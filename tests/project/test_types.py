@@ -12,25 +12,25 @@ import pytest
 from jaxtyping import AbstractArray, jaxtyped
 
 import zwidth
-from zwidth.arrays.polynomials import companion
-from zwidth.loops.rigid.boundary import sample_lobe
-from zwidth.loops.rigid.folding import find_degree
-from zwidth.loops.rigid.poles import (
+from zwidth.core import types as _types
+from zwidth.core.types import Reals, Roots
+from zwidth.numerics.polynomials import companion
+from zwidth.stability.rigid.boundary import sample_lobe
+from zwidth.stability.rigid.broadcasting import find_degree
+from zwidth.stability.rigid.poles import (
     aberth_kernel,
     compute_discs,
     factor_with_pole_axis,
     pole_kernel,
     radius_by_companion,
 )
-from zwidth.loops.rigid.polynomial import (
+from zwidth.stability.rigid.polynomial import (
     build_frequency_loop,
     compute_coefficients,
     expand_affine,
     find_boundary_wall,
 )
-from zwidth.loops.rigid.response import step_response
-from zwidth.words import types as _types
-from zwidth.words.types import Reals, Roots
+from zwidth.stability.rigid.step_response import step_response
 
 with patch.object(typing, "TYPE_CHECKING", True):
     ALIASES = {name: value for name, value in runpy.run_path(_types.__file__).items() if name[0] != "_"}

@@ -17,9 +17,9 @@ import pytest
 from bounds import bound_radius
 
 import zwidth
-from zwidth.loops.rigid.normalization import wall_status
-from zwidth.loops.rigid.response import settling_time
-from zwidth.words.status import Status
+from zwidth.core.status import Status
+from zwidth.stability.rigid.normalization import wall_status
+from zwidth.stability.rigid.step_response import settling_time
 
 # Walls that are judged at one time: few enough for NumPy, so that nothing is compiled.
 BLOCK = 2000

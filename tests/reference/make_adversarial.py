@@ -236,9 +236,9 @@ def labelled(count: int, seed: int) -> dict[str, np.ndarray]:
 def check(points: dict[str, np.ndarray]) -> int:
     """Hold the certified method to the labels; how many it gets wrong or leaves undecided."""
     import zwidth
-    from zwidth.loops.rigid.certified import OPEN, filter_walls
-    from zwidth.loops.rigid.normalization import wall_status
-    from zwidth.words.status import Status
+    from zwidth.core.status import Status
+    from zwidth.stability.rigid.certified import OPEN, filter_walls
+    from zwidth.stability.rigid.normalization import wall_status
 
     start = time.perf_counter()
     walls = [points[name] for name in ("alpha", "beta", "delta", "d")]

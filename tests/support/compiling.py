@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from zwidth.words.xp import filter_options
+from zwidth.core.xp import filter_options
 
 # In a third of the time, for what runs once or a few times: XLA simplifies and fuses, but does little work on machine
 # code, in one piece and by its older emitters. Where both were compared the numbers were the same to the last places.

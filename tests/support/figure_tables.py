@@ -1,8 +1,8 @@
-"""Tables of studies with made-up columns, and what each function of `zwidth.figures` draws of them."""
+"""Tables of studies with made-up columns, and what each function of `zwidth.plotting` draws of them."""
 
 import numpy as np
 
-from zwidth.figures.table import stack
+from zwidth.plotting.table import stack
 
 
 def outline(delta, d=0.0, line=False):

@@ -9,8 +9,9 @@ from functools import wraps
 from typing import Any
 from unittest.mock import patch
 
-from zwidth.fitting import buzz, columns
-from zwidth.fitting.device_fit import DeviceFit
+from zwidth.identification import columns
+from zwidth.identification import onset_fit as buzz
+from zwidth.identification.device_fit import DeviceFit
 
 _fitted: dict[tuple[str, bytes], DeviceFit] = {}
 

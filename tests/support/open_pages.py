@@ -8,8 +8,8 @@ from typing import Any
 
 from bokeh.document import Document
 
-from zwidth.pages.explorer.controls import Controls
-from zwidth.pages.explorer.page import Page
+from zwidth.app.explorer.controls import Controls
+from zwidth.app.explorer.page import Page
 
 
 class Queue:

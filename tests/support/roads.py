@@ -17,9 +17,9 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli import cli
-from zwidth.loops.linear.passivity import find_unsupported_reason
+from zwidth.core.status import Status
 from zwidth.simulation.result import MotionKind
-from zwidth.words.status import Status
+from zwidth.stability.linear.passivity import find_unsupported_reason
 
 # Relative distance from the edge within which two roads may round to different sides.
 BAND = 1e-8

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from zwidth import figures
+from zwidth import plotting
 
 
 def _write_name(
     drawn: Any, stem: Path, formats: Sequence[str] = ("png", "svg"), dpi: float | None = None
 ) -> tuple[Path, ...]:
-    """In place of `zwidth.figures.save`."""
+    """In place of `zwidth.plotting.save`."""
     files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)
     for file in files:
         file.write_text(file.name, encoding="utf-8")
@@ -24,5 +24,5 @@ def _write_name(
 @contextmanager
 def painting_nothing() -> Iterator[None]:
     """Meanwhile figures are drawn as ever, and their files hold their names alone."""
-    with patch.object(figures, "save", _write_name):
+    with patch.object(plotting, "save", _write_name):
         yield

@@ -15,10 +15,10 @@ from pkgutil import iter_modules
 
 import click
 
-from zwidth.arrays.kernel_cache import use_compilation_cache
 from zwidth.cli.commands import EXIT_FAILED, EXIT_INPUT, cli
-from zwidth.words.errors import ZwidthError
-from zwidth.words.files import REMEDIES
+from zwidth.core.errors import ZwidthError
+from zwidth.io.files import REMEDIES
+from zwidth.numerics.kernel_cache import use_compilation_cache
 
 # Import every module of the package, because each adds its commands to `cli` when it is imported.
 for _module in iter_modules(__path__, f"{__name__}."):

@@ -15,6 +15,8 @@ from typing import Any
 import click
 
 from zwidth import __version__
+from zwidth.app import printing
+from zwidth.app.printing import format_row
 from zwidth.cli.hardware import diagnose_wall, hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
@@ -31,16 +33,14 @@ from zwidth.cli.options import (
     scene_options,
     verbose_option,
 )
-from zwidth.pages import words
-from zwidth.pages.words import format_row
-from zwidth.parts.device import Device
-from zwidth.parts.measured import MeasuredDevice
-from zwidth.parts.timing import Timing
-from zwidth.parts.wall import VirtualWall
-from zwidth.words.errors import InputError, ZwidthError, check_choice, format_install_command
-from zwidth.words.formatting import format_stiffness, plain, with_unit
-from zwidth.words.quantities import SIZES, Range
-from zwidth.words.status import Status
+from zwidth.core.errors import InputError, ZwidthError, check_choice, format_install_command
+from zwidth.core.status import Status
+from zwidth.model.device import Device
+from zwidth.model.measured_device import MeasuredDevice
+from zwidth.model.timing import Timing
+from zwidth.model.wall import VirtualWall
+from zwidth.units.formatting import format_stiffness, plain, with_unit
+from zwidth.units.quantities import SIZES, Range
 
 EXIT_FAILED = 1  # exit code if no wall exists or a computation fails
 EXIT_INPUT = 2  # exit code for invalid input
@@ -78,17 +78,20 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
     the folder of a run) supplies parameters not given as options; options override it. The exit code is 0 for every
     verdict.
     """
-    from zwidth.pages.verdict import format_check
-    from zwidth.scenes.assessment import assess, limits_of
-    from zwidth.scenes.stabilization import stabilize
+    from zwidth.analysis.assessment import assess, limits_of
+    from zwidth.analysis.stabilization import stabilize
+    from zwidth.app.verdict import format_check
 
-    verdict, limits, notes = assess(scene), limits_of(scene), words.list_notes(scene)
+    verdict, limits, notes = assess(scene), limits_of(scene), printing.list_notes(scene)
     result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
     lines, diagnosis = list[str](), diagnose_wall(scene, hardware, remedies=not get_hardware())
     if diagnosis is not None:
         result["diagnosis"] = diagnosis.as_dict()
     if as_json:
-        result["cautions"] = [*words.list_limit_cautions(scene), *words.list_omission_cautions(scene, find_omitted())]
+        result["cautions"] = [
+            *printing.list_limit_cautions(scene),
+            *printing.list_omission_cautions(scene, find_omitted()),
+        ]
         result["islands"] = [island._asdict() for island in scene.islands()]
         unstable = verdict.stable is False and not verdict.marginal
         if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
@@ -97,7 +100,7 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
     else:
         texts = {"omitted": find_omitted(), "hardware": spell_hardware_of_file(scene)}
         lines = format_check(scene, verdict, limits, **texts, diagnosis=diagnosis, verbose=verbose)
-    words.print_result(result, lines + words.format_notes(notes), as_json, words.LABEL)
+    printing.print_result(result, lines + printing.format_notes(notes), as_json, printing.LABEL)
 
 
 @cli.command(**show_example("ridge", OF_SCENE))
@@ -116,10 +119,10 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
     K_max to each parameter is also printed. `zwidth recommend` recommends a softer wall to set. SCENE.yaml (or the
     folder of a run) supplies parameters not given as options; options override it.
     """
-    from zwidth.pages.verdict import spell_device
-    from zwidth.scenes.assessment import name_kind
-    from zwidth.scenes.scene import Scene
-    from zwidth.scenes.stiffest import explain_missing
+    from zwidth.analysis.assessment import name_kind
+    from zwidth.analysis.optimization import explain_missing
+    from zwidth.analysis.scene import Scene
+    from zwidth.app.verdict import spell_device
 
     if (scene is None) == (delta is None) or (delta is None) != (d is None):
         raise click.UsageError("give either --delta and --d, or --mass and --rate (with --damping and --delay)")
@@ -138,18 +141,18 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
         numbers = {"delta": scene.delta, "d": scene.d, "alpha_max": alpha, "beta": beta, "omega": omega}
         result = {name: float(number) for name, number in numbers.items()}
         optimum = f"alpha_max {result['alpha_max']:.12g}, beta {result['beta']:.12g}"
-        lines = [words.format_line("", f"({optimum}, delta {plain(result['delta'])}, d {plain(result['d'])})")]
+        lines = [printing.format_line("", f"({optimum}, delta {plain(result['delta'])}, d {plain(result['d'])})")]
         if given is None:
             lines = [
-                words.format_line("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
-                words.format_line("beta", f"{result['beta']:.12g}"),
-                words.format_line("device", f"delta {plain(result['delta'])}, d {plain(result['d'])}"),
+                printing.format_line("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
+                printing.format_line("beta", f"{result['beta']:.12g}"),
+                printing.format_line("device", f"delta {plain(result['delta'])}, d {plain(result['d'])}"),
             ]
     result["kind"] = kind
     if given is not None:
-        slopes, notes = words.list_slopes(scene), words.list_notes(scene) + _list_obstacles(scene)
+        slopes, notes = printing.list_slopes(scene), printing.list_notes(scene) + _list_obstacles(scene)
         stiffest = scene.replace(wall=VirtualWall(float(wall.stiffness), float(wall.virtual_damping)))
-        cautions = [*words.compare_with_limit(stiffest), *words.list_omission_cautions(scene, find_omitted())]
+        cautions = [*printing.compare_with_limit(stiffest), *printing.list_omission_cautions(scene, find_omitted())]
         wall_values = wall.stiffness, wall.virtual_damping, wall.frequency
         named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, wall_values), strict=True))
         result |= named | {
@@ -162,24 +165,24 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
         K = format_stiffness(named["stiffness_max"], scene.unit_system)
         top = f"{K} at B = {B}, {f} ({kind.replace('_', ' ')} optimum)"
         lines = [
-            words.format_line("K_max", top),
+            printing.format_line("K_max", top),
             *lines,
-            words.format_line("device", spell_device(scene, find_omitted())),
-            *words.format_parts(scene),
-            *(words.format_line("CAUTION", text) for text in cautions),
-            words.format_line("next", "zwidth recommend, with the same options, for the wall to set"),
+            printing.format_line("device", spell_device(scene, find_omitted())),
+            *printing.format_parts(scene),
+            *(printing.format_line("CAUTION", text) for text in cautions),
+            printing.format_line("next", "zwidth recommend, with the same options, for the wall to set"),
             "",
             *(slope.line() for slope in slopes),
-            *words.format_notes(notes),
+            *printing.format_notes(notes),
         ]
-    words.print_result(result, lines, as_json, words.LABEL)
+    printing.print_result(result, lines, as_json, printing.LABEL)
 
 
 def _list_obstacles(scene: Any) -> list[str]:
     """Return notes on the measurements that would be required to certify a stiffer wall on a measured response."""
     if not isinstance(scene.device, MeasuredDevice):
         return []
-    from zwidth.fitting.respond import find_nominal_limit
+    from zwidth.identification.response_estimate import find_nominal_limit
 
     top = find_nominal_limit(scene)
     said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else []
@@ -192,7 +195,7 @@ def schema() -> None:
     """Print the JSON Schema of configuration files, for editors."""
     from zwidth.studies.document import config_json_schema
 
-    words.print_json(config_json_schema())
+    printing.print_json(config_json_schema())
 
 
 @cli.command()
@@ -200,7 +203,7 @@ def schema() -> None:
 @json_option
 def devices(name: str | None, as_json: bool) -> None:
     """List devices with published parameters, or the parameters of the device NAME with their sources."""
-    from zwidth.parts.devices import DEVICES, find_device
+    from zwidth.model.devices import DEVICES, find_device
 
     chosen = DEVICES if name is None else (find_device(name),)
     if name is None:
@@ -215,7 +218,7 @@ def devices(name: str | None, as_json: bool) -> None:
         lines += [
             format_row(key, f"{each.spell()}{notes[key]}; {each.source}") for key, each in chosen[0].numbers.items()
         ]
-    words.print_result([device.as_dict() for device in chosen], lines, as_json)
+    printing.print_result([device.as_dict() for device in chosen], lines, as_json)
 
 
 def _complete(context: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
@@ -244,7 +247,7 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
             comments = [line.lstrip("# ") for line in path.read_text(encoding="utf-8").splitlines() if line[:1] == "#"]
             sentence = re.match(r".*?[.?](?= |$)", " ".join(filter(None, comments[1:])))
             assert sentence is not None, "every example begins with a description"
-            words.print_lines([f"{each:<{width}}  {sentence.group()}"], width + 2)
+            printing.print_lines([f"{each:<{width}}  {sentence.group()}"], width + 2)
         return
     example = example or (name if name in examples else "quickstart")
     check_choice("--example", example, tuple(examples))
@@ -296,14 +299,14 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
     import webbrowser
 
     try:
-        from zwidth.pages.explorer.server import Explorer
+        from zwidth.app.explorer.server import Explorer
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("bokeh", "tornado"):
             raise
         raise InputError(
             f"explore: requires bokeh, which is not installed; install it: {format_install_command('explore')}"
         ) from error
-    from zwidth.pages.explorer.controls import read_controls
+    from zwidth.app.explorer.controls import read_controls
     from zwidth.runs.record import find_config
 
     explorer = Explorer(read_controls(find_config(path) if path and path.is_dir() else path), port)
@@ -324,10 +327,10 @@ def report(folder: Path, out: Path | None, as_json: bool) -> None:
 
     The file contains figures, methods, versions and configuration, and requires no server and no network.
     """
-    from zwidth.runs.report.page import write_report
+    from zwidth.app.report.page import write_report
 
     file = write_report(folder, out)
-    words.print_result({"file": str(file), "bytes": file.stat().st_size}, [f"wrote {file}"], as_json)
+    printing.print_result({"file": str(file), "bytes": file.stat().st_size}, [f"wrote {file}"], as_json)
 
 
 _FACTOR = Parsed("FACTOR", read_factor, "write a factor, such as 2 or 6 dB")
@@ -376,7 +379,7 @@ def recommend(
     SCENE.yaml (or the folder of a run) supplies parameters not given as options; options override it. Exit code 1: no
     wall exists.
     """
-    from zwidth.pages.verdict import format_recommendation
+    from zwidth.app.verdict import format_recommendation
 
     if code and as_json:
         raise click.UsageError("give only one of --code or --json: each replaces the whole output")
@@ -389,7 +392,7 @@ def recommend(
     if code:
         if recommendation.status != Status.OK:
             raise click.ClickException(recommendation.reason)
-        for caution in words.list_omission_cautions(scene, find_omitted()):
+        for caution in printing.list_omission_cautions(scene, find_omitted()):
             click.echo(f"zwidth: {caution}", err=True)
         click.echo(recommendation.code(code, max_force=hardware.get("max_force", math.inf)), nl=False)
         return
@@ -398,14 +401,14 @@ def recommend(
         if recommendation.status == Status.OK
         else None
     )
-    notes, lines, result = [*words.list_period_notes(scene), *recommendation.notes], list[str](), dict[str, Any]()
+    notes, lines, result = [*printing.list_period_notes(scene), *recommendation.notes], list[str](), dict[str, Any]()
     if as_json:
         result = recommendation.as_dict() | {"notes": notes}
-        result["cautions"] += words.list_omission_cautions(scene, find_omitted())
+        result["cautions"] += printing.list_omission_cautions(scene, find_omitted())
         result |= {} if diagnosis is None else {"diagnosis": diagnosis.as_dict()}
     else:
         texts = {"omitted": find_omitted(), "hardware": spell_hardware_of_file(scene)}
         lines = format_recommendation(recommendation, **texts, diagnosis=diagnosis, verbose=verbose)
-    words.print_result(result, [*lines, *words.format_notes(notes), *written], as_json, words.LABEL)
+    printing.print_result(result, [*lines, *printing.format_notes(notes), *written], as_json, printing.LABEL)
     if recommendation.status != Status.OK:
         raise SystemExit(EXIT_FAILED)

@@ -13,6 +13,8 @@ from typing import Any
 import click
 import numpy as np
 
+from zwidth.app.printing import LABEL, format_line, format_notes, format_parts, print_result
+from zwidth.app.verdict import spell_device
 from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
@@ -23,10 +25,9 @@ from zwidth.cli.options import (
     read_pairs,
     scene_options,
 )
-from zwidth.pages.verdict import spell_device
-from zwidth.pages.words import LABEL, format_line, format_notes, format_parts, print_result
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import (
+from zwidth.core.errors import InputError
+from zwidth.core.status import Status
+from zwidth.units.formatting import (
     count_digits,
     format_stiffness,
     format_sufficient,
@@ -35,15 +36,14 @@ from zwidth.words.formatting import (
     round_conservatively,
     with_unit,
 )
-from zwidth.words.quantities import PARAMETERS
-from zwidth.words.status import Status
-from zwidth.words.units import read_share
+from zwidth.units.parsing import read_share
+from zwidth.units.quantities import PARAMETERS
 
 # Path in a scene of the parameter that each value of --find selects.
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
 _TRIED = 41  # values of a parameter at which K_max is computed, to find the largest K_max in a range
-# Parameters whose tolerances `zwidth.scenes.robust` supports in the search for a wall that is stable on all devices.
+# Parameters whose tolerances `zwidth.analysis.robust` supports in the search for a wall that is stable on all devices.
 _BOX = ("mass", "damping", "period", "delay")
 
 
@@ -193,8 +193,8 @@ def _tolerate(
     scene: Any, shares: dict[str, float], distribution: Any, samples: int | None, seed: int
 ) -> tuple[dict[str, Any], list[str]]:
     """Return the share of random devices on which the wall is stable, as a dict and as printed lines."""
-    from zwidth.scenes.assessment import describe_islands
-    from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
+    from zwidth.analysis.assessment import describe_islands
+    from zwidth.analysis.tolerances import Tolerance, simulate_tolerances
 
     count = samples if samples is not None else scene.loop.draws
     named = {name: Tolerance(share, distribution) for name, share in shares.items()}
@@ -227,7 +227,7 @@ def _tolerate(
 
 def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:
     """Return the stiffest wall that is stable for all tolerances, as a dict and as printed lines."""
-    from zwidth.scenes.robust import DIGITS, Interval, robust_max_stiffness, robust_wall
+    from zwidth.analysis.robust import DIGITS, Interval, robust_max_stiffness, robust_wall
 
     nominal = (scene.mass, scene.damping, scene.timing.period, scene.timing.delay)
     box: dict[str, Any] = dict(zip(_BOX, nominal, strict=True))

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from zwidth.cli.options import Command, get_hardware, quantity_type, warn_implausible
-from zwidth.parts.measured import MeasuredDevice
-from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
+from zwidth.model.measured_device import MeasuredDevice
+from zwidth.units.quantities import NOT_NEGATIVE, POSITIVE
 
 if TYPE_CHECKING:
-    from zwidth.scenes.scene import Scene
+    from zwidth.analysis.scene import Scene
 
 # Parameters of the hardware: option, name of the parameter, SI unit, allowed range, and help text.
 _HARDWARE = (
@@ -70,7 +70,7 @@ def hardware_options(command: Command) -> Command:
 
 def spell_hardware_of_file(scene: Scene) -> str:
     """Return a phrase with encoder, friction and motor from the scene file of the command; "" if it has none."""
-    from zwidth.scenes.trials import spell_hardware
+    from zwidth.analysis.trials import spell_hardware
 
     given = click.get_current_context().params
     values = {name: value for name, value in get_hardware().items() if given[name] is None}
@@ -86,6 +86,6 @@ def diagnose_wall(scene: Scene, hardware: dict[str, Any], *, remedies: bool) -> 
     """
     if not hardware:
         return None
-    from zwidth.scenes.diagnosis import diagnose
+    from zwidth.analysis.diagnosis import diagnose
 
     return diagnose(scene, **hardware, remedies=remedies)

@@ -15,6 +15,7 @@ from typing import Any
 
 import click
 
+from zwidth.app.printing import LABEL, format_line, format_row, print_json, print_lines, print_result, spell_diagnosis
 from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.hardware import add_option, diagnose_wall
 from zwidth.cli.help import show_example
@@ -31,17 +32,16 @@ from zwidth.cli.options import (
     warn_implausible,
 )
 from zwidth.cli.records import RecordLoop, log_options, loop_options, read_logs
-from zwidth.pages.words import LABEL, format_line, format_row, print_json, print_lines, print_result, spell_diagnosis
-from zwidth.parts.checks import find_kind
-from zwidth.parts.measured import MeasuredDevice
-from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import BackwardDifference
-from zwidth.words.errors import UnusableValueError
-from zwidth.words.formatting import format_wall, round_conservatively, with_unit
-from zwidth.words.quantities import POSITIVE
-from zwidth.words.status import Status
-from zwidth.words.unit_system import SYSTEMS, UnitSystem
-from zwidth.words.units import detect_kind
+from zwidth.core.errors import UnusableValueError
+from zwidth.core.status import Status
+from zwidth.model.checks import find_kind
+from zwidth.model.measured_device import MeasuredDevice
+from zwidth.model.timing import Timing
+from zwidth.model.velocity import BackwardDifference
+from zwidth.units.formatting import format_wall, round_conservatively, with_unit
+from zwidth.units.parsing import detect_kind
+from zwidth.units.quantities import POSITIVE
+from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 # Pattern of an entry such as "K=3.2kN/m": a letter, "=", and the text up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
@@ -124,7 +124,7 @@ def fit(
     the period of walls and of logs without a column of times; options override it. --max-force limits the force in the
     program of --code and in the simulation. Exit code 1: no wall is recommended (0 with --yaml).
     """
-    from zwidth.fitting.words import list_units, write_scene
+    from zwidth.identification.fit_report import list_units, write_scene
 
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
@@ -137,7 +137,7 @@ def fit(
                 raise click.UsageError(f"--{name.replace('_', '-')} applies only to a LOG.csv; omit it")
         if period is None:
             raise click.UsageError("give --period or --rate, or a scene file")
-        from zwidth.fitting.buzz import BuzzPoint, fit_buzz
+        from zwidth.identification.onset_fit import BuzzPoint, fit_buzz
 
         kinds = {rotary for _, rotary in walls} - {None}
         if len(kinds) > 1:
@@ -150,7 +150,7 @@ def fit(
     else:
         if noise is not None:
             raise click.UsageError("--noise applies only to --buzz; omit it, because the noise of a log is estimated")
-        from zwidth.fitting.columns import fit_motions
+        from zwidth.identification.columns import fit_motions
 
         options = {name: of_logs.pop(name) for name in ("max_delay", "resample")}
         motions = read_logs(logs, loop, **of_logs)
@@ -160,8 +160,8 @@ def fit(
     motor = {name: value for name, value in motor.items() if value}
     written = []
     if figure is not None:
-        from zwidth.figures import draw_device_fit
-        from zwidth.fitting.evidence import gather_evidence
+        from zwidth.identification.diagnostics import gather_evidence
+        from zwidth.plotting import draw_device_fit
 
         evidence: dict[str, Any] = gather_evidence(device_fit, source, points)
         written.append(save_figure(draw_device_fit(**evidence, step=device_fit.resolution), figure))
@@ -189,7 +189,7 @@ def _diagnose(device_fit: Any, motor: dict[str, float]) -> Any:
 
     Return None if none of these is known, or if no wall is recommended.
     """
-    from zwidth.fitting.words import list_hardware
+    from zwidth.identification.fit_report import list_hardware
 
     recommended = device_fit.recommended
     if recommended.status != Status.OK:
@@ -199,7 +199,7 @@ def _diagnose(device_fit: Any, motor: dict[str, float]) -> Any:
 
 def _list_lines(device_fit: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
     """Return the printed lines of a fit, with the checks of the recommended wall in a hand and by simulation."""
-    from zwidth.fitting.words import detail_fit, summarize_fit
+    from zwidth.identification.fit_report import detail_fit, summarize_fit
 
     checks, more = [], "details: --verbose; scene for the other commands: --yaml"
     if device_fit.recommended.status == Status.OK:
@@ -246,7 +246,7 @@ def excite(
     options["resolution"] = resolution or hardware.get("resolution")
     if missing := [f"--{name}" for name, value in options.items() if value is None]:
         raise click.UsageError(f"give {', '.join(missing)}".replace("--period", "--period or --rate"))
-    from zwidth.fitting.excite import excite as design
+    from zwidth.identification.excite import excite as design
 
     device = None if response is None else MeasuredDevice.read(response)
     # Infer the kind of device from the options as typed, because their parsed values have no units.
@@ -311,7 +311,7 @@ def respond(
     """
     if not logs:
         raise click.UsageError("give one LOG.csv or several")
-    from zwidth.fitting.respond import respond_to_logs
+    from zwidth.identification.response_estimate import respond_to_logs
 
     response = respond_to_logs(read_logs(logs, loop, **of_logs), loop.known_period, cycle)
     _print_response(response, logs, loop.velocity, save, figure, as_json)
@@ -321,8 +321,8 @@ def _print_response(
     response: Any, logs: tuple[Path, ...], velocity: Any, save: Path | None, figure: Path | None, as_json: bool
 ) -> None:
     """Print a measured response and its safe wall; save and plot the response if ``save`` and ``figure`` are given."""
-    from zwidth.fitting.respond import find_nominal_limit
-    from zwidth.scenes.scene import Scene
+    from zwidth.analysis.scene import Scene
+    from zwidth.identification.response_estimate import find_nominal_limit
 
     device, period, doubts = response.device, response.period, response.doubts
     kind = "parts of a repeating force" if response.cycle else "parts"
@@ -385,8 +385,8 @@ def _plain(wall: Any) -> dict[str, float]:
 
 def _draw(scene: Any, wall: Any) -> Any:
     """Draw the measured response with its error band, and the open loop with a wall."""
-    from zwidth import figures
-    from zwidth.figures.style import style_sheet
+    from zwidth import plotting
+    from zwidth.plotting.style import style_sheet
 
     device = scene.device
     table = {"frequency_Hz": device.frequency, "real_m_per_N": device.response.real}
@@ -397,4 +397,4 @@ def _draw(scene: Any, wall: Any) -> Any:
         loop = scene.frequency_response(wall.stiffness, wall.virtual_damping, device.frequency)
         table |= {"open_loop_real": loop.real, "open_loop_imag": loop.imag}
     with style_sheet(system=device.unit_system):
-        return figures.draw_response(table)
+        return plotting.draw_response(table)

@@ -11,6 +11,8 @@ from typing import Any
 
 import click
 
+from zwidth.app import printing
+from zwidth.app.printing import format_row
 from zwidth.cli.commands import cli
 from zwidth.cli.hardware import hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
@@ -22,12 +24,10 @@ from zwidth.cli.options import (
     save_figure,
     scene_options,
 )
-from zwidth.pages import words
-from zwidth.pages.words import format_row
-from zwidth.parts.linear_device import LinearDevice
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import with_unit
-from zwidth.words.quantities import ANY, POSITIVE
+from zwidth.core.errors import InputError
+from zwidth.model.linear_device import LinearDevice
+from zwidth.units.formatting import with_unit
+from zwidth.units.quantities import ANY, POSITIVE
 
 TIME_CONSTANTS = 8.0  # default length of a simulation, in time constants of the linear loop
 FEWEST_PERIODS = 300  # shortest default length of a simulation, in sampling periods
@@ -50,15 +50,15 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
     Possible causes: linear instability, steps of the encoder, limits of the motor. Required: --stiffness, --mass (or
     --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies parameters not given as options.
     """
-    from zwidth.scenes.diagnosis import diagnose as find_cause
+    from zwidth.analysis.diagnosis import diagnose as find_cause
 
     diagnosis = find_cause(scene, **hardware)
     remedy = diagnosis.advise()
     lines = [format_row(diagnosis.word, diagnosis.explain()), *([format_row("to stop it", remedy)] if remedy else [])]
-    cautions = [*words.list_limit_cautions(scene), *words.list_omission_cautions(scene, find_omitted())]
+    cautions = [*printing.list_limit_cautions(scene), *printing.list_omission_cautions(scene, find_omitted())]
     lines += [format_row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
     lines += [format_row("CAUTION", text) for text in cautions]
-    words.print_result(diagnosis.as_dict(), lines, as_json)
+    printing.print_result(diagnosis.as_dict(), lines, as_json)
 
 
 @cli.command(**show_example("simulate --hit '0.1 m/s'", _WALL, OF_SCENE))
@@ -93,8 +93,8 @@ def simulate(
     --mass (or --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies parameters not given as
     options.
     """
-    from zwidth.scenes.diagnosis import diagnose as find_cause
-    from zwidth.simulation.ending import describe_ending
+    from zwidth.analysis.diagnosis import diagnose as find_cause
+    from zwidth.simulation.behavior import describe_ending
     from zwidth.simulation.result import OF_WHOLE, MotionKind
 
     options = _choose_start(scene, hit, push, hold, hardware)
@@ -122,16 +122,16 @@ def simulate(
     ]
     if cause.cause not in ("none", "undecided"):
         lines.append(format_row("remedies", "zwidth diagnose, with the same options"))
-    cautions = [*words.list_limit_cautions(scene), *words.list_omission_cautions(scene, find_omitted())]
+    cautions = [*printing.list_limit_cautions(scene), *printing.list_omission_cautions(scene, find_omitted())]
     lines += [format_row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
     lines += [format_row("CAUTION", text) for text in cautions]
     if figure is not None:
-        from zwidth.figures import plot
+        from zwidth.plotting import plot
 
         lines.append(save_figure(plot.motion(motion).figure, figure))
     result = {name: getattr(motion, name) for name in OF_WHOLE if name not in ("outcome", "status")}
     result = {name: value.item() for name, value in result.items()} | {"outcome": MotionKind(int(motion.outcome)).name}
-    words.print_result(result | {"ending": ending, "periods": periods, "diagnosis": cause.as_dict()}, lines, as_json)
+    printing.print_result(result | {"ending": ending, "periods": periods, "diagnosis": cause.as_dict()}, lines, as_json)
 
 
 def _choose_start(

@@ -17,25 +17,25 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
+from zwidth.app.printing import format_row
 from zwidth.cli.help import OF_SCENE as OF_SCENE
 from zwidth.cli.help import show_example as show_example
-from zwidth.pages.words import format_row
-from zwidth.parts.checks import Span, find_kind, read_span
-from zwidth.parts.device import Device
-from zwidth.parts.mode import Mode
-from zwidth.parts.paths import PARTS, find_parts, spell_part
-from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import ESTIMATES, name_estimate
-from zwidth.parts.wall import NoWall, VirtualWall
-from zwidth.words.errors import InputError
-from zwidth.words.plausible import list_implausible
-from zwidth.words.quantities import ANY, CHOICES, HARDWARE, OF_PARTS, PARAMETERS, Range
-from zwidth.words.unit_system import SYSTEMS, UnitSystem
-from zwidth.words.units import DIMENSIONS, detect_kind, read_quantity, read_share
+from zwidth.core.errors import InputError
+from zwidth.model.checks import Span, find_kind, read_span
+from zwidth.model.device import Device
+from zwidth.model.mode import Mode
+from zwidth.model.parameter_paths import PARTS, find_parts, spell_part
+from zwidth.model.timing import Timing
+from zwidth.model.velocity import ESTIMATES, name_estimate
+from zwidth.model.wall import NoWall, VirtualWall
+from zwidth.units.parsing import DIMENSIONS, detect_kind, read_quantity, read_share
+from zwidth.units.plausibility import list_implausible
+from zwidth.units.quantities import ANY, CHOICES, HARDWARE, OF_PARTS, PARAMETERS, Range
+from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 if TYPE_CHECKING:
-    from zwidth.parts.devices import KnownDevice
-    from zwidth.scenes.scene import Scene
+    from zwidth.analysis.scene import Scene
+    from zwidth.model.devices import KnownDevice
 
 # Keys under which data are stored in the click context of a command.
 _WITH_KIND = "zwidth.with_kind"  # options whose units determine the kind of device, linear or rotary
@@ -185,7 +185,7 @@ def take_options(
                     values["scene"] = read_scene_file(file)
                     with_kind = {file.name: values["scene"].device, **with_kind}
                 if "device" in values:
-                    from zwidth.parts.devices import read_device
+                    from zwidth.model.devices import read_device
 
                     values["device"] = read_device(values["device"])
                     # Ignore the unit system and the hardware of the file, because the option --device replaces its
@@ -252,7 +252,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
     """Return the scene of a file after replacing the parameters that are given as options."""
-    from zwidth.parts.devices import KnownDevice
+    from zwidth.model.devices import KnownDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}
     device = changes.get("device")
@@ -292,8 +292,8 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
 
 def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scene:
     """Return the scene built from options, without a scene file."""
-    from zwidth.parts.devices import KnownDevice
-    from zwidth.scenes.scene import Scene
+    from zwidth.analysis.scene import Scene
+    from zwidth.model.devices import KnownDevice
 
     device = given.pop("device", None)
     published = device if isinstance(device, KnownDevice) else None
@@ -410,7 +410,7 @@ def read_pairs(context: click.Context, option: click.Parameter, pairs: Iterable[
 
 def save_figure(drawn: Any, file: Path) -> str:
     """Write a figure to a file, and return the line that reports its path."""
-    from zwidth.figures import save
+    from zwidth.plotting import save
 
     save(drawn, file.with_suffix(""), (file.suffix[1:],))
     return format_row("wrote", str(file))

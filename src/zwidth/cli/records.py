@@ -23,13 +23,13 @@ from zwidth.cli.options import (
     name_option,
     take_options,
 )
-from zwidth.parts.checks import find_kind
-from zwidth.words.quantities import CHOICES, OF_LOGS, OF_PARTS
-from zwidth.words.unit_system import UnitSystem
+from zwidth.model.checks import find_kind
+from zwidth.units.quantities import CHOICES, OF_LOGS, OF_PARTS
+from zwidth.units.unit_system import UnitSystem
 
 if TYPE_CHECKING:
-    from zwidth.parts.velocity import Velocity
-    from zwidth.scenes.scene import Scene
+    from zwidth.analysis.scene import Scene
+    from zwidth.model.velocity import Velocity
 
 _LONG = 2**23  # bytes; size of a log above which a message is printed before it is read
 
@@ -126,7 +126,7 @@ def read_logs(
     """
     if columns["time"] is not None and loop.period is not None:
         raise click.UsageError("give one of --time, --period and --rate")
-    from zwidth.fitting.columns import read_log
+    from zwidth.identification.columns import read_log
 
     for log in logs:
         size = log.stat().st_size if log.is_file() else 0

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from zwidth.app.printing import format_row, print_json, print_lines
 from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.options import Parsed, json_option, read_pairs
-from zwidth.pages.words import format_row, print_json, print_lines
-from zwidth.words.errors import ResourceError
-from zwidth.words.formatting import plain
+from zwidth.core.errors import ResourceError
+from zwidth.units.formatting import plain
 
 if TYPE_CHECKING:
     from zwidth.runs.run import RunResult, StudyEvent
@@ -87,7 +87,7 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi:
     Write data, figures and a record of the run into one folder, and the results of each sweep into DIR/STUDY.zarr.
     After Ctrl-C the results so far are kept; continue with --resume.
     """
-    from zwidth.figures.style import style_sheet
+    from zwidth.plotting.style import style_sheet
     from zwidth.runs.run import run as run_studies
     from zwidth.studies.document import load_config
 

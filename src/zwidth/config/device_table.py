@@ -26,12 +26,12 @@ from zwidth.config.fields import (
     quote_names,
 )
 from zwidth.config.values import quantity_of, read_entries, share_schema
-from zwidth.words.contexts import set_temporarily
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, from_cell, resembling, suggestion
-from zwidth.words.quantities import PARAMETERS
-from zwidth.words.tables import DecimalSigns, holds_data, read_lines, split_lines
-from zwidth.words.units import looks_like_number, split_title
+from zwidth.core.contexts import set_temporarily
+from zwidth.core.errors import InputError
+from zwidth.io.tables import DecimalSigns, holds_data, read_lines, split_lines
+from zwidth.units.formatting import describe, from_cell, resembling, suggestion
+from zwidth.units.parsing import looks_like_number, split_title
+from zwidth.units.quantities import PARAMETERS
 
 LABEL = "label"  # column with a name for each device
 MAX_ROWS = 100_000  # devices per table

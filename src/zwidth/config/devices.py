@@ -20,14 +20,14 @@ from zwidth.config.device_table import find_file
 from zwidth.config.fields import LocatedProblem, Strict, combine_problems, problem, quote_names
 from zwidth.config.parts import PART_NAMES, PartSection, parse_message
 from zwidth.config.values import Delay, Quantity, get_system, quantity_of
-from zwidth.parts.checks import Span
-from zwidth.parts.devices import DEVICES
-from zwidth.parts.linear_device import LinearDevice, parse_fraction
-from zwidth.parts.measured import SUFFIXES, MeasuredDevice
-from zwidth.parts.paths import PARTS
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, suggestion
-from zwidth.words.quantities import HARDWARE, POSITIVE
+from zwidth.core.errors import InputError
+from zwidth.model.checks import Span
+from zwidth.model.devices import DEVICES
+from zwidth.model.linear_device import LinearDevice, parse_fraction
+from zwidth.model.measured_device import SUFFIXES, MeasuredDevice
+from zwidth.model.parameter_paths import PARTS
+from zwidth.units.formatting import describe, suggestion
+from zwidth.units.quantities import HARDWARE, POSITIVE
 
 FORMS = "a published name, 'NUMERATOR / DENOMINATOR' in s, a table FILE.csv of a response, or a mapping"
 # Keys of each form of a linear system. The last key identifies the form, because it is required and in no other form.
@@ -94,7 +94,7 @@ class SystemSection(PartSection, noun="a linear system"):
 
     @cached_property
     def instance(self) -> LinearDevice:
-        """The linear system as an object of `zwidth.parts`, built from the keys of the given form."""
+        """The linear system as an object of `zwidth.model`, built from the keys of the given form."""
         form = next(form for form in _SYSTEM_FORMS if getattr(self, form[-1]) is not None)
         names = {"numerator": "num", "denominator": "den"}
         arguments: dict[str, Any] = {names.get(name, name): _to_array(getattr(self, name)) for name in form}
@@ -157,7 +157,7 @@ class ResponseSection(PartSection, noun="a response"):
 
     @cached_property
     def instance(self) -> MeasuredDevice:
-        """The measured response as an object of `zwidth.parts`."""
+        """The measured response as an object of `zwidth.model`."""
         real, imag = (_to_array(part) for part in (self.real, self.imag))
         if real.shape != imag.shape:
             raise InputError(f"imag: got {imag.size} numbers and {real.size} of real; give one per frequency")

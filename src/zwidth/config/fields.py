@@ -34,9 +34,9 @@ from pydantic import (
 from pydantic import ModelWrapValidatorHandler as Handler
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError
 
-from zwidth.words.errors import ConfigError
-from zwidth.words.formatting import LONGEST_VALUE, describe, resembling, suggestion
-from zwidth.words.quantities import FIELDS, Parameter
+from zwidth.core.errors import ConfigError
+from zwidth.units.formatting import LONGEST_VALUE, describe, resembling, suggestion
+from zwidth.units.quantities import FIELDS, Parameter
 
 FieldPath: TypeAlias = tuple[str | int, ...]
 Kind = TypeVar("Kind")

@@ -1,7 +1,7 @@
 """Models of the optional parts of a scene: velocity estimate, operator, coupling, actuator, modes and safe limit.
 
 Parts are those in addition to the device and its timing. The model of a section is generated from the dataclass of
-the part in `zwidth.parts`: its fields are the keys, and `words.quantities` declares their units and ranges. The part
+the part in `zwidth.model`: its fields are the keys, and `units.quantities` declares their units and ranges. The part
 itself validates combinations of values.
 """
 
@@ -25,14 +25,14 @@ from pydantic import (
 
 from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, find_kind, problem
 from zwidth.config.values import Quantity, read_entries
-from zwidth.parts.checks import find_range
-from zwidth.parts.mode import Mode
-from zwidth.parts.paths import PARTS
-from zwidth.parts.safe_limit import SafeLimit
-from zwidth.parts.velocity import ESTIMATES, FOAW
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe
-from zwidth.words.quantities import CHOICES, FIELDS, NOT_NEGATIVE
+from zwidth.core.errors import InputError
+from zwidth.model.checks import find_range
+from zwidth.model.mode import Mode
+from zwidth.model.parameter_paths import PARTS
+from zwidth.model.safe_limit import SafeLimit
+from zwidth.model.velocity import ESTIMATES, FOAW
+from zwidth.units.formatting import describe
+from zwidth.units.quantities import CHOICES, FIELDS, NOT_NEGATIVE
 
 PART_NAMES = ("velocity", *PARTS, "modes")
 
@@ -64,7 +64,7 @@ class PartSection(Strict):
 
     @cached_property
     def instance(self) -> Any:
-        """The part as an object of `zwidth.parts`, with the values of the keys of this section."""
+        """The part as an object of `zwidth.model`, with the values of the keys of this section."""
         given = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return self.part(**given)
 
@@ -100,7 +100,7 @@ def make_section(part: Any, owner: str, noun: str, kind: str = "") -> type[PartS
 
     Args:
         part: class of the part.
-        owner: prefix of the names of the part's parameters in `words.quantities`, such as "coupling".
+        owner: prefix of the names of the part's parameters in `units.quantities`, such as "coupling".
         noun: noun of the section for messages, such as "a coupling".
         kind: value of the key ``kind``; "" for a section without this key.
     """
@@ -122,7 +122,7 @@ def _head(part: Any) -> str:
 def _describe(path: str, item: Any) -> tuple[Any, str]:
     """Return the type annotation of a key, and its description for the schema.
 
-    ``path`` is the name of the key in `words.quantities`, ``item`` the field of the dataclass.
+    ``path`` is the name of the key in `units.quantities`, ``item`` the field of the dataclass.
     """
     if path in CHOICES:
         return Literal[CHOICES[path].names], f"{CHOICES[path].sentence}."
@@ -219,7 +219,7 @@ def list_parts(owner: Any) -> dict[str, Any]:
 
 
 def build_parts(owner: Any) -> dict[str, Any]:
-    """Return the given parts of a device, scene or study as objects of `zwidth.parts`, by the name of the part."""
+    """Return the given parts of a device, scene or study as objects of `zwidth.model`, by the name of the part."""
     return {
         name: [each.instance for each in section] if isinstance(section, list) else section.instance
         for name, section in list_parts(owner).items()

@@ -38,14 +38,14 @@ from zwidth.config.fields import (
     problem,
 )
 from zwidth.config.values import read_in_units
-from zwidth.parts.devices import DEVICES
-from zwidth.parts.measured import SUFFIXES, MeasuredDevice
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe
-from zwidth.words.quantities import PARAMETERS
-from zwidth.words.tables import read_columns
-from zwidth.words.unit_system import SYSTEMS
-from zwidth.words.units import detect_kind, split_head
+from zwidth.core.errors import InputError
+from zwidth.io.tables import read_columns
+from zwidth.model.devices import DEVICES
+from zwidth.model.measured_device import SUFFIXES, MeasuredDevice
+from zwidth.units.formatting import describe
+from zwidth.units.parsing import detect_kind, split_head
+from zwidth.units.quantities import PARAMETERS
+from zwidth.units.unit_system import SYSTEMS
 
 _Model = TypeVar("_Model", bound=BaseModel)
 

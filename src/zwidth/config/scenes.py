@@ -16,6 +16,7 @@ from typing import Annotated, Any, ClassVar, TypeAlias
 import numpy as np
 from pydantic import ConfigDict, WrapValidator
 
+from zwidth.analysis.scene import Scene
 from zwidth.config.devices import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
 from zwidth.config.fields import LocatedProblem, problem, quote_names
 from zwidth.config.parts import (
@@ -27,17 +28,16 @@ from zwidth.config.parts import (
     parse_input_error,
 )
 from zwidth.config.values import NonNegative, Number, quantity_of
-from zwidth.parts.device import Device
-from zwidth.parts.paths import PARTS, replace_parameters
-from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import FOAW
-from zwidth.parts.wall import VirtualWall
-from zwidth.scenes.scene import Scene
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, short
-from zwidth.words.plausible import list_implausible
-from zwidth.words.quantities import HARDWARE, LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
-from zwidth.words.xp import within
+from zwidth.core.errors import InputError
+from zwidth.core.xp import within
+from zwidth.model.device import Device
+from zwidth.model.parameter_paths import PARTS, replace_parameters
+from zwidth.model.timing import Timing
+from zwidth.model.velocity import FOAW
+from zwidth.model.wall import VirtualWall
+from zwidth.units.formatting import describe, short
+from zwidth.units.plausibility import list_implausible
+from zwidth.units.quantities import HARDWARE, LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
 
 _Parts: Any = make_parts_base("the difference of two samples", "none")
 

@@ -18,7 +18,7 @@ from zwidth.config.fields import LocatedProblem, Name, Strict, problem, quote_na
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
 from zwidth.config.values import Axis, get_system
-from zwidth.words.unit_system import UnitSystem
+from zwidth.units.unit_system import UnitSystem
 
 MAX_POINTS = 150_000_000  # points per study, except sweeps
 MAX_BYTES = 2**30  # bytes; estimated size of the result per study, except sweeps

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, GetPydanticSchema, ValidationError, WrapValidator, create_model
 from pydantic_core import PydanticCustomError
 
+from zwidth.analysis.scene import Scene
 from zwidth.config.device_table import TableField, read_table
 from zwidth.config.devices import (
     DeviceForm,
@@ -29,14 +30,13 @@ from zwidth.config.parts import build_parts, list_parts, make_parts_base, parse_
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
-from zwidth.loops.linear.passivity import find_unsupported_reason
-from zwidth.parts.device import Device
-from zwidth.parts.paths import PARTS
-from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import BackwardDifference
-from zwidth.scenes.scene import Scene
-from zwidth.words.errors import InputError
-from zwidth.words.quantities import (
+from zwidth.core.errors import InputError
+from zwidth.model.device import Device
+from zwidth.model.parameter_paths import PARTS
+from zwidth.model.timing import Timing
+from zwidth.model.velocity import BackwardDifference
+from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.units.quantities import (
     MAX_DELAY_PERIODS,
     NORMALIZED,
     OF_PARTS,
@@ -49,7 +49,7 @@ from zwidth.words.quantities import (
     Family,
     Range,
 )
-from zwidth.words.unit_system import SYSTEMS, UnitSystem
+from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 MAX_SWEEP_POINTS = 10**12  # points per sweep
 

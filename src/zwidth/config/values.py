@@ -23,13 +23,11 @@ from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from zwidth.config.fields import LocatedProblem, Strict, combine_problems, find_repeated, list_problems, problem
-from zwidth.parts.checks import Span, read_span
-from zwidth.words.contexts import set_temporarily
-from zwidth.words.errors import UnusableValueError
-from zwidth.words.formatting import describe, short, suggestion
-from zwidth.words.quantities import ANY, FIELDS, FRACTION, NOT_NEGATIVE, POSITIVE, Range
-from zwidth.words.unit_system import LINEAR, UnitSystem
-from zwidth.words.units import (
+from zwidth.core.contexts import set_temporarily
+from zwidth.core.errors import UnusableValueError
+from zwidth.model.checks import Span, read_span
+from zwidth.units.formatting import describe, short, suggestion
+from zwidth.units.parsing import (
     DIMENSIONS,
     PERIOD_WORDS,
     check_range,
@@ -38,6 +36,8 @@ from zwidth.words.units import (
     read_quantity,
     to_float,
 )
+from zwidth.units.quantities import ANY, FIELDS, FRACTION, NOT_NEGATIVE, POSITIVE, Range
+from zwidth.units.unit_system import LINEAR, UnitSystem
 
 _NOT_FINITE_TEXT = {"nan", "inf", "+inf", "-inf", "infinity"}
 LONGEST_AXIS = 10_000_000

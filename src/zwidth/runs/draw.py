@@ -16,19 +16,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.figures.curves import draw_curves, draw_outlines, find_family
-from zwidth.figures.grid import choose_axes
-from zwidth.figures.plane import Edges, draw_plane
-from zwidth.figures.stable_set import Outlines
-from zwidth.figures.style import Size, save, style_sheet
-from zwidth.parts.checks import check_number
+from zwidth.core.errors import InputError, StoreError
+from zwidth.model.checks import check_number
+from zwidth.plotting.curves import draw_curves, draw_outlines, find_family
+from zwidth.plotting.grid import choose_axes
+from zwidth.plotting.plane import Edges, draw_plane
+from zwidth.plotting.stable_set import Outlines
+from zwidth.plotting.style import Size, save, style_sheet
 from zwidth.runs.record import RUN_FILE
 from zwidth.studies.ridge import find_edges
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.store import SUFFIX, Store, list_stores
-from zwidth.words.errors import InputError, StoreError
-from zwidth.words.formatting import short
-from zwidth.words.quantities import ANY, OUTPUTS, VARIABLES
+from zwidth.units.formatting import short
+from zwidth.units.quantities import ANY, OUTPUTS, VARIABLES
 
 if TYPE_CHECKING:
     import xarray
@@ -42,7 +42,7 @@ _MIN_SURFACE = 6
 def make_edges(store: Store) -> Edges:
     """Return a function that computes the edges for a part of a sweep with one device.
 
-    The part must be prepared by `zwidth.figures.grid.prepare`. The function returns outlines by name ("stable",
+    The part must be prepared by `zwidth.plotting.grid.prepare`. The function returns outlines by name ("stable",
     "passive"), as points (stiffness, damping) in the units of the part. It returns an empty dict if the part is not a
     plane of walls, or if the parameters of its device are invalid.
     """

@@ -21,7 +21,9 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from zwidth.config.reader import find_values
-from zwidth.parts.measured import SUFFIXES
+from zwidth.core.errors import InputError, StoreError, StoreExistsError
+from zwidth.io.files import remove_quietly, write_atomically
+from zwidth.model.measured_device import SUFFIXES
 from zwidth.sweep.engine import refuse_changes, refuse_versions
 from zwidth.sweep.files import (
     ELSEWHERE,
@@ -32,9 +34,7 @@ from zwidth.sweep.files import (
     list_versions,
 )
 from zwidth.sweep.store import SUFFIX
-from zwidth.words.errors import InputError, StoreError, StoreExistsError
-from zwidth.words.files import remove_quietly, write_atomically
-from zwidth.words.formatting import describe
+from zwidth.units.formatting import describe
 
 RUN_FILE = "run.json"  # name of the file with the record
 CONFIG_FILE = "config.yaml"  # name of the copy of the configuration, in which file names are those of the copied inputs

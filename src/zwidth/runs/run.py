@@ -20,7 +20,10 @@ from typing import Any, Literal, TypeAlias
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.study import Study
 from zwidth.config.sweep import SweepStudy
-from zwidth.figures.style import style_sheet
+from zwidth.core.errors import InputError
+from zwidth.core.status import note_failures
+from zwidth.io.files import temporary_sibling
+from zwidth.plotting.style import style_sheet
 from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, FigureLook, load_config
 from zwidth.studies.outcome import LISTENER, ComputedStudy, Outcome
@@ -28,9 +31,6 @@ from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_swe
 from zwidth.sweep.files import is_fatal, lock_folder
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
-from zwidth.words.errors import InputError
-from zwidth.words.files import temporary_sibling
-from zwidth.words.status import note_failures
 
 AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
 

@@ -15,18 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_float64, join_shapes
-from zwidth.arrays.threads import count_processors
-from zwidth.parts.checks import read_texts
-from zwidth.parts.linear_device import LinearDevice
-from zwidth.parts.measured import MeasuredDevice
-from zwidth.parts.wall import resolve_wall
+from zwidth.core.errors import InputError, ResourceError, describe_choice
+from zwidth.core.xp import compute_concretely, is_traced
+from zwidth.model.checks import read_texts
+from zwidth.model.linear_device import LinearDevice
+from zwidth.model.measured_device import MeasuredDevice
+from zwidth.model.wall import resolve_wall
+from zwidth.numerics.evaluate import as_float64, join_shapes
+from zwidth.numerics.threads import count_processors
 from zwidth.simulation.batch import GROUP, name_bodies
 from zwidth.simulation.parameters import Settings, TracedLaw
-from zwidth.words.errors import InputError, ResourceError, describe_choice
-from zwidth.words.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
-from zwidth.words.unit_system import LINEAR, UnitSystem
-from zwidth.words.xp import compute_concretely, is_traced
+from zwidth.units.quantities import ANY, FIELDS, NOT_NEGATIVE, OF_MOTIONS
+from zwidth.units.unit_system import LINEAR, UnitSystem
 
 # Estimated memory of one call of `simulate`, in bytes. The estimate includes JITTER_BYTES and DRAWN_BYTES only for the
 # simulations that run at the same time.

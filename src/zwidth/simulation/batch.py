@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.threads import run_in_threads
-from zwidth.parts.chain import build_chain
-from zwidth.parts.device import Device
-from zwidth.parts.paths import Parts, replace_parameters
-from zwidth.parts.velocity import FOAW, BackwardDifference
+from zwidth.core.xp import compute_concretely
+from zwidth.model.device import Device
+from zwidth.model.mechanism import build_chain
+from zwidth.model.parameter_paths import Parts, replace_parameters
+from zwidth.model.velocity import FOAW, BackwardDifference
+from zwidth.numerics.threads import run_in_threads
 from zwidth.simulation.flow import build_mechanics
 from zwidth.simulation.parameters import (
     ExternalInputs,
@@ -32,7 +33,6 @@ from zwidth.simulation.parameters import (
     spread_scenes,
 )
 from zwidth.simulation.result import OF_ENERGY, convert_to_si
-from zwidth.words.xp import compute_concretely
 
 GROUP = 1 << 10  # simulations per compiled call: enough for vector units, few enough for their states to fit the cache
 

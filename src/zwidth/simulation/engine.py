@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zwidth.core.types import Array
+from zwidth.core.xp import filter_options
 from zwidth.simulation.flow import Flow
 from zwidth.simulation.parameters import ExternalInputs, Options, Parameters, Settings
 from zwidth.simulation.propagation import BodyState, advance, dot, propagate_with_friction, read, times
-from zwidth.words.types import Array
-from zwidth.words.xp import filter_options
 
 BLOCK = 128  # number of sampling periods that one call of the compiled program simulates
 SEGMENTS = 6  # number of equal segments of the tail; even, because the trend compares the two halves of the tail

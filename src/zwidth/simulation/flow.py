@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.parts.chain import Resonance, express_body_position
-from zwidth.parts.system import System
-from zwidth.words.errors import InputError
+from zwidth.core.errors import InputError
+from zwidth.model.linear_plant import System
+from zwidth.model.mechanism import Resonance, express_body_position
 
 # Number of terms of the Taylor series. For a matrix norm of 1/2 the truncation error is below 1e-18 in ``change`` and
 # below 5e-14 in ``loss``.
@@ -48,7 +48,7 @@ def build_mechanics(chains: Sequence[Any]) -> Mechanics:
     """Return the matrices of the mechanisms of scenes.
 
     Args:
-        chains: open loops of the scenes (`parts.chain`), with equal numbers of bodies, links, modes and actuator
+        chains: open loops of the scenes (`model.mechanism`), with equal numbers of bodies, links, modes and actuator
             states; or one linear system (`parts.system.System`) with several delays.
     """
     first: Any = chains[0]

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.parts.state_space import realize_estimate
-from zwidth.parts.velocity import FOAW
+from zwidth.core.errors import InputError
+from zwidth.core.types import Array
+from zwidth.model.state_space import realize_estimate
+from zwidth.model.velocity import FOAW
 from zwidth.simulation.flow import DIGITS, Flow, Mechanics, flow
-from zwidth.words.errors import InputError
-from zwidth.words.types import Array
 
 # Longest step with friction: the angle in rad by which the fastest motion advances. A longer step could contain two
 # events (T5).

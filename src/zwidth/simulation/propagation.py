@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zwidth.core.types import Array
 from zwidth.simulation.flow import DIGITS, Flow
 from zwidth.simulation.parameters import Parameters
-from zwidth.words.types import Array
 
 MOST_EVENTS = 512  # largest number of steps per piece, nearly all to an event; beyond it the state is set to NaN
 LAST_DIGIT = 0.5 ** (DIGITS - 1)  # shortest step, in sampling periods

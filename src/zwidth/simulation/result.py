@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.words.errors import InputError
-from zwidth.words.showing import compact_repr, draw_line, find_unit
-from zwidth.words.status import Status
+from zwidth.core.errors import InputError
+from zwidth.core.status import Status
+from zwidth.units.display import compact_repr, draw_line, find_unit
 
 if TYPE_CHECKING:
     import xarray

@@ -11,7 +11,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from zwidth.parts.checks import check_integer
+from zwidth.core.errors import check_choice
+from zwidth.core.status import Status
+from zwidth.core.types import ArrayLike
+from zwidth.model.checks import check_integer
 from zwidth.simulation.arguments import (
     ARGUMENTS,
     check_memory,
@@ -25,10 +28,7 @@ from zwidth.simulation.arguments import (
 from zwidth.simulation.batch import find_structure, run_scenes
 from zwidth.simulation.parameters import Law, Settings
 from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
-from zwidth.words.errors import check_choice
-from zwidth.words.showing import with_units
-from zwidth.words.status import Status
-from zwidth.words.types import ArrayLike
+from zwidth.units.display import with_units
 
 Contact = Literal["bilateral", "unilateral", "push_only"]
 CONTACTS: tuple[Contact, ...] = ("bilateral", "unilateral", "push_only")

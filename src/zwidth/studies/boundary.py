@@ -16,22 +16,23 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from pydantic import WrapValidator
 
-from zwidth import figures
+from zwidth import plotting
+from zwidth.analysis.scene import Scene
 from zwidth.config.fields import LocatedProblem, find_repeated, problem, require_entries
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene
 from zwidth.config.study import name_parts, register
 from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
-from zwidth.figures.stable_set import Outlines, tabulate_sets
-from zwidth.figures.table import stack
-from zwidth.loops.rigid.boundary import Piece, boundary_point, stable_region
-from zwidth.loops.rigid.normalization import status_of_results
-from zwidth.loops.rigid.passivity import is_passive
-from zwidth.loops.rigid.spectral_radius import spectral_radius
-from zwidth.loops.rigid.verdict import is_stable
-from zwidth.parts.device import Device
-from zwidth.parts.timing import Timing
-from zwidth.scenes.scene import Scene
+from zwidth.core.status import note_failures
+from zwidth.model.device import Device
+from zwidth.model.timing import Timing
+from zwidth.plotting.stable_set import Outlines, tabulate_sets
+from zwidth.plotting.table import stack
+from zwidth.stability.rigid.boundary import Piece, boundary_point, stable_region
+from zwidth.stability.rigid.normalization import status_of_results
+from zwidth.stability.rigid.passivity import is_passive
+from zwidth.stability.rigid.spectral_radius import spectral_radius
+from zwidth.stability.rigid.verdict import is_stable
 from zwidth.studies.outcome import (
     ComputedStudy,
     CurvesStudy,
@@ -43,8 +44,7 @@ from zwidth.studies.outcome import (
     summarize_stiffest,
 )
 from zwidth.studies.ridge import find_edges, passive_intervals, passive_outlines, ridge_table
-from zwidth.words.quantities import OUTPUTS, WALL_RANGE
-from zwidth.words.status import note_failures
+from zwidth.units.quantities import OUTPUTS, WALL_RANGE
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 
@@ -140,7 +140,7 @@ class BoundaryStudy(CurvesStudy):
             parts = tabulate_stable_intervals(deltas, delays)
             parts += passive_intervals(deltas, delays) if self.passivity else ()
             table = stack(parts)
-            return Outcome(table=table, figures={"": partial(figures.draw_zero_stiffness, table)})
+            return Outcome(table=table, figures={"": partial(plotting.draw_zero_stiffness, table)})
         notes: list[str] = []
         parts = [tabulate_boundary(delta, d) for d, delta in product(delays.tolist(), deltas.tolist())]
         if self.ridge_path:
@@ -151,7 +151,7 @@ class BoundaryStudy(CurvesStudy):
         share = find_device_share(self.delta, self.d, self.device or scene)
         parts += passive_outlines(deltas, delays, share) if self.passivity else ()
         table = add_si_columns(stack(parts), self.delta, self.d, self.device or scene)
-        return Outcome(table=table, figures={"": partial(figures.draw_boundary, table)}, notes=tuple(notes))
+        return Outcome(table=table, figures={"": partial(plotting.draw_boundary, table)}, notes=tuple(notes))
 
 
 def trace_device(device: PhysicalDevice, label: str) -> Outcome:
@@ -164,7 +164,7 @@ def trace_device(device: PhysicalDevice, label: str) -> Outcome:
         return Outcome(notes=("no wall of this device is stable",))
     about = {"curve": "boundary", "label": label, "d": device.d, "delta": device.delta}
     table = stack([{**about, **outlines}])
-    return Outcome(table=table, figures={"": partial(figures.draw_stable_set, table, walls)})
+    return Outcome(table=table, figures={"": partial(plotting.draw_stable_set, table, walls)})
 
 
 def tabulate_boundary(delta: float, d: float) -> dict[str, Any]:
@@ -231,7 +231,7 @@ class CompareStudy(ComputedStudy):
             rows.append({"label": label, **top, "islands": np.unique(islands).size})
         return Outcome(
             table=stack(rows),
-            figures={"": partial(figures.draw_stable_set, table, walls)} if table else {},
+            figures={"": partial(plotting.draw_stable_set, table, walls)} if table else {},
             documents={f"{self.name}_outlines.csv": csv_text(table, self.unit_system)},
             answer=tuple(
                 f"{row['label']}: {spell_stiffest(row, self.unit_system)}" for row in rows if row["kind"] != "none"
@@ -307,6 +307,6 @@ class MapStudy(ComputedStudy):
             device = Device(1.0, delta * (share if passive else 1.0))
             return find_edges(Scene(device, Timing(1.0, d))).get("passive" if passive else "stable")
 
-        draw = partial(figures.draw_map, arrays)
+        draw = partial(plotting.draw_map, arrays)
         drawn = {f"_{name}": partial(draw, name, edges=partial(find_edge, name)) for name in names}
         return Outcome(arrays=arrays, figures=drawn, notes=note_failures(np.bincount(status.ravel())))

@@ -19,25 +19,25 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, GetPydanticSchema, ValidationInfo, WithJsonSchema
 
-from zwidth import figures
+from zwidth import plotting
+from zwidth.analysis.optimization import RequiredValue
+from zwidth.analysis.scene import Scene
+from zwidth.analysis.tolerances import Tolerance, simulate_tolerances
 from zwidth.config.fields import LocatedProblem, problem, quote_names
 from zwidth.config.parts import parse_input_error
 from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register
 from zwidth.config.values import Axis, Fraction, Quantity, axis_of, quantity_of, read_entries
-from zwidth.figures.table import SI_COLUMNS, stack
-from zwidth.parts.noise import find_velocity_noise
-from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
-from zwidth.parts.wall import VirtualWall
-from zwidth.scenes.scene import Scene
-from zwidth.scenes.stiffest import RequiredValue
-from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
+from zwidth.core.errors import InputError
+from zwidth.core.status import Status
+from zwidth.model.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
+from zwidth.model.velocity_noise import find_velocity_noise
+from zwidth.model.wall import VirtualWall
+from zwidth.plotting.table import SI_COLUMNS, stack
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiffest, summarize_stiffest, track_progress
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, format_sufficient, header, short, with_unit
-from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
-from zwidth.words.status import Status
-from zwidth.words.unit_system import UnitSystem
+from zwidth.units.formatting import describe, format_sufficient, header, short, with_unit
+from zwidth.units.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
+from zwidth.units.unit_system import UnitSystem
 
 # Names of the parameters for which the design study can solve.
 FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
@@ -182,7 +182,7 @@ class DesignStudy(ComputedStudy):
         table = stack(rows)
         return Outcome(
             table=table,
-            figures={"": partial(figures.draw_requirement, curve, table)},
+            figures={"": partial(plotting.draw_requirement, curve, table)},
             documents={f"{self.name}_curve.csv": csv_text(curve, units)},
             answer=tuple(answer),
             notes=tuple(notes),
@@ -358,7 +358,7 @@ class FiltersStudy(ComputedStudy):
                 noise = find_velocity_noise(velocity, self.device.period, self.resolution)
                 row |= {"velocity_noise_m_per_s": noise, "force_noise_N": noise * abs(float(top.virtual_damping))}
             rows.append(row)
-        drawn: dict[str, Any] = {"": partial(figures.draw_filters, stack(rows))}
+        drawn: dict[str, Any] = {"": partial(plotting.draw_filters, stack(rows))}
         if self.resolution is not None:
             limit = np.nan if self.noise_limit is None else self.noise_limit
             quiet = [row for row in rows if row["velocity_noise_m_per_s"] <= limit and np.isfinite(row[SI_COLUMNS[0]])]
@@ -367,7 +367,7 @@ class FiltersStudy(ComputedStudy):
             groups = groupby(quiet, itemgetter("damping_N_s_per_m"))
             best = {id(max(group, key=itemgetter(SI_COLUMNS[0]))) for _, group in groups}
             rows = [{**row, "best": id(row) in best} for row in rows]
-            drawn["_noise"] = partial(figures.draw_filter_noise, stack(rows), limit)
+            drawn["_noise"] = partial(plotting.draw_filter_noise, stack(rows), limit)
         answer = tuple(_spell_best(row, self.unit_system) for row in rows if row.get("best"))
         return Outcome(table=stack(rows), figures=drawn, answer=answer)
 

@@ -32,18 +32,18 @@ from pydantic import (
 from pydantic_core import CoreSchema, PydanticCustomError
 
 import zwidth.config.sweep  # noqa: F401  (registers its kind)
+from zwidth.analysis.scene import Scene
 from zwidth.config.device_table import find_file
 from zwidth.config.fields import LocatedProblem, Name, Strict, find_kind, find_repeated, problem, require_entries
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register
 from zwidth.config.values import Quantity
-from zwidth.parts.wall import NoWall
-from zwidth.scenes.scene import Scene
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe
-from zwidth.words.quantities import Range
-from zwidth.words.units import looks_like_number
+from zwidth.core.errors import InputError
+from zwidth.model.wall import NoWall
+from zwidth.units.formatting import describe
+from zwidth.units.parsing import looks_like_number
+from zwidth.units.quantities import Range
 
 FORMAT_VERSION = 1  # version of the configuration format
 

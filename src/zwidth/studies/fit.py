@@ -1,9 +1,9 @@
 """Study "fit": mass, damping and delay of a device from logs of its motion, from walls at the onset of instability
 ("buzz"), or from both.
 
-Fits to logs and to walls are computed separately (`zwidth.fitting`); if both are given, a chi-squared test compares
-their parameters. The study writes a table of the fitted parameters, tables that show the quality of the fits (such as
-residuals and stability boundaries), and a scene file for each fit.
+Fits to logs and to walls are computed separately (`zwidth.identification`); if both are given, a chi-squared test
+compares their parameters. The study writes a table of the fitted parameters, tables that show the quality of the fits
+(such as residuals and stability boundaries), and a scene file for each fit.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ import numpy as np
 from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, PrivateAttr, WithJsonSchema, WrapValidator
 from pydantic_core import CoreSchema
 
-from zwidth import figures
+from zwidth import plotting
 from zwidth.config.device_table import find_file
 from zwidth.config.fields import LocatedProblem, Strict, problem, require_entries
 from zwidth.config.parts import VelocityField, parse_input_error, parse_message
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Fraction, Quantity, describe_entry, quantity_of
-from zwidth.figures.table import stack
-from zwidth.fitting.buzz import BuzzPoint, fit_buzz
-from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_step
-from zwidth.fitting.device_fit import DeviceFit
-from zwidth.fitting.evidence import gather_evidence
-from zwidth.fitting.words import detail_fit, summarize_fit, unit_of, write_scene
-from zwidth.parts.velocity import BackwardDifference
+from zwidth.core.errors import InputError
+from zwidth.core.status import Status
+from zwidth.identification.columns import LoggedMotion, fit_motions, read_log, read_step
+from zwidth.identification.device_fit import DeviceFit
+from zwidth.identification.diagnostics import gather_evidence
+from zwidth.identification.fit_report import detail_fit, summarize_fit, unit_of, write_scene
+from zwidth.identification.onset_fit import BuzzPoint, fit_buzz
+from zwidth.model.velocity import BackwardDifference
+from zwidth.plotting.table import stack
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, header, plain, with_unit
-from zwidth.words.quantities import OF_LOGS, POSITIVE
-from zwidth.words.status import Status
-from zwidth.words.unit_system import LINEAR, UnitSystem
+from zwidth.units.formatting import describe, header, plain, with_unit
+from zwidth.units.quantities import OF_LOGS, POSITIVE
+from zwidth.units.unit_system import LINEAR, UnitSystem
 
 _CHI_SQUARED_95 = 7.815  # 95 % quantile of chi-squared with three degrees of freedom
 _NORMAL_95 = 1.96  # standard deviations; half-width of the 95 % interval of a normal distribution
@@ -227,7 +227,7 @@ class FitStudy(ComputedStudy):
             notes += [f"{each.source}: {label}: {text}" for label, text in detail_fit(each.fit, each.source)[1:]]
         answers += [_compare(fits[0].fit, fits[1].fit)] if len(fits) > 1 else []
         step = next((each.fit.resolution for each in fits if each.fit.motions), 0.0)
-        draw = partial(figures.draw_device_fit, **evidence, step=step)
+        draw = partial(plotting.draw_device_fit, **evidence, step=step)
         return Outcome(
             table=stack([_tabulate(each.fit, each.source) for each in fits]),
             figures={"": draw},

@@ -15,23 +15,23 @@ from typing import Annotated, Any, Literal, get_type_hints
 import numpy as np
 from pydantic import WrapValidator, create_model
 
-from zwidth import figures
+from zwidth import plotting
+from zwidth.analysis.scene import Scene
 from zwidth.config.fields import LocatedProblem, Strict, find_repeated, problem, require_entries
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Axis, Quantity, axis_of
-from zwidth.figures.limit_cycle import AXES
-from zwidth.figures.stable_set import trace_outlines
-from zwidth.figures.table import stack
-from zwidth.parts.velocity import FOAW
-from zwidth.scenes.scene import Scene
+from zwidth.core.status import Status
+from zwidth.model.velocity import FOAW
+from zwidth.plotting.limit_cycle import AXES
+from zwidth.plotting.stable_set import trace_outlines
+from zwidth.plotting.table import stack
 from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
 from zwidth.studies.simulate import SimulatedStudy, SimulationConditions
-from zwidth.words.formatting import format_short, header, with_unit
-from zwidth.words.quantities import POSITIVE
-from zwidth.words.showing import find_unit
-from zwidth.words.status import Status
+from zwidth.units.display import find_unit
+from zwidth.units.formatting import format_short, header, with_unit
+from zwidth.units.quantities import POSITIVE
 
 _COLUMNS = {parameter.name: column for column, parameter in AXES.items()}
 _OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
@@ -188,10 +188,10 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
         # Draw curves if only one parameter varies or if one has a short list of values, because a plane needs two
         # parameters with many values.
         short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MAX_CURVES]
-        draw = partial(figures.draw_limit_cycles, arrays, table, bounds)
+        draw = partial(plotting.draw_limit_cycles, arrays, table, bounds)
         if short or len(varied) == 1:
             family = _COLUMNS[short[0]] if len(varied) > 1 else ""
-            draw = partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
+            draw = partial(plotting.draw_limit_cycle_curves, arrays, table, bounds, family)
         low, high = (format_short(bound, self.unit_system["m"]) for bound in bounds)
         rest = f"at rest: an amplitude below {low} in the last quarter of {self.duration}"
         notes.append(f"{rest}; limit cycle: amplitude from {low} to {high}")

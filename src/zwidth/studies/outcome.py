@@ -21,17 +21,17 @@ from typing import Annotated, Any, ClassVar, TypeVar
 import numpy as np
 from pydantic import WrapValidator
 
-from zwidth import figures
+from zwidth import plotting
+from zwidth.analysis.assessment import name_kind
+from zwidth.analysis.optimization import StiffestWall
+from zwidth.analysis.scene import Scene
 from zwidth.config.fields import LocatedProblem, problem, require_entries
 from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene, WallField
 from zwidth.config.study import Study
 from zwidth.config.values import Axis, DelayAxis, DeltaAxis
-from zwidth.figures.table import SI_COLUMNS
-from zwidth.scenes.assessment import name_kind
-from zwidth.scenes.scene import Scene
-from zwidth.scenes.stiffest import StiffestWall
-from zwidth.words.formatting import convert_header, round_conservatively, to_cell, with_unit
-from zwidth.words.unit_system import LINEAR, UnitSystem
+from zwidth.plotting.table import SI_COLUMNS
+from zwidth.units.formatting import convert_header, round_conservatively, to_cell, with_unit
+from zwidth.units.unit_system import LINEAR, UnitSystem
 
 Item = TypeVar("Item")
 
@@ -77,7 +77,7 @@ class Outcome:
             arrays = {_name_column(key, system): array for key, array in self.arrays.items()}
             np.savez_compressed(folder / f"{name}.npz", **arrays)  # pyright: ignore[reportArgumentType]
         for addition, draw in self.figures.items():
-            figures.save(draw(), folder / f"{name}{addition}", formats)
+            plotting.save(draw(), folder / f"{name}{addition}", formats)
 
 
 class ComputedStudy(Study):

@@ -5,8 +5,8 @@ d ("fractional_power"). For integer d both are equal. For other d, z^d has sever
 On the principal branch, the boundary is the closed form for integer delays, evaluated at real d.
 
 Symbols: alpha, beta and delta are normalized stiffness, virtual damping and physical damping. As in
-`loops.rigid.ridge_newton`, ``s = sin(omega/2)``, with the angular frequency omega in rad per sample, and ``lag`` is the
-delay d in sampling periods.
+`stability.rigid.ridge_newton`, ``s = sin(omega/2)``, with the angular frequency omega in rad per sample, and ``lag`` is
+the delay d in sampling periods.
 
 References:
     Hulin, Preusche, Hirzinger 2006, sections V and VII.
@@ -20,14 +20,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from zwidth import figures
-from zwidth.arrays.held_mass import Plant, discretize_mass
-from zwidth.arrays.roots import bisect, newton
+from zwidth import plotting
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
-from zwidth.figures.table import stack
-from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
-from zwidth.loops.rigid.ridge_newton import (
+from zwidth.numerics.held_mass import Plant, discretize_mass
+from zwidth.numerics.root_finding import bisect, newton
+from zwidth.plotting.table import stack
+from zwidth.stability.rigid.ridge import alpha_max, stiffness_slope
+from zwidth.stability.rigid.ridge_newton import (
     Curve,
     Start,
     evaluate_stationarity,
@@ -39,7 +39,7 @@ from zwidth.loops.rigid.ridge_newton import (
 from zwidth.studies.boundary import tabulate_stable_intervals
 from zwidth.studies.outcome import CurvesStudy, Outcome
 from zwidth.studies.ridge import ridge_table
-from zwidth.words.quantities import WALL_RANGE
+from zwidth.units.quantities import WALL_RANGE
 
 _NEWTON_STEPS = 16  # Newton iterations; sufficient for the shortest delays, whose maximum is close to omega = pi
 
@@ -130,7 +130,7 @@ class Fig6Study(_PaperStudy):
         power = ({"d": d, **shared, "beta_upper": find_upper_damping(delta, d)} for d in self.fractional)
         columns = "curve", "d", "delay_model", "delta", "beta_lower", "beta_upper"
         table = _tabulate(columns, tabulate_stable_intervals(delta, self.d.values()), power)
-        return Outcome(table=table, figures={"": partial(figures.draw_zero_stiffness, table)})
+        return Outcome(table=table, figures={"": partial(plotting.draw_zero_stiffness, table)})
 
 
 @register
@@ -148,5 +148,5 @@ class Fig10Study(_PaperStudy):
             for d in self.fractional
         )
         table = _tabulate(("d", "delay_model", "delta", *names, "kind"), [exact], power)
-        drawn = {"": partial(figures.draw_ridge, table, two_scalings=True)}
+        drawn = {"": partial(plotting.draw_ridge, table, two_scalings=True)}
         return Outcome(table=table, figures=drawn, notes=tuple(notes))

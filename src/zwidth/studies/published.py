@@ -19,19 +19,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from zwidth.arrays.roots import bisect
+from zwidth.analysis.scene import Scene
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
-from zwidth.loops.rigid.boundary import boundary
-from zwidth.loops.rigid.normalization import normalize
-from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
-from zwidth.parts.device import Device
-from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import WindowedDifference
-from zwidth.scenes.scene import Scene
+from zwidth.model.device import Device
+from zwidth.model.timing import Timing
+from zwidth.model.velocity import WindowedDifference
+from zwidth.numerics.root_finding import bisect
+from zwidth.stability.rigid.boundary import boundary
+from zwidth.stability.rigid.normalization import normalize
+from zwidth.stability.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.studies.paper_figures import limit_slope, maximize_alpha
-from zwidth.words.formatting import with_unit
+from zwidth.units.formatting import with_unit
 
 SOURCE = "Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006"
 

@@ -1,7 +1,7 @@
 """Studies of step responses: "step" for given walls, and "recommend" for the recommended wall of a device.
 
 The response of the position to a step of 1 N (or 1 N m) is computed with the wall acting on both sides of its surface.
-The recommended wall is the stiffest one that satisfies the required margins (`zwidth.scenes.recommendation`). The
+The recommended wall is the stiffest one that satisfies the required margins (`zwidth.analysis.recommendation`). The
 symbols alpha, beta, delta and d are normalized stiffness, virtual damping, physical damping and delay; K_max is the
 maximum stable stiffness, and alpha_max its normalized value.
 """
@@ -18,7 +18,11 @@ import numpy as np
 from pydantic import WrapValidator
 from pydantic_core import PydanticCustomError
 
-from zwidth import figures
+from zwidth import plotting
+from zwidth.analysis.diagnosis import diagnose
+from zwidth.analysis.recommendation import Recommendation
+from zwidth.analysis.trials import spell_hardware
+from zwidth.analysis.wall_search import RANGES, Grasps
 from zwidth.config.fields import LocatedProblem, problem, require_entries
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import (
@@ -34,20 +38,16 @@ from zwidth.config.scenes import (
 )
 from zwidth.config.study import make_parts_error, register
 from zwidth.config.values import Duration, Fraction, Quantity
-from zwidth.figures.stable_set import trace_outlines
-from zwidth.figures.style import WIDTH, house_style, new_figure
-from zwidth.figures.table import Table, stack
-from zwidth.loops.rigid.response import step_response
-from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.parts.checks import Span
-from zwidth.parts.measured import MeasuredDevice
-from zwidth.scenes.diagnosis import diagnose
-from zwidth.scenes.recommendation import Recommendation
-from zwidth.scenes.trials import spell_hardware
-from zwidth.scenes.wall_search import RANGES, Grasps
+from zwidth.model.checks import Span
+from zwidth.model.measured_device import MeasuredDevice
+from zwidth.plotting.stable_set import trace_outlines
+from zwidth.plotting.style import WIDTH, house_style, new_figure
+from zwidth.plotting.table import Table, stack
+from zwidth.stability.rigid.ridge import alpha_max
+from zwidth.stability.rigid.step_response import step_response
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
-from zwidth.words.formatting import format_wall, plain, to_json, with_unit
-from zwidth.words.quantities import WALL_RANGE, Range
+from zwidth.units.formatting import format_wall, plain, to_json, with_unit
+from zwidth.units.quantities import WALL_RANGE, Range
 
 
 class ResponseStudy(ComputedStudy):
@@ -177,7 +177,7 @@ class StepStudy(WallsStudy, ResponseStudy):
             parts.append(part)
             notes += [f"{label}: {note}"] if note else []
         table = stack(parts)
-        return Outcome(table=table, figures={"": partial(figures.draw_step, table)}, notes=tuple(notes))
+        return Outcome(table=table, figures={"": partial(plotting.draw_step, table)}, notes=tuple(notes))
 
 
 # Parameters that the report does not list among the parts of the device.
@@ -276,7 +276,7 @@ def draw(recommendation: Recommendation, response: Table | None = None) -> Any:
     # model to simulate.
     columns = 1 if recommendation.verdict is None or math.isnan(recommendation.verdict.frequency) else 2
     _, axes = new_figure(WIDTH if columns == 2 else 5.6, 3.5, 1, columns)
-    return figures.plot.recommendation(recommendation, axes, response=response)
+    return plotting.plot.recommendation(recommendation, axes, response=response)
 
 
 def _describe(recommendation: Recommendation, summary: dict[str, Any], lines: Iterable[str]) -> str:

@@ -18,29 +18,29 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, PrivateAttr, ValidationError, WrapValidator
 
-from zwidth import figures
+from zwidth import plotting
+from zwidth.analysis.assessment import trace_passivity_boundary
+from zwidth.analysis.scene import Scene
 from zwidth.config.device_table import DeviceTable, find_file, read_table
 from zwidth.config.devices import find_second_period, read_period
 from zwidth.config.fields import LocatedProblem, Strict, list_problems, problem
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Delay, quantity_of
-from zwidth.figures.stable_set import Outlines
-from zwidth.figures.table import SI_COLUMNS
-from zwidth.loops.rigid.passivity import passive_stiffness_slope
-from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
-from zwidth.loops.rigid.verdict import is_stable
-from zwidth.parts.device import Device
-from zwidth.parts.timing import Timing
-from zwidth.scenes.assessment import trace_passivity_boundary
-from zwidth.scenes.scene import Scene
+from zwidth.core.errors import InputError
+from zwidth.core.status import RidgeKind, Status
+from zwidth.io.tables import read_columns
+from zwidth.model.device import Device
+from zwidth.model.timing import Timing
+from zwidth.plotting.stable_set import Outlines
+from zwidth.plotting.table import SI_COLUMNS
+from zwidth.stability.rigid.passivity import passive_stiffness_slope
+from zwidth.stability.rigid.ridge import alpha_max, stiffness_slope
+from zwidth.stability.rigid.verdict import is_stable
 from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, find_device_share
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, format_wall, header, plain, round_conservatively, suggestion, with_unit
-from zwidth.words.quantities import RECOMMENDED_SHARE
-from zwidth.words.status import RidgeKind, Status
-from zwidth.words.tables import read_columns
-from zwidth.words.units import split_head
+from zwidth.units.formatting import describe, format_wall, header, plain, round_conservatively, suggestion, with_unit
+from zwidth.units.parsing import split_head
+from zwidth.units.quantities import RECOMMENDED_SHARE
 
 _STRONG_DAMPING = 100.0  # normalized damping delta above which alpha_max/delta is within some percent of g(d)
 _SLOPE_SAMPLES = 64  # samples of g(d) per unit of d; integer delays are included, because g has kinks there
@@ -59,9 +59,9 @@ class RidgeStudy(CurvesStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         table, notes = ridge_table(self.delta.values(), self.d.values())
-        drawn: dict[str, Any] = {"": partial(figures.draw_ridge, table, two_scalings=self.two_scalings)}
+        drawn: dict[str, Any] = {"": partial(plotting.draw_ridge, table, two_scalings=self.two_scalings)}
         if table["delta"].max() >= _STRONG_DAMPING:
-            drawn["_slope"] = partial(figures.draw_slope, table, slope_table(table))
+            drawn["_slope"] = partial(plotting.draw_slope, table, slope_table(table))
         return Outcome(table=table, figures=drawn, notes=tuple(notes))
 
 
@@ -109,7 +109,7 @@ class PassivityStudy(CurvesStudy):
         own_delta = find_device_share(self.delta, self.d, scene) * table["delta"]
         for name, slope in zip(("alpha_max_passive", "beta_passive"), zip(*slopes, strict=True), strict=True):
             table[name] = np.repeat(slope, self.delta.size) * own_delta
-        return Outcome(table=table, figures={"": partial(figures.draw_passivity_cost, table)}, notes=tuple(notes))
+        return Outcome(table=table, figures={"": partial(plotting.draw_passivity_cost, table)}, notes=tuple(notes))
 
 
 def trace_unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
@@ -278,5 +278,5 @@ class WorkspaceStudy(ComputedStudy):
             f"{format_wall(*wall, units)}, {100 * RECOMMENDED_SHARE:g} % of the least, is "
             f"stable in {np.count_nonzero(is_stable_at)} of {np.count_nonzero(has_result)} poses",
         )
-        draw = partial(figures.draw_workspace, table, *coordinates, names=self.poses.names)
+        draw = partial(plotting.draw_workspace, table, *coordinates, names=self.poses.names)
         return Outcome(table=table, figures={"": draw}, answer=answer, notes=tuple(notes))

@@ -12,24 +12,24 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from zwidth import figures
+from zwidth import plotting
+from zwidth.analysis.scene import Scene
 from zwidth.config.fields import LocatedProblem, Strict, problem
 from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, parse_input_error
 from zwidth.config.scenes import AnyScene, PhysicalWall, SimulatedDevice
 from zwidth.config.study import register
 from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity, quantity_of
-from zwidth.figures.table import SI_COLUMNS, stack
-from zwidth.parts.checks import Span
-from zwidth.parts.measured import MeasuredDevice
-from zwidth.parts.velocity import FOAW
-from zwidth.scenes.scene import Scene
-from zwidth.simulation.ending import describe_ending
+from zwidth.core.errors import InputError
+from zwidth.model.checks import Span
+from zwidth.model.measured_device import MeasuredDevice
+from zwidth.model.velocity import FOAW
+from zwidth.plotting.table import SI_COLUMNS, stack
+from zwidth.simulation.behavior import describe_ending
 from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion
 from zwidth.simulation.simulate import Contact
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text
-from zwidth.words.errors import InputError
-from zwidth.words.formatting import format_wall, header
-from zwidth.words.quantities import HARDWARE, NOT_NEGATIVE, POSITIVE, Range
+from zwidth.units.formatting import format_wall, header
+from zwidth.units.quantities import HARDWARE, NOT_NEGATIVE, POSITIVE, Range
 
 MAX_PERIODS = 1_000_000
 """Largest duration of a motion in sampling periods."""
@@ -177,7 +177,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
             verdict = "" if linear is None else f" (linearly {'stable' if linear[k] else 'unstable'})"
             notes.append(f"{label}{verdict}: {ending}")
         table = stack(parts)
-        drawn = {"": figures.draw_motion, "_phase": figures.draw_phase_plane, "_energy": figures.draw_energy}
+        drawn = {"": plotting.draw_motion, "_phase": plotting.draw_phase_plane, "_energy": plotting.draw_energy}
         return Outcome(
             table=table,
             figures={addition: partial(draw, table) for addition, draw in drawn.items()},

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 from zarr.core.buffer.core import default_buffer_prototype
 from zarr.storage import LocalStore
 
+from zwidth.core.errors import StoreError
 from zwidth.sweep.files import read_or_empty
 from zwidth.sweep.store import Store
-from zwidth.words.errors import StoreError
 
 if TYPE_CHECKING:
     from zarr.abc.store import ByteRequest

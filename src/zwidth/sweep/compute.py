@@ -21,19 +21,19 @@ from typing import TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.blocks import map_blocks
-from zwidth.arrays.evaluate import Route
-from zwidth.loops.rigid.margins import margins_kernel
-from zwidth.loops.rigid.normalization import status_of_results
-from zwidth.loops.rigid.outermost_poles import area_poles, list_poles
-from zwidth.loops.rigid.passivity import margin_at_one_delay
-from zwidth.loops.rigid.pole_map import Area
-from zwidth.loops.rigid.response import decay_time
-from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.loops.rigid.row_limit import row_limits
+from zwidth.core.status import Status
+from zwidth.numerics.blocks import map_blocks
+from zwidth.numerics.evaluate import Route
+from zwidth.stability.rigid.dominant_pole_grid import Area
+from zwidth.stability.rigid.dominant_poles import area_poles, list_poles
+from zwidth.stability.rigid.margins import margins_kernel
+from zwidth.stability.rigid.normalization import status_of_results
+from zwidth.stability.rigid.passivity import margin_at_one_delay
+from zwidth.stability.rigid.ridge import alpha_max
+from zwidth.stability.rigid.step_response import decay_time
+from zwidth.stability.rigid.stiffness_limit import row_limits
 from zwidth.sweep.grid import Block
-from zwidth.words.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
-from zwidth.words.status import Status
+from zwidth.units.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 Columns: TypeAlias = list[np.ndarray]
 Leaves: TypeAlias = Sequence[np.ndarray]

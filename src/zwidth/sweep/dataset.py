@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zwidth.core.errors import StoreError, StoreExistsError
+from zwidth.io.files import temporary_sibling
 from zwidth.sweep.store import (
     CHECKSUM,
     Store,
@@ -22,10 +24,8 @@ from zwidth.sweep.store import (
     list_stores,
     silence_zarr,
 )
-from zwidth.words.errors import StoreError, StoreExistsError
-from zwidth.words.files import temporary_sibling
-from zwidth.words.formatting import header, to_cell
-from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
+from zwidth.units.formatting import header, to_cell
+from zwidth.units.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
 
 if TYPE_CHECKING:
     import xarray
@@ -136,7 +136,7 @@ _ORDER = (*VARIABLES, *OUTPUTS)
 
 
 def _rank_variable(name: str) -> int:
-    """Return the rank of a variable in the order of `words.quantities`; variables not listed there rank last."""
+    """Return the rank of a variable in the order of `units.quantities`; variables not listed there rank last."""
     return _ORDER.index(name) if name in _ORDER else len(_ORDER)
 
 

@@ -17,8 +17,8 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
+from zwidth.core.errors import InputError, format_install_command
 from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, Perform, describe_failure
-from zwidth.words.errors import InputError, format_install_command
 
 if TYPE_CHECKING:
     from distributed import Client

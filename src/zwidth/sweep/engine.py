@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from zwidth.config.sweep import SweepStudy
+from zwidth.core.errors import StoreError, StoreExistsError
 from zwidth.sweep.files import ELSEWHERE, list_differences, list_versions
 from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, run_in_workers, try_job
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.store import SUFFIX, Store, create_store
-from zwidth.words.errors import StoreError, StoreExistsError
-from zwidth.words.formatting import describe
+from zwidth.units.formatting import describe
 
 _SHOWN_DIFFERENCES = 10  # largest number of differing configuration keys that one message lists
 

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from zwidth import __version__
-from zwidth.words.errors import InputError, StoreBusyError
-from zwidth.words.files import REMEDIES
+from zwidth.core.errors import InputError, StoreBusyError
+from zwidth.io.files import REMEDIES
 
 _FATAL_ERRORS = frozenset(list(REMEDIES)[:6])  # system error codes that would also affect every further write
 _PACKAGES = ("jax", "jaxlib", "numpy")  # packages whose version can change the last digit of a result

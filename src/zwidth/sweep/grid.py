@@ -18,8 +18,8 @@ import numpy as np
 
 from zwidth.config.device_table import LABEL
 from zwidth.config.sweep import SweepStudy
-from zwidth.loops.rigid.normalization import normalize
-from zwidth.words.quantities import PARAMETERS, WALL, Family
+from zwidth.stability.rigid.normalization import normalize
+from zwidth.units.quantities import PARAMETERS, WALL, Family
 
 
 class Block(NamedTuple):

@@ -23,16 +23,16 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from zwidth.analysis.scene import Scene
 from zwidth.config.sweep import SweepStudy
-from zwidth.loops.rigid.normalization import wall_status
-from zwidth.scenes.scene import Scene
+from zwidth.core.errors import InputError, ZwidthError
+from zwidth.core.status import Status
+from zwidth.stability.rigid.normalization import wall_status
 from zwidth.sweep.files import is_fatal, read_or_empty
 from zwidth.sweep.grid import SceneBlock
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store
-from zwidth.words.errors import InputError, ZwidthError
-from zwidth.words.quantities import OUTPUTS, STATUS_OF, Family
-from zwidth.words.status import Status
+from zwidth.units.quantities import OUTPUTS, STATUS_OF, Family
 
 # Function that computes and writes one chunk, given the path of the store, the family and the index of the chunk. It is
 # `perform`, or a failing replacement in tests.

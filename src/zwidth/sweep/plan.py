@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from zwidth.config.sweep import SweepStudy
+from zwidth.core.errors import ResourceError
 from zwidth.sweep.files import ELSEWHERE, check_folder, find_existing
 from zwidth.sweep.grid import Grid
-from zwidth.words.errors import ResourceError
-from zwidth.words.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
+from zwidth.units.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 MEMORY = 2**28  # default memory for the computation of one chunk, in bytes, in addition to `IDLE_MEMORY`
 IDLE_MEMORY = 500 * 2**20  # memory of a worker before its first chunk, in bytes: Python, JAX and compiled kernels

@@ -26,12 +26,12 @@ from typing import Any
 import numpy as np
 
 from zwidth.config.sweep import SweepStudy
+from zwidth.core.errors import InputError, StoreError, format_install_command
+from zwidth.core.status import Status
+from zwidth.io.files import remove_quietly, temporary_sibling, write_atomically
 from zwidth.sweep.files import hash_json, read_or_empty
 from zwidth.sweep.plan import Plan, Task, restore_plan
-from zwidth.words.errors import InputError, StoreError, format_install_command
-from zwidth.words.files import remove_quietly, temporary_sibling, write_atomically
-from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
-from zwidth.words.status import Status
+from zwidth.units.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 
 SUFFIX = ".zarr"  # suffix of the name of a store, which is a folder
 FORMAT = 2  # format version of new stores

@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner
 
 import zwidth
+from zwidth.app.verdict import spell_passivity
 from zwidth.cli.commands import cli
-from zwidth.pages.verdict import spell_passivity
 
 DEVICE = ["--mass", "100 g", "--damping", "10", "--delay", "1 periods"]
 RATE = ["--rate", "1 kHz"]

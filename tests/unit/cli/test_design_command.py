@@ -9,8 +9,8 @@ from click.testing import CliRunner
 from required_values import find_required
 
 import zwidth
+from zwidth.analysis.optimization import RequiredValue
 from zwidth.cli.commands import cli
-from zwidth.scenes.stiffest import RequiredValue
 
 DEVICE = ["--mass", "100 g", "--damping", "10", "--rate", "1 kHz", "--delay", "0.5 ms"]
 

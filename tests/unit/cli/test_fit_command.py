@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
-from zwidth.fitting.buzz import fit_buzz
+from zwidth.identification.onset_fit import fit_buzz
 from zwidth.studies.document import load_config
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"

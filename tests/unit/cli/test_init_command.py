@@ -6,8 +6,8 @@ import pytest
 from click.testing import CliRunner
 
 from zwidth.cli.commands import cli, find_examples
+from zwidth.core.errors import InputError
 from zwidth.studies.document import load_config
-from zwidth.words.errors import InputError
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 EXAMPLES = sorted(file.stem for file in CONFIGS.glob("*.yaml"))

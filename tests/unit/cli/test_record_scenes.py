@@ -10,10 +10,10 @@ from loop_logs import make_knob
 
 import zwidth
 from zwidth.cli import cli
-from zwidth.fitting.device_fit import RivalDevice
-from zwidth.fitting.words import format_rival
+from zwidth.identification.device_fit import RivalDevice
+from zwidth.identification.fit_report import format_rival
 from zwidth.studies.document import load_config
-from zwidth.words.unit_system import LINEAR, ROTARY
+from zwidth.units.unit_system import LINEAR, ROTARY
 
 pytestmark = pytest.mark.usefixtures("fitted_once", "unpainted")
 KNOB = make_knob(4, samples=1000)

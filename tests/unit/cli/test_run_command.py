@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
-from zwidth.words.formatting import plain, round_conservatively, with_unit
+from zwidth.units.formatting import plain, round_conservatively, with_unit
 
 HEAD = "version: 1\nname: small\n"
 STUDY = "studies: [{kind: recommend, name: best, stiffness_fraction: %s}]\n"

@@ -5,8 +5,8 @@ import os
 import pytest
 from sweeping import main_of
 
+from zwidth.app.printing import format_row, print_lines
 from zwidth.cli.commands import cli
-from zwidth.pages.words import format_row, print_lines
 
 LINES = [
     format_row("margins", "gain 12.19, phase 16.73 degrees at 17.7 Hz"),

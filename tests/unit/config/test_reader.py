@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import yaml
 
+from zwidth.analysis.scene import Scene
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, normalized_wall
-from zwidth.parts.checks import Span
-from zwidth.scenes.scene import Scene
+from zwidth.model.checks import Span
 from zwidth.studies.document import KINDS, Config, config_json_schema, load_config
 from zwidth.studies.ridge import PassivityStudy, RidgeStudy
 

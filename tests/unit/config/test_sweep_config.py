@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from zwidth.config.fields import ConfigFileError
-from zwidth.loops.rigid.normalization import normalize
+from zwidth.stability.rigid.normalization import normalize
 from zwidth.studies.document import Config, config_json_schema
 from zwidth.sweep.grid import Grid
 

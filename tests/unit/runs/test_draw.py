@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from sweeping import config_of, main_of, run_sweeps, study
 
 import zwidth
-from zwidth.figures import draw_curves, draw_outlines, draw_plane
+from zwidth.core.errors import InputError, StoreError
+from zwidth.plotting import draw_curves, draw_outlines, draw_plane
 from zwidth.runs import draw
 from zwidth.runs.draw import draw_stores
 from zwidth.sweep.dataset import open_dataset
-from zwidth.words.errors import InputError, StoreError
 
 PLANE = {
     "alpha": {"linear": {"start": 0.01, "stop": 1.0, "num": 15}},

@@ -6,13 +6,13 @@ import pytest
 from matplotlib.image import imread
 from sweeping import config_of, main_of, run_sweeps, study
 
-from zwidth.figures import draw_curves, draw_plane
-from zwidth.figures.grid import name_panels
-from zwidth.figures.style import figure_of, new_figure
+from zwidth.core.errors import InputError
+from zwidth.plotting import draw_curves, draw_plane
+from zwidth.plotting.grid import name_panels
+from zwidth.plotting.style import figure_of, new_figure
 from zwidth.runs import draw
 from zwidth.runs.draw import draw_stores
 from zwidth.sweep.dataset import open_dataset
-from zwidth.words.errors import InputError
 
 AXES = {
     "mass": [0.1, 0.2, 0.5],

@@ -5,8 +5,8 @@ import pytest
 from sweeping import config_of, run_sweeps, study
 
 from zwidth import Device, LowPass, Scene, Timing, is_passive, is_stable
-from zwidth.figures import draw_outlines, draw_plane
-from zwidth.figures.grid import prepare
+from zwidth.plotting import draw_outlines, draw_plane
+from zwidth.plotting.grid import prepare
 from zwidth.runs.draw import make_edges
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.store import Store

@@ -9,7 +9,7 @@ from PIL import Image
 
 import zwidth
 from zwidth.cli.commands import cli
-from zwidth.figures import style
+from zwidth.plotting import style
 from zwidth.studies.responses import draw
 
 SCENE = {"mass": 0.1, "damping": 10, "period": 1e-3, "delay": 1e-3}

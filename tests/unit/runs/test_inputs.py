@@ -8,9 +8,9 @@ import pytest
 from run_folders import record_of
 
 import zwidth
+from zwidth.core.errors import StoreError, StoreExistsError
 from zwidth.runs.record import gather_inputs
 from zwidth.sweep.dataset import open_dataset
-from zwidth.words.errors import StoreError, StoreExistsError
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

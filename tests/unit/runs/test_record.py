@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from run_folders import record_of, states
 
+from zwidth.app.report.page import write_report
+from zwidth.core.errors import InputError, StoreError, StoreExistsError
 from zwidth.runs import run
-from zwidth.runs.report.page import write_report
-from zwidth.words.errors import InputError, StoreError, StoreExistsError
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

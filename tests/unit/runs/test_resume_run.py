@@ -11,8 +11,8 @@ import pytest
 from run_folders import BOTH, contents, record_of, states
 from sweeping import chunk_file, flip
 
+from zwidth.core.errors import StoreError
 from zwidth.runs import run
-from zwidth.words.errors import StoreError
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

@@ -11,11 +11,11 @@ import pytest
 from run_folders import BOTH, SMALL, contents, record_of, states
 
 import zwidth
+from zwidth.core.errors import ConfigError, InputError, StoreError, StoreExistsError
 from zwidth.runs import run
 from zwidth.studies import Outcome, load_config
 from zwidth.studies.boundary import MapStudy
 from zwidth.sweep.dataset import verify
-from zwidth.words.errors import ConfigError, InputError, StoreError, StoreExistsError
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

@@ -8,7 +8,7 @@ from tolerances import SIMULATED_AGAIN
 
 import zwidth
 from zwidth import MotionKind, Status
-from zwidth.words.errors import InputError
+from zwidth.core.errors import InputError
 
 TIMING = zwidth.Timing(period=1e-3, delay=1e-3)
 SCENE = zwidth.Scene(zwidth.Device(mass=0.1, damping=2.0), TIMING)

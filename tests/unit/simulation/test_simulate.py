@@ -9,7 +9,7 @@ from any_loop import velocity_polynomials
 from tolerances import SIMULATED_AGAIN
 
 import zwidth
-from zwidth.words.errors import InputError, ResourceError
+from zwidth.core.errors import InputError, ResourceError
 
 SCENE = zwidth.Scene(zwidth.Device(mass=0.1, damping=2.0), zwidth.Timing(period=1e-3, delay=1.3e-3))
 FIGURES = ("amplitude", "frequency", "penetration", "bounces", "impact_velocity", "energy_given", "outcome", "status")

@@ -5,12 +5,12 @@ import pytest
 from required_values import find_required
 
 import zwidth
-from zwidth import figures
-from zwidth.figures.table import SI_COLUMNS
+from zwidth import plotting
+from zwidth.core.errors import ConfigError
+from zwidth.plotting.table import SI_COLUMNS
 from zwidth.studies.design import DesignStudy
 from zwidth.studies.document import load_config
-from zwidth.words.errors import ConfigError
-from zwidth.words.formatting import with_unit
+from zwidth.units.formatting import with_unit
 
 DEVICE = {"mass": 0.1, "damping": 10.0, "rate": 1000, "delay": 1e-3}
 FILTERED = {**DEVICE, "velocity": {"kind": "low_pass", "cutoff": 100}}
@@ -103,7 +103,7 @@ def test_the_figure_marks_what_is_needed_on_the_curve():
     curve = {"parameter": np.array(["damping"] * 2), "value_N_s_per_m": np.array([1.0, 50.0])}
     curve[SI_COLUMNS[0]] = np.array([15e3, 45e3])
     borne = outcome.table | {"stable_share": np.array([0.9996, 1.0])}
-    assert list(figures.draw_requirement(curve, borne, ax)) == [ax]
+    assert list(plotting.draw_requirement(curve, borne, ax)) == [ax]
     words = [text.get_text() for text in ax.get_legend().get_texts()]
     assert [text.partition(": ")[2] for text in words[:2]] == [
         "stable on 99.9 % of devices",

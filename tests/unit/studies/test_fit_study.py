@@ -12,8 +12,8 @@ from fitted_once import fitting_once
 
 import zwidth
 from zwidth.config.reader import read_mapping
+from zwidth.core.errors import StoreError
 from zwidth.studies.document import Config, load_config
-from zwidth.words.errors import StoreError
 
 ROOT = Path(__file__).resolve().parents[3]
 WALLS = [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zwidth.studies import Config, load_config
-from zwidth.words.formatting import header
+from zwidth.units.formatting import header
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 WORDS = {"fitted_to", "label", "curve", "kind", "delay_model", "estimate", "parameter", "enough", "status", "piece"}

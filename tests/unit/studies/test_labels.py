@@ -9,11 +9,11 @@ import pytest
 
 import zwidth
 from zwidth.config.device_table import files_relative_to, read_table
-from zwidth.figures import style
+from zwidth.plotting import style
 from zwidth.runs.draw import draw_stores
 from zwidth.studies.outcome import csv_text
 from zwidth.sweep.dataset import to_csv
-from zwidth.words.formatting import from_cell, to_cell
+from zwidth.units.formatting import from_cell, to_cell
 
 BAD = ["$a_$", "$x", "_hidden", r"\frac{$", r"$\nothing{$ and $", "=1+1", "K_max $$", "a\\$b_$^$"]
 DEVICE = {"mass": 0.1, "damping": 10, "rate": "1 kHz", "delay": "1 periods"}

@@ -5,12 +5,12 @@ import pytest
 from pydantic import ValidationError
 
 import zwidth
-from zwidth import figures
+from zwidth import plotting
 from zwidth.config.fields import list_problems
 from zwidth.config.values import read_in_units
-from zwidth.figures.style import style_sheet
+from zwidth.plotting.style import style_sheet
 from zwidth.studies.limit_cycle import LimitCycleStudy
-from zwidth.words.unit_system import ROTARY
+from zwidth.units.unit_system import ROTARY
 
 DEVICE = {"mass": 0.1, "damping": 0.1, "period": 1e-3, "delay": "1 periods"}
 SCENE = zwidth.Scene(zwidth.Device(0.1, 0.1), zwidth.Timing(period=1e-3, delay=1e-3))
@@ -108,7 +108,7 @@ def test_a_curve_without_a_point_is_named_and_explained():
         "outcome": np.full((1, 2, 3), 2), "linearly_stable": np.ones((1, 2, 3), bool),
     }  # fmt: skip
     known = {name: np.asarray(values) for name, values in arrays.items()}
-    upper, lower = figures.draw_limit_cycle_curves(known, {}, (1e-7, 1e-3), "stiffness_N_per_m")
+    upper, lower = plotting.draw_limit_cycle_curves(known, {}, (1e-7, 1e-3), "stiffness_N_per_m")
     assert [text.get_text() for text in upper.texts] == ["at rest everywhere:\n$K = 5$ kN/m"]
     assert not lower.texts
     (legend,) = upper.figure.legends

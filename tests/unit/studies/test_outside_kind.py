@@ -10,8 +10,8 @@ from sweeping import main_of
 
 import zwidth
 from zwidth.config.values import DeltaAxis
+from zwidth.core.errors import ConfigError, StoreError
 from zwidth.studies import ComputedStudy, Outcome, document, register
-from zwidth.words.errors import ConfigError, StoreError
 
 
 class RatioStudy(ComputedStudy):

@@ -7,12 +7,12 @@ import pytest
 from matplotlib.path import Path as Polygon
 
 import zwidth
-from zwidth import figures
-from zwidth.figures.table import SI_COLUMNS, select
+from zwidth import plotting
+from zwidth.plotting.table import SI_COLUMNS, select
 from zwidth.studies.boundary import BoundaryStudy, CompareStudy
 from zwidth.studies.design import FiltersStudy
 from zwidth.studies.responses import RecommendStudy
-from zwidth.words.formatting import with_unit
+from zwidth.units.formatting import with_unit
 
 DEVICE = {"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": "1 periods"}
 ISLANDS = {**DEVICE, "velocity": {"kind": "windowed_difference", "samples": 24}}
@@ -154,4 +154,4 @@ def test_figures_of_filters(filters):
     np.testing.assert_allclose(
         line.get_ydata(), select(filters.table, estimate="low_pass", damping_N_s_per_m=10.0)[SI_COLUMNS[0]] / 1e3
     )
-    assert figures.draw_filters(filters.table, both) is not None
+    assert plotting.draw_filters(filters.table, both) is not None

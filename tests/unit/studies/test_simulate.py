@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth import figures
+from zwidth import plotting
 from zwidth.config.scenes import PhysicalWall
-from zwidth.figures.table import select
+from zwidth.plotting.table import select
 from zwidth.studies.simulate import SimulateStudy
 
 DEVICE = {"mass": 0.1, "damping": 0.1, "period": 1e-3, "delay": "1 periods"}
@@ -184,7 +184,7 @@ def test_a_motion_without_end_does_not_hide_the_others():
     walls = [{"stiffness": 5e3, "virtual_damping": 20}, {"stiffness": 40e3}]
     table = study_of(walls=walls, start_position=1e-4, duration="300 periods").compute(None, True).table
     assert np.abs(table["position_m"]).max() > 1.0
-    position, _ = figures.draw_motion(table)
+    position, _ = plotting.draw_motion(table)
     low, high = position.get_ylim()
     # 0.1 mm, in µm: eight times as far is shown.
     assert -1000 < low < -500 < 500 < high < 1000

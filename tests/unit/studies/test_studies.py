@@ -8,15 +8,15 @@ import pytest
 
 import zwidth
 from zwidth.config.scenes import PhysicalScene
-from zwidth.figures.table import stack
-from zwidth.loops.rigid.passivity import passive_stiffness_slope
-from zwidth.loops.rigid.poles import radius_by_companion
-from zwidth.parts.checks import read_texts
+from zwidth.core.status import Status
+from zwidth.model.checks import read_texts
+from zwidth.plotting.table import stack
+from zwidth.stability.rigid.passivity import passive_stiffness_slope
+from zwidth.stability.rigid.poles import radius_by_companion
 from zwidth.studies.boundary import BoundaryStudy, MapStudy, tabulate_boundary, tabulate_stable_intervals
 from zwidth.studies.outcome import csv_text
 from zwidth.studies.responses import RecommendStudy, StepStudy
 from zwidth.studies.ridge import PassivityStudy, RidgeStudy, ridge_table, slope_table, trace_unit_outline
-from zwidth.words.status import Status
 
 DELTAS = np.array([0.0, 0.5, 2.0, 2.5, 4.0])
 DELAYS = np.array([0.0, 0.25, 0.9, 1.0, 4.0])

@@ -7,9 +7,9 @@ import pytest
 from sweeping import main_of
 
 import zwidth
+from zwidth.core.errors import ConfigError
 from zwidth.studies.document import load_config
 from zwidth.studies.ridge import WorkspaceStudy
-from zwidth.words.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

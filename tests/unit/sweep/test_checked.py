@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from sweeping import chunk_file, config_of, cut, flip, main_of, run_sweeps, study, values_of
 
+from zwidth.core.errors import StoreError
 from zwidth.sweep.dataset import open_dataset, verify
-from zwidth.words.errors import StoreError
 
 AXES = {"alpha": [0.1, 0.3, 0.9], "beta": [-0.1, 0.2, 0.5], "delta": [0.1, 1.0], "d": [0, 1]}
 

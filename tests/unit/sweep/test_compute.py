@@ -6,9 +6,9 @@ from sweeping import study, sweep_of
 
 import zwidth
 from methods.problems import exact_radius
+from zwidth.core.status import Status
 from zwidth.sweep.compute import compute_block
 from zwidth.sweep.grid import Grid
-from zwidth.words.status import Status
 
 OUTPUTS = ("spectral_radius", "margin")
 

@@ -21,7 +21,7 @@ from chunks import (
 )
 from sweeping import assert_same, config_of, config_of_everything, cut, flags, main_of, run_sweeps, study
 
-from zwidth.words.errors import InputError
+from zwidth.core.errors import InputError
 
 # Closing a cluster leaves sockets to the garbage collector, which pytest then reports in whatever test runs next.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")

@@ -7,9 +7,9 @@ import pytest
 import xarray
 from sweeping import config_of, run_sweeps, study
 
+from zwidth.core.errors import StoreError, StoreExistsError
 from zwidth.sweep import dataset
 from zwidth.sweep.dataset import open_dataset, to_csv, to_netcdf
-from zwidth.words.errors import StoreError, StoreExistsError
 
 AXES = {"devices": {"label": ["a", "b"], "mass": [0.1, 1], "damping": [1, 2]}, "rate": 1000, "stiffness": [10, 20, 1e6]}
 

@@ -13,12 +13,12 @@ import yaml
 from sweeping import assert_same, config_of, main_of, run_sweeps, study, values_of
 
 import zwidth
+from zwidth.core.errors import InputError, StoreBusyError
 from zwidth.sweep import files
 from zwidth.sweep.dataset import verify
 from zwidth.sweep.files import lock_folder
 from zwidth.sweep.jobs import perform
 from zwidth.sweep.store import Store
-from zwidth.words.errors import InputError, StoreBusyError
 
 # Holds the folder until it is killed, and says when it does.
 HOLD = """

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sweeping import config_of, study, sweep_of
 
+from zwidth.core.errors import ResourceError
 from zwidth.runs import plan_run
 from zwidth.sweep.plan import MEMORY, FamilyPlan, Plan, Task, check_resources, chunk_shape, make_plan, restore_plan
-from zwidth.words.errors import ResourceError
 
 HUGE = {
     "alpha": {"linear": {"start": 0, "stop": 1, "num": 100_000}},

@@ -8,11 +8,11 @@ from sweeping import config_of, run_sweeps, study
 import zwidth
 from zwidth.config.fields import ConfigFileError
 from zwidth.config.sweep import SweepStudy
+from zwidth.core.status import Status
 from zwidth.runs.draw import draw_stores
 from zwidth.studies.document import Config
 from zwidth.sweep.dataset import open_dataset, to_csv, to_netcdf, verify
 from zwidth.sweep.jobs import perform
-from zwidth.words.status import Status
 
 CUTOFFS, DAMPINGS = [10.0, 30.0, 100.0], [0.0, 10.0]
 STIFFNESS, VIRTUAL = np.linspace(100, 15_000, 23), np.linspace(-5, 60, 14)

@@ -21,11 +21,11 @@ from sweeping import (
 )
 
 import zwidth
+from zwidth.core.errors import InputError, StoreError
+from zwidth.core.status import Status
 from zwidth.sweep.dataset import open_dataset, verify
 from zwidth.sweep.engine import refuse_changes
 from zwidth.sweep.store import Store
-from zwidth.words.errors import InputError, StoreError
-from zwidth.words.status import Status
 
 
 @pytest.fixture(scope="module")

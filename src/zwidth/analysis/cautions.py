@@ -1,0 +1,118 @@
+"""Cautions about a recommended wall: small margins, slow decay and destabilizing grasps, each with its remedy.
+
+A remedy is an option of ``zwidth recommend``, i.e. a different requirement, for which the recommended wall has no such
+problem. Its text states this wall and the loss of stiffness.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from zwidth.analysis.assessment import Assessment, assess, round_margin
+from zwidth.analysis.wall_search import COARSE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN, Wanted, choose_wall
+from zwidth.core.status import Status
+from zwidth.model.device import Device
+from zwidth.model.grasps import list_grasps
+from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.units.formatting import format_wall, plain, with_unit
+
+# Limits of acceptable walls. A recommended wall that violates one of these limits has a caution.
+LEAST_PHASE_MARGIN = 10.0  # smallest phase margin, in degrees
+LEAST_GAIN_MARGIN = 1.3  # smallest gain margin, a factor on K and B together
+LEAST_DELAY_MARGIN = 0.1  # smallest delay margin, in sampling periods
+LONGEST_TIME_CONSTANT = 1.0  # largest time constant of the decay, in s
+
+
+def find_thin(verdict: Assessment, period: float) -> list[str]:
+    """Return texts that state the margins of a stable wall that are too small, and its time constant if too long.
+
+    Args:
+        verdict: assessment of the wall.
+        period: sampling period in s, the unit of the limit of the delay margin.
+    """
+    gain, phase, late = (round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay"))
+    constant = verdict.time_constant
+    thin = {
+        f"phase margin {plain(phase, 2)} deg": phase < LEAST_PHASE_MARGIN,
+        f"gain margin {plain(gain, 3)}": gain > 0 and abs(math.log(gain)) < math.log(LEAST_GAIN_MARGIN),
+        f"delay margin {with_unit(late, 's', 2)}": late < LEAST_DELAY_MARGIN * period,
+        f"time constant {with_unit(constant, 's', 2)}": constant > LONGEST_TIME_CONSTANT,
+    }
+    return [words for words, short in thin.items() if short]
+
+
+def list_cautions(recommendation: Any) -> tuple[str, ...]:
+    """Return the cautions about the wall of a `Recommendation`, one sentence each; empty if there are none."""
+    scene, verdict, wanted, cautions = recommendation.scene, recommendation.verdict, recommendation.wanted, []
+    if thin := find_thin(verdict, scene.timing.period):
+        rings = thin[0].startswith("phase") and verdict.frequency > 0 and math.isfinite(verdict.time_constant)
+        after = f": rings for {with_unit(verdict.time_constant, 's', 2)}" if rings else ""
+        advice = _advise(
+            recommendation,
+            _list_margins(wanted),
+            lambda improved: not find_thin(assess(improved), scene.timing.period),
+            "no other requirement avoids this; more damping of the device or less delay may",
+        )
+        cautions.append(f"{', '.join(thin)}{after}; {advice}")
+    if unstable := [name for name, stable in recommendation.grasps.items() if not stable]:
+        options = {"--grasps all": wanted._replace(grasps="all")}
+        if float(scene.device.damping) > 0 and not find_unsupported_reason(**vars(scene.device)):
+            options["--passive"] = Wanted(passive=True, beyond_safe=wanted.beyond_safe)
+        advice = _advise(
+            recommendation,
+            options,
+            lambda improved: all(judge_grasps(improved).values()),
+            "no wall found that is stable in every grasp",
+        )
+        cautions.append(f"unstable in the hand ({'; '.join(unstable)}); {advice}")
+    return tuple(cautions)
+
+
+def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
+    """Return other requirements that may yield larger margins; the keys are the command-line options for them."""
+    phase = max(DEFAULT_PHASE_MARGIN, wanted.phase_margin or 0.0)
+    gain = max(DEFAULT_GAIN_MARGIN, wanted.gain_margin or 0.0)
+    by_phase, by_gain = f"--phase-margin {phase:g}", f"--gain-margin {gain:g}"
+    tried = {by_phase: wanted._replace(phase_margin=phase)}
+    tried[f"{by_phase} {by_gain}"] = wanted._replace(phase_margin=phase, gain_margin=gain)
+    if wanted.passive:
+        tried[f"{by_phase} without --passive"] = wanted._replace(phase_margin=phase, passive=False)
+    defaults = Wanted.check(None, None, None, False, wanted.beyond_safe, wanted.grasps)
+    return tried | {"without options for margins": defaults}
+
+
+def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[Any], bool], otherwise: str) -> str:
+    """Return a text with the first option that solves a problem of the wall, the new wall and its loss of stiffness.
+
+    Args:
+        recommendation: the recommendation whose wall has the problem.
+        options: requirements to try, by the text of the option.
+        accepts: function that returns True if the wall of a scene does not have the problem.
+        otherwise: text to return if no option solves the problem.
+    """
+    for words, wanted in options.items():
+        scene = recommendation.scene
+        wall = choose_wall(scene, wanted, recommendation.stiffest, recommendation.stiffness, COARSE)
+        if wall.status == Status.OK and accepts(scene.replace(stiffness=wall.stiffness, virtual_damping=wall.damping)):
+            ratio = wall.stiffness / recommendation.stiffness
+            cost = f"costs {max(100.0 * (1.0 - ratio), 0.1):.2g} % of the stiffness"
+            cost = cost if ratio <= 1.0 else f"{plain(ratio, 3)} times the stiffness"
+            return f"use recommend {words}: {format_wall(wall.stiffness, wall.damping, scene.unit_system)} ({cost})"
+    return otherwise
+
+
+def judge_grasps(scene: Any) -> dict[str, bool]:
+    """Return a dictionary that maps each reference grasp to True if the wall of the scene is stable in it.
+
+    If the scene has an operator, the entry "released" is the stability without the operator.
+    """
+    if not isinstance(scene.device, Device):
+        return {}
+    grasps = list_grasps(scene.unit_system.rotary)
+    hands = [*grasps, *([("released", None)] if scene.operator is not None else [])]
+    labels: dict[str, bool] = {}
+    for name, grasp in hands:
+        labels[name] = labels.get(name, True) and bool(scene.replace(operator=grasp).is_stable())
+    return labels

@@ -1,0 +1,102 @@
+"""The public class `Scene`: device, timing, velocity estimate, operator and wall, with all analyses as methods.
+
+The parts are checked in `zwidth.analysis.base`; the analyses are in `zwidth.analysis.walls` (one wall), `stiffest`
+(optimal walls) and `recommendation`. This module adds the stability boundary, the stable region and the simulation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from zwidth.analysis.base import WallSI, wrap_methods
+from zwidth.analysis.recommendation import SceneAdvice
+from zwidth.core.types import ArrayLike
+from zwidth.core.xp import is_traced, namespace
+from zwidth.numerics.evaluate import as_float64
+from zwidth.simulation.simulate import simulate
+from zwidth.stability.linear.regions import Outline
+from zwidth.units.display import ResultList
+
+
+@dataclass(frozen=True, repr=False)
+class Scene(SceneAdvice):
+    """A control loop that renders a virtual wall: device, timing, wall, velocity estimate and operator.
+
+    Args:
+        device: mass and damping, rigid or with a coupling, modes and an actuator; or a linear system; or a measured
+            frequency response.
+        timing: sampling period and delay.
+        wall: the wall that `zwidth.assess` evaluates, and the default wall of the methods below. It may be omitted.
+        velocity: velocity estimate; the backward difference by default.
+        operator: the hand that holds the device; None for a released device.
+        safe_limit: stiffest wall that measurements of the device support, usually set by a fit. `recommend` respects
+            it; stability and maximum stiffness do not depend on it.
+
+    Numerics:
+        Parameters and walls may be values that JAX traces. Inside ``jit``, ``vmap`` and ``grad``, `max_stiffness` works
+        for every scene. For a rigid scene with the backward difference `boundary`, `is_passive`, `is_stable`,
+        `margins`, `passivity_margin`, `poles` (except with a traced delay) and `spectral_radius` work as well. All
+        other methods raise `InputError` for traced values.
+
+    Example:
+        >>> import zwidth
+        >>> device, timing = zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3, delay=1e-3)
+        >>> scene = zwidth.Scene(device, timing, velocity=zwidth.LowPass(cutoff=100))
+        >>> scene.is_stable(10e3, [5, 40])
+        array([False,  True])
+    """
+
+    def boundary(self, omega: ArrayLike) -> WallSI:
+        """Return the walls that have a pole pair on the unit circle at a given frequency.
+
+        Args:
+            omega: angular frequency in rad/s, between 0 and the Nyquist frequency ``pi/T``.
+
+        Returns:
+            ``stiffness`` in N/m and ``virtual_damping`` in N s/m; NaN for other frequencies.
+        """
+        w = (omega if is_traced(omega) else as_float64("omega", omega)) * self.timing.period
+        self._check_traceable(w, *self.units)
+        inside, units = (w > 0) & (w < np.pi), self.units
+        alpha, beta = self.loop.critical_walls(namespace(w).where(inside, w, 1.0))
+        walls = alpha * units.stiffness, beta * units.virtual_damping
+        return WallSI(*(namespace(inside, part).where(inside, part, np.nan)[()] for part in walls))
+
+    def stable_region(self) -> list[Outline]:
+        """Return the closed boundary curves (outlines) of the set of stable walls, the largest first.
+
+        Returns:
+            A list of outlines with ``stiffness`` in N/m and ``virtual_damping`` in N s/m; ``hole`` is True if unstable
+            walls lie inside, ``island`` if the outline belongs to one of the `islands`.
+        """
+        units = self.units
+        return ResultList(
+            Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, *piece[2:])
+            for piece in self.loop.outlines()
+        )
+
+    simulate = simulate
+    """Method that calls `zwidth.simulate` with this scene and all other arguments."""
+
+
+# Methods that work inside jit, vmap and grad: all for a rigid scene with the backward difference; for other scenes
+# only `max_stiffness` and the methods that convert units or replace parameters.
+TRACEABLE = (
+    "boundary",
+    "is_passive",
+    "is_stable",
+    "margins",
+    "max_stiffness",
+    "normalize_walls",
+    "parameters",
+    "passivity_margin",
+    "poles",
+    "replace",
+    "spectral_radius",
+    "to_si",
+)
+# Do not wrap the two methods in ``but``: both are traceable and return numbers without units, so a wrapper has no
+# effect but would slow down calls for single walls.
+wrap_methods(Scene, traceable=TRACEABLE, but=("is_stable", "normalize_walls"))

@@ -1,0 +1,332 @@
+"""Search for the stiffest wall of a scene that satisfies requirements on its margins.
+
+The *slack* of a requirement is the relative excess over it: 0 at the limit, negative if the requirement is violated, -1
+for an unstable wall. The slack of a stiffness K is the smallest slack of all requirements with the best damping B. The
+search brackets the largest K with nonnegative slack by steps on log K, and then finds the zero of the slack by false
+position (`numerics.root_finding.false_position`). The active requirement of a wall is the one that excludes every
+stiffer wall. Grasps are models of a hand on the device; the *safe limit* bounds K and B to walls that measurements of
+the device support.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from zwidth.analysis.optimization import (
+    SceneOptima,
+    StiffestWall,
+    choose_damping,
+    explain_missing,
+    find_connected_dampings,
+)
+from zwidth.core.errors import InputError, check_choice
+from zwidth.core.status import Status
+from zwidth.model.device import Device
+from zwidth.model.grasps import list_grasps
+from zwidth.model.safe_limit import SafeLimit, reserve_damping
+from zwidth.numerics.root_finding import false_position, find_global_minimum
+from zwidth.units.parsing import to_float
+from zwidth.units.quantities import FRACTION, RECOMMENDED_SHARE, Range
+
+# Requirements that apply if the user gives none; docs/guides/my-device.md gives the reasons for these values.
+DEFAULT_PHASE_MARGIN = 30.0  # smallest phase margin, in degrees
+DEFAULT_GAIN_MARGIN = 2.0  # smallest gain margin, a factor on K and B together; equals 6 dB
+
+SAMPLES = 18  # values of B per stiffness; a weakly damped device is passive only in a small part of its stable range
+NEAR = 5.0  # ratio of the tolerance of the best B to that of K; B may be less accurate, because its optimum is flat
+LEAST = 1e-9  # smallest stiffness tried, relative to the largest allowed one
+STEP_DOWN = 0.25  # factor by which K is lowered until a wall satisfies the requirements
+STEP_DOWN_UNSTABLE = 0.95  # the same for a device unstable without a wall, whose stable walls have a lower end in K
+GRASP_GAIN = 1.1  # factor on K and B with which a wall must be stable in a required grasp, because grasps vary
+GRASP_GUESS = 0.95  # factor on K for the initial guess if a grasp destabilizes the wall
+FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which is usually close
+WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
+COARSE = 1e-3  # half-width of the bracket of log K for alternatives, whose gain or cost is printed with 2 or 3 digits
+MAX_STEPS = 60  # root-finding steps on log K, bisections included; 8 usually suffice
+
+RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
+_EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
+OTHER_DAMPING = "B differs from that of the stiffest wall, because with that B this share of K_max is unstable"
+
+Slack = Callable[[float, Any], dict[str, np.ndarray]]
+Grasps: TypeAlias = Literal["all", "soft", "none"]
+
+
+class Wanted(NamedTuple):
+    """Requirements on a wall; None for no requirement."""
+
+    stiffness_fraction: float | None = None  # upper limit of K/K_max
+    gain_margin: float | None = None  # lower limit, as a factor
+    phase_margin: float | None = None  # lower limit, in degrees
+    passive: bool = False  # require passivity
+    beyond_safe: bool = False  # ignore the safe limit of the scene
+    grasps: Grasps = "none"  # require stability in these grasps of `zwidth.reference_grasps`
+
+    @classmethod
+    def check(
+        cls,
+        stiffness_fraction: float | None,
+        gain_margin: float | None,
+        phase_margin: float | None,
+        passive: bool,
+        beyond_safe: bool = False,
+        grasps: Grasps | None = None,
+    ) -> Wanted:
+        """Return the requirements after a check of the arguments of `recommend`, with defaults if none is given."""
+        ranges = {"stiffness_fraction": FRACTION, **RANGES}
+        limits = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
+        for name, value in limits.items():
+            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+            if value is not None and not (number and math.isfinite(to_float(value)) and ranges[name].holds(value)):
+                raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed, such as {_EXAMPLES[name]}")
+        switches = {"passive": passive, "beyond_safe": beyond_safe}
+        for name, value in switches.items():
+            if not isinstance(value, bool | np.bool_):
+                raise InputError(f"{name}: got {value!r}; True or False is needed")
+        if grasps is not None:
+            check_choice("grasps", grasps, ("all", "soft", "none"))
+        default = not passive and all(value is None for value in limits.values())
+        if default:
+            limits = dict(zip(limits, (RECOMMENDED_SHARE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN), strict=True))
+        return cls(
+            **limits,
+            passive=bool(passive),
+            beyond_safe=bool(beyond_safe),
+            grasps=grasps or ("soft" if default else "none"),
+        )
+
+    def spell(self, name: str) -> str:
+        """Return a text that describes the requirement ``name``, a field of `Wanted` or "safe_limit"."""
+        return {
+            "stiffness_fraction": f"{100.0 * (self.stiffness_fraction or 1.0):.4g} % of K_max",
+            "gain_margin": f"gain margin {self.gain_margin:g}" if self.gain_margin else "",
+            "phase_margin": f"{self.phase_margin:g} deg phase margin" if self.phase_margin else "",
+            "passive": "passivity",
+            "grasps": f"stability in {'the soft' if self.grasps == 'soft' else 'all six'} reference grasps",
+            "safe_limit": f"{100.0 * self.safe_share:.4g} % of the safe limit",
+        }[name]
+
+    @property
+    def safe_share(self) -> float:
+        """Upper limit of K as a fraction of the safe limit's stiffness."""
+        return self.stiffness_fraction or RECOMMENDED_SHARE
+
+
+class WallChoice(NamedTuple):
+    """The stiffest wall that satisfies the requirements, or the reason why none exists."""
+
+    stiffness: float  # in N/m; NaN if no wall exists
+    damping: float  # virtual damping in N s/m; NaN if no wall exists
+    limit: str  # active requirement: a field of `Wanted`, or "safe_limit"
+    status: Status
+    reason: str = ""  # reason why no wall exists
+    note: str = ""  # remark on the choice
+
+
+def list_grasped_scenes(scene: SceneOptima, wanted: Wanted) -> list[SceneOptima]:
+    """Return copies of the scene in each required grasp; if the scene has an operator, also one without operator."""
+    if not isinstance(scene.device, Device) or wanted.grasps == "none":
+        return []
+    pairs = list_grasps(scene.unit_system.rotary)
+    hands: list[Any] = [hand for name, hand in pairs if wanted.grasps == "all" or name.startswith(wanted.grasps)]
+    return [scene.replace(operator=hand) for hand in (*hands, *([None] if scene.operator is not None else []))]
+
+
+def measure_slack(scene: SceneOptima, wanted: Wanted, grasped: Sequence[SceneOptima] = ()) -> Slack:
+    """Return a function that computes the slack of each requirement for walls with K in N/m and B in N s/m.
+
+    The requirements are those on margins and passivity in ``wanted``, and stability in every scene of ``grasped``. The
+    slack of the latter is the modulus margin of the wall, so that a search for the largest slack prefers well-damped
+    walls.
+    """
+    device_damping = float(scene.device.damping)
+    reserve = 0.0 if wanted.beyond_safe else reserve_damping(scene)
+    needed_margins = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
+    needed_margins += ["modulus_margin"] if grasped else []
+
+    def slack(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
+        """Return the slack of each requirement by name, for walls with one stiffness and several dampings."""
+        alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, damping))
+        stable, slacks = scene.loop.labels(alpha, beta), {}
+        margins: Any = None
+        if needed_margins:
+            margins = scene.loop.margins(alpha, beta, needed_margins)
+            if wanted.gain_margin:
+                with np.errstate(all="ignore"):
+                    slacks["gain_margin"] = np.abs(np.log(margins.gain_margin)) / math.log(wanted.gain_margin) - 1.0
+            if wanted.phase_margin:
+                slacks["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
+        if wanted.passive:
+            margin = (np.asarray(scene.passivity_margin(stiffness, damping)) - reserve) / (device_damping or 1.0)
+            # A margin of exactly 0 must yield a negative slack, because such a wall is not passive.
+            slacks["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
+        if grasped:
+            stable_in_grasps = np.all([_is_stable_in_grasp(each, stiffness, damping) for each in grasped], axis=0)
+            slacks["grasps"] = np.where(stable_in_grasps, margins.modulus_margin, -1.0)
+        return {name: np.where(stable & ~np.isnan(value), value, -1.0) for name, value in slacks.items()}
+
+    return slack
+
+
+def _is_stable_in_grasp(grasped: SceneOptima, stiffness: float, damping: Any) -> Any:
+    """Return whether walls with K and B, and walls with both multiplied by ``GRASP_GAIN``, are stable in a grasp."""
+    return np.all([grasped.is_stable(gain * stiffness, gain * damping) for gain in (1.0, GRASP_GAIN)], axis=0)
+
+
+def find_stiffest(
+    scene: SceneOptima,
+    slack: Slack,
+    most: float,
+    near: float | None = None,
+    width: float = WIDTH,
+    safe: SafeLimit | None = None,
+) -> tuple[float, float]:
+    """Find the stiffest wall whose slack is nonnegative, and return its K and B; NaN if no such wall is found.
+
+    Args:
+        scene: the scene.
+        slack: function returned by `measure_slack`.
+        most: largest K allowed, in N/m.
+        near: initial guess of K in N/m; ``most`` if left out.
+        width: relative tolerance of K.
+        safe: safe limit that the wall must respect.
+    """
+    unit, dampings = scene.units.virtual_damping, {}
+
+    def best_slack(log_stiffness: float) -> float:
+        """Return the slack of a stiffness with the best damping, limited to the range from -1 to 1."""
+        stiffness = math.exp(log_stiffness)
+
+        def cost(beta: Any) -> np.ndarray:
+            """Return the negative of the smallest slack of all requirements, which the best damping minimizes."""
+            return -np.min(list(slack(stiffness, beta * unit).values()), axis=0)
+
+        intervals = find_connected_dampings(scene, stiffness)
+        if safe is not None:
+            intervals = _clip(intervals, *(end / unit for end in safe.dampings(stiffness) or (math.inf, -math.inf)))
+        dips = [
+            find_global_minimum(cost, low, high, SAMPLES, NEAR * width) if low < high else (float(cost(low)), low)
+            for low, high in intervals
+        ]
+        lowest, beta = min(dips, default=(1.0, math.nan))
+        if lowest <= 0:
+            dampings[log_stiffness] = beta * unit
+        # Keep the sign of the slack, but keep its magnitude above 1e-12, because `false_position` stops at values close
+        # to 0.
+        return min(max(-lowest, 1e-12), 1.0) if lowest <= 0 else max(min(-lowest, -1e-12), -1.0)
+
+    top, softest = math.log(most), scene.loop.least_stiffness(-math.inf)
+    end, longest = top + math.log(LEAST), math.log(STEP_DOWN)
+    if softest is not None:
+        end, longest = math.log(softest * scene.units.stiffness), math.log(STEP_DOWN_UNSTABLE)
+    low = high = top if near is None or not 0 < near < most else math.log(near)
+    at_low = at_high = best_slack(low)
+    step = longest if low == top else math.log(FIRST_STEP)
+    while at_high > 0 and high < top:
+        low, at_low = high, at_high
+        high = min(high - step, top)
+        at_high, step = best_slack(high), 2.0 * step
+    while at_low <= 0 and low > end:
+        high, at_high = low, at_low
+        low = low + step
+        at_low, step = best_slack(low), max(2.0 * step, longest)
+    if at_low <= 0:
+        return math.nan, math.nan
+    if low < high and at_high <= 0:
+        ends = np.float64(low), np.float64(high), np.float64(at_low), np.float64(at_high)
+        false_position(np.vectorize(best_slack, otypes=[float]), *ends, MAX_STEPS, width)
+    log_stiffness = max(dampings)
+    wall = most if log_stiffness == top else math.exp(log_stiffness), dampings[log_stiffness]
+    if wall[0] == most:
+        return wall
+    # Round K and B to six digits, which are easier to type, if the rounded wall satisfies the requirements.
+    short = float(f"{wall[0]:.6g}"), float(f"{wall[1]:.6g}")
+    return short if min(map(float, slack(*short).values())) >= 0 else wall
+
+
+def _clip(intervals: list[tuple[float, float]], low: float, high: float) -> list[tuple[float, float]]:
+    """Return the nonempty intersections of intervals with the interval from ``low`` to ``high``."""
+    clipped = [(max(start, low), min(end, high)) for start, end in intervals]
+    return [(start, end) for start, end in clipped if start <= end]
+
+
+def choose_wall(
+    scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None = None, width: float = WIDTH
+) -> WallChoice:
+    """Choose the stiffest wall of a scene that satisfies the requirements.
+
+    Args:
+        scene: the scene.
+        wanted: the requirements.
+        top: the stiffest stable wall of the scene.
+        near: initial guess of K in N/m.
+        width: relative tolerance of K.
+    """
+    grasps, active = list_grasped_scenes(scene, wanted), list[SceneOptima]()
+    free = choice = _choose_free(scene, wanted, top, near, width, active)
+    # Require stability only in grasps that destabilize a chosen wall, because each grasp makes the search slower.
+    while choice.status == Status.OK and (
+        unstable := [
+            grasped for grasped in grasps if not _is_stable_in_grasp(grasped, choice.stiffness, choice.damping)
+        ]
+    ):
+        active += unstable
+        choice = _choose_free(scene, wanted, top, GRASP_GUESS * choice.stiffness, width, active)
+    if choice.status != Status.OK:
+        return choice
+    return choice._replace(limit="grasps" if choice.stiffness < (1.0 - 2.0 * width) * free.stiffness else free.limit)
+
+
+def _choose_free(
+    scene: SceneOptima,
+    wanted: Wanted,
+    top: StiffestWall,
+    near: float | None,
+    width: float,
+    grasped: Sequence[SceneOptima],
+) -> WallChoice:
+    """Choose the stiffest wall that satisfies all requirements, with stability only in the grasps of ``grasped``.
+
+    The other arguments are those of `choose_wall`.
+    """
+    nan = math.nan
+    if top.status != Status.OK:
+        return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))
+    most, active = (wanted.stiffness_fraction or 1.0) * float(top.stiffness), "stiffness_fraction"
+    safe = None if wanted.beyond_safe else scene.safe_limit
+    if safe is not None:
+        if safe.forbids_all:
+            why = "; ".join(safe.warnings) or safe.reason or "the safe limit is 0"
+            return WallChoice(nan, nan, "", Status.UNREACHABLE, f"no wall is safe: {why}")
+        # Limit K to the same fraction of the safe limit as of K_max, because both limits need the same reserve.
+        share = wanted.safe_share * safe.stiffness
+        most, active = (share, "safe_limit") if share < most else (most, active)
+    usual, slack = choose_damping(scene, top, most), measure_slack(scene, wanted, grasped)
+    if safe is not None:
+        low, high = safe.dampings(most) or (usual, usual)
+        usual = min(max(usual, low), high)
+    spare = slack(most, usual)
+    if spare and not (wanted.stiffness_fraction and min(spare.values()) >= 0):
+        stiffness, damping = find_stiffest(scene, slack, most, near, width, safe)
+        if math.isnan(stiffness):
+            reason = f"no wall satisfies {' and '.join(map(wanted.spell, spare))}; relax a requirement"
+            if wanted.passive and scene.device.damping == 0:
+                reason = "no passive wall exists, because the device has no physical damping"
+            elif wanted.passive and safe is not None and scene.device.damping <= safe.damping_reserve:
+                reason = (
+                    "no wall is passive for certain, because the device may have no physical damping; record longer"
+                )
+            return WallChoice(nan, nan, "", Status.UNREACHABLE, reason)
+        spare = slack(stiffness, damping)
+        limit = min(spare, key=lambda name: float(spare[name])) if stiffness < most else active
+        return WallChoice(stiffness, damping, limit, Status.OK)
+    if not np.all(scene.is_stable(most, usual)):
+        share = most / float(top.stiffness)
+        reason = f"no stable wall found at {100 * share:.4g} % of K_max; choose another stiffness fraction"
+        return WallChoice(nan, nan, "", Status.UNREACHABLE, reason)
+    note = OTHER_DAMPING if usual != top.virtual_damping and active == "stiffness_fraction" else ""
+    return WallChoice(most, usual, active, Status.OK, note=note)

@@ -1,0 +1,264 @@
+"""Printed results: labeled lines, line wrapping, JSON, and phrases shared by several commands and the explorer.
+
+A printed line has a label and a text. `format_line` has a narrow column for labels (results of ``check``, ``recommend``
+and ``fit``), `format_row` a wide one. The names of functions follow their results: `format_...` returns printed lines,
+`list_...` returns texts of notes and cautions, `spell_...` returns a phrase. A caution is a text labeled CAUTION: the
+result may not hold on the real device. The verdict of a wall is an `Assessment`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import textwrap
+from collections.abc import Collection, Iterable, Iterator
+from math import isfinite, isnan
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+
+from zwidth.model.measured_device import MeasuredDevice
+from zwidth.model.parameter_paths import find_parts
+from zwidth.model.wall import NoWall
+from zwidth.units.formatting import plain, short, to_json, with_unit
+from zwidth.units.quantities import PARAMETERS
+
+if TYPE_CHECKING:
+    from zwidth.analysis.assessment import Assessment
+    from zwidth.analysis.diagnosis import Diagnosis
+    from zwidth.analysis.scene import Scene
+
+WIDTH = 100  # maximum line length of printed results
+LABEL = 11  # columns reserved for a label, including one space after it
+# Colors of labels on a terminal.
+COLORS = {"STABLE": "green", "SET": "green", "UNSTABLE": "red", "NO WALL": "red"}
+COLORS |= dict.fromkeys(("MARGINAL", "UNDECIDED", "CAUTION"), "yellow")
+_NARROW = 60  # smallest width with a separate column for labels
+_COLUMN = re.compile(r" {2,}")
+# Pattern of spaces at which lines must not break: those within quantities such as "B = 3 N s/m". It also matches some
+# other spaces, which is harmless.
+_NO_BREAK = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
+
+
+def format_row(label: str, text: str) -> str:
+    """Return a printed line: a label in a wide column for long labels, and a text."""
+    return f"{label:<20}  {text}"
+
+
+def format_line(label: str, text: str) -> str:
+    """Return a printed line: a label in a narrow column of `LABEL` characters, and a text."""
+    return f"{label:<{LABEL - 1}} {text}"
+
+
+def print_json(result: Any) -> None:
+    """Print a result as JSON, with null for values that are unknown or not finite."""
+    click.echo(json.dumps(to_json(result), indent=2, allow_nan=False))
+
+
+def wrap_lines(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) -> Iterator[str]:
+    """Yield lines wrapped to a width, with continuation lines indented and no break between a number and its unit.
+
+    A narrow width has no separate column for labels, because the text would wrap after every word.
+    """
+    narrow = width < _NARROW
+    wrap = textwrap.TextWrapper(max(width, 40), break_long_words=False, break_on_hyphens=False)
+    for each in lines:
+        each = _COLUMN.sub("  ", each) if narrow else each
+        blank = len(each) - len(each.lstrip())
+        wrap.subsequent_indent = (4 if narrow else max(indent, blank)) * " "
+        yield wrap.fill(_NO_BREAK.sub("\xa0", each)).replace("\xa0", " ")
+
+
+def print_lines(lines: Iterable[str], indent: int = 24) -> None:
+    """Print lines, wrapped to ``COLUMNS`` or the width of the terminal, at most 100 columns, with colored labels."""
+    width = shutil.get_terminal_size((WIDTH, 24)).columns
+    for each in wrap_lines(lines, indent, min(width, WIDTH)):
+        word = each[: LABEL - 1].rstrip()
+        click.echo(click.style(word, fg=COLORS[word], bold=True) + each[len(word) :] if word in COLORS else each)
+
+
+def print_result(result: Any, lines: Iterable[str], as_json: bool, indent: int = 24) -> None:
+    """Print a result as JSON if ``as_json`` is True, otherwise print its lines."""
+    if as_json:
+        print_json(result)
+    else:
+        print_lines(lines, indent)
+
+
+def format_parts(scene: Scene) -> list[str]:
+    """Return a printed line for each part of a scene except the rigid device, in order from the motor to the hand."""
+    lines = []
+    velocity = type(scene.velocity).__name__
+    parts, values = find_parts(scene), scene.parameters()
+    for name in (name for name in dict.fromkeys(("velocity", "actuator", "coupling", *parts)) if name in parts):
+        part_values = {path: value for path, value in values.items() if path.startswith(f"{name}.")}
+        if name == "velocity" and velocity == "BackwardDifference" and not part_values:
+            continue
+        named = {path.removeprefix(f"{name}.").replace("_", " "): path for path in part_values if part_values[path]}
+        words = []
+        for key, path in named.items():
+            value, unit = part_values[path], scene.unit_system[get_unit(path)]
+            spelled = with_unit(value, unit) if unit else short(value) if isinstance(value, int) else plain(value)
+            words.append(f"{key} {spelled}")
+        if name == "coupling":
+            words.append(f"sensor at the {parts[name].sensor}")
+        words = [velocity, *words] if name == "velocity" else words
+        lines.append(format_line(name.replace("modes.", "mode "), ", ".join(words)))
+    return lines
+
+
+def get_unit(path: str) -> str:
+    """Return the SI unit of a parameter of a linear device by its path; "" for numbers without a unit."""
+    return PARAMETERS[path].unit.removeprefix("1") if path in PARAMETERS else ""
+
+
+def name_verdict(verdict: Assessment) -> str:
+    """Return the verdict as one word: undecided, marginal, stable or UNSTABLE."""
+    if verdict.stable is None:
+        return "undecided"
+    return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
+
+
+def spell_radius(radius: float) -> str:
+    """Return the spectral radius as text with six decimals, or in fewer digits if it is very large."""
+    return f"spectral radius {f'{radius:.6f}' if radius < 1e4 else plain(radius)}"
+
+
+def spell_decay(constant: float, frequency: float) -> str:
+    """Return a phrase on the dominant pole, from its time constant in s (negative: growth) and its frequency in Hz."""
+    swing = f", oscillating at {with_unit(frequency, 'Hz')}" if frequency else ""
+    if isnan(constant):
+        return f"has a rate below numerical resolution, near the boundary or poles of equal magnitude{swing}"
+    if not isfinite(constant):
+        return f"neither decays nor grows{swing}"
+    verb = "decays" if constant >= 0 else "grows"
+    return f"{verb} with time constant {with_unit(abs(constant), 's')}{swing}"
+
+
+def list_period_notes(scene: Scene) -> list[str]:
+    """Return a note if the velocity estimate was designed for a period other than that of the loop."""
+    coded, period = getattr(scene.velocity, "coded_period", None), scene.timing.period
+    if coded is None or abs(coded / period - 1) < 1e-9:
+        return []
+    text = (
+        f"the velocity estimate was designed for a period of {with_unit(coded, 's')}, but that of the loop is "
+        f"{with_unit(period, 's')}: it returns {plain(period / coded, 3)} times the velocity"
+    )
+    cutoff = getattr(scene.velocity, "cutoff", None)
+    if cutoff is not None:
+        real = with_unit(cutoff * coded / period, "Hz")
+        text += f", and its cutoff is {real} instead of {with_unit(cutoff, 'Hz')}"
+    return [text]
+
+
+def list_notes(scene: Scene) -> list[str]:
+    """Return the notes on a scene: undecided walls, period of the estimate, islands of stability, safe limit."""
+    from zwidth.analysis.assessment import describe_islands
+
+    undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
+    return [*undecided, *list_period_notes(scene), *describe_islands(scene), *compare_with_limit(scene)]
+
+
+def compare_with_limit(scene: Scene) -> list[str]:
+    """Return the warnings of the scene's safe limit, preceded by a caution if the wall exceeds this limit."""
+    limit = scene.safe_limit
+    return [] if limit is None or isinstance(scene.wall, NoWall) else [*list_limit_cautions(scene), *limit.warnings]
+
+
+def list_limit_cautions(scene: Scene) -> list[str]:
+    """Return the caution that a wall exceeds the safe limit of its scene; an empty list if it does not."""
+    limit, wall = scene.safe_limit, scene.wall
+    if limit is None or isinstance(wall, NoWall) or limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
+        return []
+    return [f"this wall exceeds the safe limit: the real device may be unstable. {limit.describe(scene.unit_system)}"]
+
+
+def spell_diagnosis(diagnosis: Diagnosis | None) -> list[tuple[str, str]]:
+    """Return pairs of label and text: the result of a diagnosis and, if the device oscillates, its remedies."""
+    if diagnosis is None:
+        return []
+    advice = diagnosis.advise()
+    label = "simulated" if diagnosis.cause == "none" else "CAUTION"
+    return [(label, f"{diagnosis.word}: {diagnosis.explain()}"), *([("", f"to stop it: {advice}")] if advice else [])]
+
+
+def spell_alarm(diagnosis: Diagnosis | None, *alarms: str) -> str:
+    """Return the text appended to a headline to announce cautions: a diagnosed oscillation, if any, and ``alarms``."""
+    oscillation = [] if diagnosis is None or diagnosis.cause == "none" else [diagnosis.word.lower()]
+    words = [*oscillation, *filter(None, alarms)]
+    return f"; CAUTION: {', '.join(words)}" if words else ""
+
+
+def format_diagnosis(diagnosis: Diagnosis | None) -> list[str]:
+    """Return printed lines with the result of a diagnosis and, if the device oscillates, its remedies."""
+    return [format_line(*each) for each in spell_diagnosis(diagnosis)]
+
+
+def format_hardware(hardware: str) -> list[str]:
+    """Return the printed line with the hardware of a file, a phrase; an empty list if the phrase is empty."""
+    return [format_line("hardware", hardware)] if hardware else []
+
+
+def list_omission_cautions(scene: Scene, omitted: Collection[str]) -> list[str]:
+    """Return cautions if the delay or the friction is 0 only because it was not given.
+
+    ``omitted`` contains the names of options that were not given.
+    """
+    # Return no caution for a measured response, because it usually contains the delay, and it cannot be simulated.
+    if isinstance(scene.device, MeasuredDevice):
+        return []
+    cautions = {
+        "delay": "no delay given: the results hold only if the force acts at the sample; if it acts one period later, "
+        "add --delay '1 periods'",
+        "friction": "no friction given: the encoder is simulated without friction, which can stop a limit cycle; give "
+        "the device's friction by --friction",
+    }
+    return [text for name, text in cautions.items() if name in omitted and not (name == "delay" and scene.timing.delay)]
+
+
+def format_notes(notes: list[str]) -> list[str]:
+    """Return a printed line for each note."""
+    return [format_line("note", note) for note in notes]
+
+
+class Slope(NamedTuple):
+    """The derivative of K_max with respect to one parameter, and the effect of a small change in words."""
+
+    name: str  # path of the parameter
+    value: float  # derivative of K_max
+    unit: str  # unit of the derivative
+    words: str  # effect of a small change
+
+    def line(self) -> str:
+        """Return a printed line with the derivative, its unit and the effect of a small change."""
+        name = "inertia" if self.name == "mass" and self.unit.endswith("kg m^2") else self.name
+        return format_row(f"dK_max/d({name})", f"{with_unit(self.value, self.unit)}: {self.words}")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return a dict of the derivative and its unit for JSON output."""
+        return {"value": self.value, "unit": self.unit}
+
+
+def list_slopes(scene: Scene) -> list[Slope]:
+    """Return the derivatives of K_max with respect to all parameters of a scene, each with its effect in words."""
+    if isinstance(scene.device, MeasuredDevice):
+        return []
+    per, values = scene.sensitivities().per, scene.parameters()
+    slopes, system = [], scene.unit_system
+    for path, slope in per.items():
+        unit, value = system[get_unit(path)], float(slope)
+        # Choose a scale: for a delay the period, because the delay may be 0; for a linear damping 1 N s/m; else the
+        # value.
+        size = scene.timing.period if path == "delay" else values[path]
+        by_one = not size or unit == "N s/m"
+        # Choose the power of ten nearest to one percent of the scale as the step.
+        step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
+        effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
+        if isfinite(value) and (change := value * step):
+            effect = f"{'buys' if change > 0 else 'costs'} {with_unit(abs(change), system['N/m'], 3)}"
+        note = f" (the delay stays {scene.timing.kept_delay})" if path == "period" and scene.timing.delay else ""
+        words = f"{with_unit(step, unit, 1)} more {effect}{note}"
+        slopes.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))
+    return slopes

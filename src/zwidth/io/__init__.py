@@ -1,0 +1,1 @@
+"""Files: atomic replacement, text files with columns, and the times in recordings."""

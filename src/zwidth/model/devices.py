@@ -1,0 +1,241 @@
+"""Catalog of devices and of a hand with published parameters, each parameter with its source.
+
+The data are in ``published.json``. For a rotary device, ``mass`` is the inertia J in kg m^2, ``damping`` is in
+N m s/rad, and walls are in N m/rad and N m s/rad.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from zwidth.core.errors import InputError, describe_choice
+from zwidth.model.device import Device
+from zwidth.model.linear_device import LinearDevice
+from zwidth.model.measured_device import SUFFIXES, MeasuredDevice
+from zwidth.model.operator import Operator
+from zwidth.model.timing import Timing
+from zwidth.units.formatting import with_unit
+
+__all__ = ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_device"]
+
+
+def __dir__() -> list[str]:
+    """Return the public names of this module for completion at the prompt, without imported names."""
+    return sorted(__all__)
+
+
+class Published(NamedTuple):
+    """A published parameter with its unit, its source, and a note on its use."""
+
+    value: float
+    unit: str
+    source: str
+    note: str = ""
+
+    def spell(self) -> str:
+        """Return the value with its unit as text, to three significant digits."""
+        if self.unit in ("counts", "periods"):
+            return f"{self.value:g} {self.unit.removesuffix('s') if self.value == 1 else self.unit}"
+        return with_unit(self.value, self.unit, 3)
+
+
+@dataclass(frozen=True)
+class KnownDevice:
+    """Published parameters of one device; unpublished ones are None.
+
+    Attributes:
+        name: short name, for `find_device` and the command line.
+        title: full name, for texts.
+        motion: "linear" or "rotary"; determines the units of all other fields.
+        mass: mass in kg, or inertia in kg m^2.
+        damping: viscous damping in N s/m or N m s/rad.
+        friction: Coulomb friction in N or N m.
+        resolution: resolution of the position sensor in m or rad.
+        counts: counts of the encoder on the motor shaft, published without the transmission ratio.
+        period: sampling period in s of the loop in which the device was measured or used.
+        delay: delay of that loop from a sample to its force, in s or in periods.
+        force: largest force in N.
+        stiffness_limit: largest stiffness in use in N/m, from a software library or notes; not a stability limit.
+        damping_limit: largest virtual damping in use in N s/m, from a software library or notes.
+    """
+
+    name: str
+    title: str
+    motion: Literal["linear", "rotary"] = "linear"
+    mass: Published | None = None
+    damping: Published | None = None
+    friction: Published | None = None
+    resolution: Published | None = None
+    counts: Published | None = None
+    period: Published | None = None
+    delay: Published | None = None
+    force: Published | None = None
+    stiffness_limit: Published | None = None
+    damping_limit: Published | None = None
+
+    def __repr__(self) -> str:
+        """Return the name and the parameters, without sources."""
+        parameters = [f"{name}={parameter.spell()}" for name, parameter in self.numbers.items()]
+        return f"KnownDevice({', '.join([self.name, *parameters])})"
+
+    @property
+    def rotary(self) -> bool:
+        """True for a rotary device."""
+        return self.motion == "rotary"
+
+    @property
+    def numbers(self) -> dict[str, Published]:
+        """The published parameters by name."""
+        return {
+            field.name: value for field in fields(self) if isinstance(value := getattr(self, field.name), Published)
+        }
+
+    def to_device(self, *, mass: Any = None, damping: Any = None) -> Device:
+        """Return a `zwidth.Device` with the published mass and damping.
+
+        For a rotary device, ``Device.mass`` is the inertia in kg m^2 and ``Device.damping`` is in N m s/rad. Stiffness
+        and virtual damping of its scene are in N m/rad and N m s/rad.
+
+        Args:
+            mass: mass that replaces the published one; required if none is published.
+            damping: damping that replaces the published one; required if none is published. If the damping is unknown,
+                0 is the cautious choice, because no stable wall was found that more physical damping makes unstable.
+
+        Raises:
+            InputError: mass or damping is neither published nor passed.
+
+        Example:
+            >>> import zwidth
+            >>> zwidth.devices.find_device("haptic_wheel").to_device()
+            Device(mass=0.00045, damping=0.0013, rotary=True)
+        """
+        values = {"mass": self._choose("mass", mass), "damping": self._choose("damping", damping)}
+        return Device(**values, rotary=self.rotary)
+
+    def to_timing(self, *, period: Any = None, rate: Any = None, delay: Any = None) -> Timing:
+        """Return a `zwidth.Timing` with the published period and delay; the delay is 0 if none is published.
+
+        Args:
+            period: sampling period in s that replaces the published one; required if none is published and no ``rate``
+                is passed.
+            rate: sampling rate in Hz, instead of ``period``.
+            delay: delay in s, or a text such as "1.5 periods", that replaces the published one.
+
+        Raises:
+            InputError: no period is published, and neither ``period`` nor ``rate`` is passed.
+
+        Example:
+            >>> import zwidth
+            >>> zwidth.devices.find_device("phantom_2006").to_timing(rate="2 kHz")
+            Timing(period=0.0005, delay='1 periods')
+        """
+        if delay is None and self.delay is not None:
+            delay = f"{self.delay.value!r} periods" if self.delay.unit == "periods" else self.delay.value
+        if period is None and rate is None:
+            period = self._choose("period", None)
+        return Timing(period=period, rate=rate, delay=0.0 if delay is None else delay)
+
+    def list_missing(self, given: Collection[str]) -> list[str]:
+        """Return those of "mass" and "damping" that are neither published nor in ``given``."""
+        return [name for name in ("mass", "damping") if name not in given and getattr(self, name) is None]
+
+    def _choose(self, name: str, given: Any) -> Any:
+        """Return the passed value, or the published one if None is passed; raise `InputError` if none is published."""
+        if given is not None:
+            return given
+        published = getattr(self, name)
+        if published is None:
+            names = ", ".join(self.numbers)
+            raise InputError(f"{name}: no value is published for {self.name!r}, only {names}; pass a value")
+        return published.value
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields by name, with values that JSON can represent; unpublished parameters are None (null)."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value._asdict() if isinstance(value, Published) else value for name, value in values.items()}
+
+
+@dataclass(frozen=True)
+class KnownHand:
+    """Published parameters of a hand: mass in kg, damping in N s/m and stiffness in N/m, both to ground."""
+
+    name: str
+    title: str
+    mass: Published
+    damping: Published
+    stiffness: Published
+
+    def to_operator(self) -> Operator:
+        """Return a `zwidth.Operator` with a rigid grasp.
+
+        Pass ``coupling_stiffness`` to `dataclasses.replace` for a grasp with a spring.
+
+        Example:
+            >>> import zwidth
+            >>> zwidth.devices.HAND.to_operator().mass
+            0.554
+        """
+        return Operator(self.mass.value, self.damping.value, self.stiffness.value)
+
+
+def _read_published() -> tuple[tuple[KnownDevice, ...], KnownHand]:
+    """Return a tuple of all devices of ``published.json``, and the hand."""
+    catalog = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
+
+    def convert(entry: dict[str, Any]) -> dict[str, Any]:
+        """Convert the parameters of an entry to `Published`, with the text of the source in place of its key."""
+        return {
+            name: Published(value[0], value[1], catalog["sources"][value[2]], *value[3:])
+            if isinstance(value, list)
+            else value
+            for name, value in entry.items()
+        }
+
+    return tuple(KnownDevice(**convert(entry)) for entry in catalog["devices"]), KnownHand(**convert(catalog["hand"]))
+
+
+DEVICES, HAND = _read_published()
+"""All devices of the catalog, those with measured parameters first; and a hand with published parameters."""
+
+
+def find_device(name: str) -> KnownDevice:
+    """Return a device of the catalog.
+
+    Args:
+        name: name of a device in `zwidth.devices.DEVICES`, as listed by ``zwidth devices``.
+
+    Raises:
+        InputError: no device has this name.
+
+    References:
+        The field ``source`` of each parameter.
+
+    Example:
+        >>> import zwidth
+        >>> wheel = zwidth.devices.find_device("haptic_wheel")
+        >>> wheel.damping.value, wheel.damping.unit, wheel.friction
+        (0.0013, 'N m s/rad', None)
+    """
+    for device in DEVICES:
+        if device.name == name:
+            return device
+    raise InputError(f"device: {describe_choice(name, tuple(device.name for device in DEVICES))}")
+
+
+def read_device(text: str) -> KnownDevice | LinearDevice | MeasuredDevice:
+    """Return the device that an option ``--device`` selects.
+
+    Args:
+        text: the name of a device for `find_device`; a transfer function ``"NUMERATOR / DENOMINATOR"`` with the
+            coefficients in s, highest power first; or the name of a file for `zwidth.MeasuredDevice.read`.
+
+    Raises:
+        InputError: the text is none of these.
+    """
+    if text.endswith(SUFFIXES):
+        return MeasuredDevice.read(text)
+    return LinearDevice(text) if "/" in text else find_device(text)

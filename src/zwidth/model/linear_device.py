@@ -1,0 +1,259 @@
+"""Device defined by a linear system from commanded force to measured position.
+
+The system may be given by matrices, coefficients or roots, or as a model of scipy.signal or python-control. It is
+stored as a rational function with exact coefficients, from which poles and zeros are computed to full accuracy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from zwidth.core.errors import InputError
+from zwidth.model.exact_polynomials import (
+    Polynomial,
+    characteristic_polynomial,
+    divide,
+    find_common_factor,
+    find_roots,
+    multiply,
+    subtract,
+    trim,
+)
+from zwidth.units.formatting import short
+from zwidth.units.unit_system import SYSTEMS, UnitSystem
+
+# Accepted forms of a system, for messages.
+_FORMS = (
+    "(A, B, C), (numerator, denominator), (zeros, poles, gain), or a model of scipy.signal or python-control with one "
+    "input and one output"
+)
+
+
+class RationalResponse(NamedTuple):
+    """Transfer function ``numerator/denominator`` in s, or in z for a discrete-time system, with exact coefficients."""
+
+    numerator: Polynomial
+    denominator: Polynomial
+    dt: float | None  # sampling period in s; None for a continuous-time system
+
+
+class ResponseDevice:
+    """Base class of devices that are defined by their response only, without masses, coupling, actuator and modes."""
+
+    coupling: ClassVar[None] = None
+    actuator: ClassVar[None] = None
+    modes: ClassVar[tuple[()]] = ()
+    rotary: bool = False
+    # The damping is 0, because the response already includes the physical damping.
+    damping: ClassVar[float] = 0.0
+
+    @property
+    def unit_system(self) -> UnitSystem:
+        """The units of the device, linear or rotary."""
+        return SYSTEMS[self.rotary]
+
+
+@dataclass(frozen=True, repr=False)
+class LinearDevice(ResponseDevice):
+    """A device defined by any strictly proper linear system from commanded force (N) to measured position (m).
+
+    The coefficients are taken as exact. All functions for walls accept such a device. An operator, friction, initial
+    values and energies require a `Device`, because the masses of a linear system are unknown. Stiffest walls and
+    recommendations are restricted to B >= 0, because B < 0 would cancel modeled damping that the real device may not
+    have; `Scene.max_stiffness` includes B < 0 with ``negative_damping=True``.
+
+    Args:
+        system: matrices ``(A, B, C)``; coefficients ``(numerator, denominator)`` with the highest power first, or as
+            text, "1 / 0.1 10 0"; roots ``(zeros, poles, gain)``; or a model of scipy.signal (lti, dlti) or
+            python-control (TransferFunction, StateSpace). A discrete-time system must include hold and delay, and its
+            ``dt`` must equal the period of the loop.
+
+    Raises:
+        InputError: the system has none of these forms, or it is not strictly proper.
+
+    Example:
+        >>> import zwidth
+        >>> device = zwidth.LinearDevice(([1.0], [0.1, 10.0, 0.0]))
+        >>> scene = zwidth.Scene(device, zwidth.Timing(period=1e-3, delay=1e-3))
+        >>> print(f"{scene.max_stiffness().stiffness:.0f} N/m")
+        19865 N/m
+    """
+
+    system: Any
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.system, RationalResponse):
+            object.__setattr__(self, "system", _read(self.system))
+
+    def __repr__(self) -> str:
+        """Return the expression that creates the device."""
+        return f"LinearDevice({self.spell_form()!r})"
+
+    def spell_form(self) -> str | dict[str, Any]:
+        """Return the value of the key ``device`` in a configuration, with the coefficients rounded to float64."""
+        numerator, denominator = ([float(c) for c in part] for part in self.system[:2])
+        if self.dt:
+            return {"numerator": numerator, "denominator": denominator, "sampled": self.dt}
+        return " / ".join(" ".join(map(short, part)) for part in (numerator, denominator))
+
+    @property
+    def dt(self) -> float | None:
+        """The sampling period of a discrete-time system in s; None for a continuous-time system."""
+        return self.system.dt
+
+    def spell(self) -> str:
+        """Return a one-line description of the system."""
+        kind = "sampled" if self.dt else "continuous"
+        return f"{kind} linear system of order {self.poles.size}, {self.zeros.size} finite zeros"
+
+    @cached_property
+    def zeros(self) -> np.ndarray:
+        """The finite zeros, in s (rad/s) or in z."""
+        return find_roots(self.system.numerator)
+
+    @cached_property
+    def poles(self) -> np.ndarray:
+        """The poles, in s (rad/s) or in z."""
+        return find_roots(self.system.denominator)
+
+    @cached_property
+    def offsets(self) -> tuple[np.ndarray, np.ndarray]:
+        """``1 - z`` for the zeros and for the poles of a discrete-time system, accurate for roots near z = 1."""
+        return find_roots(self.system.numerator, True), find_roots(self.system.denominator, True)
+
+    @cached_property
+    def gain(self) -> float:
+        """The ratio of the leading coefficients of numerator and denominator."""
+        return float(self.system.numerator[0] / self.system.denominator[0])
+
+    @cached_property
+    def mass(self) -> float:
+        """The unit of mass in normalized parameters, in kg: a mass whose response is about as large as the device's."""
+        relative_degree = self.poles.size - self.zeros.size
+        if self.dt is None and relative_degree == 2 and self.gain > 0:
+            return 1.0 / self.gain
+        magnitudes = np.abs(self.poles)[np.abs(self.poles) > 0]
+        w = float(np.exp(np.mean(np.log(magnitudes)))) if magnitudes.size else 1.0
+        # Evaluate the response at a point off the imaginary axis or the unit circle, because undamped devices have
+        # poles there.
+        point, unit = (w * (0.3 + 1j), w) if self.dt is None else (0.3 + 1j, 1.0 / self.dt)
+        size = abs(self.gain) * np.prod(np.abs(point - self.zeros)) / np.prod(np.abs(point - self.poles))
+        return float(1.0 / (size * unit * unit))
+
+
+def parse_fraction(text: str) -> tuple[list[float], list[float]]:
+    """Return the coefficients of numerator and denominator from a text such as "1 / 0.1 10 0", highest power first."""
+    try:
+        numerator, denominator = ([float(c) for c in side.replace(",", " ").split()] for side in text.split("/"))
+    except ValueError:
+        raise InputError(
+            f"device: got {text!r}; it must be 'NUMERATOR / DENOMINATOR', coefficients in s, highest power first; "
+            "write '1 / 0.1 10 0'"
+        ) from None
+    return numerator, denominator
+
+
+def _read(given: Any) -> RationalResponse:
+    """Convert a system in any accepted form to an exact transfer function; raise `InputError` for other values."""
+    given = parse_fraction(given) if isinstance(given, str) else given
+    dt = getattr(given, "dt", None)
+    if dt is True:
+        raise InputError("device: got a sampled system without its period; set dt to the period of the loop in s")
+    try:
+        numerator, denominator = _read_form(given)
+    except (TypeError, ValueError, OverflowError, LookupError) as error:
+        raise InputError(f"device: got {str(given)[:60]!r}; it must be finite numbers as {_FORMS}") from error
+    if not numerator or len(denominator) < 2:
+        raise InputError("device: got a system whose position does not depend on the force; check input and output")
+    if len(numerator) >= len(denominator):
+        raise InputError(
+            f"device: got a numerator of degree {len(numerator) - 1} over one of degree {len(denominator) - 1}; "
+            "the denominator must have the higher degree; add the missing dynamics"
+        )
+    _reject_unstable_hidden_modes(find_roots(find_common_factor(numerator, denominator)), "z" if dt else "s")
+    return RationalResponse(numerator, denominator, float(dt) if dt else None)
+
+
+def _reject_unstable_hidden_modes(roots: np.ndarray, letter: str) -> None:
+    """Raise `InputError` if a canceled mode is not asymptotically stable, because no wall can stabilize it.
+
+    Args:
+        roots: common roots of numerator and denominator, which are uncontrollable or unobservable modes.
+        letter: "s" or "z", the variable of the roots.
+    """
+    unstable = roots[(np.abs(roots) >= 1.0) if letter == "z" else (np.real(roots) >= 0.0)]
+    for root in unstable.tolist():
+        raise InputError(
+            f"device: the mode {letter} = {root if root.imag else root.real:.4g} does not decay and is uncontrollable "
+            "or unobservable, so no wall is stable; remove it from the matrices"
+        )
+
+
+def _read_form(given: Any) -> tuple[Polynomial, Polynomial]:
+    """Return the exact numerator and denominator of a system that is given by matrices, coefficients or roots."""
+    if hasattr(given, "A") and hasattr(given, "C"):
+        given = (given.A, given.B, given.C, given.D)
+    elif hasattr(given, "num") and hasattr(given, "den"):
+        given = tuple(_take_channel(part) for part in (given.num, given.den))
+    elif hasattr(given, "zeros") and hasattr(given, "gain"):
+        given = (given.zeros, given.poles, given.gain)
+    if len(given) == 2:
+        return _reduce(*(trim(np.ravel(part)) for part in given))
+    if np.ndim(given[0]) < 2:
+        zeros, poles, gain = given
+        return _reduce(multiply(_expand(zeros), trim([gain])), _expand(poles))
+    A, B, C, *D = given
+    size = len(A)
+    if np.shape(A) != (size, size) or np.size(B) != size or np.size(C) != size or np.any(D):
+        raise ValueError("matrices of one input and one output without feedthrough")
+    dynamics, inputs, outputs = (_as_fractions(part) for part in (A, np.ravel(B), np.ravel(C)))
+    denominator = characteristic_polynomial(dynamics)
+    # The numerator C adj(s I - A) B is det(s I - A + B C) - det(s I - A), by the matrix determinant lemma.
+    numerator = subtract(characteristic_polynomial(dynamics - np.outer(inputs, outputs)), denominator)
+    return numerator, denominator
+
+
+def _as_fractions(values: Any) -> np.ndarray:
+    """Convert an array of floats to exact fractions."""
+    floats = np.asarray(values, float)
+    return np.array([Fraction(value) for value in floats.ravel().tolist()], object).reshape(floats.shape)
+
+
+def _expand(roots: Any) -> Polynomial:
+    """Return the monic polynomial with the given roots; raise `ValueError` if a complex root has no conjugate."""
+    values: Any = np.asarray(roots, complex).ravel()
+    product: Polynomial = (Fraction(1),)
+    for root in values[values.imag >= 0].tolist():
+        real, imag = Fraction(root.real), Fraction(root.imag)
+        if root.imag and np.sum(values == root.conjugate()) != np.sum(values == root):
+            raise ValueError("a root without its conjugate")
+        factor = (Fraction(1), -2 * real, real * real + imag * imag) if root.imag else (Fraction(1), -real)
+        product = multiply(product, factor)
+    if len(product) - 1 != values.size:
+        raise ValueError("a root without its conjugate")
+    return product
+
+
+def _reduce(numerator: Polynomial, denominator: Polynomial) -> tuple[Polynomial, Polynomial]:
+    """Return numerator and denominator divided by their greatest common divisor.
+
+    For example, the sum of two transfer functions with the same integrator has a common factor s.
+    """
+    if not numerator or len(numerator) >= len(denominator):
+        return numerator, denominator
+    common = find_common_factor(numerator, denominator)
+    return divide(numerator, common)[0], divide(denominator, common)[0]
+
+
+def _take_channel(part: Any) -> Any:
+    """Return the coefficients of the only input and output from the nested lists of python-control."""
+    while len(part) == 1 and np.ndim(part[0]) > 0:
+        part = part[0]
+    if np.ndim(part) != 1:
+        raise ValueError("more than one channel")
+    return part

@@ -1,0 +1,79 @@
+"""Timing of a loop: its sampling period, and the delay from a sample to the start of the force computed from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from zwidth.core.errors import InputError
+from zwidth.core.xp import is_jax
+from zwidth.model.checks import Part, Span, check_number, check_span, to_periods
+from zwidth.units.formatting import format_periods, with_unit
+
+
+@dataclass(frozen=True, repr=False)
+class Timing(Part):
+    """The sampling period of a loop and the delay of the wall's force.
+
+    Args:
+        period: sampling period T in s, > 0. Pass either ``period`` or ``rate``.
+        delay: delay t_d from a sample to the start of its force in s, >= 0, or a text in periods, "1.5 periods". It
+            need not be a multiple of the period. If the period changes, a delay in periods keeps its number of periods.
+        rate: sampling rate 1/T in Hz, > 0.
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.Timing(rate="4 kHz", delay="1.5 periods")
+        Timing(period=0.00025, delay='1.5 periods')
+    """
+
+    period: Any = None
+    delay: Any = 0.0
+    rate: Any = None
+    # Delay in periods if the user gave it in periods, otherwise None. This number is stored, because the quotient of
+    # delay and period in seconds may have a rounding error.
+    _periods: ClassVar[float | None] = None
+
+    def __post_init__(self) -> None:
+        if (self.period is None) == (self.rate is None):
+            both = "" if self.rate is None else "got both; "
+            raise InputError(f"timing: {both}pass either period (s) or rate (Hz), and only one of them")
+        if self.rate is not None:
+            object.__setattr__(self, "period", 1.0 / check_number("rate", self.rate))
+            object.__setattr__(self, "rate", None)
+        object.__setattr__(self, "period", check_number("period", self.period))
+        delay = check_span("delay", self.delay)
+        if isinstance(delay, Span):
+            object.__setattr__(self, "_periods", delay.value if delay.unit == "periods" else None)
+            object.__setattr__(self, "delay", delay.seconds(self.period))
+
+    def __repr__(self) -> str:
+        """Return the expression that creates this timing, with the delay in its original unit, seconds or periods."""
+        text = super().__repr__()
+        return text if self._periods is None else text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
+
+    @property
+    def in_periods(self) -> bool:
+        """True if the delay was given in periods; its number of periods is then constant if the period changes."""
+        return self._periods is not None
+
+    @property
+    def span(self) -> Any:
+        """The delay in the unit in which the user gave it: a `Span` in periods, or a number of seconds."""
+        return self.delay if self._periods is None else Span(self._periods, "periods")
+
+    @property
+    def kept_delay(self) -> str:
+        """The delay as text, "1 period" or "1 ms", in the unit in which it remains constant if the period changes."""
+        if self._periods is None:
+            return with_unit(float(self.delay), "s")
+        return format_periods(self._periods)
+
+    @property
+    def d(self) -> Any:
+        """The delay in periods; an exact integer if it differs from one only by rounding errors."""
+        if self._periods is not None:
+            return np.float64(self._periods)
+        return to_periods(*(value if is_jax(value) else np.float64(value) for value in (self.delay, self.period)))

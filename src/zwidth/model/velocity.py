@@ -1,0 +1,382 @@
+"""Velocity estimates: transfer functions F(z) from measured position to the velocity that the wall's damper uses.
+
+Parameters are in SI units; the method ``estimate`` of each class returns F for time in sampling periods, as `Estimate`.
+The *coded period* is the sampling period that the constants of an estimate were computed for. If the loop runs at
+another period T, the program divides position differences by the wrong time, and its cut-off frequency is shifted;
+`Estimate` includes these errors.
+
+Estimates are evaluated with floats, JAX arrays, and balls of python-flint (``flint.arb``). Zeros and poles are stored
+as offsets ``1 - root``, which are accurate for roots near z = 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from zwidth.core.errors import InputError
+from zwidth.core.xp import is_jax, namespace
+from zwidth.model.checks import Part
+from zwidth.model.circle_functions import CirclePoints, Jet, power_jet, product_jet
+from zwidth.model.filter_sections import (
+    NEXT_TO_ONE,
+    ball_offsets,
+    count_trailing_zeros,
+    is_rounding,
+    offsets,
+    read_sections,
+)
+from zwidth.units.quantities import Range
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A velocity estimate F for T = 1: a difference over ``window`` periods, followed by a filter.
+
+    ``F(z) = gain prod(z - z_i)/(z^lag prod(z - p_i)) (1 - z^-window)/window`` with zeros z_i and poles p_i. The last
+    factor is omitted for a window of 0.
+    """
+
+    window: int = 1
+    gain: Any = 1.0
+    lag: int = 0
+    zeros: Any = field(default_factory=lambda: np.zeros(0, complex))  # offsets 1 - z_i of the zeros
+    poles: Any = field(default_factory=lambda: np.zeros(0, complex))  # offsets 1 - p_i of the poles
+
+    def jet(self, points: CirclePoints) -> Jet:
+        """Return F and its derivative with respect to w at points e^(jw) of the unit circle."""
+        xp = namespace(points.w)
+        product = product_jet(points, self.zeros, self.gain)
+        if self.poles.size:
+            product = product.over(product_jet(points, self.poles, 1.0))
+        if self.lag:
+            product = product.times(power_jet(points, -self.lag))
+        if self.window:
+            delayed = power_jet(points, -self.window)
+            n = self.window
+            s = xp.sin(0.5 * n * points.w)
+            # Replace 1 - cos(n w) by 2 sin^2(n w/2), because the difference would cancel at low frequencies.
+            value = xp.where(points.w >= np.pi, 1.0 - delayed.value, 2.0 * s * s - 1j * delayed.value.imag) / n
+            product = product.times(Jet(value, -delayed.slope / n))
+        return product
+
+    @property
+    def is_difference(self) -> bool:
+        """True if the estimate is the difference of two successive samples, multiplied by a gain."""
+        window = self.window == 1 and not self.lag and not np.size(self.zeros) and not np.size(self.poles)
+        coefficients = not self.window and self.lag == 1 and not np.size(self.poles)
+        return window or (coefficients and np.size(self.zeros) == 1 and bool(np.all(np.equal(self.zeros, 0))))
+
+    @property
+    def degree(self) -> int:
+        """The sum of window, abs(lag) and the numbers of zeros and poles; larger than ``window`` if F has a filter."""
+        return self.window + abs(self.lag) + self.zeros.size + self.poles.size
+
+
+class _Checked(Part):
+    """Base class of the estimates whose fields have ranges in `units.quantities`."""
+
+    _owner = "velocity"
+
+
+@dataclass(frozen=True, repr=False)
+class BackwardDifference(_Checked):
+    """The backward difference ``v = (x_k - x_(k-1))/T``, the default, as in the paper.
+
+    Args:
+        coded_period: period T in s by which the difference is divided. Default: the period of the loop.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section II.
+    """
+
+    coded_period: Any = None
+
+    def estimate(self, period: Any) -> Estimate:
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
+        return Estimate(window=1, gain=_ratio(period, self.coded_period))
+
+
+@dataclass(frozen=True, repr=False)
+class WindowedDifference(_Checked):
+    """The difference over n periods, ``v = (x_k - x_(k-n))/(n T)``: the mean velocity of these periods.
+
+    Args:
+        samples: window n in periods, from 1 (the backward difference) to 1000.
+        coded_period: period T in s in the formula. Default: the period of the loop.
+
+    References:
+        chai3d/chai3d ``src/devices/CGenericHapticDevice.cpp`` (15 ms), Force Dimension SDK ``dhdc.h`` (20 ms).
+    """
+
+    samples: int
+    coded_period: Any = None
+
+    def estimate(self, period: Any) -> Estimate:
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
+        return Estimate(window=self.samples, gain=_ratio(period, self.coded_period))
+
+
+@dataclass(frozen=True, repr=False)
+class LowPass(_Checked):
+    """The backward difference, followed by one or two equal first-order low-passes.
+
+    Each low-pass computes ``v <- p v + (1 - p) input`` in every period, with ``p = exp(-T/tau)`` and
+    ``tau = 1/(2 pi cutoff)``. Therefore ``F = (1 - 1/z)/T ((1 - p) z/(z - p))^order``.
+
+    Args:
+        cutoff: cut-off frequency in Hz, > 0 and below the Nyquist frequency. Pass either ``cutoff`` or
+            ``time_constant``.
+        time_constant: tau in s, > 0.
+        order: number of low-passes, 1 or 2.
+        coded_period: period T in s for which p and the difference are computed. Default: the period of the loop.
+
+    References:
+        HannesRovina/HapticHumanRobotInterfaces-Lab ``Firmware/src/haptic_controller.c``;
+        bgromov/Hapkit3.0 ``hapkit3.h``.
+    """
+
+    cutoff: Any = None
+    time_constant: Any = None
+    order: int = field(default=1, metadata={"allowed": Range(1, 2)})
+    coded_period: Any = None
+
+    def __post_init__(self) -> None:
+        if (self.cutoff is None) == (self.time_constant is None):
+            got = "neither cutoff nor time_constant" if self.cutoff is None else "both cutoff and time_constant"
+            raise InputError(
+                f"velocity: got {got}; pass either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them"
+            )
+        super().__post_init__()
+
+    def estimate(self, period: Any) -> Estimate:
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
+        coded = period if self.coded_period is None else self.coded_period
+        if self.time_constant is None:
+            check_cutoff(self.cutoff, coded)
+            decay = 2.0 * _pi(coded) * self.cutoff * coded
+        else:
+            decay = coded / self.time_constant
+        xp = namespace(decay)
+        offset = -xp.expm1(-decay)
+        poles = xp.stack([_as_complex(xp.asarray(offset))] * self.order)
+        gain = offset**self.order * _ratio(period, self.coded_period)
+        return Estimate(1, gain, -self.order, poles=poles)
+
+
+@dataclass(frozen=True, repr=False)
+class Butterworth(_Checked):
+    """The backward difference, followed by a digital Butterworth low-pass as designed by `scipy.signal.butter`.
+
+    Args:
+        cutoff: cut-off frequency in Hz, > 0 and below the Nyquist frequency.
+        order: order of the filter, 1 to 8.
+        coded_period: period in s for which the filter was designed. Default: the period of the loop.
+
+    References:
+        mahilab/HapticPaddle ``src/main.cpp`` (order 4, 25 Hz at 1 kHz); Butterworth 1930, Wireless Engineer 7.
+    """
+
+    cutoff: Any
+    order: int = 2
+    coded_period: Any = None
+
+    def estimate(self, period: Any) -> Estimate:
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
+        coded = period if self.coded_period is None else self.coded_period
+        check_cutoff(self.cutoff, coded)
+        # The analog poles are on a circle, whose radius is prewarped so that the bilinear transform s = (z - 1)/(z + 1)
+        # yields the cut-off frequency.
+        xp = namespace(self.cutoff, coded)
+        size = xp.tan(_pi(coded) * self.cutoff * coded)
+        angles = _pi(coded) * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
+        analog = size * xp.asarray(_unit_vectors(angles))
+        offsets = -2.0 * analog / (1.0 - analog)
+        gain = xp.prod(offsets).real * 0.5**self.order * _ratio(period, self.coded_period)
+        return Estimate(1, gain, zeros=np.full(self.order, 2.0 + 0j), poles=offsets)
+
+
+@dataclass(frozen=True, repr=False)
+class VelocityFilter(Part):
+    """Any linear estimate ``F(z) = numerator/denominator``, from position in m to velocity in m/s.
+
+    Args:
+        numerator: coefficients in 1/s, highest power of z first; or a list of sections in series, each a list of
+            coefficients.
+        denominator: coefficients or sections, as for the numerator. The degree must be at least that of the numerator
+            (a causal filter), and all roots must be inside the unit circle. Use sections for a filter of high order,
+            because rounding errors in the coefficients of a single polynomial move its poles.
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.VelocityFilter([1000, -1000], [1, 0]).estimate(1e-3).gain
+        1.0
+        >>> from scipy import signal
+        >>> sos = signal.butter(8, 2, fs=1000, output="sos")
+        >>> velocity = zwidth.VelocityFilter([[1000, -1000], *sos[:, :3]], [[1, 0], *sos[:, 3:]])
+    """
+
+    numerator: Any
+    denominator: Any
+
+    def __post_init__(self) -> None:
+        for name in ("numerator", "denominator"):
+            sections: tuple[Any, ...] = read_sections(name, getattr(self, name))
+            (first, *others) = sections
+            object.__setattr__(self, name, sections if others else first)
+        top, bottom = (sum(len(section) - 1 for section in part) for part in self._sections)
+        if top > bottom:
+            raise InputError(
+                f"velocity.numerator: got degree {top} over a denominator of degree {bottom}, so the filter needs "
+                "future samples; multiply the denominator by z"
+            )
+        self._check_poles()
+
+    def _check_poles(self) -> None:
+        """Raise `InputError` with the likely cause if a pole is on or outside the unit circle."""
+        poles = self._roots[1]
+        largest = np.max(np.abs(1.0 - poles), initial=0.0)
+        if largest < 1.0:
+            return
+        got = f"velocity.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
+        # Rounding errors of the coefficients move poles far enough only if several poles are near z = 1. A single pole
+        # there is probably an intended integrator.
+        slow = np.abs(poles) < NEXT_TO_ONE
+        if np.sum(slow) != 1 and any(is_rounding(section) for section in self._sections[1]):
+            cause = "Cause: rounding errors of the coefficients; use sections in series (scipy.signal: output='sos')"
+        elif np.any(poles[slow] == 0):
+            cause = "Integral action: model controller and sampled device in series as one LinearDevice (K = 1)"
+        else:
+            cause = "Check the coefficients: highest power first"
+        raise InputError(got + cause)
+
+    @property
+    def _sections(self) -> tuple[Any, Any]:
+        """The sections of numerator and denominator; each section is a tuple of coefficients."""
+        both: Any = self.numerator, self.denominator
+        top, bottom = (part if isinstance(part[0], tuple) else (part,) for part in both)
+        return top, bottom
+
+    @cached_property
+    def _roots(self) -> tuple[np.ndarray, np.ndarray, int]:
+        """The offsets of all zeros and of all poles except at z = 0, and the excess of poles over zeros at z = 0."""
+        roots, trailing = [], []
+        for part in self._sections:
+            sections = [np.array(section) for section in part]
+            trailing.append(sum(map(count_trailing_zeros, sections)))
+            roots.append(np.concatenate([offsets(np.trim_zeros(section, "b")) for section in sections]))
+        return roots[0], roots[1], trailing[1] - trailing[0]
+
+    def estimate(self, period: Any) -> Estimate:
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
+        tops, bottoms = self._sections
+        gain = period
+        for section in tops:
+            gain = section[0] * gain
+        for section in bottoms:
+            gain = gain / section[0]
+        if hasattr(period, "mid"):
+            # If the period is a ball, compute the roots as balls from the exact coefficients, because zeros at z = 1
+            # must be exact.
+            exact = (np.concatenate([ball_offsets(section) for section in part]) for part in (tops, bottoms))
+            return Estimate(0, gain, 0, *exact)
+        zeros, poles, lag = self._roots
+        return Estimate(0, gain, lag, zeros, poles)
+
+
+@dataclass(frozen=True, repr=False)
+class FOAW(_Checked):
+    """First-order adaptive windowing, for simulations only: the estimate is nonlinear, so the loop has no poles.
+
+    The velocity is the slope of the line from the oldest to the newest position of a window. The window grows by one
+    period at a time, up to ``samples``, as long as no position in it deviates from this line by more than ``noise``.
+
+    Args:
+        noise: largest error of the measured position in m, > 0; for an encoder, one count.
+        samples: length of the longest window in periods, 1 to 64.
+
+    References:
+        Janabi-Sharifi, Hayward, Chen 2000, IEEE Trans. Control Systems Technology 8(6):1003-1009 (end-fit).
+    """
+
+    noise: Any
+    samples: int = field(default=15, metadata={"allowed": Range(1, 64)})
+
+    def estimate(self, period: Any) -> Estimate:
+        """Raise `InputError`, because FOAW is nonlinear and has no transfer function F(z)."""
+        raise InputError(
+            "velocity: FOAW has no linear form, so the loop has no poles; simulate it, or use a linear estimate such "
+            "as zwidth.WindowedDifference"
+        )
+
+
+Velocity: TypeAlias = BackwardDifference | WindowedDifference | LowPass | Butterworth | VelocityFilter | FOAW
+ESTIMATES = {
+    "backward_difference": BackwardDifference,
+    "windowed_difference": WindowedDifference,
+    "low_pass": LowPass,
+    "butterworth": Butterworth,
+    "filter": VelocityFilter,
+    "foaw": FOAW,
+}
+"""Classes of velocity estimates by the name of their kind in configurations and on the command line."""
+
+
+def name_estimate(velocity: Velocity) -> str:
+    """Return the name of the kind of an estimate in configurations; raise `InputError` for other classes."""
+    for kind, part in ESTIMATES.items():
+        if type(velocity) is part:
+            return kind
+    raise InputError(
+        f"velocity: got {type(velocity).__name__}, which is not available in configurations; use one of "
+        f"{', '.join(ESTIMATES)}"
+    )
+
+
+def is_plain(velocity: Velocity, period: Any) -> bool:
+    """Return whether an estimate is a backward difference without any parameter, divided by the period of the loop."""
+    if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
+        return False
+    estimate = velocity.estimate(period)
+    return estimate.window == 1 and estimate.is_difference and isinstance(estimate.gain, float) and estimate.gain == 1.0
+
+
+def check_cutoff(cutoff: Any, period: Any) -> None:
+    """Raise `InputError` if a cut-off frequency is not below the Nyquist frequency."""
+    if is_jax(cutoff) or is_jax(period):
+        return
+    if cutoff * period >= 0.5:
+        raise InputError(
+            f"velocity.cutoff: got {cutoff:g} Hz; it must be below half the sampling rate, {0.5 / period:g} Hz; "
+            "lower it, or remove the filter"
+        )
+
+
+def _ratio(period: Any, coded: Any) -> Any:
+    """Return the period of the loop divided by the coded period; 1 if the coded period is None."""
+    return 1.0 if coded is None else period / coded
+
+
+# The following operations differ between floats, JAX arrays and balls.
+
+
+def _pi(like: Any) -> Any:
+    """Return pi as a ball if the argument is a ball, otherwise as a float."""
+    return like.pi() if hasattr(like, "pi") else np.pi
+
+
+def _as_complex(value: Any) -> Any:
+    """Convert an array to complex dtype; return an array of balls unchanged, because balls need no conversion."""
+    return value if value.dtype == object else value + 0j
+
+
+def _unit_vectors(angles: np.ndarray) -> np.ndarray:
+    """Return ``e^(j angle)`` for each angle."""
+    if angles.dtype != object:
+        return np.exp(1j * angles)
+    import flint
+
+    return np.array([flint.acb(angle.cos(), angle.sin()) for angle in angles])

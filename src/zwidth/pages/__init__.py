@@ -1,1 +1,0 @@
-"""Results for the reader: printed lines of the command line (`words`, `verdict`), and the page of `zwidth explore`."""

@@ -1,0 +1,173 @@
+"""Represent the open loop of any linear scene by zeros, poles and gain, and as polynomials in z.
+
+In normalized units (sampling period T = 1, mass m = 1), the wall is the controller ``alpha + beta F(z)``, with the
+velocity estimate F from sampled position to velocity. G is the response from the force of the wall to the sampled
+position. The characteristic polynomial P is affine in the wall,
+
+    P(z) = D + alpha N1 + beta N2,     P(z) = 0  if and only if  alpha + beta F(z) = q(z) = -1/G(z)
+
+and q is called the *critical controller* (docs/theory/scenes.md, V6 and V7). Roots are stored as *offsets* 1 - root,
+because the poles of slow motions lie near z = 1 and would lose their significant digits in z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import chain
+from math import gcd
+
+import numpy as np
+
+from zwidth.core.types import Array
+from zwidth.model.circle_functions import (
+    CirclePoints,
+    Jet,
+    are_on_circle,
+    circle_points,
+    distances_inside,
+    power_jet,
+    product_jet,
+)
+from zwidth.model.velocity import Estimate
+from zwidth.numerics.polynomials import Affine
+
+# Coefficients below this fraction of the largest one are rounding errors of zero.
+NEGLIGIBLE_COEFFICIENT = 1e-12
+
+
+@dataclass(frozen=True)
+class LoopRoots:
+    """The loop without a wall: ``G(z) = gain prod(z - zeros)/(z^lag prod(z - poles))`` and the velocity estimate F."""
+
+    gain: float
+    lag: int
+    zeros: Array
+    poles: Array
+    estimate: Estimate
+
+    def evaluate_controller(self, points: CirclePoints) -> Jet:
+        """Return the critical controller ``q = -1/G`` and its derivative in w at points of the unit circle."""
+        quotient = product_jet(points, self.poles, -1.0).over(product_jet(points, self.zeros, self.gain))
+        return quotient.times(power_jet(points, self.lag))
+
+    def evaluate_response(self, points: CirclePoints) -> Jet:
+        """Return the response G and its derivative in w at points of the unit circle."""
+        quotient = product_jet(points, self.zeros, self.gain).over(product_jet(points, self.poles, 1.0))
+        return quotient.times(power_jet(points, -self.lag))
+
+    @property
+    def order(self) -> int:
+        """The number of closed-loop poles with a damped wall (beta != 0)."""
+        f = self.estimate
+        return self.poles.size + self.lag + f.poles.size + max(f.window + f.lag, 0)
+
+    @property
+    def device_is_unstable(self) -> bool:
+        """True if the device without a wall has a pole outside the unit circle."""
+        return bool(np.any((distances_inside(self.poles) < 0) & ~are_on_circle(self.poles)))
+
+    def as_damper(self) -> LoopRoots | None:
+        """Return the loop of walls with K = 0, in which the damping B takes the place of K as the loop gain.
+
+        The zero of the velocity estimate at z = 1 cancels a pole of the device there. Return None if the zero or the
+        pole does not exist.
+        """
+        f = self.estimate
+        device_poles, estimate_zeros = np.flatnonzero(self.poles == 0), np.flatnonzero(f.zeros == 0)
+        if not device_poles.size or not (f.window or estimate_zeros.size):
+            return None
+        # Compute the zeros of F/(z - 1) as offsets 1 - z. For a window of n samples they are the n-th roots of 1, but
+        # not 1 itself.
+        angles = 2.0 * np.pi * np.arange(1, f.window) / max(f.window, 1)
+        # Set the offset of z = -1 to exactly 2, so that it equals the offset of a zero of the device at z = -1.
+        window = np.where(angles == np.pi, 2.0, -2j * np.sin(0.5 * angles) * np.exp(0.5j * angles))
+        lag = self.lag + f.lag + f.window
+        velocity = f.zeros if f.window else np.delete(f.zeros, estimate_zeros[0])
+        zeros = np.concatenate([self.zeros, velocity, window, np.ones(max(-lag, 0))])
+        poles = np.concatenate([np.delete(self.poles, device_poles[0]), f.poles])
+        return LoopRoots(self.gain * float(f.gain) / max(f.window, 1), max(lag, 0), zeros, poles, Estimate())
+
+    def contract_powers(self) -> tuple[LoopRoots, int]:
+        """Return the loop with z^k replaced by z, for the largest k for which G and F are functions of z^k, and this k.
+
+        Returns:
+            The loop whose poles are the k-th powers of the poles of this one, and k. For most loops k is 1.
+        """
+        f = self.estimate
+        parts = [_expand(each) for each in (self.zeros, self.poles, f.zeros, f.poles)]
+        delays = [self.lag + parts[1].size - parts[0].size, f.lag + parts[3].size - parts[2].size]
+        powers = [np.flatnonzero(np.abs(part) > NEGLIGIBLE_COEFFICIENT * np.abs(part).max()).tolist() for part in parts]
+        k = gcd(f.window, *delays, *chain.from_iterable(powers))
+        if k <= 1:
+            return self, 1
+        roots = [1.0 - np.roots(part[: each[-1] + 1 : k]) for part, each in zip(parts, powers, strict=True)]
+        lags = [delay // k - roots[j + 1].size + roots[j].size for delay, j in zip(delays, (0, 2), strict=True)]
+        slow = replace(f, window=f.window // k, gain=f.gain / k, lag=lags[1], zeros=roots[2], poles=roots[3])
+        return replace(self, lag=lags[0], zeros=roots[0], poles=roots[1], estimate=slow), k
+
+    def bound_variation(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Return a bound of the relative derivatives of q and F in w, over the angles within ``reach`` of w."""
+        z_minus_1 = circle_points(w).z_minus_1[..., None]
+        roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
+        distance = np.abs(z_minus_1 + roots) - reach[..., None]
+        # Limit the resolution near a root on the unit circle. The phase of its factor z - root hardly varies near the
+        # root (V16), and only the modulus needs to be resolved.
+        floor = np.where(are_on_circle(roots), np.where(roots == 0, 1e-9, 1e-5), 0.5 * np.abs(distances_inside(roots)))
+        by_roots = (1.0 / np.maximum(distance, floor)).sum(-1)
+        return by_roots + self.lag + self.estimate.window + abs(self.estimate.lag) + 1.0
+
+
+def compute_aberth_step(roots: Array, rate: Array) -> Array:
+    """Return Aberth's steps for approximations of all roots of P, along the last axis.
+
+    The step is Newton's, corrected for the other roots, so that no two approximations converge to the same root.
+
+    Args:
+        roots: approximations.
+        rate: ``P'/P`` at the approximations.
+
+    Returns:
+        The steps, to be subtracted.
+    """
+    differences = np.where(np.eye(roots.shape[-1], dtype=bool), np.inf, roots[..., :, None] - roots[..., None, :])
+    return 1.0 / (rate - (1.0 / differences).sum(-1))
+
+
+def _expand(*offsets: np.ndarray) -> np.ndarray:
+    """Return the coefficients of the monic polynomial with the given offsets; real, because roots occur in pairs."""
+    return np.atleast_1d(np.poly(1.0 - np.concatenate(offsets))).real
+
+
+def expand_estimate(loop: LoopRoots) -> tuple[np.ndarray, np.ndarray]:
+    """Return the coefficients of the numerator and the denominator of the velocity estimate, highest power first."""
+    f = loop.estimate
+    numerator, denominator = f.gain * _expand(f.zeros), _expand(f.poles)
+    if f.window:
+        difference = np.zeros(f.window + 1)
+        difference[[0, -1]] = 1.0 / f.window, -1.0 / f.window
+        numerator = np.convolve(numerator, difference)
+    delay = f.window + f.lag
+    return np.pad(numerator, (0, max(-delay, 0))), np.pad(denominator, (0, max(delay, 0)))
+
+
+def affine_polynomial(loop: LoopRoots) -> Affine:
+    """Return the coefficients of D, N1 and N2, from which P follows for any wall."""
+    f_numerator, f_denominator = expand_estimate(loop)
+    denominator, numerator = np.pad(_expand(loop.poles), (0, loop.lag)), loop.gain * _expand(loop.zeros)
+    parts = [
+        np.convolve(denominator, f_denominator),
+        np.convolve(numerator, f_denominator),
+        np.convolve(numerator, f_numerator),
+    ]
+    length = max(part.size for part in parts)
+    return Affine(*(np.pad(part, (length - part.size, 0)) for part in parts))
+
+
+def factor_open_loop(loop: LoopRoots, alpha: float, beta: float) -> tuple[np.ndarray, np.ndarray, float, int]:
+    """Return zeros, poles, gain and lag of ``P = z^lag prod(z - poles) + gain prod(z - zeros)`` for one wall."""
+    f, (numerator, denominator) = loop.estimate, expand_estimate(loop)
+    wall = np.trim_zeros(np.polyadd(alpha * denominator, beta * numerator), "f")
+    lag = loop.lag + max(f.window + f.lag, 0)
+    zeros = np.concatenate([1.0 - loop.zeros, np.roots(wall)])
+    poles = 1.0 - np.concatenate([loop.poles, f.poles])
+    return zeros, poles, loop.gain * float(wall[0] if wall.size else 0.0), lag

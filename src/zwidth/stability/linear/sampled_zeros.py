@@ -1,0 +1,164 @@
+"""Compute the zeros of a linear system after discretization with a delayed zero-order hold, in decimal arithmetic.
+
+The system ``x' = A x + B u`` in controllable canonical form is discretized by a matrix exponential, and the
+Faddeev-LeVerrier algorithm computes the numerator of its transfer function (docs/theory/scenes.md, V4 and V22). The
+precision is doubled until two successive results agree, because float64 does not resolve slow zeros next to the aliases
+of fast poles. Zeros are returned as offsets 1 - z.
+"""
+
+from __future__ import annotations
+
+from decimal import Context, Decimal, getcontext, localcontext
+from fractions import Fraction
+from math import comb
+from typing import Any
+
+import numpy as np
+
+from zwidth.core.errors import InputError
+from zwidth.model.exact_polynomials import DIGITS, EXPONENT, Complex, Polynomial, iterate_roots, magnitude
+from zwidth.model.linear_device import LinearDevice
+
+# Largest relative difference between the results of two precisions that agree: a tenth of the resolution of float64.
+PRECISION_TOLERANCE = 1e-17
+# With n decimal digits, leading coefficients below 10^(-2n/NEGLIGIBLE_DIGITS) of the largest are rounding errors of 0.
+NEGLIGIBLE_DIGITS = 3
+
+
+def find_sampled_zeros(device: LinearDevice, period: float, fraction: float) -> tuple[float, np.ndarray]:
+    """Return the leading coefficient of the discretized numerator, in SI units, and ``1 - z`` of its zeros.
+
+    Args:
+        device: the continuous-time system.
+        period: sampling period T in s.
+        fraction: fractional part of the delay, in periods.
+
+    Raises:
+        InputError: if the results of no two precisions agree.
+    """
+    previous: tuple[Decimal, list[Any]] | None = None
+    for digits in DIGITS:
+        with localcontext(Context(prec=digits, Emax=EXPONENT, Emin=-EXPONENT)):
+            result = _compute_zeros(device, period, fraction, digits)
+            if result is not None and previous is not None and _agree(previous, result):
+                return float(result[0]), np.array([complex(*map(float, zero)) for zero in result[1]], complex)
+            previous = result
+    raise InputError(
+        "device: zeros of the sampled response cannot be computed to float64 accuracy; remove modes of tiny response"
+    )
+
+
+def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> bool:
+    """Return whether the gains and the zeros of two precisions differ by at most `PRECISION_TOLERANCE`."""
+    (gain, zeros), (gain2, zeros2) = one, other
+    if len(zeros) != len(zeros2) or abs(gain - gain2) > Decimal(PRECISION_TOLERANCE) * abs(gain2):
+        return False
+    left = list(zeros)
+    for zero in zeros2:
+        distances = [magnitude(Complex(each.real - zero.real, each.imag - zero.imag)) for each in left]
+        nearest = min(range(len(left)), key=distances.__getitem__)
+        if distances[nearest] > Decimal(PRECISION_TOLERANCE) * magnitude(zero):
+            return False
+        del left[nearest]
+    return True
+
+
+def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits: int) -> Any:
+    """Return leading coefficient and zeros with ``digits`` digits; None if all coefficients are 0 by rounding."""
+    denominator, numerator = (_as_decimals(part) for part in (device.system.denominator, device.system.numerator))
+    rest = 1 - Decimal(fraction)
+    transition, full, output = _discretize(denominator, numerator, Decimal(period))
+    if fraction:
+        newer = _discretize(denominator, numerator, Decimal(period) * rest)[1]
+        parts = (
+            [*_expand_numerator(transition, newer, output), Decimal(0)],
+            [Decimal(0), *_expand_numerator(transition, full - newer, output)],
+        )
+        response = [a + b for a, b in zip(*parts, strict=True)]
+    else:
+        response = _expand_numerator(transition, full, output)
+    largest = max(map(abs, response))
+    while response and abs(response[0]) <= largest * Decimal(10) ** (-digits // NEGLIGIBLE_DIGITS * 2):
+        response = response[1:]
+    if not response:
+        return None
+    # Substitute z = 1 - x, so that the roots x are the offsets of the zeros.
+    order = len(response) - 1
+    shifted = [
+        (-1) ** power * sum(response[order - k] * comb(k, power) for k in range(power, order + 1))
+        for power in range(order, -1, -1)
+    ]
+    # Set the zero to exactly z = 1 if the system has a zero at s = 0, that is, no static response to a constant force.
+    has_zero_at_one = device.system.numerator[-1] == 0
+    if has_zero_at_one:
+        shifted = shifted[:-1]
+    zeros, _ = iterate_roots(shifted) if len(shifted) > 1 else ([], [])
+    # Make conjugate pairs exact, and drop imaginary parts that are rounding errors.
+    tolerance = Decimal(10) ** (-digits // 3)
+    pairs = [zero for zero in zeros if zero.imag > tolerance * magnitude(zero)]
+    flat = [Complex(zero.real, Decimal(0)) for zero in zeros if abs(zero.imag) <= tolerance * magnitude(zero)]
+    result = [*pairs, *(Complex(zero.real, -zero.imag) for zero in pairs), *flat]
+    if has_zero_at_one:
+        result.append(Complex(Decimal(0), Decimal(0)))
+    return response[0], result
+
+
+def _as_decimals(polynomial: Polynomial) -> list[Decimal]:
+    """Return rational coefficients as Decimals, rounded to the precision of the decimal context."""
+    return [_as_decimal(value) for value in polynomial]
+
+
+def _as_decimal(value: Fraction) -> Decimal:
+    """Return a rational number as a Decimal, rounded to the precision of the decimal context."""
+    return Decimal(value.numerator) / Decimal(value.denominator)
+
+
+def _discretize(
+    denominator: list[Decimal], numerator: list[Decimal], time: Decimal
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the transition matrix, the state after a unit force held for ``time`` from rest, and the output vector."""
+    order = len(denominator) - 1
+    monic = [value / denominator[0] for value in denominator]
+    # Scale time so that all coefficients of the denominator are at most 1.
+    sizes = [(abs(value).ln() / k).exp() for k, value in enumerate(monic) if k and value]
+    unit = max(sizes, default=Decimal(1))  # must not depend on ``time``, because responses of two times are combined
+    block = np.full((order + 1, order + 1), Decimal(0), object)
+    for k in range(order - 1):
+        block[k, k + 1] = Decimal(1)
+    block[order - 1, :order] = [-monic[order - k] / unit ** (order - k) for k in range(order)]
+    block[order - 1, order] = Decimal(1)
+    exponential = _exponentiate(block, time * unit)
+    # The state x_k is the k-th derivative of the response of 1/denominator, times unit^(order - k).
+    padded = [Decimal(0)] * (order - len(numerator)) + numerator
+    output = np.array([padded[order - 1 - k] / denominator[0] * unit**k / unit**order for k in range(order)], object)
+    return exponential[:order, :order], exponential[:order, order], output
+
+
+def _exponentiate(matrix: np.ndarray, time: Decimal) -> np.ndarray:
+    """Return ``exp(A t)`` by its Taylor series with scaling and squaring."""
+    digits = getcontext().prec
+    norm = max(sum(map(abs, row)) for row in matrix) * time
+    doublings = max(0, int((norm.ln() / Decimal(2).ln()).to_integral_value()) + 4) if norm > 0 else 0
+    small = matrix * (time / Decimal(2) ** doublings)
+    size = len(matrix)
+    identity = np.array([[Decimal(int(i == j)) for j in range(size)] for i in range(size)], object)
+    term, total, k = identity, identity, 0
+    while k == 0 or max(abs(value) for value in term.ravel()) > Decimal(10) ** (-digits - 5):
+        k += 1
+        term = term @ small / Decimal(k)
+        total = total + term
+    for _ in range(doublings):
+        total = total @ total
+    return total
+
+
+def _expand_numerator(transition: np.ndarray, state: np.ndarray, output: np.ndarray) -> list[Decimal]:
+    """Return the coefficients of ``output adj(zI - transition) state``, highest power first, by Faddeev-LeVerrier."""
+    order = len(transition)
+    identity = np.array([[Decimal(int(i == j)) for j in range(order)] for i in range(order)], object)
+    power, coefficients = identity, []
+    for k in range(1, order + 1):
+        coefficients.append(output @ power @ state)
+        product = transition @ power
+        power = product - identity * (np.trace(product) / Decimal(k))
+    return coefficients

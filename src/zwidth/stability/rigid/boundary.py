@@ -1,0 +1,352 @@
+"""Compute the stability boundary of rigid devices: the curve, points at given beta or alpha, the outline and the area.
+
+The stable walls of a device, with its normalized physical damping delta and its delay of d = n + f periods, fill one
+region of the (alpha, beta) plane. Its outline consists of
+
+- the *lobe*, the first part of the boundary curve (`stability.rigid.curve`), on which a pole pair is at e^(+-j omega);
+- for short delays and strong damping, a line alpha + 2 beta = const of walls with a pole at z = -1, which the lobe
+  meets in the *corner*;
+- the line alpha = 0, on which a pole is at z = 1 (docs/theory/boundary.md, docs/theory/one-lobe.md).
+
+The *ridge* is the point of the lobe with the largest alpha. The code parameterizes the lobe by x
+(`stability.rigid.curve`).
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+
+from zwidth.core.errors import InputError, check_choice
+from zwidth.core.status import Status
+from zwidth.core.types import Array, ArrayLike, Vertices
+from zwidth.core.xp import materialize, namespace, nan_with_nan_derivatives, stop_gradient, tree_map
+from zwidth.model.checks import check_integer
+from zwidth.numerics.evaluate import as_number, check_scalars, evaluate
+from zwidth.numerics.held_mass import DelayClasses, classify_delays, is_valid_device
+from zwidth.numerics.root_finding import attach_root_derivatives, integrate
+from zwidth.stability.rigid.curve import (
+    build_lobe,
+    compute_corner_line,
+    compute_frequency,
+    evaluate_lobe,
+    find_column_end,
+    find_peak,
+    find_row_end,
+)
+from zwidth.stability.rigid.normalization import wall_status
+from zwidth.stability.rigid.polynomial import Wall, build_frequency_loop, find_boundary_wall
+from zwidth.stability.rigid.ridge import ridge_kernel
+from zwidth.units.display import compact_repr
+
+PointMethod: TypeAlias = Literal["auto", "optimistix"]
+
+
+def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Wall:
+    """Return the wall that puts a pole pair of the loop at ``e^(+-j omega)``, in closed form.
+
+    With ``q = -z^n (z - 1)(z - c)/(n0(z) + n1(z)/z)`` on ``z = e^(j omega)``: ``beta = Im q / sin omega``,
+    ``alpha = Re q - tan(omega/2) Im q``. The curve starts at (0, -delta), eq. (19). Its first lobe bounds the stable
+    set, see `zwidth.stable_region`. Walls on later parts of the curve have a pole on the unit circle, too, but do not
+    bound the stable set.
+
+    Args:
+        omega: frequency in rad per sample, 0 <= omega <= pi.
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, integer or fractional. All three broadcast.
+
+    Returns:
+        Wall with ``alpha`` and ``beta`` of the broadcast shape; NaN out of range. At omega = 0 and pi the
+        values are the limits. The limit at pi is infinite if N(-1) = 0, as for delta = 0 and integer d (for other d,
+        N(-1) = 0 at one delta at most); otherwise both limits are finite.
+
+    Numerics:
+        Accurate to a few units in the last place, at a cost independent of d. JAX can trace and differentiate it, also
+        in d (from the right at integer d). Float64 when called directly; the ambient precision inside `jit`.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section V; D-decomposition.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.boundary(0.0, 0.25, 2).beta:.2f}")
+        -0.25
+    """
+    return evaluate(_boundary_kernel, {"omega": omega, "delta": delta, "d": d})
+
+
+def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
+    """Compute the wall with a pole pair at ``e^(+-j omega)``, elementwise; NaN if an argument is out of range."""
+    xp = namespace(omega, delta, d)
+    ok = is_valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
+    nan_if_invalid = nan_with_nan_derivatives(ok, omega, delta, d)
+    omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
+    curve = find_boundary_wall(omega, build_frequency_loop(delta, d))
+    return Wall(curve.alpha + nan_if_invalid, curve.beta + nan_if_invalid)
+
+
+@compact_repr()
+class BoundaryPoint(NamedTuple):
+    """A wall on the stability boundary, or arrays of such walls."""
+
+    alpha: Array
+    beta: Array
+    omega: Array
+    status: Array
+
+
+def boundary_point(
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    beta: ArrayLike | None = None,
+    alpha: ArrayLike | None = None,
+    side: str = "lower",
+    method: PointMethod = "auto",
+) -> BoundaryPoint:
+    """Return the point of the stability boundary at a given virtual damping or at a given stiffness.
+
+    At a given ``beta`` it is the stiffest stable wall. At a given ``alpha`` it is the wall with the smallest
+    (``side="lower"``) or the largest (``"upper"``) stable damping. The point satisfies ``P(e^(j omega)) = 0``.
+
+    Args:
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, integer or fractional.
+        beta: normalized virtual damping B T/m; or
+        alpha: normalized stiffness K T^2/m, > 0.
+        side: "lower" or "upper", for a given ``alpha``. All arguments broadcast.
+        method: "auto" inverts the closed form of the lobe; "optimistix" solves ``P(e^(j omega)) = 0`` in real unknowns,
+            from a bracket by jaxopt. The second method is independent of the first one; JAX compiles it.
+
+    Returns:
+        BoundaryPoint: ``alpha``, ``beta``; ``omega`` of the pole on the circle (pi: a real one); ``status``, see
+        `zwidth.Status`: NO_BOUNDARY if no wall of this damping or stiffness is stable. The values are NaN unless the
+        status is OK.
+
+    Raises:
+        InputError: none or both of ``beta`` and ``alpha`` are given, an argument is no real number or a scalar out of
+            range, shapes do not broadcast, or a name is unknown.
+
+    Numerics:
+        alpha and ``beta + delta`` to about 1e-15 relative, times their condition number: near the ridge, alpha
+        determines only half of the digits of beta. NumPy, compiled and traced calls return the same; a scalar takes a
+        fraction of a millisecond and compiles nothing. JAX can differentiate it twice, also in d (from the right at
+        integer d). The stable walls of one damping or stiffness form an interval (docs/theory/one-lobe.md).
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section V.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.boundary_point(0.0, 0, beta=0.5).alpha:.4f}")
+        0.6000
+    """
+    check_choice("side", side, ("lower", "upper"))
+    check_choice("method", method, get_args(PointMethod))
+    given_lines = [(name, value) for name, value in (("beta", beta), ("alpha", alpha)) if value is not None]
+    if len(given_lines) != 1:
+        raise InputError(f"beta, alpha: got {'both' if given_lines else 'none'}; give exactly one of the two")
+    ((name, value),) = given_lines
+    line = side if beta is None else "row"
+    arguments = {"delta": delta, "d": d, name: value}
+    if method == "optimistix":
+        # Import only if requested, because importing the solvers takes a second.
+        from zwidth.stability.rigid.exact_points import point_kernel
+
+        return BoundaryPoint(*evaluate(point_kernel, arguments, line, ridge_kernel, route="jax"))
+    return evaluate(_point_kernel, arguments, line, classify_delays(d))
+
+
+def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -> BoundaryPoint:
+    """Return the boundary point at a given beta or alpha.
+
+    Args:
+        delta: Normalized physical damping.
+        d: Delay in periods.
+        number: The given beta if ``line`` is "row"; the given alpha if it is "lower" or "upper".
+        line: "row" for the largest stable alpha at this beta; "lower" or "upper" for the smallest or the largest stable
+            beta at this alpha.
+        kind: `DelayClasses` of d.
+    """
+    xp, is_row, zero = namespace(delta, d, number), line == "row", 0.0 * number
+    input_status = wall_status(*((zero, number) if is_row else (number, zero)), delta, d)
+    curve = build_lobe(delta, d, kind)
+    frozen_curve, frozen_number = stop_gradient((curve, number), xp)
+    if is_row:
+        limit = materialize(find_row_end(frozen_number, frozen_curve), delta)
+        x, on_lobe, exists = limit.x, limit.meets_lobe, (limit.meets_lobe | limit.beyond) & (limit.alpha > 0)
+        x = attach_root_derivatives(
+            lambda x, curve, b: evaluate_lobe(x, curve).b - b, x, lambda *_: True, curve, number + delta
+        )
+        point = evaluate_lobe(x, curve)
+        # Return the limit of alpha that `zwidth.is_stable` uses, but let its derivatives be those of the lobe's point.
+        alpha = (
+            limit.alpha if xp is np else stop_gradient(limit.alpha, xp) + (point.alpha - stop_gradient(point.alpha, xp))
+        )
+        beta = number
+    else:
+        top = find_peak(frozen_curve, kind)
+        exists = (frozen_number > 0) & (frozen_number < top.alpha)
+        target = xp.where(exists, frozen_number, 0.5 * top.alpha)
+        x, on_line = materialize(find_column_end(target, top, frozen_curve, line == "upper"), delta)
+        on_lobe = ~on_line
+        x = attach_root_derivatives(
+            lambda x, curve, alpha: evaluate_lobe(x, curve).alpha - alpha, x, lambda *_: True, curve, number
+        )
+        point = evaluate_lobe(x, curve)
+        # Take no further Newton step, because near the ridge the step would be a quotient of rounding errors.
+        alpha, beta = number, point.b - delta
+    omega = compute_frequency(x, curve)
+    if curve.short_curve is not None and line != "lower":
+        # On the line of walls with a pole at z = -1, alpha + 2 beta is constant.
+        line_value = compute_corner_line(curve) - (2.0 * number if is_row else number)
+        alpha = xp.where(on_lobe, alpha, line_value) if is_row else alpha
+        beta = beta if is_row else xp.where(on_lobe, beta, 0.5 * line_value)
+        omega = xp.where(on_lobe, omega, np.pi)
+    status = xp.where(exists, int(Status.OK), int(Status.NO_BOUNDARY))
+    status = xp.where(input_status == int(Status.OK), status, input_status)
+    # Values and derivatives are NaN if the point does not exist.
+    nan_if_missing = nan_with_nan_derivatives(status == int(Status.OK), delta, d, number)
+    return BoundaryPoint(alpha + nan_if_missing, beta + nan_if_missing, omega + nan_if_missing, status.astype(np.int32))
+
+
+class Piece(IntEnum):
+    """The pole that is on the unit circle along one part of the outline."""
+
+    COMPLEX_PAIR = 0
+    MINUS_ONE = 1
+    PLUS_ONE = 2
+
+
+@compact_repr()
+class StableRegion(NamedTuple):
+    """Closed outline of the stable set: vertex k lies on ``piece[k]``, and alpha = 0 joins the last to the first."""
+
+    alpha: Vertices
+    beta: Vertices
+    omega: Vertices
+    piece: np.ndarray
+
+    @property
+    def area(self) -> float:
+        """Area of the polygon, by the shoelace formula."""
+        x, y = self.alpha, self.beta
+        return float(0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
+
+
+def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices, Vertices, Vertices]:
+    """Return frequencies along the first lobe of the boundary curve, and alpha and beta at these frequencies."""
+    device = {"delta": as_number("delta", delta, 0.0), "d": as_number("d", d, 0.0)}
+    check_scalars(device)
+    points = check_integer("points", points, 8, 10**7)
+    kind = classify_delays(d)
+    with np.errstate(all="ignore"):
+        curve = build_lobe(np.float64(device["delta"]), np.float64(device["d"]), kind)
+        top = find_peak(curve, kind).x
+        first, last = (float(compute_frequency(x, curve)) for x in (top, curve.end))
+    # Space the points more closely at both ends and at the ridge, where the curvature is largest.
+    half_grid = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, points // 2)))
+    omega = (
+        np.concatenate([first * half_grid, first + (last - first) * half_grid[1:]])
+        if first < last
+        else last * half_grid
+    )
+    # Limit omega to the end of the lobe, because the rounding error of the last product may exceed it.
+    omega = np.minimum(omega, last)
+    wall = boundary(omega, delta, d)
+    return omega, np.asarray(wall.alpha), np.asarray(wall.beta)
+
+
+def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
+    """Return the outline of the stable set in the (alpha, beta) plane.
+
+    The outline is the lobe of the boundary curve, from (0, -delta) to its return to alpha = 0 or to the line on which a
+    real pole is at z = -1. It is closed along this line and along alpha = 0, where a real pole is at z = 1.
+
+    Args:
+        delta: normalized physical damping b T/m, >= 0, a single number.
+        d: delay in periods, >= 0, a single number.
+        points: number of points on the curve, 8 to 10,000,000.
+
+    Returns:
+        StableRegion: ``alpha``, ``beta``, ``omega`` (0 and pi on the straight parts), ``piece`` (see `Piece`); ``area``
+        in units of alpha times beta, of the polygon.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section V, Figs. 5 and 7.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.stable_region(0.0, 0).alpha.max():.4f}")
+        0.6863
+    """
+    omega, alpha, beta = sample_lobe(delta, d, points=points)
+    piece = np.full(omega.shape, Piece.COMPLEX_PAIR)
+    if omega[-1] == np.pi and alpha[-1] > 0:
+        # Add the straight part from the corner along alpha + 2 beta = const to alpha = 0.
+        omega, piece = np.append(omega, np.pi), np.append(piece, Piece.MINUS_ONE)
+        beta = np.append(beta, beta[-1] + 0.5 * alpha[-1])
+        alpha = np.append(alpha, 0.0)
+    alpha[-1] = 0.0
+    return StableRegion(alpha, beta, omega, piece)
+
+
+LOBE_NODES = 48  # Gauss-Legendre nodes along the lobe; the integrand alpha d(beta) is analytic there
+LOBE_WEIGHT = 16  # computing time and memory per point of `stable_area`, relative to other kernels
+
+
+def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
+    """Return the area of the stable set in the (alpha, beta) plane.
+
+    ``A = integral of alpha d(beta)`` along the outline of `zwidth.stable_region`. In SI units, the area over K and B is
+    ``A m^2/T^3``.
+
+    Args:
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, integer or fractional. Both broadcast.
+
+    Returns:
+        Array of the broadcast shape; NaN out of range.
+
+    Numerics:
+        Gauss-Legendre quadrature of the closed form, accurate to about 1e-13. JAX can differentiate it twice, in d from
+        the right at integer d.
+
+    References:
+        Colgate, Brown 1994 (Z-width); Hulin, Preusche, Hirzinger 2006, section V.
+
+    Example:
+        >>> from zwidth import stable_area
+        >>> print(f"{stable_area(0.0, 0):.4f}")
+        0.9096
+    """
+    return evaluate(_area_kernel, {"delta": delta, "d": d}, classify_delays(d), weight=LOBE_WEIGHT)
+
+
+def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
+    """Compute the area of the stable set, elementwise: the integral of alpha d(b) along the lobe, plus a triangle."""
+    xp = namespace(delta, d)
+    curve = build_lobe(delta, d, kind)
+    end = stop_gradient(curve.end, xp)
+    # If the lobe ends in the corner, the outline continues to alpha = 0 along alpha + 2 beta = const.
+    point = evaluate_lobe(end, curve)
+    corner_alpha = xp.where(curve.to_corner, point.alpha, 0.0)
+    if xp is not np:
+        # Without a corner, alpha is 0 at the end of the lobe. Add one Newton step, because second derivatives of the
+        # area need the derivative of this end.
+        end = end - xp.where(
+            curve.to_corner, 0.0, point.alpha / stop_gradient(xp.where(curve.to_corner, 1.0, point.d_alpha), xp)
+        )
+    # Add an axis for the quadrature nodes.
+    expanded = tree_map(lambda value: None if value is None else value[..., None], curve)
+
+    def integrand(x: Array) -> Array:
+        point = evaluate_lobe(x, expanded)
+        return point.alpha * point.d_b
+
+    under_lobe = integrate(integrand, (0.0 * end, end), (LOBE_NODES,))
+    return (
+        under_lobe + 0.25 * corner_alpha * corner_alpha + nan_with_nan_derivatives(is_valid_device(delta, d), delta, d)
+    )

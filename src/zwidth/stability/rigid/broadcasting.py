@@ -1,0 +1,227 @@
+"""Fold repeated values of the arguments alpha, beta, delta and d, and group points by the degree of P.
+
+A *point* is one combination of the four arguments: a wall (alpha, beta) on a device with damping delta and delay d. If
+an argument is constant along an axis (broadcast views, `numpy.meshgrid`), the axis is *folded*: the argument gets
+length 1 there. From these shapes callers recognize a grid over alpha and beta for one device, and compute the device
+once and each line of constant beta once.
+
+The characteristic polynomial P has a degree that depends on the delay. For functions whose results have the length of
+P, points are grouped by this degree, so that no array is padded before the computation. A *kernel* is a function of
+*columns*, one-dimensional arrays with one entry per point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.core.errors import TracedDelayError
+from zwidth.core.types import ArrayLike
+from zwidth.core.xp import is_traced
+from zwidth.numerics.evaluate import (
+    FEW,
+    Route,
+    as_float64,
+    broadcast,
+    broadcast_traced,
+    check_scalars,
+    evaluate_columns,
+    join_shapes,
+    to_caller,
+)
+from zwidth.units.quantities import LONGEST_DELAY
+
+NAMES: tuple[str, ...] = ("alpha", "beta", "delta", "d")
+
+
+class Degree(NamedTuple):
+    """The integer part of a delay, and whether it has a fractional part; both determine the degree of P."""
+
+    n: int  # integer part of the delay
+    fractional: bool  # the delay has a fractional part
+
+    @property
+    def poles(self) -> int:
+        """Degree of P: 3 + d for integer d, 4 + n otherwise."""
+        return self.n + (4 if self.fractional else 3)
+
+
+def find_degree(d: float) -> Degree:
+    """Return the `Degree` for one delay (a plain number); for an invalid delay, that for d = 0."""
+    if not (np.isfinite(d) and d >= 0):
+        return Degree(0, False)
+    n = int(np.floor(d))
+    return Degree(n, bool(d != n))
+
+
+def map_by_degree(
+    kernel: Callable[..., Any], values: tuple[ArrayLike, ...], *static: Any, lead: bool = False, route: Route = "auto"
+) -> Any:
+    """Evaluate a kernel for all points, one degree of P after the other, and return its vectors as one array.
+
+    The kernel is called as ``kernel(alpha, beta, delta, d, degree, *static)``.
+
+    Args:
+        kernel: Function of columns of points of one degree; returns an array (points, length).
+        values: alpha, beta, delta and d, of any delays.
+        *static: Further arguments of the kernel.
+        lead: Fill shorter vectors with leading zeros, for coefficients; otherwise with NaN at the end, for poles.
+        route: Route of `evaluate_columns`; with "numpy" the kernel receives all points of a degree at once.
+
+    Returns:
+        Array of the broadcast shape and a last axis of the greatest length.
+    """
+    arguments = dict(zip(NAMES, values, strict=True))
+    check_scalars(arguments)
+    traced = is_traced(*values)
+    if traced:
+        if is_traced(values[-1]):
+            raise TracedDelayError(
+                "d: got a traced value, but the number of poles depends on it; pass d as a plain number, "
+                "for example through jit's static_argnums or a closure"
+            )
+        delays, arrays = as_float64("d", values[-1]), broadcast_traced(arguments)
+        import jax.numpy as xp
+    else:
+        arrays, xp = broadcast(arguments), np
+        delays = arrays[-1]
+    shape = np.shape(arrays[0])
+    columns: list[Any] = [xp.reshape(array, -1) for array in arrays]
+    # Treat delays out of range as 0, because they must not determine the length of the result.
+    defined = np.broadcast_to(np.where((delays >= 0) & (delays <= LONGEST_DELAY), delays, 0.0), shape).reshape(-1)
+    vectors, indices = [], []
+    for delay, group, index in group_by_value(tuple(columns), 0.5 * (np.floor(defined) + np.ceil(defined))):
+        degree = find_degree(delay)
+        if traced or route == "numpy":
+            with np.errstate(all="ignore"):
+                vectors.append(kernel(*group, degree, *static))
+        else:
+            # Computing cost per point: an eighth of the number of poles, rounded down to a power of two, at least 1.
+            weight = 1 << max(0, degree.poles.bit_length() - 4)
+            vectors.append(evaluate_columns(kernel, group, degree, *static, weight=weight))
+        indices.append(np.arange(columns[0].size)[index])
+    (result, *others), longest = vectors, max(vector.shape[1] for vector in vectors)
+    if others:
+        order = np.argsort(np.concatenate(indices), kind="stable")
+        result = xp.concatenate([_pad_vectors(vector, longest, lead, xp) for vector in vectors])[order]
+    result = result.reshape(*shape, longest)
+    return result if traced else to_caller(result, values)
+
+
+def _pad_vectors(part: Any, longest: int, lead: bool, xp: Any) -> Any:
+    """Pad the vectors of one degree to the length ``longest``: with leading zeros, or with NaN at the end."""
+    missing = longest - part.shape[1]
+    if not lead:
+        return xp.pad(part, ((0, 0), (0, missing)), constant_values=xp.nan)
+    # Insert leading zeros before the coefficients of a valid polynomial, and NaN if the point is invalid.
+    front = xp.where(xp.isnan(part[:, :1]), xp.nan, 0.0)
+    return xp.concatenate([xp.repeat(front, missing, axis=1), part], axis=1)
+
+
+def count_uncompiled_points(degree: Degree) -> int:
+    """Return the largest number of points of one degree for which NumPy is faster than compiling."""
+    return max(1, FEW // max(8, degree.poles**2))
+
+
+# Smallest size of an argument whose values are compared to detect repetition; for fewer values a comparison takes
+# longer than folding saves.
+MIN_COMPARED_SIZE = 2048
+# Smallest grid that is compiled in its own shape. Smaller grids are flattened into columns and padded to common sizes,
+# so that they share one compiled program.
+MIN_DENSE_SIZE = 1 << 16
+
+
+class Points(NamedTuple):
+    """Float64 arrays of alpha, beta, delta and d of equal rank, with length 1 along axes on which they are constant."""
+
+    alpha: np.ndarray
+    beta: np.ndarray
+    delta: np.ndarray
+    d: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape to which the four arguments broadcast."""
+        return np.broadcast_shapes(*(array.shape for array in self))
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return int(np.prod(self.shape))
+
+    def columns(self) -> list[np.ndarray]:
+        """Return the points as one column per argument; a column has length 1 if the argument is constant."""
+        return [a.reshape(1) if a.size == 1 else np.broadcast_to(a, self.shape).reshape(-1) for a in self]
+
+    @property
+    def is_dense(self) -> bool:
+        """True if the points form a grid that is large enough to be compiled in its own shape."""
+        shape = self.shape
+        return self.size >= MIN_DENSE_SIZE and shape[-1] >= 32 and 4 * sum(a.size for a in self) <= self.size
+
+
+def fold_arguments(values: tuple[Any, Any, Any, Any]) -> tuple[Points, tuple[int, ...]]:
+    """Check plain (untraced) arguments and fold them; return the points and the shape to which they broadcast."""
+    arrays = [as_float64(name, value) for name, value in zip(NAMES, values, strict=True)]
+    shape = join_shapes(zip(NAMES, (array.shape for array in arrays), strict=True))
+    aligned = [array.reshape((1,) * (len(shape) - array.ndim) + array.shape) for array in arrays]
+    return Points(*map(fold, aligned)), shape
+
+
+def restore_shape(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Broadcast the results of folded arguments to the original shape; returns a view if a result is repeated."""
+    return values if values.shape == shape else np.broadcast_to(values, shape)
+
+
+def fold(array: np.ndarray) -> np.ndarray:
+    """Return the array with every axis along which its values are constant reduced to length 1."""
+    # Decide by the size before folding whether values are compared, because folding one axis reduces the size.
+    compare = array.size >= MIN_COMPARED_SIZE
+    for axis in range(array.ndim):
+        if array.shape[axis] > 1 and _is_constant(array, axis, compare):
+            array = array[(slice(None),) * axis + (slice(0, 1),)]
+    return array
+
+
+def _is_constant(array: np.ndarray, axis: int, compare: bool) -> bool:
+    """Return whether the values are constant along an axis: by the stride and, if ``compare``, by comparing values."""
+    if array.strides[axis] == 0:
+        return True
+    if not compare:
+        return False
+    along = np.moveaxis(array, axis, 0)
+    # Compare the last slice first, because it differs in most arrays that are not constant.
+    return bool(np.array_equal(along[0], along[-1]) and (along == along[0]).all())
+
+
+def group_by_value(
+    arrays: tuple[np.ndarray, ...], key: np.ndarray
+) -> Iterator[tuple[Any, tuple[np.ndarray, ...], Any]]:
+    """Yield each distinct value of a key, with the arguments of the points with this value and their index.
+
+    Args:
+        arrays: Arguments.
+        key: Array that broadcasts with the arguments.
+
+    Yields:
+        The value; the arguments of its points; and the index of these points in the broadcast shape.
+    """
+    # If the key varies along one axis only, each group keeps its layout; otherwise its points are flattened.
+    key = fold(key)
+    # Handle a single value separately, because it is the most frequent case; without any point, yield the value 0.
+    values = np.unique(key) if key.size else np.zeros(1)
+    varying = [axis for axis, length in enumerate(key.shape) if length > 1]
+    if values.size == 1:
+        yield values[0], arrays, ...
+        return
+    if len(varying) > 1:
+        key, *all_arrays = np.broadcast_arrays(key, *arrays)
+        for value in values:
+            yield value, tuple(array[key == value] for array in all_arrays), key == value
+        return
+    for value in values:
+        axis, index = varying[0], np.flatnonzero(key.reshape(-1) == value)
+        group = tuple(array if array.shape[axis] == 1 else array.take(index, axis) for array in arrays)
+        yield value, group, (slice(None),) * axis + (index,)

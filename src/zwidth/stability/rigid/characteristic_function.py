@@ -1,0 +1,196 @@
+"""Evaluate the characteristic polynomial P and its derivatives at a point, and take Newton or Halley steps to a pole.
+
+The polynomial is evaluated in factored form (`loops.rigid.circle.LoopFactors`),
+
+    P = z^p A + D      p = 1 + n      A = (z - 1)(z - c)      D = (a2 z + h)(s z - beta)
+
+For fractional delays both terms have one more factor: z^p becomes z^(p+1), and D is multiplied by z + q. At
+``z = e^(re + j im)`` all terms are computed from z - 1, so that poles near 1 keep their relative accuracy. P is
+divided by the larger of |z^p| and 1, so that nothing overflows for large n. As a function of log z, P is close to an
+exponential; for such functions Halley's method converges from distant starting points, and cubically near the pole.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.core.types import Array
+from zwidth.core.xp import COSINE, SINE, epsilon, horner, materialize, namespace
+from zwidth.numerics.polynomials import abs2
+from zwidth.stability.rigid.pole_count import LoopFactors
+
+# Bound of the rounding error of P, in rounding units of the sum of the moduli of its terms. The rounding error of the
+# angle p im is added separately.
+FACTOR_ROUNDING = 16.0
+# Longest step of Halley's method, relative to the distance 1/(1 + n) between neighboring poles of a long delay; longer
+# steps would lead to other poles.
+MAX_STEP = 1.0
+
+
+class Pair:
+    """A complex array as a pair of real arrays, which XLA compiles to faster loops than complex arrays."""
+
+    __slots__ = ("imag", "real")
+
+    def __init__(self, real: Array, imag: Array) -> None:
+        self.real, self.imag = real, imag
+
+    def __add__(self, other: Any) -> Pair:
+        if isinstance(other, Pair):
+            return Pair(self.real + other.real, self.imag + other.imag)
+        return Pair(self.real + other, self.imag)
+
+    def __mul__(self, other: Any) -> Pair:
+        if isinstance(other, Pair):
+            real = self.real * other.real - self.imag * other.imag
+            return Pair(real, self.real * other.imag + self.imag * other.real)
+        return Pair(self.real * other, self.imag * other)
+
+    def over(self, other: Pair) -> Pair:
+        """Return the quotient of this array and another one."""
+        size = abs2(other)
+        real = (self.real * other.real + self.imag * other.imag) / size
+        return Pair(real, (self.imag * other.real - self.real * other.imag) / size)
+
+    def conjugate(self) -> Pair:
+        """Return the complex conjugate."""
+        return Pair(self.real, -self.imag)
+
+
+def make_complex(re: Array, im: Array) -> Array:
+    """Return the complex array re + j im."""
+    # Under JAX, XLA computes one complex array in a single loop, but two real arrays in two loops, which repeat the
+    # operations that they share.
+    if namespace(re) is not np:
+        from jax.lax import complex as make_complex
+
+        return make_complex(re, im)
+    value = np.empty(np.broadcast_shapes(re.shape, im.shape), complex)
+    value.real, value.imag = re, im
+    return value
+
+
+class PolynomialValue(NamedTuple):
+    """P, scaled by the larger of |z^p| and 1, with its derivatives in log z and a bound of its rounding error."""
+
+    p: Any
+    first: Any  # first derivative in log z
+    second: Any  # second derivative in log z
+    rounding: Array  # bound of the rounding error of p
+
+
+def _sine_and_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
+    """Return sine and cosine for |x| <= pi/2."""
+    if xp is np:
+        # Convert single numbers to plain floats, because arithmetic with NumPy scalars is slower.
+        return (float(np.sin(x)), float(np.cos(x))) if type(x) is float else (np.sin(x), np.cos(x))
+    square = x * x
+    return x * horner(square, SINE), horner(square, COSINE)
+
+
+def _store_pair(value: Any, witness: Array) -> Any:
+    """Return a pair that XLA computes only once, although several of its loops use the pair."""
+    # Otherwise five loops would each repeat the series of this pair; computing it once saves 30 % of a step's time.
+    return Pair(*materialize((value.real, value.imag), witness))
+
+
+def evaluate_polynomial(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> PolynomialValue:
+    """Evaluate P and its derivatives at ``e^(re + j im)``, |im| <= pi."""
+    xp = namespace(re, loop.alpha)
+    number: Any = make_complex if xp is np else Pair
+    if xp is np and not np.ndim(re):
+        # Convert single numbers to Python's types, which are several times faster.
+        number, re, im, loop = complex, float(re), float(im), LoopFactors(*map(float, loop))
+    power = loop.n_plus_1 + 1.0 if fractional else loop.n_plus_1
+    expm1_re = float(np.expm1(re)) if number is complex else xp.expm1(re)
+    r = 1.0 + expm1_re
+    sine, cosine = _sine_and_cosine(0.5 * im, xp)
+    z_minus_1 = number(expm1_re - 2.0 * r * sine * sine, 2.0 * r * sine * cosine)
+    log_power = power * re
+    # Select by the sign and do not use abs(), because its derivative at 0 belongs to neither of the two scales below.
+    smaller = xp.exp(xp.where(log_power < 0, log_power, -log_power))
+    device_scale, wall_scale = xp.where(log_power < 0, smaller, 1.0), xp.where(log_power < 0, 1.0, smaller)
+    phase = power * im
+    full_turns = xp.round(phase / (2.0 * np.pi))
+    if number is complex:
+        device_scale, wall_scale, full_turns = float(device_scale), float(wall_scale), float(full_turns)
+    phase = phase - 2.0 * np.pi * full_turns
+    half_sine, half_cosine = _sine_and_cosine(0.5 * phase, xp)
+    delay = number(device_scale * (1.0 - 2.0 * half_sine * half_sine), 2.0 * device_scale * half_sine * half_cosine)
+    if number is Pair:
+        z_minus_1, delay = _store_pair(z_minus_1, re), _store_pair(delay, re)
+    z = z_minus_1 + 1.0
+    device, device_slope = z_minus_1 * (z_minus_1 + loop.em), z * (z_minus_1 * 2.0 + loop.em)
+    numerator = (z * loop.a2 + loop.h) * wall_scale
+    numerator_slope, wall_factor, wall_slope = z * (loop.a2 * wall_scale), z_minus_1 * loop.s + loop.alpha, z * loop.s
+    d = numerator * wall_factor
+    d1 = numerator_slope * wall_factor + numerator * wall_slope
+    d2 = d1 + numerator_slope * wall_slope * 2.0
+    abs_z_minus_1 = xp.abs(z_minus_1.real) + xp.abs(z_minus_1.imag)
+    wall_size = wall_scale * (loop.h + loop.a2 * r) * (xp.abs(loop.alpha) + xp.abs(loop.s) * abs_z_minus_1)
+    if fractional:
+        z_plus_q = z + loop.q
+        d, d1, d2 = d * z_plus_q, d1 * z_plus_q + d * z, d2 * z_plus_q + (d1 * 2.0 + d) * z
+        wall_size = wall_size * (r + loop.q)
+    t1 = delay * (device * power + device_slope)
+    t2 = delay * ((device * power + device_slope * 2.0) * power + device_slope + z * z * 2.0)
+    angle_rounding = power * (xp.abs(re) + xp.abs(im))
+    rounding = (
+        device_scale * abs_z_minus_1 * (abs_z_minus_1 + loop.em) * (FACTOR_ROUNDING + angle_rounding)
+        + FACTOR_ROUNDING * wall_size
+    )
+    values = delay * device + d, t1 + d1, t2 + d2
+    # Convert to NumPy's type, because Python's complex numbers raise an error on division by zero.
+    return PolynomialValue(
+        *(map(np.complex128, values) if number is complex else values), rounding=epsilon(re) * rounding
+    )
+
+
+class NewtonStep(NamedTuple):
+    """A Newton step for log z, with error bounds."""
+
+    re: Array  # the step in Re log z
+    im: Array  # the step in Im log z
+    radius: Array  # a pole is within this distance of the point before the step
+    end_error: Array  # estimated distance of the pole from the point after the step
+
+
+def newton_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> NewtonStep:
+    """Compute one Newton step from ``e^(re + j im)``, |im| <= pi."""
+    xp = namespace(re, loop.alpha)
+    value = evaluate_polynomial(re, im, loop, fractional)
+    norm = abs2(value.first)
+    step = value.p * value.first.conjugate() * (-1.0 / norm)
+    # A polynomial of degree N has a zero within N |P/P'| of every point.
+    degree, slope = loop.n_plus_1 + (3.0 if fractional else 2.0), xp.sqrt(norm)
+    rounding_error = value.rounding / slope
+    # Estimate the error after the step from the second derivative; near a double pole the error is half the step.
+    curvature_error = abs2(step) * xp.sqrt(abs2(value.second)) / slope
+    return NewtonStep(
+        step.real,
+        step.imag,
+        degree * (xp.sqrt(abs2(value.p)) / slope + rounding_error),
+        rounding_error + curvature_error,
+    )
+
+
+def halley_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
+    """Return the point after one Halley step, which is limited to `MAX_STEP`; the point is in the upper half plane."""
+    xp = namespace(re, loop.alpha)
+    value = evaluate_polynomial(re, im, loop, fractional)
+    inverse_first = value.first.conjugate() * (1.0 / abs2(value.first))
+    step = value.p * inverse_first
+    denominator = step * (value.second * inverse_first) * -0.5 + 1.0
+    step = step * denominator.conjugate() * (-1.0 / abs2(denominator))
+    size = xp.sqrt(abs2(step)) * (loop.n_plus_1 + 1.0)
+    factor = MAX_STEP / xp.maximum(size, MAX_STEP)
+    return shift_pole(re, im, step.real * factor, step.imag * factor)
+
+
+def shift_pole(re: Array, im: Array, step_re: Array, step_im: Array) -> tuple[Array, Array]:
+    """Add a step to log z; a result below the real axis is replaced by its complex conjugate."""
+    xp = namespace(re)
+    im = xp.abs(im + step_im)
+    return re + step_re, xp.where(im > np.pi, 2.0 * np.pi - im, im)

@@ -1,0 +1,290 @@
+"""Test and measure the passivity of walls on rigid devices (Colgate's condition), for any delay.
+
+The wall with the normalized stiffness alpha and damping beta is passive if the physical damping delta exceeds a bound
+at every frequency (docs/theory/passivity.md). The *needed damping* is the maximum of this bound over frequency
+(`stability.rigid.required_damping`). It is convex and homogeneous in (alpha, beta), so the passive walls of all devices
+with the same delay d form one convex set, scaled by delta. On grids of one delay, the needed damping is evaluated from
+a polynomial in one variable that represents the *direction* beta/alpha.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from zwidth.core.types import Array, ArrayLike
+from zwidth.core.xp import horner, is_traced, namespace, nan_with_nan_derivatives, stop_gradient
+from zwidth.numerics.evaluate import FEW, as_number, check_scalars, evaluate, evaluate_columns, to_caller
+from zwidth.numerics.held_mass import ANY, DelayClasses, classify_delays, is_valid_device
+from zwidth.numerics.root_finding import integrate
+from zwidth.stability.rigid.broadcasting import NAMES, Points, fold_arguments, group_by_value, restore_shape
+from zwidth.stability.rigid.normalization import valid_wall
+from zwidth.stability.rigid.required_damping import compute_needed_damping, find_directions, solve_larger_root
+from zwidth.units.quantities import LONGEST_DELAY
+
+# Terms of the Chebyshev series; the last one is below 1e-16 for every delay.
+N_TERMS = 30
+# Rounds of the search in `passive_stiffness_slope`; each narrows the bracket of the direction by a factor of 8.
+SEARCH_ROUNDS = 17
+NO_DELAY = DelayClasses(True, False, False)
+
+
+def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
+    """Compute `passivity_margin` elementwise, for the classes of delays ``kind``."""
+    xp = namespace(alpha, beta, delta, d)
+    valid = valid_wall(alpha, beta, delta, d)
+    # Select by alpha >= 0 and do not use the maximum of alpha and 0, because that would halve the derivative at 0.
+    safe_alpha = xp.where(valid & (alpha >= 0), alpha, 0.0)
+    safe_beta, safe_d = xp.where(valid, beta, 0.0), xp.where(valid, d, 0.0)
+    margin = delta - compute_needed_damping(safe_alpha, safe_beta, safe_d, kind)
+    return _limit_margin(margin, alpha) + nan_with_nan_derivatives(valid, alpha, beta, delta, d)
+
+
+def _limit_margin(margin: Array, alpha: Array) -> Array:
+    """Limit the margin to alpha for negative stiffness, which supplies unbounded energy even if the condition holds."""
+    xp = namespace(margin, alpha)
+    return xp.where(alpha < 0, xp.minimum(margin, alpha), margin)
+
+
+@lru_cache(maxsize=256)
+def fit_needed_damping(d: float) -> tuple[float, ...]:
+    """Fit the needed damping at one delay by a polynomial in a variable that represents the direction beta/alpha.
+
+    Between the directions ``lower`` and ``upper`` (`find_directions`), with x = beta - lower alpha,
+    ``needed/(beta + (width - lower) alpha)`` is an analytic function of ``x/(x + width alpha)``, up to beta = infinity.
+    The terms of its Chebyshev series decrease by a factor of 4, for every delay.
+
+    Returns:
+        The arguments of `_evaluate_fit` after the wall and delta.
+    """
+    lower, upper = find_directions(np.float64(d))
+    width = 0.5 * (d + 0.5)
+    span = upper - lower
+    end = span / (span + width) if np.isfinite(span) else 1.0
+    # Reduce the angles by integer arithmetic, because an angle of 30 pi would lose the last digits of its cosine.
+    multiples = np.outer(np.arange(N_TERMS), 2 * np.arange(N_TERMS) + 1) % (4 * N_TERMS)
+    cosines = np.cos(np.pi * multiples / (2 * N_TERMS))
+    nodes = cosines[1]
+    variable = 0.5 * end * (nodes + 1.0)
+    alpha = 1.0 - variable
+    beta = lower * alpha + variable * width
+    with np.errstate(all="ignore"):
+        needed = compute_needed_damping(alpha, beta, np.full(N_TERMS, d))
+    # Divide by the width, because the scale ``beta + (width - lower) alpha`` equals the width at all nodes.
+    terms = cosines @ needed * (2.0 / (N_TERMS * width))
+    terms[0] *= 0.5
+    # Convert the Chebyshev series to powers, because Clenshaw's recurrence would lose two digits at the ends of the
+    # interval. The coefficients of the powers decrease as well.
+    powers = np.polynomial.chebyshev.cheb2poly(terms)
+    limit = float(end) if np.isfinite(span) else np.inf
+    return d - np.floor(d), d + 0.5, float(lower), width, float(end), limit, *powers.tolist()
+
+
+def _evaluate_fit(alpha: Array, beta: Array, delta: Array, *fit: Any) -> Array:
+    """Evaluate `passivity_margin` at one delay, from the fitted polynomial of the needed damping.
+
+    Args:
+        alpha: Normalized stiffness.
+        beta: Normalized virtual damping.
+        delta: Normalized physical damping.
+        *fit: Result of `fit_needed_damping`: the fraction f of the delay; for integer d, the derivative in alpha of the
+            damping needed at w = 0; the lower direction; the width; the upper end of the polynomial's variable; the
+            same as a limit, infinite if there is no upper direction; and the coefficients, lowest power first.
+    """
+    xp = namespace(alpha)
+    f, zero_slope, lower, width, end, limit, *powers = fit
+    valid = valid_wall(alpha, beta, delta, 0.0 * delta)
+    safe_alpha = xp.maximum(alpha, 0.0)
+    excess = beta - lower * safe_alpha
+    scale = excess + width * safe_alpha
+    variable = excess / xp.where(excess > 0, scale, 1.0)
+    y = 2.0 * variable / end - 1.0
+    peak_value = scale * horner(y, powers)
+    zero_value, _ = solve_larger_root(zero_slope * safe_alpha - beta, f * (1.0 - f) * safe_alpha * safe_alpha, xp)
+    pi_value = (1.0 - f) * (beta + 0.5 * safe_alpha)
+    needed = xp.where(excess > 0, xp.where(variable < limit, peak_value, pi_value), zero_value)
+    return xp.where(valid, _limit_margin(delta - needed, alpha), xp.nan)
+
+
+def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: float) -> np.ndarray:
+    """Compute `passivity_margin` at one delay in NumPy; the result at a point does not depend on the other points."""
+    if not 0 <= d <= LONGEST_DELAY:
+        return np.full(alpha.shape, np.nan)
+    with np.errstate(all="ignore"):
+        return _evaluate_fit(alpha, beta, delta, *fit_needed_damping(d))
+
+
+def _compute_on_grid(values: tuple[ArrayLike, ...]) -> Array | None:
+    """Compute `passivity_margin` of many walls that share few delays; return None for other arguments."""
+    points, shape = fold_arguments(values)
+    if points.size <= FEW or np.unique(points.d).size * FEW > points.size:
+        return None
+    margins = np.full(points.shape, np.nan)
+    for delay, arrays, index in group_by_value(points, points.d):
+        if not 0 <= delay <= LONGEST_DELAY:
+            continue
+        walls = Points(*arrays)
+        columns = [*walls.columns()[:3], *map(np.atleast_1d, fit_needed_damping(float(delay)))]
+        margins[index] = evaluate_columns(_evaluate_fit, columns, route="jax").reshape(walls.shape)
+    return to_caller(restore_shape(margins, shape), values)
+
+
+def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
+    """Return the margin by which the physical damping exceeds the damping that passivity requires.
+
+    ``margin = delta - sup_w needed(w)``, in units of delta = b T/m. The wall is passive if and only if the margin is
+    positive. At d = 0 it is ``delta - alpha/2 - |beta|``, eq. (21).
+
+    Args:
+        alpha: normalized stiffness; no damping makes a wall of negative stiffness passive, and its margin is at most
+            alpha itself.
+        beta: normalized virtual damping.
+        delta: normalized physical damping, >= 0.
+        d: delay in periods, >= 0, integer or fractional. All four broadcast.
+
+    Returns:
+        Array of the broadcast shape; NaN for a point out of range.
+
+    Numerics:
+        The error is about 1e-15 of the damping needed, at a cost independent of d. The frequency of the maximum is
+        proved for integer d and was verified numerically for fractional d (`stability.rigid.required_damping`). For
+        many walls with one delay, a polynomial in the direction is evaluated. Traceable, with two derivatives. In d at
+        integer d and in alpha at alpha = 0 they are those from the right; in beta at beta = 0 and d = 0 that from
+        below; without a wall (alpha = beta = 0) they are 0 if the maximum is a peak.
+
+    References:
+        Colgate, Schenkel 1994; Hulin, Preusche, Hirzinger 2006, eqs. (20), (21), here extended to any delay.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.passivity_margin(0.2, 0.3, 1.0, 0):.2f}")
+        0.60
+    """
+    values = (alpha, beta, delta, d)
+    arguments = dict(zip(NAMES, values, strict=True))
+    if is_traced(*values):
+        return evaluate(_margin_kernel, arguments, ANY)
+    if not all(isinstance(value, int | float | np.number) for value in values):
+        check_scalars(arguments)
+        margins = _compute_on_grid(values)
+        if margins is not None:
+            return margins
+    return evaluate(_margin_kernel, arguments, NO_DELAY if classify_delays(d) == NO_DELAY else ANY)
+
+
+def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
+    """Return whether the wall is passive, i.e. `passivity_margin` > 0, for any delay.
+
+    Passive implies stable for alpha > 0; stable does not imply passive.
+
+    Args:
+        alpha, beta, delta, d: as for `passivity_margin`.
+
+    Returns:
+        Boolean array of the broadcast shape; False for a point out of range. Rounding errors matter only within about
+        1e-15 of the boundary of the passive set.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (21), here extended to any delay.
+
+    Example:
+        >>> import zwidth
+        >>> bool(zwidth.is_passive(0.2, 0.3, 1.0, 0)), bool(zwidth.is_passive(0.2, 0.9, 1.0, 0))
+        (True, False)
+    """
+    values = (alpha, beta, delta, d)
+    margin = passivity_margin(*values)
+    if is_traced(*values):
+        return margin > 0
+    # Compare in NumPy, because JAX would warn about the type outside float64 mode.
+    return to_caller(np.asarray(margin) > 0, values)
+
+
+def passive_stiffness_slope(d: float) -> tuple[float, float]:
+    """Return alpha/delta and beta/delta of the stiffest passive wall for one delay."""
+    check_scalars({"d": d})
+    delay = as_number("d", d, 0.0)
+    period = delay + 1.0
+    if period == np.floor(period):
+        # Use the frequency with cos((d + 1) w) = 0, at which the virtual damping has no effect on the condition.
+        angle = np.pi / (4.0 * period)
+        slope = 2.0 * np.tan(angle)
+        return float(slope), float(slope * (0.25 / (period * np.sin(angle) ** 2) - 0.5))
+    unit = 1.0 / (period - 0.5)
+
+    def stiffness(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        alpha, beta = unit * np.cos(angles), np.sin(angles)
+        needed = compute_needed_damping(alpha, beta, np.full(angles.shape, delay))
+        return alpha / needed, beta / needed
+
+    lower, upper = -0.49 * np.pi, 0.49 * np.pi
+    # The passive set is convex, so alpha has a single maximum over the direction.
+    with np.errstate(all="ignore"):
+        for _ in range(SEARCH_ROUNDS):
+            angles = np.linspace(lower, upper, 17)
+            best = int(np.argmax(stiffness(angles)[0]))
+            lower, upper = angles[max(best - 1, 0)], angles[min(best + 1, 16)]
+        alpha, beta = stiffness(np.array([0.5 * (lower + upper)]))
+    return float(alpha[0]), float(beta[0])
+
+
+# Numbers of Gauss-Legendre nodes on the three parts of the range of directions, on each of which the integrand is
+# analytic.
+AREA_NODES = (64, 64, 32)
+# Computing cost of a point relative to other kernels, because the integrand is evaluated at all nodes.
+AREA_WEIGHT = 64
+
+
+def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
+    """Return the area of the passive set in the (alpha, beta) plane.
+
+    The condition is convex and homogeneous in (alpha, beta, delta): with ``needed(phi)`` the physical damping that
+    the wall ``(cos phi, sin phi)`` needs, ``A = (delta^2/2) integral of needed(phi)^-2`` over phi from -pi/2 to pi/2.
+    At d = 0 it is the triangle ``delta > alpha/2 + |beta|``: ``A = 2 delta^2``.
+
+    Args:
+        delta: normalized physical damping, >= 0.
+        d: delay in periods, >= 0, integer or fractional. Both broadcast.
+
+    Returns:
+        Array of the broadcast shape; NaN for a point out of range.
+
+    Numerics:
+        Gauss-Legendre quadrature between the kinks of ``needed``: about 1e-14 relative, at a cost independent of d.
+        Traceable, with derivatives; at integer d the derivatives in d are those from the right.
+
+    References:
+        Colgate, Brown 1994 (Z-width); Hulin, Preusche, Hirzinger 2006, eq. (21), here extended to any delay.
+
+    Example:
+        >>> from zwidth import passive_area
+        >>> print(f"{passive_area(0.5, 0):.4f}")
+        0.5000
+    """
+    return evaluate(_passive_area_kernel, {"delta": delta, "d": d}, weight=AREA_WEIGHT)
+
+
+def _passive_area_kernel(delta: Array, d: Array) -> Array:
+    """Return `passive_area`, elementwise, by an integral over the direction theta.
+
+    The walls are ``alpha = cos(theta)/(d + 1/2)``, ``beta = sin(theta)``. The damping needed is analytic in theta on
+    each of three parts: below the lower direction of `find_directions` the maximum is at omega = 0, above the upper one
+    (d < 2/9 only) at pi, and in between at a frequency that increases with theta continuously.
+    """
+    xp = namespace(delta, d)
+    valid = is_valid_device(delta, d)
+    safe_d = xp.where(valid, d, 1.0)
+    unit = 1.0 / (safe_d + 0.5)
+    # Compute the ends of the parts without derivatives, because errors of the ends have no effect of first order.
+    lower, upper = (xp.arctan(t * stop_gradient(unit, xp)) for t in find_directions(stop_gradient(safe_d, xp)))
+    end = 0.5 * np.pi + 0.0 * safe_d
+
+    def integrand(theta: Array) -> Array:
+        # At theta = +-pi/2 alpha is 0, and a rounding error must not make it negative.
+        alpha = xp.maximum(xp.cos(theta), 0.0) * unit[..., None]
+        return compute_needed_damping(alpha, xp.sin(theta), safe_d[..., None] + 0.0 * theta) ** -2
+
+    inverse_squares = integrate(integrand, (-end, lower, upper, end), AREA_NODES)
+    return 0.5 * delta * delta * unit * inverse_squares + nan_with_nan_derivatives(valid, delta, d)

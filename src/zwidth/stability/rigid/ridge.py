@@ -1,0 +1,320 @@
+"""Compute the maximum stiffness of rigid devices, alpha_max(delta, d), with derivatives in delta and d.
+
+The point of maximum stiffness is the *ridge* (docs/theory/boundary.md, B2): a smooth maximum of alpha on the stability
+lobe, or the *corner*, a wall with a double pole at z = -1. It is given by s = sin(omega/2), with its frequency omega.
+`stability.rigid.ridge_newton` solves the optimality condition T(s) = 0. The derivatives of the ridge follow from T, in
+closed form for NumPy and by a custom rule for JAX. For strong damping, alpha_max is proportional to delta;
+`stiffness_slope` returns the factor, the paper's eq. (22).
+
+The delay is d = n + f. The plant has the numerator N(z) = a2 z^2 + a1 z + a0 and the pole c = e^-delta; a0, a1 and a2
+consist of phi1(x) = (1 - e^-x)/x, phi2 = (1 - phi1)/x, psi = (phi1 - e^-x)/x and gap = phi2 - psi.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+
+from zwidth.core.errors import check_choice
+from zwidth.core.status import RidgeKind, Status
+from zwidth.core.types import Array, ArrayLike
+from zwidth.core.xp import differentiate_along, epsilon, horner, materialize, namespace, nan_unless
+from zwidth.numerics.evaluate import evaluate
+from zwidth.numerics.held_mass import (
+    ANY,
+    GAP,
+    DelayClasses,
+    Plant,
+    classify_delays,
+    discretize_mass,
+    is_valid_device,
+    phi_functions,
+    split_delay,
+)
+from zwidth.stability.results import RidgePoint
+from zwidth.stability.rigid.normalization import device_status
+from zwidth.stability.rigid.ridge_newton import (
+    Ridge,
+    Start,
+    evaluate_stationarity,
+    evaluate_wall,
+    evaluate_wave,
+    expand_curve,
+    guess_start,
+    solve_ridge,
+)
+
+
+def _compute_chi(x: Array, gap: Array) -> Array:
+    """Return chi = ``gap/x = -phi2'``, which is 1/6 at x = 0; it also yields ``psi' = chi - psi``."""
+    xp = namespace(x)
+    is_small = x < 2.5
+    half = xp.where(is_small, 0.5 * x, 0.0)
+    return xp.where(is_small, xp.exp(-half) * horner(half * half, GAP), gap / xp.where(is_small, 1.0, x))
+
+
+def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
+    """Return the derivatives of `numerics.held_mass.discretize_mass` in delta and in the fraction of the delay."""
+    f, t = fraction, 1.0 - fraction
+    c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
+    phi_t, phi_f = phi_functions(delta * t), phi_functions(delta * f)
+    chi_t, chi_f = _compute_chi(delta * t, phi_t.gap), _compute_chi(delta * f, phi_f.gap)
+    # Each term of a1 decreases with delta, so no digits cancel in the sum of their derivatives.
+    a2 = -t * t * t * chi_t
+    a1 = t * t * t * (phi_t.psi - chi_t) + f * f * f * chi_f
+    a1 = -(
+        a1 + t * f * (e_t * (t * phi_f.phi1 + f * phi_f.psi) + t * phi_t.psi * phi_f.phi1 + f * phi_t.phi1 * phi_f.psi)
+    )
+    a0 = -e_t * f * f * (t * phi_f.psi + f * (phi_f.psi - chi_f))
+    slow, fast = t * phi_t.phi1, e_t * f * phi_f.phi1
+    zero = 0.0 * c
+    return Plant(-c, c, a2, a1, a0, a2 - a1 + a0), Plant(zero, zero, -slow, slow - fast, fast, 2.0 * (fast - slow))
+
+
+def recompute_ridge(s: Array, plant: Plant, n: Array, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
+    """Recompute alpha, beta, omega and s at a ridge such that their derivatives in ``plant`` and n are correct."""
+    # Differentiate one step of Newton's method, which has the derivative of the solution if it starts at the solution.
+    # A corner stays at s = 1. At a maximum the derivative of alpha in s is 0, so alpha is computed with a fixed s.
+    xp = namespace(s, plant.a2, n)
+    undelayed, curve, is_corner = not kind.long, expand_curve(plant), s >= 1.0
+    s_inside = xp.where(is_corner, 0.5, s)
+    T, T1 = evaluate_stationarity(s_inside, curve, n, undelayed)
+    s_inside = xp.where(is_corner, 0.5, s_inside - T / xp.where(is_corner, 1.0, T1))
+    s_moved = xp.where(is_corner, 1.0, s_inside)
+    # Compute omega without the series of `evaluate_wave`, because the derivative of the series has fewer digits.
+    omega = xp.where(is_corner, np.pi, 2.0 * xp.arctan(s_inside / xp.sqrt((1.0 - s_inside) * (1.0 + s_inside))))
+    alpha, beta = (evaluate_wall(evaluate_wave(s_value, n, undelayed), curve) for s_value in (s, s_moved))
+    return alpha[0], beta[1], omega, s_moved
+
+
+def differentiable_ridge(plant: Plant, n: Array, start: Start, kind: DelayClasses) -> Ridge:
+    """Return the ridge of one plant with a delay of n periods.
+
+    For JAX arrays, the derivatives in ``plant`` and n are those of `recompute_ridge`, which are exact to any order.
+    """
+    ridge = solve_ridge if namespace(plant.a2, n) is np else _jax_ridge()
+    return ridge(plant, n, start, kind)
+
+
+@cache
+def _jax_plant() -> Any:
+    """Return `numerics.held_mass.discretize_mass` as a JAX function with derivatives in closed form."""
+    import jax
+
+    function = jax.custom_jvp(lambda delta, fraction: discretize_mass(delta, fraction))
+
+    @function.defjvp
+    def rule(primals: tuple, tangents: tuple) -> tuple[Plant, Plant]:
+        (by_delta, by_f), (d_delta, d_f) = plant_slopes(*primals), tangents
+        plant_tangent = (a * d_delta + b * d_f for a, b in zip(by_delta, by_f, strict=True))
+        return function(*primals), Plant(*plant_tangent)
+
+    return function
+
+
+@cache
+def _jax_ridge() -> Any:
+    """Return `solve_ridge` as a JAX function with the derivatives of `recompute_ridge`."""
+    import jax
+
+    function = jax.custom_jvp(solve_ridge, nondiff_argnums=(3,))
+
+    def rule(kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
+        # Let the derivative of s follow from the same rule, so that derivatives of every order are exact.
+        ridge = function(*primals, kind)
+
+        def moving(plant: Plant, n: Array) -> Ridge:
+            return Ridge(*recompute_ridge(ridge.s, plant, n, kind), ridge.last)
+
+        return ridge, jax.jvp(moving, primals[:2], tangents[:2])[1]
+
+    function.defjvp(rule)
+    return function
+
+
+RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
+
+
+def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -> RidgePoint:
+    """Return the maximum stiffness of a stable virtual wall.
+
+    ``alpha_max(delta, d) = sup {alpha : some beta is stable}``; in SI units ``K_max = alpha_max m/T^2``.
+
+    Args:
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, integer or fractional. Both broadcast.
+        method: "newton" solves the stationarity of the paper's loop in closed form, "kkt" the general conditions with
+            optimistix; "auto" is "newton".
+
+    Returns:
+        RidgePoint with arrays of the broadcast shape: ``alpha``, the maximum stiffness; ``beta``, the virtual damping
+        at the maximum; ``omega``, the frequency of the oscillation there, in rad per sample; ``kind``, a code of
+        `zwidth.RidgeKind`: 0 for a smooth maximum, 1 for a corner (a double pole at z = -1); ``status``, see
+        `zwidth.Status`. If the status is not 0, ``alpha``, ``beta`` and ``omega`` are NaN and ``kind`` is 3 (NONE).
+
+    Numerics:
+        alpha to about 1e-15 relative, because at a maximum the error of alpha is of second order in that of omega. JAX
+        can trace the function in delta and d and differentiate it twice. The first derivatives of alpha are continuous,
+        also at the transition to the corner (d = 0: delta = 3.65936162742...) and at integer d > 0. The second
+        derivatives of alpha and the first ones of beta and omega jump there; at integer d they are those from the
+        right. For strong damping the second derivative in delta decreases as delta^-3. Its rounding error is 1e-15
+        (d = 0) to 1e-12 (d = 500) times alpha/delta^2, so none of its digits is reliable at delta = 1e6.
+
+        Float64 when called directly. Inside a transformation, also `jax.grad`, JAX's default precision applies: float32
+        unless ``jax.config.update("jax_enable_x64", True)`` was called; a `zwidth.PrecisionWarning` reports it once.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section VII, eqs. (24), (25).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.alpha_max(0.0, 1).alpha:.4f}")
+        0.1445
+    """
+    check_choice("method", method, get_args(RidgeMethod))
+    arguments = {"delta": delta, "d": d}
+    if method == "kkt":
+        # Import only if requested, because importing the solvers takes a second. Compile them, because they iterate
+        # long formulas.
+        from zwidth.stability.rigid.exact_points import kkt_kernel
+
+        return RidgePoint(*evaluate(kkt_kernel, arguments, route="jax"))
+    return evaluate(ridge_kernel, arguments, classify_delays(d), slopes=differentiate_point)
+
+
+def ridge_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgePoint:
+    """Compute `alpha_max` elementwise, for the classes of delays ``kind``."""
+    return _make_point(*_solve_point(delta, d, kind)[:2])
+
+
+def differentiate_point(
+    delta: Array, d: Array, kind: DelayClasses = ANY
+) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
+    """Return `alpha_max` and its derivatives in delta and in d, elementwise."""
+    ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
+    point, has_converged = _make_point(ridge, status), converged(ridge)
+
+    def differentiate(change: Plant) -> RidgePoint:
+        derivatives = differentiate_along(
+            lambda plant: recompute_ridge(ridge.s, plant, n, kind), (plant,), (change,), np
+        )
+        return point._replace(
+            **dict(zip(RidgePoint._fields, nan_unless(has_converged, *derivatives[:3]), strict=False))
+        )
+
+    by_delta, by_f = plant_slopes(delta, f)
+    return point, (differentiate(by_delta), differentiate(by_f))
+
+
+class RidgeSlopes(NamedTuple):
+    """The point of maximum stiffness, and the derivatives of its alpha in delta and d."""
+
+    point: RidgePoint
+    by_delta: Array
+    by_d: Array
+
+
+def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlopes:
+    """Return `alpha_max` and the derivatives of its alpha, elementwise; those in d from the right at integer d."""
+    ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
+    xp, wave = namespace(ridge.s), evaluate_wave(ridge.s, n, not kind.long)
+
+    def differentiate(change: Plant) -> Array:
+        return differentiate_along(lambda plant: evaluate_wall(wave, expand_curve(plant))[0], (plant,), (change,), xp)
+
+    slopes = map(differentiate, materialize(plant_slopes(delta, f), ridge.s))
+    by_delta, by_d = nan_unless(converged(ridge), *slopes)
+    return RidgeSlopes(_make_point(ridge, status), by_delta, by_d)
+
+
+def stiffness_slopes(
+    slopes: RidgeSlopes, mass: Array, period: Array, delta: Array, d: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return K_max and its derivatives in mass, damping, period and delay; see `zwidth.sensitivities`."""
+    alpha, rate, change = slopes.point.alpha, 1.0 / period, delta * slopes.by_delta
+    return (
+        alpha * mass * rate * rate,
+        (alpha - change) * rate * rate,
+        slopes.by_delta * rate,
+        (change - d * slopes.by_d - 2.0 * alpha) * mass * rate**3,
+        slopes.by_d * mass * rate**3,
+    )
+
+
+def _solve_point(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
+    """Return the ridge, its status, the plant, the integer delay n, and delta with the fraction f of the delay."""
+    status = device_status(delta, d)
+    delta, d = nan_unless(status == Status.OK, delta, d)
+    n, f = split_delay(d)
+    start = guess_start(delta, d, f, kind)
+    if kind.fractional:
+        plant = discretize_mass(delta, f) if namespace(delta, f) is np else _jax_plant()(delta, f)
+    else:
+        plant = discretize_mass(delta)
+    ridge = materialize(differentiable_ridge(plant, n, start, kind), delta)
+    return ridge, status, plant, n, (delta, f)
+
+
+def converged(ridge: Ridge) -> Array:
+    """Return a mask of the points at which the solver has converged."""
+    # Convergence is quadratic, so only rounding errors are left after a step of sqrt(eps).
+    return namespace(ridge.s).abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s
+
+
+def _make_point(ridge: Ridge, status: Array) -> RidgePoint:
+    xp = namespace(ridge.alpha)
+    has_converged = converged(ridge)
+    status = xp.where((status == Status.OK) & ~has_converged, int(Status.NOT_CONVERGED), status)
+    kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
+    kind = xp.where(status == Status.OK, kind, int(RidgeKind.NONE))
+    alpha, beta, omega = nan_unless(has_converged, ridge.alpha, ridge.beta, ridge.omega)
+    return RidgePoint(alpha, beta, omega, kind.astype(np.int32), status.astype(np.int32))
+
+
+def stiffness_slope(d: ArrayLike) -> Array:
+    """Return the derivative of the maximum stiffness in physical damping, in the limit of strong damping.
+
+    ``g(d) = lim alpha_max(delta, d)/delta`` for ``delta -> infinity``; in SI units ``K_max T/b -> g(d)``. With
+    ``alpha = g delta``, ``beta = h delta`` the loop becomes, for d = n + f,
+
+        z^(2+n) (z - 1) + ((1 - f) z + f) ((g + h) z - h) = 0
+
+    (integer d: ``z^(2+d) - z^(1+d) + (g + h) z - h = 0``). g is the largest value for which some h keeps every zero
+    inside the unit circle.
+
+    Args:
+        d: delay in periods, 0 to 1e5, integer or fractional; any shape.
+
+    Returns:
+        Array of d's shape: 4, 1, 0.631130, 0.465011, 0.369041 for d = 0, 1, 2, 3, 4. NaN if d is NaN, negative,
+        infinite or above 1e5.
+
+    Numerics:
+        About 1e-15 relative. Traceable, with derivatives of every order in d. g is ``4 (1 - 3 d)/(1 - 2 d)^2``
+        (a corner, with its maximum 4.5 at d = 1/6) up to d = 1/4 and ``1/d`` up to d = 1. It is continuous, with a kink
+        at every integer d > 0: derivatives there are those from the right (0 at d = 1, where the one from the left is
+        -1). For finite delta alpha_max has no kink: its derivative in d turns within about 1/delta of an integer d.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (22).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.stability.rigid.ridge.stiffness_slope(2):.6f}")
+        0.631130
+    """
+    return evaluate(slope_kernel, {"d": d}, classify_delays(d))
+
+
+def slope_kernel(d: Array, kind: DelayClasses = ANY) -> Array:
+    """Compute `stiffness_slope` elementwise, for the classes of delays ``kind``."""
+    (d,) = nan_unless(is_valid_device(0.0 * d, d), d)
+    zero = 0.0 * d
+    n, f = split_delay(d)
+    # Use the limit of delta N(z) for delta -> infinity, where the velocity is proportional to the force and c = 0.
+    plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
+    start = guess_start(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
+    ridge = differentiable_ridge(plant, n, start, kind)
+    return nan_unless(converged(ridge), ridge.alpha)[0]

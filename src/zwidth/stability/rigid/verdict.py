@@ -1,0 +1,151 @@
+"""Decide the stability of arrays of walls on rigid devices, by one of three methods.
+
+The public functions are `is_stable` (labels only) and `decide_stability` (labels, statuses and the method used). The
+methods:
+
+- "crossover": the closed form at the gain crossover (`stability.rigid.crossover`). On a large grid, alpha is compared
+  with the stability limit of its line of constant beta, by the same closed form (`stability.rigid.stiffness_limit`).
+- "companion": the spectral radius from all eigenvalues of the companion matrix (`stability.rigid.poles`).
+- "certified": the closed form with error bounds, then ball arithmetic (`stability.rigid.certified`).
+"""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+
+from zwidth.core.errors import InputError, check_choice
+from zwidth.core.status import Method, Status
+from zwidth.core.types import Array, ArrayLike
+from zwidth.core.xp import is_traced
+from zwidth.numerics.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
+from zwidth.numerics.held_mass import classify_delays
+from zwidth.stability.results import Stability
+from zwidth.stability.rigid.broadcasting import NAMES, Points, fold_arguments, restore_shape
+from zwidth.stability.rigid.crossover import stable_kernel
+from zwidth.stability.rigid.normalization import wall_status
+from zwidth.stability.rigid.poles import radius_by_companion
+from zwidth.stability.rigid.stiffness_limit import label_grid
+
+StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
+STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
+
+# Error of the computed eigenvalues at a double pole, about the square root of the rounding unit. The companion method
+# reports spectral radii closer to 1 than this as UNDECIDED.
+DOUBLE_POLE_ERROR = 2e-8
+
+
+def is_stable(
+    alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, method: StabilityMethod = "auto"
+) -> Array:
+    """Return whether each wall is stable: all poles are strictly inside the unit circle.
+
+    Poles are the roots of ``P(z)``, see `zwidth.char_poly`.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, integer or fractional, also mixed in one array. All four broadcast. Axes along which
+            an argument is constant cost nothing: for a grid pass alpha of shape (1, N) and beta of shape (M, 1).
+        method: "crossover" evaluates the phase at the gain crossover, in closed form; "companion" computes all poles;
+            "certified" returns True only with a certificate (`zwidth.decide_stability` returns the status of undecided
+            points). "auto" is "crossover". On a grid of one device it compares alpha with the stability limit at each
+            beta, by the same closed form.
+
+    Returns:
+        Boolean array of the broadcast shape, possibly read-only. False for unstable walls and for invalid input (NaN,
+        infinite, out of range, or negative if the argument must not be). To distinguish them, use the status that
+        `zwidth.decide_stability` returns.
+
+    Raises:
+        InputError: an argument is no real number, a scalar is out of range, shapes do not broadcast, or a name is
+            unknown.
+        TracedDelayError: d is traced with method "companion".
+
+    Numerics:
+        The cost does not depend on d. Float64 when called directly, the ambient precision inside `jit`. The label of
+        the closed form is right if alpha is more than some rounding errors away from the boundary; no faster, less
+        accurate method exists. Times per point: benchmarks/results/bench.md.
+
+    References:
+        docs/theory/one-crossover.md; Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
+
+    Example:
+        >>> import numpy as np, zwidth
+        >>> zwidth.is_stable(np.array([0.1, 0.6, 0.8]), 0.4, 0.1, 0)
+        array([ True,  True, False])
+    """
+    values = (alpha, beta, delta, d)
+    arguments, numbers = dict(zip(NAMES, values, strict=True)), are_numbers(*values)
+    if method != "auto":
+        check_choice("method", method, STABILITY_METHODS)
+    if method in ("auto", "crossover") and (numbers or is_traced(*values)):
+        return evaluate(stable_kernel, arguments, classify_delays(d))
+    check_scalars(arguments)
+    if is_traced(*values):
+        if method == "certified":
+            raise InputError(
+                "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
+                "'auto', 'crossover' or 'companion'"
+            )
+        return radius_by_companion(*values) < 1.0
+    points, shape = fold_arguments(values)
+    return to_caller(restore_shape(_decide(points, method)[0], shape), values)
+
+
+def decide_stability(
+    alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, method: StabilityMethod = "auto"
+) -> Stability:
+    """Return the stability of each wall with the method that decided it.
+
+    Args:
+        alpha, beta, delta, d, method: as for `zwidth.is_stable`.
+
+    Returns:
+        Stability: ``stable``, boolean; ``status``, see `zwidth.Status`: INVALID_INPUT or OUT_OF_RANGE for a point that
+        is not computed; with "certified" UNDECIDED or ON_BOUNDARY for a wall without a label (``stable`` is then
+        False); with "companion" UNDECIDED if the radius differs from 1 by less than the error of the eigenvalues at a
+        double pole; ``method``, the `Method` that decided. Arrays may be read-only.
+
+    Raises:
+        InputError: as for `zwidth.is_stable`, and for traced values.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.decide_stability([0.1, float("nan")], 0.4, 0.1, 1).status
+        array([0, 1], dtype=int32)
+    """
+    values = (alpha, beta, delta, d)
+    check_choice("method", method, STABILITY_METHODS)
+    check_scalars(dict(zip(NAMES, values, strict=True)))
+    if is_traced(*values):
+        raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
+    points, shape = fold_arguments(values)
+    stable, deciding_method, status = _decide(points, method)
+    input_status = wall_status(*points)
+    status = input_status if status is None else np.where(input_status == Status.OK, status, input_status)
+    codes = np.broadcast_to(status, points.shape).astype(np.int32), np.asarray(deciding_method, np.int32)
+    return to_caller(Stability(*(restore_shape(leaf, shape) for leaf in (stable, *codes))), values)
+
+
+def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
+    """Return labels, the method that decided them, and their statuses, or None if all statuses are OK."""
+    if method == "companion":
+        radius = np.asarray(radius_by_companion(*points))
+        inconclusive = (np.abs(radius - 1.0) < DOUBLE_POLE_ERROR) & (np.asarray(points[0]) != 0)
+        return radius < 1.0, Method.COMPANION, np.where(inconclusive, Status.UNDECIDED, Status.OK)
+    if method == "certified":
+        # Import only if requested, because most programs never certify.
+        from zwidth.stability.rigid.certified import certify_labels
+
+        stable, status = certify_labels(points)
+        return stable, Method.CERTIFIED, status
+    if points.is_dense:
+        return label_grid(points), Method.CROSSOVER, None
+    stable = evaluate_columns(stable_kernel, points.columns(), classify_delays(points.d))
+    return stable.reshape(points.shape), Method.CROSSOVER, None

@@ -1,0 +1,1 @@
+"""Physical quantities: symbols, units and ranges, unit systems, parsing and formatting of values, plausibility."""

@@ -1,0 +1,435 @@
+"""Registry of quantities: all parameters of scenes and all outputs of sweeps, with unit, range, symbol and description.
+
+The keys of configurations, the options of the command line, the variables of stores, and the labels of figures and of
+the explorer are generated from the entries. Descriptions are noun phrases; a note adds conditions and the default.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+from zwidth.core.status import Status
+from zwidth.units.unit_system import UnitSystem
+
+
+class Range(NamedTuple):
+    """An interval of allowed values; an end is included unless it is open."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    low_open: bool = False
+    high_open: bool = False
+
+    def holds(self, value: Any) -> Any:
+        """Return whether finite values are in the interval, elementwise."""
+        above = value > self.low if self.low_open else value >= self.low
+        if self.high == math.inf:
+            return above
+        return above & (value < self.high if self.high_open else value <= self.high)
+
+    def __str__(self) -> str:
+        ends = []
+        if self.low > -math.inf:
+            ends.append(f"{'greater than' if self.low_open else 'at least'} {self.low:g}")
+        if self.high < math.inf:
+            ends.append(f"{'less than' if self.high_open else 'at most'} {self.high:g}")
+        return " and ".join(ends)
+
+
+ANY = Range()
+NOT_NEGATIVE = Range(low=0.0)
+POSITIVE = Range(low=0.0, low_open=True)
+FRACTION = Range(0.0, 1.0, low_open=True, high_open=True)
+# These ranges are wide enough for any sampled loop, and T^2 and 1/T^2 neither overflow nor underflow in them.
+PERIODS = Range(1e-12, 1e9)  # allowed sampling periods in s
+RATES = Range(1e-9, 1e12)  # allowed sampling rates in Hz
+# Ranges of the parameters in which results are computed.
+SI_RANGE = (1e-30, 1e30)  # magnitudes of nonzero quantities in SI units
+WALL_RANGE = (1e-60, 1e60)  # magnitudes of nonzero normalized stiffness alpha and normalized virtual damping beta
+LARGEST_DAMPING = 1e12  # largest normalized physical damping delta
+LONGEST_DELAY = 1e5  # longest delay d, in periods
+# Smallest and largest magnitude of the nonzero values of each normalized parameter.
+SIZES = {"alpha": WALL_RANGE, "beta": WALL_RANGE, "delta": (0.0, LARGEST_DAMPING), "d": (0.0, LONGEST_DELAY)}
+MAX_DELAY_PERIODS = 10_000.0  # longest delay in files, in periods; a longer one indicates a wrong unit
+MOST_POLES = 4000  # largest number of poles that are computed, because this many already take minutes and 0.3 GB
+RECOMMENDED_SHARE = 0.75  # stiffness of a recommended wall, relative to the stiffest stable wall
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a scene."""
+
+    name: str  # path in files and stores, such as "mass" or "coupling.mass"
+    long_name: str  # description, a noun phrase, in stores, in the schema and in help texts
+    symbol: str  # symbol of the quantity, in mathtext without dollar signs
+    allowed: Range  # range of allowed values, in the unit of the parameter
+    unit: str = "1"  # SI unit on a linear device; "1" for a quantity without unit
+    slider: tuple[float, float] | None = None  # range of its slider in the explorer; None without a slider
+    note: str = ""  # conditions and default, in the schema and in help texts
+    short_name: str = ""  # name in figures and in the explorer, if it differs from ``long_name``
+    definition: str = ""  # definition of a normalized quantity, in mathtext
+    whole: bool = False  # True if only integers are allowed
+
+    @cached_property
+    def sign(self) -> Range:
+        """The part of the range that concerns the sign: any value, >= 0 or > 0.
+
+        Functions in Python check only the sign, because the full range is meant for configuration files.
+        """
+        if self.allowed.low < 0:
+            return ANY
+        return POSITIVE if self.allowed.low > 0 or self.allowed.low_open else NOT_NEGATIVE
+
+    @property
+    def variable(self) -> str:
+        """The name of the variable in a store, without dots, because the CF conventions do not allow them."""
+        return self.name.replace(".", "_")
+
+    @property
+    def words(self) -> str:
+        """The name in figures and in the explorer."""
+        return self.short_name or self.long_name
+
+    def words_in(self, system: UnitSystem) -> str:
+        """Return the name in figures; "inertia" replaces "mass" for rotary devices."""
+        return self.words.replace("mass", "inertia") if system.rotary else self.words
+
+    def symbol_in(self, system: UnitSystem) -> str:
+        """Return the symbol in mathtext; J replaces m for rotary devices."""
+        return re.sub(r"^m(?=_|$)", "J", self.symbol) if system.rotary else self.symbol
+
+    def label_in(self, system: UnitSystem) -> str:
+        """Return the label of a figure axis: name, symbol and definition."""
+        definition = f" = {self.definition}" if self.definition else ""
+        definition = definition.replace("/m", "/J") if system.rotary else definition
+        return f"{self.words_in(system)}  ${self.symbol_in(system)}{definition}$"
+
+    @property
+    def sentence(self) -> str:
+        """The description, beginning with a capital letter."""
+        return self.long_name[0].upper() + self.long_name[1:]
+
+
+MOST_MODES = 3  # largest number of modes in files, on axes of sweeps and on the command line; Python has no limit
+
+
+def _describe_mode(path: str, name: str, index: str) -> tuple[Parameter, ...]:
+    """Return the parameters of a structural mode: frequency, damping ratio and modal mass.
+
+    Args:
+        path: first part of the dotted paths of the parameters, such as "modes.0".
+        name: name of the mode in the descriptions.
+        index: subscript of the symbols.
+    """
+    ratios = Range(0.0, 10.0, low_open=True)
+    return (
+        Parameter(f"{path}.frequency", f"frequency of {name}", f"f_{{{index}}}", POSITIVE, "Hz"),
+        Parameter(f"{path}.damping_ratio", f"damping ratio of {name}", rf"\zeta_{{{index}}}", ratios),
+        Parameter(
+            f"{path}.mass",
+            f"modal mass of {name}",
+            f"m_{{{index}}}",
+            ANY,
+            "kg",
+            note="< 0 if actuator and sensor move in opposite directions",
+        ),
+    )
+
+
+# The parameters have the order of the dimensions of a store. Those of the wall are last, so that the results for all
+# walls of one device are contiguous in memory.
+_PARAMETERS = (
+    Parameter("period", "sampling period T", "T", PERIODS, "s", (5e-5, 0.02), short_name="sampling period"),
+    Parameter("rate", "sampling rate 1/T", "1/T", RATES, "Hz", None, "instead of the period", "sampling rate"),
+    Parameter(
+        "delay", "delay t_d from a sample to the start of its force", "t_d", NOT_NEGATIVE, "s", (0.0, 0.02),
+        "also in sampling periods, e.g. '1.5 periods'", "delay",
+    ),
+    Parameter("mass", "mass m of the device", "m", POSITIVE, "kg", (1e-3, 10.0), short_name="mass"),
+    Parameter(
+        "damping", "physical damping b of the device", "b", NOT_NEGATIVE, "N s/m", (0.0, 100.0),
+        short_name="physical damping",
+    ),
+    Parameter(
+        "d", "delay in sampling periods, t_d/T", "d", Range(0.0, MAX_DELAY_PERIODS), slider=(0.0, 10.0),
+        short_name="delay in periods", definition="t_d/T",
+    ),
+    Parameter(
+        "delta", "normalized damping of the device, b T/m", r"\delta", Range(0.0, LARGEST_DAMPING), slider=(0.0, 5.0),
+        short_name="normalized physical damping", definition="b\\,T/m",
+    ),
+    Parameter(
+        "velocity.cutoff", "cut-off frequency of the velocity filter", "f_c", POSITIVE, "Hz", (1.0, 5e3),
+        "below half the sampling rate", "cut-off",
+    ),
+    Parameter(
+        "velocity.time_constant", "time constant of the velocity filter", r"\tau", POSITIVE, "s", (2e-5, 0.2),
+        "instead of the cut-off frequency", "time constant",
+    ),
+    Parameter(
+        "velocity.samples", "length of the window of the velocity estimate", "n", Range(1, 1000), slider=(1.0, 50.0),
+        note="in sampling periods", short_name="window", whole=True,
+    ),
+    Parameter(
+        "velocity.order", "order of the velocity filter", "n_f", Range(1, 8), slider=(1.0, 8.0),
+        note="for a low-pass 1 (default) or 2, for a Butterworth filter 1 to 8 (default 2)", short_name="filter order",
+        whole=True,
+    ),
+    Parameter(
+        "velocity.coded_period", "sampling period in the formula of the velocity estimate", "T_c", POSITIVE, "s",
+        note="default: the period of the loop", short_name="coded period",
+    ),
+    Parameter(
+        "operator.mass", "mass of the hand", "m_h", NOT_NEGATIVE, "kg", (0.0, 2.0),
+        "default: 0, but > 0 if a coupling stiffness is given",
+    ),
+    Parameter(
+        "operator.damping", "damping of the hand to ground", "b_h", NOT_NEGATIVE, "N s/m", (0.0, 50.0), "default: 0",
+        short_name="damping of the hand",
+    ),
+    Parameter(
+        "operator.stiffness", "stiffness of the hand to ground", "k_h", NOT_NEGATIVE, "N/m", (0.0, 1e3), "default: 0",
+        short_name="stiffness of the hand",
+    ),
+    Parameter(
+        "operator.coupling_stiffness", "stiffness of the spring between hand and device", "k_g", POSITIVE, "N/m",
+        (10.0, 100e3), "default: a rigid grasp", "stiffness of the grasp",
+    ),
+    Parameter(
+        "operator.coupling_damping", "damping between hand and device", "c_g", NOT_NEGATIVE, "N s/m",
+        (0.0, 50.0), "only together with a coupling stiffness, default: 0", "damping of the grasp",
+    ),
+    Parameter(
+        "coupling.mass", "mass of the tip, coupled to the mass of the device", "m_2", POSITIVE, "kg", (1e-3, 1.0),
+        short_name="mass of the tip",
+    ),
+    Parameter("coupling.stiffness", "stiffness of the coupling", "k", POSITIVE, "N/m", (100.0, 1e6)),
+    Parameter("coupling.damping", "damping of the coupling", "c", NOT_NEGATIVE, "N s/m", (0.0, 50.0), "default: 0"),
+    Parameter(
+        "actuator.cutoff", "corner frequency of the actuator", "f_a", POSITIVE, "Hz", (10.0, 5e3),
+        short_name="corner of the actuator",
+    ),
+    Parameter(
+        "actuator.time_constant", "time constant of the actuator", r"\tau_a", POSITIVE, "s", (2e-5, 0.02),
+        "instead of the corner frequency", "time constant of the actuator",
+    ),
+    Parameter(
+        "actuator.order", "order of the actuator", "n_a", Range(1, 2), note="1 or 2, default: 1", whole=True,
+    ),
+    Parameter(
+        "actuator.damping_ratio", "damping ratio of the actuator", r"\zeta_a", POSITIVE, slider=(0.05, 2.0),
+        note="for order 2 only, default: sqrt(1/2)",
+    ),
+    *(each for k in range(MOST_MODES) for each in _describe_mode(f"modes.{k}", f"mode {k}", str(k))),
+    Parameter("stiffness", "stiffness K of the virtual wall", "K", ANY, "N/m", (0.0, 50e3), short_name="stiffness"),
+    Parameter(
+        "alpha", "normalized stiffness of the virtual wall, K T^2/m", r"\alpha", ANY, slider=(0.0, 1.0),
+        short_name="normalized stiffness", definition=r"K\,T^2\!/m",
+    ),
+    Parameter(
+        "virtual_damping", "damping B of the virtual wall", "B", ANY, "N s/m", (-20.0, 100.0),
+        short_name="virtual damping",
+    ),
+    Parameter(
+        "beta", "normalized damping of the virtual wall, B T/m", r"\beta", ANY, slider=(-0.5, 1.5),
+        short_name="normalized virtual damping", definition="B\\,T/m",
+    ),
+)  # fmt: skip
+PARAMETERS = {parameter.name: parameter for parameter in _PARAMETERS}
+NORMALIZED = ("alpha", "beta", "delta", "d")
+PHYSICAL = tuple(name for name in PARAMETERS if name not in NORMALIZED)
+OF_PARTS = tuple(name for name in PARAMETERS if "." in name)  # paths of the parameters of velocity estimate and parts
+VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}  # parameters by their names in a store
+_NOISE = Parameter(
+    "velocity.noise", "largest error of the measured position", "", POSITIVE, "m", note="one count of an encoder"
+)
+# Parameters of simulations.
+_OF_MOTIONS = (
+    Parameter(
+        "start_position", "initial position", "x_0", ANY, "m",
+        note="the surface of the wall is at 0, and positions inside the wall are positive",
+    ),
+    Parameter("start_velocity", "initial velocity", "v_0", ANY, "m/s"),
+    Parameter("push", "constant external force on the device", "F", ANY, "N"),
+    Parameter(
+        "resolution", "resolution of the encoder, one count", r"\Delta", NOT_NEGATIVE, "m",
+        short_name="resolution of the encoder",
+    ),
+    Parameter("noise", "standard deviation of the noise of the measured position", r"\sigma", NOT_NEGATIVE, "m"),
+    Parameter(
+        "coulomb", "Coulomb friction while the device moves", "F_c", NOT_NEGATIVE, "N", short_name="dry friction"
+    ),
+    Parameter(
+        "static", "static friction, the largest friction force at rest", "F_s", NOT_NEGATIVE, "N",
+        note="at least coulomb, default: coulomb",
+    ),
+    Parameter("max_force", "largest force of the motor", "F_m", POSITIVE, "N", note="default: no limit"),
+    Parameter(
+        "max_rate", "largest rate of change of the commanded force", "R_m", POSITIVE, "N/s", note="default: no limit"
+    ),
+)  # fmt: skip
+OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
+# Parameters of encoder, friction and motor: arguments of `zwidth.diagnose` and `zwidth.simulate`.
+HARDWARE = ("resolution", "coulomb", "static", "max_force", "max_rate")
+FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
+WALL = ("alpha", "beta", "stiffness", "virtual_damping")
+
+
+class Choice(NamedTuple):
+    """A parameter whose value is one of several names."""
+
+    names: tuple[str, ...]
+    sentence: str
+
+
+_KINDS = ("backward_difference", "windowed_difference", "low_pass", "butterworth")
+CHOICES = {
+    "velocity.kind": Choice(_KINDS, "Velocity estimate; default: implied by the options below"),
+    "coupling.sensor": Choice(("motor", "tip"), "Location of the position sensor; default: motor"),
+}
+
+# Help texts of the options that describe the columns of a log file, by name of the option.
+OF_LOGS = {
+    "time": "Time column: HEADER, HEADER:ms, or HEADER:s+HEADER:ns for two columns. Default: recognized by its header.",
+    "position": "Position column: HEADER, or with a unit HEADER:mm, HEADER:counts or HEADER:deg.",
+    "force": "Column of the commanded force: HEADER, or with a unit HEADER:mN; for a torque HEADER:'mN m'.",
+    "resolution": "Encoder resolution, e.g. 0.03mm, 0.09deg or '4000 counts/rev'.",
+    "motor_constant": "Motor constant, i.e. force per ampere, e.g. 5N/A, if the force column is a current in A.",
+}
+
+Family: TypeAlias = Literal["wall", "device"]  # an output has one value per wall, or one value per device and delay
+# Kinds of color scales: for truth values, for numbers with a good and a bad side, for other numbers, for positive
+# numbers, and for positive numbers that may be infinite.
+ColorScale: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
+NOT_COMPUTED = 255  # status of points whose chunk does not exist yet; the other codes are those of `zwidth.Status`
+
+
+@dataclass(frozen=True)
+class Output:
+    """An output of a sweep: a variable of a store."""
+
+    name: str  # name in files and stores
+    long_name: str  # description in stores, a noun phrase
+    symbol: str = ""  # symbol in figures, in mathtext
+    color_scale: ColorScale = "truth"  # kind of the color scale in figures
+    family: Family = "wall"
+    dtype: Literal["bool", "float64", "uint8"] = "float64"
+    units: str = "1"  # unit in a normalized sweep
+    physical_units: str | None = None  # unit in a sweep over SI quantities; None if it is ``units``
+    physical_only: bool = False  # True if a normalized sweep cannot compute it
+    with_parts: bool = False  # True if it can be computed for devices with a velocity filter, a hand or a coupling
+    source: str = ""  # other output from which this one is computed at no cost; "" if there is none
+    # Approximate numbers of points per second and core, for rigid devices and for devices with parts.
+    rates: tuple[float, float] = (1e6, 10.0)
+    label: str = ""  # name in figures, if it differs from ``name``
+    center: float = 0.0  # value between the good and the bad side: the limit of stability or passivity
+    below: bool = False  # True if the good side is below the center
+    flags: dict[str, Any] = field(default_factory=dict)  # meanings of codes and truth values, as CF attributes
+
+    @property
+    def words(self) -> str:
+        """The name in figures."""
+        return self.label or self.name.replace("_", " ")
+
+    @property
+    def logarithmic(self) -> bool:
+        """True if its axes and colors are logarithmic; they cannot show the value 0."""
+        return self.color_scale in ("logarithmic", "steep")
+
+    def units_in(self, physical: bool) -> str:
+        """Return the unit in a sweep over SI quantities if ``physical``, otherwise in a normalized sweep."""
+        return self.physical_units if physical and self.physical_units else self.units
+
+
+def _flags(values: list[int], meanings: str) -> dict[str, Any]:
+    """Return the attributes that the CF conventions require for a variable of codes; blanks separate the meanings."""
+    return {"flag_values": values, "flag_meanings": meanings}
+
+
+_OUTPUTS = (
+    Output(
+        "stable", "true if every pole lies strictly inside the unit circle", dtype="bool", with_parts=True,
+        rates=(3e8, 3e8), flags=_flags([0, 1], "unstable stable"),
+    ),
+    Output(
+        "spectral_radius", "largest pole magnitude", r"\rho", "diverging", with_parts=True, rates=(1e6, 5e4),
+        center=1.0, below=True,
+    ),
+    Output(
+        "margin", "1 - spectral radius, positive for a stable wall", r"1 - \rho", "diverging", source="spectral_radius"
+    ),
+    Output(
+        "decay_rate", "decay rate of the dominant pole, -ln(spectral radius); negative for an unstable wall",
+        r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", source="spectral_radius",
+        label="rate of decay",
+    ),
+    Output(
+        "gain_margin", "common factor of stiffness and damping at the limit of stability; below 1 for an unstable wall",
+        "g_m", "logarithmic", rates=(2e5, 0.0),
+    ),
+    Output(
+        "phase_margin", "phase of the open loop above -180 degrees at the gain crossover", r"\varphi_m", "diverging",
+        units="degree", source="gain_margin",
+    ),
+    Output(
+        "delay_margin", "largest additional delay with which the wall is stable; 0 for an unstable wall", r"\tau_m",
+        "logarithmic", units="sampling periods", physical_units="s", rates=(2e4, 0.0),
+    ),
+    Output(
+        "modulus_margin", "smallest distance of the open loop from -1", "s_m", "sequential", rates=(2e4, 0.0)
+    ),
+    Output(
+        "passive", "true if the wall is passive", dtype="bool", with_parts=True, rates=(4e6, 100.0),
+        flags=_flags([0, 1], "not_passive passive"),
+    ),
+    Output(
+        "passivity_margin", "normalized physical damping in excess of the smallest one for which the wall is passive",
+        r"\delta", "diverging", source="passive", label="passivity margin, in units of",
+    ),
+    Output(
+        "settling_time",
+        "time in which the dominant pole decays to 2 %, ln(50)/decay_rate; infinite for an unstable wall", r"t_{2\%}",
+        "steep", units="sampling periods", physical_units="s", source="spectral_radius", label="decay time to 2 %",
+    ),
+    Output(
+        "alpha_max", "largest normalized stiffness of a stable wall, with the best virtual damping", r"\alpha_{\max}",
+        "logarithmic", "device", label="maximum stable stiffness",
+    ),
+    Output(
+        "beta_at_max", "normalized virtual damping of the wall with alpha_max", r"\beta", "sequential", "device",
+        source="alpha_max", label="virtual damping of that wall",
+    ),
+    Output(
+        "kind", "kind of the optimum at alpha_max: smooth, or a corner with a double pole at z = -1", family="device",
+        dtype="uint8", source="alpha_max", flags=_flags([0, 1, NOT_COMPUTED], "smooth corner unknown"),
+    ),
+    Output(
+        "stiffness_max", "largest stiffness K of a stable wall, with the best virtual damping", r"K_{\max}",
+        "logarithmic", "device", units="N/m", physical_only=True, with_parts=True, source="alpha_max",
+        label="maximum stable stiffness",
+    ),
+    Output(
+        "virtual_damping_at_max", "virtual damping B of the wall with stiffness_max", "B", "sequential", "device",
+        units="N s/m", physical_only=True, with_parts=True, source="alpha_max", label="virtual damping of that wall",
+    ),
+)  # fmt: skip
+OUTPUTS = {output.name: output for output in _OUTPUTS}
+
+RADIUS_OUTPUTS = frozenset(name for name, output in OUTPUTS.items() if "spectral_radius" in (name, output.source))
+# Outputs that are NaN for a wall without such a margin (see `zwidth.margins`).
+MARGIN_OUTPUTS = frozenset({"gain_margin", "phase_margin", "delay_margin", "modulus_margin"})
+OUTPUTS_WITH_PARTS = tuple(name for name, output in OUTPUTS.items() if output.with_parts)
+
+# Names of the status variables of both families.
+STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
+
+
+def status_flags() -> dict[str, Any]:
+    """Return the attributes of a status variable, with the codes and their meanings as in the CF conventions."""
+    codes = [*(int(status) for status in Status), NOT_COMPUTED]
+    meanings = " ".join([*(status.name.lower() for status in Status), "not_computed"])
+    return {"long_name": "status of each point", **_flags(codes, meanings)}

@@ -1,1 +1,0 @@
-"""Definitions for all packages: errors, status codes, types, units, quantities, formatting, tables, NumPy and JAX."""

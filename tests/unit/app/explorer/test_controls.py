@@ -1,0 +1,158 @@
+"""The numbers and parts of the page: back and forth, from configurations, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import zwidth
+from zwidth.app.explorer.controls import (
+    CHOICES,
+    ROTARY_SLIDERS,
+    SLIDERS,
+    Controls,
+    read_controls,
+    read_link,
+    to_link,
+    to_python,
+)
+from zwidth.runs.record import find_config
+
+CONFIGS = Path(__file__).parents[4] / "configs"
+DEVICE = "mass: 0.1, period: 1 ms, delay: 1.5 periods"
+
+
+def written(folder, scene):
+    file = folder / "a.yaml"
+    file.write_text(
+        f"{{version: 1, name: a, scene: {{{scene}}}, studies: [{{kind: boundary, name: b, delta: 0, d: 0}}]}}",
+        encoding="utf-8",
+    )
+    return file
+
+
+@pytest.mark.parametrize("velocity", [kind for kind in CHOICES["velocity"] if kind != "VelocityFilter"])
+@pytest.mark.parametrize("operator", CHOICES["operator"])
+@pytest.mark.parametrize("coupling", CHOICES["coupling"])
+def test_every_choice_is_a_scene_and_every_number_of_it_can_be_moved(velocity, operator, coupling):
+    controls = Controls().change({"velocity": velocity, "operator": operator, "coupling": coupling})
+    shown = controls.shown()
+    assert type(controls.scene.velocity).__name__ == velocity
+    assert {name: shown[name] for name in ("velocity", "operator", "coupling")} == {
+        "velocity": velocity,
+        "operator": operator,
+        "coupling": coupling,
+    }
+    assert controls.change(shown) == controls
+    for name in set(shown) & set(SLIDERS):
+        moved = controls.change({name: shown[name] + 1})
+        assert moved.shown()[name] == pytest.approx(shown[name] + 1, rel=1e-15)
+        others = {other: value for other, value in moved.shown().items() if other != name}
+        assert others == {other: value for other, value in shown.items() if other != name}
+
+
+def test_the_units_are_changed_there_and_back():
+    normalized = Controls().change({"mode": "normalized"})
+    shown = normalized.shown()
+    assert shown.pop("mode") == "normalized"
+    assert shown == pytest.approx({"delta": 0.1, "d": 1.0, "alpha": 0.1, "beta": 0.4}, rel=1e-15)
+    back = normalized.change({"alpha": 0.2}).change({"mode": "physical"})
+    assert back.scene.wall.stiffness == pytest.approx(20e3, rel=1e-15)
+    assert back.scene.device.damping == pytest.approx(10, rel=1e-15)
+    assert (back.scene.mass, back.scene.timing.period) == (0.1, 1e-3)
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        ({"mass": -1}, "mass m: got -1 g; it must be greater than 0 g"),
+        ({"mass": "1"}, "mass m: got '1'"),
+        ({"mass": True}, "mass m: got 'True'"),
+        ({"mass": float("nan")}, "mass m: got 'nan'"),
+        ({"mass": 10**400}, "mass m"),
+        ({"mass": None}, "mass m: got 'None'"),
+        ({"alpha": 1}, "the page has no such parameter"),
+        ({"__class__": 1}, "the page has no such parameter"),
+        ({"velocity": "x" * 1000}, "choose one of"),
+        ({"velocity": ["LowPass"]}, "choose one of"),
+        ({"velocity": "VelocityFilter"}, "in a configuration file"),
+        ({"velocity": "LowPass", "velocity.cutoff": 600}, "velocity.cutoff: got 600 Hz"),
+        ({"delay": 1e6}, "delay: the loop has"),
+        ({"velocity": "WindowedDifference", "velocity.samples": 900}, "delay: the loop has"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_its_name(change, says):
+    with pytest.raises(zwidth.InputError) as refusal:
+        Controls().change(change)
+    assert says in str(refusal.value)
+    assert len(str(refusal.value)) < 250
+
+
+@pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda file: file.stem)
+def test_configurations_set_their_own_scene_or_say_why_not(file):
+    given: Any = zwidth.load_config(file).scene
+    if given is None or getattr(given, "device", None) is not None:
+        says = "scene: missing" if given is None else "scene.device: the page needs a model for all rates"
+        with pytest.raises(zwidth.InputError, match=says):
+            read_controls(file)
+        return
+    controls = read_controls(file)
+    expected = given.to_scene() if not controls.normalized else None
+    if expected is not None:
+        assert controls.scene.replace(stiffness=0, virtual_damping=0) == expected.replace(
+            stiffness=0, virtual_damping=0
+        )
+    if given.wall is None:
+        assert controls.scene.is_stable(*controls.wall)
+        assert controls.wall == tuple(float(f"{value:.4g}") for value in controls.wall)
+
+
+@pytest.mark.parametrize(
+    "velocity",
+    [
+        "{kind: low_pass, time_constant: 5 ms, order: 2}",
+        "{kind: low_pass, cutoff: 50, coded_period: 0.5 ms}",
+        "{kind: filter, numerator: [500, 0, -500], denominator: [1, 0, 0]}",
+        "{kind: butterworth, cutoff: 50, order: 3}",
+    ],
+)
+def test_any_estimate_of_a_configuration_is_kept(tmp_path, velocity):
+    file = written(tmp_path, f"{DEVICE}, stiffness: 1000, virtual_damping: 2, velocity: {velocity}")
+    controls = read_controls(file)
+    given: Any = zwidth.load_config(file).scene
+    assert controls.scene == given.to_scene()
+    assert controls.change({"mass": 200}).scene.velocity == controls.scene.velocity
+    assert controls.change(controls.shown()).scene.d == 1.5
+
+
+def test_a_delay_model_and_other_folders_are_refused(tmp_path):
+    with pytest.raises(zwidth.ConfigError, match="delay_model: key of an earlier release"):
+        read_controls(written(tmp_path, f"{DEVICE}, delay_model: fractional_power"))
+    with pytest.raises(zwidth.InputError, match="no run with a recorded configuration"):
+        find_config(tmp_path)
+
+
+def test_a_run_has_recorded_its_scene(tmp_path, unpainted):
+    file = written(tmp_path, f"{DEVICE}, stiffness: 1000")
+    assert zwidth.run(file, out=tmp_path / "run").ok
+    assert read_controls(find_config(tmp_path / "run")) == read_controls(file)
+
+
+@pytest.mark.parametrize("operator", CHOICES["operator"])
+@pytest.mark.parametrize("coupling", CHOICES["coupling"])
+def test_a_rotary_device_keeps_its_numbers_in_every_form_of_the_view(operator, coupling):
+    controls = Controls().change({"motion": "rotary"}).change({"operator": operator, "coupling": coupling})
+    shown = controls.shown()
+    assert controls.scene.device.rotary
+    assert controls.change(shown) == controls
+    assert read_link(to_link(controls)) == controls
+    assert "rotary=True" in to_python(controls)
+    for name in set(shown) & set(ROTARY_SLIDERS):
+        moved = controls.change({name: shown[name] * 1.5 + 1})
+        assert moved.shown()[name] == pytest.approx(shown[name] * 1.5 + 1, rel=1e-15)
+        assert ROTARY_SLIDERS[name].low <= shown[name] <= ROTARY_SLIDERS[name].high
+    if not controls.scene.parts_beyond and operator == "none":
+        assert controls.change({"mode": "normalized"}).change({"mode": "physical"}) == controls
+    assert not controls.change({"motion": "linear"}).scene.device.rotary

@@ -1,0 +1,148 @@
+"""Walls measured on devices with an actuator lag or a resonance: refused, or fitted with stable walls to set."""
+
+import numpy as np
+import pytest
+from measured_devices import OTHERS, PERIOD, OtherDevice, TrueDevice
+
+import zwidth
+from zwidth.core.status import Status
+from zwidth.identification.critical_controller import CriticalController
+from zwidth.identification.device_estimate import DimensionlessDevice, differentiate, name_parameters
+from zwidth.identification.onset_model import Onsets
+from zwidth.model.circle_functions import circle_points
+
+VELOCITY = zwidth.BackwardDifference()
+KINDS = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 2)]
+LAG = TrueDevice("", 0.1, 2.0, 1e-3, (), 0.7e-3, PERIOD, 1e-5, 3.0)
+MODE = TrueDevice("", 0.1, 2.0, 0.0, ((120.0, 0.03, 0.2),), 0.7e-3, PERIOD, 1e-5, 3.0)
+BOTH = TrueDevice("", 0.1, 2.0, 1e-3, ((120.0, 0.03, 0.2),), 0.7e-3, PERIOD, 1e-5, 3.0)
+SHARES = (0.0, 0.3, 0.6, 0.9, 1.1)
+
+
+def describe_device(lag, modes):
+    """Return a device with an actuator lag of some order and some modes."""
+    ringing = [(0.7, 0.03, 0.4), (1.7, 1.2, -0.2)][:modes]
+    return DimensionlessDevice(0.1, 0.03, 1.3, [0.8, 0.6][:lag], ringing)
+
+
+def differ(function, theta):
+    """Return the derivatives along a last axis, by central differences."""
+    steps = 1e-6 * np.eye(theta.size)
+    return np.stack([(function(theta + step) - function(theta - step)) / 2e-6 for step in steps], -1)
+
+
+@pytest.mark.parametrize("lag, modes", KINDS)
+def test_the_critical_controller_is_that_of_the_sampled_device(lag, modes):
+    device = describe_device(lag, modes)
+    at = circle_points(np.array([1e-3, 0.05, 0.3, 0.72, 1.9, 3.0]))
+    found, wanted = (
+        CriticalController(*device[1:]),
+        device.to_scene(PERIOD, VELOCITY).loop.roots.evaluate_controller(at),
+    )
+    np.testing.assert_allclose(found.evaluate(at), wanted.value, rtol=1e-12)
+    if not lag + modes:
+        np.testing.assert_allclose(found.evaluate_rigid(at).slope, wanted.slope, rtol=1e-12)
+
+
+@pytest.mark.parametrize("lag, modes", KINDS)
+def test_the_parameters_of_a_device_are_those_of_its_scene(lag, modes):
+    values = describe_device(lag, modes).to_parameters(PERIOD)
+    scene = DimensionlessDevice.from_parameters(values, PERIOD, lag).to_scene(PERIOD, VELOCITY)
+    own = scene.parameters()
+    np.testing.assert_allclose([own[name] for name in name_parameters(scene)], values, rtol=1e-15)
+
+
+def test_walls_and_parameters_have_the_derivatives_of_differences():
+    kappa, rub, w = np.array([[1e-3, 4e-3, 6e-3], [0.0, 0.01, 0.02], [0.1, 0.3, 0.4]])
+    onsets, theta = Onsets(kappa, rub, w, VELOCITY, PERIOD), np.array([np.log(0.1), 0.03, 1.3])
+
+    def follow(theta):
+        walls = onsets.predict_walls(theta)
+        return np.log(np.stack([walls.kappa, walls.w], 1))
+
+    def to_parameters(theta):
+        return onsets.normalize(theta).to_parameters(PERIOD)
+
+    slopes = onsets.predict_walls(theta).differentiate()
+    np.testing.assert_allclose(slopes, differ(follow, theta), rtol=1e-6, atol=1e-8 * np.abs(slopes).max())
+    np.testing.assert_allclose(differentiate(to_parameters, theta), differ(to_parameters, theta), rtol=1e-7, atol=1e-9)
+
+
+def begin_to_buzz(true, shares, noise=0.0, seed=0):
+    """Return walls at shares of the damping at K_max, by eigenvalues of the true device, with relative noise."""
+    A, B, C = true.sampled()
+    size, rng, walls = B.size, np.random.default_rng(seed), []
+
+    def close(stiffness, damping):
+        rate, closed = damping / true.period, np.zeros((size + 1, size + 1))
+        closed[:size, :size] = A - np.outer(B, (stiffness + rate) * C)
+        closed[:size, size], closed[size, :size] = rate * B, C
+        poles = np.linalg.eigvals(closed)
+        return poles[np.argmax(np.abs(poles))]
+
+    scene = zwidth.Scene(zwidth.LinearDevice(true.matrices()), zwidth.Timing(true.period, true.delay))
+    for damping in np.array(shares) * float(scene.max_stiffness().virtual_damping):
+        low, high = 1.0, 1.02
+        while abs(close(high, damping)) < 1:
+            low, high = high, 1.04 * high
+        while high - low > 1e-14 * high:
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if abs(close(middle, damping)) < 1 else (low, middle)
+        walls.append((low, damping, abs(np.angle(close(low, damping))) / (2 * np.pi * true.period)))
+    return np.array(walls) * (1 + noise * np.array([1, 0, 1]) * rng.standard_normal((len(walls), 3)))
+
+
+def is_stable(true, stiffness, damping):
+    """Return whether a wall and softer ones of its damping are stable on the true device."""
+    return all(true.is_stable(share * stiffness, damping) for share in (1.0, 0.7, 0.4, 0.1, 0.03))
+
+
+@pytest.mark.parametrize("true", [MODE, BOTH], ids=["mode", "both"])
+@pytest.mark.parametrize("noise", [1e-3, 0.01])
+def test_walls_that_no_rigid_device_has_are_refused(true, noise):
+    fit = zwidth.fit_buzz(begin_to_buzz(true, SHARES, noise, seed=1), period=PERIOD, noise=noise)
+    assert fit.status == Status.NO_BOUNDARY
+    assert "no rigid device has these walls" in " ".join(fit.doubts)
+    assert all(len(doubt.split()) <= 25 for doubt in fit.doubts)
+    assert np.isnan([fit.stiffness_max, fit.safe_wall().stiffness]).all()
+    assert fit.recommended.status == Status.UNREACHABLE
+    assert fit.next is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("true", [LAG, MODE, BOTH], ids=["lag", "mode", "both"])
+def test_walls_to_set_on_a_device_that_is_not_rigid_are_stable(true, seed):
+    walls = begin_to_buzz(true, SHARES, noise=0.02, seed=seed)
+    for noise in (0.02, None):
+        fit = zwidth.fit_buzz(walls, period=PERIOD, noise=noise)
+        assert not fit.is_structured
+        if fit.is_doubted:
+            assert np.isnan(fit.safe_wall().stiffness)
+            continue
+        safe, wall = fit.safe_wall(), fit.recommended
+        assert safe.stiffness > 0.3 * true.limit_of_walls()
+        for stiffness, damping in (safe[:2], (wall.stiffness, wall.virtual_damping)):
+            assert damping <= walls[:, 1].max()
+            assert is_stable(true, stiffness, damping)
+
+
+@pytest.mark.parametrize("seed, noise", [(0, 0.02), (1, 0.02), (2, 0.02), (3, 0.02), (4, None)])
+def test_walls_of_a_rigid_mass_are_not_refused(seed, noise):
+    rigid = TrueDevice("", 0.1, 2.0, 0.0, (), 0.7e-3, PERIOD, 1e-5, 3.0)
+    walls = begin_to_buzz(rigid, (0.0, 0.4, 0.8, 1.1), noise=0.02, seed=seed)
+    fit = zwidth.fit_buzz(walls, period=PERIOD, noise=noise)
+    assert (fit.status, fit.doubts) == (Status.OK, ())
+
+
+def test_the_interval_at_an_unmeasured_damping_includes_the_measured_stiffness():
+    """A resonance of 270 Hz lowers the boundary at dampings above the measured ones only."""
+    true = OtherDevice.of(OTHERS["compliance of 300 Hz, encoder at the motor"])
+    walls = [(494.7, 0.0, 10.92), (4044.0, 8.053, 33.66), (6577.0, 16.11, 45.92), (8703.0, 24.16, 54.96)]
+    fit = zwidth.fit_buzz(walls, period=PERIOD, noise=0.02)
+    assert not fit.is_structured
+    assert fit.damping_tried == 24.16
+    assert fit.virtual_damping > 24.16
+    bar, spread = fit.intervals["stiffness_max"], np.exp(fit.reach * fit.stiffness_error / fit.stiffness_max)
+    assert bar == (pytest.approx(8703 * (1 - 0.02 * fit.reach)), pytest.approx(fit.stiffness_max * spread))
+    assert bar.low < true.limit_of_walls() < bar.high
+    assert fit.safe_wall().stiffness <= fit.bound_measured_stiffness(0.99)

@@ -1,0 +1,29 @@
+"""Arguments grouped by a key and put together again, against the same work on plainly broadcast arrays."""
+
+import numpy as np
+
+import zwidth
+from zwidth.stability.rigid.broadcasting import fold, fold_arguments
+
+
+def test_an_axis_along_which_values_repeat_is_shortened_and_no_other():
+    values = np.arange(6.0).reshape(2, 1, 3)
+    assert fold(np.broadcast_to(values, (2, 4, 3))).shape == (2, 1, 3)
+    # Equal ends do not make a repetition.
+    ends = np.ones((64, 64))
+    ends[5] = 2.0
+    assert fold(ends).shape == (64, 1)
+    ends[5] = 1.0
+    assert fold(ends).shape == (1, 1)
+
+
+def test_a_contiguous_meshgrid_is_folded_as_a_sparse_one():
+    alpha, beta = np.linspace(0.01, 0.5, 512), np.linspace(0.01, 1.0, 300)
+    full = np.meshgrid(alpha, beta)
+    constant = np.full(full[0].shape, 0.1), np.ones(full[0].shape)
+    points, shape = fold_arguments((*full, *constant))
+    assert shape == (300, 512)
+    assert [array.shape for array in points] == [(1, 512), (300, 1), (1, 1), (1, 1)]
+    assert points.is_dense
+    sparse = zwidth.is_stable(alpha, beta[:, None], 0.1, 1)
+    np.testing.assert_array_equal(zwidth.is_stable(*full, *constant), sparse)
