@@ -107,7 +107,7 @@ def differentiate_stiffness_max(scene: Scene) -> tuple[float, np.ndarray]:
 
 
 def compute_reach(freedom: int | None, upper: float = UPPER) -> float:
-    """Return the half-width of a confidence interval in standard errors, a quantile of the t or normal distribution.
+    """Return the half-width of a confidence interval in standard errors: a quantile of the t or normal distribution.
 
     Args:
         freedom: degrees of freedom with which the noise was estimated; None if the noise is known.
@@ -162,12 +162,12 @@ class DeviceEstimate:
         return compute_reach(self.freedom)
 
     def normalize(self, drawn: np.ndarray) -> DimensionlessDevice:
-        """Convert parameters of random devices, one row per device in the order of ``numbers``, to one batch."""
+        """Convert parameters, one row per device and one column per entry of ``numbers``, to a batch of devices."""
         lag = 0 if self.actuator is None else self.actuator.order
         return DimensionlessDevice.from_parameters(np.moveaxis(drawn, 1, 0), self.period, lag)
 
     def propagate_errors(self, evaluate: Callable[[Scene], Any]) -> np.ndarray:
-        """Propagate the covariance of the parameters to a quantity computed from the scene, by finite differences.
+        """Propagate the covariance of the parameters to a quantity computed from a scene, by finite differences.
 
         Args:
             evaluate: function that computes the quantity, a number or an array, from a scene.
@@ -191,7 +191,7 @@ class DeviceEstimate:
         return np.array(rows)
 
     def draw(self, count: int) -> np.ndarray | None:
-        """Draw parameters of random devices from the distribution of the estimate.
+        """Draw the parameters of random devices from the distribution of the estimate, one row per device.
 
         The logarithm of the mass and the reciprocals of modal masses are drawn, because measurements determine the mass
         to a relative error and the response of a mode is proportional to the reciprocal of its modal mass. Devices with
@@ -207,7 +207,7 @@ class DeviceEstimate:
         values = self.estimates
         if not np.all(np.isfinite(self.covariance)):
             return None
-        # Modal masses are drawn as reciprocals and may have either sign.
+        # Mark the modal masses, because their reciprocals are drawn, and because they may have either sign.
         inverse = np.array([name.endswith(".mass") for name in self.numbers])
         center, slopes = values.copy(), np.ones(values.size)
         center[inverse], slopes[inverse] = 1.0 / values[inverse], -1.0 / values[inverse] ** 2
@@ -230,7 +230,7 @@ class DeviceEstimate:
         return None
 
     def bound_measured_stiffness(self, confidence: float) -> float:
-        """Return the lower confidence limit of the K measured at the largest measured B, in N/m; 0 for a log.
+        """Return a lower confidence limit in N/m of the stiffness that was measured at the largest B; 0 for a log.
 
         Args:
             confidence: probability that the true onset K is above the limit.
@@ -240,7 +240,10 @@ class DeviceEstimate:
 
     @cached_property
     def response_scene(self) -> Scene | None:
-        """The result of `build_response_scene` that includes undetected resonances, at the default reliability."""
+        """The scene of the fitted response with a radius that covers one undetected resonance; None without a response.
+
+        It is that of `build_response_scene` with the default of 99 % of the devices.
+        """
         return self.build_response_scene(RELIABILITY, True)
 
     def build_response_scene(self, reliability: float, hidden: bool) -> Scene | None:
@@ -265,7 +268,7 @@ class DeviceEstimate:
         if self.is_structured:
             changes = self.propagate_errors(lambda scene: scene.frequency_response(1.0, 0.0, fitted.frequency))
             # To first order, the confidence region of the response at one frequency is an ellipse in the complex plane.
-            # Add its longer half-axis to the radius, so that the disk contains the ellipse.
+            # Add the longer half-axis of the ellipse to the radius, so that the disk contains the ellipse.
             square, across = np.sum(np.abs(changes) ** 2, 0), np.abs(np.sum(changes**2, 0))
             count = len(self.numbers)
             reach = count * fdtri(count, self.freedom, reliability)

@@ -100,7 +100,7 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return the stiffness up to which all walls are stable, 0 if none is, for random devices and values of B.
+    """Return the stiffness up to which all walls are stable (0 if none is), an array over random devices and B.
 
     Args:
         fit: the fit.

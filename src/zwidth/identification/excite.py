@@ -3,7 +3,8 @@
 At frequencies at which the response decides the stability of walls, the frequencies are dense and the amplitudes large.
 The record consists of five *stretches*, whose sines have different phases. A stretch is three equal periods of the
 force, the first of which contains the transient. The standard errors of the response are computed from the differences
-between the stretches. A frequency is called *line* if it is counted in cycles per period of the force.
+between the stretches. The *lines* are the frequencies of the sines, each an integer number of cycles per period of the
+force.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ _HIGHEST = 0.98  # highest frequency of the force, relative to the Nyquist frequ
 _LOWEST = 1.0  # Hz; lowest frequency of the force
 _FIRST = 3  # least value of the lowest frequency, in cycles per period of the force
 _SOFT = 20.0  # Hz; below this frequency the amplitudes decrease in proportion to the frequency, to limit the motion
-# Second record, designed from the response measured with a first one.
+# Constants of a second record, which is designed from the response that a first record measured.
 # Largest uncertainty of the response between two frequencies, relative to its distance from the onset of instability.
 _GAP = 0.03
 _WEAKEST = 0.01  # smallest amplitude of a sine, relative to the largest
 # Stiffnesses of the walls whose stability the record is designed to decide, relative to the stiffest wall.
 _SHARES = np.linspace(0.3, 0.9, 7)
-# Reduction of the peaks of the force by repeated clipping.
+# Constants of the reduction of the peaks of the force by repeated clipping.
 _CLIPS = 60  # number of iterations
 _CUT = 0.75  # clipping level, relative to the peak of the force
 _FEWEST_SAMPLES = 600  # least number of samples per period of the force
@@ -189,7 +190,7 @@ def _design(
 
 
 def _build_frequency_grid(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
-    """Build the grid of lines of the force, in cycles per period of the force.
+    """Return the lines of the force, whose spacing is prescribed, as integer numbers of cycles per period of the force.
 
     Args:
         count: number of samples per period of the force.

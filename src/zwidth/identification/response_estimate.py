@@ -32,8 +32,8 @@ from zwidth.units.quantities import POSITIVE
 from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 # Deviation, in standard errors of the complex response: 4.5 standard errors of the real or of the imaginary part, each
-# of which has half of the variance. With this factor the true response is within the deviation at all of some thousand
-# lines.
+# of which has half of the variance. With this factor, the true response is within the deviation at all of several
+# thousand lines, with high probability.
 SURE = 4.5 / np.sqrt(2.0)
 # Constants of the analysis of periodic forces.
 # Largest difference between forces one period apart that count as equal, relative to the range of the force.
@@ -159,7 +159,7 @@ def _respond(
 
 
 def _fill(log: Recording, place: np.ndarray, number: int, notes: list[str]) -> Recording:
-    """Interpolate the missing samples of a log, if they are few.
+    """Return a log with its missing samples interpolated; raise `InputError` if too many samples are missing.
 
     Args:
         log: the log, whose arrays do not contain the missing samples.
