@@ -118,7 +118,8 @@ def assess(scene: SceneOptima) -> Assessment:
         >>> verdict.stable, verdict.passive
         (True, False)
     """
-    # Compute the dominant pole first, because this step raises an error if the loop has too many poles.
+    # Compute the dominant pole before the other results, because this step raises an error if the loop has too many
+    # poles.
     dominant, period = scene.loop.find_dominant(float(scene.alpha), float(scene.beta)), scene.timing.period
     margins, best, has_condition = (
         scene.margins(),
@@ -178,8 +179,8 @@ def round_margin(
         decibel: True to return a gain margin in dB.
     """
     value = float(getattr(margins, name))
-    # Round up the gain margin of an unstable wall if it exceeds 1, and of a stable wall if it is below 1, i.e. if a
-    # reduction of the gain destabilizes this wall.
+    # The safe direction is down, with two exceptions: a gain margin above 1 of an unstable wall (the gain must be
+    # increased to stabilize it), and one below 1 of a stable wall (a reduction of the gain destabilizes it).
     outward = name == "gain_margin" and (value > 1.0) != bool(stable)
     return round_conservatively(20.0 * math.log10(value) if decibel else value, "above" if outward else "below", digits)
 
@@ -304,7 +305,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
 
 def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima], float]) -> list[Limit]:
-    """Return one `Limit` per improvement of a scene, sorted by gain: the largest first, NaN last.
+    """Return a list with one `Limit` per improvement of a scene, sorted by gain: the largest first, NaN last.
 
     Args:
         scene: the scene to improve.
@@ -320,7 +321,7 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
 
 
 def describe_islands(scene: SceneOptima) -> list[str]:
-    """Return one line of text per island of stable walls, and another if the device is unstable without a wall."""
+    """Return a list of texts: one per island of stable walls, and one if the device is unstable without a wall."""
     lines, system = [], scene.unit_system
     least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
     if least is not None:

@@ -74,7 +74,7 @@ class RobustWall(NamedTuple):
 def robust_max_stiffness(
     *, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain, delay: Uncertain = 0.0
 ) -> RobustStiffness:
-    """Find the smallest K_max of all devices in a box; each of them can render any wall up to it.
+    """Find the smallest K_max of all devices in a box, the largest stiffness that each of them can render.
 
     The result is the minimum of ``K_max(m, b, T, t_d)`` over the box. The virtual damping may differ from device to
     device. For one wall (K, B) that is stable on all devices use `robust_wall`, which is never stiffer.
@@ -264,19 +264,19 @@ def _find_weakest_device(low: np.ndarray, high: np.ndarray) -> tuple:
 
 
 def _find_common_limit(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
-    """Return the limit of the walls that are stable on all devices, and a function from K to their middle B."""
+    """Return a K that no wall stable on all devices reaches, and a function that returns the middle stable B at a K."""
 
     def common(stiffness: float) -> tuple[float, float]:
-        """Return the ends of the interval of B that is stable on all devices at one K; reversed if it is empty."""
+        """Return the ends of the interval of B that is stable on all devices at one K; lower > upper if it is empty."""
         lower, upper = _stable_dampings(stiffness, devices)
         return float(np.max(lower)), float(np.min(upper))
 
     def suits(stiffness: np.ndarray) -> np.ndarray:
-        """Return whether at this K some B is stable on all devices."""
+        """Return whether a wall with this K and a suitable B is stable on all devices."""
         lower, upper = common(float(stiffness))
         return np.asarray(lower < upper)
 
-    # Round the limit up, because it must be a stiffness that no wall reaches.
+    # Round the limit up, because it must be a stiffness that no wall stable on all devices reaches.
     limit = float(np.nextafter(bisect(suits, np.float64(0.0), np.min(_compute_max_stiffness(devices))), np.inf))
     return limit, lambda stiffness: 0.5 * float(np.add(*common(stiffness)))
 

@@ -148,8 +148,8 @@ def _draw_factors(generator: np.random.Generator, share: float, distribution: st
         return generator.uniform(1.0 - share, 1.0 + share, count)
     factors = generator.normal(1.0, share, count)
     while np.any(bad := factors <= 0):
-        # Draw new values for factors <= 0, at least three standard deviations below 1, because parameters must be
-        # positive.
+        # Draw a factor again if it is not positive, because parameters must be positive. This is rare: such factors are
+        # at least three standard deviations below 1.
         factors[bad] = generator.normal(1.0, share, np.count_nonzero(bad))
     return factors
 

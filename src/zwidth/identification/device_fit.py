@@ -207,7 +207,7 @@ class DeviceFit(DeviceEstimate):
         return float(np.sqrt(np.sum(self.propagate_errors(lambda scene: scene.max_stiffness().virtual_damping) ** 2)))
 
     def value_of(self, name: str) -> float:
-        """Return the value to which the entry ``name`` of ``errors`` belongs: an attribute or a parameter of the fit."""
+        """Return the value to which the entry ``name`` of ``errors`` belongs: an attribute, or a device parameter."""
         return float(self.nominal.parameters()[name] if "." in name else getattr(self, name))
 
     @cached_property

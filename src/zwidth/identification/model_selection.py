@@ -4,8 +4,8 @@ Starting from the rigid mass, a score test of the residuals (`identification.unm
 `identification.unmodeled_lag`) decides whether the model lacks a pole or a lag. If so, all models with one *part* more
 are fitted: an actuator lag of the next order, or a resonance (*mode*) at one of the frequencies with the highest
 scores. Schwarz's criterion (BIC, Schwarz 1978) selects the model with the lowest sum of the *misfit*,
--2 log(likelihood), and log(N) per parameter, for N positions. Then the residuals are tested again. ``theta`` is the parameter vector of
-`zwidth.identification.extended_model.Recordings`.
+-2 log(likelihood), and log(N) per parameter, for N positions. Then the residuals are tested again. ``theta`` is the
+parameter vector of `identification.extended_model.Recordings`.
 """
 
 from __future__ import annotations
