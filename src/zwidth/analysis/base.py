@@ -90,7 +90,7 @@ class SceneParts(Part):
             )
 
     def _shift_parts(self) -> None:
-        """Move each part to its field if positional arguments omit the wall, so that later parts are one field early."""
+        """Move each part to its own field if positional arguments omit the wall, so that later parts are shifted."""
         estimate, fourth, hand = self.wall, self.velocity, self.operator
         if isinstance(fourth, Operator) and hand is None:
             hand = fourth

@@ -115,7 +115,7 @@ def make_section(part: Any, owner: str, noun: str, kind: str = "") -> type[PartS
 
 
 def _head(part: Any) -> str:
-    """Return the first line of the docstring of a part."""
+    """Return the first line of the docstring of a part, which describes its section."""
     return part.__doc__.partition("\n")[0]
 
 

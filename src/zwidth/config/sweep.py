@@ -320,7 +320,8 @@ class SweepStudy(_Parts, Study):
                 yield (name,), problem(f"got {name!r} with normalized axes", "parts are in SI units", "remove it")
             return
         parts = build_parts(self)
-        # Check the attributes of a linear system or measured response in place of parts, because it contains all parts.
+        # For a linear system or a measured response, check its own attributes instead of parts, because it replaces
+        # them.
         obstacle = find_unsupported_reason(**(vars(parts["device"]) if "device" in parts else parts))
         for index, name in enumerate(self.outputs):
             if name not in OUTPUTS_WITH_PARTS:

@@ -272,8 +272,8 @@ def draw(recommendation: Recommendation, response: Table | None = None) -> Any:
 
     The figure is not registered with pyplot, so that the caller need not close it.
     """
-    # Omit the panel of the step response for a measured device, whose verdict has no frequency, because there is no
-    # model to simulate.
+    # Omit the panel of the step response for a measured device, because no model exists that could be simulated. Its
+    # verdict has no frequency.
     columns = 1 if recommendation.verdict is None or math.isnan(recommendation.verdict.frequency) else 2
     _, axes = new_figure(WIDTH if columns == 2 else 5.6, 3.5, 1, columns)
     return plotting.plot.recommendation(recommendation, axes, response=response)
