@@ -57,7 +57,7 @@ def explain_missing(scene: SceneAnalysis, status: Any) -> str:
 
 
 def choose_damping(scene: SceneAnalysis, top: StiffestWall, stiffness: float) -> float:
-    """Return a damping in N s/m for a wall that is softer than the stiffest wall ``top``.
+    """Choose the damping in N s/m of a wall whose stiffness is below that of the stiffest wall ``top``.
 
     This is the damping of ``top`` if all walls with this damping between the two stiffnesses are stable. Otherwise it
     is the middle of the widest stable interval that is connected to K = 0, if one exists.

@@ -233,7 +233,8 @@ def _design_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.nd
     wall = limit.stiffness + limit.virtual_damping * units.stiffness / units.virtual_damping * F
     distance = np.min([np.abs(1.0 / (share * wall) + response) for share in _SHARES], axis=0)
     spacing = _SPACING * np.minimum(1.0, np.sqrt(_GAP * distance / np.maximum(gap, 1e-300)))
-    # Limit the ratio of neighboring spacings to 2, so that the grid becomes dense before it reaches a narrow feature.
+    # Limit the ratio of neighboring spacings to 2, so that the grid becomes dense before it reaches a narrow range
+    # that requires small spacings.
     spacing = np.minimum(spacing, np.minimum(np.roll(spacing, 1), np.roll(spacing, -1)) * 2.0)
     lines = _build_frequency_grid(count, period, np.append(spacing[:1], spacing))
     shape = distance.min() / distance[lines - 1]

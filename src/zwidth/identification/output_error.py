@@ -59,7 +59,8 @@ _MAX_DAMPING = 1e12  # damping above which the search ends
 # Limits that decide whether the log can distinguish friction from a constant force.
 # A motion counts as one in a single direction if the path traveled backward is less than this share of the whole path.
 _BACKWARD_SHARE = 0.1
-# A fit without friction is tried as a rival if the squared ratio of the friction to its standard error is smaller.
+# A fit without friction is tried as a rival if the squared ratio of the friction to its standard error is below this
+# number.
 _NEARLY_FRICTIONLESS = 900.0
 _EXCLUDED = 25.0  # a rival whose misfit exceeds that of the best fit by this much does not enlarge the covariance
 # An initial motion counts as invisible if its length is below this number of standard deviations of the noise.
@@ -171,8 +172,8 @@ class FittedModel:
 
         The value is the mean square of sums of successive residuals, divided by that expected from the noise model.
         """
-        # Add 2 N^(1/3) of the N residuals per sum, which is a usual bandwidth for errors of unknown autocorrelation
-        # (Newey, West 1987).
+        # Form sums of 2 N^(1/3) successive residuals, with N their number. This is a usual bandwidth for errors with
+        # unknown autocorrelation (Newey, West 1987).
         from scipy.special import chdtri
 
         weights, total = self.model.noise or self.noise, self.residuals.size

@@ -336,7 +336,8 @@ def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list
     sums = [np.zeros(size // 2 + 1, complex) for _ in range(3)]
     pieces = 0
     for log in logs:
-        # Omit the force of the first sample, because this sample has no difference from a previous one.
+        # Use the differences of successive positions. Omit the force of the first sample, because no previous position
+        # exists for it.
         f, x = log.force[1:], np.diff(log.position)
         segments = 2 * f.size // size - 1
         pieces += segments

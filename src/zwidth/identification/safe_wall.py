@@ -294,7 +294,7 @@ def _are_stable(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtua
 
 
 def _build_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
-    """Convert devices to a batch of `Chain` models with unit mass, damping, modes, actuator lag, delay and estimate."""
+    """Convert dimensionless devices with a common velocity estimate to a batch of open loops (`Chain`)."""
     modes = tuple(Resonance(frequency, ratio, 1.0 / mass_ratio) for frequency, ratio, mass_ratio in devices.modes)
     lag = 1.0 / devices.lag[0] if devices.lag else None
     if len(devices.lag) == 2:

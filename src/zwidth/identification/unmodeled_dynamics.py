@@ -2,9 +2,11 @@
 
 Model. The weighted residuals of a fit are ``e = r s + n``: s is the signature of one missing pole, r its size, and n
 noise of variance ``sigma^2``. The *signature* of a mode or lag is the part of its effect on the positions that no
-change of the fitted parameters ``theta`` reproduces. A mode of *mass ratio* r has the modal mass
-``m/(r sqrt(1 - zeta^2))``, with the mass m of the device and the damping ratio zeta of the mode; r is negative if
-actuator and sensor are on opposite sides of a node. A *unit mode* has mass ratio 1.
+change of the fitted parameters ``theta`` (`identification.extended_model.Recordings`) reproduces. A mode of *mass
+ratio* r has the modal mass ``m/(r sqrt(1 - zeta^2))``, with the mass m of the device and the damping ratio zeta of the
+mode; r is negative if actuator and sensor are on opposite sides of a node. A *unit mode* has mass ratio 1. J are the
+derivatives of the positions in theta, W the weights of the samples. Unless stated otherwise, times are in sampling
+periods and frequencies are relative to the sampling rate.
 
 The candidates are a bank of poles: a grid of frequencies for each of a few damping ratios, and real poles for actuator
 lags. No model with a candidate is fitted. A pole is *absorbed* if a change of ``theta`` reproduces nearly all of its
@@ -20,10 +22,6 @@ effect. K_max is the maximum stiffness of a wall. The steps are explained in doc
    ``exp(t r size - (r size)^2/2)``. Its mean over the prior is the posterior odds; `sample_resonances` draws modes from
    the posterior and computes K_max with each (Bayesian model averaging, Hoeting et al. 1999).
 5. Lags: `bound_lag` returns the longest first-order actuator lag that the data cannot distinguish from pure delay.
-
-Unless stated otherwise, times are in sampling periods, frequencies are relative to the sampling rate, and ``theta`` is
-the parameter vector of `identification.extended_model.Recordings`. J are the derivatives of the positions in theta, W
-the weights of the samples.
 
 References:
     Rao 1948, Proc. Cambridge Philos. Soc. 44, 50-57 (score test). Schwarz 1978, Annals of Statistics 6, 461-464

@@ -64,7 +64,7 @@ def _find_model(kind: Any) -> type[Study] | None:
 
 
 def _read_study(raw: Any) -> Any:
-    """Validate a study with the model of its kind, and return it; raise ``raw`` if it is a problem of `_fill_study`."""
+    """Validate a study with the model of its kind, and return it; raise ``raw`` itself if it already is a problem."""
     if isinstance(raw, Study):
         return raw
     if isinstance(raw, PydanticCustomError):
