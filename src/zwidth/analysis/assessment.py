@@ -53,7 +53,7 @@ Intervals: TypeAlias = tuple[tuple[float, float], ...]
 @compact_repr(missing=_MISSING, **_UNITS)
 @dataclass(frozen=True)
 class Assessment:
-    """Results of `assess` for any scene, in SI units except for alpha, beta, delta and d; NaN if undefined."""
+    """Assessment of the wall of a scene, in SI units except for alpha, beta, delta and d; NaN for undefined values."""
 
     alpha: float  # normalized stiffness K T^2/m, with period T and the mass m that the force of the wall acts on
     beta: float  # normalized damping B T/m
@@ -160,7 +160,7 @@ def assess(scene: SceneOptima) -> Assessment:
 
 
 def name_kind(wall: StiffestWall) -> str:
-    """Return the `RidgeKind` of a stiffest wall in lower case, such as "smooth"; "none" if no wall is stable."""
+    """Return the kind of the optimum at a stiffest wall as a word, such as "smooth"; "none" if no such wall exists."""
     return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
 
 
@@ -221,7 +221,7 @@ def assess_many(scenes: Iterable[SceneOptima] | Mapping[str, SceneOptima]) -> li
 
 
 def _build_record(name: str | int, scene: SceneOptima) -> dict[str, Any]:
-    """Return the dictionary of `assess_many` for one scene: its name, status, message, parameters and results."""
+    """Return a dictionary with the assessment of one scene: its name, status, message, parameters and results."""
     head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
     try:
         if not isinstance(scene, SceneOptima):

@@ -47,7 +47,7 @@ FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in 
 )
 @dataclass(frozen=True)
 class Diagnosis:
-    """Result of `diagnose`: the cause of the sustained oscillation of a wall, and the remedies.
+    """The cause of a sustained oscillation of a device on a wall, and the remedies.
 
     Attributes:
         cause: cause of the oscillation. "instability": the linear loop is unstable. "quantization": the steps of the

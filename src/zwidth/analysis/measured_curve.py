@@ -275,12 +275,13 @@ class DecidedWalls:
     def _list_intervals(
         self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Return the decided intervals for one batch of fixed values; the arguments are those of `_find_intervals`.
+        """Return the decided intervals of one variable, alpha or beta, for one batch of fixed values of the other.
 
         Returns:
             Index of the fixed value of each interval, its lower and upper end, and the stability of its walls.
         """
-        # At a fixed value, the quadratic form of a point of the curve is a x^2 + 2 half x + c in the free variable x.
+        # At a fixed value of one variable, the quadratic form of a point is a x^2 + 2 half x + c in the free variable
+        # x.
         M, other, across = self._forms, 3 - free, fixed[:, None]
         a = M[free, free]
         half = M[0, free] + across * M[free, other]
@@ -289,8 +290,8 @@ class DecidedWalls:
         # If a > 0, the walls between the two roots of the form are undecided; if a <= 0, those outside the roots are
         # undecided.
         has_roots, outer = discriminant >= 0, a <= 0
-        # A fixed value is unusable if one point of the curve, or the bounds outside the measured range, leave all walls
-        # with this value undecided.
+        # A fixed value is unusable if one point of the curve, or the bounds outside the measured range, leave all its
+        # walls undecided.
         usable = (least < most) & ~np.any(outer & (discriminant <= 0), 1) & (not self.curve.no_asymptote)
         line, point = np.nonzero(has_roots & usable[:, None])
         half, c, a = half[line, point], c[line, point], a[point]

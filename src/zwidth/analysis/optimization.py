@@ -187,7 +187,8 @@ def _find_crossing(surplus: Callable[[float], float], low: float, high: float) -
     try:
         root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
     except ValueError:
-        # Brent's method fails if it reaches a parameter value at which K_max cannot be computed.
+        # Brent's method fails if it reaches a parameter value at which K_max cannot be computed. No crossing is then
+        # found.
         return None
     value = math.exp(cast("float", root))
     for distance in CONFIRMATION_DISTANCES:

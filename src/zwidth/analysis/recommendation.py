@@ -256,7 +256,7 @@ class Recommendation:
         return f"stable in {count} reference grasps{radii}"
 
     def spell_passive(self) -> str:
-        """Return "yes" or "no" if the wall is passive or not; otherwise a text on why its passivity is not known."""
+        """Return "yes" for a passive wall, "no" for another one, and the reason as text if passivity is not known."""
         passive = None if self.verdict is None else self.verdict.passive
         if passive and self.verdict is not None and self.verdict.passivity_margin < reserve_damping(self.scene):
             return "uncertain, because the fitted damping is"

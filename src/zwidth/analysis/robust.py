@@ -250,13 +250,13 @@ def _place_devices(shares: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.
 
 
 def _build_grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
-    """Return all combinations of ``count`` relative positions, from 0 to 1, of each uncertain parameter of a box."""
+    """Return a grid of relative positions in a box: all combinations of ``count`` values per uncertain parameter."""
     axes = [np.linspace(0.0, 1.0, count) if b > a else np.zeros(1) for a, b in zip(low, high, strict=True)]
     return np.array(list(product(*axes)))
 
 
 def _find_weakest_device(low: np.ndarray, high: np.ndarray) -> tuple:
-    """Return the fields of `RobustStiffness` for one box, given by the lower and the upper ends of its intervals."""
+    """Find the weakest device of a box from ``low`` to ``high``, and return the fields of `RobustStiffness`."""
     device = _find_lowest(_compute_max_stiffness, low, high)
     attained = float(_compute_max_stiffness(device)[0])
     is_vertex = bool(np.all((device == low) | (device == high)))
@@ -282,7 +282,7 @@ def _find_common_limit(devices: np.ndarray) -> tuple[float, Callable[[float], fl
 
 
 def _find_wall(low: np.ndarray, high: np.ndarray) -> tuple:
-    """Return the fields of `RobustWall` for one box, given by the lower and the upper ends of its intervals."""
+    """Find the stiffest wall stable on all devices of a box, and return the fields of `RobustWall`."""
     devices = _place_devices(_build_grid(low, high, 2), low, high)
     limit, middle = _find_common_limit(devices)
     for _ in range(ROUNDS):

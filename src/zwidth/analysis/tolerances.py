@@ -40,7 +40,7 @@ class Tolerance(NamedTuple):
 )
 @dataclass(frozen=True)
 class ToleranceEstimate:
-    """Results of `simulate_tolerances`: the share of devices on which the wall is stable, and stiffness limits."""
+    """Estimated share of the devices within tolerances on which a wall is stable, and limits of the stiffness."""
 
     samples: int  # number of drawn devices
     stable: float  # share of drawn devices on which the wall of the scene is stable

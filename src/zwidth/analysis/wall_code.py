@@ -128,7 +128,7 @@ def write_wall(
 
 
 def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: float = math.inf) -> WallProgram:
-    """Build the statements that compute the force of the wall of a scene; the arguments are those of `write_wall`."""
+    """Build the program, as statements for either language, that computes the force of the wall of a scene."""
     period = float(scene.timing.period)
     estimate = scene.velocity.estimate(period)
     count, gain = estimate.window, float(estimate.gain) / period

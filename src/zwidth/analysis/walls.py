@@ -42,7 +42,7 @@ Wall: TypeAlias = float | str | None
     phase_margin="degrees", delay_margin="s", phase_crossover="Hz", gain_crossover="Hz", modulus_frequency="Hz"
 )
 class SceneMargins(Margins):
-    """Stability margins of walls as in `zwidth.Margins`, with the delay margin in s and the frequencies in Hz."""
+    """Gain, phase, delay and modulus margin of walls, with the delay margin in s and the frequencies in Hz."""
 
 
 class SceneAnalysis(SceneParts):

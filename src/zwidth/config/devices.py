@@ -212,7 +212,7 @@ class OneKind(Strict):
 
 
 def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float:
-    """Validate the key ``period`` by ``read``; if it is absent, return the inverse of the key ``rate``, in s."""
+    """Validate the key ``period`` with the function ``read``; if it is absent, return the inverse of ``rate``, in s."""
     if value is not None:
         return read(value)
     # A rate whose validation failed is absent from ``info.data``. Use 1 in its place, because the invalid rate is
@@ -224,7 +224,7 @@ def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) 
 
 
 def _validate_mass(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float | None:
-    """Validate the key ``mass`` by ``read``; return None if a linear system or a measured response replaces it."""
+    """Validate the key ``mass`` with the function ``read``; return None if a system or a response replaces it."""
     if value is not None:
         return read(value)
     if info.data.get("device", ...) is None:

@@ -69,8 +69,8 @@ def _make_axis_field(name: str) -> tuple[Any, Any]:
         rows = "Parameters that vary together, one row per device: lists of equal length, or a CSV file."
         return TableField | None, Field(default=None, description=rows)  # pyright: ignore[reportOperatorIssue]
     axis: Any = Annotated[Axis, axis_of(name)]
-    # Replace the note of the parameter, which may state a default, because the default of an axis is the value of the
-    # scene.
+    # Replace the note of the parameter, which may state another default, because the default of an axis is the value of
+    # the scene.
     description = describe_parameter(
         replace(PARAMETERS[name], note="" if name in WALL else "default: that of the scene")
     )

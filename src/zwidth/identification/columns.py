@@ -159,7 +159,7 @@ def read_log(
 
 
 def _look_like_counts(position: np.ndarray) -> bool:
-    """Return whether all positions are integers with a range of at least `_MANY_COUNTS`, as encoder counts are."""
+    """Return whether all positions are integers and have a large range, like encoder counts."""
     finite = position[np.isfinite(position)]
     return bool(np.all(finite == np.round(finite))) and float(np.ptp(finite)) >= _MANY_COUNTS
 

@@ -40,7 +40,7 @@ _TIMES = 3  # number of refinements
 
 
 class CriticalController:
-    """The critical controller ``q = -1/G`` of a batch of devices; the arguments broadcast with the frequencies.
+    """The critical controller ``q = -1/G`` of a batch of devices, whose parameters broadcast with the frequencies.
 
     A rigid device has ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``, with the coefficients of `numerics.held_mass`.
 

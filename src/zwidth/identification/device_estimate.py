@@ -43,7 +43,7 @@ class DimensionlessDevice(NamedTuple):
     modes: Any = ()  # for each mode the frequency in rad per sample, the damping ratio and the mass ratio m/m_i
 
     def to_parameters(self, period: Any) -> np.ndarray:
-        """Convert to an array of parameters in SI units, along its first axis in the order of `name_parameters`."""
+        """Return the parameters in SI units along the first axis of an array: mass, damping, delay, lag and modes."""
         mass, units = self.mass, [period, 1.0]
         values = [mass, self.delta * mass / period, self.d * period]
         values += [part * unit for part, unit in zip(self.lag, units, strict=False)]
@@ -101,7 +101,7 @@ def name_parameters(scene: Scene) -> tuple[str, ...]:
 
 
 def differentiate_stiffness_max(scene: Scene) -> tuple[float, np.ndarray]:
-    """Return K_max of a scene, and an array of its derivatives in the parameters that `name_parameters` lists."""
+    """Return K_max of a scene, and an array of its derivatives with respect to the fitted parameters of the scene."""
     sensitivities = scene.sensitivities()
     return float(sensitivities.stiffness), np.array([sensitivities.per[path] for path in name_parameters(scene)])
 
@@ -120,7 +120,7 @@ def compute_reach(freedom: int | None, upper: float = UPPER) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceEstimate:
-    """An estimated device with the covariance of its parameters; `zwidth.DeviceFit` describes the attributes."""
+    """An estimated device: its scene, the covariance of its parameters and, for a log, its frequency response."""
 
     nominal: Scene  # scene with the fitted parameters
     covariance: np.ndarray  # covariance of the parameters, in SI units

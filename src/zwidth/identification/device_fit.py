@@ -152,7 +152,7 @@ class DeviceFit(DeviceEstimate):
 
     @cached_property
     def errors(self) -> dict[str, float]:
-        """The standard error of each fitted parameter and force, by name or path."""
+        """The standard errors of the fitted parameters and forces as a dictionary, by name or path."""
         errors = np.sqrt(np.diag(self.covariance)).tolist()
         return dict(zip(self.numbers, errors, strict=True)) | self.errors_of_log
 
@@ -361,7 +361,7 @@ class DeviceFit(DeviceEstimate):
 
 
 def check_period_unit(period: float) -> list[str]:
-    """Return a warning, as a list, if the sampling period is so unusual that its unit may be wrong; else no entry."""
+    """Return a list with a warning if the sampling period probably has a wrong unit; otherwise an empty list."""
     if _SHORTEST_PERIOD <= period <= _LONGEST_PERIOD:
         return []
     unit = "in ms or us" if period > _LONGEST_PERIOD else "in s"

@@ -155,7 +155,7 @@ def _design(
     seed: int,
     system: UnitSystem,
 ) -> Excitation:
-    """Design the force as `excite` does, for arguments in the given unit system."""
+    """Design the multisine force, for arguments in the given unit system."""
     period, most = check_number("period", period), check_number("force", force, system["N"], POSITIVE)
     step, length = (
         check_number("resolution", resolution, system["m"]),

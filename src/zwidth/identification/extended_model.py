@@ -69,11 +69,11 @@ class Recordings:
     resolution: float = 0.0
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
-        """Weight columns with one row per sample by `MeasurementNoise.weigh`; without a noise model return them."""
+        """Weight columns with one row per sample according to the noise model; without one, return them unchanged."""
         return columns if self.noise is None else self.noise.weigh(columns)
 
     def truncate(self, count: int) -> Recordings:
-        """Return a copy with logs shortened to ``count`` positions by `Recording.truncate`, and with equal weights."""
+        """Return a copy with equal weights and logs cut off ``count`` positions after the first change of the force."""
         return replace(self, logs=tuple(log.truncate(count) for log in self.logs), noise=None)
 
     @property

@@ -164,7 +164,7 @@ def _describe_next(fit: DeviceFit) -> str:
 
 
 def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
-    """Return pairs (label, text) with the details of a fit that `summarize_fit` omits.
+    """Return pairs (label, text) with the details of a fit that its summary omits.
 
     Args:
         fit: the fit.

@@ -233,7 +233,7 @@ def _integrate_positions(
     delta: float,
     c: float,
 ) -> tuple[np.ndarray, Callable[[], np.ndarray]]:
-    """Integrate the velocities of the mass to displacements, and provide the derivatives of the positions.
+    """Integrate the velocities of the mass to displacements; also return a function that computes their derivatives.
 
     Args:
         parts: velocities in the parts of all periods, and stops.

@@ -146,7 +146,7 @@ def _fit(
     resolution: Any,
     system: UnitSystem,
 ) -> DeviceFit:
-    """Fit a device as `fit_log` does, to logs that have already been read and repaired.
+    """Fit a device to logs that have already been read and repaired.
 
     Args:
         read: the logs.

@@ -65,7 +65,7 @@ _NEARLY_FRICTIONLESS = 900.0
 _EXCLUDED = 25.0  # a rival whose misfit exceeds that of the best fit by this much does not enlarge the covariance
 # An initial motion counts as invisible if its length is below this number of standard deviations of the noise.
 _INVISIBLE_DISTANCE = 3.0
-# Numerical limits and levels.
+# Numerical limits and a significance level.
 _MAX_CONDITION = 1e7  # condition number of the derivatives above which some parameters are not determined
 _ROUNDING = 1e-13  # relative rounding error of a sum of squares, and of the positions
 _SIGNIFICANCE = 1e-3  # significance level of the chi-square test for the excess
@@ -97,7 +97,7 @@ class FittedModel:
 
     @property
     def count(self) -> int:
-        """The number of fitted positions; if they are weighted, the effective number `MeasurementNoise.count`."""
+        """The number of fitted positions; if they are weighted, the effective number according to the noise model."""
         return self.model.measured.size if self.model.noise is None else self.model.noise.count
 
     @cached_property
@@ -168,7 +168,7 @@ class FittedModel:
 
     @cached_property
     def excess(self) -> float:
-        """The autocorrelation of the residuals, as a factor of variance; 1 for white noise or if not significant.
+        """The factor by which autocorrelation increases the variance of sums of residuals; 1 if it is not significant.
 
         The value is the mean square of sums of successive residuals, divided by that expected from the noise model.
         """
@@ -208,7 +208,7 @@ class FittedModel:
             predicted = float(steps @ np.linalg.lstsq(correlation, steps, rcond=None)[0])
             actual = max(rival.compare_misfit(self) / self.excess, 1.0)
             # The misfit may increase less between the minimum and the rival than the derivatives predict, because the
-            # sum of squares has a kink between them. Then enlarge the covariance in this direction until both agree.
+            # sum of squares has a kink between them. If so, enlarge the covariance in this direction until both agree.
             if actual < min(predicted, _EXCLUDED):
                 covariance[block] += (1.0 / actual - 1.0 / predicted) * np.outer(away, away)
         return covariance
@@ -253,7 +253,7 @@ def fit_model(model: Recordings) -> FittedModel:
 
 
 def _list_starts(model: Recordings) -> list[np.ndarray]:
-    """Compute initial values of theta: one without friction, and one for each friction of `_FRICTIONS`.
+    """Compute initial values of theta: one without friction, and one for each value of a grid of frictions.
 
     For each friction, the damping and the delay are those with the least sum of squares on a grid, evaluated on the
     first `_N_LEADING` positions of each log.
@@ -299,7 +299,7 @@ def _list_starts(model: Recordings) -> list[np.ndarray]:
 
 
 def _simulate_rows(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.ndarray:
-    """Simulate the basis functions of the linear least squares: positions for g = 1, and their linear derivatives.
+    """Simulate the positions for g = 1 and their derivatives in the linear parameters, as basis of a linear fit.
 
     Args:
         model: the logs, with a model without lag and modes.
@@ -373,7 +373,7 @@ def _fit(model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: fl
 def fit_nonnegative(
     model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: float = _CONVERGED
 ) -> FittedModel:
-    """Fit a model by `minimize_squares`; if the damping or the delay becomes negative, fix it at 0 and fit again."""
+    """Fit a model by least squares; if the damping or the delay becomes negative, fix it at 0 and fit again."""
     best = minimize_squares(model, start, fixed, tolerance=tolerance)
     while negative := tuple(k for k in (1, 2) if best[0][k] < 0):
         best[0][list(negative)] = 0.0

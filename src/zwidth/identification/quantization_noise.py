@@ -162,7 +162,7 @@ class MeasurementNoise:
         return total
 
     def spread_each(self, columns: np.ndarray) -> np.ndarray:
-        """Return the variances of linear combinations of the errors: the diagonal of the matrix of `spread`."""
+        """Return the variances of linear combinations of the errors, without computing their covariances."""
         white = np.sum(columns**2, 0)
         total = self.variance * white
         for wave, weight in self._waves():

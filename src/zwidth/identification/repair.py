@@ -417,7 +417,7 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
 
 
 def _refuse_left_out(steps: np.ndarray, tick: float) -> None:
-    """Raise `InputError` if all time steps are 1 to 20 ticks, because the loop then logs only some of its samples.
+    """Raise `InputError` if each time step is a whole number of 1 to 20 ticks, which indicates omitted samples.
 
     Args:
         steps: time steps in s.

@@ -133,7 +133,7 @@ def respond(
 def _respond(
     time: ArrayLike, position: ArrayLike, force: ArrayLike, cycle: Any, resolution: Any, system: UnitSystem
 ) -> ResponseEstimate:
-    """Estimate the response as `respond` does, for arguments in the given unit system."""
+    """Estimate the frequency response, for arguments in the given unit system."""
     read = read_logs(time, position, force, system, resolution=resolution)
     period, notes = read.period, list(read.notes)
     logs = tuple(_fill(log, place, k, notes) for k, (log, place) in enumerate(zip(*read[:2], strict=True), start=1))

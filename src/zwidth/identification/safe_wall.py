@@ -74,7 +74,7 @@ _UNDECIDED = SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
 
 
 def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> SafeWall:
-    """Search for the safe wall of an estimated device, as `zwidth.DeviceFit.safe_wall` describes.
+    """Search for the safe wall of an estimated device, for a required proportion of devices.
 
     Args:
         fit: the estimate.

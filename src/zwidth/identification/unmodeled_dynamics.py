@@ -384,7 +384,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
 
 
 def _expand_unit_modes(fit: FittedModel, poles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the coefficients that express the position of each unit mode by the filtered forces of `_filter_forces`.
+    """Compute the coefficients that express the position of each unit mode as a combination of filtered forces.
 
     Let p be the pole, f the fractional part of the delay and g = T^2/m. If all forces acted for a whole period, the
     response of the pole would be ``(e^p - 1) e^(-f p)/p`` times the filtered force. The latest force has acted for

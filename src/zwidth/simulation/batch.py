@@ -68,7 +68,7 @@ class Model(NamedTuple):
 
 
 def build_model(scene: Any) -> Model:
-    """Build the simulation model of a scene."""
+    """Build the simulation model of a scene, with its chain, delay and velocity estimate."""
     estimate, period, mass = scene.velocity, float(scene.timing.period), float(scene.mass)
     # For FOAW, build the chain with another velocity estimate and keep the FOAW parameters separately, because FOAW is
     # not a linear filter.

@@ -129,7 +129,7 @@ class FigureLook(Strict, noun="the look of figures"):
 
     @property
     def size(self) -> tuple[float, None] | None:
-        """Width in inches, and None for a height that follows from the width; None for the usual size of figures."""
+        """Pair of the width in inches and None (the height follows from the width); None for the default size."""
         return None if self.width is None else (self.width / 0.0254, None)
 
 

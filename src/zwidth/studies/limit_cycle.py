@@ -76,7 +76,7 @@ class CycleAxes(Strict, noun="the axes of a limit_cycle study"):
 
     @property
     def given(self) -> dict[str, Axis]:
-        """Given axes, with one or several values, by the name of the parameter."""
+        """Dictionary of the axes in the configuration, with one or several values, by the name of the parameter."""
         return {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
 
     @property

@@ -230,8 +230,8 @@ class RecommendStudy(ResponseStudy):
         summary, notes, response = recommendation.as_dict(), list(recommendation.notes), None
         lines = (*recommendation.lines(), *self._simulate(recommendation, scene))
         if not bare.parts_beyond and recommendation.verdict is not None:
-            # Use the normalized wall of the verdict instead of the wall in SI units, because a conversion has rounding
-            # errors.
+            # Use the normalized wall of the assessment instead of the wall in SI units, because a conversion has
+            # rounding errors.
             wall = recommendation.verdict.alpha, recommendation.verdict.beta
             columns, note = self.respond(self.device, *wall, label=label, physical=True)
             summary["recommended"]["settling_time"] = to_json(float(columns["settling_time_s"]))
