@@ -25,7 +25,7 @@ from zwidth.model.wall import NoWall, VirtualWall
 
 
 class Parts(Protocol):
-    """Interface of a scene for annotations in modules that `zwidth.Scene` imports and that cannot import `Scene`."""
+    """The fields of a scene, for type annotations in modules that cannot import `zwidth.Scene` (circular import)."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]  # allows calls of `dataclasses.replace`
 
@@ -98,7 +98,7 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 
 
 def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
-    """Return a copy of a scene with new values by path; raise `InputError` for a path that the scene does not have."""
+    """Return a copy of a scene with the new values in ``changes``, by path; raise `InputError` for an unknown path."""
     parts = {name: part for _, name, part in _parts(scene)}
     owners = {prefix + item.name: (name, item.name) for prefix, name, part in _parts(scene) for item in fields(part)}
     owners |= {name: ("", name) for name in (*_BARE, *_NAMED, *_WHOLE)}

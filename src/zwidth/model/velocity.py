@@ -77,7 +77,7 @@ class Estimate:
 
 
 class _Checked(Part):
-    """Base class of the estimates whose fields have ranges in `units.quantities`."""
+    """Base class of the estimates whose parameters are checked against the ranges in `units.quantities`."""
 
     _owner = "velocity"
 
@@ -326,7 +326,7 @@ ESTIMATES = {
 
 
 def name_estimate(velocity: Velocity) -> str:
-    """Return the name of the kind of an estimate in configurations; raise `InputError` for other classes."""
+    """Return the name of the class of an estimate in configurations; raise `InputError` for classes without a name."""
     for kind, part in ESTIMATES.items():
         if type(velocity) is part:
             return kind
@@ -337,7 +337,7 @@ def name_estimate(velocity: Velocity) -> str:
 
 
 def is_plain(velocity: Velocity, period: Any) -> bool:
-    """Return whether an estimate is a backward difference without any parameter, divided by the period of the loop."""
+    """Return whether an estimate is the backward difference, divided by the loop's period, with no parameter set."""
     if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
         return False
     estimate = velocity.estimate(period)
@@ -360,7 +360,7 @@ def _ratio(period: Any, coded: Any) -> Any:
     return 1.0 if coded is None else period / coded
 
 
-# The following operations differ between floats, JAX arrays and balls.
+# The functions below implement operations that differ between floats, JAX arrays and balls.
 
 
 def _pi(like: Any) -> Any:
