@@ -33,12 +33,12 @@ _NUMBERS = (int, float, np.floating, np.integer)
 
 
 def are_numbers(*values: ArrayLike) -> bool:
-    """Return whether all values are plain numbers, which convert to float64 without a check."""
+    """Return whether all values are plain numbers, which can be converted to float64 without a check."""
     return _PLAIN.issuperset(map(type, values))
 
 
 def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
-    """Raise `InputError` if a plain number is larger or smaller in magnitude than the limits of its name in `SIZES`.
+    """Raise `InputError` if the magnitude of a plain number is outside the range of its parameter in `SIZES`.
 
     Other invalid numbers and arrays pass, because results report them by a status.
     """
@@ -254,7 +254,7 @@ def evaluate_columns(
 
 
 def _plain(leaf: Any) -> Any:
-    """Convert one leaf of the result at a single point to a NumPy scalar."""
+    """Convert one leaf of the result at a single point, a zero-dimensional array, to a NumPy scalar."""
     return leaf if isinstance(leaf, np.generic) else np.asarray(leaf)[()]
 
 
@@ -279,7 +279,7 @@ def compile_traced(
         return kernel(*arrays, *static)
 
     def by_argument(active: tuple[bool, ...], *arrays: Any) -> tuple[Any, Any]:
-        """Return the values of the kernel, and their derivatives in the active arguments along a new first axis."""
+        """Return the kernel's values, and their derivatives in the ``active`` arguments along a new first axis."""
         moving = [k for k, moves in enumerate(active) if moves]
 
         def of_moving(*values: Any) -> Any:
@@ -294,8 +294,8 @@ def compile_traced(
         sides = tuple(
             side.reshape(-1, *(1,) * ones.ndim) * ones[None] for side in np.eye(len(moving), dtype=ones.dtype)
         )
-        # Compute the values once, not once per direction of differentiation, and materialize the derivatives, because
-        # several products use them.
+        # Compute the values once, not once per argument, and make XLA store the derivatives, because several products
+        # use them.
         value, slopes = jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
         return value, tree_map(
             lambda leaf: leaf if leaf.dtype == jax.dtypes.float0 else materialize(leaf, leaf), slopes
@@ -305,7 +305,7 @@ def compile_traced(
 
     @cache
     def sloped(active: tuple[bool, ...]) -> Callable[..., Any]:
-        """Return `by_argument`, compiled for a choice of active arguments."""
+        """Return a compiled function for the kernel's values and their derivatives in the ``active`` arguments."""
         # Give the compiled function a derivative rule of its own. Without this rule `jax.grad` splits each equation of
         # the function into a part that is linear in the tangents and the rest, which takes twice as long.
         compiled = jax.jit(partial(by_argument, active))
@@ -352,7 +352,7 @@ def _as_precise(leaf: Any, argument: Any) -> Any:
 
 
 def _no_change(leaf: Any) -> Any:
-    """Return the zero tangent of a result that is constant, or whose type has no derivative."""
+    """Return a zero tangent of the right type, for a constant result or one whose type has no derivative."""
     import jax
 
     if jax.numpy.issubdtype(leaf.dtype, np.inexact):

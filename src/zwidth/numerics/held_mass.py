@@ -80,7 +80,7 @@ Functions = Callable[[Any], Any]
 
 
 class Plant(NamedTuple):
-    """Coefficients of the discretized device: those of its numerator N(z), and its pole c."""
+    """The discretized device: the coefficients of its numerator N(z), and its pole c."""
 
     c: Array  # e^-delta, the pole besides z = 1
     em: Array  # 1 - c, without cancellation
@@ -93,7 +93,7 @@ class Plant(NamedTuple):
 def discretize_mass(
     delta: Any, fraction: Any = None, functions: Functions = phi_functions, phi: Any = None, phi_t: Any = None
 ) -> Plant:
-    """Compute the discrete transfer function of a damped mass with a fractional delay, in any arithmetic.
+    """Compute the discrete transfer function of a damped mass with a fractional delay, for floats, JAX arrays or balls.
 
     Args:
         delta: normalized damping.

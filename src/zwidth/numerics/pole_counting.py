@@ -27,7 +27,7 @@ from zwidth.numerics.evaluate import join_shapes, to_caller
 
 # Number of loops that one NumPy call evaluates, chosen so that the intermediate arrays fit in the cache.
 BLOCK_SIZE = 1 << 9
-# Bound of the rounding error of one factor, one sum and one logarithm, in units of eps: twice the count of operations.
+# Bound on the rounding error of a factor, a sum or a logarithm, in units of eps: twice its number of operations.
 ROUNDINGS = 8.0
 # Relative difference of r^2 and |root|^2, in units of eps, below which rounding errors leave open whether a complex
 # root lies inside the circle.
@@ -255,7 +255,7 @@ def _scale_parts(
 
 
 def _find_dominant(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array, Array]:
-    """Return whether T, and whether B, is provably larger on the whole circle, by bounds of every factor.
+    """Return two masks: |T| > |B|, and |B| > |T|, proved on the whole circle by bounds on every factor.
 
     Such loops need no crossovers, whose disks are wide if many roots coincide.
     """
@@ -412,7 +412,7 @@ def _compare_parts(
     clear = xp.abs(value) > noise
     # Between two intervals with equal m the comparison need not be certain, because it does not affect the count.
     certain = (clear[..., :split] | ~gaps | (m[..., :-1] == m[..., 1:])).all(-1)
-    # The points after those of the gaps are the roots on the circle, first those of T, then those of B.
+    # The entries after those of the gaps belong to the roots on the circle: first the roots of T, then those of B.
     half = split + near.shape[-1]
     certain = certain & (~on_circle[..., 0, :] | (clear[..., split:half] & (value[..., split:half] < 0))).all(-1)
     certain = certain & (~on_circle[..., 1, :] | (clear[..., half:] & (value[..., half:] > 0))).all(-1)
