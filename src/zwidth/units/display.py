@@ -19,7 +19,7 @@ Kind = TypeVar("Kind", bound=type)
 Result = TypeVar("Result")
 Unit = str | type[IntEnum]  # unit of a field as text, or the enumeration to which the codes of a field belong
 
-# Units on linear devices of fields that several result types have, by name of the field.
+# Default units, on linear devices, of fields that occur in several result types; by name of the field.
 _DEFAULT_UNITS: dict[str, Unit] = {"stiffness": "N/m", "virtual_damping": "N s/m", "status": Status}
 _BARE = ("", "1", "degrees", "periods")  # units without SI prefixes
 _FEW = 4  # largest number of entries of an array that is displayed with all entries

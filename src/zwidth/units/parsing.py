@@ -61,7 +61,7 @@ class Dimension:
         return None if size is None else size.exponents
 
     def measure(self, unit: str) -> UnitSize | None:
-        """Return the size of a unit; None for a unit of another dimension."""
+        """Return the conversion factor of a unit to SI as a `UnitSize`; None for a unit of another dimension."""
         return measure_unit(unit, self.exponents) if self.exponents and unit else None
 
     def in_base(self, mantissa: str, exponent: int, unit: str) -> float | None:
@@ -180,7 +180,7 @@ def _canonical(unit: str) -> str:
     return re.sub(r"N[\s*·⋅.]*(?=[scm])", "N ", unit)
 
 
-# True for rotary units and False for linear ones, by exponents of kg, m, s and rad.
+# Kind of device (True: rotary, False: linear) to which a unit belongs, by the unit's exponents of kg, m, s and rad.
 _KIND_OF_EXPONENTS = {
     DIMENSIONS[base].exponents: kind == 1 for pair in UNIT_PAIRS for kind, base in enumerate(pair) if base in DIMENSIONS
 }
