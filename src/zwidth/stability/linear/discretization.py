@@ -31,7 +31,7 @@ from zwidth.numerics.held_mass import Plant, discretize_mass, factor_numerator
 from zwidth.stability.linear.roots import LoopRoots, compute_aberth_step
 from zwidth.stability.linear.sampled_zeros import find_sampled_zeros
 
-# Zeros of G
+# Settings for the zeros of G.
 SLOW_ZERO = 0.1  # |zeta| below which a zero starts from its continuous-time counterpart
 MAX_STEPS = 30  # Aberth steps
 CONVERGED_STEP = 1e-13  # last Aberth step, relative to |zeta|
@@ -40,7 +40,7 @@ RESPONSE_TOLERANCE = 1e-11  # relative difference of q by roots and by matrices,
 TEST_ANGLE = 0.5  # rad per sample at which the two are compared
 FAR_ZERO = 1e-17  # inverse |zeta| beyond which a zero is dropped
 
-# Matrix exponential
+# Settings of the matrix exponential: number of terms of its series, largest number of doublings.
 SERIES_TERMS = 15
 MAX_DOUBLINGS = 36  # 2^36 exceeds twice the largest rate that `Chain.check` allows
 
@@ -145,8 +145,8 @@ def find_roots(chain: AnyChain) -> LoopRoots:
         lag += 1
     numerator = np.trim_zeros(numerator, "f")
     if numerator.size > 1 and abs(numerator[0]) < FAR_ZERO * abs(numerator[1]):
-        # For a delay just below an integer, one zero is so far from the unit circle that it has no effect there, and
-        # Aberth's method would not find it.
+        # Drop one zero if the delay is just below an integer, because this zero is then so far from the unit circle
+        # that it has no effect on the circle and Aberth's method would not converge to it.
         numerator = numerator[1:]
     # Rounding errors of the coefficients hide zeros near the poles of a slow mode. Start the iteration for these zeros
     # from the zeros of the continuous-time response, which approximate them.
@@ -222,7 +222,7 @@ def _log_derivative(matrix: np.ndarray, change: np.ndarray) -> complex:
 
 
 def _factor_rigid_loop(chain: Chain) -> LoopRoots:
-    """Return the open loop of a rigid device by zeros, poles and gain, in closed form."""
+    """Return the zeros, poles and gain of the open loop of a rigid device, in closed form."""
     delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.n_delay)
     plant = discretize_mass(delta, fraction if fraction else None)
     if fraction:
