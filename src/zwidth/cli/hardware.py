@@ -58,7 +58,7 @@ def hardware_options(command: Command) -> Command:
         hardware = {name: value for _, name, *_ in _HARDWARE if (value := given.pop(name)) is not None}
         if "resolution" in hardware:
             warn_implausible({"resolution": hardware["resolution"]}, given["scene"].unit_system)
-        # Ignore the hardware of the file for a measured response, which has no model to simulate with it.
+        # Ignore the hardware of the file for a measured response, because without a model it cannot be simulated.
         from_file = {} if isinstance(given["scene"].device, MeasuredDevice) else get_hardware()
         return command(hardware=from_file | hardware, **given)
 
