@@ -285,7 +285,7 @@ class StableSet:
         return frozenset([min(stiff, key=lambda piece: (piece not in damped, np.min(ends[piece])))])
 
     def find_softest(self, least: float) -> float:
-        """Return the lowest alpha with beta >= ``least`` on the edges of `main` pieces; NaN if there is none."""
+        """Return the lowest alpha of the edges of `main` pieces (connected to K = 0) with beta >= ``least``, or NaN."""
         walls = [edge.alpha[edge.beta >= least] for edge in self.main_edges(least)]
         return float(min((alpha.min() for alpha in walls if alpha.size), default=np.nan))
 

@@ -64,7 +64,7 @@ NEWTON_STEPS = 4
 
 
 class Verdict(NamedTuple):
-    """Definite results of a stability test; both fields are false if the test is inconclusive."""
+    """Result of a stability test: ``stable`` and ``unstable`` are true only if certain, so both may be false."""
 
     stable: Any
     unstable: Any
