@@ -44,20 +44,19 @@ from zwidth.stability.rigid.pole_count import LoopFactors, count_poles_in_cell, 
 
 # Sides of the cells of a square grid, in walls. Cells of other grids have as many walls and the grid's proportions.
 CELL_SIDES = (128, 64, 32, 16, 8)
-# Batch sizes, chosen such that the working arrays stay in the cache: in cells per call of `_CellGrid.solve`, in cells
-# per computation of the series, and in walls per evaluation of the series.
+# Batch sizes, chosen such that the working arrays stay in the cache.
 CELLS_PER_LIST = 1 << 9
 CELLS_PER_BATCH = 1 << 7  # cells whose series are computed at once
 WALLS_PER_WRITE = 1 << 16
-# Number of Halley steps from each starting point of the search for the two largest poles of a cell's center.
+# Number of Halley steps from each starting point of the search for the two largest poles at the center of a cell.
 HALLEY_STEPS = 5
 # Distance in log z, relative to the distance between neighboring poles of a long delay. A sequence of Halley steps has
 # converged if its last step is shorter. Two sequences have found the same pole if their ends are closer together.
 SAME_POLE_DISTANCE = 1e-2
 # Largest number of walls along an axis for which powers and interpolation weights are cached.
 MAX_CACHED = 1 << 14
-# Circles on which poles are counted, tried together. Their distances in log |z| below the lower bound of the groups'
-# poles, relative to the distance between this bound and the poles of the cell's center.
+# Circles on which poles are counted: distances in log |z| below the lower bound of the groups' poles, relative to the
+# distance between this bound and the poles at the center of the cell.
 COUNT_CIRCLES = (0.3, 1.5, 6.0)
 
 
@@ -248,8 +247,8 @@ class _CellGrid:
                     re[0, index], positions[:, index], select_cells(cells, index), fractional
                 )
         enclosed = (single.order < len(ORDERS)) | certified
-        # If no certificate exists, another pole may become dominant in the cell: expand two poles as two groups. If no
-        # circle encloses the pole, it is nearly double: expand a pair.
+        # Expand two poles as two groups if the second one may become dominant, or as a pair if no circle separates
+        # them.
         for mask, poles in ((enclosed & ~certified, 1), (~enclosed, 2)):
             index = pad_to_16(np.flatnonzero(mask))
             if not index.size:
@@ -290,8 +289,7 @@ class _CellGrid:
         ]
         counts = [sum(group.n_poles for group in groups)] * len(circles)
         if self.errors.is_coarse:
-            # Also accept a cell with other poles if these exceed the poles of the groups by at most the reserve and are
-            # on the same side of the unit circle.
+            # Accept slightly larger other poles, too: up to the reserve, and on the same side of the unit circle.
             low = np.maximum.reduce([group.low for group in groups])
             circles.append(_bound_on_one_side(low, self.errors.reserve)[1])
             counts.append(0 * counts[0])
@@ -341,8 +339,8 @@ class _CellGrid:
     def _write(self, positions: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
         """Store the poles of all walls of some cells; with ``merge``, only those larger than the stored ones."""
         size, log_error = max(1, WALLS_PER_WRITE // (self.sides[0] * self.sides[1])), group.log_error[k]
-        # Interpolate the differences from the radius at the center and not the radii, because the rounding error of
-        # interpolation is proportional to the largest interpolated value.
+        # Interpolate the differences from the radius at the center and not the radii, because the rounding error is
+        # proportional to the largest interpolated value.
         center = np.exp(group.re)[:, None, None]
         if len(sums) == 1:
             (logarithms,) = sums
@@ -352,12 +350,10 @@ class _CellGrid:
             else:
                 powers = polyvander(_list_chebyshev_nodes(ORDERS[k]), ORDERS[k])
                 polynomials = [(np.exp(powers @ logarithms @ powers.T) - center, _compute_interpolation_weights)]
-            # Bound |log radius| in each cell from below by the magnitude of the constant term minus those of all other
-            # terms.
+            # Bound |log radius| from below by the magnitude of the constant term minus those of all other terms.
             sizes = np.abs(logarithms)
             least_log = np.maximum(2.0 * sizes[:, 0, 0] - sizes.sum((1, 2)), 0.0)
-            # Select the cells in which a wall may be special, i.e. too close to the unit circle or with too large an
-            # error.
+            # Select the cells in which a wall may be special, i.e. too close to the unit circle or not accurate enough.
             is_close = (least_log < 2.0 * self.errors.uncertain_width) | (log_error > self.errors.limit(least_log))
         else:
             polynomials, is_close = [(x, polyvander) for x in sums], np.ones(log_error.size, bool)
@@ -429,8 +425,7 @@ class _CellGrid:
 
 def compute_grid_poles(area: Area, accuracy: float, with_rate: bool = False) -> GridPoles:
     """Compute the dominant poles of a window of a grid; NaN for walls that no cell certifies accurately enough."""
-    # Use the cells of the whole grid and compute each separately, so that the result of a wall does not depend on the
-    # window.
+    # Compute each cell of the whole grid separately, so that the result of a wall does not depend on the window.
     sizes, errors = _list_cell_sizes(area.beta.shape[1], area.alpha.shape[1]), AllowedErrors(accuracy, with_rate)
     is_fractional = area.d != np.floor(area.d)
     results = _ResultArrays(area, sizes[0], with_rate)

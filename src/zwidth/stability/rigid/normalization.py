@@ -76,7 +76,7 @@ def _is_valid(name: str, value: Array) -> Array:
 
 
 def quantity_status(**values: Array) -> Array:
-    """Return the `Status` of quantities named as in `normalize`, elementwise; INVALID_INPUT precedes OUT_OF_RANGE."""
+    """Return the `Status` of quantities, given by name, elementwise; INVALID_INPUT has priority over OUT_OF_RANGE."""
     xp = namespace(*values.values())
     valid = inside = True
     for name, value in values.items():

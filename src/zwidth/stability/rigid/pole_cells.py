@@ -350,7 +350,7 @@ def compute_larger(first: np.ndarray, second: np.ndarray, disk: Any) -> tuple[np
 
 
 def is_larger_accurate(discriminant: np.ndarray, disk: Any, error: Any, limit: Any) -> np.ndarray:
-    """Return whether the larger pole is accurate to ``limit``, if the sums have the errors ``error`` and twice that."""
+    """Return whether the larger pole is accurate to ``limit``, if the sums have errors of ``error`` and 2 ``error``."""
     discriminant_error = 2.01 * error
     # Bound the error of sqrt(D) by two values: the square root of the error of D, and the error of D divided by
     # sqrt(D).
