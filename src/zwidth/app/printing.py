@@ -138,7 +138,7 @@ def spell_decay(constant: float, frequency: float) -> str:
 
 
 def list_period_notes(scene: Scene) -> list[str]:
-    """Return a note if the velocity estimate was designed for a period other than that of the loop."""
+    """Return a list with a note if the velocity estimate was designed for another period than the loop's."""
     coded, period = getattr(scene.velocity, "coded_period", None), scene.timing.period
     if coded is None or abs(coded / period - 1) < 1e-9:
         return []
@@ -168,7 +168,7 @@ def compare_with_limit(scene: Scene) -> list[str]:
 
 
 def list_limit_cautions(scene: Scene) -> list[str]:
-    """Return the caution that a wall exceeds the safe limit of its scene; an empty list if it does not."""
+    """Return a list with the caution that the wall exceeds the safe limit of its scene; empty if it does not."""
     limit, wall = scene.safe_limit, scene.wall
     if limit is None or isinstance(wall, NoWall) or limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
         return []
@@ -202,7 +202,7 @@ def format_hardware(hardware: str) -> list[str]:
 
 
 def list_omission_cautions(scene: Scene, omitted: Collection[str]) -> list[str]:
-    """Return cautions if the delay or the friction is 0 only because it was not given.
+    """Return a list of cautions about a delay or a friction that is 0 only because the user has not given it.
 
     ``omitted`` contains the names of options that were not given.
     """

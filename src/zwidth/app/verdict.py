@@ -248,9 +248,9 @@ def format_recommendation(
     diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
-    """Return the printed lines of `zwidth recommend` without notes; ``hardware`` is defined as in `format_check`.
+    """Return the printed lines of `zwidth recommend` without notes, from a recommendation and its checks.
 
-    ``diagnosis`` is that of the recommended wall.
+    ``hardware`` is a phrase as in `format_check`, and ``diagnosis`` is that of the recommended wall.
     """
     scene, verdict = recommendation.scene, recommendation.verdict
     device = [format_line("device", spell_device(scene, omitted)), *format_parts(scene), *format_hardware(hardware)]

@@ -80,7 +80,7 @@ def spell_hardware_of_file(scene: Scene) -> str:
 
 
 def diagnose_wall(scene: Scene, hardware: dict[str, Any], *, remedies: bool) -> Any:
-    """Return the result of `zwidth.diagnose` for a wall on the given hardware; None if no hardware is given.
+    """Simulate and diagnose a scene's wall on the given hardware (`zwidth.diagnose`); return None without hardware.
 
     ``remedies=False`` omits the search for remedies, which takes most of the run time.
     """

@@ -49,6 +49,6 @@ def find_group(flag: str) -> str:
 
 
 def show_example(command: str, *more: str) -> dict[str, Any]:
-    """Return arguments of ``cli.command`` for a command with grouped options and an example in its help."""
+    """Return keyword arguments of ``cli.command`` for a command whose help has grouped options and an example."""
     example = "\b\nExample:\n" + " \\\n    ".join((f"  zwidth {command}", *more))
     return {"cls": GroupedCommand, "epilog": example}

@@ -230,7 +230,7 @@ def read_scene_file(path: Path) -> Scene:
 
 
 def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *, wall: bool = False) -> Scene | None:
-    """Return the scene with the parameters ``given`` (by path); ``given["scene"]`` is a scene with all others.
+    """Return the scene with the parameters ``given`` (by path) and all other parameters from ``given["scene"]``.
 
     Return None if no option is given and ``instead`` names alternative options.
     """
@@ -251,7 +251,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
-    """Return the scene of a file after replacing the parameters that are given as options."""
+    """Return the scene of a file with the parameters replaced that are given as options."""
     from zwidth.model.devices import KnownDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}

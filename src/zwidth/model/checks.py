@@ -34,7 +34,8 @@ def to_periods(delay: Array, period: Array) -> Array:
     quotient = delay / period
     nearest = xp.round(quotient)
     near = xp.abs(quotient - nearest) <= 4 * np.finfo(quotient.dtype).eps * xp.maximum(nearest, 1.0)
-    # Subtract the rounding error as a constant, so that the derivatives remain those of the quotient.
+    # Subtract the rounding error as a constant (without gradient), so that the derivatives remain those of the
+    # quotient.
     return quotient - stop_gradient(xp.where(near & (nearest > 0), quotient - nearest, 0.0), xp)
 
 
@@ -195,7 +196,7 @@ class Part:
 
 
 def _flatten(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield pairs of name and value; for a list that contains texts, one pair per entry with the name of the list."""
+    """Yield the items of a dictionary as pairs (name, value); a list that contains texts yields one pair per entry."""
     for name, value in given.items():
         if isinstance(value, list | tuple) and _has_text(value):
             for each in value:

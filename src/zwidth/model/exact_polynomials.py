@@ -91,7 +91,7 @@ def find_common_factor(one: Polynomial, other: Polynomial) -> Polynomial:
     """Return the monic greatest common divisor of two polynomials, by Euclid's algorithm."""
     a, b = _to_integers(one), _to_integers(other)
     while b:
-        # Compute pseudo-remainders, because they need no fractions. Divide each of them by the common factor of its
+        # Compute pseudo-remainders, because they need only integers. Divide each by the greatest common divisor of its
         # coefficients, because the integers would otherwise grow fast.
         while len(a) >= len(b):
             a = [x * b[0] - a[0] * y for x, y in zip(a, b + [0] * (len(a) - len(b)), strict=True)][1:]

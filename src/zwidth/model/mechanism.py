@@ -117,8 +117,8 @@ class Chain:
         count, actuator_states = bodies + modes, 0 if lag is None else 2 if isinstance(lag, Resonance) else 1
         size = 2 * count + actuator_states
         zero = xp.asarray(0.0 * (self.bodies[0].mass + self.bodies[-1].damping + sum(mode.rate for mode in self.modes)))
-        # Every quantity is a linear combination of the states, the command and the external force, stored as a row of
-        # coefficients. The unit vectors in ``axes`` represent the states and both inputs themselves.
+        # Represent every quantity, a linear combination of states, command and external force, by its row of
+        # coefficients. The rows of the states and of both inputs are the unit vectors in ``axes``.
         axes = xp.asarray(np.eye(size + 2).astype(zero.dtype)).reshape(size + 2, size + 2, *[1] * zero.ndim)
         command, external = axes[size:]
         actuator_force = command if lag is None else axes[2 * count]
@@ -226,7 +226,8 @@ def build_chain(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Es
         links.append((hand.coupling_stiffness, hand.coupling_damping))
     unit = masses[0][0]
     stiffness_factor, damping_factor = period * period / unit, period / unit
-    # Do not multiply a zero stiffness, because `is_zero` would return False for the product with a traced period.
+    # Keep a zero stiffness as a plain 0, because its product with a traced period would no longer be recognized as
+    # zero.
     bodies = tuple(
         Body(m / unit, b * damping_factor, 0.0 if is_zero(k) else k * stiffness_factor) for m, b, k in masses
     )

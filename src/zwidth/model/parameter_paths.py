@@ -60,7 +60,7 @@ def find_parts(scene: Parts) -> dict[str, Any]:
 
 
 def _parts(scene: Parts) -> list[tuple[str, str, Any]]:
-    """Return a tuple (prefix of the paths of its parameters, name, part) for each part of a scene, the wall last."""
+    """Return a tuple (path prefix of the parameters, name, part) for each part of a scene, with the wall last."""
     *bare, wall = (("", name, getattr(scene, name)) for name in _BARE)
     return [*bare, *((f"{name}.", name, part) for name, part in find_parts(scene).items()), wall]
 

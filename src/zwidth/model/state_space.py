@@ -36,7 +36,7 @@ class StateSpace(NamedTuple):
 
 
 def _realize_filter(estimate: Estimate) -> StateSpace:
-    """Return the filter of a velocity estimate, without the difference over its window, in controllable canonical form.
+    """Return the filter part of a velocity estimate (without the difference) in controllable canonical form.
 
     The canonical form uses the polynomials in z - 1. Therefore 1 is added to the diagonal of A.
     """

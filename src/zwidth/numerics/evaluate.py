@@ -72,7 +72,8 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     try:
         # Convert Python integers to float first, because NumPy converts large ones to arrays of objects.
         array = np.asarray(float(value) if isinstance(value, int) else value)
-        # Reject the type void but not the kind "V", because number types such as bfloat16 have this kind as well.
+        # Reject the type void by its class and not by its kind "V", because number types such as bfloat16 also have
+        # kind "V".
         if array.dtype.kind in "OSUcmM" or array.dtype.type is np.void:
             raise TypeError(array.dtype)
         return array.astype(np.float64, copy=False)
@@ -242,8 +243,8 @@ def evaluate_columns(
     def at_once(*parts: np.ndarray) -> Any:
         with np.errstate(all="ignore"):
             result = kernel(*(part[0] if part.size == 1 else part for part in parts), *static)
-        # Copy the results, because a view of an argument or of a broadcast value may be read-only. If there is only one
-        # point, add its axis.
+        # Copy the results, because a result that is a view of an argument or of a broadcast value may be read-only. If
+        # there is only one point, add the missing axis of the points.
         shape = (count_points(parts),)
         if shape == (1,):
             return tree_map(lambda leaf: np.array(leaf)[None], result)
@@ -306,8 +307,8 @@ def compile_traced(
     @cache
     def sloped(active: tuple[bool, ...]) -> Callable[..., Any]:
         """Return a compiled function for the kernel's values and their derivatives in the ``active`` arguments."""
-        # Give the compiled function a derivative rule of its own. Without this rule `jax.grad` splits each equation of
-        # the function into a part that is linear in the tangents and the rest, which takes twice as long.
+        # Define a derivative rule for the compiled function as well. Without it, `jax.grad` would separate the terms
+        # that are linear in the tangents in each equation of the function, which takes twice as long.
         compiled = jax.jit(partial(by_argument, active))
         whole = jax.custom_jvp(compiled)
         whole.defjvp(lambda primals, tangents: jax.jvp(compiled, primals, tangents))
@@ -332,7 +333,8 @@ def compile_traced(
         def change(leaf: Any, by: Any) -> Any:
             if not jax.numpy.issubdtype(leaf.dtype, np.inexact):
                 return _no_change(leaf)
-            # Use the product of jax.lax, because that of jax.numpy compiles a program even if an argument is constant.
+            # Multiply by `jax.lax.mul`, because the product of `jax.numpy` compiles a program even if an argument is
+            # constant.
             parts = [jax.lax.mul(by[k], tangent) for k, tangent in enumerate(moving)]
             return sum(parts[1:], parts[0])
 

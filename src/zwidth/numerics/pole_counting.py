@@ -238,9 +238,9 @@ def _scale_parts(
     uncertainty = 2.0 * (xp.abs(log_gain) + xp.abs(log_power) + xp.abs(logs).sum((-2, -1)) + roots.shape[-1] + 1.0)
     weight = xp.stack([xp.exp(-xp.maximum(excess, 0.0)), -xp.exp(xp.minimum(excess, 0.0))], axis=-1)
 
-    # Rotations by multiples of 90 degrees have no rounding error. |T| and |B| must differ at z = -r, where t is
-    # infinite, so choose the rotation with the largest ratio there. Ratios above a limit count as equal, so that the
-    # first rotation, none, is preferred: unrotated real data keep their relative accuracy at small w.
+    # Choose the rotation for which the ratio of |T| and |B| at z = -r, where t is infinite, differs most from 1.
+    # Multiples of 90 degrees have no rounding error. Ratios above a limit are treated as equal, which favors the first
+    # candidate, no rotation, because unrotated real data keep their relative accuracy at small w.
     units = xp.asarray([1.0, -1.0, 1j, -1j])
     far = xp.log(xp.abs(r[..., None] + roots[..., None] * units.reshape((1,) * roots.ndim + (4,))) / scale[..., None])
     score = xp.abs(excess[..., None] + 2.0 * (far[..., 1, :, :] - far[..., 0, :, :]).sum(-2))
@@ -337,7 +337,8 @@ def _enclose_crossovers(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array,
     disk = safe[..., None] * (xp.abs(correction) + noise)
     proved = proved & xp.isfinite(disk).all(-1)
     is_real = xp.abs(guess.imag) <= disk
-    # Sorting both ends separately may pair them differently, but the union of the intervals is the same.
+    # Sort the lower and the upper ends separately. This may change the pairs of ends but not the union of the
+    # intervals.
     low = xp.sort(xp.where(is_real, guess.real - disk, xp.inf), axis=-1)
     high = xp.sort(xp.where(is_real, guess.real + disk, xp.inf), axis=-1)
     return low, high, leading, proved

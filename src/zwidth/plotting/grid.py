@@ -118,7 +118,8 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
                 np.sqrt(numbers_along.min() * numbers_along.max()) if logarithmic(numbers_along) else numbers_along
             )
             factor, unit = style.si_unit(numbers_along, str(values.attrs.get("units", "1")))
-            # Assign NumPy arrays, because a DataArray would bring its unscaled coordinates back into the dataset.
+            # Assign NumPy arrays, because assigning a DataArray would replace scaled coordinates of the dataset by
+            # unscaled ones.
             numbers = values.values * factor
             digits = count_digits_apart(numbers.ravel().tolist())
             scaled = (values.dims, numbers, {**values.attrs, "units": unit, "factor": factor, "digits": digits})
@@ -156,7 +157,7 @@ def panels(
 
 
 def spell(value: xarray.DataArray) -> str:
-    """Return a parameter value as text with its symbol and unit; a device as its label.
+    """Return a parameter value as text with symbol and unit; for a device, return its label.
 
     The text has enough digits to distinguish the values of the parameter.
     """

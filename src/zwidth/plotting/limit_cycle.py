@@ -135,7 +135,7 @@ def draw_limit_cycle_curves(
     amplitudes = cycles["amplitude_m"][oscillating] * factor
     quantities = (("amplitude_m", factor, f"amplitude  in {meter}"), ("frequency_Hz", 1.0, "frequency  in Hz"))
     looks = _list_looks(arrays, family, cycles["linearly_stable"])
-    # Draw dots in addition to lines, because a single limit cycle between two walls at rest has no line.
+    # Draw dots in addition to lines, because a wall with a limit cycle between two walls at rest has no line segment.
     dots = {"marker": "o", "markersize": 3.5 if arrays[over].size <= _MAX_DOTS else 1.25, "clip_on": False}
     largest = format_short(bounds[1], style.units()["m"])
     for row, (name, scaling, words) in enumerate(quantities):

@@ -23,8 +23,8 @@ _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}  # ma
 _ZERO_ORDER_HOLD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}  # line of the sampled wall force
 # If a motion grows without bound, the axis ends at this multiple of the largest value of the smallest motion.
 _CLIP = 8.0
-# A motion grows without bound if the largest value in the last quarter of its time exceeds the largest value before by
-# this factor. It must be above 4/3, the ratio for a motion of constant velocity.
+# A motion is taken to grow without bound if the ratio of the largest value in the last quarter of its time to the
+# largest value before exceeds this factor. The factor must be above 4/3, the ratio for a constant velocity.
 _GROWTH = 1.5
 # Length of the time axis if all motions leave the wall, as a multiple of the time at which the last contact ends.
 _WINDOW = 3.0

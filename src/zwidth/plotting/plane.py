@@ -219,7 +219,7 @@ def _draw_line(ax: Axes, panel: Panel, name: str, look: Mapping[str, Any]) -> An
 def draw_contours(
     ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, output: Output, norm: Any, others: Sequence[np.ndarray] = ()
 ) -> None:
-    """Draw labeled contours at round values; the labels keep away from the points of other lines."""
+    """Draw contours at round values, with labels that are not too close to the points of other lines."""
     levels = choose_levels(values, output, norm)
     if not levels.size:
         return

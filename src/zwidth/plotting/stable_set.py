@@ -136,7 +136,7 @@ def name_axes(ax: Axes, spring: str, damper: str) -> None:
 
 
 def agrees(outlines: Outlines, x: np.ndarray, y: np.ndarray, good: np.ndarray) -> bool:
-    """Return whether cells agree with outlines: all cells inside are ``good`` and all others are not.
+    """Return whether cells agree with outlines: ``good`` is True for all cells inside, False for all others.
 
     Cells next to the boundary are not compared.
 

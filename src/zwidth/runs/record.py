@@ -143,8 +143,8 @@ class Record:
                 f"with --overwrite, or {ELSEWHERE}"
             )
         if self.damaged:
-            # Skip the comparison of a damaged record, because all studies are computed again, and each sweep is
-            # compared with the study in its store.
+            # Do not compare a damaged record: all studies are computed again, and sweeps are compared with the study in
+            # their store.
             return
         where = self.folder / RUN_FILE
         for name, now in inputs.items():

@@ -204,7 +204,7 @@ def run(
 
 
 def plan_run(config: AnyConfig, *, memory: int = MEMORY) -> list[Study | Plan]:
-    """Return the studies that `run` would compute, a sweep as its plan, without computing anything.
+    """Return what `run` would compute, without computing it: each study, or the plan of a study that is a sweep.
 
     Raises:
         ConfigError: The configuration has faults.

@@ -72,7 +72,7 @@ def compute_block(family: Family, outputs: tuple[str, ...], block: Block, accura
 
 
 def _compute_devices(block: Block) -> dict[str, np.ndarray]:
-    """Return the wall of maximum stiffness of each device and its status, as outputs by name, of shape (D,)."""
+    """Return the stiffest stable wall of each device and its status, as a dictionary of arrays of shape (D,)."""
     alpha, beta, _, kind, status = _map_pieces(alpha_max, (block.delta, block.d), _PIECE)
     rate = block.mass / block.period
     return {
@@ -158,8 +158,8 @@ def _compute_limits(block: Block) -> np.ndarray:
     """Return the largest stable alpha of every line, of shape (D, B)."""
     columns = [part.ravel() for part in np.broadcast_arrays(block.beta, block.delta[:, None], block.d[:, None])]
     limit = np.empty(block.beta.size)
-    # Compute d < 1 and d >= 1 separately, because `row_limits` has one kernel for each. The batch sizes of both kernels
-    # would vary if a piece contained delays of both ranges.
+    # Compute delays d < 1 and d >= 1 separately, because `row_limits` has one kernel for each range. If a piece
+    # contained delays of both ranges, the batch sizes of the kernels would not be constant.
     for long in (False, True):
         # Write the comparison as in `row_limits`, so that both functions treat d = NaN as a short delay.
         index = np.flatnonzero((columns[2] >= 1) == long)

@@ -166,7 +166,7 @@ class Grid:
         return np.broadcast_to(values, shape or (1,)).ravel()
 
     def _wall_values(self, name: str, by_dim: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
-        """Return the values of a wall parameter of a block, for the same arguments as `_device_values`.
+        """Return the values of a parameter of the walls in a block; the arguments are those of `_device_values`.
 
         The shape is (1, number of values) if the parameter is a dimension of the walls, otherwise (D, 1).
         """

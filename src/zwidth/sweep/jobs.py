@@ -170,7 +170,7 @@ class _Worker:
     def start(self, job: Job) -> None:
         """Send a job to the process."""
         self.job = job
-        # Ignore the error if the process is dead, because `run_in_workers` detects this by the sentinel of the process.
+        # Ignore the error of sending to a dead process, because `run_in_workers` detects its death by its sentinel.
         with suppress(OSError):
             self.pipe.send(job)
 
@@ -301,8 +301,8 @@ def _compute_walls(
     alpha, beta = scene.normalize_walls(stiffness, virtual_damping)
     status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
     if "stable" in outputs:
-        # Transpose the walls, so that all walls of a row have the same damping, because `decide` computes the stable
-        # intervals of K once per row. The status reports walls of a measured response that remain undecided.
+        # Transpose the walls, so that all walls of a row have the same damping: `decide` computes the stable intervals
+        # of K once per row. With a measured response, walls may remain undecided, which the status reports.
         labels = scene.loop.decide(alpha.T, beta.T, "auto", (stiffness.T, virtual_damping.T))
         results["stable"], status = np.asarray(labels.stable).T, np.asarray(labels.status).T
     unknown = np.zeros(status.shape, bool)

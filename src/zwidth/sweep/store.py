@@ -157,8 +157,8 @@ class Store:
         shape = tuple(part.stop - part.start for part in task.slices)
         with silence_zarr():
             for name, file in zip(task.plan.variables, self.files(task), strict=True):
-                # Remove an old file first. Zarr reads an existing file before it overwrites a chunk that extends beyond
-                # the grid, and would fail if that file is damaged.
+                # Remove an old file first: Zarr would read it before overwriting a chunk that extends beyond the grid,
+                # and fail if the file is damaged.
                 remove_quietly(file)
                 self._arrays[name][task.slices or ...] = np.ascontiguousarray(values[name]).reshape(shape)
 

@@ -112,7 +112,7 @@ def with_units(result: Result, system: UnitSystem | None) -> Result:
     JAX does not pass the unit system on: results of `jit`, `vmap` and `tree.map` are displayed without unit symbols.
     """
     for each in result if isinstance(result, list) else [result]:
-        # Skip objects such as scenes that define their unit system themselves.
+        # Set the unit system only where the class has the default None; objects such as scenes define their own.
         if getattr(type(each), "unit_system", "") is None:
             object.__setattr__(each, "unit_system", system)
     return result

@@ -41,7 +41,8 @@ class Dimension:
 
     names: str  # usual units, separated by commas, the base unit first; "" for ratios
     example: str  # a quantity, for messages
-    # Factors to the base unit for units with other exponents of kg, m, s and rad, such as rad/s for frequencies in Hz.
+    # Conversion factors to the base unit for additional units with other exponents of kg, m, s and rad, such as rad/s
+    # for frequencies in Hz.
     factors: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -120,7 +121,7 @@ def detect_kind(value: Any) -> bool | None:
         return True
     size = measure_unit(unit) if unit else None
     if size is None:
-        # Classify an unknown unit by its denominator: a unit per angle is rotary.
+        # Classify a unit that cannot be parsed by its denominator: a unit per angle is rotary.
         return True if _canonical(unit).endswith(("/rad", "/deg", "/°", "/turn", "/rev")) else None
     return _KIND_OF_EXPONENTS.get(size.exponents, True if size.exponents[3] else None)
 

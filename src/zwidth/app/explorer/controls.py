@@ -185,7 +185,7 @@ class Controls:
 
     def check(self) -> Controls:
         """Return the controls unchanged; raise `InputError` if the loop has too many poles for the page."""
-        # Build the loop, which also checks combinations of parts, such as a cutoff above the Nyquist frequency.
+        # Build the loop, because this also checks combinations of parts, such as a cutoff above the Nyquist frequency.
         order = self.scene.loop.roots.order
         if order > _MOST_POLES:
             raise InputError(
@@ -206,7 +206,7 @@ class Controls:
         return Controls(replace(other, timing=self.scene.timing))
 
     def _choose_part(self, name: str, kind: str) -> Controls:
-        """Return the controls after choosing a usual form of a part, or a class of the velocity estimate."""
+        """Return the controls after choosing a preset of a part, or a class of the velocity estimate."""
         scene = self.scene
         if name in PARTS:
             self._refuse_change(name)
@@ -221,7 +221,7 @@ class Controls:
         return replace(self, scene=scene.replace(velocity=estimates[kind]))
 
     def _make_usual(self, name: str, kind: str) -> Any:
-        """Return a part in one of its usual forms, with typical values for linear or rotary devices."""
+        """Return a part with the values of one of its presets, converted to typical values of this kind of device."""
         given = dict(PARTS[name].usual[kind])
         for key, value in given.items():
             unit = get_unit(f"{name}.{key}")
@@ -256,7 +256,7 @@ def _round(value: float, digits: int) -> float:
 
 
 def _find_form(part: Any) -> str:
-    """Return the name of the usual form of a part: the one with the same values in all fields that are not floats."""
+    """Return the name of the preset of a part that has the same values in all fields that are not floats."""
 
     def shape(part: Any) -> dict[str, Any]:
         values = {item.name: getattr(part, item.name) for item in fields(part)}
@@ -314,7 +314,7 @@ def to_link(controls: Controls) -> str:
 
 
 def read_link(link: str) -> Controls:
-    """Return the controls for a fragment written by `to_link`."""
+    """Return the controls for the fragment of an address, as written by `to_link`."""
     try:
         section = {name: _read_value(text) for name, text in parse_qsl(link, strict_parsing=True, max_num_fields=99)}
     except (ValueError, RecursionError):

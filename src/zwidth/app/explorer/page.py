@@ -34,7 +34,7 @@ from zwidth.model.wall import VirtualWall
 from zwidth.plotting import style
 
 _LONGEST_MESSAGE = 16_000  # characters; a message contains some dozen numbers, or an address
-# Properties of a glyph whose values are names of columns of its data source, except the value "center".
+# Properties of a glyph whose value, unless it is "center", is the name of a column of the data source.
 _FROM_SOURCE = ("x", "y", "xs", "ys", "text", "angle", "text_align")
 # Data sources of slow results that depend only on the device. If the device changes, they are emptied immediately.
 _OF_DEVICE = ("contours", "passive", "ridge", "best")
@@ -98,7 +98,7 @@ class Page:
         plot.toolbar.logo, plot.toolbar.autohide, plot.toolbar.active_drag = None, True, None  # pyright: ignore
         plot.outline_line_color = None  # pyright: ignore
         for axis in plot.axis:
-            # Write small numbers such as 0.001 without an exponent.
+            # Set the tick labels so that small numbers such as 0.001 have no exponent.
             if isinstance(axis.formatter, BasicTickFormatter):
                 axis.formatter.power_limit_low = -6
         self.inks += [(plot, "background_fill_color", "paper"), (plot, "border_fill_color", "paper")]

@@ -158,9 +158,9 @@ class Boundary:
         Returns:
             Angle and alpha of each crossing.
         """
-        # Solve ``ratio(w) = 0``. Im(q - beta F) increases with w at the crossing if a pair leaves the circle (V11);
-        # ``ratio`` is Im(q - beta F) divided by factors with the signs ``signs``. Converged crossings leave the
-        # iteration.
+        # Solve ``ratio(w) = 0``, where ``ratio`` is Im(q - beta F) divided by factors with the signs ``signs``. It is
+        # rising or falling at the crossing: Im(q - beta F) increases with w if a pole pair leaves the circle (V11).
+        # Converged crossings are removed from the iteration.
         joined, nodes = self._joined, self._node_values
         lower = np.where(joined.w[k - 1] < joined.w[k], k - 1, k)
         upper = 2 * k - 1 - lower
@@ -169,8 +169,7 @@ class Boundary:
         signs = [np.sign(middle - np.cos(w)) for w in self._pair_angles]
         rising = joined.leaving[arc] * np.prod(signs, axis=0) > 0
         first, last = nodes.select(lower).evaluate_rows(beta), nodes.select(upper).evaluate_rows(beta)
-        # If the line of constant B passes through a node, use this node as the crossing; otherwise estimate the
-        # crossing.
+        # If the line of constant B passes through a node, the node is the crossing; otherwise estimate the crossing.
         angle = np.where(
             last.ratio == 0, above, np.where(first.ratio == 0, below, _estimate_crossing(below, above, first, last))
         )
@@ -333,7 +332,8 @@ class Boundary:
         arc, block = self.find_arc(w), max(1, BLOCK_SIZE // max(1, len(self.arcs)))
         for part in np.array_split(np.flatnonzero(result), 1 + result.sum() // block):
             sums, consistent = self._sum_below(curve.alpha[part], curve.beta[part], arc[part])
-            # Use ``leaving`` of the whole arc, because at a single angle rounding errors may change its sign.
+            # Use the value of ``leaving`` that holds for the whole arc, because its sign at a single angle may be wrong
+            # by rounding errors.
             below = self.count_below(curve.beta[part])
             result[part] = consistent & (below + sums == np.where(self._joined.leaving[arc[part]] > 0, 0, 2))
         return result
@@ -437,8 +437,8 @@ def _estimate_crossing(below: np.ndarray, above: np.ndarray, first: _RowValues, 
     share = -first.ratio / rise
     bends = rise * (1.0 - share) / first.ratio_slope, rise * share / last.ratio_slope
     cubic = below + share * (share * (3.0 - 2.0 * share) * width + (1.0 - share) * (bends[0] - bends[1]))
-    # The parabola has the values of ``ratio`` at both angles, and its derivative at the angle where this is smaller.
-    # Near an extremum of beta the derivative is 0, and the cubic interpolation fails.
+    # The cubic interpolation fails near an extremum of beta, where the derivative of ``ratio`` is 0. Use a parabola
+    # with the values at both angles and the derivative at the angle where it is smaller in magnitude.
     flat = np.abs(first.ratio_slope) < np.abs(last.ratio_slope)
     start, slope = np.where(flat, first.ratio, last.ratio), np.where(flat, first.ratio_slope, -last.ratio_slope) * width
     rise = np.where(flat, rise, -rise)

@@ -137,8 +137,8 @@ def find_lines(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
         q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
         real = is_end | (np.abs(q.value.imag) <= REAL_TOLERANCE * np.abs(q.value))
     values = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
-    # Treat a zero of G as located at an angle if their distance is at most ``reach``, because of rounding errors.
-    # ``reach`` is smallest at z = 1, because the offsets of zeros near z = 1 have a small relative error.
+    # Treat a zero of G as located at e^(jw) if its distance is at most ``reach``, because zeros have rounding errors.
+    # ``reach`` is smallest at z = 1, because the offsets of zeros near z = 1 have small errors.
     reach = np.where(w == 0.0, 1e-15, np.where(is_end, 1e-12, 1e-9))
     near = np.abs(points.z_minus_1[:, None] + loop.zeros) <= reach[:, None]
     selected = np.flatnonzero(real & ~near.any(1) & np.isfinite(values).all(1))

@@ -47,10 +47,11 @@ MAX_DOUBLINGS = 36  # 2^36 exceeds twice the largest rate that `Chain.check` all
 
 def compute_transition(A: Any, B: Any, time: Any) -> tuple[Any, Any]:
     """Return ``e^(A t) - 1`` and Gamma(t), the state after a unit force held for time t from rest."""
-    # Evaluate the series for the time divided by a power of 2, then double: y(2 t) = y(t) (2 + y(t)) for y = e^(A t) -
-    # 1, and similarly Gamma. This keeps the relative accuracy of slow and of strongly damped modes. Two separate loops
-    # keep the program short, because compiling its derivatives takes time proportional to its length: with JAX's own
-    # exponential, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to compile.
+    # Evaluate the series for the time divided by a power of 2, then double the time repeatedly: y(2 t) = y(t) (2 +
+    # y(t)) for y = e^(A t) - 1, and similarly Gamma. This keeps the relative accuracy of slow and of strongly damped
+    # modes. Use two loops, because they make the program short and the compile time of derivatives is proportional to
+    # its length: with JAX's own exponential, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long
+    # to compile.
     xp = namespace(A)
     norm = stop_gradient(xp.abs(A * time).sum(0).max(), xp)
     doublings = xp.ceil(xp.log2(xp.maximum(2.0 * norm, 1.0)))
@@ -156,11 +157,11 @@ def find_roots(chain: AnyChain) -> LoopRoots:
     zeros = np.roots(numerator).astype(complex)
     zeros[np.argsort(np.abs(zeros))[: slow.size]] = slow
     candidates = []
-    # Modes that decay within a period leave a cluster of zeros near z = 0. If the determinant does not separate them,
-    # keep the roots of ``numerator`` there, which are accurate as a group.
+    # Refine all zeros first. Modes that decay within a period have a cluster of zeros near z = 0, which the determinant
+    # may not separate; then keep the roots of ``numerator`` in this cluster, because they are accurate as a group.
     for is_refined in (np.full(zeros.shape, True), np.abs(1.0 + zeros) > CLUSTER_RADIUS):
-        # Move the initial values off the real axis. Aberth's steps would keep them real, but two real zeros of the
-        # coefficients may be a complex pair of the determinant.
+        # Move real starting values off the real axis, because Aberth's steps keep real values real, and two zeros that
+        # are real according to the coefficients may be a complex pair.
         off_axis = 1.0 + 1e-6j * (1.0 - 2.0 * (np.arange(zeros.size) % 2)) * is_refined
         refined = -_refine_zeros(discretized, zeros * off_axis, is_refined)
         loop = LoopRoots(float(numerator[0]), lag, refined, poles, chain.estimate)

@@ -139,7 +139,7 @@ class OpenLoop(NamedTuple):
         step, sign = np.diff(w), np.sign(value[:-1])
         approaching = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
         size, descent = np.abs(value), np.abs(slope)
-        # Ignore NaN, because L may be 0 at the Nyquist frequency, where the tangent of its logarithm is undefined.
+        # Ignore NaN, which occurs because L may be 0 at the Nyquist frequency, where log|L| has no tangent.
         with np.errstate(invalid="ignore"):
             lowest = np.minimum(size[:-1] - descent[:-1] * step, size[1:] - descent[1:] * step)
         k = np.flatnonzero(approaching & (lowest < 0))

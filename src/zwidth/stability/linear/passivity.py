@@ -98,8 +98,8 @@ class PassivityCondition:
         )
         denominator = polynomial.polyfromroots([*-estimate.poles, *[-1.0] * lag]).real
         spring = numerator[0] / denominator[0]
-        # Divide the numerator of F - F(1) by zeta to get that of E: drop the constant coefficient, which is 0. If F is
-        # constant, no coefficient remains.
+        # Compute the numerator of E by dividing that of F - F(1) by zeta: drop the constant coefficient, which is 0. If
+        # F is constant, no coefficient remains.
         quotient = np.trim_zeros(polynomial.polysub(numerator, spring * denominator)[1:], "b")
         quotient = quotient if quotient.size else np.zeros(1)
         E = Estimate(0, quotient[-1], lag, -polynomial.polyroots(quotient) + 0j, estimate.poles)

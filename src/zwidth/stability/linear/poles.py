@@ -104,9 +104,9 @@ def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
     monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
     zeta = np.linalg.eigvals(companion(monic)) - 1.0 + 0j
     _refine_poles(loop, alpha, beta, zeta, np.arange(len(zeta)))
-    # Aberth's steps keep real approximations real and complex pairs complex. They do not converge if rounding errors
-    # split a nearly double real pole into a complex pair of eigenvalues, or vice versa. Perturb unconverged
-    # approximations by complex factors and repeat.
+    # Aberth's steps keep real approximations real and complex pairs complex. If rounding errors have split a nearly
+    # double real pole into a complex pair of eigenvalues, or vice versa, they do not converge. Therefore multiply
+    # approximations that have not converged by different complex factors, and repeat.
     for restart in range(MAX_RESTARTS):
         P = evaluate_polynomial(loop, alpha[:, None], beta[:, None], zeta)
         with np.errstate(all="ignore"):
@@ -195,8 +195,8 @@ def is_marginal(loop: LoopRoots, alpha: float, beta: float) -> bool:
     wall = np.array([alpha]), np.array([beta])
     P = evaluate_polynomial(loop, *wall, np.zeros(1, complex))
     undamped = evaluate_polynomial(loop, wall[0], 0.0 * wall[1], np.zeros(1, complex))
-    # Treat P'(1) as 0 if it is a rounding error, because the negative damping of the wall may cancel that of the
-    # device, and then the pole at z = 1 is double.
+    # Treat P'(1) as 0 if it is not larger than its rounding error. The pole at z = 1 is then double, because the
+    # negative damping of the wall cancels the damping of the device.
     terms = np.abs(undamped.slope[0]) + np.abs(P.slope[0] - undamped.slope[0])
     if P.value[0] != 0 or np.abs(P.slope[0]) <= CANCELLATION * terms:
         return False

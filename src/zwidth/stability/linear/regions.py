@@ -207,7 +207,7 @@ class StableSet:
             return self._triangle if meetings.gap.size else []
         bounds = np.pad(np.isfinite(rows.alpha.T), ((0, 0), (1, 1)))
         begins, ends = bounds[:, 1:-1] & ~bounds[:, :-2], bounds[:, 1:-1] & ~bounds[:, 2:]
-        # Assign two edges to the same piece if they bound the same interval of a line or meet.
+        # Assign two edges to the same piece if they bound the same stable interval or if they end at the same meeting.
         number = np.cumsum(begins).reshape(begins.shape).T - 1
         row, below = np.nonzero(rows.upper >= 0)
         pairs = [number[row, below], number[row, rows.upper[row, below]]]
@@ -291,9 +291,9 @@ class StableSet:
 
     def is_in_main(self, alpha: float, beta: float) -> bool:
         """Return whether a wall lies in a piece that is connected to K = 0."""
-        # Find the edge at the upper end of the wall's stable interval, and compare it with the edges of main pieces.
-        # Near a meeting, rounding errors may select a neighboring edge, so also search two lines of constant B close to
-        # the wall.
+        # Find the column at the upper end of the wall's stable interval, and search the edges of main pieces for an
+        # edge in this column. Near a meeting, rounding errors may select a neighboring edge; therefore also test two
+        # lines of constant B close to the wall.
         rows = beta + NEAR_EDGE * (abs(beta) + self.width) * np.array([0.0, -1.0, 1.0])
         intervals = find_stable_intervals(self.boundary, rows)
         row, k = np.nonzero((intervals.low < alpha) & (alpha < intervals.high))

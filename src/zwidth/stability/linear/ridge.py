@@ -175,8 +175,8 @@ def _classify_angle(w: float) -> Condition:
 
 def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> RidgeSolution:
     """Compute the corner close to a wall by Newton's method, and its two active constraints."""
-    # Solve for the beta at which two crossings have the same alpha. Do not use the end of an edge, because near an
-    # undamped mode it is only as accurate as the last digit of its angle.
+    # Solve for the beta at which two crossings have the same alpha. Do not use the tabulated end of an edge, because
+    # near an undamped mode a rounding error of its angle changes alpha considerably.
     (w, other), heights, slopes, step = _find_nearest_two(stable_set.boundary, alpha, beta)
     for _ in range(MAX_STEPS):
         if not CONVERGED_STEP * abs(beta) < abs(step) <= NEAR_CORNER * abs(beta):

@@ -69,7 +69,7 @@ def collect_by_line(find: Callable[..., tuple[np.ndarray, ...]], batch: int, *li
 
 
 def _list_intervals(boundary: Boundary, beta: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return all stable intervals of some lines of constant B as columns for `collect_by_line`.
+    """Return all stable intervals of some lines of constant B as columns, one entry per interval.
 
     The columns are the row, and for the lower and the upper end: alpha, angle and column of the crossing.
     """
@@ -175,7 +175,7 @@ def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
         return np.zeros((0, 2))
 
     def label(beta: np.ndarray) -> np.ndarray:
-        """Return the labels of the walls with this alpha and the given beta: True if stable."""
+        """Return a mask of the stable walls among those with the given betas and this alpha."""
         return label_walls(boundary, np.full(beta.size, alpha), beta)
 
     reach = np.ptp(crossed) + np.abs(crossed).max() + 1.0

@@ -65,7 +65,7 @@ def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> 
 
 
 def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits: int) -> Any:
-    """Return leading coefficient and zeros with ``digits`` digits; None if all coefficients are 0 by rounding."""
+    """Return leading coefficient and zeros, computed with ``digits`` digits; None if all coefficients round to 0."""
     denominator, numerator = (_as_decimals(part) for part in (device.system.denominator, device.system.numerator))
     rest = 1 - Decimal(fraction)
     transition, full, output = _discretize(denominator, numerator, Decimal(period))

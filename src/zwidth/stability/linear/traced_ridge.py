@@ -180,7 +180,7 @@ def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
         stationary = (jnp.conj(f) * slope).imag
         size = jax.lax.stop_gradient(jnp.abs(f) * jnp.abs(slope))
         stationary = stationary / jnp.where(size > 0, size, 1.0)
-        # For a real pole at z = -1 use Im dr/dw itself, because F is real there and may be 0.
+        # For a real pole at z = -1 use Im dr/dw itself and do not divide by F, because F may be 0 there.
         return r, jnp.where(conditions[0] == Condition.PAIR, stationary, slope.imag)
 
     # Evaluate both angles in one vmap, so that the function is compiled only once.

@@ -129,8 +129,8 @@ def count_uncompiled_points(degree: Degree) -> int:
 # Smallest size of an argument whose values are compared to detect repetition; for fewer values a comparison takes
 # longer than folding saves.
 MIN_COMPARED_SIZE = 2048
-# Smallest grid that is compiled in its own shape. Smaller grids are flattened into columns and padded to common sizes,
-# so that they share one compiled program.
+# Smallest number of points of a grid for which a program is compiled in the shape of the grid. Smaller grids are
+# flattened into columns and padded to common sizes, so that they share one program.
 MIN_DENSE_SIZE = 1 << 16
 
 
@@ -187,7 +187,7 @@ def fold(array: np.ndarray) -> np.ndarray:
 
 
 def _is_constant(array: np.ndarray, axis: int, compare: bool) -> bool:
-    """Return whether the values are constant along an axis: by the stride and, if ``compare``, by comparing values."""
+    """Return whether values are constant along an axis, as shown by a stride of 0 or, if ``compare``, by the values."""
     if array.strides[axis] == 0:
         return True
     if not compare:

@@ -54,7 +54,7 @@ CROSSOVER_WIDTH = 2.0**-39  # largest relative error of the gain crossover u = 1
 CUBIC_TOLERANCE = 2.0**-45  # largest error of the cubic H whose zero is u
 TINY = 2.0**-960  # added to each size; TOLERANCE * TINY exceeds what XLA flushes to zero
 
-# Codes of walls returned by `compute_wall_codes`.
+# Codes of walls, the results of the test with the static error bound.
 UNSTABLE = 0
 STABLE = 1
 OPEN = 2  # the error bound permits both verdicts

@@ -197,7 +197,7 @@ def find_peak(lobe: Lobe, kind: DelayClasses) -> Peak:
 
 
 def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
-    """Return x of the point of the lobe with a given alpha, and whether no such point exists because of the corner.
+    """Return x of the point of the lobe with a given alpha, and whether the lobe ends in the corner before this point.
 
     Args:
         alpha: Normalized stiffness, 0 < alpha < ``top.alpha``.
@@ -220,9 +220,10 @@ def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[A
 
 
 def _find_short_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
-    """Return y of the point with a given alpha before or after the peak, a zero of the cubic ``(alpha(y) - alpha) V``.
+    """Return y of the point with a given alpha before or after the peak, as a zero of a cubic, for n = 0.
 
-    The cubic is ``-c0 + c1 y + c2 y^2 + c3 y^3``. The second value is that of `find_column_end`.
+    The cubic ``(alpha(y) - alpha) V`` is ``-c0 + c1 y + c2 y^2 + c3 y^3``. The second value is that of
+    `find_column_end`.
     """
     xp = namespace(alpha, lobe.d)
     _, (v0, v1, v2), (a, s, t) = lobe.short_curve

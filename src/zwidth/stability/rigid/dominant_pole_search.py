@@ -71,7 +71,7 @@ BISECTIONS_PER_COUNT = 3  # per call in NumPy; for few walls, counting on 7 circ
 # previous one, because on a closer circle the rounding error of the count may be too large.
 MAX_TRIALS = 6
 
-# Inside a JAX transformation, walls are divided into at most this many parts of at least this many walls.
+# Inside a JAX transformation, the walls are divided into at most MAX_PARTS parts with at least MIN_PART_SIZE walls.
 MAX_PARTS = 16
 MIN_PART_SIZE = 1 << 9
 # Angles of the third and of the fourth starting point, relative to the angle of the first pair.
@@ -330,7 +330,7 @@ def _find_traced(loop: LoopFactors, fractional: bool) -> tuple[Array, Array, Arr
 
 
 def _find_in_rounds(begin: Any, end: Any, loop: LoopFactors, fractional: bool) -> tuple[Array, Array, Array]:
-    """Run the rounds ``begin`` to ``end - 1`` of the search on some walls, while any of them has no certificate.
+    """Run the rounds ``begin`` to ``end - 1`` of the search on some walls, until all of them are certified.
 
     Round 0 refines and certifies the larger pole, round 1 bisects the radius, and round 2 refines and certifies the
     pole on the bisected circle.

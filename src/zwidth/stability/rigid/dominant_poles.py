@@ -180,7 +180,7 @@ class WallPoles(NamedTuple):
 
 
 def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPoles:
-    """Compute the dominant poles of a grid by Taylor series in cells of walls, and one by one where these fail.
+    """Compute the dominant poles of a grid by Taylor series in cells of walls; walls where these fail, one by one.
 
     Nothing is compiled, and the result of a wall does not depend on the window of the grid.
     """
@@ -258,8 +258,8 @@ def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: flo
             if not index.size:
                 continue
             loop = factor_loop(*(column[index] for column in columns), fractional=fractional)
-            # Count the poles outside a smaller circle. If no other pole is nearly as large, the error of the rate is
-            # that of the dominant pole.
+            # Count the poles outside a slightly smaller circle. If only the dominant pole is outside, the error of the
+            # rate is that of this pole.
             poles_outside = count_poles(poles.re[index] - width[index], loop, fractional)
             is_only = poles_outside.certain & (
                 poles_outside.outside == np.where(np.sin(poles.im[index]) < REAL_AXIS_WIDTH, 1, 2)

@@ -38,7 +38,7 @@ class Normalized(NamedTuple):
 
 @compact_repr(mass="kg", damping="N s/m", period="s", delay="s")
 class Physical(NamedTuple):
-    """The device, its loop and the wall in SI units: kg, N s/m, s, s, N/m, N s/m."""
+    """Mass and damping of the device, period and delay of the loop, stiffness and damping of the wall, in SI."""
 
     mass: Array
     damping: Array
@@ -86,7 +86,7 @@ def quantity_status(**values: Array) -> Array:
 
 
 def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """Return whether a wall and its device are valid and in the range of the model."""
+    """Return a mask of the walls that are valid and in range, together with their device."""
     return is_valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
 
 

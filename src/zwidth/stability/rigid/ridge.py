@@ -116,7 +116,7 @@ def _jax_plant() -> Any:
 
 @cache
 def _jax_ridge() -> Any:
-    """Return `solve_ridge` as a JAX function with the derivatives of `recompute_ridge`."""
+    """Return a JAX function that solves for the ridge, with a custom rule for its derivatives in plant and n."""
     import jax
 
     function = jax.custom_jvp(solve_ridge, nondiff_argnums=(3,))
@@ -186,14 +186,14 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
 
 
 def ridge_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgePoint:
-    """Compute `alpha_max` elementwise, for the classes of delays ``kind``."""
+    """Compute the point of maximum stiffness elementwise, for the classes of delays ``kind``."""
     return _make_point(*_solve_point(delta, d, kind)[:2])
 
 
 def differentiate_point(
     delta: Array, d: Array, kind: DelayClasses = ANY
 ) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
-    """Return `alpha_max` and its derivatives in delta and in d, elementwise."""
+    """Return the point of maximum stiffness and its derivatives in delta and in d, elementwise."""
     ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
     point, has_converged = _make_point(ridge, status), converged(ridge)
 
@@ -218,7 +218,7 @@ class RidgeSlopes(NamedTuple):
 
 
 def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlopes:
-    """Return `alpha_max` and the derivatives of its alpha, elementwise; those in d from the right at integer d."""
+    """Return the point of maximum stiffness, and d alpha/d delta and d alpha/dd (from the right at integer d)."""
     ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
     xp, wave = namespace(ridge.s), evaluate_wave(ridge.s, n, not kind.long)
 
@@ -311,7 +311,7 @@ def stiffness_slope(d: ArrayLike) -> Array:
 
 
 def slope_kernel(d: Array, kind: DelayClasses = ANY) -> Array:
-    """Compute `stiffness_slope` elementwise, for the classes of delays ``kind``."""
+    """Compute the limit g(d) of alpha_max/delta for strong damping elementwise, for the classes of delays ``kind``."""
     (d,) = nan_unless(is_valid_device(0.0 * d, d), d)
     zero = 0.0 * d
     n, f = split_delay(d)

@@ -157,7 +157,7 @@ class Corner(NamedTuple):
 
 
 def find_corner(curve: Curve, n: Array) -> Corner:
-    """Return the corner, in which the lobe may end; it is the ridge if alpha still increases there."""
+    """Return the corner, in which the lobe may end; it is the ridge if alpha increases up to the corner."""
     # The lobe ends in the corner only if D = 1 and arg M increases up to pi, i.e. gap > 0 and mu > 0.
     xp = namespace(curve.sigma, n)
     E = sum(curve.E[1:], curve.E[0])

@@ -145,7 +145,8 @@ class LobeTerms:
         self.k = k
         s4, c4 = _compute_sine_and_cosine(0.25 * omega)
         sk4, ck4 = _compute_sine_and_cosine(0.25 * k * omega)
-        # Compute differences of cosines from half angles, which keeps their relative accuracy for small w.
+        # Compute sines of half angles first, because differences of cosines computed from them keep their relative
+        # accuracy for small w.
         s_half = 2.0 * sk4 * ck4
         self.s, self.c = 2.0 * s4 * c4, 1.0 - 2.0 * s4 * s4
         self.sin_k = 2.0 * s_half * (1.0 - 2.0 * sk4 * sk4)
@@ -265,7 +266,7 @@ def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
 
 
 def _approximate_arcsine(x: Array) -> Array:
-    """Approximate arcsin x for 0 <= x <= 1 to three or four digits, from its half-angle tangent."""
+    """Approximate arcsin x for 0 <= x <= 1 to three or four digits, from the tangent of half the angle."""
     xp = namespace(x)
     t = x / (1.0 + xp.sqrt(xp.maximum((1.0 - x) * (1.0 + x), 0.0)))
     return 2.0 * t * horner(t * t, ARCTAN)
