@@ -32,7 +32,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line with the given arguments, by default those of the process, and exit with a code."""
     use_compilation_cache()
     try:
-        # Disable colors for NO_COLOR and for terminals without colors, because click ignores both. With None, click
+        # Disable colors if NO_COLOR is set or the terminal has none, because click ignores both. With None, click
         # decides whether to use colors.
         color = False if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" else None
         cli.main(args=arguments, prog_name="zwidth", standalone_mode=False, color=color)

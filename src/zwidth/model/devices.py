@@ -140,7 +140,7 @@ class KnownDevice:
         return Timing(period=period, rate=rate, delay=0.0 if delay is None else delay)
 
     def list_missing(self, given: Collection[str]) -> list[str]:
-        """Return the names among "mass" and "damping" that are neither published nor among the names ``given``."""
+        """Return a list of the names "mass" and "damping" without those that are published or in ``given``."""
         return [name for name in ("mass", "damping") if name not in given and getattr(self, name) is None]
 
     def _choose(self, name: str, given: Any) -> Any:

@@ -57,7 +57,7 @@ class System:
         return sum(denominator) == 0 if self.sampled else denominator[-1] == 0
 
     def state_units(self, speed: float, force: float) -> list[float]:
-        """Return 1 as the unit of each state, because the units are unknown; the arguments are those of `Chain`."""
+        """Return 1 as the unit of each state, because the units are unknown; the arguments have no effect."""
         return [1.0] * self.device.poles.size
 
     def realize(self) -> Realization:

@@ -242,8 +242,8 @@ class VelocityFilter(Part):
         if largest < 1.0:
             return
         got = f"velocity.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
-        # Blame rounding errors of the coefficients only if several poles are near z = 1, because they hardly move a
-        # single one; a single pole at z = 1 is probably an intended integrator.
+        # Report rounding errors of the coefficients as the cause only if several poles are near z = 1, because they
+        # hardly move a single pole; a single pole at z = 1 is probably an intended integrator.
         slow = np.abs(poles) < NEXT_TO_ONE
         if np.sum(slow) != 1 and any(is_rounding(section) for section in self._sections[1]):
             cause = "Cause: rounding errors of the coefficients; use sections in series (scipy.signal: output='sos')"

@@ -110,8 +110,8 @@ def _compute_walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> d
             )
             radius, certified, rate = _apply_to_walls(listed, block, shape, leaves=3)
         values["spectral_radius"], not_certified = radius, certified == 0
-        # Compute decay rate, margin and settling time from the rate and not from the spectral radius, which rounds to 1
-        # for slow decay.
+        # Compute these outputs from the logarithmic decay rate and not from the spectral radius, which rounds to 1 for
+        # slow decay.
         values |= {"decay_rate": rate / period, "margin": -np.expm1(-rate), "settling_time": decay_time(rate) * period}
     if MARGIN_OUTPUTS & set(outputs):
         compute = partial(_compute_margins, "delay_margin" in outputs, "modulus_margin" in outputs)

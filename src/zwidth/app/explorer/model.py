@@ -271,8 +271,8 @@ def compute_details(
         yield {"passive": {"x": x, "y": y}, "contours": find_contours(scene, across, up)}
     if not normalized_text:
         yield {"verdict": write_check(scene, verdict, limits_of(scene))}
-    # Omit ridge and hit for a linear system, because the ridge varies its damping and the hit its velocity, but it has
-    # neither as a parameter.
+    # Omit ridge and hit for a linear system, because it has no damping parameter, which the ridge varies, and no body
+    # whose velocity the hit could set.
     bodies = isinstance(scene.device, Device)
     if of_device:
         x, y = compute_ridge(scene) if bodies else (np.empty(0), np.empty(0))

@@ -299,7 +299,7 @@ def bound_interpolation(
 
 
 class JoinedArcs(NamedTuple):
-    """The nodes of all arcs, joined into one sequence; a *step* of it is the interval from one node to the next."""
+    """The nodes of all arcs, joined into one sequence; a *step* is the interval from one node to the next."""
 
     w: np.ndarray
     beta: np.ndarray

@@ -247,8 +247,7 @@ class _CellGrid:
                     re[0, index], positions[:, index], select_cells(cells, index), fractional
                 )
         enclosed = (single.order < len(ORDERS)) | certified
-        # Expand two poles as two groups if the second one may become dominant, or as a pair if no circle separates
-        # them.
+        # Expand two poles: as two groups if the other may become dominant; as a pair if no circle encloses one alone.
         for mask, poles in ((enclosed & ~certified, 1), (~enclosed, 2)):
             index = pad_to_16(np.flatnonzero(mask))
             if not index.size:
