@@ -109,7 +109,7 @@ def minimize_golden_section(
     return middle, value
 
 
-# Search for the global minimum
+# Settings of the search for the global minimum.
 N_MINIMA = 3  # lowest local minima of the samples that are refined
 MAX_GOLDEN_STEPS = 52  # largest number of steps of the golden-section search
 SMALL_SHARE = 1e-9  # argument next to 0, relative to the first sample, that shows if the function rises from 0
@@ -227,7 +227,7 @@ def false_position(
     return state[1].best
 
 
-# Search for zeros between nodes
+# Settings of the search for zeros between nodes.
 MAX_BETWEEN_STEPS = 120  # largest number of steps of false position
 BETWEEN_WIDTH = 4e-16  # relative width of the final bracket
 
