@@ -25,7 +25,7 @@ from zwidth.core.types import Array, ArrayLike, Vertices
 from zwidth.core.xp import materialize, namespace, nan_with_nan_derivatives, stop_gradient, tree_map
 from zwidth.model.checks import check_integer
 from zwidth.numerics.evaluate import as_number, check_scalars, evaluate
-from zwidth.numerics.held_mass import DelayClasses, classify_delays, is_valid_device
+from zwidth.numerics.held_mass import DelayClasses, classify_delays, discretize_mass, is_valid_device, split_delay
 from zwidth.numerics.root_finding import attach_root_derivatives, integrate
 from zwidth.stability.rigid.curve import (
     build_lobe,
@@ -37,11 +37,17 @@ from zwidth.stability.rigid.curve import (
     find_row_end,
 )
 from zwidth.stability.rigid.normalization import wall_status
-from zwidth.stability.rigid.polynomial import Wall, build_frequency_loop, find_boundary_wall
-from zwidth.stability.rigid.ridge import ridge_kernel
+from zwidth.stability.rigid.ridge_newton import evaluate_wall, evaluate_wave_at, expand_curve
 from zwidth.units.display import compact_repr
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
+
+
+class Wall(NamedTuple):
+    """The normalized stiffness and damping of a wall, or arrays of them."""
+
+    alpha: Array
+    beta: Array
 
 
 def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Wall:
@@ -83,8 +89,9 @@ def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
     ok = is_valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
     nan_if_invalid = nan_with_nan_derivatives(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
-    curve = find_boundary_wall(omega, build_frequency_loop(delta, d))
-    return Wall(curve.alpha + nan_if_invalid, curve.beta + nan_if_invalid)
+    n, fraction = split_delay(d)
+    wall = evaluate_wall(evaluate_wave_at(omega, n), expand_curve(discretize_mass(delta, fraction)))
+    return Wall(*(value + nan_if_invalid for value in wall))
 
 
 @compact_repr()
@@ -155,7 +162,7 @@ def boundary_point(
         # Import the solvers only if this method is requested, because the import takes a second.
         from zwidth.stability.rigid.exact_points import point_kernel
 
-        return BoundaryPoint(*evaluate(point_kernel, arguments, line, ridge_kernel, route="jax"))
+        return BoundaryPoint(*evaluate(point_kernel, arguments, line, route="jax"))
     return evaluate(_point_kernel, arguments, line, classify_delays(d))
 
 

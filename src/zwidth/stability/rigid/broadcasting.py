@@ -31,21 +31,10 @@ from zwidth.numerics.evaluate import (
     join_shapes,
     to_caller,
 )
+from zwidth.stability.reference import Degree
 from zwidth.units.quantities import LONGEST_DELAY
 
 NAMES: tuple[str, ...] = ("alpha", "beta", "delta", "d")
-
-
-class Degree(NamedTuple):
-    """The integer part of a delay, and whether it has a fractional part; both determine the degree of P."""
-
-    n: int  # integer part of the delay
-    fractional: bool  # the delay has a fractional part
-
-    @property
-    def poles(self) -> int:
-        """Degree of P: 3 + d for integer d, 4 + n otherwise."""
-        return self.n + (4 if self.fractional else 3)
 
 
 def find_degree(d: float) -> Degree:
