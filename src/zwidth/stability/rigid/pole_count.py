@@ -34,8 +34,8 @@ CUBIC_STEPS = 6
 # Factor by which the bounds of a cell are widened, to cover their rounding errors.
 WIDENING = 1.0 + 1e-12
 # If the wall varies within a cell, the angle w of a crossover varies within an interval. This interval is divided into
-# four equal pieces, on each of which the phase change is bounded separately. These are the positions in the interval,
-# from 0 to 1, of the ends of the pieces (even indices) and of their midpoints (odd indices).
+# four equal pieces, and the phase change is bounded on each piece. The positions are those of the ends of the pieces
+# (even indices) and of their midpoints (odd indices), from 0 to 1 in the interval.
 PIECE_POINTS = np.arange(9)[:, None, None] / 8.0
 
 
@@ -309,7 +309,7 @@ def count_poles_in_cell(
         fractional: Whether any delay is fractional.
 
     Returns:
-        The number of poles outside, and whether it certainly holds for every wall of the cell.
+        The number of poles outside, and whether it is certified for every wall of the cell.
     """
     circle = _evaluate_on_circle(log_r, loop, fractional, np)
     a, b = half
