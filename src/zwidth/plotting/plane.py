@@ -281,7 +281,7 @@ def _add_legend(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any
     crossed = finite.size and finite.min() < output.center < finite.max()
     if crossed if output.color_scale == "diverging" else (exact and output.color_scale != "truth"):
         walls = "passive" if name == "passivity_margin" else "stable"
-        handles.append(style.line(f"boundary of {walls} walls", width=1.3, color=style.BLACK))
+        handles.append(style.line(f"boundary of the {walls} walls", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):
         handles.append(Patch(facecolor=MISSING, label="unstable"))
     elif any(np.ma.is_masked(panel.variables[name]) for panel in panels):
