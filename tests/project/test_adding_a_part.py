@@ -136,7 +136,7 @@ def copied(tmp_path_factory):
             text = text.replace(old, new)
         (package / file).write_text(text, encoding="utf-8")
     (folder / "mounted.yaml").write_text(CONFIGURATION, encoding="utf-8")
-    wrong = CONFIGURATION.replace("stiffness: 0.135 N/mm, damping: 6", "stiffness: 0, dampin: 6")
+    wrong = CONFIGURATION.replace("stiffness: 0.135 N/mm, damping: 6", "stiffness: 0, dampin: 6")  # codespell:ignore
     (folder / "wrong.yaml").write_text(wrong, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     found = subprocess.run(
