@@ -78,7 +78,7 @@ class MeasuredLoop(LinearLoop):
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod = "auto", exact: Any = ()
     ) -> Stability:
-        """Return for each wall whether every admitted response makes it stable, and a status that states whether it is decided.
+        """Return for each wall whether it is stable for every admitted response, with a status.
 
         The status is UNDECIDED if the lines are too far apart, if their errors are too large, or if the range of
         measured frequencies is too narrow. ``exact`` is an argument of the base class and ignored.
