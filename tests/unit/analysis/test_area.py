@@ -1,5 +1,6 @@
-"""Test `stable_area` and `passive_area` against polygons of the boundary, quadrature in mpmath, and Colgate's passivity
-condition.
+"""Test `stable_area` and `passive_area`.
+
+References: polygons of the boundary, quadrature in mpmath, and Colgate's passivity condition.
 """
 
 import jax

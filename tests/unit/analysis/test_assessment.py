@@ -1,5 +1,6 @@
-"""Test `zwidth.assess` and `assess_many`: margins, passivity (against a frequency scan of Colgate's condition) and
-marginal walls (against eigenvalues of a state-space model).
+"""Test `zwidth.assess` and `assess_many`: margins, passivity and marginal walls.
+
+References: a frequency scan of Colgate's condition, and eigenvalues of a state-space model.
 """
 
 import csv

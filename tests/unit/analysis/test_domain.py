@@ -1,6 +1,4 @@
-"""Test that walls outside the accepted range are rejected, elementwise in arrays, and that walls inside the range are
-not.
-"""
+"""Test that walls outside the accepted range are rejected, elementwise in arrays, and no others."""
 
 import numpy as np
 import pytest

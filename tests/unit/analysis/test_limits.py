@@ -1,6 +1,4 @@
-"""Test `limits_of`: the gain of each improvement equals the ratio of maximum stiffnesses of the improved and the
-original scene.
-"""
+"""Test `limits_of`: each gain is the ratio of the maximum stiffness with and without the improvement."""
 
 import numpy as np
 import pytest

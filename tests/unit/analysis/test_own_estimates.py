@@ -1,5 +1,6 @@
-"""Test velocity estimates of user-defined classes: only their transfer function determines stability; reference poles
-from polynomials in NumPy.
+"""Test velocity estimates of user-defined classes: only the transfer function determines stability.
+
+Reference: roots of the characteristic polynomial, in NumPy.
 """
 
 import math

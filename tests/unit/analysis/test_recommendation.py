@@ -158,7 +158,7 @@ def test_printed_wall_is_not_stiffer_than_recommended(damping, delay):
 
 @pytest.mark.parametrize("share", [0.95, 0.99])
 def test_printed_wall_next_to_corner_is_stable(share):
-    """At strong damping without delay, B is so close to the end of the stable dampings that four digits do not suffice."""
+    """At strong damping without delay, B is so close to an end of its stable range that four digits do not suffice."""
     scene = zwidth.Scene(zwidth.Device(0.1, 20e3), zwidth.Timing(1e-3))
     recommendation = scene.recommend(stiffness_fraction=share)
     (K, B), *_ = re.findall("K = (.*?), B = (.*?):", recommendation.lines()[0])

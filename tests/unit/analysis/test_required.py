@@ -1,5 +1,6 @@
-"""Test `Scene.required`, the parameter value at which the maximum stiffness reaches a given stiffness, against the
-closed form and evaluations of K_max on both sides.
+"""Test `Scene.required`, the parameter value at which the maximum stiffness reaches a given stiffness.
+
+References: the closed form of rigid scenes, and K_max on both sides of each crossing.
 """
 
 import numpy as np

@@ -1,5 +1,6 @@
-"""Test `robust_max_stiffness` and `robust_wall` for boxes of devices against random samples, certified verdicts and a
-local search.
+"""Test `robust_max_stiffness` and `robust_wall` for boxes of devices.
+
+References: random samples, certified verdicts and a local search.
 """
 
 import numpy as np

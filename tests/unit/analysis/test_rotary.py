@@ -1,6 +1,4 @@
-"""Test rotary devices: results equal those of linear devices with the same values, in rotary units, and mixing both
-unit systems is rejected.
-"""
+"""Test rotary devices: the values of linear devices in rotary units. Mixed unit systems are rejected."""
 
 import copy
 import dataclasses

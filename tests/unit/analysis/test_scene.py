@@ -1,5 +1,6 @@
-"""Test scenes and the conversion between SI units and normalized parameters, against eqs. (14) and (16) of the paper in
-mpmath and against the paper's example.
+"""Test scenes, and the conversion between SI units and normalized parameters.
+
+References: eqs. (14) and (16) of the paper in mpmath, and the example of the paper.
 """
 
 import dataclasses

@@ -1,5 +1,6 @@
-"""Test `simulate_tolerances`: sampled devices, the share of stable devices and its confidence interval, and the
-stiffness for a given reliability.
+"""Test `simulate_tolerances`: sampled devices, the share of stable devices, and the reliable stiffness.
+
+References: decisions for the individual devices, and the interval of Clopper and Pearson (1934).
 """
 
 import numpy as np

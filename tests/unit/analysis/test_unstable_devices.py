@@ -1,5 +1,6 @@
-"""Test devices that are unstable without a wall: functions and commands use the stable region at positive K; reference
-poles from scipy's discretization.
+"""Test devices that are unstable without a wall, with a stable region at positive K only.
+
+Reference: poles of the discretization by scipy.
 """
 
 import json

@@ -1,6 +1,4 @@
-"""Test generated wall programs: they compile without warnings and, driven sample by sample, return the forces of
-simulations.
-"""
+"""Test generated wall programs: they compile without warnings and return the forces of simulations."""
 
 import ctypes
 import shutil

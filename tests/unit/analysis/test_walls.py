@@ -1,5 +1,6 @@
-"""Test poles, spectral radius, state space and frequency response of random scenes against state-space matrices from
-matrix exponentials.
+"""Test poles, spectral radius, state space and frequency response of random scenes.
+
+Reference: state-space matrices from matrix exponentials.
 """
 
 from typing import Any
