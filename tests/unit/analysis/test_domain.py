@@ -39,7 +39,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("ask", REFUSED.values(), ids=REFUSED)
+@pytest.mark.parametrize("function", REFUSED.values(), ids=REFUSED)
 def test_integers_that_overflow_float64_are_rejected(function):
     with pytest.raises(zwidth.InputError, match=r"got|is needed"):
         function(zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3)))

@@ -197,7 +197,7 @@ FUNCTIONS = {
 }
 
 
-@pytest.mark.parametrize("ask", FUNCTIONS.values(), ids=FUNCTIONS)
+@pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNCTIONS)
 def test_functions_that_need_a_model_are_rejected(function):
     with pytest.raises(InputError, match=r"^[\w ]+: [^\n]+$"):
         function(make_measured(SCENES["rigid"], DENSE))
