@@ -57,8 +57,8 @@ def test_parameters_of_dimensionless_device_match_its_scene(lag, modes):
 
 
 def test_derivatives_of_walls_and_parameters_match_differences():
-    kappa, damping, w = np.array([[1e-3, 4e-3, 6e-3], [0.0, 0.01, 0.02], [0.1, 0.3, 0.4]])
-    onsets, theta = Onsets(kappa, damping, w, VELOCITY, PERIOD), np.array([np.log(0.1), 0.03, 1.3])
+    kappa, scaled_damping, w = np.array([[1e-3, 4e-3, 6e-3], [0.0, 0.01, 0.02], [0.1, 0.3, 0.4]])
+    onsets, theta = Onsets(kappa, scaled_damping, w, VELOCITY, PERIOD), np.array([np.log(0.1), 0.03, 1.3])
 
     def predict_logarithms(theta):
         walls = onsets.predict_walls(theta)

@@ -61,7 +61,7 @@ def test_derivatives_of_motion_match_differences(case, friction, order):
 
 
 def test_motion_is_finite_at_the_bounds_of_damping_and_lag():
-    """Without separate bounds, the poles of lag and damping could coincide, as for a device held by a spring."""
+    """The bounds keep the poles of damping and lag distinct, as needed for the fit of a device held by a spring."""
     model, theta = build_model(*CASES["lag"])
     low, high = model.bounds()
     theta[1], theta[3] = high[1], low[3]
@@ -75,8 +75,8 @@ def test_derivatives_of_scene_parameters_match_differences():
     names += tuple(f"modes.{k}.{name}" for k in range(2) for name in ("frequency", "damping_ratio", "mass"))
 
     def evaluate_parameters(theta, period=PERIOD):
-        parameters = model.normalize(theta, period).to_scene(period, velocity).parameters()
-        return np.array([parameters[name] for name in names])
+        by_name = model.normalize(theta, period).to_scene(period, velocity).parameters()
+        return np.array([by_name[name] for name in names])
 
     slopes = differentiate(lambda theta: model.normalize(theta, PERIOD).to_parameters(PERIOD), theta)
     for k in range(len(names)):

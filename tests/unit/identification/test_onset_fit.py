@@ -118,13 +118,13 @@ def test_device_without_damping_and_delay_is_recovered():
 
 
 def test_estimates_scatter_by_their_standard_errors():
-    scene, rng, noise = make_scene(0.1, 0.1, 1.4, 1e-3), np.random.default_rng(3), 0.02
+    scene, rng, noise_level = make_scene(0.1, 0.1, 1.4, 1e-3), np.random.default_rng(3), 0.02
     walls, true = compute_onsets(scene, [0.0, 0.4, 0.8, 1.1]), float(scene.max_stiffness().stiffness)
     deviations, inside = [], []
     for _ in range(20):
         noisy = walls.copy()
-        noisy[:, [0, 2]] *= 1 + noise * rng.standard_normal((4, 2))
-        fit = zwidth.fit_buzz(noisy, period=1e-3, noise=noise)
+        noisy[:, [0, 2]] *= 1 + noise_level * rng.standard_normal((4, 2))
+        fit = zwidth.fit_buzz(noisy, period=1e-3, noise=noise_level)
         deviations.append((fit.stiffness_max - true) / fit.stiffness_error)
         interval = fit.intervals["stiffness_max"]
         inside.append(interval.low <= true <= interval.high)
