@@ -20,9 +20,7 @@ TIP = zwidth.Scene(zwidth.Device(0.1, 10.0, zwidth.Coupling(0.05, 20e3, 1.0, "ti
 
 
 def satisfy_requirements(scene, stiffness, damping, wanted):
-    """Return a mask of the stable walls, after removal of the unstable ones, that satisfy the requirements by their
-    margins.
-    """
+    """Return, for each stable wall of the given dampings, whether its margins satisfy the requirements."""
     damping = np.atleast_1d(damping)
     damping = damping[scene.is_stable(stiffness, damping)]
     margins, good = scene.margins(stiffness, damping), np.full(damping.shape, True)

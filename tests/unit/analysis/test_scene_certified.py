@@ -41,9 +41,7 @@ def test_certified_status_is_on_boundary_without_stiffness():
 
 
 def test_undamped_device_with_damped_coupling_and_no_virtual_damping():
-    """With a damped coupling such walls are stable above some stiffness, although the device has a double pole at z =
-    1.
-    """
+    """With a damped coupling, walls above some stiffness are stable, although the device has two poles at z = 1."""
     coupling = zwidth.Coupling(mass=3.5, stiffness=10716.0, damping=525.0)
     scene = zwidth.Scene(zwidth.Device(2.8, 0.0, coupling), zwidth.Timing(1.575e-3))
     stiffness = np.array([1.0, 600.0, 800.0, 6e5, 7e5])

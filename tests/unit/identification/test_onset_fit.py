@@ -1,5 +1,4 @@
-"""Test `zwidth.fit_buzz` on walls at the onset of instability: exact ones recover the device, unsuitable ones are
-rejected.
+"""Test `zwidth.fit_buzz` on exact, noisy and unsuitable walls at the onset of instability.
 
 References: the closed-form boundary, and eigenvalues of a matrix exponential.
 """

@@ -147,9 +147,7 @@ def test_log_with_omitted_samples_is_rejected_with_its_cause():
 
 @pytest.mark.parametrize("seed", range(60))
 def test_repaired_positions_are_true_up_to_a_constant(seed):
-    """Random knobs, encoders and glitches: positions that are kept differ from the true ones by a constant number of
-    turns.
-    """
+    """Random knobs, encoders and glitches: the kept positions are true up to a constant number of turns."""
     rng = np.random.default_rng(seed)
     knob = make_knob(seed, samples=800, counts=int(rng.choice([1000, 2000, 4096, 16384, 65536])))
     count, wraps = knob.reading, rng.random() < 0.7

@@ -85,8 +85,16 @@ def test_encoder_errors_at_repeated_positions_are_correlated():
 
 
 def fit_simulated_mass(delta, d, friction, steps, noise, seed, count=600):
-    """Fit a log of a mass of 100 g: delta = b T/m, d in periods, friction in N, encoder steps over the range, noise in
-    steps.
+    """Fit a log of a mass of 100 g.
+
+    Args:
+        delta: Normalized damping b T/m.
+        d: Delay in periods.
+        friction: Coulomb friction in N.
+        steps: Encoder steps over the range of motion.
+        noise: Standard deviation of the position noise in encoder steps.
+        seed: Seed of force and noise.
+        count: Number of samples.
     """
     random = np.random.default_rng(seed)
     force = np.concatenate([np.zeros(SKIP + 2), np.repeat(random.choice([-1.0, 1.0], count // 20 + 1), 20)[:count]])
