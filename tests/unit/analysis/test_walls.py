@@ -156,7 +156,7 @@ def test_to_control_keeps_poles_and_period():
 
 
 def test_spectral_radius_resolves_poles_close_to_one():
-    """Compare with Newton-refined poles minus one, for soft walls on devices with almost no damping."""
+    """Compare with poles computed as z - 1, for soft walls on devices with almost no damping."""
     rng = np.random.default_rng(1)
     for _ in range(60):
         period, mass, damping = 10 ** rng.uniform(-4, -2), 10 ** rng.uniform(-2, 1), 10 ** rng.uniform(-12, -4)

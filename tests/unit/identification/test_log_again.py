@@ -22,9 +22,9 @@ PERIOD, SKIP, STEP = 1e-3, 22, 3e-5
 
 
 def simulate_positions(mass, damping, delay, start, offset, friction, force, count):
-    """Return positions of ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, integrated from stop to stop, in seconds.
+    """Return positions of ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, integrated from stop to stop.
 
-    The first position belongs to the time at which the last ``count`` forces begin.
+    Times are in seconds. The first position belongs to the time at which the last ``count`` forces begin.
     """
     n_delay = math.floor(delay / PERIOD)
     spans = (delay - n_delay * PERIOD, (n_delay + 1) * PERIOD - delay)

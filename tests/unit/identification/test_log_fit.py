@@ -255,7 +255,7 @@ def simulate_single_pulse(coulomb, samples=1500):
 
 
 @pytest.mark.parametrize("coulomb", [0.002, 0.005, 0.02])
-def test_low_friction_after_single_pulse_is_estimated_without_error(coulomb):
+def test_low_friction_after_single_pulse_is_estimated_without_interval(coulomb):
     position, force = simulate_single_pulse(coulomb)
     fit = zwidth.fit_log(PERIOD, position, force)
     np.testing.assert_allclose([fit.mass, fit.damping, fit.friction], [0.1, 0.5, coulomb], rtol=1e-8)

@@ -59,7 +59,7 @@ def test_error_of_friction_includes_zero_if_zero_fits_as_well(seed):
 
 # In directions that these logs hardly determine, the steps of the search converge slowly.
 @pytest.mark.parametrize("seed", [17, 97, 333, 545, 549])
-def test_slowly_converging_search_converges(seed):
+def test_search_converges_in_poorly_determined_directions(seed):
     fit, deviations = fit_simulated_log(seed)
     assert (fit.status, fit.doubts) == (Status.OK, ())
     assert not fit.intervals["friction"].low > 0

@@ -81,7 +81,7 @@ def test_damping_ratio_of_weakly_damped_resonance_is_recovered():
 
 
 def test_undetermined_resonance_has_no_safe_wall():
-    # Four modes nearly cancel: a step along any principal axis of the covariance leaves the set of valid devices.
+    # Four modes nearly cancel: along some principal axis of the covariance, every step makes one of them invalid.
     force, position = record_log(OTHERS["compliance of 50 Hz, encoder at the motor"], 0, step=2e-4)
     fit = zwidth.fit_log(PERIOD, position, force)
     safe = fit.safe_wall()

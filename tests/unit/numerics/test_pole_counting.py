@@ -87,7 +87,7 @@ def random_loop(rng, conjugate=True):
 
 
 def haptic_loop(rng, lag):
-    """Return the loop of a wall with low-pass filtered velocity (model.md, section 7), sometimes with a second filter."""
+    """Return the loop of a wall with low-pass filtered velocity (model.md, section 7), sometimes with two filters."""
     delta, a = 10 ** rng.uniform(-6, 1), rng.uniform(0, 0.97)
     c, phi1 = np.exp(-delta), -np.expm1(-delta) / delta
     phi2 = (1 - phi1) / delta if delta > 1e-3 else 0.5 - delta / 6

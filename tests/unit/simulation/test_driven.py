@@ -24,24 +24,24 @@ class NewtonIntegrator:
     """Bodies in SI units: positions and velocities, then modes and actuator; forces of command and operator."""
 
     def __init__(self, scene: zwidth.Scene, coulomb: float, static: float) -> None:
-        table, self.size, self.seen = any_loop.rate_table(scene)
+        table, self.size, self.sensor = any_loop.rate_table(scene)
         self.matrix, self.bodies = np.array(table)[:-1, :-1], len(any_loop._masses_and_links(scene)[0])
         self.command = np.array(table)[:-1, -1]
         self.mass, self.coulomb, self.static = scene.device.mass, coulomb, static
         self.direct = np.eye(self.size)[self.bodies] / self.mass
-        self.known: dict[Any, np.ndarray] = {}
+        self.flows: dict[Any, np.ndarray] = {}
 
     def flow(self, sticks: bool, span: float) -> np.ndarray:
         """Return the matrix that maps (state, command, force on the first body) over a time span."""
-        if (sticks, span) not in self.known:
+        if (sticks, span) not in self.flows:
             block = np.zeros((self.size + 2, self.size + 2))
             block[: self.size] = np.column_stack([self.matrix, self.command, self.direct])
             if sticks:
                 block[[0, self.bodies]] = 0.0
-            self.known[sticks, span] = scipy.linalg.expm(block * span)[: self.size]
-        return self.known[sticks, span]
+            self.flows[sticks, span] = scipy.linalg.expm(block * span)[: self.size]
+        return self.flows[sticks, span]
 
-    def pressed(self, x: np.ndarray, u: float, f: float) -> float:
+    def compute_net_force(self, x: np.ndarray, u: float, f: float) -> float:
         """Return the force on the first body without its friction."""
         v = self.bodies
         return self.mass * float(self.matrix[v] @ x + self.command[v] * u + self.direct[v] * f)
@@ -49,13 +49,13 @@ class NewtonIntegrator:
     def move(self, x: np.ndarray, slip: float, u: float, f: float, span: float) -> tuple[np.ndarray, float]:
         v = self.bodies
         if self.static and (slip == 0 or x[v] == 0):
-            other = self.pressed(x, u, f)
+            other = self.compute_net_force(x, u, f)
             slip = 0.0 if abs(other) <= self.static else np.sign(other)
 
         def event_occurs(y: np.ndarray) -> bool:
             if not self.static:
                 return False
-            return abs(self.pressed(y, u, f)) > self.static if slip == 0 else slip * y[v] < 0
+            return abs(self.compute_net_force(y, u, f)) > self.static if slip == 0 else slip * y[v] < 0
 
         def evaluate_state(time: float) -> np.ndarray:
             return self.flow(slip == 0 and self.static > 0, time) @ [*x, u, f - slip * self.coulomb]
@@ -67,13 +67,13 @@ class NewtonIntegrator:
         for _ in range(40):
             middle = 0.5 * (low + high)
             low, high = (low, middle) if event_occurs(evaluate_state(middle)) else (middle, high)
-        self.known = {key: value for key, value in self.known.items() if key[1] == span}
+        self.flows = {key: value for key, value in self.flows.items() if key[1] == span}
         y = evaluate_state(high)
         if slip:
             y[v], slip = 0.0, 0.0
             return self.move(y, slip, u, f, span - high)
         # Released from friction, the body moves on.
-        slip = float(np.sign(self.pressed(y, u, f)))
+        slip = float(np.sign(self.compute_net_force(y, u, f)))
         return self.flow(False, span - high) @ [*y, u, f - slip * self.coulomb], slip
 
 
@@ -89,7 +89,7 @@ def integrate_motion(
     read = (lambda y: quantum * np.floor(y / quantum + 0.5)) if quantum else (lambda y: y)
     last, positions = read(last), []
     for _ in range(PERIODS):
-        sensed = float(integrator.seen @ x)
+        sensed = float(integrator.sensor @ x)
         positions.append((sensed, x[0]))
         measured = read(sensed)
         wall = -(K * measured + B * (measured - last) / T) if measured > 0 else 0.0

@@ -32,12 +32,12 @@ def test_step_response_of_rigid_device_matches_closed_form(wall):
     assert relative_error(response.velocity[:, 0] * mass / period, expected.velocity) < tol.JUDGE.float64
 
 
-def steady_filter_state(top, bottom, position, step):
-    """Return the state of the filter of `any_loop` after an infinite ramp, newest first: ``bottom w = x``."""
-    order = bottom.size - 1
-    bottom = bottom / bottom[0]
-    growth = step / bottom.sum()
-    now = (position + np.arange(bottom.size) @ bottom * growth) / bottom.sum()
+def steady_filter_state(numerator, denominator, position, step):
+    """Return the state of the filter of `any_loop` after an infinite ramp, newest first: ``denominator w = x``."""
+    order = denominator.size - 1
+    denominator = denominator / denominator[0]
+    growth = step / denominator.sum()
+    now = (position + np.arange(denominator.size) @ denominator * growth) / denominator.sum()
     return now - growth * np.arange(1, order + 1)
 
 
@@ -53,8 +53,10 @@ def test_linear_loop_is_a_power_of_its_matrix(kind):
         start, speed = 2e-3, 0.1
         state = np.zeros(len(matrix))
         state[:n], state[n : 2 * n] = start, speed
-        top, bottom = any_loop.velocity_polynomials(scene)
-        state[2 * n : 2 * n + bottom.size - 1] = steady_filter_state(top, bottom, start, speed * scene.timing.period)
+        numerator, denominator = any_loop.velocity_polynomials(scene)
+        state[2 * n : 2 * n + denominator.size - 1] = steady_filter_state(
+            numerator, denominator, start, speed * scene.timing.period
+        )
         response = integrate(scene, K, B, 60, position=start, velocity=speed)
         expected = [state]
         for _ in range(60):
@@ -80,8 +82,8 @@ def test_velocity_estimates_continue_an_infinite_ramp(velocity):
     measured = 0.3 + np.random.default_rng(23).normal(0.0, 1e-3, 60)
     program = velocity_program(scene, 0.3, -0.2)
     past = 0.3 + 0.2 * 1e-3 * np.arange(3000, 0, -1)
-    top, bottom = any_loop.velocity_polynomials(scene)
-    expected = scipy.signal.lfilter(top, bottom, np.concatenate([past, measured]))[past.size :]
+    numerator, denominator = any_loop.velocity_polynomials(scene)
+    expected = scipy.signal.lfilter(numerator, denominator, np.concatenate([past, measured]))[past.size :]
     assert relative_error([program(x) for x in measured], expected) < tol.JUDGE.float64
 
 
