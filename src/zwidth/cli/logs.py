@@ -324,7 +324,7 @@ def _print_response(
     from zwidth.analysis.scene import Scene
     from zwidth.identification.response_estimate import find_nominal_limit
 
-    device, period, doubts = response.device, response.period, response.doubts
+    device, period, warnings = response.device, response.period, response.warnings
     kind = "parts of a repeating force" if response.cycle else "parts"
     source = f"{' and '.join(log.name for log in logs)}, {response.records} {kind}"
     scene = Scene(device, Timing(period), velocity=velocity or BackwardDifference())
@@ -342,11 +342,11 @@ def _print_response(
         else "undecided"
     )
     lines.append(format_row("K_max", words))
-    given = safe.status == Status.OK and device.deviation is not None and not doubts
+    given = safe.status == Status.OK and device.deviation is not None and not warnings
     words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none"
     lines.append(format_row("safe wall", words))
     lines += [format_row("stiffer wall" if k == 0 else "", text) for k, text in enumerate(undecided)]
-    lines += [format_row("warning", text) for text in doubts]
+    lines += [format_row("warning", text) for text in warnings]
     lines += [format_row("note", text) for text in response.notes]
     if save is not None:
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
@@ -354,7 +354,7 @@ def _print_response(
     if figure is not None:
         lines.append(save_figure(_draw(scene, safe if safe.status == Status.OK else None), figure))
     result = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
-    result |= {"safe_wall": _plain(safe) if given else None, "undecided": undecided, "doubts": list(doubts)}
+    result |= {"safe_wall": _plain(safe) if given else None, "undecided": undecided, "warnings": list(warnings)}
     result |= {"notes": list(response.notes), "rotary": device.rotary}
     print_result(result, lines, as_json)
 

@@ -223,7 +223,7 @@ def read_scene_file(path: Path) -> Scene:
 
     file = find_config(path) if path.is_dir() else path
     given = load_config(file).scene
-    for line in getattr(given, "doubts", ()):
+    for line in getattr(given, "warnings", ()):
         click.echo(f"zwidth: {line}", err=True)
     click.get_current_context().meta[_HARDWARE] = getattr(given, "hardware", {})
     return load_scene(file)

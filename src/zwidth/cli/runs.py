@@ -92,7 +92,7 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi:
     from zwidth.studies.document import load_config
 
     config = load_config(path)
-    for line in getattr(config.scene, "doubts", ()):
+    for line in getattr(config.scene, "warnings", ()):
         click.echo(f"zwidth: {path}: {line}", err=True)
     if dry_run:
         _print_plan(config, **options)

@@ -214,7 +214,7 @@ class PhysicalScene(_PhysicalPlant, noun="a scene"):
         return kind(**{name: value for name, value in values.items() if value is not None}, **list_parts(self))
 
     @property
-    def doubts(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """Warnings about implausible values of parameters, one line each."""
         parameters = {
             path: value for path, value in self.to_scene().parameters().items() if path not in ("period", "rate")

@@ -77,8 +77,8 @@ class RivalDevice(NamedTuple):
 
 
 @compact_repr(
-    ("mass", "damping", "delay", "stiffness_max", "stiffness_error", "friction", "status", "doubts"),
-    missing=dict.fromkeys(("stiffness_max", "stiffness_error"), "see status and doubts"),
+    ("mass", "damping", "delay", "stiffness_max", "stiffness_error", "friction", "status", "warnings"),
+    missing=dict.fromkeys(("stiffness_max", "stiffness_error"), "see status and warnings"),
     mass="kg",
     damping="N s/m",
     delay="s",
@@ -107,8 +107,7 @@ class DeviceFit(DeviceEstimate):
             frequency f, relative; for a log that of the position in m.
         residuals: measured minus fitted values: for walls an array (n, 2) in units of the noise of K and f; for a log
             in m, NaN for samples that are not fitted.
-        doubts: warnings about the measurements or the estimate, one sentence each. With a warning there is no safe
-            wall.
+        warnings: sentences about questionable measurements or estimates. With a warning there is no safe wall.
         notes: interpretations of the columns of a log and repairs of its rows, one clause each.
         status: code of `zwidth.Status`; UNDECIDED if another device fits equally well, or if the residuals of a log are
             not white noise.
@@ -137,7 +136,7 @@ class DeviceFit(DeviceEstimate):
     """
 
     residuals: np.ndarray
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     status: int
     next: FurtherExperiment | None = None
     offset: float = 0.0
@@ -176,13 +175,13 @@ class DeviceFit(DeviceEstimate):
         return self._stiffest[1]
 
     @property
-    def is_doubted(self) -> bool:
+    def is_unreliable(self) -> bool:
         """True if the fit has a warning or its status is not OK; then no wall is recommended.
 
         In simulations, dynamics that the model lacks changed K_max by a factor of up to 2.8, mostly in fits with
         warnings.
         """
-        return self.status != Status.OK or bool(self.doubts)
+        return self.status != Status.OK or bool(self.warnings)
 
     @cached_property
     def scene(self) -> Scene:
@@ -318,7 +317,7 @@ class DeviceFit(DeviceEstimate):
         if options not in self._safe_walls:
             status = self.status if self.status != Status.OK else int(Status.UNDECIDED)
             none = SafeWall(np.nan, np.nan, np.nan, status)
-            self._safe_walls[options] = none if self.is_doubted else find_safe_wall(self, *options)
+            self._safe_walls[options] = none if self.is_unreliable else find_safe_wall(self, *options)
         return self._safe_walls[options]
 
     @cached_property
@@ -337,7 +336,10 @@ class DeviceFit(DeviceEstimate):
             "intervals": self.intervals,
             "covariance": self.covariance.tolist(),
             "noise": self.noise,
-            **{name: getattr(self, name) for name in ("offset", "friction", "resolution", "period", "doubts", "notes")},
+            **{
+                name: getattr(self, name)
+                for name in ("offset", "friction", "resolution", "period", "warnings", "notes")
+            },
             "status": int(self.status),
             "rivals": [rival._asdict() for rival in self.rivals],
             "next": None if self.next is None else self.next._asdict(),

@@ -71,7 +71,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
     """
     recommended = fit.recommended
     rows = [("NO WALL", recommended.reason)]
-    if fit.is_doubted:
+    if fit.is_unreliable:
         rows = [("NO WALL", "resolve the warnings first, then record again")]
     elif recommended.status == Status.OK:
         limit = recommended.scene.safe_limit
@@ -87,7 +87,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
         rows += [*checks, *(("CAUTION", caution) for caution in recommended.cautions)]
     # Describe the status only if it is NOT_CONVERGED, because the warnings of the fit describe every other status.
     unconverged = [f"NOT_CONVERGED: {describe_status(fit)}"] if fit.status == Status.NOT_CONVERGED else []
-    rows += [("WARNING", text) for text in (*unconverged, *fit.doubts)] or [("warnings", "none")]
+    rows += [("WARNING", text) for text in (*unconverged, *fit.warnings)] or [("warnings", "none")]
     rows += [("note", note) for note in fit.notes]
     if fit.next is not None:
         rows.append(("next", _describe_next(fit)))
@@ -199,7 +199,7 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
         rows.append(
             ("alternative", f"an actuator lag of up to {lag}; at this lag the fitted delay is {delay} and K_max is {K}")
         )
-    if fit.is_doubted or fit.scene.safe_limit is None:
+    if fit.is_unreliable or fit.scene.safe_limit is None:
         return rows
     rows.append(("safe limit", fit.scene.safe_limit.describe(units)))
     if (wall := _assume_rigid(fit)) is not None:

@@ -97,8 +97,8 @@ def fit_log(
 
     Returns:
         DeviceFit: ``friction`` and ``offset`` have errors NaN if the log does not distinguish the two forces, as for
-        motion in one direction only. ``doubts`` are warnings, for example about a unit; with a warning there is no safe
-        wall. ``status`` is UNREACHABLE if the delay is at the end of the search range; NOT_CONVERGED if the search did
+        motion in one direction only. ``warnings`` may concern a unit, for example; with a warning there is no safe wall.
+        ``status`` is UNREACHABLE if the delay is at the end of the search range; NOT_CONVERGED if the search did
         not converge; UNDECIDED, with K_max NaN, if the residuals are not white noise. ``response`` limits the safe wall
         for a device with undetected resonances.
 
@@ -217,7 +217,7 @@ def _fit(
         motions=motions,
         noise=float(np.sqrt(best.variance)),
         residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
-        doubts=(*warnings, *check_period_unit(period)),
+        warnings=(*warnings, *check_period_unit(period)),
         status=int(status),
         freedom=freedom,
         notes=notes,

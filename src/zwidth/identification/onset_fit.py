@@ -193,7 +193,7 @@ def fit_buzz(
         covariance=covariance,
         noise=noise_pair or (float(np.sqrt(scale)), float(np.sqrt(scale))),
         residuals=best.residuals / np.sqrt(scale),
-        doubts=(*warnings, *check_period_unit(period)),
+        warnings=(*warnings, *check_period_unit(period)),
         status=int(status),
         freedom=None if noise_pair else rigid_fit.freedom,
         rivals=rivals,

@@ -65,7 +65,7 @@ class ResponseEstimate:
         cycle: period of the force in s; None for a force that is not periodic.
         records: number of stretches of periodic force, or number of segments of a force that is not periodic.
         noise: standard deviation of a sampled position in m, for a periodic force.
-        doubts: warnings, one sentence each.
+        warnings: sentences about questionable measurements.
         notes: interpretations of the columns of the logs and repairs of their rows, one clause each.
     """
 
@@ -75,7 +75,7 @@ class ResponseEstimate:
     cycle: float | None
     records: int
     noise: float
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
 
@@ -102,7 +102,7 @@ def respond(
 
     Returns:
         ResponseEstimate: ``device``, with a deviation of 4.5 standard errors; ``period``, ``coherence``, ``cycle``,
-        ``records``, ``noise``, ``doubts``.
+        ``records``, ``noise``, ``warnings``.
 
     Raises:
         InputError: times are uneven, force or position never changes, or the motion does not follow the force.

@@ -76,9 +76,9 @@ def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
         fit: the fit.
         rigid: assume that the device has no resonances other than the fitted ones, as in `DeviceFit.safe_wall`.
     """
-    if fit.is_doubted:
+    if fit.is_unreliable:
         text = describe_status(fit)
-        return SafeLimit(0.0, reason=text or "resolve the warnings first", warnings=fit.doubts)
+        return SafeLimit(0.0, reason=text or "resolve the warnings first", warnings=fit.warnings)
     wall = fit.safe_wall(rigid=rigid)
     if wall.status != Status.OK or not wall.stiffness > 0:
         return SafeLimit(0.0, reason="the fitted parameters are too uncertain for any wall; record longer")

@@ -80,7 +80,7 @@ def test_excite_and_respond_take_a_scene_from_a_file(files, tmp_path):
     assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
     assert np.abs(played["a.csv"]).max() == pytest.approx(2.0 * np.abs(played["c.csv"]).max()) == 0.02
     given = "--resolution", "16384 counts", "--velocity-cutoff", "80 Hz"
-    assert json.loads(run("respond", bare, scene, "--json"))["doubts"]
+    assert json.loads(run("respond", bare, scene, "--json"))["warnings"]
     assert run("respond", timed, scene, "--json") == run("respond", timed, *given, "--json")
 
 

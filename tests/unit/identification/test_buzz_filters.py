@@ -30,7 +30,7 @@ def walls_of(scene, shares):
 def assert_found(fit, scene):
     found = [fit.mass / scene.mass, fit.damping / scene.damping, (fit.delay - scene.timing.delay) / PERIOD]
     np.testing.assert_allclose(found, [1, 1, 0], rtol=EXACT, atol=EXACT)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
 
 
 ESTIMATES = [

@@ -102,8 +102,8 @@ def is_stable(true, stiffness, damping):
 def test_walls_that_no_rigid_device_has_are_refused(true, noise):
     fit = zwidth.fit_buzz(begin_to_buzz(true, SHARES, noise, seed=1), period=PERIOD, noise=noise)
     assert fit.status == Status.NO_BOUNDARY
-    assert "no rigid device has these walls" in " ".join(fit.doubts)
-    assert all(len(doubt.split()) <= 25 for doubt in fit.doubts)
+    assert "no rigid device has these walls" in " ".join(fit.warnings)
+    assert all(len(warning.split()) <= 25 for warning in fit.warnings)
     assert np.isnan([fit.stiffness_max, fit.safe_wall().stiffness]).all()
     assert fit.recommended.status == Status.UNREACHABLE
     assert fit.next is None
@@ -116,7 +116,7 @@ def test_walls_to_set_on_a_device_that_is_not_rigid_are_stable(true, seed):
     for noise in (0.02, None):
         fit = zwidth.fit_buzz(walls, period=PERIOD, noise=noise)
         assert not fit.is_structured
-        if fit.is_doubted:
+        if fit.is_unreliable:
             assert np.isnan(fit.safe_wall().stiffness)
             continue
         safe, wall = fit.safe_wall(), fit.recommended
@@ -131,7 +131,7 @@ def test_walls_of_a_rigid_mass_are_not_refused(seed, noise):
     rigid = TrueDevice("", 0.1, 2.0, 0.0, (), 0.7e-3, PERIOD, 1e-5, 3.0)
     walls = begin_to_buzz(rigid, (0.0, 0.4, 0.8, 1.1), noise=0.02, seed=seed)
     fit = zwidth.fit_buzz(walls, period=PERIOD, noise=noise)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
 
 
 def test_the_interval_at_an_unmeasured_damping_includes_the_measured_stiffness():

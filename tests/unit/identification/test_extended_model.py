@@ -93,4 +93,4 @@ def test_where_a_lag_and_a_resonance_explain_a_log_alike_neither_is_believed():
     force = 3 * np.repeat(rng.choice([-1.0, 1.0], 100), 25)
     fit = zwidth.fit_log(PERIOD, true.play(force), force)
     found = fit.intervals["stiffness_max"]
-    assert fit.is_doubted or found.low <= true.limit_of_walls() <= found.high
+    assert fit.is_unreliable or found.low <= true.limit_of_walls() <= found.high

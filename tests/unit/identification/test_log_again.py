@@ -90,7 +90,7 @@ def test_a_log_may_begin_with_a_long_rest():
     force = np.concatenate([np.zeros(2700), push_to_and_fro(rng, 400)])
     position = record(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.08)
     fit = zwidth.fit_log(PERIOD, position, force)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     for name, true in {"mass": 0.075, "damping": 0.6, "delay": 2.3e-3, "friction": 0.08}.items():
         assert abs(getattr(fit, name) - true) < 4 * fit.errors[name]
 
@@ -106,13 +106,13 @@ def test_errors_know_the_encoder_where_residuals_hide_it(share):
     np.testing.assert_allclose(few, usual, rtol=1e-9)
 
 
-def test_few_positions_are_doubted():
+def test_few_positions_cause_warnings():
     rng = np.random.default_rng(0)
     force = push_to_and_fro(rng, 120)
     position = record(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.0)
-    assert not any("positions are fitted" in doubt for doubt in zwidth.fit_log(PERIOD, position, force).doubts)
+    assert not any("positions are fitted" in warning for warning in zwidth.fit_log(PERIOD, position, force).warnings)
     fit = zwidth.fit_log(PERIOD, position[:70], force[:70])
-    assert any("only 48 positions are fitted" in doubt for doubt in fit.doubts)
+    assert any("only 48 positions are fitted" in warning for warning in fit.warnings)
 
 
 def test_what_lies_before_and_behind_a_gap_is_fitted_as_two_logs():
@@ -136,22 +136,22 @@ def test_what_lies_before_and_behind_a_gap_is_fitted_as_two_logs():
         zwidth.respond(clock[kept], position[kept], force[kept])
 
 
-def test_milliseconds_read_as_seconds_are_doubted():
+def test_milliseconds_read_as_seconds_cause_warnings():
     rng = np.random.default_rng(0)
     force = push_to_and_fro(rng, 300)
     fit = zwidth.fit_log(1.0, record(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.0), force)
-    assert any("the time in ms" in doubt for doubt in fit.doubts)
+    assert any("the time in ms" in warning for warning in fit.warnings)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_delay_of_0_is_doubted_only_where_the_force_comes_late(seed):
+def test_a_delay_of_0_causes_a_warning_only_where_the_force_comes_late(seed):
     rng = np.random.default_rng(seed)
     force = push_to_and_fro(rng, 1000)
     position = record(rng, force, 0.08, 0.5, 0.0, 0.0, 0.02)
     fit = zwidth.fit_log(PERIOD, position, force, resolution=STEP)
-    assert fit.doubts == ()
+    assert fit.warnings == ()
     assert 0 < fit.safe_wall().stiffness < fit.stiffness_max
     late = zwidth.fit_log(PERIOD, position[1:], force[:-1], resolution=STEP)
     assert late.delay == 0
-    assert any("a negative delay would fit better" in warning for warning in late.doubts)
+    assert any("a negative delay would fit better" in warning for warning in late.warnings)
     assert np.isnan(late.safe_wall().stiffness)

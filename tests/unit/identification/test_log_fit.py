@@ -61,7 +61,7 @@ def test_an_exact_log_gives_the_device_back(mass, damping, delay):
     np.testing.assert_allclose([fit.mass, fit.damping], [mass, damping], rtol=EXACT)
     assert fit.delay == pytest.approx(delay, abs=EXACT * PERIOD)
     assert fit.offset == pytest.approx(0.0, abs=EXACT)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -129,26 +129,26 @@ def test_a_log_too_short_to_see_the_damping_says_so():
     exact = move(2.0, 0.5, 1e-3, force)
     fit = zwidth.fit_log(PERIOD, exact + 0.01 * np.std(exact) * rng.standard_normal(120), force)
     assert fit.intervals["damping"].low == 0.0
-    assert any("damping" in doubt for doubt in fit.doubts)
+    assert any("damping" in warning for warning in fit.warnings)
 
 
 @pytest.mark.parametrize("scale, unit", [(1e3, "mm"), (1e-3, "mN")])
-def test_units_off_by_a_thousand_are_doubted(scale, unit):
+def test_units_off_by_a_thousand_cause_warnings(scale, unit):
     rng = np.random.default_rng(10)
     force = steps_to_and_fro(rng, 400)
     fit = zwidth.fit_log(PERIOD, scale * move(0.1, 2.0, 1e-3, force), force)
-    assert any(f"in {unit}" in doubt for doubt in fit.doubts)
+    assert any(f"in {unit}" in warning for warning in fit.warnings)
 
 
 @pytest.mark.parametrize("inertia, scale, unit", [(0.05, 1e-3, "mN m"), (1e-4, 57.3, "degrees"), (1e-6, 1e4, "counts")])
-def test_units_of_a_rotary_axis_are_doubted(inertia, scale, unit):
+def test_units_of_a_rotary_axis_cause_warnings(inertia, scale, unit):
     rng = np.random.default_rng(10)
     force = 500 * inertia * steps_to_and_fro(rng, 400)
     angle = move(inertia, 20 * inertia, 1e-3, force)
-    assert zwidth.fit_log(PERIOD, angle, force, rotary=True).doubts == ()
+    assert zwidth.fit_log(PERIOD, angle, force, rotary=True).warnings == ()
     # A torque a thousand times as large is as if the angle were so much smaller.
     fit = zwidth.fit_log(PERIOD, scale * angle, force, rotary=True)
-    assert any(unit in doubt for doubt in fit.doubts)
+    assert any(unit in warning for warning in fit.warnings)
     assert np.isnan(fit.safe_wall().stiffness)
 
 
@@ -161,7 +161,7 @@ def test_friction_comes_back_from_a_simulated_motion(delay):
     # A push acts at once: the loop's delay is of the wall's force.
     np.testing.assert_allclose([fit.mass, fit.damping, fit.friction], [0.1, 2.0, 0.3], rtol=EXACT)
     assert fit.delay == pytest.approx(0.0, abs=EXACT)
-    assert (fit.doubts, fit.status) == ((), Status.OK)
+    assert (fit.warnings, fit.status) == ((), Status.OK)
 
 
 def test_a_lag_that_swings_is_modelled_and_a_hand_refused():
@@ -188,7 +188,7 @@ def test_a_delay_beyond_the_range_is_told():
     position = move(0.1, 2.0, 6e-3, force)
     fit = zwidth.fit_log(PERIOD, position, force, max_delay="3 ms")
     assert fit.status == Status.UNREACHABLE
-    assert any("max_delay" in doubt for doubt in fit.doubts)
+    assert any("max_delay" in warning for warning in fit.warnings)
     assert zwidth.fit_log(PERIOD, position, force, max_delay="8 ms").status == Status.OK
 
 
@@ -253,7 +253,7 @@ def test_little_friction_after_a_single_push_is_found_and_how_much_of_it_is_a_co
     position, force = push_once(coulomb)
     fit = zwidth.fit_log(PERIOD, position, force)
     np.testing.assert_allclose([fit.mass, fit.damping, fit.friction], [0.1, 0.5, coulomb], rtol=1e-8)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     # A constant force of -coulomb until it rests moves it alike: no tight interval.
     assert np.isnan([fit.errors["friction"], *fit.intervals["friction"]]).all()
     assert fit.safe_wall().stiffness > 0
@@ -286,10 +286,10 @@ def test_a_clock_that_wavers_changes_nothing_but_the_period(share):
 
 
 @pytest.mark.parametrize("period, scale, word", [(1.0, 1.0, "sampling period"), (PERIOD, 1e4, "mm")])
-def test_under_a_doubt_there_is_no_wall(period, scale, word):
+def test_with_a_warning_there_is_no_wall(period, scale, word):
     force = steps_to_and_fro(np.random.default_rng(15), 300)
     fit = zwidth.fit_log(period, scale * move(0.1, 2.0, 1e-3, force), force)
-    assert any(word in doubt for doubt in fit.doubts)
+    assert any(word in warning for warning in fit.warnings)
     assert np.isnan(fit.safe_wall()[:3]).all()
     assert fit.safe_wall().status == Status.UNDECIDED
     assert fit.recommended.status == Status.UNREACHABLE
@@ -301,7 +301,7 @@ def test_under_a_doubt_there_is_no_wall(period, scale, word):
     assert "safe limit" not in dict(detail_fit(fit, "a log"))
     text = "\n".join(write_scene(fit, "a log"))
     assert "    stiffness: 0.0 N/m\n" in text
-    assert f'    warnings:\n      - "{fit.doubts[0]}"' in text
+    assert f'    warnings:\n      - "{fit.warnings[0]}"' in text
 
 
 def test_of_a_long_log_the_beginning_is_fitted_and_that_is_said(monkeypatch):

@@ -31,7 +31,7 @@ def assert_found(fit, scene):
     found = [fit.mass / scene.mass, fit.damping / scene.damping, (fit.delay - scene.timing.delay) / scene.timing.period]
     np.testing.assert_allclose(found, [1, 1, 0], rtol=EXACT, atol=EXACT)
     assert fit.status == Status.OK
-    assert fit.doubts == ()
+    assert fit.warnings == ()
 
 
 def random_scene(seed):
@@ -146,11 +146,11 @@ def test_the_next_experiment_narrows_what_it_promises():
     assert after.stiffness_error < 0.5 * fit.stiffness_error
 
 
-def test_walls_that_contradict_each_other_are_doubted():
+def test_walls_that_contradict_each_other_cause_warnings():
     walls = walls_of(scene_of(0.1, 0.1, 1.0, 1e-3), [0.0, 0.4, 0.8])
     walls[1, 0] *= 1.5
     fit = zwidth.fit_buzz(walls, period=1e-3, noise=0.01)
-    assert any("no rigid device has these walls" in doubt for doubt in fit.doubts)
+    assert any("no rigid device has these walls" in warning for warning in fit.warnings)
     assert fit.status == Status.NO_BOUNDARY
     assert np.isnan(fit.stiffness_max)
     # Where nobody knows the noise, half as much again is none.
@@ -170,7 +170,7 @@ def test_a_second_device_that_fits_as_well_is_told():
         except InputError as error:
             told += "not determine" in str(error)
         else:
-            told += fit.status == Status.UNDECIDED or "mass is hardly" in " ".join(fit.doubts)
+            told += fit.status == Status.UNDECIDED or "mass is hardly" in " ".join(fit.warnings)
     assert told >= 2
 
 
@@ -188,7 +188,7 @@ def test_rivals_leave_a_stiffness_only_where_they_agree_on_it(seed, agree):
     fit = zwidth.fit_buzz(walls, period=period, noise=0.03)
     assert fit.status == Status.UNDECIDED
     (rival,) = fit.rivals
-    assert "another device" in " ".join(fit.doubts)
+    assert "another device" in " ".join(fit.warnings)
     # It fits the walls as well as the best one: both have them on their edges, within the noise.
     for device in (fit, rival):
         scene = zwidth.Scene(zwidth.Device(device.mass, device.damping), zwidth.Timing(period, device.delay))
@@ -224,7 +224,7 @@ def test_a_wall_given_twice_is_no_new_information_unless_it_was_measured_twice()
     walls = [(6850, 0, 40.1), (15900, 18.7, 68.6), (19700, 37.4, 89.1)]
     once, twice = (zwidth.fit_buzz(points, period=1e-3) for points in (walls, [*walls, walls[0]]))
     assert twice.errors == once.errors
-    assert any("repeat" in doubt for doubt in twice.doubts)
+    assert any("repeat" in warning for warning in twice.warnings)
     once, twice = (zwidth.fit_buzz(points, period=1e-3, noise=0.02) for points in (walls, [*walls, walls[0]]))
     assert twice.errors["mass"] < once.errors["mass"]
 
@@ -295,7 +295,7 @@ def test_no_wall_to_set_has_more_damping_than_a_wall_that_was_tried():
     true = OtherDevice.of(OTHERS["compliance of 300 Hz, encoder at the motor"])
     walls = [(494.7, 0.0, 10.92), (4044.0, 8.053, 33.66), (6577.0, 16.11, 45.92), (8703.0, 24.16, 54.96)]
     fit = zwidth.fit_buzz(walls, period=PERIOD, noise=0.02)
-    assert not fit.is_doubted
+    assert not fit.is_unreliable
     known, safe, wall = fit.safe_wall(rigid=True), fit.safe_wall(), fit.recommended
     assert known.virtual_damping > 26.8
     assert not true.is_stable(*known[:2])

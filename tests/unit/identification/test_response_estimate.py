@@ -42,7 +42,7 @@ def test_the_band_holds_the_true_response_and_is_no_wider_than_needed():
     np.testing.assert_allclose(found.device.frequency, played.frequency, rtol=1e-12)
     assert found.cycle == pytest.approx(2.0)
     assert found.records == 5
-    assert found.doubts == ()
+    assert found.warnings == ()
     # What was expected of an encoder whose errors are white.
     assert np.median(found.device.deviation / played.deviation) == pytest.approx(1.0, abs=0.25)
     assert np.median(found.coherence) > 0.99
@@ -89,12 +89,12 @@ def test_a_loop_that_holds_the_device_needs_the_cycle():
     assert found.records == 1
 
 
-def test_a_force_that_does_not_repeat_is_answered_with_a_doubt():
+def test_a_force_that_does_not_repeat_is_reported_with_a_warning():
     rng = np.random.default_rng(4)
     force = np.repeat(rng.choice([-3.0, 3.0], 40000), 1)
     found = zwidth.respond(PERIOD, DEVICE.play(force), force)
     assert found.cycle is None
-    assert "does not repeat" in found.doubts[0]
+    assert "does not repeat" in found.warnings[0]
     middle = (found.device.frequency > 5) & (found.device.frequency < 300)
     off = np.abs(found.device.response - exact(found.device.frequency))[middle]
     assert (off < found.device.deviation[middle]).mean() > 0.99

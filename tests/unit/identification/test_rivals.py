@@ -30,7 +30,7 @@ def fit_made(seed, span=bench_fit.NOISY):
 @pytest.mark.parametrize("seed", [189, 209, 469])
 def test_a_mass_that_slides_one_way_leaves_friction_open(seed):
     fit, away = fit_made(seed)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     assert np.isnan([fit.errors["friction"], fit.errors["offset"]]).all()
     assert set(away) == {"mass", "damping", "delay"}
     assert np.abs(list(away.values())).max() < 4.0
@@ -41,7 +41,7 @@ def test_a_mass_that_slides_one_way_leaves_friction_open(seed):
 @pytest.mark.parametrize("seed", [86, 254, 462, 518])
 def test_sticking_hides_no_device(seed):
     fit, away = fit_made(seed)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     assert set(away) == {"mass", "damping", "delay", "friction", "offset"}
     assert np.abs(list(away.values())).max() < 4.0
 
@@ -60,7 +60,7 @@ def test_errors_of_friction_reach_to_none_where_none_fits_as_well(seed):
 @pytest.mark.parametrize("seed", [17, 97, 333, 545, 549])
 def test_a_search_that_creeps_has_arrived(seed):
     fit, away = fit_made(seed)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     assert not fit.intervals["friction"].low > 0
     assert np.abs(list(away.values())).max() < 4.0
 
@@ -71,7 +71,7 @@ def test_a_search_that_creeps_has_arrived(seed):
 @pytest.mark.parametrize("seed", [29, 89, 197, 209, 1165, 221, 285, 297, 1037, 1297])
 def test_a_rest_counts_once_where_an_encoder_has_no_noise(seed):
     fit, away = fit_made(seed, bench_fit.SILENT)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     assert set(away) == {"mass", "damping", "delay"}
     assert np.abs(list(away.values())).max() < 4.0
 
@@ -79,7 +79,7 @@ def test_a_rest_counts_once_where_an_encoder_has_no_noise(seed):
 def test_errors_are_alike_wherever_a_device_returns_to_the_same_place():
     # Inside a wall, on and off for a step of the encoder. Stays taken for independent: 6 standard errors off.
     fit, away = fit_made(1174, bench_fit.SILENT)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     assert np.abs(list(away.values())).max() < 4.0
 
 
@@ -98,7 +98,7 @@ def play(delta, d, friction, steps, noise, seed, count=600):
 @pytest.mark.parametrize("seed", [3, 31])
 def test_a_strong_damper_hides_no_friction(seed):
     fit = play(0.6, 2.87, 0.008, 3e4, 0.0, seed)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     truth = {"mass": 0.1, "damping": 60.0, "delay": 2.87e-3, "friction": 0.008}
     assert max(abs(getattr(fit, name) - value) / fit.errors[name] for name, value in truth.items()) < 4.0
 

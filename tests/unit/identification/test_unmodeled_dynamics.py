@@ -38,7 +38,7 @@ def fit_hidden():
 def test_a_device_with_more_parts_is_modelled_with_them_or_has_no_wall(name):
     true, fit = OtherDevice.of(OTHERS[name]), fit_other(name)
     safe, wall = fit.safe_wall(), fit.recommended
-    if fit.is_doubted:
+    if fit.is_unreliable:
         assert wall.status == Status.UNREACHABLE
         assert np.isnan([fit.stiffness_max, fit.stiffness_error, safe.stiffness]).all()
         return
@@ -51,7 +51,7 @@ def test_a_device_with_more_parts_is_modelled_with_them_or_has_no_wall(name):
 def test_a_resonance_is_found_with_its_numbers_and_written_into_the_scene(tmp_path):
     force, position = record(add_mode(RIGID, 120, 0.03, 0.1), 1)
     fit = zwidth.fit_log(PERIOD, position, force)
-    assert (fit.status, fit.doubts, fit.actuator) == (Status.OK, (), None)
+    assert (fit.status, fit.warnings, fit.actuator) == (Status.OK, (), None)
     true = {"frequency": 120.0, "damping_ratio": 0.03, "mass": 10 * MASS}
     for name, value in true.items():
         path = f"modes.0.{name}"
@@ -69,10 +69,10 @@ def test_a_resonance_is_found_with_its_numbers_and_written_into_the_scene(tmp_pa
 
 
 def test_a_resonance_that_hardly_decays_has_its_damping_ratio():
-    """Held at 5e-4 at the least, it kept the other numbers off by many of their errors, without a doubt."""
+    """Held at 5e-4 at the least, it kept the other numbers off by many of their errors, without a warning."""
     force, position = record(add_mode(RIGID, 120, 1e-4, 0.1), 1, step=1e-6)
     fit = zwidth.fit_log(PERIOD, position, force)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     true = {"mass": MASS, "damping": DAMPING, "modes.0.frequency": 120.0, "modes.0.damping_ratio": 1e-4}
     assert max(abs(fit.value_of(name) - value) / fit.errors[name] for name, value in true.items()) < 4.0
 
@@ -82,7 +82,7 @@ def test_a_resonance_whose_numbers_are_open_has_no_safe_wall():
     force, position = record(OTHERS["compliance of 50 Hz, encoder at the motor"], 0, step=2e-4)
     fit = zwidth.fit_log(PERIOD, position, force)
     safe = fit.safe_wall()
-    assert fit.is_doubted or fit.build_response_scene(0.99, True) is None
+    assert fit.is_unreliable or fit.build_response_scene(0.99, True) is None
     assert safe.status == Status.UNDECIDED
     assert np.isnan(safe.stiffness)
     assert fit.recommended.status == Status.UNREACHABLE
@@ -122,7 +122,7 @@ def test_logs_of_rigid_devices_have_no_parts_and_keep_their_walls():
     true = float(scene.max_stiffness().stiffness)
     logs = [record(RIGID, seed) for seed in range(12)]
     fits = [zwidth.fit_log(PERIOD, position, force) for force, position in logs]
-    assert [(fit.status, fit.doubts, fit.is_structured) for fit in fits] == 12 * [(Status.OK, (), False)]
+    assert [(fit.status, fit.warnings, fit.is_structured) for fit in fits] == 12 * [(Status.OK, (), False)]
     assert all(fit.response is not None for fit in fits)
     held = [fit.intervals["stiffness_max"].low <= true <= fit.intervals["stiffness_max"].high for fit in fits]
     # Of 12 intervals of 95 % fewer than 9 hold by chance in 2 of 1,000 cases.
@@ -136,7 +136,7 @@ def test_logs_of_rigid_devices_have_no_parts_and_keep_their_walls():
 def test_a_resonance_that_a_coarse_encoder_hides_bounds_the_safe_wall():
     hidden = TrueDevice("", MASS, DAMPING, 0.0, ((200.0, 0.03, MASS / 0.4),), DELAY, PERIOD, 2e-4, 3.0)
     fit = fit_hidden()
-    assert fit.doubts == ()
+    assert fit.warnings == ()
     safe, rigid = fit.safe_wall(), fit.safe_wall(rigid=True)
     assert hidden.is_stable(*safe[:2])
     assert not hidden.is_stable(*rigid[:2])

@@ -244,7 +244,7 @@ def test_a_period_beside_other_times_is_refused(monkeypatch):
         study_of(log=log, period="2 ms").compute(None, True)
 
 
-def test_the_doubts_on_the_page_are_those_that_are_told():
+def test_the_warnings_on_the_page_are_those_that_are_printed():
     page = (ROOT / "docs" / "guides" / "my-log.md").read_text(encoding="utf-8")
     told = [row.split("|")[1].strip() for row in page.partition("|---|---|---|\n")[2].splitlines()]
     sources = (ROOT / "src" / "zwidth").glob("*/*.py")
