@@ -162,15 +162,15 @@ def _report_end(result: RunResult, command: str) -> None:
     sweeps = result.sweeps.values()
     chunks = [sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")]
     done = sum(study.state in ("done", "kept") for study in result.studies if study.sweep is None)
-    parts = [f"{done} of {result.whole} done"] if result.whole else []
+    parts = [f"{done} of {result.computed_count} done"] if result.computed_count else []
     parts += [f"{chunks[0] + chunks[1]} of {chunks[2]} chunks done ({chunks[0]} now)"] if sweeps else []
     click.echo(f"{', '.join(parts) or 'nothing done'}, results in {result.folder}")
     for study in result.studies:
         print_lines(format_row("" if number else study.name, line) for number, line in enumerate(study.answer))
     if any(study.sweep and study.state in ("done", "kept") for study in result.studies):
         click.echo(f"figures of the sweeps: {shlex.join(['zwidth', 'figures', str(result.folder)])}")
-    if result.hopeless:
-        click.echo(f"Error: out: {result.folder}: {result.hopeless}", err=True)
+    if result.fatal_error:
+        click.echo(f"Error: out: {result.folder}: {result.fatal_error}", err=True)
         click.echo(f"zwidth: the disk is full or read-only; make room and resume with: {command}", err=True)
         return
     for study in result.failed:
@@ -178,8 +178,8 @@ def _report_end(result: RunResult, command: str) -> None:
             click.echo(f"Error: chunk {chunk} failed: {error}", err=True)
         if not study.sweep:
             click.echo(f"Error: study {study.name!r} failed: {study.error}", err=True)
-    if result.lost:
-        click.echo(f"Error: {result.lost}; results so far are kept. Resume with: {command}", err=True)
+    if result.cluster_error:
+        click.echo(f"Error: {result.cluster_error}; results so far are kept. Resume with: {command}", err=True)
     elif result.failed and not result.interrupted:
         click.echo(f"zwidth: retry the failed parts with: {command}", err=True)
 

@@ -42,7 +42,7 @@ def draw_device_fit(
     """Draw a fitted device: measured motion, residuals, their autocorrelation, and the stable walls.
 
     The last panel shows the stability boundary with its 95 % band, the stiffest wall, the recommended wall, and the
-    onsets of instability. For a fit to a log, the panels before it show the measured and the modelled position, the
+    onsets of instability. For a fit to a log, the panels before it show the measured and the modeled position, the
     residuals, and their autocorrelation with the 95 % band of white noise. For a fit to onsets, one panel shows their
     deviations from the fit, in standard deviations of their noise.
 
@@ -52,7 +52,7 @@ def draw_device_fit(
         walls: Columns fitted_to, kind ("stiffest", "set" for the recommended wall, or "buzzing" for an onset),
             stiffness, its error, virtual_damping, frequency; for onsets also stiffness_residual and frequency_residual.
         axes: Existing Axes, one per panel.
-        motion: Columns log, time, position, modelled and residual of the logs.
+        motion: Columns log, time, position, modeled and residual of the logs.
         correlation: Columns lag, autocorrelation and band of the logs.
         step: Encoder step, drawn with the residuals; 0 for none.
     """
@@ -84,24 +84,24 @@ def _make_panels(axes: style.AnyAxes | None, rows: int) -> Any:
 
 
 def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
-    """Draw measured and modelled position, and the residuals, of the first log.
+    """Draw measured and modeled position, and the residuals, of the first log.
 
     Args:
         panels: Axes by name; "position" and "residuals" are optional.
-        motion: Columns log, time, position, modelled and residual.
+        motion: Columns log, time, position, modeled and residual.
         step: Encoder step, drawn with the residuals; 0 for none.
     """
     logs = np.asarray(motion["log"])
     first = select(motion, log=logs[0])
     thin = slice(None, None, max(1, -(-logs[logs == logs[0]].size // _MAX_SAMPLES)))
-    time, place, model, rest = (first[name] for name in ("time_s", "position_m", "modelled_m", "residual_m"))
+    time, place, model, rest = (first[name] for name in ("time_s", "position_m", "modeled_m", "residual_m"))
     clock, second = style.si_unit(time[-1] - time[0], "s")
     time = (time - time[0]) * clock
     if "position" in panels:
         ax = panels["position"]
         factor, length = style.si_unit(np.ptp(place), "m")
         ax.plot(time[thin], place[thin] * factor, color=style.GRAY, linewidth=2.4, alpha=0.55, label="measured")
-        ax.plot(time[thin], model[thin] * factor, color=style.VERMILION, linewidth=0.9, label="modelled")
+        ax.plot(time[thin], model[thin] * factor, color=style.VERMILION, linewidth=0.9, label="modeled")
         ax.set(ylabel=f"{'angle' if style.units().rotary else 'position'}  in {length}", xlim=(0.0, time[-1]))
         ax.tick_params(labelbottom="residuals" not in panels)
         _put_above(ax)

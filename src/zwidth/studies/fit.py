@@ -257,7 +257,7 @@ def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
     row: dict[str, Any] = {"fitted_to": source, "status": Status(fit.status).name}
     errors = fit.errors | {"stiffness_max": fit.stiffness_error}
     log_parameters = [name for name in ("friction", "offset") if name in errors]
-    for name in (*fit.numbers[:3], "stiffness_max", *fit.numbers[3:], *log_parameters):
+    for name in (*fit.parameter_names[:3], "stiffness_max", *fit.parameter_names[3:], *log_parameters):
         ends = fit.intervals[name]
         numbers = {"": fit.value_of(name), "_error": errors[name], "_low": ends.low, "_high": ends.high}
         row |= {header(name + end, unit_of(name, fit.unit_system)): value for end, value in numbers.items()}
@@ -272,7 +272,7 @@ def _compare(one: DeviceFit, other: DeviceFit) -> str:
     """
     values = [np.array([fit.mass, fit.damping, fit.delay]) for fit in (one, other)]
     difference = values[0] - values[1]
-    covariance = sum((fit.reach / _NORMAL_95) ** 2 * fit.covariance[:3, :3] for fit in (one, other))
+    covariance = sum((fit.coverage_factor / _NORMAL_95) ** 2 * fit.covariance[:3, :3] for fit in (one, other))
     # Add a small value to the variances, because they are 0 for data without noise, and the matrix would be singular.
     floor = (1e-9 * np.maximum(np.abs(values[0]), np.abs(values[1]))) ** 2 + 1e-300
     statistic = float(difference @ np.linalg.solve(covariance + np.diag(floor), difference))

@@ -10,8 +10,8 @@ from loop_logs import make_knob
 
 import zwidth
 from zwidth.cli import cli
-from zwidth.identification.device_fit import RivalDevice
-from zwidth.identification.fit_report import format_rival
+from zwidth.identification.device_fit import AlternativeDevice
+from zwidth.identification.fit_report import format_alternative
 from zwidth.studies.document import load_config
 from zwidth.units.unit_system import LINEAR, ROTARY
 
@@ -166,6 +166,6 @@ def test_a_normalized_scene_has_no_hardware(tmp_path):
 
 
 def test_the_inertia_of_a_rotary_device_has_the_symbol_j():
-    rival = RivalDevice(1e-5, 1e-4, 1e-3, 1.0)
-    assert format_rival(rival, ROTARY).startswith("J = 100.0 g cm^2")
-    assert format_rival(rival, LINEAR).startswith("m = ")
+    alternative = AlternativeDevice(1e-5, 1e-4, 1e-3, 1.0)
+    assert format_alternative(alternative, ROTARY).startswith("J = 100.0 g cm^2")
+    assert format_alternative(alternative, LINEAR).startswith("m = ")

@@ -140,9 +140,9 @@ def test_the_interval_at_an_unmeasured_damping_includes_the_measured_stiffness()
     walls = [(494.7, 0.0, 10.92), (4044.0, 8.053, 33.66), (6577.0, 16.11, 45.92), (8703.0, 24.16, 54.96)]
     fit = zwidth.fit_buzz(walls, period=PERIOD, noise=0.02)
     assert not fit.is_structured
-    assert fit.damping_tried == 24.16
+    assert fit.measured_damping == 24.16
     assert fit.virtual_damping > 24.16
-    bar, spread = fit.intervals["stiffness_max"], np.exp(fit.reach * fit.stiffness_error / fit.stiffness_max)
-    assert bar == (pytest.approx(8703 * (1 - 0.02 * fit.reach)), pytest.approx(fit.stiffness_max * spread))
+    bar, spread = fit.intervals["stiffness_max"], np.exp(fit.coverage_factor * fit.stiffness_error / fit.stiffness_max)
+    assert bar == (pytest.approx(8703 * (1 - 0.02 * fit.coverage_factor)), pytest.approx(fit.stiffness_max * spread))
     assert bar.low < true.limit_of_walls() < bar.high
     assert fit.safe_wall().stiffness <= fit.bound_measured_stiffness(0.99)

@@ -67,7 +67,7 @@ def test_a_noise_that_is_estimated_widens_the_band(heard):
 
 def test_residuals_of_white_noise_are_not_correlated(logged):
     found = correlate_residuals(logged)
-    rests = [motion.position - motion.modelled for motion in logged.motions]
+    rests = [motion.position - motion.modeled for motion in logged.motions]
     good = [rest[np.isfinite(rest)] for rest in rests]
     assert found["lag_s"][0] == logged.period
     assert found["band"][0] == pytest.approx(1.96 / np.sqrt(sum(rest.size for rest in good)), rel=1e-4)
@@ -80,7 +80,7 @@ def test_the_motion_is_every_sample_of_every_log(logged):
     tables = gather_evidence(logged, "two logs")
     motion = tables["motion"]
     assert np.bincount(motion["log"]).tolist() == [0, 800, 800]
-    np.testing.assert_array_equal(motion["position_m"] - motion["modelled_m"], motion["residual_m"])
+    np.testing.assert_array_equal(motion["position_m"] - motion["modeled_m"], motion["residual_m"])
     assert np.nanstd(motion["residual_m"]) == pytest.approx(1e-5, rel=0.1)
     assert set(tables["walls"]["kind"]) == {"stiffest", "set"}
 

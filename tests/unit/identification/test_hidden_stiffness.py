@@ -71,13 +71,13 @@ def test_the_interval_is_that_of_all_devices_alike():
     _, force, position = play((), 1e-4)
     fit = zwidth.fit_log(PERIOD, position, force)
     assert fit.hidden is not None
-    assert fit.freedom is not None
+    assert fit.degrees_of_freedom is not None
     rng, count = np.random.default_rng(0), 400_000
     for odds, ratios in ((0.0, [0.5]), (0.3, [0.4, 0.9, 1.2]), (4.0, [0.2, 1.0])):
         alike = replace(fit, hidden=HiddenResonances(odds, np.array(ratios)), lag=None)
         hides = rng.random(count) < odds / (1.0 + odds)
         middle = fit.stiffness_max * np.where(hides, rng.choice(ratios, count), 1.0)
-        drawn = middle * np.exp(fit.stiffness_error / fit.stiffness_max * rng.standard_t(fit.freedom, count))
+        drawn = middle * np.exp(fit.stiffness_error / fit.stiffness_max * rng.standard_t(fit.degrees_of_freedom, count))
         low, high = np.quantile(drawn, [0.025, 0.975])
         found = alike.intervals["stiffness_max"]
         assert found == pytest.approx((low, high), abs=0.1 * fit.stiffness_error)
@@ -98,9 +98,9 @@ def test_the_interval_holds_what_a_resonance_that_does_not_show_leaves():
         low, high = fit.intervals["stiffness_max"]
         limit = true.limit_of_walls()
         held += fit.is_unreliable or low <= limit <= high
-        assert abs(limit - fit.stiffness_max) > fit.reach * fit.stiffness_error or fit.is_unreliable
+        assert abs(limit - fit.stiffness_max) > fit.coverage_factor * fit.stiffness_error or fit.is_unreliable
         # An encoder that would show it leaves the interval as it is.
         fit = zwidth.fit_log(PERIOD, play((), 1e-7, seed)[2], force)
-        clear.append(np.ptp(fit.intervals["stiffness_max"]) / (2.0 * fit.reach * fit.stiffness_error))
+        clear.append(np.ptp(fit.intervals["stiffness_max"]) / (2.0 * fit.coverage_factor * fit.stiffness_error))
     assert held == 4
     assert max(clear) < 20.0

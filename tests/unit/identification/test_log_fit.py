@@ -164,7 +164,7 @@ def test_friction_comes_back_from_a_simulated_motion(delay):
     assert (fit.warnings, fit.status) == ((), Status.OK)
 
 
-def test_a_lag_that_swings_is_modelled_and_a_hand_refused():
+def test_a_lag_that_swings_is_modeled_and_a_hand_refused():
     rng = np.random.default_rng(11)
     force = steps_to_and_fro(rng, 600, 40)
     swinging = lfilter([0.2], [1.0, -1.6, 0.8], force)

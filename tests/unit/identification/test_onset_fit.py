@@ -142,7 +142,7 @@ def test_the_next_experiment_narrows_what_it_promises():
     assert step is not None
     more = np.vstack([walls, [step.stiffness, step.virtual_damping, step.frequency]])
     after = zwidth.fit_buzz(more, period=1e-3, noise=(0.03, 0.01))
-    assert after.stiffness_error == pytest.approx(step.error_afterwards, rel=1e-6)
+    assert after.stiffness_error == pytest.approx(step.stiffness_error, rel=1e-6)
     assert after.stiffness_error < 0.5 * fit.stiffness_error
 
 
@@ -183,28 +183,29 @@ def noisy_walls(seed, damped):
 
 
 @pytest.mark.parametrize("seed, agree", [(380, True), (337, False)])
-def test_rivals_leave_a_stiffness_only_where_they_agree_on_it(seed, agree):
+def test_alternatives_leave_a_stiffness_only_where_they_agree_on_it(seed, agree):
     walls, period = noisy_walls(seed, 0.5)
     fit = zwidth.fit_buzz(walls, period=period, noise=0.03)
     assert fit.status == Status.UNDECIDED
-    (rival,) = fit.rivals
+    (alternative,) = fit.alternatives
     assert "another device" in " ".join(fit.warnings)
     # It fits the walls as well as the best one: both have them on their edges, within the noise.
-    for device in (fit, rival):
+    for device in (fit, alternative):
         scene = zwidth.Scene(zwidth.Device(device.mass, device.damping), zwidth.Timing(period, device.delay))
         ends = [scene.stable_stiffness(damping)[0, 1] for damping in walls[:, 1]]
         np.testing.assert_allclose(ends, walls[:, 0], rtol=0.2)
         assert float(scene.max_stiffness().stiffness) == pytest.approx(
-            rival.stiffness_max if device is rival else float(fit.nominal.max_stiffness().stiffness), rel=1e-9
+            alternative.stiffness_max if device is alternative else float(fit.nominal.max_stiffness().stiffness),
+            rel=1e-9,
         )
     best = float(fit.nominal.max_stiffness().stiffness)
     assert np.isfinite(fit.stiffness_max) == np.isfinite(fit.stiffness_error) == agree
     if agree:
-        assert abs(rival.stiffness_max - best) <= fit.stiffness_error
+        assert abs(alternative.stiffness_max - best) <= fit.stiffness_error
     assert np.isnan(fit.safe_wall().stiffness)
     assert fit.next is not None
-    assert np.isfinite(fit.next.error_afterwards) == agree
-    assert fit.as_dict()["rivals"][0]["mass"] == rival.mass
+    assert np.isfinite(fit.next.stiffness_error) == agree
+    assert fit.as_dict()["alternatives"][0]["mass"] == alternative.mass
     assert fit.as_dict()["stiffness_max"] == (fit.stiffness_max if agree else None)
 
 
@@ -272,7 +273,7 @@ def test_the_result_as_plain_numbers():
     plain = fit.as_dict()
     assert plain["mass"] == fit.mass
     # By the logarithm of K_max.
-    spread = np.exp(fit.reach * fit.stiffness_error / fit.stiffness_max)
+    spread = np.exp(fit.coverage_factor * fit.stiffness_error / fit.stiffness_max)
     assert plain["intervals"]["stiffness_max"] == pytest.approx(
         [fit.stiffness_max / spread, fit.stiffness_max * spread], rel=1e-14
     )

@@ -23,7 +23,7 @@ def record(**options):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_safe_walls_are_stable_on_devices_nobody_modelled(seed):
+def test_safe_walls_are_stable_on_devices_nobody_modeled(seed):
     # A share of benchmarks/measured_walls.py.
     trial = measured_devices.measure(seed)
     assert False not in trial.stable

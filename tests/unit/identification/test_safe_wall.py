@@ -53,7 +53,7 @@ def test_equal_fits_give_equal_walls_and_a_smaller_share_stiffer_ones(fit):
 
 
 def test_a_noise_that_was_estimated_from_little_costs_stiffness(fit):
-    guessed = replace(fit, freedom=2)
+    guessed = replace(fit, degrees_of_freedom=2)
     assert guessed.safe_wall().stiffness < 0.95 * fit.safe_wall().stiffness
 
 
@@ -67,7 +67,9 @@ def test_what_the_records_leave_open_leaves_nothing_to_render(fit):
 
 @pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=100)])
 def test_devices_beyond_all_bounds_bear_nothing(fit, velocity):
-    lost = replace(fit, covariance=1e8 * fit.covariance, freedom=1, nominal=replace(fit.nominal, velocity=velocity))
+    lost = replace(
+        fit, covariance=1e8 * fit.covariance, degrees_of_freedom=1, nominal=replace(fit.nominal, velocity=velocity)
+    )
     assert lost.safe_wall()[:2] == (0.0, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Logs of devices that are more than a rigid mass, moved by matrix exponentials: modelled, or refused with no wall."""
+"""Logs of devices that are more than a rigid mass, moved by matrix exponentials: modeled, or refused with no wall."""
 
 from dataclasses import replace
 from functools import cache
@@ -35,7 +35,7 @@ def fit_hidden():
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_a_device_with_more_parts_is_modelled_with_them_or_has_no_wall(name):
+def test_a_device_with_more_parts_is_modeled_with_them_or_has_no_wall(name):
     true, fit = OtherDevice.of(OTHERS[name]), fit_other(name)
     safe, wall = fit.safe_wall(), fit.recommended
     if fit.is_unreliable:

@@ -86,9 +86,9 @@ def test_the_figure_shows_what_the_tables_hold(both):
         return np.array([float(row[name] or "nan") for row in rows])
 
     position, residual, correlation, walls, boundary = panels
-    measured, modelled = position.lines
+    measured, modeled = position.lines
     np.testing.assert_allclose(measured.get_ydata(), 1e3 * column("motion", "position_m"))
-    np.testing.assert_allclose(modelled.get_ydata(), 1e3 * column("motion", "modelled_m"))
+    np.testing.assert_allclose(modeled.get_ydata(), 1e3 * column("motion", "modeled_m"))
     np.testing.assert_allclose(residual.lines[0].get_ydata(), 1e6 * column("motion", "residual_m"))
     halves = [line.get_ydata()[0] for line in residual.lines if line.get_label() == "half a step"]
     assert halves == [pytest.approx(-15.0), pytest.approx(15.0)]

@@ -115,7 +115,7 @@ def test_the_interval_of_the_stiffest_wall_reaches_to_a_device_without_delay(see
 
 
 @pytest.mark.parametrize("lag, expected", [(0.0, 1.0), (4.0, 4.0), (30.0, None)])
-def test_a_rival_is_as_many_errors_away_as_its_squares_say(lag, expected):
+def test_an_alternative_is_as_many_errors_away_as_its_squares_say(lag, expected):
     random = np.random.default_rng(4)
     force = np.concatenate([np.zeros(SKIP), np.repeat(random.choice([-1.0, 1.0], 20), 20)])
     theta = np.array([1e-5, 0.02, 2.3, 0.0, 1e-5, 1e-7, 1e-6])
@@ -127,8 +127,8 @@ def test_a_rival_is_as_many_errors_away_as_its_squares_say(lag, expected):
     # By slopes it is 50 errors away in each of two numbers.
     away = np.zeros(7)
     away[[1, 6]] = 50.0 * np.sqrt(np.diag(alone.covariance)[[1, 6]])
-    rival = FittedModel(model, theta + away, squares * np.exp(lag / 400), True)
-    widened = replace(alone, rivals=(rival,)).covariance
+    alternative = FittedModel(model, theta + away, squares * np.exp(lag / 400), True)
+    widened = replace(alone, alternatives=(alternative,)).covariance
     if expected is None:
         np.testing.assert_array_equal(widened, alone.covariance)
     else:
