@@ -258,7 +258,7 @@ def list_slopes(scene: Scene) -> list[Slope]:
         effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
         if isfinite(value) and (change := value * step):
             effect = f"{'buys' if change > 0 else 'costs'} {with_unit(abs(change), system['N/m'], 3)}"
-        note = f" (the delay stays {scene.timing.kept_delay})" if path == "period" and scene.timing.delay else ""
+        note = f" (the delay stays {scene.timing.delay_text})" if path == "period" and scene.timing.delay else ""
         words = f"{with_unit(step, unit, 1)} more {effect}{note}"
         slopes.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))
     return slopes

@@ -89,7 +89,7 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
     if find is None and not tolerances:
         raise click.UsageError("give --find or --tolerance, or both")
     shares, uniform = tolerances, drawn["distribution"] == "uniform"
-    searchable = shares and uniform and not scene.parts_beyond and all(name in _BOX for name in shares)
+    searchable = shares and uniform and not scene.nonrigid_parts and all(name in _BOX for name in shares)
     # Exclude this combination, because the search assumes independent intervals of period and delay, but a delay in
     # periods varies with the period.
     searchable = searchable and not ("period" in shares and scene.timing.in_periods)
@@ -135,7 +135,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         result["rate"] = needed.value if path == "rate" else 1.0 / needed.value
     low, high = (with_unit(end, unit) for end in needed.range)
     goal = f"for K_max = {format_stiffness(wanted, units)}"
-    kept = f" (the delay stays {scene.timing.kept_delay})" if path in ("period", "rate") and scene.timing.delay else ""
+    kept = f" (the delay stays {scene.timing.delay_text})" if path in ("period", "rate") and scene.timing.delay else ""
     if needed.status == Status.UNREACHABLE:
         best = _find_best(scene, path, needed.range)
         result["best"] = best

@@ -192,7 +192,7 @@ def recommendation(
             min(max(MIN_PERIODS, 1.5 * (recommended["decay_time"] or 0.0) / scene.timing.period), MAX_PERIODS)
         )
         columns = _tabulate_step(scene, K, B, periods)
-        if not scene.parts_beyond:
+        if not scene.nonrigid_parts:
             wall = verdict.alpha, verdict.beta, float(scene.delta), float(scene.d)
             columns["settling_time_s"] = settling_time(*wall) * scene.timing.period
         response = stack([columns])

@@ -34,7 +34,7 @@ def test_no_other_damping_settles_faster(case):
 def test_no_other_damping_is_more_robust(case):
     scene, stiffness, trials = case
     best = scene.best_damping(stiffness, goal="robust")
-    some = trials[:: 400 if scene.parts_beyond else 10]
+    some = trials[:: 400 if scene.nonrigid_parts else 10]
     margin = scene.margins(stiffness, some).modulus_margin
     assert best.modulus_margin >= margin.max() - 1e-12
     assert scene.margins(stiffness, best.virtual_damping).modulus_margin == pytest.approx(best.modulus_margin, rel=1e-9)

@@ -60,14 +60,14 @@ def test_only_what_the_scene_has():
 def test_a_filter_that_cannot_be_twice_as_fast_is_left_out(velocity):
     scene = RIGID.replace(velocity=velocity)
     (limit,) = [limit for limit in limits_of(scene) if limit.name == "velocity"]
-    assert limit.words == "no velocity filter"
+    assert limit.label == "no velocity filter"
     assert limit.stiffness == RIGID.max_stiffness().stiffness
 
 
 def test_a_window_keeps_its_length_in_seconds():
     scene = RIGID.replace(velocity=WindowedDifference(15, coded_period=2e-3))
     found = {limit.name: limit for limit in limits_of(scene)}
-    assert (found["period"].words, found["period"].note) == ("twice the rate", "the delay stays 1.000 ms")
+    assert (found["period"].label, found["period"].note) == ("twice the rate", "the delay stays 1.000 ms")
     same = scene.replace(period=0.5e-3, velocity=WindowedDifference(30, coded_period=1e-3))
     assert found["period"].stiffness == pytest.approx(same.max_stiffness().stiffness, rel=1e-12)
     half = scene.replace(velocity=WindowedDifference(8, coded_period=2e-3))
@@ -79,7 +79,7 @@ def test_amplifier_and_structure():
     scene = Scene(device, Timing(1e-3))
     found = {limit.name: limit for limit in limits_of(scene)}
     faster = scene.replace(**{"actuator.cutoff": 600.0})
-    assert found["actuator"].words == "an amplifier twice as fast"
+    assert found["actuator"].label == "an amplifier twice as fast"
     assert found["actuator"].stiffness == pytest.approx(faster.max_stiffness().stiffness, rel=1e-12)
     stiffer = scene.replace(**{"modes.0.frequency": 200.0 * np.sqrt(2.0)})
     assert found["modes"].stiffness == pytest.approx(stiffer.max_stiffness().stiffness, rel=1e-12)

@@ -8,7 +8,7 @@ import pytest
 
 import zwidth
 from zwidth.analysis.cautions import find_thin
-from zwidth.analysis.wall_search import Wanted
+from zwidth.analysis.wall_search import Requirements
 from zwidth.core.status import Status
 
 TIMING = zwidth.Timing(1e-3, 1e-3)
@@ -80,7 +80,7 @@ def test_a_gain_margin_alone_is_that_share_of_the_stiffest_wall():
 def test_a_share_alone_has_the_damping_of_the_stiffest_wall():
     found, top = RIGID.recommend(stiffness_fraction=0.75), RIGID.max_stiffness()
     assert (found.stiffness, found.virtual_damping) == (0.75 * top.stiffness, top.virtual_damping)
-    assert found.wanted == Wanted(0.75)
+    assert found.requirements == Requirements(0.75)
     assert found.limited_by == "stiffness_fraction"
     assert found.verdict == zwidth.assess(
         RIGID.replace(stiffness=found.stiffness, virtual_damping=found.virtual_damping)
@@ -164,10 +164,10 @@ def test_a_wall_next_to_a_corner_is_stable_as_it_is_printed(share):
 
 def test_steps_of_a_share_are_those_of_limits_that_help():
     found = ISLANDS.recommend(stiffness_fraction=0.5)
-    steps = [(step.name, pytest.approx(step.gain, rel=1e-6)) for step in found.steps]
+    steps = [(step.name, pytest.approx(step.gain, rel=1e-6)) for step in found.improvements]
     assert steps == [(limit.name, limit.gain) for limit in zwidth.limits_of(ISLANDS) if limit.gain > 1]
     assert "island of stable walls" in found.notes[0]
-    assert not any("64" in step.words for step in found.steps)
+    assert not any("64" in step.label for step in found.improvements)
 
 
 @pytest.mark.parametrize(
@@ -207,13 +207,13 @@ def test_steps_are_those_of_the_wall_recommended_again(scene, wanted):
         "period": {"rate": 2 / scene.timing.period},
         "velocity": {"velocity": zwidth.LowPass(cutoff=200.0)},
     }
-    assert found.steps
-    for step in found.steps:
+    assert found.improvements
+    for step in found.improvements:
         if step.name in changed:
             again = scene.replace(**changed[step.name]).recommend(**wanted)
             assert step.gain == pytest.approx(again.stiffness / found.stiffness, rel=5e-3)
             assert step.stiffness == pytest.approx(again.stiffness, rel=5e-3)
-    gains = {step.name: step.gain for step in found.steps}
+    gains = {step.name: step.gain for step in found.improvements}
     if scene.timing.in_periods:
         assert "period_and_delay" not in gains
     elif not wanted.get("passive"):
@@ -223,7 +223,7 @@ def test_steps_are_those_of_the_wall_recommended_again(scene, wanted):
 
 def test_steps_of_a_passive_wall_of_the_readme_device():
     """K_max gains 1.72 by half the delay and 1.03 by a tenth more damping; the passive wall 1.42 and 1.10."""
-    gains = {step.name: step.gain for step in RIGID.recommend(passive=True).steps}
+    gains = {step.name: step.gain for step in RIGID.recommend(passive=True).improvements}
     assert gains["delay"] == pytest.approx(1.42, abs=0.01)
     assert gains["damping"] == pytest.approx(1.10, abs=0.005)
     assert gains["period"] == pytest.approx(1.29, abs=0.01)
@@ -232,7 +232,7 @@ def test_steps_of_a_passive_wall_of_the_readme_device():
 def test_the_default_asks_for_margins():
     for scene in (RIGID, FILTERED, KNOB):
         found = scene.recommend()
-        assert found.wanted == Wanted(0.75, 2.0, 30.0, grasps="soft")
+        assert found.requirements == Requirements(0.75, 2.0, 30.0, grasps="soft")
         margins = scene.margins(found.stiffness, found.virtual_damping)
         assert margins.phase_margin >= 30
         assert margins.gain_margin >= 2
@@ -241,7 +241,7 @@ def test_the_default_asks_for_margins():
         assert not find_thin(found.verdict, scene.timing.period)
         assert all(stable for name, stable in found.grasps.items() if name.startswith("soft"))
     # Any requirement replaces the defaults.
-    assert RIGID.recommend(phase_margin=20).wanted == Wanted(None, None, 20)
+    assert RIGID.recommend(phase_margin=20).requirements == Requirements(None, None, 20)
 
 
 def test_a_wall_on_the_brink_carries_a_caution_with_a_remedy_that_holds():
@@ -282,7 +282,7 @@ def test_grasps_that_destabilize_a_wall_are_named_with_a_wall_that_none_destabil
     assert all_grasps.limited_by == "grasps"
     assert all(all_grasps.grasps.values())
     assert all_grasps.stiffness == pytest.approx(float(K.split()[0]) * 1e3, rel=2e-3)
-    assert scene.recommend(grasps="none").wanted == Wanted(0.75, 2.0, 30.0)
+    assert scene.recommend(grasps="none").requirements == Requirements(0.75, 2.0, 30.0)
 
 
 def test_grasps_need_a_device_with_a_mass():

@@ -71,10 +71,10 @@ def test_no_device_that_another_search_finds_is_weaker(seed):
     box = random_box(np.random.default_rng(100 + seed))
     worst, wall = robust_max_stiffness(**box), robust_wall(**box)
     assert worst.status == Status.OK, box
-    assert worst.attained * (1 - 2e-6) < worst.stiffness < worst.attained
+    assert worst.stiffness_max * (1 - 2e-6) < worst.stiffness < worst.stiffness_max
     assert search(box, lambda devices: max_stiffness(**devices), seed) >= worst.stiffness
     assert wall.status == Status.OK, box
-    assert wall.limit * (1 - 2e-6) < wall.stiffness < wall.limit <= worst.attained * (1 + 1e-9)
+    assert wall.limit * (1 - 2e-6) < wall.stiffness < wall.limit <= worst.stiffness_max * (1 + 1e-9)
     assert search(box, row_end(wall), seed) > 1.0
 
 
@@ -120,7 +120,7 @@ def test_a_worst_case_inside():
     worst = robust_max_stiffness(**box)
     fine = max_stiffness(mass=np.linspace(0.01, 1.0, 20_001), damping=100.0, period=1e-3, delay=2e-3)
     assert not worst.is_vertex
-    assert worst.attained == pytest.approx(fine.min(), rel=1e-8)
+    assert worst.stiffness_max == pytest.approx(fine.min(), rel=1e-8)
     assert 0.01 < worst.mass < 1.0
 
 
@@ -129,8 +129,8 @@ def test_a_dip_over_the_period_at_strong_damping():
     worst = robust_max_stiffness(
         mass=1.0, damping=2590418.159202655, period=Interval(2e-3 / 3, 1e-3), delay=0.003575165172380617
     )
-    assert worst.attained == pytest.approx(1069478082.5, rel=1e-9)
-    assert worst.stiffness == pytest.approx(worst.attained, rel=2e-6)
+    assert worst.stiffness_max == pytest.approx(1069478082.5, rel=1e-9)
+    assert worst.stiffness == pytest.approx(worst.stiffness_max, rel=2e-6)
     assert not worst.is_vertex
 
 
@@ -178,7 +178,7 @@ def test_undamped_devices_without_delay_have_a_closed_form():
     found, wall = robust_max_stiffness(**box), robust_wall(**box)
     expected = (12 - 8 * np.sqrt(2)) * 0.08 / 1e-3**2
     assert found.status == wall.status == Status.OK
-    assert found.attained == pytest.approx(expected, rel=1e-12)
+    assert found.stiffness_max == pytest.approx(expected, rel=1e-12)
     assert expected * (1 - 2e-6) <= found.stiffness <= expected
     assert wall.stiffness <= found.stiffness * (1 + 1e-12)
     assert (found.mass, found.damping, found.period, found.delay) == (0.08, 0.0, 1e-3, 0.0)

@@ -94,7 +94,10 @@ def test_tolerances_count_walls_of_the_stable_region():
 
 
 def test_no_grasps_are_required_of_a_device_without_a_mass():
-    assert zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 50"), zwidth.Timing(1e-3)).recommend().wanted.grasps == "none"
+    assert (
+        zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 50"), zwidth.Timing(1e-3)).recommend().requirements.grasps
+        == "none"
+    )
     result = CliRunner().invoke(cli, ["recommend", *PENDULUM])
     assert "(not checked in the reference grasps)" in " ".join(result.stdout.split())
 

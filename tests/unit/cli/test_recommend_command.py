@@ -51,7 +51,7 @@ def test_a_wall_stable_in_every_grasp():
     assert "limited by stability in all six reference grasps" in text
     assert "in a hand stable in all six reference grasps" in text
     printed = json.loads(recommend("--stiffness-fraction", "95%", "--grasps", "all", "--json").stdout)
-    assert printed["wanted"]["grasps"] == "all"
+    assert printed["requirements"]["grasps"] == "all"
     assert printed["recommended"]["limited_by"] == "grasps"
     assert all(printed["grasps"].values())
     assert "Virtual wall: K = 15." in recommend("--stiffness-fraction", "95%", "--grasps", "all", "--code", "c").stdout

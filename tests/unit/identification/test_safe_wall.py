@@ -76,7 +76,7 @@ def test_devices_beyond_all_bounds_bear_nothing(fit, velocity):
 def test_another_route_to_the_same_wall(fit, monkeypatch):
     # A window of one sample is the backward difference, of which this scene does not know the closed form.
     alike = replace(fit, nominal=replace(fit.nominal, velocity=zwidth.WindowedDifference(samples=1)))
-    assert alike.nominal.parts_beyond
+    assert alike.nominal.nonrigid_parts
     monkeypatch.setattr("zwidth.identification.safe_wall._SAMPLES", 1000)
     wall, same = alike.safe_wall(), replace(fit).safe_wall()
     assert wall.stiffness == pytest.approx(same.stiffness, rel=5e-3)

@@ -96,7 +96,7 @@ def test_recommendations_stay_within_the_limit(wanted):
     free = SCENE.recommend(**wanted, beyond_safe=True)
     assert free.stiffness > 2 * found.stiffness or wanted == {"passive": True}
     assert free.stiffness == pytest.approx(SCENE.replace(safe_limit=None).recommend(**wanted).stiffness, rel=1e-12)
-    assert found.steps == []
+    assert found.improvements == []
     assert "limited by" in found.lines()[0]
     assert "safe limit" in found.lines()[0]
 

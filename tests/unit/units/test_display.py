@@ -150,7 +150,14 @@ def test_a_line_of_nothing_is_no_picture():
 
 
 def test_modules_show_their_own_names():
-    assert dir(zwidth.devices) == ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_device"]
+    assert dir(zwidth.devices) == [
+        "DEVICES",
+        "HAND",
+        "PublishedDevice",
+        "PublishedHand",
+        "PublishedValue",
+        "find_device",
+    ]
 
 
 def test_an_array_says_why_it_has_nan_and_a_zero_has_no_sign():
