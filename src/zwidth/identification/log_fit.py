@@ -128,9 +128,9 @@ def fit_log(
         >>> import numpy as np
         >>> import zwidth
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 2), zwidth.Timing(period=1e-3))
-        >>> push = np.where(np.arange(400) % 60 < 30, 1.0, -1.0)
-        >>> motion = zwidth.simulate(scene, 0.0, 0.0, push_history=push, periods=400)
-        >>> fit = zwidth.fit_log(1e-3, motion.position[:400], push)
+        >>> force = np.where(np.arange(400) % 60 < 30, 1.0, -1.0)
+        >>> motion = zwidth.simulate(scene, 0.0, 0.0, external_force_history=force, periods=400)
+        >>> fit = zwidth.fit_log(1e-3, motion.position[:400], force)
         >>> print(f"{fit.mass * 1e3:.1f} g, {fit.damping:.2f} N s/m")
         100.0 g, 2.00 N s/m
     """

@@ -121,7 +121,7 @@ def respond(
         >>> import zwidth
         >>> record = zwidth.excite(period=1e-3, force=2.0, resolution=1e-5, duration=15)
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 5), zwidth.Timing(period=1e-3))
-        >>> motion = zwidth.simulate(scene, 0.0, 0.0, push_history=record.force, periods=record.force.size)
+        >>> motion = zwidth.simulate(scene, 0.0, 0.0, external_force_history=record.force, periods=record.force.size)
         >>> estimate = zwidth.respond(1e-3, motion.position[: record.force.size], record.force)
         >>> f"{estimate.device.frequency.size} lines from {estimate.records} stretches"
         '409 lines from 5 stretches'

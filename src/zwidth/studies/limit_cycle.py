@@ -34,7 +34,7 @@ from zwidth.units.formatting import format_short, header, with_unit
 from zwidth.units.quantities import POSITIVE
 
 _COLUMNS = {parameter.name: column for column, parameter in AXES.items()}
-_OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
+_OUTPUTS = ("amplitude", "frequency", "wall_work_max", "outcome", "status")
 _MAX_CURVES = 6  # largest number of values of a list that are drawn as curves; a longer list is drawn as a plane
 # Default of the largest amplitude that counts as a limit cycle: in m for linear devices (key False), in rad for rotary
 # devices (key True).

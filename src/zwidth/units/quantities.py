@@ -254,7 +254,7 @@ _OF_MOTIONS = (
         note="the surface of the wall is at 0, and positions inside the wall are positive",
     ),
     Parameter("start_velocity", "initial velocity", "v_0", ANY, "m/s"),
-    Parameter("push", "constant external force on the device", "F", ANY, "N"),
+    Parameter("external_force", "constant external force on the device", "F", ANY, "N"),
     Parameter(
         "resolution", "resolution of the encoder, one count", r"\Delta", NOT_NEGATIVE, "m",
         short_name="resolution of the encoder",

@@ -47,7 +47,7 @@ def motions():
     """Pushed into the wall from in front of it, to fall out of it again and come back."""
     push = 3.0 * np.sin(np.arange(PERIODS) / 20.0) + 1.0
     scenes = [scene_with(velocity) for velocity in ESTIMATES.values()]
-    options = {"periods": PERIODS, "start_position": -1e-3, "push_history": push, "contact": "unilateral"}
+    options = {"periods": PERIODS, "start_position": -1e-3, "external_force_history": push, "contact": "unilateral"}
     found = zwidth.simulate(scenes, **options)
     return {name: (found.measured[k], found.command[k]) for k, name in enumerate(ESTIMATES)}
 

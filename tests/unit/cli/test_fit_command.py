@@ -29,7 +29,7 @@ def run(*arguments, code=0):
 def log(tmp_path_factory):
     force = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], 24), 25)
     scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=1e-3))
-    position = zwidth.simulate(scene, 0.0, 0.0, push_history=force, periods=600).position[:600]
+    position = zwidth.simulate(scene, 0.0, 0.0, external_force_history=force, periods=600).position[:600]
     file = tmp_path_factory.mktemp("log") / "log.csv"
     rows = [f"{k},{1e3 * x!r},{f!r}" for k, (x, f) in enumerate(zip(position.tolist(), force.tolist(), strict=True))]
     file.write_text("\n".join(["t,x,f", *rows]), encoding="utf-8")

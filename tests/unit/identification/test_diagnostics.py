@@ -28,7 +28,9 @@ def logged():
     rng = np.random.default_rng(1)
     scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=1e-3))
     force = np.repeat(rng.choice([-1.0, 1.0], (2, 40)), 20, axis=1)
-    places = [zwidth.simulate(scene, 0.0, 0.0, push_history=push, periods=800).position[:800] for push in force]
+    places = [
+        zwidth.simulate(scene, 0.0, 0.0, external_force_history=push, periods=800).position[:800] for push in force
+    ]
     noisy = [place + 1e-5 * rng.standard_normal(800) for place in places]
     return zwidth.fit_log([1e-3, 1e-3], noisy, list(force))
 

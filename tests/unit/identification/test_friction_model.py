@@ -26,7 +26,7 @@ def test_a_mass_moves_as_in_the_time_domain(friction, delay, damping):
     fine = np.concatenate([np.zeros(late), np.repeat(force, FINER)])[: FINER * force.size]
     scene = zwidth.Scene(zwidth.Device(mass, damping), zwidth.Timing(period=PERIOD / FINER))
     rub = {"coulomb": friction} if friction else {}
-    motion = zwidth.simulate(scene, 0.0, 0.0, push_history=fine, periods=fine.size, **rub)
+    motion = zwidth.simulate(scene, 0.0, 0.0, external_force_history=fine, periods=fine.size, **rub)
     exact = motion.position[: fine.size : FINER]
     speed = float(motion.velocity[SKIP * FINER]) * PERIOD
     g = PERIOD**2 / mass

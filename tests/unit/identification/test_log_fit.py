@@ -82,7 +82,7 @@ def test_a_simulated_motion_gives_its_device_back():
     scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=PERIOD))
     force = steps_to_and_fro(np.random.default_rng(4), 500)
     late = np.concatenate([np.zeros(3), force[:-3]])
-    motion = zwidth.simulate(scene, 0.0, 0.0, push_history=late, periods=500)
+    motion = zwidth.simulate(scene, 0.0, 0.0, external_force_history=late, periods=500)
     fit = zwidth.fit_log(PERIOD, motion.position[:500], force)
     np.testing.assert_allclose([fit.mass, fit.damping, fit.delay / PERIOD], [0.1, 2.0, 3.0], rtol=EXACT)
 
@@ -156,7 +156,7 @@ def test_units_of_a_rotary_axis_cause_warnings(inertia, scale, unit):
 def test_friction_comes_back_from_a_simulated_motion(delay):
     force = 2.0 * steps_to_and_fro(np.random.default_rng(11), 600, 40)
     scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=PERIOD, delay=delay))
-    rubbed = zwidth.simulate(scene, 0.0, 0.0, push_history=force, coulomb=0.3, periods=600).position[:600]
+    rubbed = zwidth.simulate(scene, 0.0, 0.0, external_force_history=force, coulomb=0.3, periods=600).position[:600]
     fit = zwidth.fit_log(PERIOD, rubbed, force)
     # A push acts at once: the loop's delay is of the wall's force.
     np.testing.assert_allclose([fit.mass, fit.damping, fit.friction], [0.1, 2.0, 0.3], rtol=EXACT)
@@ -243,7 +243,7 @@ def push_once(coulomb, samples=1500):
     force = np.zeros(samples)
     force[50:90] = 1.0
     scene = zwidth.Scene(zwidth.Device(0.1, 0.5), zwidth.Timing(period=PERIOD))
-    return zwidth.simulate(scene, 0.0, 0.0, push_history=force, coulomb=coulomb, periods=samples).position[
+    return zwidth.simulate(scene, 0.0, 0.0, external_force_history=force, coulomb=coulomb, periods=samples).position[
         :samples
     ], force
 

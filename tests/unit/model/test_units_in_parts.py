@@ -83,7 +83,7 @@ QUESTIONS = {
     "frequency_response": (lambda *at: SCENE.frequency_response(*at), (10e3, 40, "0.1 kHz"), (10e3, 40, 100)),
     "state_space": (lambda *wall: SCENE.state_space(*wall).A, ("10 kN/m", 40), (10e3, 40)),
     "simulate": (
-        lambda K, x, push: SCENE.simulate(K, 40, start_position=x, push=push, periods=3).position,
+        lambda K, x, push: SCENE.simulate(K, 40, start_position=x, external_force=push, periods=3).position,
         ("10 kN/m", "0.1 mm", ["1 N", "2 N"]),
         (10e3, 1e-4, [1, 2]),
     ),

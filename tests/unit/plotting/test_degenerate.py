@@ -56,7 +56,7 @@ def test_colors_and_contours_of_numbers_close_together_are_named_in_plain_number
 
 def test_a_motion_that_is_over_at_once_has_an_axis_of_time(recwarn):
     columns = ("time_s", "position_m", "velocity_m_per_s", "wall_force_N", "contact")
-    energies = [f"{name}_J" for name in ("wall_work", "push_work", "damping_loss", "friction_loss", "energy")]
+    energies = [f"{name}_J" for name in ("wall_work", "external_work", "damping_loss", "friction_loss", "energy")]
     table = {"label": np.array(["still"]), **{name: np.zeros(1) for name in (*columns, *energies)}}
     for draw in (plotting.draw_motion, plotting.draw_energy):
         assert draw(table)[0].get_xlim() == (0.0, 1.0)

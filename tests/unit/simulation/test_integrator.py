@@ -138,7 +138,7 @@ def test_block_on_friction_stops_and_sticks():
     assert got.velocity[got.time > stop].tolist() == [[0.0]] * int((got.time > stop).sum())
 
 
-@pytest.mark.parametrize("push", [0.69, -0.71, 0.71])
+@pytest.mark.parametrize("external_force", [0.69, -0.71, 0.71])
 def test_block_at_rest_leaves_beyond_static_friction(push):
     scene = zwidth.Scene(zwidth.Device(mass=0.3), zwidth.Timing(1e-3))
     got = integrate(scene, 0.0, 0.0, 50, push=push, coulomb=0.5, static=0.7)

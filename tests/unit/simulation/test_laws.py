@@ -200,8 +200,8 @@ def test_a_recorded_hand_moves_the_end_of_its_spring():
         found = scene.simulate(0.0, **given)
         exact = scipy.integrate.solve_ivp(newton, (0, span), [0.0, 0.0], t_eval=times[:-1], rtol=1e-10, atol=1e-13)
         errors.append(np.abs(found.position - exact.y[0]).max() / np.abs(exact.y[0]).max())
-        both = scene.simulate(0.0, push_history=np.full(periods, 0.7), **given)
-        apart = scene.simulate(0.0, push=0.7, periods=periods)
+        both = scene.simulate(0.0, external_force_history=np.full(periods, 0.7), **given)
+        apart = scene.simulate(0.0, external_force=0.7, periods=periods)
         np.testing.assert_allclose(both.position, found.position + apart.position, atol=1e-15)
     # A force held at its mean is wrong by the square of the period.
     assert errors[1] < 1e-4
@@ -212,7 +212,11 @@ def test_contact_of_a_law_means_force():
     """A force of 5 N where the position is at most 0, as in ros_falcon: contact begins and ends."""
     scene = zwidth.Scene(zwidth.Device(0.1, 0.5), zwidth.Timing(1e-3, 1e-3))
     found = zwidth.simulate(
-        scene, force=lambda x, v, t: jnp.where(x <= 0, 5.0, 0.0), start_position=0.01, start_velocity=-0.1, push=-1.0
+        scene,
+        force=lambda x, v, t: jnp.where(x <= 0, 5.0, 0.0),
+        start_position=0.01,
+        start_velocity=-0.1,
+        external_force=-1.0,
     )
     assert found.position is not None
     np.testing.assert_array_equal(found.contact, found.measured <= 0)

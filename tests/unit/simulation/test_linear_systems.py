@@ -30,7 +30,13 @@ HAND = np.repeat(np.random.default_rng(1).normal(0.0, 0.5, 60), 10)
 )
 @pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=100), zwidth.FOAW(1e-6)])
 def test_motions_are_those_of_the_bodies(circumstances, velocity):
-    options = {"periods": HAND.size, "substeps": SUBSTEPS, "push": 0.3, "push_history": HAND, **circumstances}
+    options = {
+        "periods": HAND.size,
+        "substeps": SUBSTEPS,
+        "external_force": 0.3,
+        "external_force_history": HAND,
+        **circumstances,
+    }
     known, found = (
         zwidth.Scene(device, TIMING, velocity=velocity).simulate(4e3, 10.0, **options) for device in (BODIES, SYSTEM)
     )
@@ -44,20 +50,22 @@ def test_motions_are_those_of_the_bodies(circumstances, velocity):
 
 @pytest.mark.parametrize("stiffness", [4e3, 40e3])
 def test_the_end_is_that_of_the_poles(stiffness):
-    motion = zwidth.Scene(SYSTEM, TIMING).simulate(stiffness, 10.0, push=0.3, substeps=SUBSTEPS)
+    motion = zwidth.Scene(SYSTEM, TIMING).simulate(stiffness, 10.0, external_force=0.3, substeps=SUBSTEPS)
     stable = zwidth.Scene(SYSTEM, TIMING).is_stable(stiffness, 10.0)
     ends = zwidth.MotionKind.REST, zwidth.MotionKind.DECAYING
     assert (zwidth.MotionKind(int(motion.outcome)) in ends) == stable
-    touched = zwidth.Scene(SYSTEM, TIMING).simulate(4e3, 10.0, push=0.3, contact="unilateral", substeps=SUBSTEPS)
+    touched = zwidth.Scene(SYSTEM, TIMING).simulate(
+        4e3, 10.0, external_force=0.3, contact="unilateral", substeps=SUBSTEPS
+    )
     assert touched.outcome == zwidth.MotionKind.REST
 
 
 def test_a_batch_may_hold_several_systems_and_bodies():
     slower = zwidth.LinearDevice(([1.0], [0.2, 3.0, 0.0]))
     scenes = [zwidth.Scene(device, TIMING) for device in (SYSTEM, slower, BODIES)]
-    together = zwidth.simulate(scenes, 3e3, 10.0, push=0.3, periods=50, substeps=SUBSTEPS)
+    together = zwidth.simulate(scenes, 3e3, 10.0, external_force=0.3, periods=50, substeps=SUBSTEPS)
     for k, scene in enumerate(scenes):
-        alone = scene.simulate(3e3, 10.0, push=0.3, periods=50, substeps=SUBSTEPS)
+        alone = scene.simulate(3e3, 10.0, external_force=0.3, periods=50, substeps=SUBSTEPS)
         np.testing.assert_array_equal(together.position[k], alone.position)
 
 
@@ -74,7 +82,7 @@ def test_a_step_is_that_of_the_state_space(system):
     scene = zwidth.Scene(zwidth.LinearDevice(system), TIMING)
     wall = 0.02 * scene.units.stiffness, 0.1 * scene.units.virtual_damping
     known = scene.state_space(*wall).step(300)
-    moved = scene.simulate(*wall, push=1.0, periods=300)
+    moved = scene.simulate(*wall, external_force=1.0, periods=300)
     np.testing.assert_allclose(moved.position, known, rtol=0, atol=1e-9 * np.abs(known).max())
     grows = zwidth.MotionKind.GROWING, zwidth.MotionKind.DIVERGED
     assert (zwidth.MotionKind(int(moved.outcome)) in grows) == (not scene.is_stable(*wall))
@@ -98,7 +106,7 @@ def test_what_needs_a_body_is_refused(options, field):
 
 def test_what_moves_at_once_or_between_unknown_samples_is_refused():
     with pytest.raises(zwidth.InputError, match="velocity jumps with the force"):
-        zwidth.Scene(zwidth.LinearDevice(([1.0], [3.0, 0.0])), TIMING).simulate(100.0, 0.0, push=1.0)
+        zwidth.Scene(zwidth.LinearDevice(([1.0], [3.0, 0.0])), TIMING).simulate(100.0, 0.0, external_force=1.0)
     device = zwidth.LinearDevice(scipy.signal.dlti([4e-6, 4e-6], [1.0, -1.9, 0.9], dt=1e-3))
     with pytest.raises(zwidth.InputError, match="discrete-time system"):
-        zwidth.Scene(device, zwidth.Timing(1e-3)).simulate(100.0, 0.0, push=1.0)
+        zwidth.Scene(device, zwidth.Timing(1e-3)).simulate(100.0, 0.0, external_force=1.0)

@@ -37,7 +37,7 @@ def test_an_undamped_swing_is_steady():
 def test_a_decay_below_a_step_of_the_encoder_is_not_steady():
     hand = zwidth.Operator(mass=0.01, damping=0.05, stiffness=100.0)
     scene = zwidth.Scene(zwidth.Device(0.1, 0.05), TIMING, operator=hand)
-    found = scene.simulate(1e3, 0.0, resolution=1e-4, push=-0.001, periods=2000)
+    found = scene.simulate(1e3, 0.0, resolution=1e-4, external_force=-0.001, periods=2000)
     assert MotionKind(found.outcome) in (MotionKind.DECAYING, MotionKind.UNCLEAR)
 
 
@@ -146,8 +146,12 @@ def test_a_dataset_has_one_time_where_all_share_it_and_else_instants():
         (SCENE, {"seed": [[1], [2, 3]]}, "seed: got"),
         (SCENE, {"stiffness": np.ones(0)}, "use at least one simulation"),
         ([], {}, "use at least one simulation"),
-        (SCENE, {"push_history": np.zeros((3, 10)), "stiffness": [1.0, 2.0]}, "push_history"),
-        (SCENE, {"push_history": [0.0] * 9 + [np.nan]}, "push_history: got a value that is not finite"),
+        (SCENE, {"external_force_history": np.zeros((3, 10)), "stiffness": [1.0, 2.0]}, "external_force_history"),
+        (
+            SCENE,
+            {"external_force_history": [0.0] * 9 + [np.nan]},
+            "external_force_history: got a value that is not finite",
+        ),
     ],
 )
 def test_what_cannot_be_simulated_is_named(scenes, options, words):
@@ -158,7 +162,7 @@ def test_what_cannot_be_simulated_is_named(scenes, options, words):
 def test_a_gap_in_one_history_spoils_no_other():
     pushes = np.ones((3, 20))
     pushes[1, 5] = np.nan
-    found = SCENE.simulate(1e3, 5.0, push_history=pushes, periods=20)
+    found = SCENE.simulate(1e3, 5.0, external_force_history=pushes, periods=20)
     assert found.status.tolist() == [Status.OK, Status.INVALID_INPUT, Status.OK]
     assert np.isnan(found.position[1]).all()
     close = SIMULATED_AGAIN.float64 * np.abs(found.position[0]).max()

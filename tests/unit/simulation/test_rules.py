@@ -89,11 +89,11 @@ def test_energy_is_kept_with_every_part_and_without(kind, rough):
         substeps=2,
         start_position=1e-3,
         start_velocity=rng.uniform(-1, 1, 6) * 1e-4 / period,
-        push=rng.uniform(-0.01, 0.01, 6) * force,
-        push_history=rng.normal(size=(6, 80)) * force[:, None] * 0.01,
+        external_force=rng.uniform(-0.01, 0.01, 6) * force,
+        external_force_history=rng.normal(size=(6, 80)) * force[:, None] * 0.01,
         **options,
     )
-    flows = [motion.energy, -motion.wall_work, -motion.push_work, motion.damping_loss, motion.friction_loss]
+    flows = [motion.energy, -motion.wall_work, -motion.external_work, motion.damping_loss, motion.friction_loss]
     balance = np.sum(flows, axis=0)
     drift = np.abs(balance - balance[:, :1]).max(1)
     assert np.all(drift <= ENERGY_KEPT.float64 * np.abs(flows).max((0, 2)))
@@ -137,7 +137,7 @@ def test_a_damped_sliding_mass_stops_where_the_closed_form_says():
 
 def test_a_mass_at_rest_stays_until_the_push_exceeds_static_friction():
     ramp = np.linspace(0.0, 2.0, 101)[1:]
-    motion = slide_free(FREE, push_history=np.stack([ramp, -ramp] * 2), coulomb=0.5, static=1.01)
+    motion = slide_free(FREE, external_force_history=np.stack([ramp, -ramp] * 2), coulomb=0.5, static=1.01)
     first = int(np.argmax(ramp > 1.01))
     # At the instant at which the push grows the mass is still held.
     held = np.arange(300) <= 3 * first

@@ -48,7 +48,7 @@ def test_the_arrays_are_those_of_the_simulation(plane):
     assert (K[0, 0], K[-1, 0], B[0], B[-1]) == (1e3, 25e3, -5.0, 100.0)
     for k, resolution in enumerate((0.0, 2e-5)):
         expected = zwidth.simulate(SCENE, K, B, start_position=1e-4, periods=400, record=False, resolution=resolution)
-        names = {"amplitude": "_m", "frequency": "_Hz", "energy_given": "_J", "outcome": "", "status": ""}
+        names = {"amplitude": "_m", "frequency": "_Hz", "wall_work_max": "_J", "outcome": "", "status": ""}
         for name, unit in names.items():
             np.testing.assert_array_equal(arrays[name + unit][k], getattr(expected, name))
         np.testing.assert_array_equal(arrays["linearly_stable"][k], SCENE.is_stable(K, B))
