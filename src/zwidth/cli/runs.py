@@ -231,6 +231,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option(
     "--at",
+    "selection",
     multiple=True,
     type=_SLICE,
     callback=read_pairs,
@@ -245,7 +246,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
 @json_option
-def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, **drawing: Any) -> None:
+def figures(folder: Path, selection: dict[str, str], out: Path | None, as_json: bool, **drawing: Any) -> None:
     """Draw the sweeps in DIR, as PNG and SVG.
 
     The figures show stable and passive walls with their boundaries, contours of margins and decay times, and the
@@ -256,7 +257,7 @@ def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, *
 
     callbacks: dict[str, Any] = {"note": lambda text: click.echo(f"zwidth: {text}", err=True)}
     callbacks |= {} if as_json else {"progress": lambda file: click.echo(f"wrote {file}")}
-    files = draw_stores(folder, out, at=at, **drawing, **callbacks)
+    files = draw_stores(folder, out, selection=selection, **drawing, **callbacks)
     if as_json:
         print_json({"files": [str(file) for file in files]})
     if not files:

@@ -150,16 +150,16 @@ def _trace_passive(scene: Scene, label: str = "") -> dict[str, Any]:
 
 @_with_house_style
 def recommendation(
-    found: Recommendation, axes: style.AnyAxes | None = None, *, response: Table | None = None
+    recommendation: Recommendation, axes: style.AnyAxes | None = None, *, response: Table | None = None
 ) -> np.ndarray:
     """Draw a recommended wall among the stable ones, and its response to a step of 1 N.
 
     Args:
-        found: Result of `zwidth.Scene.recommend`; if it has no wall, only the stable walls are drawn.
+        recommendation: Result of `zwidth.Scene.recommend`; if it has no wall, only the stable walls are drawn.
         axes: An existing Axes for the walls only, or two. Default: a pyplot figure.
         response: Columns of a step study of this wall, in SI units. Default: computed at the samples.
     """
-    scene, verdict, recommended = found.scene, found.verdict, found.as_dict()["recommended"]
+    scene, verdict, recommended = recommendation.scene, recommendation.verdict, recommendation.as_dict()["recommended"]
     # Leave out the response of a measured device, because no model exists from which it could be computed.
     has_model = not isinstance(scene.device, MeasuredDevice)
     if axes is None:
@@ -174,7 +174,7 @@ def recommendation(
         outlines = stack([outlines, _trace_passive(scene)])
     if verdict is None:
         return draw_stable_set(outlines, walls, panels[:1])
-    K, B = found.stiffness, found.virtual_damping
+    K, B = recommendation.stiffness, recommendation.virtual_damping
     row = {
         "label": "",
         "wall": f"recommended ({100 * recommended['stiffness_fraction']:.3g} %)",
@@ -405,23 +405,23 @@ def poles(
 
 
 @_with_house_style
-def motion(found: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
+def motion(motion: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
     """Draw the position of one or several simulated motions over time.
 
     Args:
-        found: Result of `zwidth.simulate` with recorded positions.
+        motion: Result of `zwidth.simulate` with recorded positions.
         ax: An existing Axes. Default: pyplot's current one.
         labels: Names of several motions, in their order.
     """
-    if not hasattr(found, "wall_force"):
-        raise InputError(f"found: got {type(found).__name__}; pass the result of zwidth.simulate")
-    if found.position is None or found.time is None:
-        raise InputError("found: got a motion that was not recorded; simulate with record=True")
-    rows = found.position.reshape(-1, found.position.shape[-1])
+    if not hasattr(motion, "wall_force"):
+        raise InputError(f"motion: got {type(motion).__name__}; pass the result of zwidth.simulate")
+    if motion.position is None or motion.time is None:
+        raise InputError("motion: got a motion that was not recorded; simulate with record=True")
+    rows = motion.position.reshape(-1, motion.position.shape[-1])
     if labels and len(labels) != len(rows):
         raise InputError(f"labels: got {len(labels)} for {len(rows)} motions; pass one for each")
-    times = np.broadcast_to(found.time.reshape(-1, rows.shape[-1]), rows.shape)
-    contact = found.contact.reshape(len(rows), -1)
+    times = np.broadcast_to(motion.time.reshape(-1, rows.shape[-1]), rows.shape)
+    contact = motion.contact.reshape(len(rows), -1)
     touching = np.repeat(contact, rows.shape[-1] // contact.shape[-1], axis=1)
     columns = zip(list(labels) or [""] * len(rows), times, rows, touching, strict=True)
     names = ("label", "time_s", "position_m", "contact")
