@@ -206,7 +206,7 @@ class Recommendation:
         )
         room = f"B from {lower} to {upper} is stable at this K"
         margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"
-        hands = [f"in a hand: {hands}"] if (hands := self.spell_hands()) else []
+        hands = [f"grasps: {hands}"] if (hands := self.spell_hands()) else []
         cautions = (f"caution: {caution}" for caution in self.cautions)
         return f"{self.spell_wall()}: {self.spell_limit()}", margins, *hands, *cautions
 

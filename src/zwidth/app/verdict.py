@@ -258,7 +258,7 @@ def format_recommendation(
     if verdict is None:
         return [format_line("NO WALL", recommendation.reason), *device, *omission_lines]
     thin = "small margins" if find_thin(verdict, scene.timing.period) else ""
-    alarm = spell_alarm(diagnosis, thin, "" if all(recommendation.grasps.values()) else "unstable in a hand")
+    alarm = spell_alarm(diagnosis, thin, "" if all(recommendation.grasps.values()) else "unstable in a grasp")
     margins = [format_line("margins", recommendation.spell_margins())]
     if verbose:
         margins = [
@@ -270,7 +270,7 @@ def format_recommendation(
         format_line("SET", f"{recommendation.spell_wall()}; {recommendation.spell_limit()}{alarm}"),
         *device,
         *margins,
-        *([format_line("in a hand", hands)] if (hands := recommendation.spell_hands()) else []),
+        *([format_line("grasps", hands)] if (hands := recommendation.spell_hands()) else []),
         *format_diagnosis(diagnosis),
         format_line("passive", spell_passivity(scene, verdict) if verbose else recommendation.spell_passive()),
         *omission_lines,

@@ -218,7 +218,7 @@ def _tolerate(
     lines = [
         format_line("wall", format_wall(scene.wall.stiffness, scene.wall.virtual_damping, scene.unit_system)),
         format_line("stable", f"{share} ({interval})"),
-        format_line(percent, f"of them are stable for K up to {stiffness} at this B"),
+        format_line("stiffness", f"{percent} of them are stable for K up to {stiffness} at this B"),
     ]
     if simulation.stiffness_max == simulation.stiffness_max:
         lines.append(format_line("", f"or up to {stiffness_best}, each device with its best B"))
@@ -248,6 +248,6 @@ def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], l
     units, names = scene.unit_system, ("stiffness", "stiffness_max")
     stiffness, stiffness_best = (with_unit(round_conservatively(result[name], "below"), units["N/m"]) for name in names)
     damping = with_unit(result["virtual_damping"], units["N s/m"], DIGITS)
-    text = f"of all devices within the tolerances are stable for K up to {stiffness} at B = {damping} (by search), "
+    text = f"all devices within the tolerances are stable for K up to {stiffness} at B = {damping} (by search), "
     text += f"or up to {stiffness_best}, each device with its best B"
-    return result, [format_line("100 %", text)]
+    return result, [format_line("stiffness", text)]

@@ -127,9 +127,7 @@ def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str
     )
     noise = fit.noise[0] if isinstance(fit.noise, tuple) else np.nan
     for each, residual in zip(points, fit.residuals if points else (), strict=True):
-        rows.append(
-            ("buzzing", each.stiffness, each.virtual_damping, noise * each.stiffness, each.frequency, *residual)
-        )
+        rows.append(("onset", each.stiffness, each.virtual_damping, noise * each.stiffness, each.frequency, *residual))
     kinds, *numbers = zip(*rows, strict=True)
     stiffness, damping = (unit_of(name, fit.unit_system) for name in ("stiffness", "damping"))
     heads = {"stiffness": stiffness, "virtual_damping": damping, "stiffness_error": stiffness, "frequency": "Hz"}

@@ -169,22 +169,22 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
         fit: the fit.
         source: name of the log, or number of walls, for the first line.
     """
-    rows, units = [("fitted to", source)], fit.unit_system
+    rows, units = [("data", source)], fit.unit_system
     count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
     gaps = sum(int(np.count_nonzero(np.diff(motion.time) > 1.5 * fit.period)) for motion in fit.motions)
     if gaps:
         where = "a gap" if gaps == 1 else f"each of {gaps} gaps"
         rows.append(
             (
-                "used",
-                f"{count:,} of {total:,} samples: those after {where} depend on forces that were not logged",
+                "samples",
+                f"{count:,} of {total:,} used: those after {where} depend on forces that were not logged",
             )
         )
     elif any(np.isnan(motion.modeled[-1]) for motion in fit.motions):
-        rows.append(("used", f"{count:,} of {total:,} samples, from the start; more would only reduce the errors"))
+        rows.append(("samples", f"{count:,} of {total:,} used, from the start; more would only reduce the errors"))
     if math.isfinite(fit.virtual_damping):
         B, error = (format_value("damping", value, units) for value in (fit.virtual_damping, fit.virtual_damping_error))
-        rows.append(("at K_max", f"B = {B} (standard error {error})"))
+        rows.append(("B at K_max", f"{B} (standard error {error})"))
     for name in ("friction", "offset"):
         if name in fit.errors and not math.isfinite(fit.errors[name]):
             rows.append(
@@ -203,8 +203,8 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
         return rows
     rows.append(("safe limit", fit.scene.safe_limit.describe(units)))
     if (wall := _assume_rigid(fit)) is not None:
-        kind = "no further resonances" if fit.is_structured else "a rigid device"
-        rows.append(("assuming", f"{kind}: {wall.spell_wall()}; {wall.spell_requirement()}"))
+        condition = "has no further resonances" if fit.is_structured else "is rigid"
+        rows.append(("stiffer wall", f"{wall.spell_wall()} if the device {condition}; {wall.spell_requirement()}"))
     return rows
 
 

@@ -241,7 +241,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
         ax.fill_between(grid, 0.0, top * factor, color=style.BLUE, alpha=0.08, linewidth=0.0)
     words = quantity.label_in(scene.unit_system) if quantity else style.literal(parameter)
     words += f"  in {value_unit}" if value_unit not in ("", "1") else ""
-    ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
+    ax.set(xlabel=words, ylabel=rf"maximum stable stiffness  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
     scale_axis(ax, "x", grid)
     if whole and ax.get_xscale() == "linear":
         ax.set_xlim(*style.span(float(grid.min()), float(grid.max())))
@@ -396,7 +396,10 @@ def poles(
     outside = np.abs(z) >= 1.0
     reach = 1.15 * max(1.0, float(np.abs(z).max()))
     ax = _make_complex_plane(ax, (-reach, reach), (-reach, reach))
-    looks = (~outside, style.BLUE, "x", "inside"), (outside, style.VERMILION, "D", "not inside")
+    looks = (
+        (~outside, style.BLUE, "x", "inside the unit circle"),
+        (outside, style.VERMILION, "D", "on or outside the unit circle"),
+    )
     for mask, color, mark, words in looks:
         if mask.any():
             ax.plot(z[mask].real, z[mask].imag, mark, color=color, markersize=6, label=f"poles {words}")

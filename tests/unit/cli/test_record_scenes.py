@@ -117,7 +117,7 @@ def test_a_fit_hands_friction_and_encoder_to_the_other_commands(files, tmp_path)
     assert (found["resolution"], found["coulomb"]) == (pytest.approx(KNOB.step), 2e-4)
     for words in (["recommend", fitted], ["fit", files[0], "--resolution", "16384 counts"]):
         printed = " ".join(run(*words).split())
-        assert "in a hand stable in all six reference grasps" in printed
+        assert "grasps stable in all six reference grasps" in printed
         # A sentence of the simulation, whether the wall comes to rest or not.
         assert "the linear loop is stable" in printed
 

@@ -89,7 +89,7 @@ def test_the_motion_is_every_sample_of_every_log(logged):
 
 def test_walls_that_buzzed_keep_their_errors_and_distances(heard):
     walls = gather_evidence(heard, "walls", HEARD)["walls"]
-    those = walls["kind"] == "buzzing"
+    those = walls["kind"] == "onset"
     np.testing.assert_array_equal(walls[K][those], [wall.stiffness for wall in HEARD])
     np.testing.assert_allclose(walls["stiffness_error_N_per_m"][those], 0.02 * walls[K][those])
     np.testing.assert_array_equal(walls["stiffness_residual"][those], heard.residuals[:, 0])

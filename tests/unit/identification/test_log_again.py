@@ -130,7 +130,7 @@ def test_what_lies_before_and_behind_a_gap_is_fitted_as_two_logs():
     np.testing.assert_allclose(motion.time, clock[kept], rtol=1e-9, atol=1e-12)
     both = np.concatenate([each.modeled for each in apart.motions])
     np.testing.assert_allclose(motion.modeled[(motion.time < 0.1495) | (motion.time > 0.1905)], both, rtol=1e-9)
-    said = dict(detail_fit(fit, "log"))["used"]
+    said = dict(detail_fit(fit, "log"))["samples"]
     assert said == "315 of 379 samples: those after each of 2 gaps depend on forces that were not logged"
     with pytest.raises(InputError, match="21 samples of log 1 are missing, most of them after sample 169"):
         zwidth.respond(clock[kept], position[kept], force[kept])

@@ -314,5 +314,5 @@ def test_of_a_long_log_the_beginning_is_fitted_and_that_is_said(monkeypatch):
     assert (known[0], known.size) == (22, known[-1] - 21)
     assert 400 <= known.size < 500
     assert abs(fit.mass - 0.1) < 4 * fit.errors["mass"]
-    assert dict(detail_fit(fit, "a log"))["used"].startswith(f"{known.size} of 900 samples")
-    assert "used" not in dict(detail_fit(zwidth.fit_log(PERIOD, position[:400], force[:400]), "a log"))
+    assert dict(detail_fit(fit, "a log"))["samples"].startswith(f"{known.size} of 900 samples")
+    assert "samples" not in dict(detail_fit(zwidth.fit_log(PERIOD, position[:400], force[:400]), "a log"))

@@ -60,7 +60,7 @@ def test_a_resonance_is_found_with_its_numbers_and_written_into_the_scene(tmp_pa
     resonance = dict(summarize_fit(fit))["resonance"]
     assert resonance.startswith(f"frequency {fit.value_of('modes.0.frequency'):.2f} Hz (95 %: ")
     assert "damping ratio" in resonance
-    assert dict(detail_fit(fit, "a log"))["assuming"].startswith("no further resonances: K = ")
+    assert dict(detail_fit(fit, "a log"))["stiffer wall"].startswith("K = ")
     (tmp_path / "scene.yaml").write_text("\n".join(write_scene(fit, "a log")))
     section: Any = zwidth.load_config(tmp_path / "scene.yaml").scene
     (written,) = section.modes
@@ -154,7 +154,7 @@ def test_a_resonance_that_a_coarse_encoder_hides_bounds_the_safe_wall():
     assert [label for label, _ in said[:2]] == ["SET", ""]
     assert ", with B limited by the safe limit: a resonance near" in said[1][1]
     assert "zwidth excite --rate '1.000 kHz' --force '3.0 N' --resolution '200 µm'" in dict(said)["next"]
-    assert dict(detail_fit(fit, "a log"))["assuming"].startswith("a rigid device: K = ")
+    assert dict(detail_fit(fit, "a log"))["stiffer wall"].startswith("K = ")
     assert any(line.startswith('    reason: "a resonance near') for line in write_scene(fit, "a log"))
 
 

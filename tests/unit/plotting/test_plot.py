@@ -195,7 +195,7 @@ def test_the_gain_crossover_is_on_the_unit_circle_at_its_margin():
 
 def test_poles_outside_look_different():
     ax = plot.poles(RIGID, 25e3, 40.0)
-    outside = np.hypot(*line(ax, "poles not inside"))
+    outside = np.hypot(*line(ax, "poles on or outside the unit circle"))
     assert outside.min() > 1.0
     assert outside.size + line(ax, "poles inside")[0].size == RIGID.poles(25e3, 40.0).size
 

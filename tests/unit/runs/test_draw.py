@@ -201,7 +201,7 @@ def test_what_is_not_computed_is_left_blank_and_said(tmp_path):
     assert any(np.ma.getmaskarray(mesh).any() for mesh in meshes(drawn))
     # A grid finer than a page is thinned.
     assert [mesh.shape for mesh in meshes(drawn)] == [(13, 500)] * 3
-    assert "no answer" in [text.get_text() for text in drawn[0].figure.legends[0].get_texts()]
+    assert "no result" in [text.get_text() for text in drawn[0].figure.legends[0].get_texts()]
 
 
 @pytest.mark.parametrize(
