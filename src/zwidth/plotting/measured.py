@@ -49,7 +49,7 @@ def draw_device_fit(
     Args:
         boundary: Columns virtual_damping and stiffness with its lower and upper end, of one or several fits, given by
             the column ``fitted_to``.
-        walls: Columns fitted_to, kind ("stiffest", "set" for the recommended wall, or "onset" for an onset of instability),
+        walls: Columns fitted_to, kind ("stiffest", "set" for the recommended wall, or "onset" of instability),
             stiffness, its error, virtual_damping, frequency; for onsets also stiffness_residual and frequency_residual.
         axes: Existing Axes, one per panel.
         motion: Columns log, time, position, modeled and residual of the logs.
