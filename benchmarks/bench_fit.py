@@ -186,7 +186,7 @@ def judge(seed: int, span: tuple[float, float]) -> dict[str, Any]:
     known = {name: bar for name, bar in fit.intervals.items() if np.isfinite(bar.low) and name in truth}
     safe = fit.safe_wall()
     # In standard errors.
-    away = {name: abs(getattr(fit, name) - truth[name]) * fit.reach / (bar.high - getattr(fit, name))
+    away = {name: abs(getattr(fit, name) - truth[name]) * fit.coverage_factor / (bar.high - getattr(fit, name))
             for name, bar in known.items()}  # fmt: skip
     return {
         "seed": seed,

@@ -63,7 +63,7 @@ def test_a_noise_that_is_estimated_widens_the_band(heard):
     open_noise = zwidth.fit_buzz(HEARD, period=1e-3)
     widths = [np.nanmax(traced[HIGH] - traced[LOW]) / fit.stiffness_error for fit in (heard, open_noise)
               for traced in [trace_boundary(fit)]]  # fmt: skip
-    assert open_noise.reach > 1.5 * heard.reach
+    assert open_noise.coverage_factor > 1.5 * heard.coverage_factor
     assert widths[1] > 1.3 * widths[0]
 
 

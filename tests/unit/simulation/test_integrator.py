@@ -26,7 +26,7 @@ def test_rigid_device_answers_a_step_as_the_closed_form_says(wall):
     mass, period, force = 0.2, 5e-4, 3.0
     device = zwidth.Device(mass, delta * mass / period)
     scene = zwidth.Scene(device, zwidth.Timing(period, d * period))
-    got = integrate(scene, alpha * mass / period**2, beta * mass / period, 99, push=force)
+    got = integrate(scene, alpha * mass / period**2, beta * mass / period, 99, external_force=force)
     expected = zwidth.step_response(*wall, substeps=1, force=force)
     assert worst(got.position[:, 0] * mass / period**2, expected.position) < tol.JUDGE.float64
     assert worst(got.velocity[:, 0] * mass / period, expected.velocity) < tol.JUDGE.float64
@@ -85,17 +85,17 @@ def test_estimates_continue_a_long_ramp(velocity):
     assert worst([program(x) for x in measured], expected) < tol.JUDGE.float64
 
 
-def newton(wall, slip, push, friction):
+def newton(wall, slip, external_force, friction):
     """Rates of motor, tip and soft hand, and of everything their energy goes into or comes from."""
 
     def rate(_, y):
         x1, x2, x3, v1, v2, v3 = y[:6]
         tie, grip = 20e3 * (x2 - x1) + 0.5 * (v2 - v1), 800.0 * (x3 - x2) + 3.0 * (v3 - v2)
         dry = -friction * slip
-        a1 = (wall + push + dry - 0.4 * v1 + tie) / 0.1 if slip else 0.0
+        a1 = (wall + external_force + dry - 0.4 * v1 + tie) / 0.1 if slip else 0.0
         a2, a3 = (grip - tie) / 0.06, (-grip - 5.0 * v3 - 100.0 * x3) / 0.4
         lost = 0.4 * v1**2 + 0.5 * (v2 - v1) ** 2 + 3.0 * (v3 - v2) ** 2 + 5.0 * v3**2 - dry * v1
-        return [v1, v2, v3, a1, a2, a3, lost, (wall + push) * v1]
+        return [v1, v2, v3, a1, a2, a3, lost, (wall + external_force) * v1]
 
     return rate
 
@@ -111,7 +111,9 @@ def test_energy_balances_on_friction():
     hand = zwidth.Operator(0.4, 5.0, 100.0, coupling_stiffness=800.0, coupling_damping=3.0)
     scene = zwidth.Scene(zwidth.Device(0.1, 0.4, coupling), zwidth.Timing(1e-3, 1.6e-3), operator=hand)
     friction: Any = {"coulomb": 0.6, "static": 0.8}
-    got = integrate(scene, 8e3, 5.0, 200, position=-1e-3, velocity=0.15, push=0.3, contact="unilateral", **friction)
+    got = integrate(
+        scene, 8e3, 5.0, 200, position=-1e-3, velocity=0.15, external_force=0.3, contact="unilateral", **friction
+    )
     assert {kind for _, kind in got.events} == {"stick", "turn", "slip"}
     lost = worked = 0.0
     before = energy(got.pieces[0].state)
@@ -139,11 +141,11 @@ def test_block_on_friction_stops_and_sticks():
 
 
 @pytest.mark.parametrize("external_force", [0.69, -0.71, 0.71])
-def test_block_at_rest_leaves_beyond_static_friction(push):
+def test_block_at_rest_leaves_beyond_static_friction(external_force):
     scene = zwidth.Scene(zwidth.Device(mass=0.3), zwidth.Timing(1e-3))
-    got = integrate(scene, 0.0, 0.0, 50, push=push, coulomb=0.5, static=0.7)
-    rest = abs(push) < 0.7
-    way = 0.0 if rest else np.sign(push) * 0.5 * (abs(push) - 0.5) / 0.3 * 0.05**2
+    got = integrate(scene, 0.0, 0.0, 50, external_force=external_force, coulomb=0.5, static=0.7)
+    rest = abs(external_force) < 0.7
+    way = 0.0 if rest else np.sign(external_force) * 0.5 * (abs(external_force) - 0.5) / 0.3 * 0.05**2
     assert got.position[-1, 0] == pytest.approx(way, rel=tol.JUDGE.float64)
     assert got.events == ([] if rest else [(0.0, "slip")])
 
