@@ -255,10 +255,10 @@ def list_slopes(scene: Scene) -> list[Slope]:
         by_one = not size or unit == "N s/m"
         # Choose the power of ten nearest to one percent of the scale as the step.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
-        effect = "does not change K_max" if isfinite(value) else "has an effect that could not be computed"
+        effect = "no change" if isfinite(value) else "not computed"
         if isfinite(value) and (change := value * step):
-            effect = f"{'increases' if change > 0 else 'decreases'} K_max by {with_unit(abs(change), system['N/m'], 3)}"
+            effect = f"{'+' if change > 0 else '-'}{with_unit(abs(change), system['N/m'], 3)}"
         note = f" (the delay stays {scene.timing.delay_text})" if path == "period" and scene.timing.delay else ""
-        words = f"{with_unit(step, unit, 1)} more {effect}{note}"
+        words = f"{effect} for {with_unit(step, unit, 1)} more{note}"
         slopes.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))
     return slopes

@@ -311,7 +311,7 @@ def test_the_ridge_of_a_scene_with_parts():
     there, here = (scene.replace(**{"velocity.cutoff": 100 + s}).max_stiffness().stiffness for s in (step, -step))
     assert np.isclose(per["velocity.cutoff"], (there - here) / (2 * step), rtol=1e-6)
     lines = run(*arguments).stdout.splitlines()
-    assert lines[-1].startswith("dK_max/d(velocity.cutoff)  52.53 N/m per Hz: 1 Hz more increases K_max by 52.5 N/m")
+    assert lines[-1].startswith("dK_max/d(velocity.cutoff)  52.53 N/m per Hz: +52.5 N/m for 1 Hz more")
 
 
 def test_the_ridge_of_a_rigid_hand_counts_the_hand_s_mass():

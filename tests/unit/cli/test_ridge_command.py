@@ -20,10 +20,10 @@ def ridge(*arguments):
 
 def test_sensitivities_are_printed_with_units_and_in_words():
     assert ridge(*DEVICE).splitlines()[-4:] == [
-        "dK_max/d(mass)        141.4 kN/m per kg: 1 g more increases K_max by 141 N/m",
-        "dK_max/d(damping)     572.2 N/m per N s/m: 1 N s/m more increases K_max by 572 N/m",
-        "dK_max/d(period)      -15.34 MN/m per s: 10 µs more decreases K_max by 153 N/m (the delay stays 1.000 ms)",
-        "dK_max/d(delay)       -18.67 MN/m per s: 10 µs more decreases K_max by 187 N/m",
+        "dK_max/d(mass)        141.4 kN/m per kg: +141 N/m for 1 g more",
+        "dK_max/d(damping)     572.2 N/m per N s/m: +572 N/m for 1 N s/m more",
+        "dK_max/d(period)      -15.34 MN/m per s: -153 N/m for 10 µs more (the delay stays 1.000 ms)",
+        "dK_max/d(delay)       -18.67 MN/m per s: -187 N/m for 10 µs more",
     ]
 
 
