@@ -128,9 +128,9 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     if path == "delay" and needed.status == Status.UNREACHABLE and within is None:
         # Extend the default range to shorter delays, because a large stiffness may require a very short delay.
         needed = scene.required(path, wanted, within=(1e-4 * present, needed.range[1]))
-    result = {"parameter": path, "value": needed.value, "unit": unit, "enough": needed.enough}
+    result = {"parameter": path, "value": needed.value, "unit": unit, "sufficient_side": needed.sufficient_side}
     result["status"] = Status(needed.status).name
-    result |= {"crossings": [[c.value, c.enough] for c in needed.crossings], "range": list(needed.range)}
+    result |= {"crossings": [[c.value, c.sufficient_side] for c in needed.crossings], "range": list(needed.range)}
     if path in ("period", "rate"):
         result["rate"] = needed.value if path == "rate" else 1.0 / needed.value
     low, high = (with_unit(end, unit) for end in needed.range)
@@ -143,11 +143,11 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         text = f"none {goal} from {low} to {high}{kept}; {reached}" if best["stiffness"] else f"none {goal}"
     elif needed.status != Status.OK:
         text = f"not found from {low} to {high}{kept}: {Status(needed.status).message}"
-    elif needed.enough == "everywhere":
+    elif needed.sufficient_side == "everywhere":
         text = f"any from {low} to {high} {goal}{kept}"
     else:
         values = [crossing.value for crossing in needed.crossings]
-        text = f"{format_sufficient(needed.value, needed.enough, values, unit)}"
+        text = f"{format_sufficient(needed.value, needed.sufficient_side, values, unit)}"
         # Subtract the crossings of K_max with the goal (one or two) that the text already contains.
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"

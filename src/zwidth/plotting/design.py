@@ -150,7 +150,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     Args:
         curve: Columns parameter, value with its unit (such as ``value_Hz``), stiffness_N_per_m.
         required: Columns of a design study: stiffness_N_per_m, reserve; present, value and other_crossings with the
-            unit of the parameter in their names; enough; and with tolerances stable_share.
+            unit of the parameter in their names; sufficient_side; and with tolerances stable_share.
         axes: An existing Axes.
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 3.8)
@@ -170,7 +170,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
         height = np.exp(np.interp(np.log(present), *np.log(curve_drawn)))
         look: dict[str, Any] = {"marker": "s", "markersize": 5, "markerfacecolor": "white", "color": style.BLACK}
         ax.plot([present], [height], linestyle="", label="present", zorder=5, **look)
-    columns = (required[name] for name in (value_in, "enough", header("other_crossings", parameter.unit)))
+    columns = (required[name] for name in (value_in, "sufficient_side", header("other_crossings", parameter.unit)))
     names = []
     for target, value, enough, others in zip(targets, *columns, strict=True):
         all_known = enough in ENOUGH

@@ -15,7 +15,7 @@ FILTERED = RIGID.replace(velocity=LowPass(cutoff=30.0))
 def test_a_rigid_scene_needs_what_the_closed_form_says():
     got = RIGID.required("damping", 25e3)
     exact = find_required("damping", 25e3, 1.0, 100.0, mass=0.1, period=1e-3, delay=1e-3)
-    assert (got.status, got.enough) == (Status.OK, "above")
+    assert (got.status, got.sufficient_side) == (Status.OK, "above")
     assert got.value == pytest.approx(exact, rel=1e-10)
 
 
@@ -24,9 +24,9 @@ def test_both_sides_are_what_is_told(parameter, stiffness, side):
     value = FILTERED.parameters()[parameter]
     got = FILTERED.required(parameter, stiffness, within=(0.2 * value, 4.0 * value))
     assert got.status == Status.OK
-    assert got.enough == side
+    assert got.sufficient_side == side
     for crossing in got.crossings:
-        turn = 1.0 if crossing.enough == "above" else -1.0
+        turn = 1.0 if crossing.sufficient_side == "above" else -1.0
         for there in (crossing.value, crossing.value * (1.0 + 1e-4 * turn)):
             assert FILTERED.replace(**{parameter: there}).max_stiffness().stiffness >= stiffness
         beyond = FILTERED.replace(**{parameter: crossing.value * (1.0 - 1e-4 * turn)})
@@ -37,8 +37,8 @@ def test_of_several_crossings_the_nearest_is_told():
     """K_max is least at some mass between them."""
     scene = RIGID.replace(velocity=LowPass(cutoff=100.0))
     light, heavy = (scene.replace(mass=mass).required("mass", 7.8e3, within=(0.01, 0.5)) for mass in (0.012, 0.2))
-    assert [crossing.enough for crossing in light.crossings] == ["below", "above"]
-    assert (light.enough, heavy.enough) == ("below", "above")
+    assert [crossing.sufficient_side for crossing in light.crossings] == ["below", "above"]
+    assert (light.sufficient_side, heavy.sufficient_side) == ("below", "above")
     assert light.value < 0.03 < heavy.value
     for found in (light, heavy):
         assert scene.replace(mass=found.value).max_stiffness().stiffness == pytest.approx(7.8e3, rel=1e-9)
@@ -49,23 +49,23 @@ def test_no_dip_between_the_values_is_passed_over(mass, above):
     """K_max is 7585.93 N/m at 20.5 g, and more with less mass and with more."""
     stiffness, scene = 7585.93 * (1.0 + above), RIGID.replace(velocity=LowPass(cutoff=100.0), mass=mass)
     got = scene.required("mass", stiffness, within=(0.000592, 0.5326))
-    assert [crossing.enough for crossing in got.crossings] == ["below", "above"]
+    assert [crossing.sufficient_side for crossing in got.crossings] == ["below", "above"]
     assert got.crossings[0].value < 0.0204557 < got.crossings[1].value
     assert scene.replace(mass=got.value).max_stiffness().stiffness >= stiffness
 
 
 def test_a_rate_is_the_inverse_of_a_period():
     rate, period = (FILTERED.required(name, 8.5e3) for name in ("rate", "period"))
-    assert (rate.enough, period.enough) == ("above", "below")
+    assert (rate.sufficient_side, period.sufficient_side) == ("above", "below")
     assert rate.value * period.value == pytest.approx(1.0, rel=1e-10)
 
 
 def test_out_of_reach_and_everywhere():
     never = FILTERED.required("mass", 1e9, within=(0.05, 0.2))
-    assert (never.status, never.enough, never.crossings) == (Status.UNREACHABLE, "nowhere", ())
+    assert (never.status, never.sufficient_side, never.crossings) == (Status.UNREACHABLE, "nowhere", ())
     assert np.isnan(never.value)
     always = FILTERED.required("mass", 1.0, within=(0.05, 0.2))
-    assert (always.status, always.enough, always.value) == (Status.OK, "everywhere", 0.1)
+    assert (always.status, always.sufficient_side, always.value) == (Status.OK, "everywhere", 0.1)
 
 
 @pytest.mark.parametrize("unknown, status", [((11, 15), Status.NOT_CONVERGED), ((60, 80), Status.OK)])
@@ -79,13 +79,13 @@ def test_a_nearer_crossing_may_hide_where_nothing_is_known(unknown, status, monk
     monkeypatch.setattr(Scene, "max_stiffness", ask)
     got = RIGID.required("damping", 25e3)
     assert (got.status, np.isnan(got.value)) == (status, status != Status.OK)
-    assert [crossing.enough for crossing in got.crossings] == ["above"]
+    assert [crossing.sufficient_side for crossing in got.crossings] == ["above"]
 
 
 def test_the_range_ends_where_values_are_refused():
     got = FILTERED.required("velocity.cutoff", 9e3, within=(20.0, 5e3))
     assert got.range[1] < 500.0
-    assert [crossing.enough for crossing in got.crossings] == ["above"]
+    assert [crossing.sufficient_side for crossing in got.crossings] == ["above"]
 
 
 @pytest.mark.parametrize(

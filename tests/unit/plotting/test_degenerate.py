@@ -69,7 +69,7 @@ def test_wanted_stiffnesses_close_together_are_told_apart():
     required = {"stiffness_N_per_m": wanted, "reserve": np.ones(3), "present_s": np.full(3, 1e-3)}
     required |= {
         "value_s": np.full(3, 1e-3),
-        "enough": np.array(["below"] * 3),
+        "sufficient_side": np.array(["below"] * 3),
         "other_crossings_s": np.array([""] * 3),
     }
     (ax,) = plotting.draw_requirement(curve, required)

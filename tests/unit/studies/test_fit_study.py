@@ -90,7 +90,7 @@ def test_the_figure_shows_what_the_tables_hold(both):
     np.testing.assert_allclose(measured.get_ydata(), 1e3 * column("motion", "position_m"))
     np.testing.assert_allclose(modeled.get_ydata(), 1e3 * column("motion", "modeled_m"))
     np.testing.assert_allclose(residual.lines[0].get_ydata(), 1e6 * column("motion", "residual_m"))
-    halves = [line.get_ydata()[0] for line in residual.lines if line.get_label() == "half a step"]
+    halves = [line.get_ydata()[0] for line in residual.lines if line.get_label() == "half an encoder step"]
     assert halves == [pytest.approx(-15.0), pytest.approx(15.0)]
     sticks = next(each for each in correlation.collections if each.get_label() == "autocorrelation")
     heights = [segment[1][1] for segment in sticks.get_segments()]
