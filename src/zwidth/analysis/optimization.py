@@ -301,8 +301,8 @@ class SceneOptima(SceneAnalysis):
             negative_damping: as for `max_stiffness`.
 
         Returns:
-            ``value``, the sufficient value closest to the current one; ``sufficient_side``, the side of it on which K_max
-            is sufficient ("above" or "below"), "everywhere" if it is in the whole range (``value`` is then the current
+            ``value``, the sufficient value closest to the current one; ``sufficient_side``, its side on which K_max is
+            sufficient ("above" or "below"), "everywhere" if it is in the whole range (``value`` is then the current
             value, or the closest end of the range), or "nowhere"; ``crossings``, all crossings found, each confirmed by
             K_max on both sides; ``range``, the range searched; ``status``, UNREACHABLE with NaN if K_max is below the
             required stiffness in the whole range.
