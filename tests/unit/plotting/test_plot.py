@@ -197,7 +197,7 @@ def test_poles_outside_look_different():
     ax = plot.poles(RIGID, 25e3, 40.0)
     outside = np.hypot(*line(ax, "poles on or outside the unit circle"))
     assert outside.min() > 1.0
-    assert outside.size + line(ax, "poles inside")[0].size == RIGID.poles(25e3, 40.0).size
+    assert outside.size + line(ax, "poles inside the unit circle")[0].size == RIGID.poles(25e3, 40.0).size
 
 
 def test_motions_over_time():
