@@ -186,7 +186,7 @@ def judge(seed: int, span: tuple[float, float]) -> dict[str, Any]:
     known = {name: bar for name, bar in fit.intervals.items() if np.isfinite(bar.low) and name in truth}
     safe = fit.safe_wall()
     # In standard errors.
-    away = {name: abs(getattr(fit, name) - truth[name]) * fit.reach / (bar.high - getattr(fit, name))
+    away = {name: abs(getattr(fit, name) - truth[name]) * fit.coverage_factor / (bar.high - getattr(fit, name))
             for name, bar in known.items()}  # fmt: skip
     return {
         "seed": seed,
@@ -197,7 +197,7 @@ def judge(seed: int, span: tuple[float, float]) -> dict[str, Any]:
         "open": "friction" not in known,
         "away": away,
         "status": fit.status,
-        "doubts": fit.doubts,
+        "warnings": fit.warnings,
         "safe": bool(scene.is_stable(safe.stiffness, safe.virtual_damping)) if safe.stiffness > 0 else None,
         "share": safe.stiffness / truth["stiffness_max"],
         "width": measure_width(fit),
@@ -225,7 +225,7 @@ def judge_device(seed: int) -> dict[str, Any]:
         fit = zwidth.fit_log(true.period, read, force)
     except zwidth.ZwidthError:
         return row | {"given": False}
-    if fit.is_doubted:
+    if fit.is_unreliable:
         return row | {"given": False}
     limit, bar, safe, rigid = (
         true.limit_of_walls(),
@@ -277,8 +277,8 @@ def tabulate_kinds(rows: list[dict[str, Any]]) -> Iterator[str]:
         held = [share([row["held"][name] for row in those if name in row["held"]])
                 for name in (*NAMES, "offset", "stiffness_max")]  # fmt: skip
         safe = [row["safe"] for row in those if row["safe"] is not None]
-        doubted = sum(bool(row["doubts"]) for row in those)
-        cells = [*held, str(sum(row["open"] for row in those)), str(doubted), f"{sum(safe)} of {len(safe)}"]
+        warned = sum(bool(row["warnings"]) for row in those)
+        cells = [*held, str(sum(row["open"] for row in those)), str(warned), f"{sum(safe)} of {len(safe)}"]
         yield f"| {kind} | {' | '.join(cells)} |"
 
 
@@ -318,15 +318,15 @@ def spell_widths(rows: list[dict[str, Any]]) -> str:
 
 
 def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
-    """What is refused and doubted, and what is wrong without a word."""
-    sure = [row for row in fitted if row["status"] == 0 and not row["doubts"]]
+    """What is refused and warned, and what is wrong without a word."""
+    sure = [row for row in fitted if row["status"] == 0 and not row["warnings"]]
     wrong = [row for row in sure if max(row["away"].values()) > 5]
     safe = [row["safe"] for row in fitted if row["safe"] is not None]
     low, middle, high = np.quantile([row["share"] for row in fitted if row["safe"] is not None], [0.1, 0.5, 0.9])
     spread = f"{middle:.2f}; it is less than {low:.2f} for one wall in ten and more than {high:.2f} for one in ten"
-    doubted, troubled = sum(bool(row["doubts"]) for row in fitted), sum(row["status"] != 0 for row in fitted)
+    warned, troubled = sum(bool(row["warnings"]) for row in fitted), sum(row["status"] != 0 for row in fitted)
     return "\n".join([
-        f"Logs that the fit refuses: {len(rows) - len(fitted)}. Fits with a warning: {doubted}.",
+        f"Logs that the fit refuses: {len(rows) - len(fitted)}. Fits with a warning: {warned}.",
         f"Fits with a status other than OK: {troubled}. {spell_widths(fitted)}",
         "Fits without a warning and with the status OK in which an estimate differs from the true value by more",
         f"than 5 standard errors: {len(wrong)} of {len(sure)}.",
@@ -345,7 +345,7 @@ def report(count: int, parts: int, processes: int) -> str:
     devices = judge_all(judge_device, parts, processes)
     fitted, quiet = ([row for row in rows if "refused" not in row] for rows in (noisy, silent))
     for row in (*noisy, *silent):
-        if "refused" in row or row["safe"] is False or (not row["doubts"] and max(row["away"].values()) > 5):
+        if "refused" in row or row["safe"] is False or (not row["warnings"] and max(row["away"].values()) > 5):
             print(row)
     # Of this machine and this day: not for the page.
     print(f"a fit took {np.median([row['took'] for row in fitted]):.2f} s of the processor (median)")

@@ -112,13 +112,13 @@ def judge(seed: int, rigid: bool) -> dict[str, Any] | None:
     if measured is None:
         return None
     true, walls, limit = measured
-    row: dict[str, Any] = {"seed": seed, "kind": name_kind(true), "doubted": True, "refused": False}
+    row: dict[str, Any] = {"seed": seed, "kind": name_kind(true), "unreliable": True, "refused": False}
     try:
         fit = zwidth.fit_buzz(walls, period=true.period, noise=NOISE)
     except zwidth.InputError as error:
         return {**row, "refused": True, "why": str(error)}
-    row |= {"doubted": fit.is_doubted, "why": "; ".join(fit.doubts), "structured": fit.is_structured}
-    if fit.is_doubted:
+    row |= {"unreliable": fit.is_unreliable, "why": "; ".join(fit.warnings), "structured": fit.is_structured}
+    if fit.is_unreliable:
         return row
     bar, safe, advice = fit.intervals["stiffness_max"], fit.safe_wall(), fit.recommended
 
@@ -154,7 +154,7 @@ def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
     kinds = sorted({row["kind"] for row in rows} - {"rigid"})
     for kind in ("rigid", *kinds, "all but rigid"):
         those = [row for row in rows if kind == row["kind"] or (kind == "all but rigid" and row["kind"] in kinds)]
-        known = [row for row in those if not row["doubted"]]
+        known = [row for row in those if not row["unreliable"]]
         walls = [row for row in known if row["safe"] is not None]
         held = sum(row["held"] for row in known)
         cells = [

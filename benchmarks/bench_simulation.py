@@ -73,11 +73,11 @@ def report() -> str:
     """The tables in Markdown."""
     scenes, stiffness, damping = random_scenes()
     walls = list(zip(scenes[:BESIDE], stiffness[:BESIDE].tolist(), damping[:BESIDE].tolist(), strict=True))
-    options: dict[str, Any] = {"periods": PERIODS, "push": PUSH, "record": False}
+    options: dict[str, Any] = {"periods": PERIODS, "external_force": PUSH, "record": False}
     cold = seconds(lambda: zwidth.simulate(scenes, stiffness, damping, **options), 1)
     each = SCENES * PERIODS
     own = seconds(lambda: zwidth.simulate(scenes, stiffness, damping, **options)) / each
-    few = zwidth.simulate(scenes[:BESIDE], stiffness[:BESIDE], damping[:BESIDE], periods=PERIODS, push=PUSH)
+    few = zwidth.simulate(scenes[:BESIDE], stiffness[:BESIDE], damping[:BESIDE], periods=PERIODS, external_force=PUSH)
     assert few.position is not None, "a recorded motion"
     lines = [
         "# Run times of simulations",

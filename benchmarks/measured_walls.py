@@ -1,4 +1,4 @@
-"""How safe and how stiff the walls are that two records tell of a device nobody modelled.
+"""How safe and how stiff the walls are that two records tell of a device nobody modeled.
 
     .venv/bin/python benchmarks/measured_walls.py [DEVICES] [FIRST]
 

@@ -147,7 +147,9 @@ def scenes() -> Answers:
 
 def simulate(scene: zwidth.Scene, stiffness: np.ndarray, damping: np.ndarray) -> dict[str, Any]:
     """The figures of a motion, and where it ends."""
-    motion = scene.simulate(stiffness, damping, start_velocity=0.1, push=1.0, contact="unilateral", periods=300)
+    motion = scene.simulate(
+        stiffness, damping, start_velocity=0.1, external_force=1.0, contact="unilateral", periods=300
+    )
     return {"end": motion.position[..., -1], "amplitude": motion.amplitude, "outcome": motion.outcome}
 
 

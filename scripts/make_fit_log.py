@@ -39,7 +39,7 @@ def move(force: np.ndarray) -> np.ndarray:
     late = np.repeat(force, FINER)
     late = np.concatenate([np.zeros(round(DELAY / PERIOD * FINER)), late])[: late.size]
     scene = zwidth.Scene(zwidth.Device(MASS, DAMPING), zwidth.Timing(period=PERIOD / FINER))
-    options = {"coulomb": FRICTION, "resolution": RESOLUTION, "push_history": late, "periods": late.size}
+    options = {"coulomb": FRICTION, "resolution": RESOLUTION, "external_force_history": late, "periods": late.size}
     measured = zwidth.simulate(scene, 0.0, 0.0, **options).measured
     assert measured is not None, "it is recorded"
     return np.round(measured[::FINER][:SAMPLES] / RESOLUTION).astype(int)

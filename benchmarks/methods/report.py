@@ -130,7 +130,7 @@ def summary(rows: Sequence[Row]) -> str:
 
 
 def _faster(row: Row, references: dict[float, float]) -> str:
-    """Against a batch of NumPy's, which one call for one number is no rival of."""
+    """Against a batch of NumPy's, which one call for one number is no competitor of."""
     return f"{row.rate / references[row.d]:,.3g}" if row.d in references and row.layout != "one" else ""
 
 

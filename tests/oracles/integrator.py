@@ -126,7 +126,7 @@ def integrate(
     law: Callable[[float, float, float], float] | None = None,
     position: float | Sequence[float] = 0.0,
     velocity: float | Sequence[float] = 0.0,
-    push: float = 0.0,
+    external_force: float = 0.0,
     contact: str = "bilateral",
     resolution: float = 0.0,
     coulomb: float = 0.0,
@@ -170,7 +170,7 @@ def integrate(
 
     def pass_time(y: np.ndarray, start: float, span: float, slip: float | None) -> tuple[np.ndarray, float | None]:
         """One stretch of constant wall force, from event to event."""
-        force = wall + push
+        force = wall + external_force
         if slip is None or friction is None:
             pieces.append(Piece(span, y, wall, slip))
             return bodies.move(y, span, force, slip), slip

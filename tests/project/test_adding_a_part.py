@@ -111,7 +111,7 @@ print(json.dumps({
     "slopes": sorted(scene.sensitivities().per),
     "help": say("check", "--help"),
     "checked": say(*CHECK, "--mount-stiffness", "135", "--mount-damping", "6"),
-    "doubted": say(*CHECK, "--mount-stiffness", "1e12"),
+    "warned": say(*CHECK, "--mount-stiffness", "1e12"),
     "needed": say(*CHECK, "--mount-damping", "1"),
     "refused": [refuse(lambda: zwidth.Mount(stiffness=0)), refuse(lambda: scene.replace(mount=None).replace(mount=5))],
     "faults": refuse(lambda: zwidth.load_config("wrong.yaml")),
@@ -174,10 +174,10 @@ def test_every_answer_is_that_of_a_massless_hand_with_the_same_numbers(copied):
     assert mounted[2:4] == [True, False]
 
 
-def test_the_command_line_takes_judges_and_doubts_it(copied):
+def test_the_command_line_accepts_judges_and_warns_about_it(copied):
     assert "Stiffness of the mount, in N/m." in copied["help"]
     assert re.search(r"^mount +stiffness 135\.0 N/m, damping 6\.000 N s/m", copied["checked"], re.MULTILINE)
-    assert "--mount-stiffness is 1e+12 N/m, an implausible value" in copied["doubted"]
+    assert "--mount-stiffness is 1e+12 N/m, an implausible value" in copied["warned"]
     assert "a mount requires a stiffness; give --mount-stiffness" in copied["needed"]
 
 

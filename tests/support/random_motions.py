@@ -48,12 +48,12 @@ def random_motion(kind: str, rng: np.random.Generator) -> RandomMotion:
     dry = rng.random() < 0.7
     while True:
         scene = random_scene(kind, rng)
-        matrix, push, _ = continuous(scene)
+        matrix, external_force, _ = continuous(scene)
         fastest = float(np.abs(np.linalg.eigvals(matrix)).max()) * scene.timing.period
         if not dry or fastest < _FASTEST_LINK:
             break
     K, B, inside = _wall(scene, rng.random() < 0.5, rng)
-    period, mass = scene.timing.period, 1.0 / float(push[push.size // 2])
+    period, mass = scene.timing.period, 1.0 / float(external_force[external_force.size // 2])
     velocity = 10 ** rng.uniform(-2, 0)
     # The force that stops this impact, by its energy, and what its damper adds.
     peak = velocity * (math.sqrt(K * mass) + abs(B))
@@ -75,7 +75,7 @@ def random_motion(kind: str, rng: np.random.Generator) -> RandomMotion:
         "virtual_damping": B,
         "position": -way,
         "velocity": velocity,
-        "push": peak * rng.uniform(0.0, 0.3) if rng.random() < 0.7 else 0.0,
+        "external_force": peak * rng.uniform(0.0, 0.3) if rng.random() < 0.7 else 0.0,
         "contact": str(rng.choice(["bilateral", "unilateral", "push_only"])),
         "resolution": velocity * period * now_and_then(0.4, -2.0, 0.5, 0.0),
         "coulomb": coulomb,

@@ -111,12 +111,12 @@ def verdicts(wall: Wall) -> dict[str, bool | None]:
         "is_stable of arrays": bool(scene.is_stable([K, 2 * K, K], [B, B, 0.0])[0]),
         **{f"decide_stability, {name}": _known(told) for name, told in decided.items()},
         "spectral_radius": None if np.isnan(radius) else radius < 1,
-        "poles": _inside(poles, ROUGH if scene.parts_beyond else ROUGH_DOUBLE),
+        "poles": _inside(poles, ROUGH if scene.nonrigid_parts else ROUGH_DOUBLE),
         "stable_stiffness": bool(np.any((rows[:, 0] < K) & (rows[:, 1] > K))),
         "state_space": _inside(np.linalg.eigvals(scene.state_space(K, B).A)),
         "to_control": _inside(control.poles(zwidth.to_control(scene, K, B))),
     }
-    if not scene.parts_beyond:
+    if not scene.nonrigid_parts:
         alpha, beta = (float(part) for part in scene.normalize_walls(K, B))
         said["zwidth.is_stable"] = bool(zwidth.is_stable(alpha, beta, scene.delta, scene.d))
     return said
@@ -155,7 +155,7 @@ def highest_questions(wall: Wall) -> Iterator[Question]:
     scene = wall.scene
     top = scene.max_stiffness()
     tops = {"max_stiffness": top.stiffness}
-    if not scene.parts_beyond:
+    if not scene.nonrigid_parts:
         tops["alpha_max"] = zwidth.alpha_max(scene.delta, scene.d).alpha * scene.units.stiffness
     yield Question("K_max", tops, SAME)
     if top.status == Status.OK:

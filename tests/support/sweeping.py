@@ -90,7 +90,7 @@ def run_sweeps(config, out, *, perform=None, **options):
     sweeps = result.sweeps.values()
     counts = {name: sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")}
     failed = {chunk: error for sweep in sweeps for chunk, error in sweep.failed.items()}
-    more = {name: getattr(result, name) for name in ("ok", "repaired", "hopeless", "interrupted")}
+    more = {name: getattr(result, name) for name in ("ok", "repaired", "fatal_error", "interrupted")}
     return SimpleNamespace(**counts, **more, failed=failed)
 
 

@@ -209,14 +209,16 @@ def devices(name: str | None, as_json: bool) -> None:
     if name is None:
         lines = []
         for device in chosen:
-            numbers = (f"{key.replace('_', ' ')} {each.spell()}" for key, each in device.numbers.items())
+            numbers = (f"{key.replace('_', ' ')} {each.spell()}" for key, each in device.parameters.items())
             # Omit the name of the parameter "counts", because its unit has the same name.
             lines.append(format_row(device.name, ", ".join(number.removeprefix("counts ") for number in numbers)))
     else:
-        notes = {quantity: f" ({number.note})" if number.note else "" for quantity, number in chosen[0].numbers.items()}
+        notes = {
+            quantity: f" ({number.note})" if number.note else "" for quantity, number in chosen[0].parameters.items()
+        }
         lines = [f"{chosen[0].title} ({chosen[0].motion})"]
         lines += [
-            format_row(key, f"{each.spell()}{notes[key]}; {each.source}") for key, each in chosen[0].numbers.items()
+            format_row(key, f"{each.spell()}{notes[key]}; {each.source}") for key, each in chosen[0].parameters.items()
         ]
     printing.print_result([device.as_dict() for device in chosen], lines, as_json)
 

@@ -146,7 +146,7 @@ def fit(
         points, rotary = tuple(BuzzPoint(*point) for point, _ in walls), kinds.pop() if kinds else rotary_scene
         loop.check_kind(rotary)
         device_fit = fit_buzz(points, period=period, velocity=velocity, noise=noise, rotary=rotary)
-        source = f"{len(walls)} buzzing walls"
+        source = f"{len(walls)} onsets of instability"
     else:
         if noise is not None:
             raise click.UsageError("--noise applies only to --buzz; omit it, because the noise of a log is estimated")
@@ -198,12 +198,12 @@ def _diagnose(device_fit: Any, motor: dict[str, float]) -> Any:
 
 
 def _list_lines(device_fit: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
-    """Return the printed lines of a fit, with the checks of the recommended wall in a hand and by simulation."""
+    """Return the printed lines of a fit, with the checks of the recommended wall in grasps and by simulation."""
     from zwidth.identification.fit_report import detail_fit, summarize_fit
 
     checks, more = [], "details: --verbose; scene for the other commands: --yaml"
     if device_fit.recommended.status == Status.OK:
-        checks = [("in a hand", device_fit.recommended.spell_hands())]
+        checks = [("grasps", device_fit.recommended.spell_hands())]
         more += "; program for the loop: --code c"
     checks += spell_diagnosis(diagnosis)
     details = [("", ""), *detail_fit(device_fit, source)] if verbose else []
@@ -274,7 +274,9 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
     units = SYSTEMS[made.rotary]
     lines = [
         format_row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), units['N'])}"),
-        format_row("lines", f"{made.frequency.size} from {low} to {high}, repeated after {with_unit(made.cycle, 's')}"),
+        format_row(
+            "frequencies", f"{made.frequency.size} from {low} to {high}, repeated after {with_unit(made.cycle, 's')}"
+        ),
         format_row("deviation", f"{_compliance(made.deviation, units)} expected (median)"),
     ]
     result: dict[str, Any] = {"file": str(out), "samples": made.force.size, "cycle": made.cycle}
@@ -282,7 +284,7 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
         share = float(made.expected.stiffness / made.limit.stiffness)
         result |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
         expected = format_wall(made.expected.stiffness, made.expected.virtual_damping, units)
-        lines += [format_row("expected", f"safe wall {expected}, {100 * share:.0f} % of the present K_max")]
+        lines += [format_row("expected safe wall", f"{expected}, {100 * share:.0f} % of the present K_max")]
     print_result(result, [*lines, format_row("wrote", str(out))], as_json)
 
 
@@ -324,13 +326,13 @@ def _print_response(
     from zwidth.analysis.scene import Scene
     from zwidth.identification.response_estimate import find_nominal_limit
 
-    device, period, doubts = response.device, response.period, response.doubts
+    device, period, warnings = response.device, response.period, response.warnings
     kind = "parts of a repeating force" if response.cycle else "parts"
     source = f"{' and '.join(log.name for log in logs)}, {response.records} {kind}"
     scene = Scene(device, Timing(period), velocity=velocity or BackwardDifference())
     top, safe = find_nominal_limit(scene), scene.max_stiffness()
     low, high = (with_unit(float(end), "Hz") for end in device.frequency[[0, -1]])
-    lines = [format_row("response of", source), format_row("lines", f"{device.frequency.size} from {low} to {high}")]
+    lines = [format_row("data", source), format_row("frequencies", f"{device.frequency.size} from {low} to {high}")]
     if device.deviation is not None:
         lines.append(format_row("deviation", f"{_compliance(device.deviation, device.unit_system)} (median)"))
     undecided = (
@@ -342,19 +344,19 @@ def _print_response(
         else "undecided"
     )
     lines.append(format_row("K_max", words))
-    given = safe.status == Status.OK and device.deviation is not None and not doubts
+    given = safe.status == Status.OK and device.deviation is not None and not warnings
     words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none"
     lines.append(format_row("safe wall", words))
     lines += [format_row("stiffer wall" if k == 0 else "", text) for k, text in enumerate(undecided)]
-    lines += [format_row("warning", text) for text in doubts]
+    lines += [format_row("WARNING", text) for text in warnings]
     lines += [format_row("note", text) for text in response.notes]
     if save is not None:
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
         lines.append(format_row("wrote", str(save)))
     if figure is not None:
         lines.append(save_figure(_draw(scene, safe if safe.status == Status.OK else None), figure))
-    result = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
-    result |= {"safe_wall": _plain(safe) if given else None, "undecided": undecided, "doubts": list(doubts)}
+    result = {"frequencies": device.frequency.size, "period": period, "maximum": _plain(top)}
+    result |= {"safe_wall": _plain(safe) if given else None, "undecided": undecided, "warnings": list(warnings)}
     result |= {"notes": list(response.notes), "rotary": device.rotary}
     print_result(result, lines, as_json)
 

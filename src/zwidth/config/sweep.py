@@ -253,7 +253,7 @@ class SweepStudy(_Parts, Study):
     @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         axes = raw.get("axes")
-        if not isinstance(axes, dict) or not scene.parts_beyond:
+        if not isinstance(axes, dict) or not scene.nonrigid_parts:
             return
         given = _list_given(axes)
         if not given & set(PHYSICAL) and not {"delta", "d"} <= given:

@@ -250,7 +250,7 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         f"{len(printed)} printed numbers, {len(computed)} of them results: {agreeing} of {len(computed)} agree.",
         f"Agreement: the computed value lies within half a unit of the last printed digit.{cited}",
         "",
-        "| quantity | where | printed | computed | agrees |",
+        "| quantity | location | printed | computed | agrees |",
         "|---|---|---|---|---|",
         *(
             f"| {row.quantity} | {row.where} | {row.printed} | {_spell(row)} | {_AGREEMENT[row.agrees]} |"

@@ -123,7 +123,7 @@ def find_edges(scene: Scene) -> dict[str, Outlines]:
     The keys of the dict are "stable" and "passive".
     """
     edges: dict[str, Outlines] = {"stable": [(np.stack(piece[:2], -1), piece.hole) for piece in scene.stable_region()]}
-    if not scene.parts_beyond and scene.device.damping > 0:
+    if not scene.nonrigid_parts and scene.device.damping > 0:
         edges["passive"] = [(np.stack(trace_passivity_boundary(scene), -1), False)]
     return edges
 

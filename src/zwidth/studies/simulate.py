@@ -49,7 +49,7 @@ class SimulationConditions(Strict):
 
     start_position: Annotated[float, quantity_of("start_position")] = 0.0
     start_velocity: Annotated[float, quantity_of("start_velocity")] = 0.0
-    push: Annotated[float, quantity_of("push")] = 0.0
+    external_force: Annotated[float, quantity_of("external_force")] = 0.0
 
     contact: Contact = "bilateral"
     """Contact of the wall: bilateral (the wall acts on both sides of its surface), unilateral (only for positive

@@ -34,7 +34,7 @@ def test_no_stable_damping_has_a_smaller_spectral_radius(case):
 def test_no_stable_damping_has_a_larger_modulus_margin(case):
     scene, stiffness, trials = case
     best = scene.best_damping(stiffness, goal="robust")
-    sample = trials[:: 400 if scene.parts_beyond else 10]
+    sample = trials[:: 400 if scene.nonrigid_parts else 10]
     margin = scene.margins(stiffness, sample).modulus_margin
     assert best.modulus_margin >= margin.max() - 1e-12
     assert scene.margins(stiffness, best.virtual_damping).modulus_margin == pytest.approx(best.modulus_margin, rel=1e-9)

@@ -64,14 +64,14 @@ def test_limits_exist_only_for_parts_of_the_scene():
 def test_filter_above_nyquist_at_double_cutoff_is_removed_instead(velocity):
     scene = RIGID.replace(velocity=velocity)
     (limit,) = [limit for limit in limits_of(scene) if limit.name == "velocity"]
-    assert limit.words == "no velocity filter"
+    assert limit.label == "no velocity filter"
     assert limit.stiffness == RIGID.max_stiffness().stiffness
 
 
 def test_window_keeps_its_length_in_seconds():
     scene = RIGID.replace(velocity=WindowedDifference(15, coded_period=2e-3))
     limits = {limit.name: limit for limit in limits_of(scene)}
-    assert (limits["period"].words, limits["period"].note) == ("twice the rate", "the delay stays 1.000 ms")
+    assert (limits["period"].label, limits["period"].note) == ("twice the rate", "the delay stays 1.000 ms")
     same = scene.replace(period=0.5e-3, velocity=WindowedDifference(30, coded_period=1e-3))
     assert limits["period"].stiffness == pytest.approx(same.max_stiffness().stiffness, rel=1e-12)
     half = scene.replace(velocity=WindowedDifference(8, coded_period=2e-3))
@@ -83,7 +83,7 @@ def test_limits_of_actuator_and_modes():
     scene = Scene(device, Timing(1e-3))
     limits = {limit.name: limit for limit in limits_of(scene)}
     faster = scene.replace(**{"actuator.cutoff": 600.0})
-    assert limits["actuator"].words == "an amplifier twice as fast"
+    assert limits["actuator"].label == "an amplifier twice as fast"
     assert limits["actuator"].stiffness == pytest.approx(faster.max_stiffness().stiffness, rel=1e-12)
     stiffer = scene.replace(**{"modes.0.frequency": 200.0 * np.sqrt(2.0)})
     assert limits["modes"].stiffness == pytest.approx(stiffer.max_stiffness().stiffness, rel=1e-12)

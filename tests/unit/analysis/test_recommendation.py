@@ -8,7 +8,7 @@ import pytest
 
 import zwidth
 from zwidth.analysis.cautions import find_thin
-from zwidth.analysis.wall_search import Wanted
+from zwidth.analysis.wall_search import Requirements
 from zwidth.core.status import Status
 
 TIMING = zwidth.Timing(1e-3, 1e-3)
@@ -80,7 +80,7 @@ def test_gain_margin_only_divides_the_maximum_stiffness():
 def test_stiffness_fraction_only_keeps_damping_of_stiffest_wall():
     recommendation, top = RIGID.recommend(stiffness_fraction=0.75), RIGID.max_stiffness()
     assert (recommendation.stiffness, recommendation.virtual_damping) == (0.75 * top.stiffness, top.virtual_damping)
-    assert recommendation.wanted == Wanted(0.75)
+    assert recommendation.requirements == Requirements(0.75)
     assert recommendation.limited_by == "stiffness_fraction"
     assert recommendation.verdict == zwidth.assess(
         RIGID.replace(stiffness=recommendation.stiffness, virtual_damping=recommendation.virtual_damping)
@@ -166,10 +166,10 @@ def test_printed_wall_next_to_corner_is_stable(share):
 
 def test_improvements_of_stiffness_fraction_are_limits_with_gain():
     recommendation = ISLANDS.recommend(stiffness_fraction=0.5)
-    steps = [(step.name, pytest.approx(step.gain, rel=1e-6)) for step in recommendation.steps]
+    steps = [(step.name, pytest.approx(step.gain, rel=1e-6)) for step in recommendation.improvements]
     assert steps == [(limit.name, limit.gain) for limit in zwidth.limits_of(ISLANDS) if limit.gain > 1]
     assert "island of stable walls" in recommendation.notes[0]
-    assert not any("64" in step.words for step in recommendation.steps)
+    assert not any("64" in step.label for step in recommendation.improvements)
 
 
 @pytest.mark.parametrize(
@@ -209,13 +209,13 @@ def test_gains_of_improvements_match_new_recommendations(scene, wanted):
         "period": {"rate": 2 / scene.timing.period},
         "velocity": {"velocity": zwidth.LowPass(cutoff=200.0)},
     }
-    assert recommendation.steps
-    for step in recommendation.steps:
+    assert recommendation.improvements
+    for step in recommendation.improvements:
         if step.name in changed:
             again = scene.replace(**changed[step.name]).recommend(**wanted)
             assert step.gain == pytest.approx(again.stiffness / recommendation.stiffness, rel=5e-3)
             assert step.stiffness == pytest.approx(again.stiffness, rel=5e-3)
-    gains = {step.name: step.gain for step in recommendation.steps}
+    gains = {step.name: step.gain for step in recommendation.improvements}
     if scene.timing.in_periods:
         assert "period_and_delay" not in gains
     elif not wanted.get("passive"):
@@ -225,7 +225,7 @@ def test_gains_of_improvements_match_new_recommendations(scene, wanted):
 
 def test_gains_of_improvements_for_passive_wall_of_readme_device():
     """Half the delay raises K_max by 1.72 and the passive stiffness by 1.42; 10 % more damping by 1.03 and 1.10."""
-    gains = {step.name: step.gain for step in RIGID.recommend(passive=True).steps}
+    gains = {step.name: step.gain for step in RIGID.recommend(passive=True).improvements}
     assert gains["delay"] == pytest.approx(1.42, abs=0.01)
     assert gains["damping"] == pytest.approx(1.10, abs=0.005)
     assert gains["period"] == pytest.approx(1.29, abs=0.01)
@@ -234,7 +234,7 @@ def test_gains_of_improvements_for_passive_wall_of_readme_device():
 def test_default_requirements_are_margins():
     for scene in (RIGID, FILTERED, KNOB):
         recommendation = scene.recommend()
-        assert recommendation.wanted == Wanted(0.75, 2.0, 30.0, grasps="soft")
+        assert recommendation.requirements == Requirements(0.75, 2.0, 30.0, grasps="soft")
         margins = scene.margins(recommendation.stiffness, recommendation.virtual_damping)
         assert margins.phase_margin >= 30
         assert margins.gain_margin >= 2
@@ -243,7 +243,7 @@ def test_default_requirements_are_margins():
         assert not find_thin(recommendation.verdict, scene.timing.period)
         assert all(stable for name, stable in recommendation.grasps.items() if name.startswith("soft"))
     # Any explicit requirement replaces the defaults.
-    assert RIGID.recommend(phase_margin=20).wanted == Wanted(None, None, 20)
+    assert RIGID.recommend(phase_margin=20).requirements == Requirements(None, None, 20)
 
 
 def test_caution_about_thin_margins_suggests_sufficient_requirements():
@@ -284,7 +284,7 @@ def test_destabilizing_grasps_are_reported_with_an_alternative_wall():
     assert all_grasps.limited_by == "grasps"
     assert all(all_grasps.grasps.values())
     assert all_grasps.stiffness == pytest.approx(float(K.split()[0]) * 1e3, rel=2e-3)
-    assert scene.recommend(grasps="none").wanted == Wanted(0.75, 2.0, 30.0)
+    assert scene.recommend(grasps="none").requirements == Requirements(0.75, 2.0, 30.0)
 
 
 def test_grasps_require_a_device_with_mass():
@@ -345,5 +345,5 @@ def test_printed_damping_range_contains_printed_damping(seed):
     recommendation = zwidth.Scene(device, zwidth.Timing(1e-3)).recommend(phase_margin=wanted)
     printed = re.search(r"B from (\S+)(?: N s/m)? to (\S+) N s/m is stable", recommendation.lines()[1])
     assert printed is not None
-    assert float(printed[1]) <= recommendation.read[1] <= float(printed[2])
-    assert recommendation.scene.is_stable(*recommendation.read[:2])
+    assert float(printed[1]) <= recommendation.rounded_wall[1] <= float(printed[2])
+    assert recommendation.scene.is_stable(*recommendation.rounded_wall[:2])

@@ -18,7 +18,7 @@ FILTERED = RIGID.replace(velocity=LowPass(cutoff=30.0))
 def test_required_damping_of_rigid_scene_matches_closed_form():
     result = RIGID.required("damping", 25e3)
     expected = find_required("damping", 25e3, 1.0, 100.0, mass=0.1, period=1e-3, delay=1e-3)
-    assert (result.status, result.enough) == (Status.OK, "above")
+    assert (result.status, result.sufficient_side) == (Status.OK, "above")
     assert result.value == pytest.approx(expected, rel=1e-10)
 
 
@@ -27,9 +27,9 @@ def test_max_stiffness_on_both_sides_of_a_crossing(parameter, stiffness, side):
     value = FILTERED.parameters()[parameter]
     result = FILTERED.required(parameter, stiffness, within=(0.2 * value, 4.0 * value))
     assert result.status == Status.OK
-    assert result.enough == side
+    assert result.sufficient_side == side
     for crossing in result.crossings:
-        sign = 1.0 if crossing.enough == "above" else -1.0
+        sign = 1.0 if crossing.sufficient_side == "above" else -1.0
         for value_inside in (crossing.value, crossing.value * (1.0 + 1e-4 * sign)):
             assert FILTERED.replace(**{parameter: value_inside}).max_stiffness().stiffness >= stiffness
         outside = FILTERED.replace(**{parameter: crossing.value * (1.0 - 1e-4 * sign)})
@@ -40,8 +40,8 @@ def test_nearest_of_several_crossings_is_returned():
     """K_max has its minimum at a mass between the two crossings."""
     scene = RIGID.replace(velocity=LowPass(cutoff=100.0))
     light, heavy = (scene.replace(mass=mass).required("mass", 7.8e3, within=(0.01, 0.5)) for mass in (0.012, 0.2))
-    assert [crossing.enough for crossing in light.crossings] == ["below", "above"]
-    assert (light.enough, heavy.enough) == ("below", "above")
+    assert [crossing.sufficient_side for crossing in light.crossings] == ["below", "above"]
+    assert (light.sufficient_side, heavy.sufficient_side) == ("below", "above")
     assert light.value < 0.03 < heavy.value
     for result in (light, heavy):
         assert scene.replace(mass=result.value).max_stiffness().stiffness == pytest.approx(7.8e3, rel=1e-9)
@@ -52,23 +52,27 @@ def test_narrow_dip_of_max_stiffness_is_detected(mass, above):
     """K_max has a minimum of 7585.93 N/m at 20.5 g."""
     stiffness, scene = 7585.93 * (1.0 + above), RIGID.replace(velocity=LowPass(cutoff=100.0), mass=mass)
     result = scene.required("mass", stiffness, within=(0.000592, 0.5326))
-    assert [crossing.enough for crossing in result.crossings] == ["below", "above"]
+    assert [crossing.sufficient_side for crossing in result.crossings] == ["below", "above"]
     assert result.crossings[0].value < 0.0204557 < result.crossings[1].value
     assert scene.replace(mass=result.value).max_stiffness().stiffness >= stiffness
 
 
 def test_required_rate_is_inverse_of_required_period():
     rate, period = (FILTERED.required(name, 8.5e3) for name in ("rate", "period"))
-    assert (rate.enough, period.enough) == ("above", "below")
+    assert (rate.sufficient_side, period.sufficient_side) == ("above", "below")
     assert rate.value * period.value == pytest.approx(1.0, rel=1e-10)
 
 
 def test_unreachable_stiffness_and_stiffness_reached_everywhere():
     unreachable = FILTERED.required("mass", 1e9, within=(0.05, 0.2))
-    assert (unreachable.status, unreachable.enough, unreachable.crossings) == (Status.UNREACHABLE, "nowhere", ())
+    assert (unreachable.status, unreachable.sufficient_side, unreachable.crossings) == (
+        Status.UNREACHABLE,
+        "nowhere",
+        (),
+    )
     assert np.isnan(unreachable.value)
     everywhere = FILTERED.required("mass", 1.0, within=(0.05, 0.2))
-    assert (everywhere.status, everywhere.enough, everywhere.value) == (Status.OK, "everywhere", 0.1)
+    assert (everywhere.status, everywhere.sufficient_side, everywhere.value) == (Status.OK, "everywhere", 0.1)
 
 
 @pytest.mark.parametrize("failing, status", [((11, 15), Status.NOT_CONVERGED), ((60, 80), Status.OK)])
@@ -84,13 +88,13 @@ def test_required_is_nan_if_a_nearer_crossing_cannot_be_excluded(failing, status
     monkeypatch.setattr(Scene, "max_stiffness", fail_in_interval)
     result = RIGID.required("damping", 25e3)
     assert (result.status, np.isnan(result.value)) == (status, status != Status.OK)
-    assert [crossing.enough for crossing in result.crossings] == ["above"]
+    assert [crossing.sufficient_side for crossing in result.crossings] == ["above"]
 
 
 def test_range_ends_at_values_rejected_by_the_scene():
     result = FILTERED.required("velocity.cutoff", 9e3, within=(20.0, 5e3))
     assert result.range[1] < 500.0
-    assert [crossing.enough for crossing in result.crossings] == ["above"]
+    assert [crossing.sufficient_side for crossing in result.crossings] == ["above"]
 
 
 @pytest.mark.parametrize(

@@ -74,10 +74,10 @@ def test_local_search_finds_no_weaker_device(seed):
     box = random_box(np.random.default_rng(100 + seed))
     worst, wall = robust_max_stiffness(**box), robust_wall(**box)
     assert worst.status == Status.OK, box
-    assert worst.attained * (1 - 2e-6) < worst.stiffness < worst.attained
+    assert worst.stiffness_max * (1 - 2e-6) < worst.stiffness < worst.stiffness_max
     assert minimize_cost(box, lambda devices: max_stiffness(**devices), seed) >= worst.stiffness
     assert wall.status == Status.OK, box
-    assert wall.limit * (1 - 2e-6) < wall.stiffness < wall.limit <= worst.attained * (1 + 1e-9)
+    assert wall.limit * (1 - 2e-6) < wall.stiffness < wall.limit <= worst.stiffness_max * (1 + 1e-9)
     assert minimize_cost(box, build_limit_cost(wall), seed) > 1.0
 
 
@@ -123,7 +123,7 @@ def test_worst_case_at_interior_mass():
     worst = robust_max_stiffness(**box)
     fine = max_stiffness(mass=np.linspace(0.01, 1.0, 20_001), damping=100.0, period=1e-3, delay=2e-3)
     assert not worst.is_vertex
-    assert worst.attained == pytest.approx(fine.min(), rel=1e-8)
+    assert worst.stiffness_max == pytest.approx(fine.min(), rel=1e-8)
     assert 0.01 < worst.mass < 1.0
 
 
@@ -132,8 +132,8 @@ def test_worst_case_at_interior_period_with_strong_damping():
     worst = robust_max_stiffness(
         mass=1.0, damping=2590418.159202655, period=Interval(2e-3 / 3, 1e-3), delay=0.003575165172380617
     )
-    assert worst.attained == pytest.approx(1069478082.5, rel=1e-9)
-    assert worst.stiffness == pytest.approx(worst.attained, rel=2e-6)
+    assert worst.stiffness_max == pytest.approx(1069478082.5, rel=1e-9)
+    assert worst.stiffness == pytest.approx(worst.stiffness_max, rel=2e-6)
     assert not worst.is_vertex
 
 
@@ -181,7 +181,7 @@ def test_undamped_devices_without_delay_closed_form():
     worst, wall = robust_max_stiffness(**box), robust_wall(**box)
     expected = (12 - 8 * np.sqrt(2)) * 0.08 / 1e-3**2
     assert worst.status == wall.status == Status.OK
-    assert worst.attained == pytest.approx(expected, rel=1e-12)
+    assert worst.stiffness_max == pytest.approx(expected, rel=1e-12)
     assert expected * (1 - 2e-6) <= worst.stiffness <= expected
     assert wall.stiffness <= worst.stiffness * (1 + 1e-12)
     assert (worst.mass, worst.damping, worst.period, worst.delay) == (0.08, 0.0, 1e-3, 0.0)

@@ -106,7 +106,10 @@ def test_tolerance_analysis_of_device_unstable_without_wall():
 
 
 def test_grasps_are_not_checked_for_linear_devices():
-    assert zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 50"), zwidth.Timing(1e-3)).recommend().wanted.grasps == "none"
+    assert (
+        zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 50"), zwidth.Timing(1e-3)).recommend().requirements.grasps
+        == "none"
+    )
     result = CliRunner().invoke(cli, ["recommend", *PENDULUM])
     assert "(not checked in the reference grasps)" in " ".join(result.stdout.split())
 

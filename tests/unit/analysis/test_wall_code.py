@@ -47,7 +47,7 @@ def trajectories():
     """Simulate motions that enter and leave the wall several times under a sinusoidal external force."""
     force = 3.0 * np.sin(np.arange(PERIODS) / 20.0) + 1.0
     scenes = [make_scene(velocity) for velocity in ESTIMATES.values()]
-    options = {"periods": PERIODS, "start_position": -1e-3, "push_history": force, "contact": "unilateral"}
+    options = {"periods": PERIODS, "start_position": -1e-3, "external_force_history": force, "contact": "unilateral"}
     motions = zwidth.simulate(scenes, **options)
     return {name: (motions.measured[k], motions.command[k]) for k, name in enumerate(ESTIMATES)}
 

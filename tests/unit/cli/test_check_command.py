@@ -1,4 +1,4 @@
-"""`zwidth check`: scenes on the command line, doubts, remedies, gains, simulation, and imports."""
+"""`zwidth check`: scenes on the command line, warnings, remedies, gains, simulation, and imports."""
 
 import json
 import re
@@ -42,8 +42,8 @@ def run(*arguments):
     return result
 
 
-def doubts_of(result):
-    """Lines of doubt, which go to stderr; older versions of click's runner do not tell the two apart."""
+def warnings_of(result):
+    """Return the warnings, which go to stderr; older versions of click's runner mix it with stdout."""
     return [line for line in result.output.splitlines() if line.startswith("zwidth: ")]
 
 
@@ -196,7 +196,7 @@ def test_rate_and_period_are_one_thing():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "doubt"),
+    ("arguments", "warning"),
     [
         (["--mass", "70", *RATE], "--mass is 70 kg, an implausible value; did you mean --mass '70 g'?"),
         (["--mass", "1", "--period", "4000"], "--period is 4000 s, .* did you mean --rate '4000 Hz'?"),
@@ -224,19 +224,19 @@ def test_rate_and_period_are_one_thing():
         ),
     ],
 )
-def test_what_no_device_has_gets_a_line_of_doubt(arguments, doubt):
+def test_what_no_device_has_gets_a_warning(arguments, warning):
     result = run("check", "--stiffness", "100", *arguments)
     assert re.search("^(STABLE|UNSTABLE|MARGINAL) ", result.output, re.MULTILINE)
-    (line,) = doubts_of(result)
-    assert re.fullmatch(f"zwidth: {doubt.replace('?', '[?]')}", line)
+    (line,) = warnings_of(result)
+    assert re.fullmatch(f"zwidth: {warning.replace('?', '[?]')}", line)
 
 
-def test_a_stiffness_beyond_all_walls_is_doubted_and_usual_values_are_not():
-    (line,) = doubts_of(run("check", "--stiffness", "1e9", *DEVICE, *RATE))
+def test_a_stiffness_beyond_all_walls_causes_a_warning_and_usual_values_are_not():
+    (line,) = warnings_of(run("check", "--stiffness", "1e9", *DEVICE, *RATE))
     assert "--stiffness is 1e+09 N/m" in line
-    assert doubts_of(run("check", *WALL, *DEVICE, *RATE, *PARTS["soft hand"][0])) == []
+    assert warnings_of(run("check", *WALL, *DEVICE, *RATE, *PARTS["soft hand"][0])) == []
     wheel = ["--stiffness", "2", "--mass", "4.5e-4", "--damping", "0.0013", "--rate", "1 kHz"]
-    assert doubts_of(run("check", *wheel)) == []
+    assert warnings_of(run("check", *wheel)) == []
 
 
 def test_encoder_friction_and_motor_are_simulated():
@@ -311,7 +311,7 @@ def test_the_ridge_of_a_scene_with_parts():
     there, here = (scene.replace(**{"velocity.cutoff": 100 + s}).max_stiffness().stiffness for s in (step, -step))
     assert np.isclose(per["velocity.cutoff"], (there - here) / (2 * step), rtol=1e-6)
     lines = run(*arguments).stdout.splitlines()
-    assert lines[-1].startswith("dK_max/d(velocity.cutoff)  52.53 N/m per Hz: 1 Hz more buys 52.5 N/m")
+    assert lines[-1].startswith("dK_max/d(velocity.cutoff)  52.53 N/m per Hz: +52.5 N/m for 1 Hz more")
 
 
 def test_the_ridge_of_a_rigid_hand_counts_the_hand_s_mass():

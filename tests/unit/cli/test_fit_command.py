@@ -29,7 +29,7 @@ def run(*arguments, code=0):
 def log(tmp_path_factory):
     force = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], 24), 25)
     scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=1e-3))
-    position = zwidth.simulate(scene, 0.0, 0.0, push_history=force, periods=600).position[:600]
+    position = zwidth.simulate(scene, 0.0, 0.0, external_force_history=force, periods=600).position[:600]
     file = tmp_path_factory.mktemp("log") / "log.csv"
     rows = [f"{k},{1e3 * x!r},{f!r}" for k, (x, f) in enumerate(zip(position.tolist(), force.tolist(), strict=True))]
     file.write_text("\n".join(["t,x,f", *rows]), encoding="utf-8")
@@ -55,8 +55,8 @@ def test_a_log_in_millimeters_and_milliseconds(log):
     # Nothing but the name says which column the force is, and which are the others.
     assert json.loads(run(log, "--time", "t:ms", "--position", "x:mm", "--json")) == found
     words = run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f", "--verbose")
-    assert "fitted to  log.csv" in words
-    assert "fitted to" not in run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f")
+    assert "data       log.csv" in words
+    assert "data  " not in run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f")
 
 
 @pytest.mark.parametrize(
@@ -69,11 +69,11 @@ def test_a_log_in_millimeters_and_milliseconds(log):
 )
 def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(unpainted, more, velocity, tmp_path):
     text = run(*WALLS, "--period", "1 ms", "--yaml", *more)
-    assert text.startswith("# Fitted to 2 buzzing walls: 95 % between")
+    assert text.startswith("# Fitted to 2 onsets of instability: 95 % between")
     assert text.count("# fitted, 95 % between") == 3
     file = tmp_path / "fitted.yaml"
     file.write_text(text, encoding="utf-8")
-    assert load_config(file).name == "fitted_2_buzzing_walls"
+    assert load_config(file).name == "fitted_2_onsets_of_instability"
     fitted = json.loads(run(*WALLS, "--period", "1 ms", "--json", *more))
     assert fitted["mass"] == fit_buzz(POINTS, period=1e-3, velocity=velocity).mass
     for name in ("mass", "damping", "delay"):
@@ -134,7 +134,7 @@ def test_several_logs_in_counts_and_a_figure(tmp_path):
         files.append(tmp_path / f"part{k}.csv")
         files[-1].write_text("\n".join([head, *part]), encoding="utf-8")
     words = run(*map(str, files), "--resolution", "0.03mm", "--verbose", "--figure", str(tmp_path / "fit.png"))
-    assert "\nfitted to  part0.csv and part1.csv\n" in words
+    assert "\ndata       part0.csv and part1.csv\n" in words
     assert "friction 8" in words
     assert "a constant force" in words
     assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")

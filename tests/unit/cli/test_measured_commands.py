@@ -48,7 +48,7 @@ def first(tmp_path_factory):
     """The log of the first record, its response, and what was said."""
     folder = tmp_path_factory.mktemp("measured")
     said = call("excite", *LOOP, "--out", folder / "play.csv")
-    assert "664" in said or "lines" in said
+    assert "664" in said or "frequencies" in said
     write_log(folder / "play.csv", folder / "log.csv")
     options = ["--position", "encoder [counts]", "--resolution", "10um"]
     said = call("respond", folder / "log.csv", *options, "--save", folder / "r.csv", "--figure", folder / "r.png")
@@ -58,7 +58,7 @@ def first(tmp_path_factory):
 def test_a_log_tells_a_safe_wall_and_what_a_stiffer_one_needs(first):
     folder, said = first
     lines = dict(line.split("  ", 1) for line in said.splitlines() if line[0] != " ")
-    assert {"response of", "lines", "deviation", "K_max", "safe wall", "wrote"} <= lines.keys()
+    assert {"data", "frequencies", "deviation", "K_max", "safe wall", "wrote"} <= lines.keys()
     assert "stable for every response in the band" in lines["safe wall"]
     assert "measure again from" in said
     assert (folder / "r.png").stat().st_size > 10_000
@@ -188,7 +188,7 @@ def test_a_rotary_device_is_measured_from_the_file_to_play_to_the_safe_wall(tmp_
         assert next(played) == "time [s],torque [N m]\n"
     time, torque = np.genfromtxt(tmp_path / "play.csv", delimiter=",", skip_header=1).T
     knob = zwidth.Scene(zwidth.Device("60 g cm^2", "0.02 mN m s/rad"), zwidth.Timing("1 ms"))
-    moved = zwidth.simulate(knob, 0.0, 0.0, push_history=torque, periods=torque.size).position[: torque.size]
+    moved = zwidth.simulate(knob, 0.0, 0.0, external_force_history=torque, periods=torque.size).position[: torque.size]
     # The encoder wraps after each turn.
     counts = np.mod(np.round(moved * 2000 / (2 * np.pi)), 2000)
     rows = [f"{1e3 * t:.6g},{count:.0f},{f:.7g}" for t, count, f in zip(time, counts, torque, strict=True)]

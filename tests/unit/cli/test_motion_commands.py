@@ -70,7 +70,7 @@ def test_a_hit(tmp_path):
 
 
 def test_a_push_and_a_release():
-    found = parse("simulate", *HANDLE, *SOFT, "--push", "2 N", "--duration", "500 periods")
+    found = parse("simulate", *HANDLE, *SOFT, "--external-force", "2 N", "--duration", "500 periods")
     assert found["periods"] == 500
     # With a constant force the device rests at F/K, after one overshoot of less than twice that.
     assert 2 / 8008 < found["penetration"] < 4 / 8008
@@ -82,7 +82,7 @@ def test_a_push_and_a_release():
 
 def test_a_transfer_function_is_pushed():
     found = run(*("simulate", "--device", "1 / 0.1 10 0", "--rate", "1 kHz", *SOFT, "--virtual-damping", "33.45"))
-    assert "pushed with 8.01 N" in found
+    assert "external force 8.01 N" in found
 
 
 def test_a_scene_file(tmp_path):

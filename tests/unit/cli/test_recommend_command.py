@@ -27,7 +27,7 @@ def test_a_person_reads_what_to_set_and_what_to_buy():
     assert "limited by 30 deg phase margin" in " ".join(" ".join(lines[:2]).split())
     text = "\n".join(lines)
     assert "margins    gain 1.93, phase 30.0 deg, delay 1.29 ms" in text
-    assert "in a hand  stable in all six reference grasps" in text
+    assert "grasps     stable in all six reference grasps" in text
     assert "twice the rate                   24.2" in text
     assert "(x 3.02; the delay stays 1 period)" in text
     assert "half the delay                   12.7" in text
@@ -45,13 +45,13 @@ def test_a_wall_on_the_brink_carries_a_caution():
 
 def test_a_wall_stable_in_every_grasp():
     text = " ".join(recommend("--stiffness-fraction", "95%").stdout.split())
-    assert "CAUTION: small margins, unstable in a hand device" in text
+    assert "CAUTION: small margins, unstable in a grasp device" in text
     assert "unstable in the hand (firm, light damping); use recommend --grasps all: K = 15." in text
     text = " ".join(recommend("--stiffness-fraction", "95%", "--grasps", "all").stdout.split())
     assert "limited by stability in all six reference grasps" in text
-    assert "in a hand stable in all six reference grasps" in text
+    assert "grasps stable in all six reference grasps" in text
     printed = json.loads(recommend("--stiffness-fraction", "95%", "--grasps", "all", "--json").stdout)
-    assert printed["wanted"]["grasps"] == "all"
+    assert printed["requirements"]["grasps"] == "all"
     assert printed["recommended"]["limited_by"] == "grasps"
     assert all(printed["grasps"].values())
     assert "Virtual wall: K = 15." in recommend("--stiffness-fraction", "95%", "--grasps", "all", "--code", "c").stdout

@@ -10,8 +10,8 @@ from loop_logs import make_knob
 
 import zwidth
 from zwidth.cli import cli
-from zwidth.identification.device_fit import RivalDevice
-from zwidth.identification.fit_report import format_rival
+from zwidth.identification.device_fit import AlternativeDevice
+from zwidth.identification.fit_report import format_alternative
 from zwidth.studies.document import load_config
 from zwidth.units.unit_system import LINEAR, ROTARY
 
@@ -80,7 +80,7 @@ def test_excite_and_respond_take_a_scene_from_a_file(files, tmp_path):
     assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
     assert np.abs(played["a.csv"]).max() == pytest.approx(2.0 * np.abs(played["c.csv"]).max()) == 0.02
     given = "--resolution", "16384 counts", "--velocity-cutoff", "80 Hz"
-    assert json.loads(run("respond", bare, scene, "--json"))["doubts"]
+    assert json.loads(run("respond", bare, scene, "--json"))["warnings"]
     assert run("respond", timed, scene, "--json") == run("respond", timed, *given, "--json")
 
 
@@ -117,7 +117,7 @@ def test_a_fit_hands_friction_and_encoder_to_the_other_commands(files, tmp_path)
     assert (found["resolution"], found["coulomb"]) == (pytest.approx(KNOB.step), 2e-4)
     for words in (["recommend", fitted], ["fit", files[0], "--resolution", "16384 counts"]):
         printed = " ".join(run(*words).split())
-        assert "in a hand stable in all six reference grasps" in printed
+        assert "grasps stable in all six reference grasps" in printed
         # A sentence of the simulation, whether the wall comes to rest or not.
         assert "the linear loop is stable" in printed
 
@@ -166,6 +166,6 @@ def test_a_normalized_scene_has_no_hardware(tmp_path):
 
 
 def test_the_inertia_of_a_rotary_device_has_the_symbol_j():
-    rival = RivalDevice(1e-5, 1e-4, 1e-3, 1.0)
-    assert format_rival(rival, ROTARY).startswith("J = 100.0 g cm^2")
-    assert format_rival(rival, LINEAR).startswith("m = ")
+    alternative = AlternativeDevice(1e-5, 1e-4, 1e-3, 1.0)
+    assert format_alternative(alternative, ROTARY).startswith("J = 100.0 g cm^2")
+    assert format_alternative(alternative, LINEAR).startswith("m = ")

@@ -20,10 +20,10 @@ def ridge(*arguments):
 
 def test_sensitivities_are_printed_with_units_and_in_words():
     assert ridge(*DEVICE).splitlines()[-4:] == [
-        "dK_max/d(mass)        141.4 kN/m per kg: 1 g more buys 141 N/m",
-        "dK_max/d(damping)     572.2 N/m per N s/m: 1 N s/m more buys 572 N/m",
-        "dK_max/d(period)      -15.34 MN/m per s: 10 µs more costs 153 N/m (the delay stays 1.000 ms)",
-        "dK_max/d(delay)       -18.67 MN/m per s: 10 µs more costs 187 N/m",
+        "dK_max/d(mass)        141.4 kN/m per kg: +141 N/m for 1 g more",
+        "dK_max/d(damping)     572.2 N/m per N s/m: +572 N/m for 1 N s/m more",
+        "dK_max/d(period)      -15.34 MN/m per s: -153 N/m for 10 µs more (the delay stays 1.000 ms)",
+        "dK_max/d(delay)       -18.67 MN/m per s: -187 N/m for 10 µs more",
     ]
 
 
@@ -62,7 +62,7 @@ def test_a_number_without_unit_has_no_prefix():
         *DEVICE, *["--actuator-cutoff", "200", "--actuator-order", "2", "--actuator-damping-ratio", "0.7"]
     ).splitlines()[-1]
     assert last.startswith("dK_max/d(actuator.damping_ratio)  ")
-    assert "N/m: 0.01 more " in last
+    assert last.endswith("N/m for 0.01 more")
 
 
 FITTED = """\

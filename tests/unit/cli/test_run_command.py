@@ -63,27 +63,27 @@ def test_a_study_asks_for_margins(run):
     assert "no wall: no passive wall exists" in " ".join(told.split())
 
 
-def test_a_scene_that_no_device_has_is_doubted_before_anything_is_computed(tmp_path, monkeypatch, unpainted):
+def test_a_scene_that_no_device_has_causes_a_warning_before_anything_is_computed(tmp_path, monkeypatch, unpainted):
     monkeypatch.chdir(tmp_path)
 
-    def doubts_of(scene):
+    def warnings_of(scene):
         (tmp_path / "small.yaml").write_text(HEAD + f"scene: {scene}\n" + STUDY % 0.5, encoding="utf-8")
         result = CliRunner().invoke(cli, ["run", "small.yaml", "--dry-run"], catch_exceptions=False)
         # Older versions of click's runner do not tell stderr from the answer.
-        doubts, plan, _ = result.output.partition("study best\n")
+        warnings, plan, _ = result.output.partition("study best\n")
         assert plan
-        return [line.removeprefix("zwidth: small.yaml: scene.") for line in doubts.splitlines()]
+        return [line.removeprefix("zwidth: small.yaml: scene.") for line in warnings.splitlines()]
 
-    assert doubts_of("{mass: 100, damping: 10, rate: 1, delay: 1}") == [
+    assert warnings_of("{mass: 100, damping: 10, rate: 1, delay: 1}") == [
         "mass is 100 kg, an implausible value; did you mean 'mass: 100 g'?",
         "delay is 1 s, an implausible value; did you mean 'delay: 1 ms' or 'delay: 1 periods'?",
         "rate is 1 Hz, an implausible value; did you mean 'rate: 1 kHz'?",
     ]
-    (of_a_part,) = doubts_of("{mass: 1, rate: 1 kHz, operator: {mass: 70, stiffness: 100}}")
+    (of_a_part,) = warnings_of("{mass: 1, rate: 1 kHz, operator: {mass: 70, stiffness: 100}}")
     assert of_a_part == "operator.mass is 70 kg, an implausible value; did you mean 'operator.mass: 70 g'?"
-    (of_a_turn,) = doubts_of("{rotary: true, mass: 50, rate: 1 kHz}")
+    (of_a_turn,) = warnings_of("{rotary: true, mass: 50, rate: 1 kHz}")
     assert of_a_turn == "mass is 50 kg m^2, an implausible value; check its unit"
-    assert doubts_of("{mass: 0.1, damping: 10, period: 1e-3, delay: 2 periods, stiffness: 5 kN/m}") == []
+    assert warnings_of("{mass: 0.1, damping: 10, period: 1e-3, delay: 2 periods, stiffness: 5 kN/m}") == []
 
 
 def test_a_terminal_shows_a_bar_and_keeps_the_lines(tmp_path):

@@ -180,7 +180,7 @@ def test_encoder_and_friction_of_a_file_are_printed(tmp_path):
         assert "hardware encoder step 20.0 µm, friction 50.0 mN (from fitted.yaml)" in text
     done = CliRunner().invoke(cli, ["run", str(file), "--out", str(tmp_path / "run")])
     text = " ".join(done.stdout.split())
-    assert "in a hand: stable in all six reference grasps" in text
+    assert "grasps: stable in all six reference grasps" in text
     assert f"simulated with {used}: " in text
     assert f"simulated with {used}: " in (tmp_path / "run" / "recommendation.md").read_text("utf-8")
     assert "hardware" not in CliRunner().invoke(cli, ["check", *wall, *DEVICE, "--resolution", "20 um"]).stdout

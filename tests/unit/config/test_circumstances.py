@@ -27,7 +27,7 @@ def test_units_become_the_arguments_of_simulate():
             "duration": "0.2 s",
             "start_position": "-1 mm",
             "start_velocity": "10 cm/s",
-            "push": "500 mN",
+            "external_force": "500 mN",
             "contact": "push_only",
             "resolution": "20 um",
             "noise": 1e-6,
@@ -48,7 +48,13 @@ def test_units_become_the_arguments_of_simulate():
     numbers = {name: value for name, value in found.items() if isinstance(value, float)}
     assert numbers == pytest.approx(
         {
-            **{"start_position": -1e-3, "start_velocity": 0.1, "push": 0.5, "resolution": 2e-5, "noise": 1e-6},
+            **{
+                "start_position": -1e-3,
+                "start_velocity": 0.1,
+                "external_force": 0.5,
+                "resolution": 2e-5,
+                "noise": 1e-6,
+            },
             **{"coulomb": 0.3, "static": 0.4, "max_force": 8.5, "max_rate": 2e3, "jitter": 2e-4},
         }
     )

@@ -30,7 +30,7 @@ def select_walls(scene, shares):
 def assert_recovered(fit, scene):
     estimates = [fit.mass / scene.mass, fit.damping / scene.damping, (fit.delay - scene.timing.delay) / PERIOD]
     np.testing.assert_allclose(estimates, [1, 1, 0], rtol=EXACT, atol=EXACT)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
 
 
 ESTIMATES = [

@@ -106,8 +106,8 @@ def is_stable(true, stiffness, damping):
 def test_onsets_that_no_rigid_device_has_are_rejected(true, noise):
     fit = zwidth.fit_buzz(find_onsets(true, SHARES, noise, seed=1), period=PERIOD, noise=noise)
     assert fit.status == Status.NO_BOUNDARY
-    assert "no rigid device has these walls" in " ".join(fit.doubts)
-    assert all(len(warning.split()) <= 25 for warning in fit.doubts)
+    assert "no rigid device has these walls" in " ".join(fit.warnings)
+    assert all(len(warning.split()) <= 25 for warning in fit.warnings)
     assert np.isnan([fit.stiffness_max, fit.safe_wall().stiffness]).all()
     assert fit.recommended.status == Status.UNREACHABLE
     assert fit.next is None
@@ -120,7 +120,7 @@ def test_recommended_walls_of_non_rigid_devices_are_stable(true, seed):
     for noise in (0.02, None):
         fit = zwidth.fit_buzz(walls, period=PERIOD, noise=noise)
         assert not fit.is_structured
-        if fit.is_doubted:
+        if fit.is_unreliable:
             assert np.isnan(fit.safe_wall().stiffness)
             continue
         safe, wall = fit.safe_wall(), fit.recommended
@@ -135,7 +135,7 @@ def test_onsets_of_rigid_mass_are_accepted(seed, noise):
     rigid = TrueDevice("", 0.1, 2.0, 0.0, (), 0.7e-3, PERIOD, 1e-5, 3.0)
     walls = find_onsets(rigid, (0.0, 0.4, 0.8, 1.1), noise=0.02, seed=seed)
     fit = zwidth.fit_buzz(walls, period=PERIOD, noise=noise)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
 
 
 def test_interval_at_unmeasured_damping_includes_measured_stiffness():
@@ -144,9 +144,15 @@ def test_interval_at_unmeasured_damping_includes_measured_stiffness():
     walls = [(494.7, 0.0, 10.92), (4044.0, 8.053, 33.66), (6577.0, 16.11, 45.92), (8703.0, 24.16, 54.96)]
     fit = zwidth.fit_buzz(walls, period=PERIOD, noise=0.02)
     assert not fit.is_structured
-    assert fit.damping_tried == 24.16
+    assert fit.measured_damping == 24.16
     assert fit.virtual_damping > 24.16
-    interval, spread = fit.intervals["stiffness_max"], np.exp(fit.reach * fit.stiffness_error / fit.stiffness_max)
-    assert interval == (pytest.approx(8703 * (1 - 0.02 * fit.reach)), pytest.approx(fit.stiffness_max * spread))
+    interval, spread = (
+        fit.intervals["stiffness_max"],
+        np.exp(fit.coverage_factor * fit.stiffness_error / fit.stiffness_max),
+    )
+    assert interval == (
+        pytest.approx(8703 * (1 - 0.02 * fit.coverage_factor)),
+        pytest.approx(fit.stiffness_max * spread),
+    )
     assert interval.low < true.limit_of_walls() < interval.high
     assert fit.safe_wall().stiffness <= fit.bound_measured_stiffness(0.99)

@@ -29,7 +29,8 @@ def log_fit():
     scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=1e-3))
     force = np.repeat(rng.choice([-1.0, 1.0], (2, 40)), 20, axis=1)
     positions = [
-        zwidth.simulate(scene, 0.0, 0.0, push_history=external, periods=800).position[:800] for external in force
+        zwidth.simulate(scene, 0.0, 0.0, external_force_history=external, periods=800).position[:800]
+        for external in force
     ]
     noisy = [clean + 1e-5 * rng.standard_normal(800) for clean in positions]
     return zwidth.fit_log([1e-3, 1e-3], noisy, list(force))
@@ -63,13 +64,13 @@ def test_estimated_noise_widens_the_band(onset_fit):
     open_noise = zwidth.fit_buzz(ONSETS, period=1e-3)
     widths = [np.nanmax(traced[HIGH] - traced[LOW]) / fit.stiffness_error for fit in (onset_fit, open_noise)
               for traced in [trace_boundary(fit)]]  # fmt: skip
-    assert open_noise.reach > 1.5 * onset_fit.reach
+    assert open_noise.coverage_factor > 1.5 * onset_fit.coverage_factor
     assert widths[1] > 1.3 * widths[0]
 
 
 def test_white_residuals_are_uncorrelated(log_fit):
     correlation = correlate_residuals(log_fit)
-    residuals = [motion.position - motion.modelled for motion in log_fit.motions]
+    residuals = [motion.position - motion.modeled for motion in log_fit.motions]
     finite = [residual[np.isfinite(residual)] for residual in residuals]
     assert correlation["lag_s"][0] == log_fit.period
     assert correlation["band"][0] == pytest.approx(1.96 / np.sqrt(sum(residual.size for residual in finite)), rel=1e-4)
@@ -84,14 +85,14 @@ def test_motion_table_contains_every_sample_of_every_log(log_fit):
     tables = gather_evidence(log_fit, "two logs")
     motion = tables["motion"]
     assert np.bincount(motion["log"]).tolist() == [0, 800, 800]
-    np.testing.assert_array_equal(motion["position_m"] - motion["modelled_m"], motion["residual_m"])
+    np.testing.assert_array_equal(motion["position_m"] - motion["modeled_m"], motion["residual_m"])
     assert np.nanstd(motion["residual_m"]) == pytest.approx(1e-5, rel=0.1)
     assert set(tables["walls"]["kind"]) == {"stiffest", "set"}
 
 
 def test_wall_table_contains_errors_and_residuals_of_onsets(onset_fit):
     walls = gather_evidence(onset_fit, "walls", ONSETS)["walls"]
-    is_onset = walls["kind"] == "buzzing"
+    is_onset = walls["kind"] == "onset"
     np.testing.assert_array_equal(walls[K][is_onset], [wall.stiffness for wall in ONSETS])
     np.testing.assert_allclose(walls["stiffness_error_N_per_m"][is_onset], 0.02 * walls[K][is_onset])
     np.testing.assert_array_equal(walls["stiffness_residual"][is_onset], onset_fit.residuals[:, 0])

@@ -96,4 +96,4 @@ def test_interval_is_valid_if_lag_and_resonance_fit_equally_well():
     force = 3 * np.repeat(rng.choice([-1.0, 1.0], 100), 25)
     fit = zwidth.fit_log(PERIOD, true.play(force), force)
     interval = fit.intervals["stiffness_max"]
-    assert fit.is_doubted or interval.low <= true.limit_of_walls() <= interval.high
+    assert fit.is_unreliable or interval.low <= true.limit_of_walls() <= interval.high

@@ -30,7 +30,9 @@ def test_motion_matches_simulation_with_finer_period(friction, delay, damping):
     fine_force = np.concatenate([np.zeros(n_delay), np.repeat(force, FINER)])[: FINER * force.size]
     scene = zwidth.Scene(zwidth.Device(mass, damping), zwidth.Timing(period=PERIOD / FINER))
     friction_options = {"coulomb": friction} if friction else {}
-    motion = zwidth.simulate(scene, 0.0, 0.0, push_history=fine_force, periods=fine_force.size, **friction_options)
+    motion = zwidth.simulate(
+        scene, 0.0, 0.0, external_force_history=fine_force, periods=fine_force.size, **friction_options
+    )
     exact = motion.position[: fine_force.size : FINER]
     speed = float(motion.velocity[SKIP * FINER]) * PERIOD
     g = PERIOD**2 / mass

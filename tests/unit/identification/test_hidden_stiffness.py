@@ -74,13 +74,15 @@ def test_interval_matches_quantiles_of_a_sampled_mixture():
     _, force, position = simulate_log((), 1e-4)
     fit = zwidth.fit_log(PERIOD, position, force)
     assert fit.hidden is not None
-    assert fit.freedom is not None
+    assert fit.degrees_of_freedom is not None
     rng, count = np.random.default_rng(0), 400_000
     for odds, ratios in ((0.0, [0.5]), (0.3, [0.4, 0.9, 1.2]), (4.0, [0.2, 1.0])):
         mixture = replace(fit, hidden=HiddenResonances(odds, np.array(ratios)), lag=None)
         has_resonance = rng.random(count) < odds / (1.0 + odds)
         middle = fit.stiffness_max * np.where(has_resonance, rng.choice(ratios, count), 1.0)
-        sampled = middle * np.exp(fit.stiffness_error / fit.stiffness_max * rng.standard_t(fit.freedom, count))
+        sampled = middle * np.exp(
+            fit.stiffness_error / fit.stiffness_max * rng.standard_t(fit.degrees_of_freedom, count)
+        )
         low, high = np.quantile(sampled, [0.025, 0.975])
         interval = mixture.intervals["stiffness_max"]
         assert interval == pytest.approx((low, high), abs=0.1 * fit.stiffness_error)
@@ -100,10 +102,10 @@ def test_interval_covers_the_effect_of_an_invisible_resonance():
         assert not fit.modes
         low, high = fit.intervals["stiffness_max"]
         limit = true.limit_of_walls()
-        covered += fit.is_doubted or low <= limit <= high
-        assert abs(limit - fit.stiffness_max) > fit.reach * fit.stiffness_error or fit.is_doubted
+        covered += fit.is_unreliable or low <= limit <= high
+        assert abs(limit - fit.stiffness_max) > fit.coverage_factor * fit.stiffness_error or fit.is_unreliable
         # An encoder that would reveal the resonance leaves the interval narrow.
         fit = zwidth.fit_log(PERIOD, simulate_log((), 1e-7, seed)[2], force)
-        widths.append(np.ptp(fit.intervals["stiffness_max"]) / (2.0 * fit.reach * fit.stiffness_error))
+        widths.append(np.ptp(fit.intervals["stiffness_max"]) / (2.0 * fit.coverage_factor * fit.stiffness_error))
     assert covered == 4
     assert max(widths) < 20.0

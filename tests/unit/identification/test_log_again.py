@@ -96,7 +96,7 @@ def test_long_initial_rest_does_not_affect_the_fit():
     force = np.concatenate([np.zeros(2700), random_pulses(rng, 400)])
     position = record_positions(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.08)
     fit = zwidth.fit_log(PERIOD, position, force)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     for name, true in {"mass": 0.075, "damping": 0.6, "delay": 2.3e-3, "friction": 0.08}.items():
         assert abs(getattr(fit, name) - true) < 4 * fit.errors[name]
 
@@ -117,9 +117,9 @@ def test_few_positions_yield_a_warning():
     rng = np.random.default_rng(0)
     force = random_pulses(rng, 120)
     position = record_positions(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.0)
-    assert not any("positions are fitted" in warning for warning in zwidth.fit_log(PERIOD, position, force).doubts)
+    assert not any("positions are fitted" in warning for warning in zwidth.fit_log(PERIOD, position, force).warnings)
     fit = zwidth.fit_log(PERIOD, position[:70], force[:70])
-    assert any("only 48 positions are fitted" in warning for warning in fit.doubts)
+    assert any("only 48 positions are fitted" in warning for warning in fit.warnings)
 
 
 def test_log_with_gaps_is_fitted_as_several_logs():
@@ -135,9 +135,9 @@ def test_log_with_gaps_is_fitted_as_several_logs():
         assert getattr(fit, name) == pytest.approx(getattr(separate, name), rel=1e-9)
     (motion,) = fit.motions
     np.testing.assert_allclose(motion.time, clock[is_kept], rtol=1e-9, atol=1e-12)
-    both = np.concatenate([each.modelled for each in separate.motions])
-    np.testing.assert_allclose(motion.modelled[(motion.time < 0.1495) | (motion.time > 0.1905)], both, rtol=1e-9)
-    note = dict(detail_fit(fit, "log"))["used"]
+    both = np.concatenate([each.modeled for each in separate.motions])
+    np.testing.assert_allclose(motion.modeled[(motion.time < 0.1495) | (motion.time > 0.1905)], both, rtol=1e-9)
+    note = dict(detail_fit(fit, "log"))["samples"]
     assert note == "315 of 379 samples: those after each of 2 gaps depend on forces that were not logged"
     with pytest.raises(InputError, match="21 samples of log 1 are missing, most of them after sample 169"):
         zwidth.respond(clock[is_kept], position[is_kept], force[is_kept])
@@ -147,7 +147,7 @@ def test_milliseconds_read_as_seconds_yield_a_warning():
     rng = np.random.default_rng(0)
     force = random_pulses(rng, 300)
     fit = zwidth.fit_log(1.0, record_positions(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.0), force)
-    assert any("the time in ms" in warning for warning in fit.doubts)
+    assert any("the time in ms" in warning for warning in fit.warnings)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -156,9 +156,9 @@ def test_zero_delay_yields_a_warning_only_if_the_force_is_late(seed):
     force = random_pulses(rng, 1000)
     position = record_positions(rng, force, 0.08, 0.5, 0.0, 0.0, 0.02)
     fit = zwidth.fit_log(PERIOD, position, force, resolution=STEP)
-    assert fit.doubts == ()
+    assert fit.warnings == ()
     assert 0 < fit.safe_wall().stiffness < fit.stiffness_max
     late = zwidth.fit_log(PERIOD, position[1:], force[:-1], resolution=STEP)
     assert late.delay == 0
-    assert any("a negative delay would fit better" in warning for warning in late.doubts)
+    assert any("a negative delay would fit better" in warning for warning in late.warnings)
     assert np.isnan(late.safe_wall().stiffness)

@@ -64,7 +64,7 @@ def test_exact_log_recovers_the_device(mass, damping, delay):
     np.testing.assert_allclose([fit.mass, fit.damping], [mass, damping], rtol=EXACT)
     assert fit.delay == pytest.approx(delay, abs=EXACT * PERIOD)
     assert fit.offset == pytest.approx(0.0, abs=EXACT)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -88,7 +88,7 @@ def test_simulated_motion_recovers_the_device():
     scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=PERIOD))
     force = random_steps(np.random.default_rng(4), 500)
     delayed = np.concatenate([np.zeros(3), force[:-3]])
-    motion = zwidth.simulate(scene, 0.0, 0.0, push_history=delayed, periods=500)
+    motion = zwidth.simulate(scene, 0.0, 0.0, external_force_history=delayed, periods=500)
     fit = zwidth.fit_log(PERIOD, motion.position[:500], force)
     np.testing.assert_allclose([fit.mass, fit.damping, fit.delay / PERIOD], [0.1, 2.0, 3.0], rtol=EXACT)
 
@@ -135,7 +135,7 @@ def test_short_log_with_undetermined_damping_yields_warning():
     exact = simulate_positions(2.0, 0.5, 1e-3, force)
     fit = zwidth.fit_log(PERIOD, exact + 0.01 * np.std(exact) * rng.standard_normal(120), force)
     assert fit.intervals["damping"].low == 0.0
-    assert any("damping" in warning for warning in fit.doubts)
+    assert any("damping" in warning for warning in fit.warnings)
 
 
 @pytest.mark.parametrize("scale, unit", [(1e3, "mm"), (1e-3, "mN")])
@@ -143,7 +143,7 @@ def test_units_wrong_by_1000_yield_warning(scale, unit):
     rng = np.random.default_rng(10)
     force = random_steps(rng, 400)
     fit = zwidth.fit_log(PERIOD, scale * simulate_positions(0.1, 2.0, 1e-3, force), force)
-    assert any(f"in {unit}" in warning for warning in fit.doubts)
+    assert any(f"in {unit}" in warning for warning in fit.warnings)
 
 
 @pytest.mark.parametrize("inertia, scale, unit", [(0.05, 1e-3, "mN m"), (1e-4, 57.3, "degrees"), (1e-6, 1e4, "counts")])
@@ -151,10 +151,10 @@ def test_wrong_units_of_rotary_axis_yield_warning(inertia, scale, unit):
     rng = np.random.default_rng(10)
     force = 500 * inertia * random_steps(rng, 400)
     angle = simulate_positions(inertia, 20 * inertia, 1e-3, force)
-    assert zwidth.fit_log(PERIOD, angle, force, rotary=True).doubts == ()
+    assert zwidth.fit_log(PERIOD, angle, force, rotary=True).warnings == ()
     # A torque that is 1000 times as large has the effect of an angle that is 1000 times as small.
     fit = zwidth.fit_log(PERIOD, scale * angle, force, rotary=True)
-    assert any(unit in warning for warning in fit.doubts)
+    assert any(unit in warning for warning in fit.warnings)
     assert np.isnan(fit.safe_wall().stiffness)
 
 
@@ -162,12 +162,12 @@ def test_wrong_units_of_rotary_axis_yield_warning(inertia, scale, unit):
 def test_friction_is_recovered_from_simulated_motion(delay):
     force = 2.0 * random_steps(np.random.default_rng(11), 600, 40)
     scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=PERIOD, delay=delay))
-    positions = zwidth.simulate(scene, 0.0, 0.0, push_history=force, coulomb=0.3, periods=600).position[:600]
+    positions = zwidth.simulate(scene, 0.0, 0.0, external_force_history=force, coulomb=0.3, periods=600).position[:600]
     fit = zwidth.fit_log(PERIOD, positions, force)
     # An external force acts without delay: the delay of the scene applies to the wall force only.
     np.testing.assert_allclose([fit.mass, fit.damping, fit.friction], [0.1, 2.0, 0.3], rtol=EXACT)
     assert fit.delay == pytest.approx(0.0, abs=EXACT)
-    assert (fit.doubts, fit.status) == ((), Status.OK)
+    assert (fit.warnings, fit.status) == ((), Status.OK)
 
 
 def test_oscillatory_lag_is_modeled_and_operator_force_rejected():
@@ -194,7 +194,7 @@ def test_delay_above_max_delay_yields_status_unreachable():
     position = simulate_positions(0.1, 2.0, 6e-3, force)
     fit = zwidth.fit_log(PERIOD, position, force, max_delay="3 ms")
     assert fit.status == Status.UNREACHABLE
-    assert any("max_delay" in warning for warning in fit.doubts)
+    assert any("max_delay" in warning for warning in fit.warnings)
     assert zwidth.fit_log(PERIOD, position, force, max_delay="8 ms").status == Status.OK
 
 
@@ -249,7 +249,7 @@ def simulate_single_pulse(coulomb, samples=1500):
     force = np.zeros(samples)
     force[50:90] = 1.0
     scene = zwidth.Scene(zwidth.Device(0.1, 0.5), zwidth.Timing(period=PERIOD))
-    return zwidth.simulate(scene, 0.0, 0.0, push_history=force, coulomb=coulomb, periods=samples).position[
+    return zwidth.simulate(scene, 0.0, 0.0, external_force_history=force, coulomb=coulomb, periods=samples).position[
         :samples
     ], force
 
@@ -259,7 +259,7 @@ def test_low_friction_after_single_pulse_is_estimated_without_interval(coulomb):
     position, force = simulate_single_pulse(coulomb)
     fit = zwidth.fit_log(PERIOD, position, force)
     np.testing.assert_allclose([fit.mass, fit.damping, fit.friction], [0.1, 0.5, coulomb], rtol=1e-8)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     # A constant force of -coulomb until rest causes the same motion, so no finite interval exists.
     assert np.isnan([fit.errors["friction"], *fit.intervals["friction"]]).all()
     assert fit.safe_wall().stiffness > 0
@@ -295,7 +295,7 @@ def test_timestamp_jitter_changes_only_the_period(share):
 def test_no_wall_is_recommended_while_warnings_remain(period, scale, word):
     force = random_steps(np.random.default_rng(15), 300)
     fit = zwidth.fit_log(period, scale * simulate_positions(0.1, 2.0, 1e-3, force), force)
-    assert any(word in warning for warning in fit.doubts)
+    assert any(word in warning for warning in fit.warnings)
     assert np.isnan(fit.safe_wall()[:3]).all()
     assert fit.safe_wall().status == Status.UNDECIDED
     assert fit.recommended.status == Status.UNREACHABLE
@@ -307,7 +307,7 @@ def test_no_wall_is_recommended_while_warnings_remain(period, scale, word):
     assert "safe limit" not in dict(detail_fit(fit, "a log"))
     text = "\n".join(write_scene(fit, "a log"))
     assert "    stiffness: 0.0 N/m\n" in text
-    assert f'    warnings:\n      - "{fit.doubts[0]}"' in text
+    assert f'    warnings:\n      - "{fit.warnings[0]}"' in text
 
 
 def test_long_log_is_truncated_and_reported(monkeypatch):
@@ -320,5 +320,5 @@ def test_long_log_is_truncated_and_reported(monkeypatch):
     assert (finite[0], finite.size) == (22, finite[-1] - 21)
     assert 400 <= finite.size < 500
     assert abs(fit.mass - 0.1) < 4 * fit.errors["mass"]
-    assert dict(detail_fit(fit, "a log"))["used"].startswith(f"{finite.size} of 900 samples")
-    assert "used" not in dict(detail_fit(zwidth.fit_log(PERIOD, position[:400], force[:400]), "a log"))
+    assert dict(detail_fit(fit, "a log"))["samples"].startswith(f"{finite.size} of 900 samples")
+    assert "samples" not in dict(detail_fit(zwidth.fit_log(PERIOD, position[:400], force[:400]), "a log"))

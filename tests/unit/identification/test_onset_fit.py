@@ -38,7 +38,7 @@ def assert_recovered(fit, scene):
     ]
     np.testing.assert_allclose(estimates, [1, 1, 0], rtol=EXACT, atol=EXACT)
     assert fit.status == Status.OK
-    assert fit.doubts == ()
+    assert fit.warnings == ()
 
 
 def random_scene(seed):
@@ -149,7 +149,7 @@ def test_next_experiment_reduces_the_error_as_predicted():
     assert step is not None
     more = np.vstack([walls, [step.stiffness, step.virtual_damping, step.frequency]])
     after = zwidth.fit_buzz(more, period=1e-3, noise=(0.03, 0.01))
-    assert after.stiffness_error == pytest.approx(step.error_afterwards, rel=1e-6)
+    assert after.stiffness_error == pytest.approx(step.stiffness_error, rel=1e-6)
     assert after.stiffness_error < 0.5 * fit.stiffness_error
 
 
@@ -157,7 +157,7 @@ def test_contradicting_onsets_yield_a_warning():
     walls = compute_onsets(make_scene(0.1, 0.1, 1.0, 1e-3), [0.0, 0.4, 0.8])
     walls[1, 0] *= 1.5
     fit = zwidth.fit_buzz(walls, period=1e-3, noise=0.01)
-    assert any("no rigid device has these walls" in warning for warning in fit.doubts)
+    assert any("no rigid device has these walls" in warning for warning in fit.warnings)
     assert fit.status == Status.NO_BOUNDARY
     assert np.isnan(fit.stiffness_max)
     # Also with unspecified noise, because no plausible noise explains a deviation of 50 %.
@@ -177,7 +177,7 @@ def test_undetermined_mass_of_strongly_damped_device_is_reported():
         except InputError as error:
             reports += "not determine" in str(error)
         else:
-            reports += fit.status == Status.UNDECIDED or "mass is hardly" in " ".join(fit.doubts)
+            reports += fit.status == Status.UNDECIDED or "mass is hardly" in " ".join(fit.warnings)
     assert reports >= 2
 
 
@@ -194,24 +194,25 @@ def test_alternative_optima_keep_stiffness_only_if_they_agree(seed, agree):
     walls, period = noisy_walls(seed, 0.5)
     fit = zwidth.fit_buzz(walls, period=period, noise=0.03)
     assert fit.status == Status.UNDECIDED
-    (rival,) = fit.rivals
-    assert "another device" in " ".join(fit.doubts)
+    (alternative,) = fit.alternatives
+    assert "another device" in " ".join(fit.warnings)
     # Both devices fit: each measured wall is on their stability boundaries, within the noise.
-    for device in (fit, rival):
+    for device in (fit, alternative):
         scene = zwidth.Scene(zwidth.Device(device.mass, device.damping), zwidth.Timing(period, device.delay))
         ends = [scene.stable_stiffness(damping)[0, 1] for damping in walls[:, 1]]
         np.testing.assert_allclose(ends, walls[:, 0], rtol=0.2)
         assert float(scene.max_stiffness().stiffness) == pytest.approx(
-            rival.stiffness_max if device is rival else float(fit.nominal.max_stiffness().stiffness), rel=1e-9
+            alternative.stiffness_max if device is alternative else float(fit.nominal.max_stiffness().stiffness),
+            rel=1e-9,
         )
     best = float(fit.nominal.max_stiffness().stiffness)
     assert np.isfinite(fit.stiffness_max) == np.isfinite(fit.stiffness_error) == agree
     if agree:
-        assert abs(rival.stiffness_max - best) <= fit.stiffness_error
+        assert abs(alternative.stiffness_max - best) <= fit.stiffness_error
     assert np.isnan(fit.safe_wall().stiffness)
     assert fit.next is not None
-    assert np.isfinite(fit.next.error_afterwards) == agree
-    assert fit.as_dict()["rivals"][0]["mass"] == rival.mass
+    assert np.isfinite(fit.next.stiffness_error) == agree
+    assert fit.as_dict()["alternatives"][0]["mass"] == alternative.mass
     assert fit.as_dict()["stiffness_max"] == (fit.stiffness_max if agree else None)
 
 
@@ -231,7 +232,7 @@ def test_repeated_wall_counts_once_unless_noise_is_given():
     walls = [(6850, 0, 40.1), (15900, 18.7, 68.6), (19700, 37.4, 89.1)]
     once, twice = (zwidth.fit_buzz(points, period=1e-3) for points in (walls, [*walls, walls[0]]))
     assert twice.errors == once.errors
-    assert any("repeat" in warning for warning in twice.doubts)
+    assert any("repeat" in warning for warning in twice.warnings)
     once, twice = (zwidth.fit_buzz(points, period=1e-3, noise=0.02) for points in (walls, [*walls, walls[0]]))
     assert twice.errors["mass"] < once.errors["mass"]
 
@@ -279,7 +280,7 @@ def test_as_dict_and_scene_of_the_fit():
     plain = fit.as_dict()
     assert plain["mass"] == fit.mass
     # The interval is symmetric in the logarithm of K_max.
-    spread = np.exp(fit.reach * fit.stiffness_error / fit.stiffness_max)
+    spread = np.exp(fit.coverage_factor * fit.stiffness_error / fit.stiffness_max)
     assert plain["intervals"]["stiffness_max"] == pytest.approx(
         [fit.stiffness_max / spread, fit.stiffness_max * spread], rel=1e-14
     )
@@ -303,7 +304,7 @@ def test_recommended_damping_does_not_exceed_the_tested_damping():
     true = OtherDevice.of(OTHERS["compliance of 300 Hz, encoder at the motor"])
     walls = [(494.7, 0.0, 10.92), (4044.0, 8.053, 33.66), (6577.0, 16.11, 45.92), (8703.0, 24.16, 54.96)]
     fit = zwidth.fit_buzz(walls, period=PERIOD, noise=0.02)
-    assert not fit.is_doubted
+    assert not fit.is_unreliable
     rigid_wall, safe, wall = fit.safe_wall(rigid=True), fit.safe_wall(), fit.recommended
     assert rigid_wall.virtual_damping > 26.8
     assert not true.is_stable(*rigid_wall[:2])

@@ -113,7 +113,7 @@ def test_true_device_is_recovered_from_repaired_logs(name, tmp_path):
     fit = fit_motions([read_log(file, {}, resolution=f"{KNOB.counts} counts/rev")])
     assert KNOB.holds(fit, 2.0)
     assert fit.status == Status.OK
-    assert fit.doubts == ()
+    assert fit.warnings == ()
     assert any(note in each for each in fit.notes)
 
 
@@ -212,10 +212,10 @@ def test_rounded_force_column_is_reported():
     assert exact.status == Status.OK
     fit = zwidth.fit_log(1e-3, step * np.round(position / step), np.round(torque, 4), rotary=True)
     assert fit.status == Status.UNDECIDED
-    assert any("the force column is rounded to 100 µN m" in warning for warning in fit.doubts)
-    assert not any("resonance" in warning for warning in fit.doubts)
+    assert any("the force column is rounded to 100 µN m" in warning for warning in fit.warnings)
+    assert not any("resonance" in warning for warning in fit.warnings)
     # Each warning is printed separately.
-    assert [label for label, _ in summarize_fit(fit)].count("WARNING") == len(fit.doubts)
+    assert [label for label, _ in summarize_fit(fit)].count("WARNING") == len(fit.warnings)
 
 
 @pytest.mark.parametrize("unit, decimals", [("deg", 3), ("rad", 5)])

@@ -47,7 +47,7 @@ def test_deviation_covers_the_true_response_and_is_tight():
     np.testing.assert_allclose(estimate.device.frequency, excitation.frequency, rtol=1e-12)
     assert estimate.cycle == pytest.approx(2.0)
     assert estimate.records == 5
-    assert estimate.doubts == ()
+    assert estimate.warnings == ()
     # The prediction assumes white encoder errors.
     assert np.median(estimate.device.deviation / excitation.deviation) == pytest.approx(1.0, abs=0.25)
     assert np.median(estimate.coherence) > 0.99
@@ -107,7 +107,7 @@ def test_force_without_cycle_yields_a_warning():
     force = np.repeat(rng.choice([-3.0, 3.0], 40000), 1)
     estimate = zwidth.respond(PERIOD, DEVICE.play(force), force)
     assert estimate.cycle is None
-    assert "does not repeat" in estimate.doubts[0]
+    assert "does not repeat" in estimate.warnings[0]
     middle = (estimate.device.frequency > 5) & (estimate.device.frequency < 300)
     error = np.abs(estimate.device.response - evaluate_response(estimate.device.frequency))[middle]
     assert (error < estimate.device.deviation[middle]).mean() > 0.99

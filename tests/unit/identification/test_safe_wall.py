@@ -59,7 +59,7 @@ def test_safe_wall_is_reproducible_and_stiffer_at_lower_reliability(fit):
 
 
 def test_few_degrees_of_freedom_reduce_the_safe_stiffness(fit):
-    uncertain = replace(fit, freedom=2)
+    uncertain = replace(fit, degrees_of_freedom=2)
     assert uncertain.safe_wall().stiffness < 0.95 * fit.safe_wall().stiffness
 
 
@@ -74,7 +74,7 @@ def test_large_covariance_reduces_the_safe_stiffness(fit):
 @pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=100)])
 def test_unbounded_covariance_leaves_no_safe_stiffness(fit, velocity):
     unbounded = replace(
-        fit, covariance=1e8 * fit.covariance, freedom=1, nominal=replace(fit.nominal, velocity=velocity)
+        fit, covariance=1e8 * fit.covariance, degrees_of_freedom=1, nominal=replace(fit.nominal, velocity=velocity)
     )
     assert unbounded.safe_wall()[:2] == (0.0, 0.0)
 
@@ -82,7 +82,7 @@ def test_unbounded_covariance_leaves_no_safe_stiffness(fit, velocity):
 def test_sampled_implementation_matches_the_closed_form(fit, monkeypatch):
     # A window of one sample equals the backward difference, but the scene uses the sampled implementation.
     sampled = replace(fit, nominal=replace(fit.nominal, velocity=zwidth.WindowedDifference(samples=1)))
-    assert sampled.nominal.parts_beyond
+    assert sampled.nominal.nonrigid_parts
     monkeypatch.setattr("zwidth.identification.safe_wall._SAMPLES", 1000)
     wall, expected = sampled.safe_wall(), replace(fit).safe_wall()
     assert wall.stiffness == pytest.approx(expected.stiffness, rel=5e-3)

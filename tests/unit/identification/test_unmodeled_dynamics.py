@@ -41,7 +41,7 @@ def fit_hidden():
 def test_non_rigid_device_is_modeled_or_has_no_wall(name):
     true, fit = OtherDevice.of(OTHERS[name]), fit_other(name)
     safe, wall = fit.safe_wall(), fit.recommended
-    if fit.is_doubted:
+    if fit.is_unreliable:
         assert wall.status == Status.UNREACHABLE
         assert np.isnan([fit.stiffness_max, fit.stiffness_error, safe.stiffness]).all()
         return
@@ -54,7 +54,7 @@ def test_non_rigid_device_is_modeled_or_has_no_wall(name):
 def test_resonance_is_identified_and_written_to_the_scene(tmp_path):
     force, position = record_log(add_mode(RIGID, 120, 0.03, 0.1), 1)
     fit = zwidth.fit_log(PERIOD, position, force)
-    assert (fit.status, fit.doubts, fit.actuator) == (Status.OK, (), None)
+    assert (fit.status, fit.warnings, fit.actuator) == (Status.OK, (), None)
     true = {"frequency": 120.0, "damping_ratio": 0.03, "mass": 10 * MASS}
     for name, value in true.items():
         path = f"modes.0.{name}"
@@ -63,7 +63,7 @@ def test_resonance_is_identified_and_written_to_the_scene(tmp_path):
     resonance = dict(summarize_fit(fit))["resonance"]
     assert resonance.startswith(f"frequency {fit.value_of('modes.0.frequency'):.2f} Hz (95 %: ")
     assert "damping ratio" in resonance
-    assert dict(detail_fit(fit, "a log"))["assuming"].startswith("no further resonances: K = ")
+    assert dict(detail_fit(fit, "a log"))["stiffer wall"].startswith("K = ")
     (tmp_path / "scene.yaml").write_text("\n".join(write_scene(fit, "a log")))
     section: Any = zwidth.load_config(tmp_path / "scene.yaml").scene
     (written,) = section.modes
@@ -75,7 +75,7 @@ def test_damping_ratio_of_weakly_damped_resonance_is_recovered():
     """With a lower bound of 5e-4 the other parameters were many standard errors off, without a warning."""
     force, position = record_log(add_mode(RIGID, 120, 1e-4, 0.1), 1, step=1e-6)
     fit = zwidth.fit_log(PERIOD, position, force)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     true = {"mass": MASS, "damping": DAMPING, "modes.0.frequency": 120.0, "modes.0.damping_ratio": 1e-4}
     assert max(abs(fit.value_of(name) - value) / fit.errors[name] for name, value in true.items()) < 4.0
 
@@ -85,7 +85,7 @@ def test_undetermined_resonance_has_no_safe_wall():
     force, position = record_log(OTHERS["compliance of 50 Hz, encoder at the motor"], 0, step=2e-4)
     fit = zwidth.fit_log(PERIOD, position, force)
     safe = fit.safe_wall()
-    assert fit.is_doubted or fit.build_response_scene(0.99, True) is None
+    assert fit.is_unreliable or fit.build_response_scene(0.99, True) is None
     assert safe.status == Status.UNDECIDED
     assert np.isnan(safe.stiffness)
     assert fit.recommended.status == Status.UNREACHABLE
@@ -125,7 +125,7 @@ def test_rigid_devices_are_fitted_without_modes_and_keep_their_walls():
     true = float(scene.max_stiffness().stiffness)
     logs = [record_log(RIGID, seed) for seed in range(12)]
     fits = [zwidth.fit_log(PERIOD, position, force) for force, position in logs]
-    assert [(fit.status, fit.doubts, fit.is_structured) for fit in fits] == 12 * [(Status.OK, (), False)]
+    assert [(fit.status, fit.warnings, fit.is_structured) for fit in fits] == 12 * [(Status.OK, (), False)]
     assert all(fit.response is not None for fit in fits)
     covered = [fit.intervals["stiffness_max"].low <= true <= fit.intervals["stiffness_max"].high for fit in fits]
     # With 12 intervals of 95 %, fewer than 9 cover the true value with a probability of 0.2 %.
@@ -140,7 +140,7 @@ def test_rigid_devices_are_fitted_without_modes_and_keep_their_walls():
 def test_hidden_resonance_bounds_the_safe_wall():
     hidden = TrueDevice("", MASS, DAMPING, 0.0, ((200.0, 0.03, MASS / 0.4),), DELAY, PERIOD, 2e-4, 3.0)
     fit = fit_hidden()
-    assert fit.doubts == ()
+    assert fit.warnings == ()
     safe, rigid = fit.safe_wall(), fit.safe_wall(rigid=True)
     assert hidden.is_stable(*safe[:2])
     assert not hidden.is_stable(*rigid[:2])
@@ -158,7 +158,7 @@ def test_hidden_resonance_bounds_the_safe_wall():
     assert [label for label, _ in summary[:2]] == ["SET", ""]
     assert ", with B limited by the safe limit: a resonance near" in summary[1][1]
     assert "zwidth excite --rate '1.000 kHz' --force '3.0 N' --resolution '200 µm'" in dict(summary)["next"]
-    assert dict(detail_fit(fit, "a log"))["assuming"].startswith("a rigid device: K = ")
+    assert dict(detail_fit(fit, "a log"))["stiffer wall"].startswith("K = ")
     assert any(line.startswith('    reason: "a resonance near') for line in write_scene(fit, "a log"))
 
 

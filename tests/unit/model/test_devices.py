@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
-from zwidth.model.devices import DEVICES, HAND, Published, find_device
+from zwidth.model.devices import DEVICES, HAND, PublishedValue, find_device
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 # One N mm/deg in N m/rad.
@@ -31,7 +31,9 @@ def test_haptic_wheel_reproduces_published_critical_stiffness(period, critical):
 
 def test_phantom_reproduces_alpha_max_of_the_paper():
     published = find_device("phantom_2006")
-    scene = zwidth.Scene(published.to_device(damping=10), zwidth.Timing(published.numbers["period"].value, delay=1e-3))
+    scene = zwidth.Scene(
+        published.to_device(damping=10), zwidth.Timing(published.parameters["period"].value, delay=1e-3)
+    )
     assert zwidth.alpha_max(scene.delta, scene.d).alpha == pytest.approx(0.1986, abs=5e-5)
 
 
@@ -48,8 +50,8 @@ def test_every_value_has_a_source_and_the_unit_of_its_motion():
             "damping_limit": "N s/m",
         }
         units |= rotary if device.motion == "rotary" else linear
-        assert device.numbers
-        for name, number in device.numbers.items():
+        assert device.parameters
+        for name, number in device.parameters.items():
             assert number.source
             assert number.value > 0
             assert number.unit == units[name], (device.name, name)
@@ -75,14 +77,14 @@ def test_devices_command_lists_devices_and_sources():
     listed = re.sub(r"\n {2,}", " ", CliRunner().invoke(cli, ["devices"]).output).splitlines()
     assert [line.split()[0] for line in listed] == [device.name for device in DEVICES]
     for line, device in zip(listed, DEVICES, strict=True):
-        assert all(number.spell() in line for number in device.numbers.values())
+        assert all(number.spell() in line for number in device.parameters.values())
     details = CliRunner().invoke(cli, ["devices", "haptic_wheel"]).output
     assert "4500 g cm^2" in details
-    assert find_device("haptic_wheel").numbers["mass"].source in details
+    assert find_device("haptic_wheel").parameters["mass"].source in details
     machine = json.loads(CliRunner().invoke(cli, ["devices", "--json"]).output)
     assert [entry["name"] for entry in machine] == [device.name for device in DEVICES]
     wheel = machine[1]
-    assert Published(**wheel["damping"]) == find_device("haptic_wheel").damping
+    assert PublishedValue(**wheel["damping"]) == find_device("haptic_wheel").damping
     assert wheel["friction"] is None
 
 

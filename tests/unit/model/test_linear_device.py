@@ -247,7 +247,7 @@ def test_invalid_systems_are_rejected(system, message):
 
 def test_functions_that_need_a_mass_are_rejected():
     scene = zwidth.Scene(zwidth.LinearDevice(COEFFICIENTS), TIMING)
-    with pytest.raises(zwidth.InputError, match=r"use push or push_history, or a zwidth\.Device"):
+    with pytest.raises(zwidth.InputError, match=r"use external_force or external_force_history, or a zwidth\.Device"):
         scene.simulate(1e3, 1.0, start_velocity=0.1)
     with pytest.raises(zwidth.InputError, match="passivity with a linear device"):
         scene.passivity_margin(1e3, 1.0)

@@ -98,7 +98,7 @@ def test_recommendations_stay_within_the_limit(requirements):
     assert unlimited.stiffness == pytest.approx(
         SCENE.replace(safe_limit=None).recommend(**requirements).stiffness, rel=1e-12
     )
-    assert recommendation.steps == []
+    assert recommendation.improvements == []
     assert "limited by" in recommendation.lines()[0]
     assert "safe limit" in recommendation.lines()[0]
 

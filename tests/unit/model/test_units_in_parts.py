@@ -87,7 +87,7 @@ FUNCTIONS = {
     ),
     "state_space": (lambda *wall: SCENE.state_space(*wall).A, ("10 kN/m", 40), (10e3, 40)),
     "simulate": (
-        lambda K, x, push: SCENE.simulate(K, 40, start_position=x, push=push, periods=3).position,
+        lambda K, x, push: SCENE.simulate(K, 40, start_position=x, external_force=push, periods=3).position,
         ("10 kN/m", "0.1 mm", ["1 N", "2 N"]),
         (10e3, 1e-4, [1, 2]),
     ),

@@ -56,7 +56,7 @@ def test_colors_and_contours_of_numbers_close_together_are_named_in_plain_number
 
 def test_a_motion_that_is_over_at_once_has_an_axis_of_time(recwarn):
     columns = ("time_s", "position_m", "velocity_m_per_s", "wall_force_N", "contact")
-    energies = [f"{name}_J" for name in ("wall_work", "push_work", "damping_loss", "friction_loss", "energy")]
+    energies = [f"{name}_J" for name in ("wall_work", "external_work", "damping_loss", "friction_loss", "energy")]
     table = {"label": np.array(["still"]), **{name: np.zeros(1) for name in (*columns, *energies)}}
     for draw in (plotting.draw_motion, plotting.draw_energy):
         assert draw(table)[0].get_xlim() == (0.0, 1.0)
@@ -69,7 +69,7 @@ def test_wanted_stiffnesses_close_together_are_told_apart():
     required = {"stiffness_N_per_m": wanted, "reserve": np.ones(3), "present_s": np.full(3, 1e-3)}
     required |= {
         "value_s": np.full(3, 1e-3),
-        "enough": np.array(["below"] * 3),
+        "sufficient_side": np.array(["below"] * 3),
         "other_crossings_s": np.array([""] * 3),
     }
     (ax,) = plotting.draw_requirement(curve, required)

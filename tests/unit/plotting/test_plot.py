@@ -152,7 +152,7 @@ def test_several_scenes_have_their_labels():
 def test_labels_are_text(label):
     drawn = [
         plot.region({label: RIGID, "other": FILTERED}),
-        plot.motion(RIGID.simulate(5e3, 20.0, push=1.0, periods=50), labels=[label]),
+        plot.motion(RIGID.simulate(5e3, 20.0, external_force=1.0, periods=50), labels=[label]),
     ]
     for ax in drawn:
         plotting.style.figure_of(ax).draw_without_rendering()
@@ -183,7 +183,7 @@ def test_a_ridge_is_the_stiffest_wall_at_every_value():
 def test_a_step_is_the_simulated_one():
     ax = plot.step(FILTERED, *WALL, periods=60)
     y = np.asarray(ax.lines[0].get_ydata(), float) * 1e-6
-    np.testing.assert_allclose(y, FILTERED.simulate(*WALL, push=1.0, periods=60).position, atol=1e-14)
+    np.testing.assert_allclose(y, FILTERED.simulate(*WALL, external_force=1.0, periods=60).position, atol=1e-14)
 
 
 def test_the_gain_crossover_is_on_the_unit_circle_at_its_margin():
@@ -195,13 +195,13 @@ def test_the_gain_crossover_is_on_the_unit_circle_at_its_margin():
 
 def test_poles_outside_look_different():
     ax = plot.poles(RIGID, 25e3, 40.0)
-    outside = np.hypot(*line(ax, "poles not inside"))
+    outside = np.hypot(*line(ax, "poles on or outside the unit circle"))
     assert outside.min() > 1.0
-    assert outside.size + line(ax, "poles inside")[0].size == RIGID.poles(25e3, 40.0).size
+    assert outside.size + line(ax, "poles inside the unit circle")[0].size == RIGID.poles(25e3, 40.0).size
 
 
 def test_motions_over_time():
-    found = RIGID.simulate([5e3, 10e3], 20.0, push=1.0, periods=50)
+    found = RIGID.simulate([5e3, 10e3], 20.0, external_force=1.0, periods=50)
     ax = plot.motion(found, labels=["soft", "stiff"])
     np.testing.assert_allclose(line(ax, "stiff")[1] * 1e-6, np.asarray(found.position)[1])
     with pytest.raises(zwidth.InputError, match="got 1 for 2 motions"):
@@ -252,7 +252,7 @@ def test_a_short_contact_fills_a_third_of_the_axis():
         assert low <= values.min()
         assert values.max() <= high
     # What stays in contact is shown to the end.
-    pressed = RIGID.simulate(1e3, 5.0, start_position=1e-4, push=1.0, contact="unilateral", periods=1000)
+    pressed = RIGID.simulate(1e3, 5.0, start_position=1e-4, external_force=1.0, contact="unilateral", periods=1000)
     assert plot.motion(pressed, plt.figure().subplots()).get_xlim()[1] == pytest.approx(999.0)
 
 

@@ -11,7 +11,7 @@ EDGE = np.append(np.stack([0.5 * (1 - np.sin(TURN) ** 2), np.sqrt(0.5) * np.sin(
 
 
 def exact(ax):
-    return [line.get_xydata() for line in ax.lines if line.get_label() == "exact edge"]
+    return [line.get_xydata() for line in ax.lines if line.get_label() == "exact boundary"]
 
 
 def test_the_outline_is_drawn_where_the_cells_agree():
@@ -34,7 +34,7 @@ def test_axes_in_equal_ratios_are_logarithmic_and_points_without_an_answer_are_g
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "linear")
     drawn = ax.collections[0].get_array()
     np.testing.assert_array_equal(np.ma.getmaskarray(drawn).T, status[:, :, 0, 0] == 7)
-    assert "no answer" in [text.get_text() for legend in ax.figure.legends for text in legend.get_texts()]
+    assert "no result" in [text.get_text() for legend in ax.figure.legends for text in legend.get_texts()]
 
 
 def test_a_color_means_one_radius_in_all_panels():

@@ -166,10 +166,10 @@ def test_slices_are_the_nearest_values(folder, capsys, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(draw, "save", lambda drawn, stem, *_, **__: found.append((stem.name, drawn)) or ())
         notes: list[str] = []
-        draw_stores(folder / "devices.zarr", tmp_path, at={"rate": "2.1 kHz"}, note=notes.append)
-        draw_stores(folder / "devices.zarr", tmp_path, at={"rate": "2kHz"}, note=notes.append)
-        draw_stores(folder / "plane.zarr", tmp_path, at={"delta": "0.12", "d": 0.9})
-        draw_stores(folder / "devices.zarr", tmp_path, at={"device": "heavy"})
+        draw_stores(folder / "devices.zarr", tmp_path, selection={"rate": "2.1 kHz"}, note=notes.append)
+        draw_stores(folder / "devices.zarr", tmp_path, selection={"rate": "2kHz"}, note=notes.append)
+        draw_stores(folder / "plane.zarr", tmp_path, selection={"delta": "0.12", "d": 0.9})
+        draw_stores(folder / "devices.zarr", tmp_path, selection={"device": "heavy"})
     assert notes == ["devices.zarr: rate = 2000 Hz, the value of the sweep nearest to 2.1 kHz"]
     drawn = dict(found)
     assert titles(drawn["plane_stable"]) == [r"$d = 1$,  $\delta = 0.1$"]
@@ -201,7 +201,7 @@ def test_what_is_not_computed_is_left_blank_and_said(tmp_path):
     assert any(np.ma.getmaskarray(mesh).any() for mesh in meshes(drawn))
     # A grid finer than a page is thinned.
     assert [mesh.shape for mesh in meshes(drawn)] == [(13, 500)] * 3
-    assert "no answer" in [text.get_text() for text in drawn[0].figure.legends[0].get_texts()]
+    assert "no result" in [text.get_text() for text in drawn[0].figure.legends[0].get_texts()]
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ def test_what_is_not_computed_is_left_blank_and_said(tmp_path):
 )
 def test_slices_that_do_not_exist_are_refused(folder, tmp_path, at, says):
     with pytest.raises(InputError, match=says):
-        draw_stores(folder, tmp_path / "no", at=at)
+        draw_stores(folder, tmp_path / "no", selection=at)
     assert not (tmp_path / "no").exists()
 
 

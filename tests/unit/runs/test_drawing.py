@@ -44,7 +44,7 @@ def drawn(monkeypatch, tmp_path):
     def draw_at(path, at=None):
         found.clear()
         notes.clear()
-        draw_stores(path, tmp_path, at=at, note=notes.append)
+        draw_stores(path, tmp_path, selection=at, note=notes.append)
         return found, notes
 
     return draw_at

@@ -98,7 +98,7 @@ def test_each_value_of_a_part_has_its_own_edge(folder, k, cutoff):
 
 
 def exact_lines(ax):
-    return [line.get_xydata() for line in ax.lines if line.get_label() == "exact edge"]
+    return [line.get_xydata() for line in ax.lines if line.get_label() == "exact boundary"]
 
 
 def test_a_plane_draws_the_edges(folder):

@@ -125,7 +125,7 @@ def test_motion_matches_newtons_laws(parts, friction):
         # device.
         scene = scene.replace(operator=None, mass=0.15, damping=1.5)
     motion = scene.simulate(
-        K, B, periods=PERIODS, start_position=-1e-3, start_velocity=0.1, push=0.02, contact="unilateral",
+        K, B, periods=PERIODS, start_position=-1e-3, start_velocity=0.1, external_force=0.02, contact="unilateral",
         coulomb=friction[0], static=friction[1], substeps=SUBSTEPS,
     )  # fmt: skip
     sensed, first = integrate_motion(scene, K, B, -1e-3, 0.02, friction, 0.0)
@@ -138,10 +138,10 @@ def test_motion_matches_newtons_laws(parts, friction):
 @pytest.mark.parametrize("parts", CASES.values(), ids=CASES.keys())
 def test_external_work_and_losses(parts):
     scene = zwidth.Scene(zwidth.Device(0.1, 1.0, **parts), TIMING)
-    motion = scene.simulate(500.0, 1.0, periods=100, start_position=1e-3, push=0.5, substeps=SUBSTEPS)
+    motion = scene.simulate(500.0, 1.0, periods=100, start_position=1e-3, external_force=0.5, substeps=SUBSTEPS)
     # The work of the external force follows from the displacement; the damper to ground only dissipates energy.
     displacement = np.asarray(motion.position) - 1e-3
-    np.testing.assert_allclose(np.asarray(motion.push_work), 0.5 * displacement, atol=1e-9 * 0.5e-3)
+    np.testing.assert_allclose(np.asarray(motion.external_work), 0.5 * displacement, atol=1e-9 * 0.5e-3)
     assert np.all(np.diff(np.asarray(motion.damping_loss, float)) > -1e-15)
 
 

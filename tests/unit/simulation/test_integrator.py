@@ -26,7 +26,7 @@ def test_step_response_of_rigid_device_matches_closed_form(wall):
     mass, period, force = 0.2, 5e-4, 3.0
     device = zwidth.Device(mass, delta * mass / period)
     scene = zwidth.Scene(device, zwidth.Timing(period, d * period))
-    response = integrate(scene, alpha * mass / period**2, beta * mass / period, 99, push=force)
+    response = integrate(scene, alpha * mass / period**2, beta * mass / period, 99, external_force=force)
     expected = zwidth.step_response(*wall, substeps=1, force=force)
     assert relative_error(response.position[:, 0] * mass / period**2, expected.position) < tol.JUDGE.float64
     assert relative_error(response.velocity[:, 0] * mass / period, expected.velocity) < tol.JUDGE.float64
@@ -87,17 +87,17 @@ def test_velocity_estimates_continue_an_infinite_ramp(velocity):
     assert relative_error([program(x) for x in measured], expected) < tol.JUDGE.float64
 
 
-def build_rates(wall, slip, push, friction):
+def build_rates(wall, slip, external_force, friction):
     """Return the rates of motor, tip and coupled operator, and the powers of losses and of the applied forces."""
 
     def rate(_, y):
         x1, x2, x3, v1, v2, v3 = y[:6]
         coupling_force, operator_force = 20e3 * (x2 - x1) + 0.5 * (v2 - v1), 800.0 * (x3 - x2) + 3.0 * (v3 - v2)
         friction_force = -friction * slip
-        a1 = (wall + push + friction_force - 0.4 * v1 + coupling_force) / 0.1 if slip else 0.0
+        a1 = (wall + external_force + friction_force - 0.4 * v1 + coupling_force) / 0.1 if slip else 0.0
         a2, a3 = (operator_force - coupling_force) / 0.06, (-operator_force - 5.0 * v3 - 100.0 * x3) / 0.4
         power_lost = 0.4 * v1**2 + 0.5 * (v2 - v1) ** 2 + 3.0 * (v3 - v2) ** 2 + 5.0 * v3**2 - friction_force * v1
-        return [v1, v2, v3, a1, a2, a3, power_lost, (wall + push) * v1]
+        return [v1, v2, v3, a1, a2, a3, power_lost, (wall + external_force) * v1]
 
     return rate
 
@@ -114,7 +114,7 @@ def test_energy_balance_with_friction():
     scene = zwidth.Scene(zwidth.Device(0.1, 0.4, coupling), zwidth.Timing(1e-3, 1.6e-3), operator=hand)
     friction: Any = {"coulomb": 0.6, "static": 0.8}
     response = integrate(
-        scene, 8e3, 5.0, 200, position=-1e-3, velocity=0.15, push=0.3, contact="unilateral", **friction
+        scene, 8e3, 5.0, 200, position=-1e-3, velocity=0.15, external_force=0.3, contact="unilateral", **friction
     )
     assert {kind for _, kind in response.events} == {"stick", "turn", "slip"}
     dissipated = worked = 0.0
@@ -144,12 +144,12 @@ def test_sliding_block_stops_and_sticks():
     assert response.velocity[response.time > stop].tolist() == [[0.0]] * int((response.time > stop).sum())
 
 
-@pytest.mark.parametrize("push", [0.69, -0.71, 0.71])
-def test_block_at_rest_slips_only_above_static_friction(push):
+@pytest.mark.parametrize("external_force", [0.69, -0.71, 0.71])
+def test_block_at_rest_slips_only_above_static_friction(external_force):
     scene = zwidth.Scene(zwidth.Device(mass=0.3), zwidth.Timing(1e-3))
-    response = integrate(scene, 0.0, 0.0, 50, push=push, coulomb=0.5, static=0.7)
-    stays_at_rest = abs(push) < 0.7
-    distance = 0.0 if stays_at_rest else np.sign(push) * 0.5 * (abs(push) - 0.5) / 0.3 * 0.05**2
+    response = integrate(scene, 0.0, 0.0, 50, external_force=external_force, coulomb=0.5, static=0.7)
+    stays_at_rest = abs(external_force) < 0.7
+    distance = 0.0 if stays_at_rest else np.sign(external_force) * 0.5 * (abs(external_force) - 0.5) / 0.3 * 0.05**2
     assert response.position[-1, 0] == pytest.approx(distance, rel=tol.JUDGE.float64)
     assert response.events == ([] if stays_at_rest else [(0.0, "slip")])
 

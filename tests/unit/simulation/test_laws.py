@@ -215,8 +215,8 @@ def test_recorded_operator_position_drives_its_spring():
             compute_rates, (0, span), [0.0, 0.0], t_eval=times[:-1], rtol=1e-10, atol=1e-13
         )
         errors.append(np.abs(motion.position - reference.y[0]).max() / np.abs(reference.y[0]).max())
-        combined = scene.simulate(0.0, push_history=np.full(periods, 0.7), **arguments)
-        force_only = scene.simulate(0.0, push=0.7, periods=periods)
+        combined = scene.simulate(0.0, external_force_history=np.full(periods, 0.7), **arguments)
+        force_only = scene.simulate(0.0, external_force=0.7, periods=periods)
         np.testing.assert_allclose(combined.position, motion.position + force_only.position, atol=1e-15)
     # The operator force is held at its mean over each period, with an error proportional to the period squared.
     assert errors[1] < 1e-4
@@ -227,7 +227,11 @@ def test_contact_of_force_law_is_nonzero_force():
     """A force of 5 N where the position is at most 0, as in ros_falcon: contact begins and ends repeatedly."""
     scene = zwidth.Scene(zwidth.Device(0.1, 0.5), zwidth.Timing(1e-3, 1e-3))
     motion = zwidth.simulate(
-        scene, force=lambda x, v, t: jnp.where(x <= 0, 5.0, 0.0), start_position=0.01, start_velocity=-0.1, push=-1.0
+        scene,
+        force=lambda x, v, t: jnp.where(x <= 0, 5.0, 0.0),
+        start_position=0.01,
+        start_velocity=-0.1,
+        external_force=-1.0,
     )
     assert motion.position is not None
     np.testing.assert_array_equal(motion.contact, motion.measured <= 0)

@@ -36,8 +36,8 @@ def test_motion_matches_the_equivalent_device(conditions, velocity):
     options = {
         "periods": EXTERNAL_FORCE.size,
         "substeps": SUBSTEPS,
-        "push": 0.3,
-        "push_history": EXTERNAL_FORCE,
+        "external_force": 0.3,
+        "external_force_history": EXTERNAL_FORCE,
         **conditions,
     }
     expected, motion = (
@@ -57,20 +57,22 @@ def test_motion_matches_the_equivalent_device(conditions, velocity):
 
 @pytest.mark.parametrize("stiffness", [4e3, 40e3])
 def test_final_state_matches_the_verdict(stiffness):
-    motion = zwidth.Scene(SYSTEM, TIMING).simulate(stiffness, 10.0, push=0.3, substeps=SUBSTEPS)
+    motion = zwidth.Scene(SYSTEM, TIMING).simulate(stiffness, 10.0, external_force=0.3, substeps=SUBSTEPS)
     stable = zwidth.Scene(SYSTEM, TIMING).is_stable(stiffness, 10.0)
     ends = zwidth.MotionKind.REST, zwidth.MotionKind.DECAYING
     assert (zwidth.MotionKind(int(motion.outcome)) in ends) == stable
-    unilateral = zwidth.Scene(SYSTEM, TIMING).simulate(4e3, 10.0, push=0.3, contact="unilateral", substeps=SUBSTEPS)
+    unilateral = zwidth.Scene(SYSTEM, TIMING).simulate(
+        4e3, 10.0, external_force=0.3, contact="unilateral", substeps=SUBSTEPS
+    )
     assert unilateral.outcome == zwidth.MotionKind.REST
 
 
 def test_batch_may_contain_several_systems_and_devices():
     slower = zwidth.LinearDevice(([1.0], [0.2, 3.0, 0.0]))
     scenes = [zwidth.Scene(device, TIMING) for device in (SYSTEM, slower, BODIES)]
-    batch = zwidth.simulate(scenes, 3e3, 10.0, push=0.3, periods=50, substeps=SUBSTEPS)
+    batch = zwidth.simulate(scenes, 3e3, 10.0, external_force=0.3, periods=50, substeps=SUBSTEPS)
     for k, scene in enumerate(scenes):
-        single = scene.simulate(3e3, 10.0, push=0.3, periods=50, substeps=SUBSTEPS)
+        single = scene.simulate(3e3, 10.0, external_force=0.3, periods=50, substeps=SUBSTEPS)
         np.testing.assert_array_equal(batch.position[k], single.position)
 
 
@@ -87,7 +89,7 @@ def test_step_response_matches_the_state_space(system):
     scene = zwidth.Scene(zwidth.LinearDevice(system), TIMING)
     wall = 0.02 * scene.units.stiffness, 0.1 * scene.units.virtual_damping
     expected = scene.state_space(*wall).step(300)
-    motion = scene.simulate(*wall, push=1.0, periods=300)
+    motion = scene.simulate(*wall, external_force=1.0, periods=300)
     np.testing.assert_allclose(motion.position, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
     grows = zwidth.MotionKind.GROWING, zwidth.MotionKind.DIVERGED
     assert (zwidth.MotionKind(int(motion.outcome)) in grows) == (not scene.is_stable(*wall))
@@ -111,7 +113,7 @@ def test_arguments_that_need_a_body_are_rejected(options, field):
 
 def test_systems_without_a_defined_velocity_are_rejected():
     with pytest.raises(zwidth.InputError, match="velocity jumps with the force"):
-        zwidth.Scene(zwidth.LinearDevice(([1.0], [3.0, 0.0])), TIMING).simulate(100.0, 0.0, push=1.0)
+        zwidth.Scene(zwidth.LinearDevice(([1.0], [3.0, 0.0])), TIMING).simulate(100.0, 0.0, external_force=1.0)
     device = zwidth.LinearDevice(scipy.signal.dlti([4e-6, 4e-6], [1.0, -1.9, 0.9], dt=1e-3))
     with pytest.raises(zwidth.InputError, match="discrete-time system"):
-        zwidth.Scene(device, zwidth.Timing(1e-3)).simulate(100.0, 0.0, push=1.0)
+        zwidth.Scene(device, zwidth.Timing(1e-3)).simulate(100.0, 0.0, external_force=1.0)

@@ -37,7 +37,7 @@ def test_outcome_of_weakly_damped_oscillation():
 def test_decay_below_the_encoder_step_is_not_steady():
     hand = zwidth.Operator(mass=0.01, damping=0.05, stiffness=100.0)
     scene = zwidth.Scene(zwidth.Device(0.1, 0.05), TIMING, operator=hand)
-    motion = scene.simulate(1e3, 0.0, resolution=1e-4, push=-0.001, periods=2000)
+    motion = scene.simulate(1e3, 0.0, resolution=1e-4, external_force=-0.001, periods=2000)
     assert MotionKind(motion.outcome) in (MotionKind.DECAYING, MotionKind.UNCLEAR)
 
 
@@ -149,8 +149,12 @@ def test_dataset_has_common_time_or_sample_instants():
         (SCENE, {"seed": [[1], [2, 3]]}, "seed: got"),
         (SCENE, {"stiffness": np.ones(0)}, "use at least one simulation"),
         ([], {}, "use at least one simulation"),
-        (SCENE, {"push_history": np.zeros((3, 10)), "stiffness": [1.0, 2.0]}, "push_history"),
-        (SCENE, {"push_history": [0.0] * 9 + [np.nan]}, "push_history: got a value that is not finite"),
+        (SCENE, {"external_force_history": np.zeros((3, 10)), "stiffness": [1.0, 2.0]}, "external_force_history"),
+        (
+            SCENE,
+            {"external_force_history": [0.0] * 9 + [np.nan]},
+            "external_force_history: got a value that is not finite",
+        ),
     ],
 )
 def test_invalid_arguments_are_rejected_with_their_name(scenes, options, message):
@@ -161,7 +165,7 @@ def test_invalid_arguments_are_rejected_with_their_name(scenes, options, message
 def test_nan_in_one_history_does_not_affect_other_batch_entries():
     pushes = np.ones((3, 20))
     pushes[1, 5] = np.nan
-    motion = SCENE.simulate(1e3, 5.0, push_history=pushes, periods=20)
+    motion = SCENE.simulate(1e3, 5.0, external_force_history=pushes, periods=20)
     assert motion.status.tolist() == [Status.OK, Status.INVALID_INPUT, Status.OK]
     assert np.isnan(motion.position[1]).all()
     tolerance = SIMULATED_AGAIN.float64 * np.abs(motion.position[0]).max()

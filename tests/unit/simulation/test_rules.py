@@ -90,11 +90,11 @@ def test_energy_is_conserved_with_every_part(kind, with_friction):
         substeps=2,
         start_position=1e-3,
         start_velocity=rng.uniform(-1, 1, 6) * 1e-4 / period,
-        push=rng.uniform(-0.01, 0.01, 6) * force,
-        push_history=rng.normal(size=(6, 80)) * force[:, None] * 0.01,
+        external_force=rng.uniform(-0.01, 0.01, 6) * force,
+        external_force_history=rng.normal(size=(6, 80)) * force[:, None] * 0.01,
         **options,
     )
-    flows = [motion.energy, -motion.wall_work, -motion.push_work, motion.damping_loss, motion.friction_loss]
+    flows = [motion.energy, -motion.wall_work, -motion.external_work, motion.damping_loss, motion.friction_loss]
     balance = np.sum(flows, axis=0)
     drift = np.abs(balance - balance[:, :1]).max(1)
     assert np.all(drift <= ENERGY_KEPT.float64 * np.abs(flows).max((0, 2)))
@@ -138,7 +138,7 @@ def test_damped_sliding_mass_stops_at_closed_form_position():
 
 def test_mass_at_rest_moves_only_above_static_friction():
     ramp = np.linspace(0.0, 2.0, 101)[1:]
-    motion = simulate_without_wall(FREE, push_history=np.stack([ramp, -ramp] * 2), coulomb=0.5, static=1.01)
+    motion = simulate_without_wall(FREE, external_force_history=np.stack([ramp, -ramp] * 2), coulomb=0.5, static=1.01)
     first = int(np.argmax(ramp > 1.01))
     # At the instant of the increase of the force the mass still sticks.
     sticks = np.arange(300) <= 3 * first

@@ -15,7 +15,7 @@ import zwidth
 from zwidth.core.errors import InputError, ResourceError
 
 SCENE = zwidth.Scene(zwidth.Device(mass=0.1, damping=2.0), zwidth.Timing(period=1e-3, delay=1.3e-3))
-RESULTS = ("amplitude", "frequency", "penetration", "bounces", "impact_velocity", "energy_given", "outcome", "status")
+RESULTS = ("amplitude", "frequency", "penetration", "bounces", "impact_velocity", "wall_work_max", "outcome", "status")
 
 
 def run(*args, **options):
@@ -38,7 +38,7 @@ def assert_same_motion(actual, expected, name):
     [
         ({"stiffness": np.nan}, "stiffness"),
         ({"stiffness": "stiff"}, "stiffness"),
-        ({"stiffness": [1.0, 2.0, 3.0], "push": [1.0, 2.0]}, "broadcast"),
+        ({"stiffness": [1.0, 2.0, 3.0], "external_force": [1.0, 2.0]}, "broadcast"),
         ({"periods": 0}, "periods"),
         ({"periods": 10.5}, "periods"),
         ({"substeps": 0}, "substeps"),
@@ -50,9 +50,9 @@ def assert_same_motion(actual, expected, name):
         ({"jitter": 1e-3}, "jitter"),
         ({"resolution": -1e-6}, "resolution"),
         ({"max_force": -1.0}, "max_force"),
-        ({"push_history": np.ones(5)}, "push_history"),
-        ({"push_history": 1.0}, "push_history"),
-        ({"push_history": np.full(200, np.nan)}, "push_history"),
+        ({"external_force_history": np.ones(5)}, "external_force_history"),
+        ({"external_force_history": 1.0}, "external_force_history"),
+        ({"external_force_history": np.full(200, np.nan)}, "external_force_history"),
     ],
 )
 def test_invalid_arguments_are_rejected(options, field):
@@ -226,9 +226,9 @@ def test_energy_given_is_the_work_of_the_wall_force():
     motion = run(scene, stiffness=[300.0, 1200.0, 4000.0], start_velocity=0.1, start_position=0.0, contact="unilateral")
     work = np.cumsum(motion.wall_force[:, :-1] * np.diff(motion.position), axis=1)
     np.testing.assert_allclose(motion.wall_work[:, 1:], work, rtol=0, atol=1e-12 * np.abs(work).max())
-    np.testing.assert_allclose(motion.energy_given[:2], np.maximum(work[:2].max(1), 0.0), rtol=1e-9, atol=1e-15)
-    assert motion.energy_given[1] > 1e-6
-    assert motion.energy_given[2] >= work[2].max() > 1e-4
+    np.testing.assert_allclose(motion.wall_work_max[:2], np.maximum(work[:2].max(1), 0.0), rtol=1e-9, atol=1e-15)
+    assert motion.wall_work_max[1] > 1e-6
+    assert motion.wall_work_max[2] >= work[2].max() > 1e-4
 
 
 @pytest.mark.parametrize("periods", [17, 128, 129, 300])

@@ -36,7 +36,7 @@ def test_damping_rate_and_delay_are_those_of_the_closed_search():
         table, unit = found.table, UNITS[find].replace("_per_", "/").replace("_", " ")
         assert found.answer[0].startswith(f"K_max = 30.00 kN/m: {find} of {with_unit(value, unit)} or ")
         assert table[f"value_{UNITS[find]}"][0] == pytest.approx(value, rel=1e-9)
-        assert table["enough"][0] == ("below" if find == "delay" else "above")
+        assert table["sufficient_side"][0] == ("below" if find == "delay" else "above")
         assert table["stiffness_max_N_per_m"][0] >= 30e3
 
 
@@ -44,7 +44,7 @@ def test_damping_rate_and_delay_are_those_of_the_closed_search():
 def test_the_value_is_enough_and_its_other_side_is_not(find, stiffness):
     study = design(find, stiffness, FILTERED, num=3)
     table = study.compute(None, True).table
-    (value,), (enough,) = table[f"value_{UNITS[find]}"], table["enough"]
+    (value,), (enough,) = table[f"value_{UNITS[find]}"], table["sufficient_side"]
     nominal = study.device.to_scene()
     side = {"above": 1, "below": -1}[enough]
     more, less = (nominal.replace(**{find: value * (1 + k * side * 1e-3)}).max_stiffness().stiffness for k in (1, -1))
@@ -59,12 +59,12 @@ def test_a_rate_is_searched_within_its_own_range():
     # The delay of 1 ms in seconds stays, which no rate makes up for.
     assert table["status"].tolist() == ["OK", "UNREACHABLE"]
     assert np.isnan(table["value_Hz"][1])
-    assert table["enough"][1] == "nowhere"
+    assert table["sufficient_side"][1] == "nowhere"
 
 
 def test_what_is_out_of_reach_or_always_enough_is_said():
     outcome = design("damping", [1e3, 30e3, 1e9], within=[1, 100], num=3).compute(None, True)
-    assert outcome.table["enough"].tolist() == ["everywhere", "above", "nowhere"]
+    assert outcome.table["sufficient_side"].tolist() == ["everywhere", "above", "nowhere"]
     assert len(outcome.notes) == 2
     assert len(outcome.figures[""]()) == 1
 
@@ -93,7 +93,7 @@ def test_the_figure_marks_what_is_needed_on_the_curve():
     assert [float(line.get_xdata()[0]) for line in drawn["required"]] == found
     assert [float(line.get_ydata()[0]) for line in drawn["required"]] == pytest.approx([22.0, 33.0])
     assert float(drawn["present"][0].get_xdata()[0]) == 10.0
-    for line, value in zip(drawn["enough"], found, strict=True):
+    for line, value in zip(drawn["sufficient"], found, strict=True):
         x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
         assert x[np.isfinite(y)].min() == value
     # Written with three digits, on the side that is enough.

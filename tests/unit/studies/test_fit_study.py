@@ -73,7 +73,7 @@ def test_the_intervals_of_the_example_hold_the_true_device(both, script):
     assert both.table["friction_low_N"][0] < script.FRICTION < both.table["friction_high_N"][0]
     assert np.isnan(both.table["friction_N"][1])
     assert both.table["resolution_m"].tolist() == [script.RESOLUTION, 0.0]
-    assert "log and buzzing walls agree" in both.answer[-1]
+    assert "log and onsets agree" in both.answer[-1]
 
 
 def test_the_figure_shows_what_the_tables_hold(both):
@@ -86,18 +86,18 @@ def test_the_figure_shows_what_the_tables_hold(both):
         return np.array([float(row[name] or "nan") for row in rows])
 
     position, residual, correlation, walls, boundary = panels
-    measured, modelled = position.lines
+    measured, modeled = position.lines
     np.testing.assert_allclose(measured.get_ydata(), 1e3 * column("motion", "position_m"))
-    np.testing.assert_allclose(modelled.get_ydata(), 1e3 * column("motion", "modelled_m"))
+    np.testing.assert_allclose(modeled.get_ydata(), 1e3 * column("motion", "modeled_m"))
     np.testing.assert_allclose(residual.lines[0].get_ydata(), 1e6 * column("motion", "residual_m"))
-    halves = [line.get_ydata()[0] for line in residual.lines if line.get_label() == "half a step"]
+    halves = [line.get_ydata()[0] for line in residual.lines if line.get_label() == "half an encoder step"]
     assert halves == [pytest.approx(-15.0), pytest.approx(15.0)]
     sticks = next(each for each in correlation.collections if each.get_label() == "autocorrelation")
     heights = [segment[1][1] for segment in sticks.get_segments()]
     np.testing.assert_allclose(heights, column("correlation", "autocorrelation"))
     dots = {line.get_label(): line.get_ydata() for line in walls.lines}
-    np.testing.assert_allclose(dots["stiffness"], column("walls", "stiffness_residual", kind="buzzing"))
-    for source, color in (("fit_log.csv", "#0072B2"), ("4 buzzing walls", "#009E73")):
+    np.testing.assert_allclose(dots["stiffness"], column("walls", "stiffness_residual", kind="onset"))
+    for source, color in (("fit_log.csv", "#0072B2"), ("4 onsets of instability", "#009E73")):
         (line,) = [line for line in boundary.lines if line.get_label() == f"boundary, {source}"]
         assert line.get_color() == color
         rows = column("boundary", "stiffness_N_per_m", fitted_to=source) / 1e3
@@ -129,7 +129,7 @@ def test_walls_alone_are_fitted_as_in_python():
         assert outcome.table[head].tolist() == [getattr(expected, name)]
     assert outcome.table["mass_error_kg"].tolist() == [expected.errors["mass"]]
     wall = expected.recommended
-    assert outcome.answer[:2] == ("fitted to 3 buzzing walls", f"SET: {wall.spell_wall()}")
+    assert outcome.answer[:2] == ("data: 3 onsets of instability", f"SET: {wall.spell_wall()}")
     assert any(line.startswith("device: m = 99.98 g (95 %: ") for line in outcome.answer)
     assert any(line.startswith("K_max: 19.87 kN/m (95 %: ") for line in outcome.answer)
     assert any(line.startswith("next: raise K at B = ") for line in outcome.answer)
@@ -153,7 +153,7 @@ def test_records_of_two_devices_do_not_agree(monkeypatch):
     monkeypatch.chdir(ROOT / "configs")
     log = {"csv": "fit_log.csv", "resolution": "0.03 mm"}
     outcome = study_of(log=log, buzz=WALLS, noise=0.02).compute(None, True)
-    assert "log and buzzing walls do NOT agree" in outcome.answer[-1]
+    assert "log and onsets do NOT agree" in outcome.answer[-1]
 
 
 def test_several_logs_and_a_velocity_estimate(tmp_path):
@@ -244,7 +244,7 @@ def test_a_period_beside_other_times_is_refused(monkeypatch):
         study_of(log=log, period="2 ms").compute(None, True)
 
 
-def test_the_doubts_on_the_page_are_those_that_are_told():
+def test_the_warnings_on_the_page_are_those_that_are_printed():
     page = (ROOT / "docs" / "guides" / "my-log.md").read_text(encoding="utf-8")
     told = [row.split("|")[1].strip() for row in page.partition("|---|---|---|\n")[2].splitlines()]
     sources = (ROOT / "src" / "zwidth").glob("*/*.py")

@@ -9,7 +9,18 @@ from zwidth.studies import Config, load_config
 from zwidth.units.formatting import header
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
-WORDS = {"fitted_to", "label", "curve", "kind", "delay_model", "estimate", "parameter", "enough", "status", "piece"}
+WORDS = {
+    "fitted_to",
+    "label",
+    "curve",
+    "kind",
+    "delay_model",
+    "estimate",
+    "parameter",
+    "sufficient_side",
+    "status",
+    "piece",
+}
 COUNTS = {"log", "number", "islands", "samples", "best"}
 SHARES = {
     "autocorrelation",

@@ -44,7 +44,7 @@ def test_a_study_of_any_label_is_drawn(tmp_path):
 @pytest.mark.parametrize("kind", ["simulate", "limit_cycle"])
 def test_walls_and_conditions_are_drawn_with_any_label(kind, tmp_path):
     scene = {"mass": 0.1, "damping": 1, "period": "1 ms", "delay": "1 periods"}
-    extra = {"stiffness_fraction": [0.5], "push": 0.5, "duration": "5 ms"}
+    extra = {"stiffness_fraction": [0.5], "external_force": 0.5, "duration": "5 ms"}
     if kind == "limit_cycle":
         conditions = [{"label": label, "resolution": "20 um"} for label in BAD]
         axes = {"stiffness": [1000, 2000], "virtual_damping": [1, 2]}

@@ -37,7 +37,7 @@ def curves():
         "virtual_damping": 42.5,
         "resolution": {"log": {"start": "1 um", "stop": "100 um", "num": 5}},
     }
-    keys = {"start_position": "0.1 mm", "max_force": "8.5 N", "duration": "400 periods", "silence": "0.1 um"}
+    keys = {"start_position": "0.1 mm", "max_force": "8.5 N", "duration": "400 periods", "smallest_amplitude": "0.1 um"}
     return study_of(axes, **keys).compute(None, True)
 
 
@@ -48,7 +48,7 @@ def test_the_arrays_are_those_of_the_simulation(plane):
     assert (K[0, 0], K[-1, 0], B[0], B[-1]) == (1e3, 25e3, -5.0, 100.0)
     for k, resolution in enumerate((0.0, 2e-5)):
         expected = zwidth.simulate(SCENE, K, B, start_position=1e-4, periods=400, record=False, resolution=resolution)
-        names = {"amplitude": "_m", "frequency": "_Hz", "energy_given": "_J", "outcome": "", "status": ""}
+        names = {"amplitude": "_m", "frequency": "_Hz", "wall_work_max": "_J", "outcome": "", "status": ""}
         for name, unit in names.items():
             np.testing.assert_array_equal(arrays[name + unit][k], getattr(expected, name))
         np.testing.assert_array_equal(arrays["linearly_stable"][k], SCENE.is_stable(K, B))
@@ -156,7 +156,7 @@ def test_the_bounds_follow_a_coarse_encoder():
 
 def test_a_figure_without_limit_cycles_gives_the_reason():
     with read_in_units(ROTARY), style_sheet(system=ROTARY):
-        outcome = knob_of(widest="0.1 mrad").compute(None, True)
+        outcome = knob_of(largest_amplitude="0.1 mrad").compute(None, True)
         (draw,) = outcome.figures.values()
         upper, _ = draw()
     assert "2 larger than 100 µrad" in outcome.notes[0]
@@ -219,7 +219,7 @@ def test_an_adaptive_window_has_no_linear_boundary():
             {"axes": {**PLANE, "coulomb": 0.1}, "conditions": [{"label": "a", "coulomb": 0.2}]},
             "in the condition and as an axis",
         ),
-        ({"silence": "2 mm"}, "silence must be less than widest"),
+        ({"smallest_amplitude": "2 mm"}, "smallest_amplitude must be less than largest_amplitude"),
         ({"conditions": [{"label": "a", "coulomb": 0.2, "static": 0.1}]}, "below coulomb, 0.2 N"),
     ],
 )

@@ -12,7 +12,7 @@ from zwidth.plotting.table import select
 from zwidth.studies.simulate import SimulateStudy
 
 DEVICE = {"mass": 0.1, "damping": 0.1, "period": 1e-3, "delay": "1 periods"}
-IMPACT = {"start_position": -1e-3, "start_velocity": 0.1, "push": 0.5, "contact": "unilateral"}
+IMPACT = {"start_position": -1e-3, "start_velocity": 0.1, "external_force": 0.5, "contact": "unilateral"}
 
 
 def study_of(**keys):
@@ -52,7 +52,7 @@ def test_the_summary_has_what_is_said_of_each_motion(impact, motion):
     rows = summary_of(impact)
     for name, column in {
         "penetration": "penetration_m",
-        "energy_given": "energy_given_J",
+        "wall_work_max": "wall_work_max_J",
         "bounces": "bounces",
     }.items():
         np.testing.assert_array_equal([float(row[column]) for row in rows], getattr(motion, name))

@@ -257,7 +257,7 @@ def test_walls_out_of_range_leave_the_rest_of_a_map_alone():
     assert outcome.notes == ("4 of 8 points have no result: 4 out of range",)
     for draw in outcome.figures.values():
         (legend,) = draw()[0].figure.legends
-        assert "no answer" in [text.get_text() for text in legend.get_texts()]
+        assert "no result" in [text.get_text() for text in legend.get_texts()]
 
 
 def test_a_map_of_the_scene_alone_is_in_si_units_too():

@@ -99,7 +99,7 @@ def test_names_in_stores_tables_and_netcdf_have_no_dots(folder, tmp_path):
 
 
 def test_figures_are_drawn_and_sliced_by_path(folder, tmp_path):
-    files = {file.name for file in draw_stores(folder, tmp_path, at={"velocity.cutoff": 40.0})}
+    files = {file.name for file in draw_stores(folder, tmp_path, selection={"velocity.cutoff": 40.0})}
     assert {"walls_stable.png", "walls_boundaries.png", "devices_stiffness_max.png"} <= files
 
 

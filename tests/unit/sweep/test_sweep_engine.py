@@ -184,7 +184,7 @@ def test_ctrl_c_keeps_what_is_done(finished, tmp_path):
 def test_a_full_disk_ends_the_run(finished, tmp_path):
     config, _ = finished
     result = run_sweeps(config, tmp_path, perform=disk_full_on_2)
-    assert "No space left on device" in result.hopeless
+    assert "No space left on device" in result.fatal_error
     assert result.computed == 2
 
 

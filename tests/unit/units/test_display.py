@@ -152,7 +152,14 @@ def test_draw_line_without_finite_values_is_empty():
 
 
 def test_dir_of_modules_lists_only_public_names():
-    assert dir(zwidth.devices) == ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_device"]
+    assert dir(zwidth.devices) == [
+        "DEVICES",
+        "HAND",
+        "PublishedDevice",
+        "PublishedHand",
+        "PublishedValue",
+        "find_device",
+    ]
 
 
 def test_arrays_show_the_reason_for_nan_and_no_negative_zero():

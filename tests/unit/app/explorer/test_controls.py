@@ -153,6 +153,6 @@ def test_a_rotary_device_keeps_its_numbers_in_every_form_of_the_view(operator, c
         moved = controls.change({name: shown[name] * 1.5 + 1})
         assert moved.shown()[name] == pytest.approx(shown[name] * 1.5 + 1, rel=1e-15)
         assert ROTARY_SLIDERS[name].low <= shown[name] <= ROTARY_SLIDERS[name].high
-    if not controls.scene.parts_beyond and operator == "none":
+    if not controls.scene.nonrigid_parts and operator == "none":
         assert controls.change({"mode": "normalized"}).change({"mode": "physical"}) == controls
     assert not controls.change({"motion": "linear"}).scene.device.rotary

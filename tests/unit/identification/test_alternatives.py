@@ -31,7 +31,7 @@ def fit_simulated_log(seed, span=bench_fit.NOISY):
 @pytest.mark.parametrize("seed", [189, 209, 469])
 def test_friction_is_undetermined_if_mass_slides_in_one_direction(seed):
     fit, deviations = fit_simulated_log(seed)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     assert np.isnan([fit.errors["friction"], fit.errors["offset"]]).all()
     assert set(deviations) == {"mass", "damping", "delay"}
     assert np.abs(list(deviations.values())).max() < 4.0
@@ -42,7 +42,7 @@ def test_friction_is_undetermined_if_mass_slides_in_one_direction(seed):
 @pytest.mark.parametrize("seed", [86, 254, 462, 518])
 def test_sticking_mass_is_recovered(seed):
     fit, deviations = fit_simulated_log(seed)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     assert set(deviations) == {"mass", "damping", "delay", "friction", "offset"}
     assert np.abs(list(deviations.values())).max() < 4.0
 
@@ -61,7 +61,7 @@ def test_error_of_friction_includes_zero_if_zero_fits_as_well(seed):
 @pytest.mark.parametrize("seed", [17, 97, 333, 545, 549])
 def test_search_converges_in_poorly_determined_directions(seed):
     fit, deviations = fit_simulated_log(seed)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     assert not fit.intervals["friction"].low > 0
     assert np.abs(list(deviations.values())).max() < 4.0
 
@@ -72,7 +72,7 @@ def test_search_converges_in_poorly_determined_directions(seed):
 @pytest.mark.parametrize("seed", [29, 89, 197, 209, 1165, 221, 285, 297, 1037, 1297])
 def test_rest_counts_as_one_sample_for_encoder_without_noise(seed):
     fit, deviations = fit_simulated_log(seed, bench_fit.SILENT)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     assert set(deviations) == {"mass", "damping", "delay"}
     assert np.abs(list(deviations.values())).max() < 4.0
 
@@ -80,7 +80,7 @@ def test_rest_counts_as_one_sample_for_encoder_without_noise(seed):
 def test_encoder_errors_at_repeated_positions_are_correlated():
     # Inside a wall the device returns to the same encoder step. With independent errors: 6 standard errors off.
     fit, deviations = fit_simulated_log(1174, bench_fit.SILENT)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     assert np.abs(list(deviations.values())).max() < 4.0
 
 
@@ -109,7 +109,7 @@ def fit_simulated_mass(delta, d, friction, steps, noise, seed, count=600):
 @pytest.mark.parametrize("seed", [3, 31])
 def test_friction_of_strongly_damped_device_is_recovered(seed):
     fit = fit_simulated_mass(0.6, 2.87, 0.008, 3e4, 0.0, seed)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
     truth = {"mass": 0.1, "damping": 60.0, "delay": 2.87e-3, "friction": 0.008}
     assert max(abs(getattr(fit, name) - value) / fit.errors[name] for name, value in truth.items()) < 4.0
 
@@ -139,7 +139,7 @@ def test_distance_of_alternative_optimum_follows_its_sum_of_squares(lag, expecte
     offset = np.zeros(7)
     offset[[1, 6]] = 50.0 * np.sqrt(np.diag(single.covariance)[[1, 6]])
     alternative = FittedModel(model, theta + offset, squares * np.exp(lag / 400), True)
-    widened = replace(single, rivals=(alternative,)).covariance
+    widened = replace(single, alternatives=(alternative,)).covariance
     if expected is None:
         np.testing.assert_array_equal(widened, single.covariance)
     else:
