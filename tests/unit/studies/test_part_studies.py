@@ -26,7 +26,9 @@ def make_boundary_study(device):
     return BoundaryStudy.model_validate({"kind": "boundary", "name": "b", "device": device})
 
 
-@pytest.mark.parametrize("device", [ISLANDS, WITH_POLE, TIP, WITH_OPERATOR], ids=["islands", "poles", "tip", "held"])
+@pytest.mark.parametrize(
+    "device", [ISLANDS, WITH_POLE, TIP, WITH_OPERATOR], ids=["islands", "poles", "tip", "operator"]
+)
 def test_outlines_contain_exactly_the_stable_walls(device):
     study = make_boundary_study(device)
     assert study.device is not None
