@@ -1,10 +1,10 @@
-"""Garbage collection of a command: none at exit."""
+"""Garbage collection is disabled at exit of a command."""
 
 import subprocess
 import sys
 
 
-def test_a_command_collects_no_garbage_at_exit():
+def test_command_collects_no_garbage_at_exit():
     text = (
         "import atexit, gc, sys\n"
         "atexit.register(lambda: print(len(gc.get_objects()) < 1000, gc.get_freeze_count() > 10_000))\n"
