@@ -127,8 +127,8 @@ def test_unreadable_columns_are_reported(columns, message, tmp_path):
 
 
 def test_several_logs_in_counts_with_a_figure(tmp_path):
-    printed = (CONFIGS / "fit_log.csv").read_text("utf-8")
-    head, lines = printed.splitlines()[2], text.splitlines()[3:]
+    text = (CONFIGS / "fit_log.csv").read_text("utf-8")
+    head, lines = text.splitlines()[2], text.splitlines()[3:]
     files = []
     for k, part in enumerate((lines[:1500], lines[1500:])):
         files.append(tmp_path / f"part{k}.csv")

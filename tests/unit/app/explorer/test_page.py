@@ -1,4 +1,4 @@
-"""The page without a browser: messages in, figures and texts out."""
+"""The explorer page without a browser: incoming messages, resulting figures and texts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def page():
     return open_page(Controls())
 
 
-def test_a_drag_shows_edge_wall_poles_and_verdict_alone(page):
+def test_drag_updates_only_outline_wall_poles_and_verdict(page):
     say(page, serial=1, set={"damping": 20})
     scene = Controls().change({"damping": 20}).scene
     (edge,) = scene.stable_region()
@@ -34,11 +34,11 @@ def test_a_drag_shows_edge_wall_poles_and_verdict_alone(page):
     assert len(page.sources["contours"].data["xs"]) == 0
 
 
-@pytest.mark.parametrize("parts", [{}, {"velocity": "LowPass"}])
-def test_at_rest_the_words_are_those_of_check(page, parts):
-    say(page, set=parts, rest=True)
+@pytest.mark.parametrize("components", [{}, {"velocity": "LowPass"}])
+def test_text_at_rest_agrees_with_check(page, components):
+    say(page, set=components, rest=True)
     page.queue.work()
-    options = ["--velocity-cutoff", "100"] if parts else []
+    options = ["--velocity-cutoff", "100"] if components else []
     device = ["--mass", "0.1", "--damping", "10", "--period", "1e-3", "--delay", "1e-3"]
     done = CliRunner().invoke(cli, ["check", "--stiffness", "10e3", "--virtual-damping", "40", *device, *options])
     assert page.texts["verdict"] + "\n" == done.stdout
@@ -47,14 +47,14 @@ def test_at_rest_the_words_are_those_of_check(page, parts):
     assert len(page.sources["passive"].data["x"]) > 3
 
 
-def test_a_drag_shows_the_outlines_of_a_scene_with_parts(page):
+def test_drag_updates_the_outline_of_a_filtered_scene(page):
     say(page, set={"velocity": "LowPass"})
     (outline,) = page.controls.scene.stable_region()
     np.testing.assert_array_equal(page.sources["edge"].data["x"][:-2], outline.stiffness)
     np.testing.assert_array_equal(page.sources["area"].data["ys"][0][0][0][:-1], outline.virtual_damping)
 
 
-def test_what_is_of_another_device_is_taken_away_at_once(page):
+def test_results_of_another_device_are_removed_immediately(page):
     say(page, set={}, rest=True)
     page.queue.work()
     assert len(page.sources["ridge"].data["x"]) > 0
@@ -66,7 +66,7 @@ def test_what_is_of_another_device_is_taken_away_at_once(page):
     assert page.texts["slopes"] == ""
 
 
-def test_what_is_no_longer_wanted_is_not_shown(page):
+def test_outdated_computation_is_discarded(page):
     say(page, set={"damping": 20}, rest=True)
     say(page, set={"damping": 30}, rest=True)
     old, *page.queue.tasks = page.queue.tasks
@@ -76,14 +76,14 @@ def test_what_is_no_longer_wanted_is_not_shown(page):
     assert "30.00 N s/m" in page.texts["verdict"]
 
 
-def test_parts_show_their_ridge_and_slopes(page):
+def test_filtered_scene_shows_ridge_and_sensitivities(page):
     say(page, set={"velocity": "LowPass"}, rest=True)
     page.queue.work()
     assert len(page.sources["ridge"].data["x"]) > 3
     assert "velocity.cutoff" in page.texts["slopes"]
 
 
-def test_what_a_newer_wall_has_cut_short_is_computed_for_it(page):
+def test_interrupted_computation_is_repeated_for_the_new_wall(page):
     say(page, set={"damping": 11}, rest=True)
     (work,), page.queue.tasks = page.queue.tasks, []
     say(page, set={"stiffness": 5e3}, rest=True)
@@ -93,7 +93,7 @@ def test_what_a_newer_wall_has_cut_short_is_computed_for_it(page):
     assert len(page.sources["ridge"].data["x"]) > 3
 
 
-NO_MESSAGES = [
+INVALID_MESSAGES = [
     {},
     {"json": []},
     {"json": ["{"]},
@@ -107,8 +107,8 @@ NO_MESSAGES = [
 ]
 
 
-def test_what_is_no_message_is_said_and_changes_nothing(page):
-    for data in NO_MESSAGES:
+def test_invalid_message_is_reported_and_changes_nothing(page):
+    for data in INVALID_MESSAGES:
         before = page.controls
         page.receive(data)
         assert "invalid message" in page.texts["error"], data
@@ -117,7 +117,7 @@ def test_what_is_no_message_is_said_and_changes_nothing(page):
         assert page.texts["error"] == "", data
 
 
-def test_a_refused_number_leaves_the_last_good_view(page):
+def test_invalid_value_keeps_the_last_valid_view(page):
     say(page, set={"mass": 200})
     say(page, set={"mass": -1})
     assert page.texts["error"].startswith("mass m: got -1 g")
@@ -125,7 +125,7 @@ def test_a_refused_number_leaves_the_last_good_view(page):
     assert page.controls.scene.mass == 0.2
 
 
-def test_a_refused_number_leaves_the_computation_of_the_shown_state(page):
+def test_invalid_value_keeps_the_running_computation(page):
     say(page, set={"mass": 200}, rest=True)
     say(page, set={"mass": -1}, rest=True)
     page.queue.work()
@@ -134,7 +134,7 @@ def test_a_refused_number_leaves_the_computation_of_the_shown_state(page):
     assert page.texts["busy"] is False
 
 
-def test_what_goes_wrong_while_computing_is_said(page, monkeypatch):
+def test_failed_computation_is_reported(page, monkeypatch):
     def fail(scene):
         raise ZeroDivisionError("far away")
 
@@ -143,18 +143,18 @@ def test_what_goes_wrong_while_computing_is_said(page, monkeypatch):
     page.queue.work()
     assert page.texts["error"].startswith("the computation failed (ZeroDivisionError: far away); ")
     assert page.texts["busy"] is False
-    # Nothing is left that is of the wall before.
+    # Results of the previous wall are removed.
     assert page.texts["verdict"] == ""
 
 
-def test_a_dark_page_has_other_inks(page):
+def test_dark_page_has_different_colors(page):
     say(page, dark=True)
     dark = [getattr(glyph, name) for glyph, name, _ in page.inks]
     say(page, dark=False)
     assert all(before != getattr(glyph, name) for before, (glyph, name, _) in zip(dark, page.inks, strict=True))
 
 
-def test_a_figure_is_a_table(page):
+def test_figures_are_exported_as_csv(page):
     say(page, set={"velocity": "WindowedDifference"})
     say(page, set={"velocity.samples": 24}, rest=True)
     page.queue.work()
@@ -163,7 +163,7 @@ def test_a_figure_is_a_table(page):
     assert rows[0] == ["curve", "piece", "stiffness K in N/m", "damping B in N s/m"]
     pieces = [[row for row in rows if row[:2] == ["stable", number]] for number in ("1", "2", "3")]
     outlines = page.controls.scene.stable_region()
-    assert [len(piece) for piece in pieces] == [*(one.stiffness.size + 1 for one in outlines), 0]
+    assert [len(piece) for piece in pieces] == [*(outline.stiffness.size + 1 for outline in outlines), 0]
     for piece, outline in zip(pieces, outlines, strict=False):
         np.testing.assert_allclose([float(row[2]) for row in piece[:-1]], outline.stiffness, rtol=1e-7, atol=1e-7)
     assert ["your wall", "1", "10000", "40"] in rows
@@ -171,7 +171,7 @@ def test_a_figure_is_a_table(page):
     assert page.texts["csv"].splitlines()[0] == "curve,piece,frequency in Hz,|L| in dB"
 
 
-def test_an_address_is_opened_and_an_empty_one_is_the_first_visit(page):
+def test_link_sets_the_scene_and_an_empty_one_resets_it(page):
     say(page, open="mass=200+g&period=2+ms&stiffness=1+kN/m&virtual_damping=3+N+s/m", rest=True)
     assert page.controls.scene.mass == 0.2
     assert page.texts["link"] == "mass=200+g&damping=0+N+s/m&period=2+ms&stiffness=1+kN/m&virtual_damping=3+N+s/m"
@@ -182,7 +182,7 @@ def test_an_address_is_opened_and_an_empty_one_is_the_first_visit(page):
     assert page.controls == Controls()
 
 
-def test_a_linear_system_is_shown_by_what_it_has(tmp_path):
+def test_linear_device_is_shown_and_copied(tmp_path):
     file = tmp_path / "system.yaml"
     scene = "{device: 1900 / 0.1 191 1900 0, period: 1 ms, stiffness: 5 kN/m, virtual_damping: 30}"
     file.write_text(f"version: 1\nname: s\nscene: {scene}\nstudies: [{{kind: boundary, name: b}}]\n")
@@ -192,8 +192,8 @@ def test_a_linear_system_is_shown_by_what_it_has(tmp_path):
     assert page.texts["error"] == ""
     assert page.texts["busy"] is False
     system = zwidth.LinearDevice(([1900.0], [0.1, 191.0, 1900.0, 0.0]))
-    known = zwidth.Scene(system, zwidth.Timing(1e-3, 0.5e-3), zwidth.VirtualWall(5e3, 30.0))
-    assert page.controls.scene == known
+    expected = zwidth.Scene(system, zwidth.Timing(1e-3, 0.5e-3), zwidth.VirtualWall(5e3, 30.0))
+    assert page.controls.scene == expected
     done = CliRunner().invoke(
         cli,
         "check --device '1900 / 0.1 191 1900 0' --period 1ms --delay 0.5ms --stiffness 5e3 --virtual-damping 30",
@@ -202,13 +202,13 @@ def test_a_linear_system_is_shown_by_what_it_has(tmp_path):
     assert len(page.sources["step"].data["x"]) > 10
     assert len(page.sources["contact"].data["x"]) == 0
     assert "no body" in page.texts["contact_words"]
-    # What the page copies gives the same scene.
+    # The copied code, link and configuration reproduce the scene.
     names: dict = {}
     exec(page.texts["python"].partition("verdict =")[0], names)
-    assert names["scene"] == known
-    assert read_link(page.texts["link"]).scene == known
+    assert names["scene"] == expected
+    assert read_link(page.texts["link"]).scene == expected
     (tmp_path / "copied.yaml").write_text(page.texts["yaml"])
-    assert zwidth.load_config(tmp_path / "copied.yaml").scene.to_scene() == known  # pyright: ignore
+    assert zwidth.load_config(tmp_path / "copied.yaml").scene.to_scene() == expected  # pyright: ignore
     for name, value in (("mode", "normalized"), ("coupling", "tip"), ("motion", "rotary"), ("operator", "rigid")):
         with pytest.raises(zwidth.InputError, match=f"^{name}: "):
             page.controls.change({name: value})
