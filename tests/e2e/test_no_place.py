@@ -9,8 +9,8 @@ from contextlib import contextmanager
 
 import pytest
 import yaml
-from chunks import failing_on_2
-from sweeping import AXES, assert_same, chunk_file, command, flags, flip, main_of, study
+from chunks import fail_on_2
+from sweeping import AXES, assert_equal_stores, chunk_file, command, flip_byte, list_status_files, run_main, study
 from waiting import LONGEST
 
 # A limit set between fork and exec would have Python code run in a copy of a process with JAX's threads.
@@ -37,7 +37,7 @@ def config(tmp_path_factory):
 def finished(config, tmp_path_factory):
     """The folder of a run that nothing disturbed."""
     folder = tmp_path_factory.mktemp("finished") / "out"
-    assert main_of("run", config, "--out", folder) == 0
+    assert run_main("run", config, "--out", folder) == 0
     return folder
 
 
@@ -87,8 +87,8 @@ def test_no_room_for_a_file_ends_the_run_and_room_lets_it_go_on(tmp_path):
     for noise in ("Traceback", "UserWarning", "compilation cache"):
         assert noise not in result.stderr
     assert list(out.rglob("*.partial")) == []
-    assert main_of("run", config, "--out", out, "--resume") == 0
-    assert main_of("verify", out) == 0
+    assert run_main("run", config, "--out", out, "--resume") == 0
+    assert run_main("verify", out) == 0
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
@@ -99,7 +99,7 @@ def test_a_file_in_the_place_of_the_folder_is_refused(config, words, name, tmp_p
     file = tmp_path / "a_file"
     file.touch()
     for out, says in ((file, "is a file"), (file / "below", f"cannot be created because {file} is a file")):
-        assert main_of(*words, config, "--out", out) == 2
+        assert run_main(*words, config, "--out", out) == 2
         message = capsys.readouterr().err
         assert message.startswith(f"Error: out: {out} {says}")
         assert "choose another" in message
@@ -114,30 +114,30 @@ def test_a_read_only_folder_is_refused(config, tmp_path, capsys):
     folder.mkdir()
     folder.chmod(0o555)
     with as_nobody():
-        assert main_of("run", config, "--out", folder / "out") == 2
+        assert run_main("run", config, "--out", folder / "out") == 2
     says = f"Error: out: {folder}/out cannot be created because {folder} is not writable for you; choose another"
     assert capsys.readouterr().err.startswith(says)
 
 
 def test_a_store_that_became_read_only_ends_the_run_with_a_message(config, copy, capsys):
-    next(iter(flags(copy))).unlink()
+    next(iter(list_status_files(copy))).unlink()
     readable_by_all(copy)
     readable_by_all(config.parent)
     for path in (copy / "map.zarr").rglob("*"):
         path.chmod(0o555 if path.is_dir() else 0o444)
     copy.chmod(0o777)
     with as_nobody():
-        assert main_of("run", config, "--out", copy, "--resume") == 1
+        assert run_main("run", config, "--out", copy, "--resume") == 1
     assert "Permission denied" in (message := capsys.readouterr().err)
     assert "esume with: zwidth run" in message
-    assert main_of("run", config, "--out", copy, "--resume") == 0
+    assert run_main("run", config, "--out", copy, "--resume") == 0
 
 
 def test_what_the_disk_has_no_room_for_is_refused_before_any_work(config, tmp_path, capsys):
     axes = {name: {"linear": {"start": 0, "stop": 1, "num": num}} for name, num in (("alpha", 10**6), ("beta", 10**5))}
     axes |= {"delta": [0.1, 0.2, 0.3, 0.4, 0.5], "d": 1}
     huge = written(tmp_path / "huge.yaml", study(axes=axes, outputs=("margin",)))
-    assert main_of("run", huge, "--out", tmp_path / "out") == 2
+    assert run_main("run", huge, "--out", tmp_path / "out") == 2
     assert "free, but the results may take" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -145,40 +145,40 @@ def test_what_the_disk_has_no_room_for_is_refused_before_any_work(config, tmp_pa
 @pytest.mark.parametrize(
     "damage, says",
     [
-        (lambda file: flip(file, 5), "stable is damaged"),
+        (lambda file: flip_byte(file, 5), "stable is damaged"),
         (lambda file: file.unlink(), "stable is missing"),
     ],
     ids=["flipped", "removed"],
 )
 def test_verify_names_a_damaged_chunk_and_resume_repairs_it_alone(config, finished, copy, damage, says, capsys):
     damage(chunk_file(copy / "map.zarr", "stable", 3))
-    before = flags(copy)
-    assert main_of("verify", copy) == 1
+    before = list_status_files(copy)
+    assert run_main("verify", copy) == 1
     out, err = capsys.readouterr()
     assert "map.zarr: 8 of 8 chunks done, 1 damaged" in out
     (line,) = err.splitlines()
     assert line.startswith(f"Error: {copy}/map.zarr: wall/3 (d ")
     assert line.endswith(f": {says}")
-    assert main_of("verify", copy, "--json") == 1
+    assert run_main("verify", copy, "--json") == 1
     report = json.loads(capsys.readouterr().out)["map.zarr"]
     assert (report["ok"], report["done"], len(report["damaged"])) == (False, 8, 1)
-    assert main_of("run", config, "--out", copy, "--resume") == 0
+    assert run_main("run", config, "--out", copy, "--resume") == 0
     out, err = capsys.readouterr()
     assert f"repaired map/{line.partition('map.zarr: ')[2]}" in err
     assert "8 of 8 chunks done (1 now)" in out
-    assert len(before.items() & flags(copy).items()) == 7
-    assert main_of("verify", copy) == 0
-    assert_same(finished, copy)
+    assert len(before.items() & list_status_files(copy).items()) == 7
+    assert run_main("verify", copy) == 0
+    assert_equal_stores(finished, copy)
 
 
 def test_a_chunk_that_fails_is_named_and_the_exit_code_is_1(config, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("zwidth.sweep.jobs.perform", failing_on_2)
-    assert main_of("run", config, "--out", tmp_path / "out") == 1
+    monkeypatch.setattr("zwidth.sweep.jobs.perform", fail_on_2)
+    assert run_main("run", config, "--out", tmp_path / "out") == 1
     out, err = capsys.readouterr()
     assert "7 of 8 chunks done" in out
     assert "Error: chunk map/wall/2 (d 1:2, delta 0:2, alpha 0:40, beta 0:300) failed: ArithmeticError: no" in err
     assert f"retry the failed parts with: zwidth run {config} --out {tmp_path}/out --resume" in err
-    assert main_of("verify", tmp_path / "out") == 1
+    assert run_main("verify", tmp_path / "out") == 1
     assert "map.zarr: 7 of 8 chunks done, none damaged" in capsys.readouterr().out
 
 
@@ -186,15 +186,15 @@ def test_a_damaged_description_of_a_store_is_told(config, copy, capsys):
     text = (copy / "map.zarr" / "zarr.json").read_text(encoding="utf-8")
     for damaged in (text[:100], "", "[]", text.replace("float64", "float32")):
         (copy / "map.zarr" / "zarr.json").write_text(damaged, encoding="utf-8")
-        assert main_of("verify", copy) == 1
+        assert run_main("verify", copy) == 1
         # There is a second copy.
-        assert main_of("run", config, "--out", copy, "--resume") == 0
+        assert run_main("run", config, "--out", copy, "--resume") == 0
         assert "repaired map/zarr.json (restored)" in capsys.readouterr().err
-        assert main_of("verify", copy) == 0
+        assert run_main("verify", copy) == 0
         for name in ("zarr.json", "zwidth.json"):
             (copy / "map.zarr" / name).write_text(damaged, encoding="utf-8")
-        assert main_of("verify", copy) == 1
-        assert main_of("run", config, "--out", copy, "--resume") == 2
+        assert run_main("verify", copy) == 1
+        assert run_main("run", config, "--out", copy, "--resume") == 2
         err = capsys.readouterr().err
         assert "map.zarr: zarr.json " in err
         assert "start again in a new folder" in err
@@ -204,14 +204,14 @@ def test_a_damaged_description_of_a_store_is_told(config, copy, capsys):
 
 def test_a_folder_without_a_store_is_told(tmp_path, capsys):
     for words in (["verify", tmp_path], ["export", tmp_path, "--csv", tmp_path / "x.csv"]):
-        assert main_of(*words) == 2
+        assert run_main(*words) == 2
         assert "contains no store of a sweep" in capsys.readouterr().err
-    assert main_of("verify", tmp_path / "no") == 2
+    assert run_main("verify", tmp_path / "no") == 2
     assert "no such folder" in capsys.readouterr().err
 
 
 def test_the_plan_of_a_configuration_without_sweeps(tmp_path, capsys):
     config = written(tmp_path / "others.yaml", {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0})
-    assert main_of("run", "--dry-run", config, "--out", tmp_path / "out") == 0
+    assert run_main("run", "--dry-run", config, "--out", tmp_path / "out") == 0
     assert "study r\n  2 points" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()

@@ -78,7 +78,7 @@ def test_a_shipped_configuration_goes_all_the_way(config, tmp_path, monkeypatch,
 
 def test_a_shipped_configuration_opens_in_the_explorer(config, tmp_path):
     pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
-    from open_pages import open_page, say
+    from open_pages import open_page, send_message
 
     from zwidth.app.explorer.controls import read_controls
 
@@ -88,7 +88,7 @@ def test_a_shipped_configuration_opens_in_the_explorer(config, tmp_path):
             read_controls(config)
         return
     page = open_page(read_controls(config))
-    say(page, set={}, rest=True)
+    send_message(page, set={}, rest=True)
     page.queue.work()
     assert page.texts["error"] == ""
     assert page.texts["word"].upper() in page.texts["verdict"]

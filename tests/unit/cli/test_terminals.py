@@ -3,7 +3,7 @@
 import os
 
 import pytest
-from sweeping import main_of
+from sweeping import run_main
 
 from zwidth.app.printing import format_row, print_lines
 from zwidth.cli.commands import cli
@@ -41,5 +41,5 @@ def test_colors_are_disabled_by_environment(name, value, monkeypatch):
     passed = {}
     monkeypatch.setattr(cli, "main", lambda **options: passed.update(options))
     monkeypatch.setenv(name, value)
-    main_of("devices")
+    run_main("devices")
     assert passed["color"] is False

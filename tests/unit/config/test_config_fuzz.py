@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from sweeping import main_of
+from sweeping import run_main
 
 from zwidth.config.fields import ConfigFileError, format_path
 from zwidth.config.reader import MAX_DEPTH, MAX_NODES
@@ -233,7 +233,7 @@ def test_any_mutation_yields_a_plan_or_exit_code_2(seed, tmp_path, capsys):
     path.write_bytes(rng.choice([flip_bits, rearrange, mutate])(shipped.read_bytes(), rng))
     for table in CONFIGS.glob("*.csv"):
         (tmp_path / table.name).write_bytes(table.read_bytes())
-    code = main_of("run", "--dry-run", path, "--out", tmp_path / "out")
+    code = run_main("run", "--dry-run", path, "--out", tmp_path / "out")
     out, err = capsys.readouterr()
     lines = err.splitlines()
     assert code == (2 if lines else 0)

@@ -3,7 +3,7 @@
 import shutil
 
 import pytest
-from run_folders import BOTH, SMALL
+from run_folders import SMALL, SMALL_WITH_SWEEP
 from unpainted import painting_nothing
 
 from zwidth.runs import run
@@ -20,7 +20,7 @@ def config(tmp_path):
 @pytest.fixture
 def config_with_sweep(tmp_path):
     file = tmp_path / "both.yaml"
-    file.write_text(BOTH, encoding="utf-8")
+    file.write_text(SMALL_WITH_SWEEP, encoding="utf-8")
     return file
 
 
@@ -28,7 +28,7 @@ def config_with_sweep(tmp_path):
 def undisturbed(tmp_path_factory):
     """Return the folder of an undisturbed run."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    (folder / "both.yaml").write_text(BOTH, encoding="utf-8")
+    (folder / "both.yaml").write_text(SMALL_WITH_SWEEP, encoding="utf-8")
     with painting_nothing():
         result = run(folder / "both.yaml", out=folder / "out")
     assert result.ok

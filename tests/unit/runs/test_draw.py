@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from chunks import failing_on_2
+from chunks import fail_on_2
 from matplotlib.figure import Figure
-from sweeping import config_of, main_of, run_sweeps, study
+from sweeping import make_config, run_main, run_sweeps, study
 
 import zwidth
 from zwidth.core.errors import InputError, StoreError
@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
         study("devices", axes=DEVICES, outputs=("stiffness_max", "virtual_damping_at_max")),
         study("point", axes={"alpha": 0.1, "beta": 0.1, "delta": 0.1, "d": 1}),
     ]
-    assert run_sweeps(config_of(*studies), folder).ok
+    assert run_sweeps(make_config(*studies), folder).ok
     return folder
 
 
@@ -175,7 +175,7 @@ def test_slices_are_at_the_nearest_values(folder, capsys, tmp_path, monkeypatch)
     assert titles(drawn["plane_stable"]) == [r"$d = 1$,  $\delta = 0.1$"]
     assert titles(drawn["devices_stiffness_max"]) == ["heavy"]
     words = ["figures", folder / "plane.zarr", "--at", "delta=0.12", "--at", "d=1", "--out", tmp_path, "--json"]
-    assert main_of(*words) == 0
+    assert run_main(*words) == 0
     assert len(json.loads(capsys.readouterr().out)["files"]) == 8
     assert all(file.stat().st_size > 1000 for file in tmp_path.iterdir())
 
@@ -196,7 +196,7 @@ def test_curves_have_readable_units(folder):
 
 def test_missing_points_are_blank_and_in_the_legend(tmp_path):
     axes = {**PLANE, "alpha": {"linear": {"start": 0.01, "stop": 1.0, "num": 2000}}, "delta": [0.1], "d": [0, 1, 2]}
-    run_sweeps(config_of(study(axes=axes)), tmp_path, perform=failing_on_2)
+    run_sweeps(make_config(study(axes=axes)), tmp_path, perform=fail_on_2)
     drawn = draw_plane(open_dataset(tmp_path), "stable")
     assert any(np.ma.getmaskarray(mesh).any() for mesh in color_values(drawn))
     # A grid finer than the page is thinned.
@@ -224,6 +224,6 @@ def test_invalid_slices_raise(folder, tmp_path, at, message):
 def test_folder_without_stores_raises(tmp_path, capsys):
     with pytest.raises(StoreError, match="contains no store of a sweep"):
         draw_stores(tmp_path)
-    assert main_of("figures", tmp_path) == 2
-    assert main_of("figures", tmp_path, "--at", "delta") == 2
+    assert run_main("figures", tmp_path) == 2
+    assert run_main("figures", tmp_path, "--at", "delta") == 2
     assert "write NAME=VALUE, such as delta=0.1" in capsys.readouterr().err

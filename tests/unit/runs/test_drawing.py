@@ -4,7 +4,7 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from sweeping import config_of, main_of, run_sweeps, study
+from sweeping import make_config, run_main, run_sweeps, study
 
 from zwidth.core.errors import InputError
 from zwidth.plotting import draw_curves, draw_plane
@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
         study("walls", axes=WALLS, outputs=("stable", "margin")),
         study("point", axes={"alpha": 0.1, "beta": 0.1, "delta": 0.1, "d": 1}),
     ]
-    assert run_sweeps(config_of(*studies), folder).ok
+    assert run_sweeps(make_config(*studies), folder).ok
     return folder
 
 
@@ -117,7 +117,7 @@ def test_files_have_the_given_format_size_and_style(folder, tmp_path, capsys):
     words = ["--at", "delay=0", "--at", "damping=1", "--style", sheet]
     words += ["--format", "png", "--format", "pdf", "--dpi", "50", "--size", "6x3"]
     before = dict(matplotlib.rcParams)
-    assert main_of("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
+    assert run_main("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
     assert dict(matplotlib.rcParams) == before
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [
         "ridge_stiffness_max.pdf",
@@ -126,7 +126,7 @@ def test_files_have_the_given_format_size_and_style(folder, tmp_path, capsys):
     assert imread(tmp_path / "out" / "ridge_stiffness_max.png").shape[:2] == (150, 300)
     assert (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes().startswith(b"%PDF")
     first = (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes()
-    assert main_of("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
+    assert run_main("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
     assert (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes() == first
     with draw.style_sheet(sheet):
         (ax,) = draw_curves(open_dataset(folder / "ridge.zarr").isel(delay=0, damping=0), "stiffness_max", x="rate")
@@ -146,13 +146,13 @@ def test_files_have_the_given_format_size_and_style(folder, tmp_path, capsys):
     ],
 )
 def test_invalid_figure_options_raise(folder, tmp_path, capsys, words, message):
-    assert main_of("figures", folder, *words, "--out", tmp_path / "out") == 2
+    assert run_main("figures", folder, *words, "--out", tmp_path / "out") == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
 def test_command_without_figures_states_the_reason(folder, tmp_path, capsys):
-    assert main_of("figures", folder / "point.zarr", "--out", tmp_path / "out") == 1
+    assert run_main("figures", folder / "point.zarr", "--out", tmp_path / "out") == 1
     assert "point.zarr: no figure, because it is a single point" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from sweeping import config_of, run_sweeps, study
+from sweeping import make_config, run_sweeps, study
 
 from zwidth import Device, LowPass, Scene, Timing, is_passive, is_stable
 from zwidth.plotting import draw_outlines, draw_plane
@@ -37,7 +37,7 @@ def folder(tmp_path_factory):
         study("filtered", axes=FILTERED, velocity={"kind": "low_pass", "cutoff": "50 Hz"}),
         study("cut_off", axes=CUT_OFF, velocity={"kind": "low_pass", "cutoff": "50 Hz"}),
     ]
-    assert run_sweeps(config_of(*studies), folder).ok
+    assert run_sweeps(make_config(*studies), folder).ok
     return folder
 
 
@@ -155,7 +155,7 @@ def test_legend_omits_edges_that_are_not_drawn(tmp_path):
     beta = {"linear": {"start": -0.4, "stop": 3.0, "num": 9}}
     for name, start, in_legend in (("all", 0.0, True), ("unstable", 2.0, False)):
         axes = {"alpha": {"linear": {"start": start, "stop": 3.0, "num": 9}}, "beta": beta, "delta": 0.5, "d": 1}
-        assert run_sweeps(config_of(study(name, axes=axes, outputs=("decay_rate",))), tmp_path / name).ok
+        assert run_sweeps(make_config(study(name, axes=axes, outputs=("decay_rate",))), tmp_path / name).ok
         data, edges = open_with_edges(tmp_path / name, name)
         (ax,) = draw_plane(data, "decay_rate", edges=edges)
         legend = ax.figure.legends[0].get_texts() if ax.figure.legends else []

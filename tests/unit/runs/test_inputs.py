@@ -5,7 +5,7 @@ import shutil
 from typing import Any
 
 import pytest
-from run_folders import record_of
+from run_folders import read_record
 
 import zwidth
 from zwidth.core.errors import StoreError, StoreExistsError
@@ -44,7 +44,7 @@ def test_run_is_repeatable_from_its_own_folder(tmp_path, table_path):
     assert zwidth.run(config, out=out).ok
     (copy,) = (out / "inputs").iterdir()
     assert copy.read_text(encoding="utf-8") == TABLE
-    assert record_of(out)["inputs"] == {copy.name: hashlib.sha256(TABLE.encode()).hexdigest()}
+    assert read_record(out)["inputs"] == {copy.name: hashlib.sha256(TABLE.encode()).hexdigest()}
     text = (out / "config.yaml").read_text(encoding="utf-8")
     assert f"csv: inputs/{copy.name}}}, rate: 1 kHz, delay: 1 periods}}  # of the workshop" in text
     shutil.rmtree(config.parent)

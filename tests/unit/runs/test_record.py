@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 import pytest
-from run_folders import record_of, states
+from run_folders import read_record, read_states
 
 from zwidth.app.report.page import write_report
 from zwidth.core.errors import InputError, StoreError, StoreExistsError
@@ -75,7 +75,7 @@ def test_links_in_a_run_are_replaced_without_touching_their_targets(finished, co
         (finished / name).symlink_to(victim / target)
     # A link left by another study and named in the record.
     (finished / "left.zarr").symlink_to(victim / "tree")
-    record = record_of(finished)
+    record = read_record(finished)
     record["studies"][0]["files"]["left.zarr"] = None
     record["studies"][0]["state"] = "open"
     (finished / "run.json").write_text(json.dumps(record), encoding="utf-8")
@@ -104,7 +104,7 @@ def test_lost_record_is_reported_and_restored(finished, config_with_sweep, optio
         run(config_with_sweep, out=finished)
     result = run(config_with_sweep, out=finished, **options)
     assert result.ok
-    assert states(finished) == {"one": "done", "two": "done", "swept": "done"}
+    assert read_states(finished) == {"one": "done", "two": "done", "swept": "done"}
     assert result.sweeps["swept"].computed == (0 if "resume" in options else 1)
     np.testing.assert_array_equal(np.load(finished / "two.npz")["stable"], values)
     assert (finished / "mine.txt").read_text(encoding="utf-8") == "mine"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from run_folders import BOTH, SMALL, contents, record_of, states
+from run_folders import SMALL, SMALL_WITH_SWEEP, list_contents, read_record, read_states
 
 import zwidth
 from zwidth.core.errors import ConfigError, InputError, StoreError, StoreExistsError
@@ -26,7 +26,7 @@ def test_run_writes_the_files_of_its_record(config, tmp_path):
     assert 0 < result.seconds <= time.perf_counter() - clock
     assert result.ok
     assert result.folder == tmp_path / "out"
-    record = record_of(result.folder)
+    record = read_record(result.folder)
     listed = {file for study in record["studies"] for file in study["files"]}
     assert listed == {"one.npz", "one_stable.png", "one_stable.svg", "two.npz"}
     assert {file.name for file in result.folder.iterdir()} == listed | {"run.json", "config.yaml", ".locks"}
@@ -90,7 +90,7 @@ def test_each_sweep_reports_the_time_of_its_chunks(tmp_path):
     assert min(one, two) > 0
     # The sum must not exceed the total time.
     assert one + two <= time.perf_counter() - clock
-    assert [entry["seconds"] for entry in record_of(tmp_path / "out")["studies"]] == [round(one, 3), round(two, 3)]
+    assert [entry["seconds"] for entry in read_record(tmp_path / "out")["studies"]] == [round(one, 3), round(two, 3)]
 
 
 def test_existing_run_is_overwritten_only_on_request(config, tmp_path):
@@ -139,8 +139,8 @@ def test_failed_study_does_not_affect_others(config, tmp_path, fail):
     assert [study.name for study in result.failed] == ["one"]
     assert isinstance(result.failed[0].exception, FloatingPointError)
     assert (result.folder / "two.npz").is_file()
-    assert states(result.folder) == {"one": "failed", "two": "done"}
-    entry = next(entry for entry in record_of(result.folder)["studies"] if entry["name"] == "one")
+    assert read_states(result.folder) == {"one": "failed", "two": "done"}
+    entry = next(entry for entry in read_record(result.folder)["studies"] if entry["name"] == "one")
     assert entry["error"] == "FloatingPointError: no such luck"
 
 
@@ -161,10 +161,10 @@ def test_overwriting_keeps_files_not_written_by_the_run(finished, config_with_sw
     (finished / "notes.txt").write_text("mine", encoding="utf-8")
     (finished / "photos").mkdir()
     (finished / "photos" / "device.jpg").write_bytes(b"jpg")
-    before, original = contents(inner), contents(finished)
+    before, original = list_contents(inner), list_contents(finished)
     assert run(config_with_sweep, out=finished, overwrite=True).ok
-    after = contents(finished)
-    assert contents(inner) == before
+    after = list_contents(finished)
+    assert list_contents(inner) == before
     assert {name for name in after if after[name] == original.get(name)} == {
         *("notes.txt", "photos/device.jpg"),
         *(f"another/{name}" for name in before),
@@ -175,7 +175,7 @@ def test_overwriting_keeps_files_not_written_by_the_run(finished, config_with_sw
 def test_overwriting_removes_results_of_the_old_configuration(finished, config):
     assert run(config, out=finished, overwrite=True).ok
     assert not (finished / "swept.zarr").exists()
-    assert states(finished) == {"one": "done", "two": "done"}
+    assert read_states(finished) == {"one": "done", "two": "done"}
 
 
 def test_foreign_file_with_the_name_of_a_result_is_not_replaced(config_with_sweep, tmp_path):
@@ -190,7 +190,7 @@ def test_foreign_file_with_the_name_of_a_result_is_not_replaced(config_with_swee
         f"StoreExistsError: out: {out / 'thesis.npz'} was not written by this run; move it away"
     )
     assert (out / "thesis.npz").read_bytes() == b"years of work"
-    assert states(out)["thesis"] == "failed"
+    assert read_states(out)["thesis"] == "failed"
     (out / "thesis.npz").unlink()
     assert run(config_with_sweep, out=out, resume=True).ok
 
@@ -204,9 +204,9 @@ def test_foreign_config_yaml_is_never_replaced(config_with_sweep, tmp_path):
         assert (out / "config.yaml").read_text(encoding="utf-8") == "mine"
     (out / "config.yaml").unlink()
     assert run(config_with_sweep, out=out, overwrite=True).ok
-    assert (out / "config.yaml").read_text(encoding="utf-8") == BOTH
+    assert (out / "config.yaml").read_text(encoding="utf-8") == SMALL_WITH_SWEEP
     assert run(config_with_sweep, out=out, overwrite=True).ok
-    assert (out / "config.yaml").read_text(encoding="utf-8") == BOTH
+    assert (out / "config.yaml").read_text(encoding="utf-8") == SMALL_WITH_SWEEP
 
 
 def test_foreign_store_of_the_same_name_is_never_replaced(config_with_sweep, tmp_path):
@@ -232,7 +232,7 @@ def test_slow_study_reports_its_progress(tmp_path):
 def test_record_and_store_have_equal_configuration_hashes(config_with_sweep, tmp_path):
     folder = run(config_with_sweep, out=tmp_path / "out").folder
     digest = hashlib.sha256((folder / "config.yaml").read_bytes()).hexdigest()
-    assert record_of(folder)["config_sha256"] == digest
+    assert read_record(folder)["config_sha256"] == digest
     (store,) = folder.glob("*.zarr")
     with zwidth.open_dataset(store) as data:
         assert data.attrs["config_sha256"] == digest

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from sweeping import main_of
+from sweeping import run_main
 
 import zwidth
 from zwidth.config.values import DeltaAxis
@@ -53,9 +53,9 @@ def config(tmp_path):
 def test_external_study_is_run_and_resumed(config, tmp_path, capsys):
     register(RatioStudy)
     out = tmp_path / "out"
-    assert main_of("run", config, "--dry-run", "--out", out) == 0
+    assert run_main("run", config, "--dry-run", "--out", out) == 0
     assert "study r\n  1 points (delta = 1)" in capsys.readouterr().out
-    assert main_of("run", config, "--out", out) == 0
+    assert run_main("run", config, "--out", out) == 0
     header, row = (out / "r.csv").read_text(encoding="utf-8").split()
     assert header == "delta,ratio"
     np.testing.assert_allclose([float(text) for text in row.split(",")], [0.5, zwidth.alpha_max(0.5, 0).alpha / 1.0])

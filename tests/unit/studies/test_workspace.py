@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sweeping import main_of
+from sweeping import run_main
 
 import zwidth
 from zwidth.core.errors import ConfigError
@@ -27,7 +27,7 @@ def write_config(folder, study=STUDY, poses=POSES, scene=""):
 
 
 def test_every_pose_agrees_with_its_scene(tmp_path, capsys):
-    assert main_of("run", write_config(tmp_path), "--out", tmp_path / "out") == 0
+    assert run_main("run", write_config(tmp_path), "--out", tmp_path / "out") == 0
     output = capsys.readouterr().out
     table = np.genfromtxt(tmp_path / "out" / "w.csv", delimiter=",", names=True)
     assert table.dtype.names is not None
@@ -44,7 +44,7 @@ def test_every_pose_agrees_with_its_scene(tmp_path, capsys):
 
 def test_table_of_inertias_is_rotary(tmp_path, capsys):
     poses = "shoulder [deg],elbow [deg],mass [g cm^2],damping [mN m s/rad]\n0,30,77,0.02\n60,30,60,0.03\n"
-    assert main_of("run", write_config(tmp_path, poses=poses), "--out", tmp_path / "out") == 0
+    assert run_main("run", write_config(tmp_path, poses=poses), "--out", tmp_path / "out") == 0
     device = zwidth.Device("60 g cm^2", "0.03 mN m s/rad")
     top = zwidth.Scene(device, zwidth.Timing("1 ms", "1 periods")).max_stiffness()
     output = " ".join(capsys.readouterr().out.split())
@@ -66,7 +66,7 @@ def test_recommended_wall_is_checked_in_every_pose(tmp_path, capsys):
     # The damping that suits the heavy, weakest pose is too large for the light, damped one.
     poses = "a,b,mass [g],damping [N s/m]\n0,0,100,0\n1,0,10,25\n"
     study = STUDY.replace("shoulder", "a").replace("elbow", "b")
-    assert main_of("run", write_config(tmp_path, study, poses), "--out", tmp_path / "out") == 0
+    assert run_main("run", write_config(tmp_path, study, poses), "--out", tmp_path / "out") == 0
     stiffness, damping = 0.75 * np.array(
         zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(1e-3, 1e-3)).max_stiffness()[:2]
     )
@@ -84,7 +84,7 @@ def test_recommended_stiffness_is_rounded_down(tmp_path, capsys):
     scale = 75_057.0 / (0.75 * float(top.stiffness))
     poses = f"a,b,mass,damping\n0,0,{0.1 * scale!r},{scale!r}\n1,0,{0.2 * scale!r},{2 * scale!r}\n"
     study = STUDY.replace("shoulder", "a").replace("elbow", "b").replace("1 periods", "0 s")
-    assert main_of("run", write_config(tmp_path, study, poses), "--out", tmp_path / "out") == 0
+    assert run_main("run", write_config(tmp_path, study, poses), "--out", tmp_path / "out") == 0
     assert "K = 75.05 kN/m, " in capsys.readouterr().out
 
 
@@ -146,7 +146,7 @@ def test_pose_without_maximum_is_reported_and_does_not_affect_others(tmp_path, c
     for name, poses in (("complete", POSES), ("incomplete", POSES.replace("0,90,150,1.2", "0,90,1e-20,1e5"))):
         folder = tmp_path / name
         folder.mkdir()
-        assert main_of("run", write_config(folder, poses=poses), "--out", folder / "out") == 0
+        assert run_main("run", write_config(folder, poses=poses), "--out", folder / "out") == 0
         table[name] = np.genfromtxt(folder / "out" / "w.csv", delimiter=",", names=True)["stiffness_N_per_m"]
     output = capsys.readouterr()
     assert np.isnan(table["incomplete"]).tolist() == [False, False, True, False]
@@ -161,5 +161,5 @@ def test_pose_without_maximum_is_reported_and_does_not_affect_others(tmp_path, c
 
 def test_workspace_without_any_maximum_raises(tmp_path, capsys):
     poses = POSES.splitlines()[0] + "\n0,30,1e-20,1e5\n60,30,1e-20,1e6\n"
-    assert main_of("run", write_config(tmp_path, poses=poses), "--out", tmp_path / "out") == 1
+    assert run_main("run", write_config(tmp_path, poses=poses), "--out", tmp_path / "out") == 1
     assert "no pose of arm.csv has a K_max; first pose: shoulder 0 deg, elbow 30 deg" in capsys.readouterr().err

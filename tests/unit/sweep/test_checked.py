@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sweeping import chunk_file, config_of, cut, flip, main_of, run_sweeps, study, values_of
+from sweeping import chunk_file, flip_byte, limit_chunk_sizes, make_config, read_values, run_main, run_sweeps, study
 
 from zwidth.core.errors import StoreError
 from zwidth.sweep.dataset import open_dataset, verify
@@ -18,9 +18,9 @@ AXES = {"alpha": [0.1, 0.3, 0.9], "beta": [-0.1, 0.2, 0.5], "delta": [0.1, 1.0],
 def finished(tmp_path_factory):
     """Return configuration, folder and contents of a finished run of several chunks."""
     folder = tmp_path_factory.mktemp("finished")
-    config = config_of(study(axes=AXES, outputs=("stable", "passivity_margin", "alpha_max")))
+    config = make_config(study(axes=AXES, outputs=("stable", "passivity_margin", "alpha_max")))
     with pytest.MonkeyPatch.context() as patch:
-        cut(patch, 5, 2)
+        limit_chunk_sizes(patch, 5, 2)
         assert run_sweeps(config, folder).computed > 5
     return config, folder, read(folder)
 
@@ -45,7 +45,7 @@ DAMAGES = {
     "cut off": lambda file: file.write_bytes(file.read_bytes()[:-1]),
     "empty": lambda file: file.write_bytes(b""),
     "zeros": lambda file: file.write_bytes(bytes(file.stat().st_size)),
-    "flipped": flip,
+    "flipped": flip_byte,
     "grown": lambda file: file.write_bytes(file.read_bytes() + b"0"),
 }
 
@@ -97,7 +97,7 @@ def test_unfinished_chunk_is_read_as_missing(finished, store):
         stable = [
             value for value, missing in zip(data.stable.values.flat, missing_points.flat, strict=True) if not missing
         ]
-    before = values_of(finished[1])["stable"][~missing_points]
+    before = read_values(finished[1])["stable"][~missing_points]
     assert stable == before.tolist()
 
 
@@ -144,7 +144,7 @@ def test_commands_report_damage_in_one_line(store, words, tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     file = chunk_file(store, "stable", 1)
     file.unlink()
-    assert main_of(words[0], store.parent, *words[1:]) == 2
+    assert run_main(words[0], store.parent, *words[1:]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f"Error: {store.parent / 'map.zarr'}{str(file)[len(str(store)) :]}: missing; " + (
         "'zwidth run CONFIG --resume' computes it again"
@@ -154,7 +154,7 @@ def test_commands_report_damage_in_one_line(store, words, tmp_path, monkeypatch,
 
 def test_export_of_an_incomplete_store_warns(store, tmp_path, capsys):
     chunk_file(store, "status", 1).unlink()
-    assert main_of("export", store, "--csv", tmp_path / "x.csv") == 0
+    assert run_main("export", store, "--csv", tmp_path / "x.csv") == 0
     assert "1 chunks are missing; their points have status 255" in capsys.readouterr().err
 
 
@@ -162,9 +162,9 @@ def test_store_of_an_old_format_is_readable_but_not_resumable(tmp_path):
     # Written by zwidth 0.1.0, with the checksums in separate arrays.
     shutil.unpack_archive(Path(__file__).parents[2] / "reference" / "store_of_format_1.zip", tmp_path)
     axes = {"alpha": [0.1, 0.3, 0.9], "beta": [-0.1, 0.2], "delta": [0.1, 1.0], "d": [0, 1]}
-    config = config_of(study(axes=axes, outputs=("stable", "passivity_margin", "alpha_max")))
+    config = make_config(study(axes=axes, outputs=("stable", "passivity_margin", "alpha_max")))
     assert run_sweeps(config, tmp_path / "new").ok
-    old, new = values_of(tmp_path / "map.zarr"), values_of(tmp_path / "new")
+    old, new = read_values(tmp_path / "map.zarr"), read_values(tmp_path / "new")
     assert old.keys() == new.keys()
     assert all(np.allclose(old[name], new[name], rtol=1e-12, equal_nan=True) for name in new)
     assert open_dataset(tmp_path / "map.zarr").attrs["complete"] == 1

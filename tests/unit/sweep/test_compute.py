@@ -4,7 +4,7 @@ zwidth.decide_stability.
 
 import numpy as np
 import pytest
-from sweeping import study, sweep_of
+from sweeping import make_sweep, study
 
 import zwidth
 from methods.problems import exact_radius
@@ -23,7 +23,7 @@ def grid_of(d, **axes):
         "d": d,
         **axes,
     }
-    return Grid(sweep_of(study(axes=axes, outputs=OUTPUTS)))
+    return Grid(make_sweep(study(axes=axes, outputs=OUTPUTS)))
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_points_out_of_range_have_their_status():
     """Compare with `zwidth.decide_stability`: label False and status OUT_OF_RANGE."""
     axes = {"alpha": [0.1, 1e61], "beta": [0.1, 1e61], "delta": [1.0, 1e12], "d": [0, 0.5]}
     outputs = ("stable", "passive", "spectral_radius", "gain_margin")
-    grid = Grid(sweep_of(study(axes=axes, outputs=outputs)))
+    grid = Grid(make_sweep(study(axes=axes, outputs=outputs)))
     block = grid.block(slices_of(grid))
     # The configuration accepts at most 1e12, so simulate a tiny mass.
     block = block._replace(delta=block.delta * np.where(block.delta == 1e12, 10, 1))

@@ -12,14 +12,23 @@ from typing import Any
 import pytest
 import yaml
 from chunks import (
-    doing_nothing,
-    killed_on_2,
-    killed_once_on_2,
-    killing_the_scheduler_on_2,
+    kill_scheduler_on_2,
+    kill_worker_on_2,
+    kill_worker_once_on_2,
     replay_from,
-    stopping_the_scheduler_on_2,
+    stop_scheduler_on_2,
+    store_nothing,
 )
-from sweeping import assert_same, config_of, config_of_everything, cut, flags, main_of, run_sweeps, study
+from sweeping import (
+    assert_equal_stores,
+    limit_chunk_sizes,
+    list_status_files,
+    make_config,
+    make_full_config,
+    run_main,
+    run_sweeps,
+    study,
+)
 
 from zwidth.core.errors import InputError
 
@@ -54,25 +63,25 @@ def cluster(workers):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
-    assert run_sweeps(config_of(), folder).ok
+    assert run_sweeps(make_config(), folder).ok
     return folder
 
 
 def test_results_are_independent_of_cluster_and_chunks(cluster, tmp_path, monkeypatch):
-    config = config_of_everything()
+    config = make_full_config()
     assert run_sweeps(config, tmp_path / "local").ok
-    cut(monkeypatch, 5, 3)
+    limit_chunk_sizes(monkeypatch, 5, 3)
     result = run_sweeps(config, tmp_path / "cluster", scheduler=cluster)
     assert result.ok
     assert result.computed == result.total > 50
-    assert_same(tmp_path / "local", tmp_path / "cluster")
+    assert_equal_stores(tmp_path / "local", tmp_path / "cluster")
 
 
 def test_chunk_of_a_killed_worker_is_computed_by_another(cluster, finished, tmp_path):
     replay_from(finished, tmp_path)
-    result = run_sweeps(config_of(), tmp_path, scheduler=cluster, perform=killed_once_on_2)
+    result = run_sweeps(make_config(), tmp_path, scheduler=cluster, perform=kill_worker_once_on_2)
     assert result.ok
-    assert_same(finished, tmp_path)
+    assert_equal_stores(finished, tmp_path)
 
 
 def test_chunk_that_kills_every_worker_is_reported_with_exit_code_1(
@@ -80,11 +89,11 @@ def test_chunk_that_kills_every_worker_is_reported_with_exit_code_1(
 ):
     # Without allowed failures dask abandons also other chunks of the killed worker; these are retried individually.
     monkeypatch.setattr(workers.scheduler, "allowed_failures", 0)
-    monkeypatch.setattr("zwidth.sweep.jobs.perform", killed_on_2)
+    monkeypatch.setattr("zwidth.sweep.jobs.perform", kill_worker_on_2)
     replay_from(finished, tmp_path / "out")
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump({"version": 1, "name": "sweep", "studies": [study()]}), encoding="utf-8")
-    assert main_of("run", path, "--out", tmp_path / "out", "--scheduler", cluster) == 1
+    assert run_main("run", path, "--out", tmp_path / "out", "--scheduler", cluster) == 1
     out, err = capsys.readouterr()
     assert "7 of 8 chunks done" in out
     assert "Error: chunk map/wall/2 (" in err
@@ -96,7 +105,7 @@ def test_chunk_that_kills_every_worker_is_reported_with_exit_code_1(
 def test_unreachable_scheduler_raises(tmp_path, monkeypatch):
     monkeypatch.setattr("zwidth.sweep.distributed._CONNECT_SECONDS", 1)
     with pytest.raises(InputError, match=r"scheduler: no answer from 'tcp://127\.0\.0\.1:9'"):
-        run_sweeps(config_of(), tmp_path, scheduler="tcp://127.0.0.1:9")
+        run_sweeps(make_config(), tmp_path, scheduler="tcp://127.0.0.1:9")
 
 
 @contextmanager
@@ -130,14 +139,14 @@ def start_cluster(folder):
                 process.wait()
 
 
-@pytest.mark.parametrize("disturbed", [killing_the_scheduler_on_2, stopping_the_scheduler_on_2])
+@pytest.mark.parametrize("disturbed", [kill_scheduler_on_2, stop_scheduler_on_2])
 def test_lost_scheduler_ends_the_run_with_one_message(finished, tmp_path, monkeypatch, capfd, disturbed):
     monkeypatch.setattr("zwidth.sweep.jobs.perform", disturbed)
     path, out = tmp_path / "sweep.yaml", tmp_path / "out"
     replay_from(finished, out)
     path.write_text(yaml.safe_dump({"version": 1, "name": "test", "studies": [study()]}), encoding="utf-8")
     with start_cluster(tmp_path) as address:
-        assert main_of("run", path, "--out", out, "--scheduler", address) == 1
+        assert run_main("run", path, "--out", out, "--scheduler", address) == 1
     out_text, err = capfd.readouterr()
     messages = [line for line in err.splitlines() if not line.startswith(("map ", "[1/1] map "))]
     resume_hint = f"Resume with: zwidth run {path} --out {out} --resume --scheduler {address}"
@@ -146,16 +155,16 @@ def test_lost_scheduler_ends_the_run_with_one_message(finished, tmp_path, monkey
     ]
     reported = int(out_text.split(" of 8 chunks done")[0])
     # The chunk in progress may have finished after the report.
-    assert reported <= len(flags(out)) < 8
+    assert reported <= len(list_status_files(out)) < 8
     monkeypatch.undo()
-    assert run_sweeps(config_of(), out, resume=True).ok
-    assert_same(finished, out)
+    assert run_sweeps(make_config(), out, resume=True).ok
+    assert_equal_stores(finished, out)
 
 
 def test_chunk_counts_as_done_only_if_stored(cluster, tmp_path):
     for engine in ({"scheduler": cluster}, {"workers": 1}, {}):
         out = tmp_path / "-".join(["out", *engine])
-        result = run_sweeps(config_of(), out, perform=doing_nothing, **engine)
+        result = run_sweeps(make_config(), out, perform=store_nothing, **engine)
         assert not result.ok
         assert (result.computed, result.total) == (0, 8)
         assert set(result.failed.values()) == {"reported as computed but missing from the store"}

@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 import xarray
-from sweeping import config_of, run_sweeps, study
+from sweeping import make_config, run_sweeps, study
 
 from zwidth.core.errors import StoreError, StoreExistsError
 from zwidth.sweep import dataset
@@ -17,7 +17,7 @@ AXES = {"devices": {"label": ["a", "b"], "mass": [0.1, 1], "damping": [1, 2]}, "
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    assert run_sweeps(config_of(study(axes=AXES), study("other", axes=AXES)), folder).ok
+    assert run_sweeps(make_config(study(axes=AXES), study("other", axes=AXES)), folder).ok
     return folder
 
 

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 import yaml
-from sweeping import assert_same, config_of, main_of, run_sweeps, study, values_of
+from sweeping import assert_equal_stores, make_config, read_values, run_main, run_sweeps, study
 
 import zwidth
 from zwidth.core.errors import InputError, StoreBusyError
@@ -62,7 +62,7 @@ def kill(process):
 def test_second_run_raises_with_the_holder_of_the_lock(holder, tmp_path):
     process = holder(tmp_path)
     with pytest.raises(StoreBusyError) as caught:
-        run_sweeps(config_of(), tmp_path, resume=True)
+        run_sweeps(make_config(), tmp_path, resume=True)
     message = str(caught.value)
     assert message.startswith(f"out: {tmp_path}: another run is writing to this folder (process {process.pid} on ")
     assert f" on {socket.gethostname()}, since 20" in message
@@ -74,14 +74,14 @@ def test_killed_holder_does_not_block_a_run(holder, tmp_path):
     kill(holder(tmp_path))
     # The files of the killed process remain.
     assert f" on {socket.gethostname()}, since " in (tmp_path / ".locks" / "holder").read_text(encoding="utf-8")
-    assert run_sweeps(config_of(), tmp_path, resume=True).ok
+    assert run_sweeps(make_config(), tmp_path, resume=True).ok
 
 
 def test_lock_is_released_after_success_and_failure(tmp_path):
-    assert run_sweeps(config_of(), tmp_path).ok
+    assert run_sweeps(make_config(), tmp_path).ok
     with pytest.raises(ZeroDivisionError), lock_folder(tmp_path):
         raise ZeroDivisionError
-    assert run_sweeps(config_of(), tmp_path, resume=True).ok
+    assert run_sweeps(make_config(), tmp_path, resume=True).ok
 
 
 def test_two_runs_of_one_process_exclude_each_other(tmp_path):
@@ -93,21 +93,21 @@ def test_two_runs_of_one_process_exclude_each_other(tmp_path):
 def test_command_reports_a_locked_folder_with_exit_code_2(holder, tmp_path, capsys):
     path, out = tmp_path / "sweep.yaml", tmp_path / "out"
     path.write_text(yaml.safe_dump({"version": 1, "name": "sweep", "studies": [study()]}), encoding="utf-8")
-    assert main_of("run", path, "--out", out) == 0
-    before = values_of(out)
+    assert run_main("run", path, "--out", out) == 0
+    before = read_values(out)
     process = holder(out)
     capsys.readouterr()
     for words in (["--resume"], ["--overwrite"]):
-        assert main_of("run", path, "--out", out, *words) == 2
+        assert run_main("run", path, "--out", out, *words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"Error: out: {out}: another run is writing to this folder (process {process.pid} on ")
     # Commands that only read need no lock.
-    assert main_of("verify", out) == 0
-    assert main_of("export", out, "--csv", tmp_path / "table.csv") == 0
-    assert main_of("run", path, "--out", out, "--dry-run") == 0
-    assert values_of(out).keys() == before.keys()
+    assert run_main("verify", out) == 0
+    assert run_main("export", out, "--csv", tmp_path / "table.csv") == 0
+    assert run_main("run", path, "--out", out, "--dry-run") == 0
+    assert read_values(out).keys() == before.keys()
     kill(process)
-    assert main_of("run", path, "--out", out, "--overwrite") == 0
+    assert run_main("run", path, "--out", out, "--overwrite") == 0
 
 
 def test_locked_folder_is_neither_overwritten_nor_extended(holder, tmp_path, capsys):
@@ -115,10 +115,10 @@ def test_locked_folder_is_neither_overwritten_nor_extended(holder, tmp_path, cap
     path, out = tmp_path / "both.yaml", tmp_path / "out"
     path.write_text(yaml.safe_dump({"version": 1, "name": "both", "studies": [ridge, study()]}), encoding="utf-8")
     process = holder(out)
-    assert main_of("run", path, "--out", out) == 2
+    assert run_main("run", path, "--out", out) == 2
     assert f"another run is writing to this folder (process {process.pid} " in capsys.readouterr().err
     kill(process)
-    assert main_of("run", path, "--out", out) == 0
+    assert run_main("run", path, "--out", out) == 0
     holder(out)
     with pytest.raises(StoreBusyError):
         zwidth.run(path, out=out, overwrite=True)
@@ -129,7 +129,7 @@ def test_locked_folder_is_neither_overwritten_nor_extended(holder, tmp_path, cap
 def test_store_copied_over_another_is_computed_from_its_own_files(tmp_path):
     for name, alpha in (("first", 0.1), ("second", 0.3)):
         axes = {"alpha": [alpha, 2 * alpha], "beta": 0.1, "delta": 0.1, "d": 1}
-        assert run_sweeps(config_of(study(axes=axes, outputs=["spectral_radius"])), tmp_path / name).ok
+        assert run_sweeps(make_config(study(axes=axes, outputs=["spectral_radius"])), tmp_path / name).ok
     path = tmp_path / "first" / "map.zarr"
     # The copied files keep their inode numbers; a new store may reuse those of a deleted one.
     shutil.copytree(tmp_path / "second" / "map.zarr", path, dirs_exist_ok=True)
@@ -137,7 +137,7 @@ def test_store_copied_over_another_is_computed_from_its_own_files(tmp_path):
     for task in store.plan.tasks():
         store.status_file(task).unlink()
         perform(str(path), task.family, task.index)
-    assert_same(path.parent, tmp_path / "second")
+    assert_equal_stores(path.parent, tmp_path / "second")
 
 
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sweeping import config_of, study, sweep_of
+from sweeping import make_config, make_sweep, study
 
 from zwidth.core.errors import ResourceError
 from zwidth.runs import plan_run
@@ -22,7 +22,7 @@ HUGE = {
 
 def make_plans(sweep) -> list[Plan]:
     """Return the plans of a run of one sweep."""
-    plans = plan_run(config_of(sweep))
+    plans = plan_run(make_config(sweep))
     return [plan for plan in plans if isinstance(plan, Plan)]
 
 
@@ -44,12 +44,12 @@ def test_chunks_cover_every_point_once(shape, target):
 @pytest.mark.parametrize("outputs", [("stable",), ("spectral_radius", "passive"), ("alpha_max", "stable")])
 @pytest.mark.parametrize("memory", [2**27, MEMORY, 2**30])
 def test_chunk_stays_within_its_memory_limit(outputs, memory):
-    plan = make_plan(sweep_of(study(axes=HUGE, outputs=outputs)), memory=memory)
+    plan = make_plan(make_sweep(study(axes=HUGE, outputs=outputs)), memory=memory)
     assert plan.memory <= memory
 
 
 def test_stored_plan_is_restored_unchanged():
-    small = sweep_of(study(outputs=("stable", "alpha_max")))
+    small = make_sweep(study(outputs=("stable", "alpha_max")))
     plan = make_plan(small, memory=2**27)
     assert restore_plan(small, plan.as_dict()).families == plan.families
     assert restore_plan(small, plan.as_dict()).methods == plan.methods
@@ -87,11 +87,11 @@ def test_plan_lists_points_chunks_methods_and_resources():
 
 def test_plan_states_method_and_certified_accuracy_of_radii():
     axes = {**HUGE, "d": [1, 70.5]}
-    plan = make_plan(sweep_of(study(axes=axes, outputs=("margin", "stable"), accuracy=1e-6)))
+    plan = make_plan(make_sweep(study(axes=axes, outputs=("margin", "stable"), accuracy=1e-6)))
     assert plan.as_dict()["methods"] == {"spectral_radius": "newton", "stable": "crossover"}
     lines = "\n".join(plan.lines())
     assert "spectral_radius by newton: certified to 1e-06" in lines
     assert "stable by crossover: stability limit of each line of constant B" in lines
     assert "polynomials of degree up to 74" in lines
-    default_plan = make_plan(sweep_of(study(axes=HUGE, outputs=("margin",))))
+    default_plan = make_plan(make_sweep(study(axes=HUGE, outputs=("margin",))))
     assert "certified to 1e-09" in default_plan.methods["spectral_radius"][1]

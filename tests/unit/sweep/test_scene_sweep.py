@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from any_loop import closed_loop_matrix
-from sweeping import config_of, run_sweeps, study
+from sweeping import make_config, run_sweeps, study
 
 import zwidth
 from zwidth.config.fields import ConfigFileError
@@ -28,7 +28,7 @@ def scene_of(cutoff, damping):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    config = config_of(
+    config = make_config(
         study("walls", {**AXES, **WALLS}, ("stable",), **FILTER),
         study("devices", AXES, ("stiffness_max", "virtual_damping_at_max"), **FILTER),
     )
@@ -73,7 +73,7 @@ def test_maximum_stiffness_is_on_the_boundary(folder):
 def test_radii_and_passivity_agree_with_single_scenes(tmp_path):
     walls = {"stiffness": [500.0, 5000.0], "virtual_damping": [0.0, 5.0, 60.0]}
     outputs = ("stable", "spectral_radius", "passive")
-    config = config_of(study("s", {**DEVICE, "velocity.cutoff": [30, 100], **walls}, outputs, **FILTER))
+    config = make_config(study("s", {**DEVICE, "velocity.cutoff": [30, 100], **walls}, outputs, **FILTER))
     assert zwidth.run(config, out=tmp_path).ok
     data = open_dataset(tmp_path).load()
     assert (data.status == Status.OK).all()
@@ -104,7 +104,7 @@ def test_figures_are_sliced_by_parameter_path(folder, tmp_path):
 
 
 def test_interrupted_run_is_resumed_and_verified(folder, tmp_path):
-    config = config_of(
+    config = make_config(
         study("walls", {**AXES, **WALLS}, ("stable",), **FILTER), study("other", AXES, ("stiffness_max",), **FILTER)
     )
     done = []
@@ -141,7 +141,7 @@ def test_interrupted_run_is_resumed_and_verified(folder, tmp_path):
 )
 def test_every_parameter_of_a_component_may_be_an_axis(path, values, parts, tmp_path):
     axes = {"mass": 0.1, "damping": 2, "period": 1e-3, path: values}
-    config = config_of(study("s", axes, ("stiffness_max",), **parts))
+    config = make_config(study("s", axes, ("stiffness_max",), **parts))
     assert zwidth.run(config, out=tmp_path).ok
     data = open_dataset(tmp_path).load()
     assert (data.ridge_status == Status.OK).all()
@@ -159,7 +159,7 @@ def test_every_parameter_of_a_component_may_be_an_axis(path, values, parts, tmp_
 def test_invalid_device_does_not_affect_others(tmp_path):
     """A cutoff of 80 Hz is above the Nyquist frequency of 100 Hz sampling, but valid at 1 kHz."""
     axes = {**DEVICE, "damping": 10, "period": ["1 ms", "10 ms"], "velocity.cutoff": [20, 80], "stiffness": [100, 200]}
-    config = config_of(study("s", axes, ("stable", "stiffness_max"), **FILTER))
+    config = make_config(study("s", axes, ("stable", "stiffness_max"), **FILTER))
     assert zwidth.run(config, out=tmp_path).ok
     data = open_dataset(tmp_path).load()
     bad = np.array([[False, False], [False, True]])
@@ -171,7 +171,7 @@ def test_invalid_device_does_not_affect_others(tmp_path):
 def test_table_of_devices_may_vary_component_parameters(tmp_path):
     devices = {"label": ["a", "b"], "mass": [0.1, 0.2], "velocity.cutoff": ["30 Hz", "0.1 kHz"]}
     axes = {"devices": devices, "period": 1e-3, "delay": 1e-3, "damping": 0}
-    config = config_of(study("s", axes, ("stiffness_max",), **FILTER))
+    config = make_config(study("s", axes, ("stiffness_max",), **FILTER))
     assert zwidth.run(config, out=tmp_path).ok
     stiffness = open_dataset(tmp_path).stiffness_max.values
     np.testing.assert_allclose(stiffness, [2795.31, 2 * 7279.64], rtol=1e-5)
@@ -228,7 +228,7 @@ def test_linear_and_measured_devices_are_swept(tmp_path):
     zwidth.MeasuredDevice(frequencies, response, 1e-9).save(tmp_path / "response.csv")
     system, measured = "1 / 0.1 10 0", str(tmp_path / "response.csv")
     delays = {"delay": ["0 ms", "1 ms"], "velocity.cutoff": [30.0, 100.0]}
-    config = config_of(
+    config = make_config(
         study("system", {**timing, **delays}, ("stiffness_max",), device=system, **FILTER),
         study(
             "measured",
@@ -254,7 +254,7 @@ def test_linear_and_measured_devices_are_swept(tmp_path):
 @pytest.mark.parametrize("axis", ["mass", "damping", "actuator.cutoff"])
 def test_linear_device_with_a_mass_axis_raises(axis):
     with pytest.raises(ValueError, match="together with a system or response"):
-        config_of(study("s", {"period": 1e-3, axis: [1.0, 2.0]}, ("stiffness_max",), device="1 / 0.1 10 0"))
+        make_config(study("s", {"period": 1e-3, axis: [1.0, 2.0]}, ("stiffness_max",), device="1 / 0.1 10 0"))
 
 
 def test_walls_within_the_uncertainty_of_a_measurement_are_undecided(tmp_path):
@@ -265,7 +265,7 @@ def test_walls_within_the_uncertainty_of_a_measurement_are_undecided(tmp_path):
     )
     device = zwidth.MeasuredDevice(frequencies, response, 0.1 * np.abs(response))
     device.save(tmp_path / "response.csv")
-    config = config_of(study("s", {"period": 1e-3, **WALLS}, ("stable",), device=str(tmp_path / "response.csv")))
+    config = make_config(study("s", {"period": 1e-3, **WALLS}, ("stable",), device=str(tmp_path / "response.csv")))
     result = zwidth.run(config, out=tmp_path / "run")
     assert result.ok
     data = open_dataset(tmp_path / "run")
@@ -288,6 +288,6 @@ def test_walls_out_of_range_have_their_status(tmp_path):
     assert scene.decide_stability(stiffness, 0.0).status.tolist() == statuses
     for output in ("stable", "spectral_radius", "passive"):
         axes = {**device, "stiffness": stiffness}
-        config = config_of(study("s", axes, (output,), velocity={"kind": "low_pass", "cutoff": 1e-4}))
+        config = make_config(study("s", axes, (output,), velocity={"kind": "low_pass", "cutoff": 1e-4}))
         assert zwidth.run(config, out=tmp_path, overwrite=True).ok
         assert open_dataset(tmp_path).status.values.tolist() == statuses

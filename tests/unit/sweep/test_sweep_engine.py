@@ -2,22 +2,22 @@
 
 import numpy as np
 import pytest
-from chunks import disk_full_on_2, failing_on_2, interrupted_on_2, killed_on_2, killed_once_on_2, replay_from
+from chunks import fail_on_2, fill_disk_on_2, interrupt_on_2, kill_worker_on_2, kill_worker_once_on_2, replay_from
 from sweeping import (
     AXES,
     DEVICES,
     FEW,
     WALLS,
-    assert_same,
+    assert_equal_stores,
     chunk_file,
-    config_of,
-    config_of_everything,
-    cut,
-    flags,
-    flip,
+    flip_byte,
+    limit_chunk_sizes,
+    list_status_files,
+    make_config,
+    make_full_config,
+    read_values,
     run_sweeps,
     study,
-    values_of,
 )
 
 import zwidth
@@ -32,7 +32,7 @@ from zwidth.sweep.store import Store
 def finished(tmp_path_factory):
     """Return configuration and folder of an undisturbed run."""
     folder = tmp_path_factory.mktemp("finished")
-    config = config_of()
+    config = make_config()
     result = run_sweeps(config, folder)
     assert result.ok
     assert result.computed == result.total > 5
@@ -49,7 +49,7 @@ def copy_of(finished, folder):
 
 
 def test_values_agree_with_the_library(tmp_path):
-    run_sweeps(config_of(study(axes=FEW, outputs=(*WALLS, *DEVICES))), tmp_path)
+    run_sweeps(make_config(study(axes=FEW, outputs=(*WALLS, *DEVICES))), tmp_path)
     data = open_dataset(tmp_path).load()
     assert data.stable.dims == ("d", "delta", "alpha", "beta")
     assert data.stable.dtype == bool
@@ -78,7 +78,7 @@ def test_values_agree_with_the_library(tmp_path):
 
 def test_physical_results_are_in_si_units(tmp_path):
     axes = {"mass": "100 g", "damping": [0, 10], "rate": "1 kHz", "delay": "1 ms", "stiffness": [1000, 20_000]}
-    run_sweeps(config_of(study(axes=axes, outputs=("stable", "settling_time", "stiffness_max"))), tmp_path)
+    run_sweeps(make_config(study(axes=axes, outputs=("stable", "settling_time", "stiffness_max"))), tmp_path)
     data = open_dataset(tmp_path).load()
     scene = [zwidth.Scene(zwidth.Device(0.1, damping), zwidth.Timing(1e-3, 1e-3)) for damping in (0.0, 10.0)]
     best = [float(zwidth.alpha_max(each.delta, each.d).alpha) for each in scene]
@@ -109,14 +109,14 @@ def test_values_are_independent_of_chunks(tmp_path, monkeypatch, axes, targets):
     # Pieces of 64 points, so that chunks fill several.
     for size in ("_PIECE", "_WALL_PIECE"):
         monkeypatch.setattr(f"zwidth.sweep.compute.{size}", 64)
-    config = config_of(study(axes=axes, outputs=(*WALLS, *DEVICES)))
+    config = make_config(study(axes=axes, outputs=(*WALLS, *DEVICES)))
     run_sweeps(config, tmp_path / "whole")
     chunks = []
     for target in targets:
         with monkeypatch.context() as patch:
-            cut(patch, target, 2)
+            limit_chunk_sizes(patch, target, 2)
             chunks.append(run_sweeps(config, tmp_path / f"parts of {target}").computed)
-        assert_same(tmp_path / "whole", tmp_path / f"parts of {target}")
+        assert_equal_stores(tmp_path / "whole", tmp_path / f"parts of {target}")
     assert chunks[0] > 2 * chunks[1] > 8
 
 
@@ -124,47 +124,47 @@ def test_values_are_independent_of_chunks(tmp_path, monkeypatch, axes, targets):
 def everything(tmp_path_factory):
     """Return the folder of a run of every output in the largest possible chunks."""
     folder = tmp_path_factory.mktemp("everything")
-    assert run_sweeps(config_of_everything(), folder).ok
+    assert run_sweeps(make_full_config(), folder).ok
     return folder
 
 
 # Compiled kernels process pieces of fixed size. The test detects values that depend on neighboring points, on their
 # number, or on the number of processors of a worker.
 def test_values_are_independent_of_workers_and_chunks(everything, tmp_path, monkeypatch):
-    cut(monkeypatch, 11, 3)
-    result = run_sweeps(config_of_everything(), tmp_path, workers=2)
+    limit_chunk_sizes(monkeypatch, 11, 3)
+    result = run_sweeps(make_full_config(), tmp_path, workers=2)
     assert result.ok
     assert result.computed > 20
-    assert_same(everything, tmp_path)
+    assert_equal_stores(everything, tmp_path)
 
 
 def test_failed_chunk_is_reported_and_the_others_complete(finished, tmp_path):
     config, folder = finished
-    result = run_sweeps(config, tmp_path, perform=failing_on_2)
+    result = run_sweeps(config, tmp_path, perform=fail_on_2)
     assert not result.ok
     ((chunk, error),) = result.failed.items()
     assert chunk.startswith("map/wall/2 (d ")
     assert error == "ArithmeticError: no number is good enough"
     assert open_dataset(tmp_path).attrs["complete"] == 0
     assert (open_dataset(tmp_path).status.values == 255).any()
-    before = flags(tmp_path)
+    before = list_status_files(tmp_path)
     assert run_sweeps(config, tmp_path, resume=True).computed == 1
-    assert before.items() <= flags(tmp_path).items()
-    assert_same(folder, tmp_path)
+    assert before.items() <= list_status_files(tmp_path).items()
+    assert_equal_stores(folder, tmp_path)
 
 
 def test_killed_worker_is_replaced(finished, tmp_path):
     config, folder = finished
     replay_from(folder, tmp_path)
-    result = run_sweeps(config, tmp_path, workers=1, perform=killed_once_on_2)
+    result = run_sweeps(config, tmp_path, workers=1, perform=kill_worker_once_on_2)
     assert result.ok
-    assert_same(folder, tmp_path)
+    assert_equal_stores(folder, tmp_path)
 
 
 def test_chunk_that_kills_every_worker_is_reported(finished, tmp_path):
     config, folder = finished
     replay_from(folder, tmp_path)
-    result = run_sweeps(config, tmp_path, workers=1, perform=killed_on_2)
+    result = run_sweeps(config, tmp_path, workers=1, perform=kill_worker_on_2)
     ((chunk, error),) = result.failed.items()
     assert chunk.startswith("map/wall/2 ")
     assert error == "the worker process died in all 3 attempts (signal SIGKILL)"
@@ -173,24 +173,24 @@ def test_chunk_that_kills_every_worker_is_reported(finished, tmp_path):
 
 def test_interrupt_keeps_finished_chunks(finished, tmp_path):
     config, folder = finished
-    result = run_sweeps(config, tmp_path, perform=interrupted_on_2)
+    result = run_sweeps(config, tmp_path, perform=interrupt_on_2)
     assert result.interrupted
     assert result.computed == 2
     resumed = run_sweeps(config, tmp_path, resume=True)
     assert (resumed.skipped, resumed.ok) == (2, True)
-    assert_same(folder, tmp_path)
+    assert_equal_stores(folder, tmp_path)
 
 
 def test_full_disk_ends_the_run(finished, tmp_path):
     config, _ = finished
-    result = run_sweeps(config, tmp_path, perform=disk_full_on_2)
+    result = run_sweeps(config, tmp_path, perform=fill_disk_on_2)
     assert "No space left on device" in result.hopeless
     assert result.computed == 2
 
 
 def test_progress_events_report_chunks_and_points(tmp_path):
     events = []
-    run_sweeps(config_of(), tmp_path, progress=events.append)
+    run_sweeps(make_config(), tmp_path, progress=events.append)
     assert events[0].result is events[0].progress is None
     assert events[-1].result.state == "done"
     reports = [event.progress for event in events[1:-1]]
@@ -211,13 +211,13 @@ def test_progress_events_report_chunks_and_points(tmp_path):
 )
 def test_resuming_with_another_configuration_raises(finished, change, key, words):
     _, folder = finished
-    before = flags(folder)
-    changed = config_of(study(**change))
+    before = list_status_files(folder)
+    changed = make_config(study(**change))
     with pytest.raises(StoreError) as caught:
         run_sweeps(changed, folder, resume=True)
     assert f"studies[map].{key}: the run was created with" in str(caught.value)
     assert words in str(caught.value)
-    assert flags(folder) == before
+    assert list_status_files(folder) == before
 
 
 def test_delay_models_of_earlier_releases_are_accepted_if_held(tmp_path):
@@ -231,13 +231,13 @@ def test_delay_models_of_earlier_releases_are_accepted_if_held(tmp_path):
 def test_only_damaged_chunks_are_reported_and_repaired(finished, tmp_path):
     config, path = copy_of(finished, tmp_path)
     damages = {
-        "stable/1": lambda: flip(chunk_file(path, "stable", 1)),
+        "stable/1": lambda: flip_byte(chunk_file(path, "stable", 1)),
         "status/3": lambda: chunk_file(path, "status", 3).write_bytes(chunk_file(path, "status", 3).read_bytes()[:-3]),
         "stable/5": lambda: chunk_file(path, "stable", 5).unlink(),
     }
     for damage in damages.values():
         damage()
-    before = flags(path)
+    before = list_status_files(path)
     (report,) = verify(path)
     assert not report.ok
     assert len(report.damaged) == 3
@@ -247,20 +247,20 @@ def test_only_damaged_chunks_are_reported_and_repaired(finished, tmp_path):
     result = run_sweeps(config, tmp_path, resume=True)
     assert sorted(f"map/{chunk}" for chunk in report.damaged) == sorted(result.repaired)
     assert result.computed == 3
-    assert len(before.items() & flags(path).items()) == len(before) - 3
+    assert len(before.items() & list_status_files(path).items()) == len(before) - 3
     assert verify(path)[0].ok
-    assert_same(finished[1], tmp_path)
+    assert_equal_stores(finished[1], tmp_path)
 
 
 def test_missing_status_and_damaged_coordinates_are_repaired(finished, tmp_path):
     config, path = copy_of(finished, tmp_path)
     chunk_file(path, "status", 1).unlink()
-    flip(path / "alpha" / "c" / "0")
+    flip_byte(path / "alpha" / "c" / "0")
     assert verify(path)[0].damaged == ("alpha/c/0 is damaged or missing",)
     result = run_sweeps(config, tmp_path, resume=True)
     assert (len(result.repaired), result.computed) == (1, 1)
     assert verify(path)[0].ok
-    assert_same(finished[1], tmp_path)
+    assert_equal_stores(finished[1], tmp_path)
 
 
 @pytest.mark.parametrize("names", [["zarr.json"], ["zwidth.json"]])
@@ -274,7 +274,7 @@ def test_damaged_group_metadata_is_restored(finished, tmp_path, names):
     assert run_sweeps(config, tmp_path, resume=True).computed == 0
     assert verify(tmp_path)[0].ok
     assert (path / "zarr.json").read_bytes() == (path / "zwidth.json").read_bytes() == good
-    assert_same(finished[1], tmp_path)
+    assert_equal_stores(finished[1], tmp_path)
 
 
 def test_damaged_metadata_and_copy_raise(finished, tmp_path):
@@ -290,7 +290,7 @@ def test_damaged_metadata_and_copy_raise(finished, tmp_path):
 def test_missing_store_libraries_raise_with_the_install_command(tmp_path, monkeypatch):
     monkeypatch.setattr("zwidth.sweep.store.find_spec", lambda name: None if name == "zarr" else name)
     with pytest.raises(InputError, match=r"sweep: needs zarr, .*(zwidth\[store\]|scripts/setup store)"):
-        run_sweeps(config_of(), tmp_path / "out")
+        run_sweeps(make_config(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -306,14 +306,14 @@ def test_partial_files_of_a_killed_run_are_removed(finished, tmp_path):
 def test_invalid_worker_options_raise(tmp_path):
     for options in ({"workers": 1, "scheduler": "tcp://x"}, {"workers": 0}):
         with pytest.raises(InputError):
-            run_sweeps(config_of(), tmp_path, **options)
+            run_sweeps(make_config(), tmp_path, **options)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_single_point(tmp_path):
     axes = {"alpha": 0.1, "beta": 0.1, "delta": 0.1, "d": 1}
-    run_sweeps(config_of(study(axes=axes)), tmp_path)
-    values = values_of(tmp_path)
+    run_sweeps(make_config(study(axes=axes)), tmp_path)
+    values = read_values(tmp_path)
     assert values["stable"] == np.array(True)
     assert values["status"].shape == ()
     (task,) = Store(tmp_path / "map.zarr").plan.tasks()

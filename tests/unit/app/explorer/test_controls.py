@@ -86,7 +86,7 @@ def test_units_are_converted_and_restored():
 def test_invalid_value_raises_with_its_name(change, message):
     with pytest.raises(zwidth.InputError) as refusal:
         Controls().change(change)
-    assert says in str(refusal.value)
+    assert message in str(refusal.value)
     assert len(str(refusal.value)) < 250
 
 

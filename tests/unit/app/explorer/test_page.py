@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
 
 from click.testing import CliRunner
-from open_pages import open_page, say
+from open_pages import open_page, send_message
 
 import zwidth
 from zwidth.app.explorer.controls import Controls, read_controls, read_link
@@ -21,7 +21,7 @@ def page():
 
 
 def test_drag_updates_only_outline_wall_poles_and_verdict(page):
-    say(page, serial=1, set={"damping": 20})
+    send_message(page, serial=1, set={"damping": 20})
     scene = Controls().change({"damping": 20}).scene
     (edge,) = scene.stable_region()
     closed = [*edge[0], edge[0][0], np.nan]
@@ -36,7 +36,7 @@ def test_drag_updates_only_outline_wall_poles_and_verdict(page):
 
 @pytest.mark.parametrize("components", [{}, {"velocity": "LowPass"}])
 def test_text_at_rest_agrees_with_check(page, components):
-    say(page, set=components, rest=True)
+    send_message(page, set=components, rest=True)
     page.queue.work()
     options = ["--velocity-cutoff", "100"] if components else []
     device = ["--mass", "0.1", "--damping", "10", "--period", "1e-3", "--delay", "1e-3"]
@@ -48,27 +48,27 @@ def test_text_at_rest_agrees_with_check(page, components):
 
 
 def test_drag_updates_the_outline_of_a_filtered_scene(page):
-    say(page, set={"velocity": "LowPass"})
+    send_message(page, set={"velocity": "LowPass"})
     (outline,) = page.controls.scene.stable_region()
     np.testing.assert_array_equal(page.sources["edge"].data["x"][:-2], outline.stiffness)
     np.testing.assert_array_equal(page.sources["area"].data["ys"][0][0][0][:-1], outline.virtual_damping)
 
 
 def test_results_of_another_device_are_removed_immediately(page):
-    say(page, set={}, rest=True)
+    send_message(page, set={}, rest=True)
     page.queue.work()
     assert len(page.sources["ridge"].data["x"]) > 0
-    say(page, set={"stiffness": 5e3})
+    send_message(page, set={"stiffness": 5e3})
     assert len(page.sources["ridge"].data["x"]) > 0
-    say(page, set={"damping": 11})
+    send_message(page, set={"damping": 11})
     for name in ("contours", "passive", "ridge", "best"):
         assert not any(len(column) for column in page.sources[name].data.values())
     assert page.texts["slopes"] == ""
 
 
 def test_outdated_computation_is_discarded(page):
-    say(page, set={"damping": 20}, rest=True)
-    say(page, set={"damping": 30}, rest=True)
+    send_message(page, set={"damping": 20}, rest=True)
+    send_message(page, set={"damping": 30}, rest=True)
     old, *page.queue.tasks = page.queue.tasks
     old()
     assert "verdict" not in page.texts
@@ -77,16 +77,16 @@ def test_outdated_computation_is_discarded(page):
 
 
 def test_filtered_scene_shows_ridge_and_sensitivities(page):
-    say(page, set={"velocity": "LowPass"}, rest=True)
+    send_message(page, set={"velocity": "LowPass"}, rest=True)
     page.queue.work()
     assert len(page.sources["ridge"].data["x"]) > 3
     assert "velocity.cutoff" in page.texts["slopes"]
 
 
 def test_interrupted_computation_is_repeated_for_the_new_wall(page):
-    say(page, set={"damping": 11}, rest=True)
+    send_message(page, set={"damping": 11}, rest=True)
     (work,), page.queue.tasks = page.queue.tasks, []
-    say(page, set={"stiffness": 5e3}, rest=True)
+    send_message(page, set={"stiffness": 5e3}, rest=True)
     work()
     assert len(page.sources["ridge"].data["x"]) == 0
     page.queue.work()
@@ -113,21 +113,21 @@ def test_invalid_message_is_reported_and_changes_nothing(page):
         page.receive(data)
         assert "invalid message" in page.texts["error"], data
         assert page.controls == before, data
-        say(page, set={"mass": 200})
+        send_message(page, set={"mass": 200})
         assert page.texts["error"] == "", data
 
 
 def test_invalid_value_keeps_the_last_valid_view(page):
-    say(page, set={"mass": 200})
-    say(page, set={"mass": -1})
+    send_message(page, set={"mass": 200})
+    send_message(page, set={"mass": -1})
     assert page.texts["error"].startswith("mass m: got -1 g")
     assert page.texts["state"]["mass"] == 200
     assert page.controls.scene.mass == 0.2
 
 
 def test_invalid_value_keeps_the_running_computation(page):
-    say(page, set={"mass": 200}, rest=True)
-    say(page, set={"mass": -1}, rest=True)
+    send_message(page, set={"mass": 200}, rest=True)
+    send_message(page, set={"mass": -1}, rest=True)
     page.queue.work()
     assert "200.0 g" in page.texts["verdict"]
     assert len(page.sources["contours"].data["xs"]) > 3
@@ -139,7 +139,7 @@ def test_failed_computation_is_reported(page, monkeypatch):
         raise ZeroDivisionError("far away")
 
     monkeypatch.setattr("zwidth.app.explorer.model.assess", fail)
-    say(page, rest=True)
+    send_message(page, rest=True)
     page.queue.work()
     assert page.texts["error"].startswith("the computation failed (ZeroDivisionError: far away); ")
     assert page.texts["busy"] is False
@@ -148,17 +148,17 @@ def test_failed_computation_is_reported(page, monkeypatch):
 
 
 def test_dark_page_has_different_colors(page):
-    say(page, dark=True)
+    send_message(page, dark=True)
     dark = [getattr(glyph, name) for glyph, name, _ in page.inks]
-    say(page, dark=False)
+    send_message(page, dark=False)
     assert all(before != getattr(glyph, name) for before, (glyph, name, _) in zip(dark, page.inks, strict=True))
 
 
 def test_figures_are_exported_as_csv(page):
-    say(page, set={"velocity": "WindowedDifference"})
-    say(page, set={"velocity.samples": 24}, rest=True)
+    send_message(page, set={"velocity": "WindowedDifference"})
+    send_message(page, set={"velocity.samples": 24}, rest=True)
     page.queue.work()
-    say(page, csv="plane")
+    send_message(page, csv="plane")
     rows = [line.split(",") for line in page.texts["csv"].splitlines()]
     assert rows[0] == ["curve", "piece", "stiffness K in N/m", "damping B in N s/m"]
     pieces = [[row for row in rows if row[:2] == ["stable", number]] for number in ("1", "2", "3")]
@@ -167,18 +167,18 @@ def test_figures_are_exported_as_csv(page):
     for piece, outline in zip(pieces, outlines, strict=False):
         np.testing.assert_allclose([float(row[2]) for row in piece[:-1]], outline.stiffness, rtol=1e-7, atol=1e-7)
     assert ["your wall", "1", "10000", "40"] in rows
-    say(page, csv="gain")
+    send_message(page, csv="gain")
     assert page.texts["csv"].splitlines()[0] == "curve,piece,frequency in Hz,|L| in dB"
 
 
 def test_link_sets_the_scene_and_an_empty_one_resets_it(page):
-    say(page, open="mass=200+g&period=2+ms&stiffness=1+kN/m&virtual_damping=3+N+s/m", rest=True)
+    send_message(page, open="mass=200+g&period=2+ms&stiffness=1+kN/m&virtual_damping=3+N+s/m", rest=True)
     assert page.controls.scene.mass == 0.2
     assert page.texts["link"] == "mass=200+g&damping=0+N+s/m&period=2+ms&stiffness=1+kN/m&virtual_damping=3+N+s/m"
-    say(page, open="mass=heavy&period=1+ms")
+    send_message(page, open="mass=heavy&period=1+ms")
     assert "scene.mass: got 'heavy'" in page.texts["error"]
     assert page.controls.scene.mass == 0.2
-    say(page, open="", rest=True)
+    send_message(page, open="", rest=True)
     assert page.controls == Controls()
 
 
@@ -187,7 +187,7 @@ def test_linear_device_is_shown_and_copied(tmp_path):
     scene = "{device: 1900 / 0.1 191 1900 0, period: 1 ms, stiffness: 5 kN/m, virtual_damping: 30}"
     file.write_text(f"version: 1\nname: s\nscene: {scene}\nstudies: [{{kind: boundary, name: b}}]\n")
     page = open_page(read_controls(file))
-    say(page, set={"delay": 0.5}, rest=True, contact=True)
+    send_message(page, set={"delay": 0.5}, rest=True, contact=True)
     page.queue.work()
     assert page.texts["error"] == ""
     assert page.texts["busy"] is False

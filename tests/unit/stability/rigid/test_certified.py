@@ -7,8 +7,8 @@ from pathlib import Path
 import mpmath as mp
 import numpy as np
 import pytest
+from certified_labels import certified_stable
 from mpmath import mpf
-from proved import certified_stable
 from waiting import LONGEST
 
 import zwidth

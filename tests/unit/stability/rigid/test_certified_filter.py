@@ -6,8 +6,8 @@
 import jax
 import numpy as np
 import pytest
+from certified_labels import certified_stable
 from mpmath import mp
-from proved import certified_stable
 
 import oracles
 from zwidth.numerics.held_mass import classify_delays, phi_functions
