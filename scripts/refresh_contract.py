@@ -9,12 +9,12 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-from contract.table import page  # noqa: E402
+from contract.table import build_page  # noqa: E402
 
 
 def main() -> None:
     """Write the page."""
-    (ROOT / "docs" / "contract.md").write_text(page(), encoding="utf-8")
+    (ROOT / "docs" / "contract.md").write_text(build_page(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -133,7 +133,7 @@ def test_every_control_is_labeled_and_reachable_by_keyboard(page):
     assert unlabeled == []
 
 
-@pytest.mark.parametrize("place", [(0.4, 0.5), (0.85, 0.25)])
+@pytest.mark.parametrize("position", [(0.4, 0.5), (0.85, 0.25)])
 def test_click_shows_the_verdict_of_the_check_command(page, position):
     plane = page.locator("#plane").bounding_box()
     before = read_value(page, "stiffness")

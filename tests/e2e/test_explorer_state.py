@@ -13,8 +13,8 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 from browser import open_page
-from download import wait_for
 from explorer_server import enter, serve, settle, value_of
+from waiting import wait_for
 
 import zwidth
 
@@ -101,7 +101,9 @@ def test_url_and_history_restore_the_scene(page, browser):
     settle(page, "document.getElementById('velocity').value === 'BackwardDifference'")
 
 
-@pytest.mark.parametrize("entry, says", [("-5", "mass m: got -5 g; it must be greater than 0 g"), ("", "not a number")])
+@pytest.mark.parametrize(
+    "entry, message", [("-5", "mass m: got -5 g; it must be greater than 0 g"), ("", "not a number")]
+)
 def test_verdict_is_marked_stale_while_an_entry_is_invalid(page, entry, message):
     badge = page.inner_text("#word")
     page.fill("#mass", entry)

@@ -91,7 +91,7 @@ def test_full_disk_ends_the_run_which_resumes_with_more_room(tmp_path):
     assert run_main("verify", out) == 0
 
 
-@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+@pytest.mark.parametrize("arguments", COMMANDS, ids=" ".join)
 @pytest.mark.parametrize("name", ["sweep", "others"])
 def test_out_that_is_a_file_is_refused(config, arguments, name, tmp_path, capsys):
     if name == "others":
@@ -143,7 +143,7 @@ def test_sweep_larger_than_the_free_disk_space_is_refused_before_computing(confi
 
 
 @pytest.mark.parametrize(
-    "damage, says",
+    "damage, message",
     [
         (lambda file: flip_byte(file, 5), "stable is damaged"),
         (lambda file: file.unlink(), "stable is missing"),
