@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write docs/contract.md: what every public function promises, from the cases that the tests run through."""
+"""Write docs/contract.md, the guarantees of every public function, from the cases of the contract tests."""
 
 from __future__ import annotations
 
