@@ -70,7 +70,7 @@ def eigenvalue_labels(scene: zwidth.Scene, alpha: np.ndarray, beta: np.ndarray) 
 
 
 def measure(scene: zwidth.Scene) -> tuple[int, float, float, float, float, int, float]:
-    """Return poles, times of a first verdict, a wall, a map wall, its eigenvalues; wrong labels; time of the maximum."""
+    """Return poles, times of a first verdict, a wall, a map wall and its eigenvalues, wrong labels, maximum time."""
     top = float(scene.max_stiffness().stiffness)
     damping = 2.0 * max(abs(float(scene.max_stiffness().virtual_damping)), 10.0)
     stiffness, rows = np.linspace(0.0, 1.5 * top, MAP), np.linspace(-0.2 * damping, damping, MAP)[:, None]
