@@ -63,7 +63,7 @@ EDITS = {
         )
     },
     "__init__.pyi": {
-        "from .parts.operator": "from .parts.mount import Mount as Mount\nfrom .parts.operator",
+        "from .model.operator": "from .model.mount import Mount as Mount\nfrom .model.operator",
     },
 }
 
@@ -128,7 +128,7 @@ def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("copy")
     package = folder / "zwidth"
     shutil.copytree(ROOT / "src" / "zwidth", package, ignore=shutil.ignore_patterns("__pycache__"))
-    (package / "parts" / "mount.py").write_text(MOUNT, encoding="utf-8")
+    (package / "model" / "mount.py").write_text(MOUNT, encoding="utf-8")
     for file, edits in EDITS.items():
         text = (package / file).read_text(encoding="utf-8")
         for old, new in edits.items():

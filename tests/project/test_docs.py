@@ -123,7 +123,7 @@ def test_included_section_ends_at_the_next_heading(refresh_docs):
     assert "###" not in section
 
 
-@pytest.mark.parametrize("module", ["", "figures"])
+@pytest.mark.parametrize("module", ["", "plotting"])
 def test_every_public_name_is_listed_once_in_the_reference(module):
     stub = (ROOT / "src" / "zwidth" / module / "__init__.pyi").read_text(encoding="utf-8")
     public = re.findall(r"^from .* as (\w+)$", stub, re.MULTILINE)

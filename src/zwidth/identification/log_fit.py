@@ -52,7 +52,7 @@ _FEWEST = 20  # least number of fitted positions per stretch; shorter stretches 
 _FEW = 60  # number of fitted positions below which a warning is issued, because very different devices may fit them
 # Largest number of fitted positions of all logs. More would need gigabytes of memory and only reduce the errors.
 _MOST = 200_000
-_FINER = 0.3  # an encoder step is excluded if the residuals are smaller than its quantization noise by this factor
+_FINER = 0.3  # an encoder step is excluded if the residuals are at most this share of its quantization noise (RMS)
 _SEEN = 5.0  # least effect of the force on the positions, in standard errors; smaller effects are refused
 # A log is refused if its residuals exceed both of the following limits.
 _UNEXPLAINED = 0.01  # residual sum of squares, relative to that of a model without forces
@@ -146,7 +146,7 @@ def _fit(
     resolution: Any,
     system: UnitSystem,
 ) -> DeviceFit:
-    """Fit a device to logs that are read and repaired.
+    """Fit a device to logs that have already been read and repaired.
 
     Args:
         read: the logs.
@@ -257,7 +257,7 @@ def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float,
 
 
 def _convert_force(best: FittedModel, k: int) -> tuple[float, float]:
-    """Convert the acceleration at index ``k`` of theta, by the constant force or by friction, to a force in N.
+    """Convert entry ``k`` of theta, the acceleration by the constant force or by friction, to a force in N.
 
     Returns:
         The force and its standard error.
@@ -297,7 +297,7 @@ def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[li
 
 
 def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[float]) -> tuple[float, Choice]:
-    """Fit the device with one encoder step after another, until the residuals do not exclude the step.
+    """Fit the device with one candidate of the encoder step after another, until the residuals do not exclude it.
 
     Args:
         recordings: the logs.
@@ -316,8 +316,8 @@ def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[
 def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:
     """Raise `InputError` if the commanded force explains too little of the motion, or the fitted mass is negative."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
-    # Fit the positions by a free motion from the initial states alone, without any force. The reduction of its
-    # residuals is the effect of the forces.
+    # Fit the positions by the free motion from the initial states, without any force. The amount by which the fitted
+    # model reduces the residuals of the free motion is the effect of the forces.
     alone = model.simulate(np.append(theta[:-2], [0.0, 0.0])).derivatives[:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]

@@ -89,7 +89,7 @@ class PeriodInputs(NamedTuple):
 
 
 def _write(rows: Array, row: Array, index: Array) -> Array:
-    """Return a copy of an array in which one row (index along the first axis) is replaced."""
+    """Return a copy of an array in which the row with an index along the first axis is replaced."""
     return jax.lax.dynamic_update_index_in_dim(rows, row, index, 0, allow_negative_indices=False)
 
 
@@ -307,8 +307,8 @@ def _simulate_period(
             body, work = carry
             return propagate(params, options, body, work, force, inputs.push, (j, number), read(lasting, number)), None
 
-        # With friction or jitter, loop over the pieces by `scan`, so that the long program of a piece is compiled only
-        # once.
+        # With friction or jitter, loop over the pieces by `scan`, because the program of one piece is then long and
+        # should be compiled only once.
         if options.friction or options.jitter:
             return jax.lax.scan(one, carry, (np.arange(options.pieces), jnp.stack(forces)))[0], frame
         for piece in enumerate(forces):

@@ -265,7 +265,7 @@ def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
 
 
 def _compare(one: DeviceFit, other: DeviceFit) -> str:
-    """Test if two fits of one device agree, by a chi-squared test, and return a line of text with the result.
+    """Return a line of text that states whether two fits of one device agree, by a chi-squared test.
 
     The statistic is e' C^-1 e, with the difference e of mass, damping and delay between the fits, and the sum C of
     their covariances.
