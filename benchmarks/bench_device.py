@@ -56,7 +56,7 @@ def measure(function: Callable[..., Any], walls: tuple[np.ndarray, ...], device:
         best = time_calls(lambda: jax.block_until_ready(program(*there)), runs)[0].min()
         got = np.asarray(program(*there))[:SAMPLE].astype(float)
     with jax.default_device(jax.devices("cpu")[0]):
-        # Derivatives are compiled here as well.
+        # Derivatives are also compiled here.
         direct = np.asarray(function(*(column[:SAMPLE] for column in walls))).astype(float)
     same = np.isnan(got) == np.isnan(direct)
     apart = np.abs(got - direct) / np.maximum(1.0, np.abs(direct))

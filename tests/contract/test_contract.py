@@ -226,8 +226,8 @@ def is_marked(result, index):
     floats = [np.isnan(value).any() for _, value in values if value.dtype.kind in "fc"]
     if floats:
         return any(floats)
-    kept = {value.dtype.kind: value for name, value in values if name not in ("status", "method")}
-    return not kept["b"] if "b" in kept else kept["i"] == -1
+    remaining = {value.dtype.kind: value for name, value in values if name not in ("status", "method")}
+    return not remaining["b"] if "b" in remaining else remaining["i"] == -1
 
 
 TRACED = [case for case in CASES if not case.refuses_tracing]

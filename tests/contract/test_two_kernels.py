@@ -46,7 +46,7 @@ def test_stability_labels_agree(loops):
     for method in ("auto", "companion", "certified"):
         decided = [loop.decide(alpha[:8], beta[:8], method, (alpha[:8], beta[:8])) for loop in (rigid, linear)]
         for field in ("stable", "status", "method"):
-            np.testing.assert_array_equal(*(getattr(each, field) for each in decided))
+            np.testing.assert_array_equal(*(getattr(decision, field) for decision in decided))
 
 
 def test_stable_rows_and_columns_agree(loops):

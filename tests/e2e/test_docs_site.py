@@ -148,16 +148,16 @@ def test_sources_are_not_published(site):
 
 
 def test_names_become_links_and_doctests_become_code(site):
-    choose = (site / "how-to-choose.html").read_text(encoding="utf-8")
-    assert 'href="reference/stability.html#zwidth.is_stable"' in choose
+    guide = (site / "how-to-choose.html").read_text(encoding="utf-8")
+    assert 'href="reference/stability.html#zwidth.is_stable"' in guide
     pages = {page.name: page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html")}
     scene = set(re.findall(r'id="zwidth\.Scene\.(\w+)"', pages["scene.html"]))
     assert scene >= {"is_stable", "max_stiffness"}
     assert not scene & {"check_parts", "loop", "integer_delay"}
     for path in sorted((DOCS / "theory").glob("*.md")):
-        shown = (site / "theory" / f"{path.stem}.html").read_text(encoding="utf-8")
+        html = (site / "theory" / f"{path.stem}.html").read_text(encoding="utf-8")
         prompts = re.findall("^>>>", path.read_text(encoding="utf-8"), re.MULTILINE)
-        assert (path.stem, len(re.findall(">&gt;&gt;&gt; ?<", shown))) == (path.stem, len(prompts))
+        assert (path.stem, len(re.findall(">&gt;&gt;&gt; ?<", html))) == (path.stem, len(prompts))
     # Markdown turns ">>>" outside a code block into nested quotations.
     assert [name for name, text in pages.items() if "<blockquote" in text] == []
     assert pages["stability.html"].count('class="gp"') > 10

@@ -85,8 +85,8 @@ def read_scene(page):
 def run_check(scene):
     options = {"mass": scene.mass, "damping": scene.damping, "period": scene.timing.period, "delay": scene.timing.delay}
     options |= {"stiffness": scene.wall.stiffness, "virtual-damping": scene.wall.virtual_damping}
-    words = [f"--{name}={value!r}" for name, value in options.items()]
-    result = CliRunner().invoke(cli, ["check", *words])
+    arguments = [f"--{name}={value!r}" for name, value in options.items()]
+    result = CliRunner().invoke(cli, ["check", *arguments])
     assert result.exit_code == 0, result.output
     return result.stdout.rstrip("\n")
 
@@ -186,8 +186,8 @@ def test_copied_configuration_runs(page, tmp_path, unpainted):
     file = tmp_path / "copied.yaml"
     file.write_text(text, encoding="utf-8")
     assert zwidth.run(file, out=tmp_path / "run").ok
-    given: Any = zwidth.load_config(file).scene
-    scene = given.to_scene()
+    section: Any = zwidth.load_config(file).scene
+    scene = section.to_scene()
     assert scene.device.damping == 7.5
     assert scene.velocity == zwidth.LowPass(cutoff=cutoff, order=1)
 
@@ -197,11 +197,11 @@ def test_contact_is_simulated_on_demand(page):
     page.check("#contact-wanted")
     wait_until(page, "document.getElementById('contact_words').textContent !== ''")
     settle(page)
-    scene, shown = read_scene(page), read_data(page, "contact")
+    scene, data = read_scene(page), read_data(page, "contact")
     page.uncheck("#contact-wanted")
     start = -0.5 * scene.timing.period / max(1.0, 10.0 * scene.delta)
-    contact = scene.simulate(start_position=start, start_velocity=0.1, contact="unilateral", periods=shown["x"].size)
-    np.testing.assert_array_equal(shown["force"], contact.wall_force)
+    contact = scene.simulate(start_position=start, start_velocity=0.1, contact="unilateral", periods=data["x"].size)
+    np.testing.assert_array_equal(data["force"], contact.wall_force)
 
 
 def test_invalid_value_is_reported_and_page_stays_usable(page):

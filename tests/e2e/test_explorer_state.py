@@ -145,11 +145,11 @@ def test_figures_are_saved_as_shown(page, tmp_path):
     outline = np.stack([region.alpha * units.stiffness, region.beta * units.virtual_damping], -1)
     np.testing.assert_allclose(edge, [*outline, outline[0]], rtol=1e-7, atol=1e-7)
     # A figure without data cannot be saved.
-    shown = page.input_value("#figure")
+    selected_figure = page.input_value("#figure")
     page.select_option("#figure", "force")
     page.click("[data-save=png]")
     assert page.inner_text("#copied") == "simulate a hit first"
-    page.select_option("#figure", shown)
+    page.select_option("#figure", selected_figure)
 
 
 def test_arrow_points_at_a_wall_outside_the_chart(page):

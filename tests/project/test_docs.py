@@ -81,7 +81,7 @@ def hooks(monkeypatch):
 
 
 def test_formulas_are_typeset_as_mathml(hooks):
-    shown = hooks.typeset("T^ <= sqrt(a2) e^(-delta t) phi1, of x''")
+    html = hooks.typeset("T^ <= sqrt(a2) e^(-delta t) phi1, of x''")
     for part in (
         "<mover><mi>T</mi><mo>^</mo></mover>",
         "<mo>≤</mo>",
@@ -91,7 +91,7 @@ def test_formulas_are_typeset_as_mathml(hooks):
         "<mtext>of</mtext>",
         "<msup><mi>x</mi><mo>′′</mo></msup>",
     ):
-        assert part in shown
+        assert part in html
     assert hooks.typeset("a (b < c") == "<code>a (b &lt; c</code>"
 
 

@@ -165,7 +165,7 @@ def test_every_ci_step_runs_even_if_others_fail(tmp_path, failing):
     tools = ["lint-imports ", "pyright ", "ruff check", "ruff format --check"]
     tests = ["test ", "test-package ", "test-processors ", "test-versions oldest"]
     assert sorted(recorded[1:]) == tools + tests
-    # The output of steps that run beside the tests is printed as well.
+    # The output of steps that run in parallel with the tests is printed, too.
     assert all(f"this is {Path(name).name}" in result.stdout for name in (*STEPS, *TOOLS) if "chromium" not in name)
     assert result.returncode == (1 if failing else 0)
     assert result.stdout.count("FAILED (exit 3)") == len(failing)

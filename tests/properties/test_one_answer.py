@@ -87,7 +87,7 @@ class Tally:
     compared: Counter[str] = field(default_factory=Counter)
     unknown: Counter[str] = field(default_factory=Counter)
     routes: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
-    found: list[tuple[int, str, str, Wall]] = field(default_factory=list)
+    contradictions: list[tuple[int, str, str, Wall]] = field(default_factory=list)
 
     def compare(self, k: int, wall: Wall, every: Every) -> None:
         """Compare all quantities of scene k."""
@@ -99,7 +99,7 @@ class Tally:
                 for comparison in comparisons(wall):
                     self._compare(k, comparison, wall)
             except Exception:
-                self.found.append((k, "error", traceback.format_exc(limit=-4), wall))
+                self.contradictions.append((k, "error", traceback.format_exc(limit=-4), wall))
 
     def _compare(self, k: int, comparison: Comparison, wall: Wall) -> None:
         # Derivatives by all parameters share one row.
@@ -110,13 +110,13 @@ class Tally:
         self.unknown[name] += len(values) - decided
         self.routes[name] |= values.keys()
         if text := describe_contradiction(comparison, wall):
-            self.found.append((k, comparison.name, text, wall))
+            self.contradictions.append((k, comparison.name, text, wall))
 
     def table(self) -> Iterator[str]:
         """Return the number of comparisons and results per quantity, in Markdown."""
         yield "| quantity | routes | scenes | results compared | undecided | contradictions |"
         yield "|---|--:|--:|--:|--:|--:|"
-        bad = Counter(name.split(" in ")[0] for _, name, *_ in self.found)
+        bad = Counter(name.split(" in ")[0] for _, name, *_ in self.contradictions)
         for name in (*self.scenes_by_name, *(bad.keys() - self.scenes_by_name.keys())):
             counts = (
                 len(self.routes[name]),
@@ -146,7 +146,7 @@ def compare_scenes(count: int, seed: int, every: Every = EVERY) -> Tally:
 
 def test_all_routes_agree():
     tally = compare_scenes(64, SEED, Every(2, 8, 16, 32))
-    assert tally.found == []
+    assert tally.contradictions == []
     assert sum(tally.rejected.values()) <= 2, "a link with a resonance at thousands of times the sampling rate"
     routes = {"check", "sweep", "simulate", "simulate, label", "to_control", "zwidth.is_stable", "assess.stable"}
     assert routes <= tally.routes["stable"]
@@ -164,11 +164,11 @@ if __name__ == "__main__":
     warnings.simplefilter("ignore", zwidth.PrecisionWarning)
     start, every = time.process_time(), Every(*(getattr(arguments, name) for name in Every._fields))
     tally = compare_scenes(arguments.count, arguments.seed, every)
-    for k, comparison, text, wall in tally.found:
+    for k, comparison, text, wall in tally.contradictions:
         print(f"{k}: {comparison}: {text}\n    {wall}")
     print("\n".join(tally.table()))
     intervals = ", ".join(f"{name} every {nth}th" for name, nth in every._asdict().items())
     print(
         f"{tally.scenes} scenes ({intervals}), {sum(tally.rejected.values())} rejected {dict(tally.rejected)}, "
-        f"{len(tally.found)} contradictions, {time.process_time() - start:.0f} s of CPU"
+        f"{len(tally.contradictions)} contradictions, {time.process_time() - start:.0f} s of CPU"
     )

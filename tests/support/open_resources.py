@@ -38,8 +38,10 @@ def list_open() -> Open:
     """Return the open resources, without those that libraries keep."""
     threads = threading.enumerate()
     loops = sum(thread.name.startswith(_KEPT_LOOPS) for thread in threads)
-    kept = (*_KEPT_LOOPS, *_KEPT_THREADS, *_names_of_dask())
-    threads_open = (f"thread {thread.name}, {thread.ident}" for thread in threads if not thread.name.startswith(kept))
+    excluded = (*_KEPT_LOOPS, *_KEPT_THREADS, *_names_of_dask())
+    threads_open = (
+        f"thread {thread.name}, {thread.ident}" for thread in threads if not thread.name.startswith(excluded)
+    )
     return Open(_count_sockets() - 2 * loops, frozenset(_name_processes()), frozenset(threads_open))
 
 

@@ -63,11 +63,11 @@ def make_full_config():
 
 def limit_chunk_sizes(monkeypatch, walls, devices):
     """Limit chunks to this many points; other processes read the plan from the store."""
-    whole = plan.chunk_shape
+    original = plan.chunk_shape
 
     def chunk_shape(shape, target):
         # Grids of walls have two dimensions more than those of devices.
-        return whole(shape, walls if len(shape) > 3 else devices)
+        return original(shape, walls if len(shape) > 3 else devices)
 
     monkeypatch.setattr(plan, "chunk_shape", chunk_shape)
 

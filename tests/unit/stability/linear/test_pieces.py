@@ -89,7 +89,7 @@ def test_maximum_stiffness_agrees_with_a_flood_fill_from_zero_stiffness(name):
     scene, negative = SCENES[name]
     top, other, step = flood_fill(scene, negative, 160)
     wall = scene.max_stiffness(negative_damping=negative)
-    # The grid misses what is thinner than its step.
+    # The grid misses intervals thinner than its step.
     assert wall.stiffness == pytest.approx(top, abs=2.0 * step)
     islands = scene.islands(negative_damping=negative)
     assert bool(islands) >= np.isfinite(other)
