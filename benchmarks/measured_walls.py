@@ -43,8 +43,8 @@ def main() -> None:
         f"Of {count} devices:\n",
         *describe(trials),
         "",
-        f"What the second record was said to tell and what it told are {gap:.1%} of K_max apart in the median, and",
-        f"{missed:.1e} of all lines lie outside of their band.",
+        f"The predicted and the actual safe stiffness of the second record differ by {gap:.1%} of K_max in the median.",
+        f"The true response is outside the error band at {missed:.1e} of all frequencies.",
     ]
     print(*text, sep="\n")
     if len(sys.argv) == 1:

@@ -136,7 +136,10 @@ def results(tmp_path_factory):
             text = text.replace(old, new)
         (package / file).write_text(text, encoding="utf-8")
     (folder / "mounted.yaml").write_text(CONFIGURATION, encoding="utf-8")
-    invalid_config = CONFIGURATION.replace("stiffness: 0.135 N/mm, damping: 6", "stiffness: 0, dampin: 6")
+    invalid_config = CONFIGURATION.replace(
+        "stiffness: 0.135 N/mm, damping: 6",
+        "stiffness: 0, dampin: 6",  # codespell:ignore
+    )
     (folder / "wrong.yaml").write_text(invalid_config, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     result = subprocess.run(

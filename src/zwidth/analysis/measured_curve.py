@@ -101,8 +101,8 @@ class ResponseCurve:
         w = 2.0 * np.pi * device.frequency * period
         if w[-1] >= np.pi:
             raise InputError(
-                f"frequency: got {device.frequency[-1]:g} Hz at a period of {period:g} s; it must be less than half "
-                f"the rate, {0.5 / period:g} Hz: remove the lines above, or correct the period"
+                f"frequency: got {device.frequency[-1]:g} Hz at a period of {period:g} s; it must be below the "
+                f"Nyquist frequency, {0.5 / period:g} Hz: remove the higher frequencies, or correct the period"
             )
         G = device.response * stiffness
         r = np.zeros(w.size) if device.deviation is None else device.deviation * stiffness

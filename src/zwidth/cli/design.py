@@ -39,7 +39,7 @@ from zwidth.units.formatting import (
 from zwidth.units.parsing import read_share
 from zwidth.units.quantities import PARAMETERS
 
-# By value of the option --find: path in a scene of the parameter that it selects.
+# Path in a scene of the parameter that each value of the option --find selects.
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
 _TRIED = 41  # number of values of a parameter at which K_max is computed, to find its largest value in a range

@@ -8,7 +8,7 @@ with the mass m, the damping b, the delay d in sampling periods T, a constant fo
 and v0 are the position and velocity at the first sample. In each period the delayed force F(t - d) changes once, at the
 fractional part f of the delay. The period therefore has two *parts* of durations f and 1 - f in which a is constant.
 
-Within a part the velocity approaches a/delta exponentially, so it reaches 0 at most once. At such a *stop* the mass
+Within a part the velocity approaches a/delta exponentially, so it reaches 0 at most once. At this *stop* the mass
 sticks if ``|g F + o| <= c``; otherwise it reverses. The time of the stop follows from a logarithm. Before and after it
 the velocity and position have a closed form in the phi-functions of `zwidth.numerics.held_mass`. The derivatives in the
 parameters are exact, too: a change dv of the velocity near the stop shifts its time by -dv/a.

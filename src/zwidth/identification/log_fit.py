@@ -1,7 +1,7 @@
 """Fit a device to a log of its free motion under a commanded force.
 
 The steps are: read and repair the logs (`identification.recordings`); fit the positions by least squares
-(`identification.output_error`) with the model structure that Schwarz's criterion selects
+(`identification.output_error`) with the model structure that the Bayesian information criterion (BIC) selects
 (`identification.model_selection`); refuse logs whose motion the force does not explain; test the residuals for white
 noise; and bound undetected resonances and actuator lags (`identification.unmodeled_dynamics`,
 `identification.unmodeled_lag`). ``theta`` is the parameter vector of `identification.extended_model`. A *stretch* is a
@@ -77,8 +77,8 @@ def fit_log(
     The model is ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, with zero-order hold of the force; the positions
     are fitted by least squares. The constant force f0 and the friction F_c are always fitted. This increases the errors
     of the other parameters, but omitting f0 or F_c when they are hardly visible could bias the other parameters by many
-    standard errors. An actuator lag of first or second order and resonances are added if Schwarz's criterion requires
-    them.
+    standard errors. An actuator lag of first or second order and resonances are added if the Bayesian information
+    criterion (BIC) requires them.
 
     Args:
         time: times of the samples in s, evenly spaced, or only the sampling period. The parts before and after missing
@@ -163,8 +163,8 @@ def _fit(
         if not parts:
             most = max((each.stop - each.start for each in find_even(places[k], 1)), default=1)
             raise InputError(
-                f"time: log {k + 1} has {most} samples without a gap, of which the first {skip} only provide past "
-                f"forces; at least {skip + _FEWEST} are needed: record longer, or give a shorter max_delay"
+                f"time: log {k + 1} has {most} samples without a gap; at least {skip + _FEWEST} are needed, "
+                f"because the first {skip} only provide past forces: record longer, or give a shorter max_delay"
             )
     count = sum(map(len, stretches))
     recordings = tuple(

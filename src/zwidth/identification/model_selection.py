@@ -1,11 +1,12 @@
-"""Select the structure of a device by Schwarz's criterion: a rigid mass, or one with an actuator lag and resonances.
+"""Select the structure of a device by the BIC: a rigid mass, or a mass with an actuator lag and resonances.
 
-Starting from the rigid mass, a score test of the residuals (`identification.unmodeled_dynamics`,
-`identification.unmodeled_lag`) decides whether the model lacks a pole or a lag. If so, all models with one *part* more
-are fitted: an actuator lag of the next order, or a resonance (*mode*) at one of the frequencies with the highest
-scores. Schwarz's criterion (BIC, Schwarz 1978) selects the model with the lowest sum of the *misfit*,
--2 log(likelihood), and log(N) per parameter, for N positions. Then the residuals are tested again. ``theta`` is the
-parameter vector of `identification.extended_model.Recordings`.
+Starting from the rigid mass, a score test of the residuals (`zwidth.identification.unmodeled_dynamics`,
+`identification.unmodeled_lag`)
+decides whether the model lacks a pole or a lag. If so, all models with one *part* more are fitted: an actuator lag of
+the next order, or a resonance (*mode*) at one of the frequencies with the highest scores. The Bayesian information
+criterion (BIC, Schwarz 1978) selects the model with the lowest sum of the *misfit*, -2 log(likelihood), and log(N) per
+parameter, for N positions. Then the residuals are tested again. ``theta`` is the parameter vector of
+`zwidth.identification.extended_model.Recordings`.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ def _test_residuals(best: FittedModel) -> Choice:
 
 
 def _add_part(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, HiddenPole | None]:
-    """Fit all models with one part more than ``best``, and return the one that Schwarz's criterion selects.
+    """Fit all models with one part more than ``best``, and return the one that the BIC selects.
 
     A weak resonance has nearly the same effect on the positions as a lag, which has fewer parameters, but its K_max is
     very different. Therefore a resonance that fits significantly better than the selected lag is returned as well.

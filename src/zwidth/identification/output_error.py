@@ -163,7 +163,7 @@ class FittedModel:
         return self.count * np.log(ratio)
 
     def fits_as_well_as(self, other: FittedModel) -> bool:
-        """Return whether Schwarz's criterion (BIC) prefers this model to ``other``, which has more parameters."""
+        """Return whether the BIC (Schwarz 1978) prefers this model to ``other``, which has more parameters."""
         return self.compare_misfit(other) < max(1, other.inverse.rank - self.inverse.rank) * np.log(self.count)
 
     @cached_property

@@ -14,8 +14,8 @@ effect. K_max is the maximum stiffness of a wall. The steps are explained in doc
 
 1. Score: the reduction of the sum of squares, in sigma^2, if the real and imaginary part of the force filtered by the
    pole are added to the model (Rao 1948). It is a chi-square variable if no pole is missing.
-2. Detection: `detect_missing_pole` returns the pole of the highest score if it satisfies Schwarz's criterion (BIC,
-   Schwarz 1978) for white noise and for the autocorrelated errors of the encoder.
+2. Detection: `detect_missing_pole` returns the pole of the highest score if it satisfies the Bayesian information
+   criterion (BIC, Schwarz 1978) for white noise and for the autocorrelated errors of the encoder.
 3. Bound: if no pole is detected, |r| is at most ``(sqrt(score) + 4)/size``, with ``size = |s|/sigma`` of the unit mode.
    `bound_response` computes the largest change of the response by such a mode, a radius that limits the safe walls.
 4. Averaging: with ``t = s'e/(sigma^2 size)``, the likelihood ratio of a device with one more mode to one without it is
@@ -141,7 +141,7 @@ def detect_missing_pole(fit: FittedModel) -> tuple[HiddenPole | None, PoleBank]:
         fit: The fitted model, at the minimum of its sum of squares.
 
     Returns:
-        The pole with the highest score that satisfies Schwarz's criterion (BIC), or None; and the scores of all poles.
+        The pole with the highest score that satisfies the BIC, or None; and the scores of all poles.
     """
     fit = truncate_logs(fit)
     basis, residuals = fit.inverse.basis, fit.model.weigh(fit.residuals)
@@ -149,7 +149,7 @@ def detect_missing_pole(fit: FittedModel) -> tuple[HiddenPole | None, PoleBank]:
     noise_variance = fit.variance * fit.excess
     bank = _score_poles(fit, basis, residuals, noise_variance)
     squares = float(residuals @ residuals)
-    # Schwarz's criterion (BIC) requires that each further parameter reduces -2 log(likelihood) by log(count). A complex
+    # The BIC requires that each further parameter reduces -2 log(likelihood) by log(count). A complex
     # pole adds two real parameters for the pole and two amplitudes, a real pole one of each. Both therefore add two
     # parameters per amplitude.
     threshold_per_amplitude = 2.0 * np.log(fit.count)

@@ -80,7 +80,7 @@ class System:
                 )
             if self.d != self.n_delay:
                 raise InputError(
-                    f"delay: got {float(self.d):g} periods; a sampled device allows only whole periods; include the "
+                    f"delay: got {float(self.d):g} periods; a sampled device allows only an integer delay; include the "
                     "fraction in the device"
                 )
             return

@@ -28,12 +28,12 @@ from zwidth.units.quantities import PARAMETERS
 
 _STIFFNESS = SI_COLUMNS[0]  # name of the column of K_max
 _NOISE = "velocity_noise_m_per_s"  # name of the column of the velocity noise
-# By kind of filter: column and axis label of the parameter over which K_max is drawn.
+# Column and axis label of the parameter over which K_max is drawn, for each kind of filter.
 _OVER = {
     "low_pass": ("cutoff_Hz", "cut-off of the low-pass  $f_c$  in Hz"),
     "windowed_difference": ("samples", "length of the window  $n$  in periods"),
 }
-# By kind of velocity estimate: line style, marker and legend entry.
+# Line style, marker and legend entry of each kind of velocity estimate.
 _KINDS: dict[str, tuple[Any, str, str]] = {
     "low_pass": (style.SOLID, "", "low-pass"),
     "windowed_difference": (style.DOTTED, "", "window"),

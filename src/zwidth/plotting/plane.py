@@ -34,7 +34,7 @@ Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, stable_set.Outlines]
 # Outputs that have a contour along the boundary of the stable walls. It is smoother than the contour of the Boolean
 # output "stable".
 SMOOTH = ("margin", "spectral_radius")
-# By Boolean output: smooth outputs that have a contour along the boundary of its region.
+# Smooth outputs that have a contour along the boundary of the region of each Boolean output.
 _SMOOTH_OUTPUTS = {"stable": SMOOTH, "passive": ("passivity_margin",)}
 # Outputs that are finite for stable walls only.
 _FINITE_IF_STABLE = ("settling_time", "delay_margin")
@@ -282,7 +282,7 @@ def _add_legend(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any
     crossed = finite.size and finite.min() < output.center < finite.max()
     if crossed if output.color_scale == "diverging" else (exact and output.color_scale != "truth"):
         walls = "passive" if name == "passivity_margin" else "stable"
-        handles.append(style.line(f"edge of what is {walls}", width=1.3, color=style.BLACK))
+        handles.append(style.line(f"boundary of the {walls} walls", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):
         handles.append(Patch(facecolor=MISSING, label="unstable"))
     elif any(np.ma.is_masked(panel.variables[name]) for panel in panels):

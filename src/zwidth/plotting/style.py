@@ -149,7 +149,7 @@ def panels(given: AnyAxes | None, count: int, width: float, height: float, colum
     """Return a 1-D array of the Axes to draw into: the given ones, or those of a new figure.
 
     Args:
-        given: Existing Axes, of which the first ``count`` are returned; None for a new figure.
+        given: Existing Axes; the first ``count`` of them are returned. None for a new figure.
         count: Number of panels.
         width: Width of a new figure in inches.
         height: Height of a new figure in inches.

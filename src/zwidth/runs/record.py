@@ -4,7 +4,7 @@ The record contains one *entry* per study. It is written again after every study
 time leaves a correct record. The files of a study are created in a hidden folder, then entered in the record, and only
 then moved to their names in the folder of the run. So no file of a run is ever incomplete under its name, and a file
 that is not in the record, a file *of the user*, is never replaced or removed. *Inputs* of a study are its configuration
-and the files that this configuration reads, of which the folder ``inputs`` contains copies.
+and the files that this configuration reads; the folder ``inputs`` contains copies of them.
 """
 
 from __future__ import annotations

@@ -5,8 +5,9 @@ the index of a sample. One compiled *block* simulates a fixed number of periods,
 further compilation. A period is divided into *substeps*, at whose starts a *frame* is recorded, and a substep into
 *pieces* with constant force; a *reading* is the result of the control program at one sample. A *ring* is a circular
 buffer of positions or commands, indexed by k modulo its length. The *tail* is the last part of a simulation, in which
-its behavior is classified. ``x`` is the state of the bodies, of which the rows ``params.place`` and ``params.motion``
-compute their positions and velocities. FOAW is the adaptive velocity estimate of Janabi-Sharifi et al. 2000.
+its behavior is classified. ``x`` is the state of the bodies; its products with the rows of ``params.place`` and
+``params.motion`` are their positions and velocities. FOAW is the adaptive velocity estimate of Janabi-Sharifi et al.
+2000.
 """
 
 from __future__ import annotations

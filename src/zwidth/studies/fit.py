@@ -1,9 +1,9 @@
-"""Study "fit": mass, damping and delay of a device from logs of its motion, from walls at the onset of instability
-("buzz"), or from both.
+"""Study "fit": mass, damping and delay of a device from logs of its motion, from walls at the onset, or from both.
 
-Fits to logs and to walls are computed separately (`zwidth.identification`); if both are given, a chi-squared test
-compares their parameters. The study writes a table of the fitted parameters, tables that show the quality of the fits
-(such as residuals and stability boundaries), and a scene file for each fit.
+The walls are at the onset of instability ("buzz"). Fits to logs and to walls are computed separately
+(`zwidth.identification`); if both are given, a chi-squared test compares their parameters. The study writes a table of
+the fitted parameters, tables that show the quality of the fits (such as residuals and stability boundaries), and a
+scene file for each fit.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A *store* is the Zarr group with the results of one sweep (`sweep.store`); `zwidth.open_dataset` reads it through
 `CheckedStore`. A *chunk* is one block of the grid of a sweep (`sweep.plan`). Each variable of the store has one file
 of values per chunk, which ends with a checksum. A chunk is *finished* once all its files are written. The *description*
-of the store is a JSON document, of which the store contains two copies.
+of the store is a JSON document; the store contains two copies of it.
 """
 
 from __future__ import annotations

@@ -139,7 +139,7 @@ class Store:
         return self.status_file(task).exists()
 
     def is_visible(self, task: Task) -> bool:
-        """Return whether a chunk is marked as done, also if another machine has written it very recently."""
+        """Return whether a chunk is marked as done, even if another machine wrote it a moment ago."""
         if not self.is_done(task):
             # List the folders to refresh the cache of a network file system, which may still report a new file as
             # missing.

@@ -104,7 +104,7 @@ PHYSICAL = "stiffness: 1, mass: 1, rate: 1 kHz, "
         ("delta: 1, d: 1", "", "axes", "alpha missing"),
         (NORMALIZED, ", outputs: [alpha_max]", "axes.alpha", "changes no output"),
         ("delta: 1, d: 1", ", outputs: [stiffness_max]", "outputs[0]", "SI units"),
-        (NORMALIZED, ", outputs: [stabel]", "outputs[0]", "did you mean 'stable'?"),
+        (NORMALIZED, ", outputs: [stabel]", "outputs[0]", "did you mean 'stable'?"),  # codespell:ignore
         (NORMALIZED, ", accuracy: 0", "accuracy", "at least"),
         (NORMALIZED, ", accuracy: 1e-13", "accuracy", "at least 1e-12"),
         (NORMALIZED, ", accuracy: tight", "accuracy", "one number"),

@@ -148,7 +148,7 @@ def test_settling_times_end_at_the_edge(folder):
     for ax in axes:
         assert ax.get_xscale() == "log"
         assert len(exact_lines(ax)) == 1
-    assert "edge of what is stable" in [text.get_text() for text in axes[0].figure.legends[0].get_texts()]
+    assert "boundary of the stable walls" in [text.get_text() for text in axes[0].figure.legends[0].get_texts()]
 
 
 def test_legend_omits_edges_that_are_not_drawn(tmp_path):
@@ -159,4 +159,4 @@ def test_legend_omits_edges_that_are_not_drawn(tmp_path):
         data, edges = open_with_edges(tmp_path / name, name)
         (ax,) = draw_plane(data, "decay_rate", edges=edges)
         legend = ax.figure.legends[0].get_texts() if ax.figure.legends else []
-        assert ("edge of what is stable" in [text.get_text() for text in legend]) == in_legend
+        assert ("boundary of the stable walls" in [text.get_text() for text in legend]) == in_legend

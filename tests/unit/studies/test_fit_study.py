@@ -198,7 +198,7 @@ FAULTS = {
     "no data": ("    noise: 0.1\n", "log or buzz is missing"),
     "no file": ("    log: {csv: nowhere.csv}\n", "studies[0].log.csv: "),
     "no column": ("    log: {csv: log.csv, position: z}\n", "has no column 'z'"),
-    "unknown key of log": ("    log: {csv: log.csv, positon: x}\n", "did you mean 'position'?"),
+    "unknown key of log": ("    log: {csv: log.csv, positon: x}\n", "did you mean 'position'?"),  # codespell:ignore
     "unknown key of study": ("    log: {csv: log.csv}\n    max_dely: 1 ms\n", "did you mean 'max_delay'?"),
     "wrong unit": ("    log: {csv: log.csv, resolution: 1 kg}\n", "got '1 kg'"),
     "empty list": ("    log: []\n", "got an empty list"),

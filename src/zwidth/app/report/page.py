@@ -161,7 +161,7 @@ def _write_section(where: Path, entry: dict[str, Any]) -> str:
     """Return the HTML section of a study, from the folder of the run and the entry of the study."""
     kind, name = str(entry["kind"]), escape(str(entry["name"]))
     remarks = [*entry.get("answer", ()), *entry.get("notes", ())]
-    notes = f'<div class="told">{"".join(f"<p>{escape(str(each))}</p>" for each in remarks)}</div>' if remarks else ""
+    notes = f'<div class="notes">{"".join(f"<p>{escape(str(each))}</p>" for each in remarks)}</div>' if remarks else ""
     method = f'<p class="soft">{escape(KINDS[kind].method)}</p>' if kind in KINDS and KINDS[kind].method else ""
     body = "".join(_write_contents(where, entry))
     listed = ", ".join(escape(file) for file in sorted(entry.get("files", {})))

@@ -269,8 +269,7 @@ def find_first_root(coefficients: tuple[Array, ...]) -> Array:
     # Start from the quadratic in which the cubic term h3 u^3 is replaced by (h3/2) u^2.
     negative_h2 = -(h2 + 0.5 * rest[0]) if rest else -h2
     discriminant_root = xp.sqrt(xp.maximum(h1 * h1 + 4.0 * negative_h2 * h0, 0.0))
-    # Of the two forms of the quadratic formula, choose the one that adds terms of equal sign and so avoids
-    # cancellation.
+    # Choose the form of the quadratic formula that adds terms of equal sign, to avoid cancellation.
     falling = h1 < 0
     root = xp.where(falling, 2.0 * h0, h1 + discriminant_root) / xp.where(
         falling, discriminant_root - h1, 2.0 * negative_h2

@@ -214,7 +214,7 @@ def find_dominant_pole(wall: tuple[float, float, float, float]) -> tuple[float, 
 def _find_listed(
     columns: list[np.ndarray], accuracy: float, with_rate: bool, route: Route
 ) -> tuple[WallPoles, DominantPoles]:
-    """Return the radii of columns of walls and, if requested, the rates; and the dominant poles."""
+    """Return the radii of walls given as columns (1-D arrays) and, if requested, the rates; and the dominant poles."""
     dominant = compute_dominant_poles(columns, accuracy, route)
     rate = compute_rates(dominant, columns, accuracy) if with_rate else NO_RATE
     radius = np.exp(np.where(np.isinf(dominant.error), np.nan, dominant.re))

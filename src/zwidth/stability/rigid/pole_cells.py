@@ -52,8 +52,8 @@ REAL_AXIS_WIDTH = 1e-7
 NEWTON_STEPS = 4
 # Radii of the circles that are tried, relative to the largest radius.
 CIRCLE_RADII = 2.0 ** (-0.5 * np.arange(14))
-# By number of poles in a group: distance, in indices of `CIRCLE_RADII`, from the chosen circle to the smaller and the
-# larger circle that bound the error of its means (C3).
+# Distance, in indices of `CIRCLE_RADII`, from the chosen circle to the smaller and the larger circle that bound the
+# error of its means (C3), for each number of poles in a group.
 CIRCLE_OFFSET = {1: 2, 2: 1}
 # Ratio R above which the choice of a circle does not depend on R, because the truncation error is then negligible.
 AMPLE_RATIO = 100.0

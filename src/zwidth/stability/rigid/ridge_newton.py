@@ -117,7 +117,7 @@ def _evaluate_polynomials(wave: Wave, curve: Curve) -> tuple[Array, Array, Array
     xp = namespace(wave.y, curve.sigma)
     E = curve.E[0] + wave.y * (curve.E[1] + wave.y * curve.E[2])
     H = curve.H[0] + wave.y * curve.H[1]
-    # Of two forms of m, choose the one without cancellation.
+    # Choose the form of m without cancellation.
     m = xp.where(wave.y < 0.5, curve.at_one - 2.0 * curve.sigma * wave.y, 2.0 * curve.sigma * wave.q - curve.gap)
     return E, H, m, m * m + curve.mu * curve.mu * (4.0 * wave.y * wave.q)
 
