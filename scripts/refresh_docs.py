@@ -141,7 +141,7 @@ MADE = {"gallery": list_gallery, "published": compare_paper, **TABLES}
 def main() -> None:
     """Update or check the pages."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("pages", nargs="*", type=Path, help="all of them where left out")
+    parser.add_argument("pages", nargs="*", type=Path, help="default: all pages")
     parser.add_argument("--check", action="store_true", help="change nothing; fail where a page is out of date")
     options = parser.parse_args()
     stale = []

@@ -43,7 +43,7 @@ def draw(config: Path, out: Path) -> list[Path]:
 def main() -> None:
     """Run the configurations and copy their figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("names", nargs="*", help="configurations without folder and ending; all where left out")
+    parser.add_argument("names", nargs="*", help="configurations without folder and suffix; default: all")
     parser.add_argument("--runs", type=Path, help="folder that keeps the runs, which go on where they are there")
     options = parser.parse_args()
     names = options.names or sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))

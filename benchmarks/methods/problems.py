@@ -150,7 +150,7 @@ def exact_radius(alpha: float, beta: float, delta: float, d: float) -> float:
 
 
 def refined_radius(alpha: float, beta: float, delta: float, d: float) -> float:
-    """Return the spectral radius for long delays by Newton's method, from the pole that float64 proves outermost.
+    """Return the spectral radius for long delays by Newton's method, from the pole that float64 proves dominant.
 
     Raises:
         ArithmeticError: there is no proof, or Newton's method diverges from the pole.
@@ -159,7 +159,7 @@ def refined_radius(alpha: float, beta: float, delta: float, d: float) -> float:
 
     pole = compute_dominant_poles([np.array([value]) for value in (alpha, beta, delta, d)], 1e-9)
     if not pole.error[0] <= 1e-9:
-        raise ArithmeticError(f"no proof of the outermost pole at {(alpha, beta, delta, d)}")
+        raise ArithmeticError(f"no proof of the dominant pole at {(alpha, beta, delta, d)}")
     with flint.ctx.workprec(_ROOT_BITS):
         coefficients = ball_polynomial(alpha, beta, delta, d, _ROOT_BITS)
         terms = [(k, value.mid()) for k, value in enumerate(coefficients) if value != 0]
@@ -171,7 +171,7 @@ def refined_radius(alpha: float, beta: float, delta: float, d: float) -> float:
             step = (value / slope).mid()
             z = (z - step).mid()
         if not (abs(step) < _ROOT_WIDTH and abs(z - start) < 1e-8):
-            raise ArithmeticError(f"Newton's method left the outermost pole at {(alpha, beta, delta, d)}")
+            raise ArithmeticError(f"Newton's method left the dominant pole at {(alpha, beta, delta, d)}")
         return float(abs(z).mid())
 
 

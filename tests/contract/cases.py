@@ -33,13 +33,13 @@ class Case:
     concrete: tuple[str, ...] = ()
     # Number of axes of the results beyond those of the arguments.
     extra_axes: int = 0
-    # Whether tracing raises an error.
+    # True if tracing raises an error.
     refuses_tracing: bool = False
     # Test file of the derivatives, for functions whose gradient is slow to compile.
     gradient_in: str = ""
     # Tolerance, relative and absolute, between float32 and float64.
     single: float = 2e-3
-    # Whether a single invalid number raises an error, as for quantities in SI units.
+    # True if a single invalid number raises an error, as for quantities in SI units.
     strict: bool = False
     # Integer-valued point at which `contract.matrix` tries every type; missing arguments are 1.
     point: dict[str, int] = field(default_factory=dict)

@@ -125,7 +125,7 @@ def test_error_names_the_argument_that_is_not_real(case, value):
         # None stands for an omitted line or delay.
         if value is None and (case.function, name) in OPTIONAL:
             continue
-        # Where units are accepted, the message for a string without a unit differs.
+        # Arguments that accept units have a different message for a string without a unit.
         with pytest.raises(InputError, match=rf"^{name}\w*: got .*(real number|drop the quotes)"):
             case.call(**(case.arguments | {name: value}))
 
@@ -221,7 +221,7 @@ def is_called_by_name(case):
 
 
 def is_marked(result, index):
-    """Whether a point is marked as bad: NaN, False, or a count of -1."""
+    """Return True if a point is marked as bad: NaN, False, or a count of -1."""
     values = [(name, np.asarray(value)[index]) for name, value in result.items()]
     floats = [np.isnan(value).any() for _, value in values if value.dtype.kind in "fc"]
     if floats:

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 QUICK = ROOT / "tests" / "quick.txt"
 LISTS = sorted((ROOT / "tests").glob("*.txt"))
 ON_EVERY_CORE = ["--numprocesses", "auto", "--dist", "loadfile"]
-# Packages of which the quick tests must contain some tests.
+# Packages for which the quick tests must contain at least one test.
 PACKAGES = sorted(path.name for path in (ROOT / "tests" / "unit").iterdir() if path.is_dir() and path.name[0] != "_")
 
 # Fake programs append each call to the file "calls"; the fake uv also creates an environment with a fake pytest.

@@ -17,7 +17,7 @@ _MARK = f"\0ZWIDTH_TESTED_BY={os.getpid()}\0".encode()
 _KEPT_LOOPS = ("zarr_io", "IO loop")
 # Threads to which zarr's loop and distributed delegate work.
 _KEPT_THREADS = ("asyncio_", "zarr_pool", "Dask-Offload", "Dask-Callback-Thread")
-# By its command line: Python's resource tracker, started with the first worker.
+# Identified by its command line: Python's resource tracker, started with the first worker.
 _KEPT_PROCESS = "multiprocessing.resource_tracker"
 
 
@@ -29,7 +29,7 @@ class Open(NamedTuple):
     threads: frozenset[str]
 
     def list_new(self, before: Open) -> str:
-        """Return a description of what was not open before, or an empty string."""
+        """Return a description of newly opened resources, or an empty string."""
         new = [f"{self.sockets - before.sockets} sockets"] if self.sockets > before.sockets else []
         return "; ".join([*new, *sorted(self.processes - before.processes), *sorted(self.threads - before.threads)])
 

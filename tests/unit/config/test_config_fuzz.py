@@ -68,7 +68,7 @@ def list_fields(data, loader=yaml.SafeLoader):
         fields[format_path(path)] = node
         if isinstance(node, yaml.MappingNode):
             for key, value in node.value:
-                # Of duplicate keys the first counts.
+                # The first of duplicate keys counts.
                 if isinstance(key, yaml.ScalarNode) and format_path((*path, key.value)) not in fields:
                     walk(value, (*path, key.value))
         elif isinstance(node, yaml.SequenceNode):
