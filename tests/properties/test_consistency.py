@@ -154,8 +154,8 @@ def contradictions(f: Facts) -> dict[str, np.ndarray]:
     rows, columns = f.row.status == Status.OK, f.lower.status == Status.OK
     inside = (beta > f.lower.beta) & (beta < f.upper.beta)
     return {
-        "the certified verdict is known": ~f.known,
-        "the certified verdict is the verdict": f.known & (f.proved != stable),
+        "the certified verdict is known": ~f.decided,
+        "the certified verdict is the verdict": f.decided & (f.proved != stable),
         "stable walls are springs": stable & ~spring,
         "the radius is below 1 for stable walls": stable & (f.radius >= 1.0),
         "the radius of other walls is not": ~stable & (f.radius < 1.0),
