@@ -128,8 +128,8 @@ def test_piped_lines_have_at_most_100_columns(command):
 def test_json_keys_are_equal_for_every_scene():
     for command, *wall in (["check", *WALL], ["ridge"]):
         arguments = [command, *wall, *DEVICE, *RATE]
-        parts = ([], *(words for words, _ in COMPONENTS.values()))
-        rigid, *others = (json.loads(run(*arguments, *words, "--json").stdout) for words in parts)
+        parts = ([], *(options for options, _ in COMPONENTS.values()))
+        rigid, *others = (json.loads(run(*arguments, *options, "--json").stdout) for options in parts)
         assert all(list(other) == list(rigid) for other in others)
 
 
@@ -307,7 +307,7 @@ def test_check_does_not_import_jax():
     bare = ["check", *WALL, *DEVICE, *RATE]
     code = (
         "import sys\nfrom zwidth.cli.commands import cli\n"
-        f"for name, words in {[('bare', []), *((name, words) for name, (words, *_) in COMPONENTS.items())]!r}:\n"
+        f"for name, words in {[('bare', []), *((name, options) for name, (options, *_) in COMPONENTS.items())]!r}:\n"
         f"    cli.main(args=[*{bare!r}, *words], standalone_mode=False)\n    assert 'jax' not in sys.modules, name\n"
     )
     subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

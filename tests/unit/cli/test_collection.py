@@ -12,6 +12,6 @@ def test_command_collects_no_garbage_at_exit():
         "sys.argv = ['zwidth', '--version']\n"
         "main()\n"
     )
-    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "True True"
+    result = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.splitlines()[-1] == "True True"

@@ -14,10 +14,10 @@ PAGE = Path(__file__).resolve().parents[3] / "docs" / "shell-completion.md"
 
 def run_zwidth(**variables):
     command = [sys.executable, "-m", "zwidth"]
-    done = subprocess.run(
+    result = subprocess.run(
         command, env={**os.environ, **variables}, capture_output=True, text=True, check=False, timeout=LONGEST
     )
-    return done.stdout
+    return result.stdout
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
@@ -30,7 +30,7 @@ def test_completion_script_is_generated_as_documented(shell):
 
 
 @pytest.mark.parametrize(
-    "words, index, expected",
+    "arguments, index, expected",
     [
         ("zwidth ver", 1, ["plain,verify"]),
         ("zwidth figures --ov", 2, []),
@@ -39,6 +39,6 @@ def test_completion_script_is_generated_as_documented(shell):
         ("zwidth init --example tele", 3, ["plain,teleoperation"]),
     ],
 )
-def test_commands_options_and_examples_are_completed(words, index, expected):
-    output = run_zwidth(_ZWIDTH_COMPLETE="bash_complete", COMP_WORDS=words, COMP_CWORD=str(index))
+def test_commands_options_and_examples_are_completed(arguments, index, expected):
+    output = run_zwidth(_ZWIDTH_COMPLETE="bash_complete", COMP_WORDS=arguments, COMP_CWORD=str(index))
     assert output.split() == expected

@@ -16,20 +16,20 @@ def test_help_mentions_rotary_units_and_grasps():
 
 
 def read_help(name: str) -> str:
-    done = CliRunner().invoke(cli, [name, "--help"], terminal_width=80)
-    assert done.exit_code == 0
-    return done.stdout
+    result = CliRunner().invoke(cli, [name, "--help"], terminal_width=80)
+    assert result.exit_code == 0
+    return result.stdout
 
 
 @pytest.mark.parametrize("name", ["check", "recommend", "ridge", "design", "fit", "excite"])
 def test_example_in_the_help_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     example = read_help(name).partition("Example:\n")[2].replace("\\\n", " ")
-    words = shlex.split(example)
-    assert words[:2] == ["zwidth", name]
-    done = CliRunner().invoke(cli, words[1:])
-    assert done.exit_code == 0, done.output
-    assert "NO_BOUNDARY" not in done.output
+    arguments = shlex.split(example)
+    assert arguments[:2] == ["zwidth", name]
+    result = CliRunner().invoke(cli, arguments[1:])
+    assert result.exit_code == 0, result.output
+    assert "NO_BOUNDARY" not in result.output
 
 
 @pytest.mark.parametrize("name", sorted(cli.commands))
@@ -49,9 +49,9 @@ def test_help_fits_80_columns_without_unit_one(name):
     ],
 )
 def test_missing_options_are_named(command, message):
-    done = CliRunner().invoke(cli, command.split())
-    assert done.exit_code == 2
-    assert done.stderr.rstrip().endswith(f"Error: {message}")
+    result = CliRunner().invoke(cli, command.split())
+    assert result.exit_code == 2
+    assert result.stderr.rstrip().endswith(f"Error: {message}")
 
 
 def test_unwritable_file_is_named_as_given(tmp_path):

@@ -19,9 +19,9 @@ LOOP = ["--period", "1 ms", "--force", "3 N", "--resolution", "10 um", "--durati
 
 
 def call(*arguments):
-    done = CliRunner().invoke(cli, [str(argument) for argument in arguments], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.output
+    result = CliRunner().invoke(cli, [str(argument) for argument in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
 
 
 def write_log(played, log):
@@ -178,9 +178,9 @@ def test_transfer_function_agrees_with_the_rigid_device():
     ],
 )
 def test_invalid_devices_raise(options, message):
-    done = CliRunner().invoke(cli, ["ridge", "--period", "1 ms", *options])
-    assert done.exit_code != 0
-    assert message in (done.output or str(done.exception)) or message in str(done.exception)
+    result = CliRunner().invoke(cli, ["ridge", "--period", "1 ms", *options])
+    assert result.exit_code != 0
+    assert message in (result.output or str(result.exception)) or message in str(result.exception)
 
 
 def test_rotary_device_from_excitation_to_safe_wall(tmp_path):

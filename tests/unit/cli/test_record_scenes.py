@@ -31,16 +31,16 @@ studies: [{{kind: recommend, name: wall}}]
 ONSETS = "--buzz", "K=0.218 N m/rad B=0 f=26.5", "--buzz", "K=2.53 N m/rad B=0.008 N m s/rad f=107", "--noise", "2%"
 
 
-def run(*words, code=0):
-    done = CliRunner().invoke(cli, [str(word) for word in words])
-    assert done.exit_code == code, done.output
-    return done.stderr if code else done.stdout
+def run(*arguments, code=0):
+    result = CliRunner().invoke(cli, [str(word) for word in arguments])
+    assert result.exit_code == code, result.output
+    return result.stderr if code else result.stdout
 
 
-def run_invalid(*words):
-    done = CliRunner().invoke(cli, [str(word) for word in words])
-    assert isinstance(done.exception, SystemExit | zwidth.ZwidthError)
-    return done.stderr if isinstance(done.exception, SystemExit) else str(done.exception)
+def run_invalid(*arguments):
+    result = CliRunner().invoke(cli, [str(word) for word in arguments])
+    assert isinstance(result.exception, SystemExit | zwidth.ZwidthError)
+    return result.stderr if isinstance(result.exception, SystemExit) else str(result.exception)
 
 
 @pytest.fixture
@@ -74,8 +74,8 @@ def test_fit_of_walls_uses_period_and_units_of_a_scene_file(files):
 def test_excite_and_respond_use_a_scene_file(files, tmp_path):
     timed, bare, scene = files
     given = "--rate", "1 kHz", "--force", "20 mN m", "--resolution", "16384 counts", "--velocity-cutoff", "80 Hz"
-    for out, words in (("a.csv", [scene]), ("b.csv", given), ("c.csv", [scene, "--force", "10 mN m"])):
-        run("excite", *words, "--duration", "10 s", "--out", tmp_path / out)
+    for out, arguments in (("a.csv", [scene]), ("b.csv", given), ("c.csv", [scene, "--force", "10 mN m"])):
+        run("excite", *arguments, "--duration", "10 s", "--out", tmp_path / out)
     played = {out: np.loadtxt(tmp_path / out, delimiter=",", skiprows=1)[:, 1] for out in ("a.csv", "b.csv", "c.csv")}
     assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
     assert np.abs(played["a.csv"]).max() == pytest.approx(2.0 * np.abs(played["c.csv"]).max()) == 0.02
@@ -91,9 +91,9 @@ def test_contradictions_between_log_and_scene_file_raise(files, tmp_path):
     assert "got 2.000 ms, but the samples of the log are 1.000 ms apart" in run_invalid("fit", timed, slow)
     linear = tmp_path / "linear.yaml"
     linear.write_text("version: 1\nname: a\nscene: {mass: 1, rate: 1 kHz}\nstudies: [{kind: recommend, name: b}]\n")
-    words = "the record is that of a rotary device, but the scene file has a linear one"
-    assert words in run_invalid("fit", timed, linear, "--resolution", "16384 counts")
-    assert words in run_invalid("fit", linear, *ONSETS)
+    arguments = "the record is that of a rotary device, but the scene file has a linear one"
+    assert arguments in run_invalid("fit", timed, linear, "--resolution", "16384 counts")
+    assert arguments in run_invalid("fit", linear, *ONSETS)
     assert "got 2 scene files" in run_invalid("fit", timed, scene, slow)
     assert "give one LOG.csv or several" in run_invalid("respond", scene)
     assert "give --force, --resolution" in run_invalid("excite", linear)
@@ -115,8 +115,8 @@ def test_fitted_scene_passes_friction_and_encoder_to_other_commands(files, tmp_p
         assert diagnosis["hardware"]["coulomb"] == 1e-4
     diagnosis = json.loads(run("diagnose", fitted, *wall, "--friction", "0.2 mN m", "--json"))["hardware"]
     assert (diagnosis["resolution"], diagnosis["coulomb"]) == (pytest.approx(KNOB.step), 2e-4)
-    for words in (["recommend", fitted], ["fit", files[0], "--resolution", "16384 counts"]):
-        printed = " ".join(run(*words).split())
+    for arguments in (["recommend", fitted], ["fit", files[0], "--resolution", "16384 counts"]):
+        printed = " ".join(run(*arguments).split())
         assert "in a hand stable in all six reference grasps" in printed
         # Printed by the simulation for any final state.
         assert "the linear loop is stable" in printed
@@ -125,7 +125,9 @@ def test_fitted_scene_passes_friction_and_encoder_to_other_commands(files, tmp_p
 def test_largest_force_limits_the_code_of_a_fit(files, tmp_path):
     timed, _, scene = files
     given = "--resolution", "16384 counts", "--velocity-cutoff", "80 Hz"
-    programs = [run("fit", timed, *words, "--code", "c") for words in ([scene], [*given, "--max-force", "20 mN m"])]
+    programs = [
+        run("fit", timed, *arguments, "--code", "c") for arguments in ([scene], [*given, "--max-force", "20 mN m"])
+    ]
     assert programs[0] == programs[1] != run("fit", timed, *given, "--code", "c")
     fitted = tmp_path / "fitted.yaml"
     fitted.write_text(run("fit", timed, scene, "--max-force", "10 mN m", "--yaml"))
@@ -137,8 +139,8 @@ def test_largest_force_limits_the_code_of_a_fit(files, tmp_path):
         json.loads(run("fit", timed, scene, "--max-force", "10 mN m", "--json"))["diagnosis"]["hardware"]["max_force"]
         == 0.01
     )
-    words = "the record is that of a rotary device, but --max-force has units of a linear one"
-    assert words in run_invalid("fit", timed, *given, "--max-force", "3 N", "--code", "c")
+    arguments = "the record is that of a rotary device, but --max-force has units of a linear one"
+    assert arguments in run_invalid("fit", timed, *given, "--max-force", "3 N", "--code", "c")
     assert "must be greater than 0" in run_invalid("fit", timed, *given, "--max-force", "-3 N m")
 
 

@@ -32,22 +32,22 @@ def write_scene(tmp_path):
     return write_scene
 
 
-def run(*words):
-    return CliRunner().invoke(cli, [str(word) for word in words])
+def run(*arguments):
+    return CliRunner().invoke(cli, [str(word) for word in arguments])
 
 
-def run_invalid(*words):
+def run_invalid(*arguments):
     """Return the error message of an invalid call, which `main` prints on stderr."""
-    done = run(*words)
-    assert done.exit_code != 0, done.output
-    assert isinstance(done.exception, SystemExit | zwidth.ZwidthError)
-    return done.stderr if isinstance(done.exception, SystemExit) else str(done.exception)
+    result = run(*arguments)
+    assert result.exit_code != 0, result.output
+    assert isinstance(result.exception, SystemExit | zwidth.ZwidthError)
+    return result.stderr if isinstance(result.exception, SystemExit) else str(result.exception)
 
 
-def run_json(*words):
-    done = run(*words, "--json")
-    assert done.exit_code == 0, done.output
-    return json.loads(done.stdout)
+def run_json(*arguments):
+    result = run(*arguments, "--json")
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
 
 
 def make_options(keys):
@@ -122,9 +122,9 @@ def test_device_option_replaces_the_device_of_the_file(write_scene):
 
 def test_rotary_file_implies_rotary_units(write_scene):
     file = write_scene(mass="60 g cm^2", damping="0.02 mN m s/rad", rate="1 kHz", delay="0.7 periods")
-    done = run("check", file, "--stiffness", "0.05")
-    assert done.exit_code == 0, done.output
-    assert "mN m/rad" in done.output
+    result = run("check", file, "--stiffness", "0.05")
+    assert result.exit_code == 0, result.output
+    assert "mN m/rad" in result.output
     assert "in linear units, together with scene.yaml" in run_invalid("check", file, "--stiffness", "10 N/m")
 
 
@@ -173,15 +173,15 @@ def test_hardware_of_a_file_is_printed(tmp_path):
     file, wall = tmp_path / "fitted.yaml", ("--stiffness", "5 kN/m", "--virtual-damping", "30 N s/m")
     file.write_text(WITH_HARDWARE.format(", resolution: 20 um, coulomb: 50 mN, max_force: 3 N"))
     used = "encoder step 20.0 µm, friction 50.0 mN, largest motor output 3.00 N"
-    for words in (["recommend", str(file)], ["check", str(file), *wall]):
-        text = " ".join(CliRunner().invoke(cli, words).stdout.split())
+    for arguments in (["recommend", str(file)], ["check", str(file), *wall]):
+        text = " ".join(CliRunner().invoke(cli, arguments).stdout.split())
         assert f"hardware {used} (from fitted.yaml)" in text
         assert "no friction given" not in text
     for name in ("diagnose", "simulate"):
         text = " ".join(CliRunner().invoke(cli, [name, str(file), *wall, "--max-force", "4 N"]).stdout.split())
         assert "hardware encoder step 20.0 µm, friction 50.0 mN (from fitted.yaml)" in text
-    done = CliRunner().invoke(cli, ["run", str(file), "--out", str(tmp_path / "run")])
-    text = " ".join(done.stdout.split())
+    result = CliRunner().invoke(cli, ["run", str(file), "--out", str(tmp_path / "run")])
+    text = " ".join(result.stdout.split())
     assert "in a hand: stable in all six reference grasps" in text
     assert f"simulated with {used}: " in text
     assert f"simulated with {used}: " in (tmp_path / "run" / "recommendation.md").read_text("utf-8")
@@ -193,9 +193,9 @@ def test_encoder_without_friction_has_a_caution(tmp_path):
     file.write_text(WITH_HARDWARE.format(", resolution: 20 um"))
     wall = "--stiffness", "5 kN/m", "--virtual-damping", "30 N s/m"
     options = [*DEVICE, "--resolution", "20 um"]
-    for words in (["check", str(file)], ["recommend", *options], ["simulate", *options], ["diagnose", str(file)]):
-        words += wall if words[0] != "recommend" else ()
-        text = " ".join(CliRunner().invoke(cli, words).stdout.split())
+    for arguments in (["check", str(file)], ["recommend", *options], ["simulate", *options], ["diagnose", str(file)]):
+        arguments += wall if arguments[0] != "recommend" else ()
+        text = " ".join(CliRunner().invoke(cli, arguments).stdout.split())
         assert text.count(f"CAUTION {caution}, which can stop a limit cycle; give") == 1
     assert "no friction given" not in CliRunner().invoke(cli, ["check", str(file), *wall, "--friction", "0"]).stdout
     assert caution in json.loads(CliRunner().invoke(cli, ["recommend", str(file), "--json"]).stdout)["cautions"][-1]

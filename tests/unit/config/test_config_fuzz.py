@@ -203,9 +203,9 @@ def rescale(value, rng):
     factor = rng.choice([-1, 0, 1e-12, 1e-3, 1e3, 1e12, 1e300])
     if isinstance(value, int | float):
         return value * factor
-    words = str(value).split()
+    arguments = str(value).split()
     try:
-        return " ".join([repr(float(words[0]) * factor), *words[1:]])
+        return " ".join([repr(float(arguments[0]) * factor), *arguments[1:]])
     except (IndexError, ValueError):
         return f"{value}{value}"
 

@@ -174,8 +174,8 @@ def test_slices_are_at_the_nearest_values(folder, capsys, tmp_path, monkeypatch)
     drawn = dict(figures)
     assert titles(drawn["plane_stable"]) == [r"$d = 1$,  $\delta = 0.1$"]
     assert titles(drawn["devices_stiffness_max"]) == ["heavy"]
-    words = ["figures", folder / "plane.zarr", "--at", "delta=0.12", "--at", "d=1", "--out", tmp_path, "--json"]
-    assert run_main(*words) == 0
+    arguments = ["figures", folder / "plane.zarr", "--at", "delta=0.12", "--at", "d=1", "--out", tmp_path, "--json"]
+    assert run_main(*arguments) == 0
     assert len(json.loads(capsys.readouterr().out)["files"]) == 8
     assert all(file.stat().st_size > 1000 for file in tmp_path.iterdir())
 

@@ -114,10 +114,10 @@ def test_remaining_axes_are_chosen_automatically(folder):
 def test_files_have_the_given_format_size_and_style(folder, tmp_path, capsys):
     sheet = tmp_path / "mine.mplstyle"
     sheet.write_text("lines.linewidth: 4\n", encoding="utf-8")
-    words = ["--at", "delay=0", "--at", "damping=1", "--style", sheet]
-    words += ["--format", "png", "--format", "pdf", "--dpi", "50", "--size", "6x3"]
+    arguments = ["--at", "delay=0", "--at", "damping=1", "--style", sheet]
+    arguments += ["--format", "png", "--format", "pdf", "--dpi", "50", "--size", "6x3"]
     before = dict(matplotlib.rcParams)
-    assert run_main("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
+    assert run_main("figures", folder / "ridge.zarr", *arguments, "--out", tmp_path / "out") == 0
     assert dict(matplotlib.rcParams) == before
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [
         "ridge_stiffness_max.pdf",
@@ -126,7 +126,7 @@ def test_files_have_the_given_format_size_and_style(folder, tmp_path, capsys):
     assert imread(tmp_path / "out" / "ridge_stiffness_max.png").shape[:2] == (150, 300)
     assert (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes().startswith(b"%PDF")
     first = (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes()
-    assert run_main("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
+    assert run_main("figures", folder / "ridge.zarr", *arguments, "--out", tmp_path / "out") == 0
     assert (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes() == first
     with draw.style_sheet(sheet):
         (ax,) = draw_curves(open_dataset(folder / "ridge.zarr").isel(delay=0, damping=0), "stiffness_max", x="rate")
@@ -135,7 +135,7 @@ def test_files_have_the_given_format_size_and_style(folder, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "words, message",
+    "arguments, message",
     [
         (["--size", "7"], "got '7'; write width x height"),
         (["--size", "0x4"], "got '0x4'; write width x height"),
@@ -145,8 +145,8 @@ def test_files_have_the_given_format_size_and_style(folder, tmp_path, capsys):
         (["--style", "no/such.mplstyle"], "style: no/such.mplstyle: No such file"),
     ],
 )
-def test_invalid_figure_options_raise(folder, tmp_path, capsys, words, message):
-    assert run_main("figures", folder, *words, "--out", tmp_path / "out") == 2
+def test_invalid_figure_options_raise(folder, tmp_path, capsys, arguments, message):
+    assert run_main("figures", folder, *arguments, "--out", tmp_path / "out") == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

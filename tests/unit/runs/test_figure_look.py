@@ -37,15 +37,15 @@ def test_resolution_is_set_by_configuration_or_command(tmp_path):
     for look, options in (({}, []), ({"dpi": 90}, []), ({}, ["--dpi", "360"]), ({"dpi": 90}, ["--dpi", "360"])):
         file, out = tmp_path / "c.json", tmp_path / f"r{len(widths)}"
         file.with_suffix(".yaml").write_text(json.dumps({**CONFIG, "figure": look}), encoding="utf-8")
-        done = CliRunner().invoke(cli, ["run", str(file.with_suffix(".yaml")), "--out", str(out), *options])
-        assert done.exit_code == 0, done.output
+        result = CliRunner().invoke(cli, ["run", str(file.with_suffix(".yaml")), "--out", str(out), *options])
+        assert result.exit_code == 0, result.output
         with Image.open(out / "best.png") as picture:
             widths.append(picture.width / picture.info["dpi"][0])
             assert round(picture.info["dpi"][0]) == (360 if options else look.get("dpi", 180))
     assert widths == pytest.approx(widths[:1] * 4, rel=0.01)
-    done = CliRunner().invoke(cli, ["figures", str(tmp_path / "r0")])
-    assert "contains no sweep" in str(done.exception)
-    assert "--overwrite --size 85mm --dpi 300" in str(done.exception)
+    result = CliRunner().invoke(cli, ["figures", str(tmp_path / "r0")])
+    assert "contains no sweep" in str(result.exception)
+    assert "--overwrite --size 85mm --dpi 300" in str(result.exception)
 
 
 def test_resuming_with_another_figure_format_raises(tmp_path):

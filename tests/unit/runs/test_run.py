@@ -226,7 +226,7 @@ def test_slow_study_reports_its_progress(tmp_path):
     device = {"mass": 0.1, "damping": 1, "period": 1e-3, "delay": 1e-3}
     study = {"kind": "filters", "name": "f", "device": device, "damping": [1, 10], "samples": [2, 3]}
     assert run({"version": 1, "name": "n", "studies": [study]}, out=tmp_path / "out", progress=events.append).ok
-    assert [event.parts for event in events] == [None, *((done, 6) for done in range(6)), None]
+    assert [event.parts for event in events] == [None, *((result, 6) for result in range(6)), None]
 
 
 def test_record_and_store_have_equal_configuration_hashes(config_with_sweep, tmp_path):

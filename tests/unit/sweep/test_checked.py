@@ -138,13 +138,13 @@ def test_random_damage_is_reported_or_repaired(finished, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "words", [["export", "--csv", "x.csv"], ["export", "--netcdf", "x.nc"], ["figures"], ["report"]]
+    "arguments", [["export", "--csv", "x.csv"], ["export", "--netcdf", "x.nc"], ["figures"], ["report"]]
 )
-def test_commands_report_damage_in_one_line(store, words, tmp_path, monkeypatch, capsys):
+def test_commands_report_damage_in_one_line(store, arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     file = chunk_file(store, "stable", 1)
     file.unlink()
-    assert run_main(words[0], store.parent, *words[1:]) == 2
+    assert run_main(arguments[0], store.parent, *arguments[1:]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f"Error: {store.parent / 'map.zarr'}{str(file)[len(str(store)) :]}: missing; " + (
         "'zwidth run CONFIG --resume' computes it again"

@@ -24,8 +24,8 @@ def run_script(tmp_path):
         "SCRATCH": "/scratch/of somebody",
         "SLURM_CPUS_PER_TASK": "16",
     }
-    done = subprocess.run(["bash", "-eu", "-c", script], env=environment, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
+    result = subprocess.run(["bash", "-eu", "-c", script], env=environment, capture_output=True, text=True, check=True)
+    return json.loads(result.stdout)
 
 
 def test_job_script_uses_the_allocated_processors(tmp_path):

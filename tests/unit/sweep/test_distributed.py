@@ -124,8 +124,8 @@ def start_cluster(folder):
     with open(folder / "log", "wb") as log:
         options = {"stdout": log, "stderr": log, "env": environment}
         started = [
-            subprocess.Popen([*python, *words], **options)
-            for words in (scheduler, [*worker, "--local-directory", folder])
+            subprocess.Popen([*python, *arguments], **options)
+            for arguments in (scheduler, [*worker, "--local-directory", folder])
         ]
         (folder / "pid").write_text(str(started[0].pid), encoding="utf-8")
         try:

@@ -97,8 +97,8 @@ def test_command_reports_a_locked_folder_with_exit_code_2(holder, tmp_path, caps
     before = read_values(out)
     process = holder(out)
     capsys.readouterr()
-    for words in (["--resume"], ["--overwrite"]):
-        assert run_main("run", path, "--out", out, *words) == 2
+    for arguments in (["--resume"], ["--overwrite"]):
+        assert run_main("run", path, "--out", out, *arguments) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"Error: out: {out}: another run is writing to this folder (process {process.pid} on ")
     # Commands that only read need no lock.

@@ -107,13 +107,13 @@ def test_interrupted_run_is_resumed_and_verified(folder, tmp_path):
     config = make_config(
         study("walls", {**AXES, **WALLS}, ("stable",), **FILTER), study("other", AXES, ("stiffness_max",), **FILTER)
     )
-    done = []
+    result = []
 
     def stop_after_one(path, family, index):
-        if done:
+        if result:
             raise KeyboardInterrupt
         perform(path, family, index)
-        done.append(family)
+        result.append(family)
 
     run_sweeps(config, tmp_path, perform=stop_after_one)
     assert zwidth.run(config, out=tmp_path, resume=True).ok

@@ -201,7 +201,7 @@ def test_progress_events_report_chunks_and_points(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change, key, words",
+    "change, key, arguments",
     [
         ({"axes": {**AXES, "d": [0, 0.5, 1, 3]}}, "axes.d[3]", "2.0, the configuration has 3.0"),
         ({"axes": {**AXES, "d": [0, 1]}}, "axes.d", "a list of 4 items, the configuration has a list of 2 items"),
@@ -209,14 +209,14 @@ def test_progress_events_report_chunks_and_points(tmp_path):
         ({"accuracy": 1e-3}, "accuracy", "1e-09, the configuration has 0.001"),
     ],
 )
-def test_resuming_with_another_configuration_raises(finished, change, key, words):
+def test_resuming_with_another_configuration_raises(finished, change, key, arguments):
     _, folder = finished
     before = list_status_files(folder)
     changed = make_config(study(**change))
     with pytest.raises(StoreError) as caught:
         run_sweeps(changed, folder, resume=True)
     assert f"studies[map].{key}: the run was created with" in str(caught.value)
-    assert words in str(caught.value)
+    assert arguments in str(caught.value)
     assert list_status_files(folder) == before
 
 
@@ -242,8 +242,8 @@ def test_only_damaged_chunks_are_reported_and_repaired(finished, tmp_path):
     assert not report.ok
     assert len(report.damaged) == 3
     text = "\n".join(report.damaged)
-    for words in ("stable is damaged", "status is damaged", "stable is missing"):
-        assert words in text
+    for arguments in ("stable is damaged", "status is damaged", "stable is missing"):
+        assert arguments in text
     result = run_sweeps(config, tmp_path, resume=True)
     assert sorted(f"map/{chunk}" for chunk in report.damaged) == sorted(result.repaired)
     assert result.computed == 3

@@ -18,20 +18,20 @@ def test_missing_bokeh_raises_with_the_install_command(monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == "bokeh"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "bokeh", None)
-    done = CliRunner().invoke(cli, ["explore", "--no-browser"])
-    assert isinstance(done.exception, InputError)
-    assert str(done.exception).endswith(("pip install 'zwidth[explore]'", "scripts/setup explore"))
+    result = CliRunner().invoke(cli, ["explore", "--no-browser"])
+    assert isinstance(result.exception, InputError)
+    assert str(result.exception).endswith(("pip install 'zwidth[explore]'", "scripts/setup explore"))
 
 
 def test_port_in_use_raises():
     pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        done = CliRunner().invoke(cli, ["explore", "--no-browser", "--port", str(taken.getsockname()[1])])
-    assert isinstance(done.exception, InputError)
-    assert "choose another" in str(done.exception)
+        result = CliRunner().invoke(cli, ["explore", "--no-browser", "--port", str(taken.getsockname()[1])])
+    assert isinstance(result.exception, InputError)
+    assert "choose another" in str(result.exception)
 
 
 def test_missing_file_raises():
-    done = CliRunner().invoke(cli, ["explore", "--no-browser", "nowhere.yaml"])
-    assert isinstance(done.exception, ConfigError)
-    assert "nowhere.yaml: no such file; check the path" in str(done.exception)
+    result = CliRunner().invoke(cli, ["explore", "--no-browser", "nowhere.yaml"])
+    assert isinstance(result.exception, ConfigError)
+    assert "nowhere.yaml: no such file; check the path" in str(result.exception)

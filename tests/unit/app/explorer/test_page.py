@@ -40,8 +40,8 @@ def test_text_at_rest_agrees_with_check(page, components):
     page.queue.work()
     options = ["--velocity-cutoff", "100"] if components else []
     device = ["--mass", "0.1", "--damping", "10", "--period", "1e-3", "--delay", "1e-3"]
-    done = CliRunner().invoke(cli, ["check", "--stiffness", "10e3", "--virtual-damping", "40", *device, *options])
-    assert page.texts["verdict"] + "\n" == done.stdout
+    result = CliRunner().invoke(cli, ["check", "--stiffness", "10e3", "--virtual-damping", "40", *device, *options])
+    assert page.texts["verdict"] + "\n" == result.stdout
     assert page.texts["busy"] is False
     assert len(page.sources["contours"].data["xs"]) > 3
     assert len(page.sources["passive"].data["x"]) > 3
@@ -194,11 +194,11 @@ def test_linear_device_is_shown_and_copied(tmp_path):
     system = zwidth.LinearDevice(([1900.0], [0.1, 191.0, 1900.0, 0.0]))
     expected = zwidth.Scene(system, zwidth.Timing(1e-3, 0.5e-3), zwidth.VirtualWall(5e3, 30.0))
     assert page.controls.scene == expected
-    done = CliRunner().invoke(
+    result = CliRunner().invoke(
         cli,
         "check --device '1900 / 0.1 191 1900 0' --period 1ms --delay 0.5ms --stiffness 5e3 --virtual-damping 30",
     )
-    assert page.texts["verdict"] + "\n" == done.stdout
+    assert page.texts["verdict"] + "\n" == result.stdout
     assert len(page.sources["step"].data["x"]) > 10
     assert len(page.sources["contact"].data["x"]) == 0
     assert "no body" in page.texts["contact_words"]

@@ -136,8 +136,8 @@ def test_gradients_without_compiler_agree_with_compiled_ones(x64):
 def test_first_gradient_compiles_no_kernel(x64, monkeypatch):
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
-        lambda event, duration_secs, **words: (
-            compiled.append(words.get("fun_name")) if "backend_compile" in event else None
+        lambda event, duration_secs, **arguments: (
+            compiled.append(arguments.get("fun_name")) if "backend_compile" in event else None
         )
     )
     try:
