@@ -48,7 +48,7 @@ def read_code(text: str) -> tuple[float, float]:
 
 
 def hand_over(seed: int, folder: Path, with_run: bool) -> Counter[str]:
-    """Fit one device and count what holds of its wall."""
+    """Fit one device and count the checks that its wall passes."""
     true, force, position = draw_hidden(seed)
     counts: Counter[str] = Counter(devices=1)
     try:

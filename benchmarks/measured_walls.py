@@ -1,11 +1,11 @@
-"""How safe and how stiff the walls are that two records tell of a device nobody modeled.
+"""Measure safety and stiffness of walls recommended from two records of devices without a known modeled.
 
     .venv/bin/python benchmarks/measured_walls.py [DEVICES] [FIRST]
 
-Random devices, rigid, behind an amplifier, with one or two resonances of 0.5 to 10 % damping, with encoders of 1 to 40
-um and a force limit, are simulated exactly (`tests/oracles/measured_devices.py`). For each the record of
-`zwidth.excite` is played, `zwidth.respond` finds the response, and the stiffest safe wall is judged by eigenvalues of
-the true closed loop. What is said of 300 devices stands in ``results/measured_walls.md``.
+Random devices are simulated exactly (`tests/oracles/measured_devices.py`): rigid, with an amplifier lag, or with one or
+two resonances of 0.5 to 10 % damping, with encoders of 1 to 40 um and a force limit. Each device is excited by the
+signal of `zwidth.excite`, `zwidth.respond` estimates the response, and the stiffest safe wall is checked by eigenvalues
+of the true closed loop. Results for 300 devices are in ``results/measured_walls.md``.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def describe(trials: list[Trial]) -> list[str]:
-    """A table of both records."""
+    """Return the lines of a table of both records."""
     both = [
         ([trial.stable[turn] for trial in trials], np.array([trial.share[turn] for trial in trials])) for turn in (0, 1)
     ]

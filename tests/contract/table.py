@@ -1,4 +1,4 @@
-"""The contract as a page: what every public function promises, and which test holds it to that."""
+"""Generator of docs/contract.md: what every public function guarantees, and which tests check it."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ Domains of finite arguments:
 """
 
 
-def page() -> str:
-    """The whole page."""
+def build_page() -> str:
+    """Text of the page."""
     rows = "".join(_row(case) for case in CASES)
     elsewhere = ", ".join(f"`{case.name}`" for case in CASES if case.gradient_in)
-    domains = "".join(f"| {name} | {said} |\n" for name, said in DOMAINS.items())
+    domains = "".join(f"| {name} | {description} |\n" for name, description in DOMAINS.items())
     number = sum(1 for case in EVERY_CASE for _ in combinations(case))
     head = _HEAD.format(elsewhere=elsewhere, domains=domains, combinations=number)
-    others = "".join(f"| `{name}` | {why} |\n" for name, why in sorted(OTHERS.items()))
-    rest = "Functions that do not compute arrays point by point, and functions that compile even for numbers:"
-    return f"{head}{rows}\n{rest}\n\n| function | arguments, and tests of the contract |\n|---|---|\n{others}"
+    others = "".join(f"| `{name}` | {tests} |\n" for name, tests in sorted(OTHERS.items()))
+    others_heading = "Functions that do not compute arrays point by point, and functions that compile even for numbers:"
+    return f"{head}{rows}\n{others_heading}\n\n| function | arguments, and tests of the contract |\n|---|---|\n{others}"
 
 
 def _row(case: Case) -> str:
