@@ -23,10 +23,10 @@ from measured_devices import KINDS, Trial, measure
 RESULT = Path(__file__).parent / "results" / "measured_walls.md"
 ROWS = {
     "safe walls that are unstable on the true device": lambda stable, share: f"{stable.count(False)}",
-    "undecided": lambda stable, share: f"{stable.count(None)}",
-    "stiffness of the safe wall over K_max of the true device, median": lambda stable, share: f"{np.median(share):.3f}",
-    "a tenth of the devices below": lambda stable, share: f"{np.quantile(share, 0.1):.3f}",
-    "at least 0.8": lambda stable, share: f"{np.mean(share >= 0.8):.1%}",
+    "devices without a safe wall": lambda stable, share: f"{stable.count(None)}",
+    "stiffness of the safe wall, divided by K_max of the true device: median": lambda stable, share: f"{np.median(share):.3f}",
+    "the same ratio: 10 % quantile": lambda stable, share: f"{np.quantile(share, 0.1):.3f}",
+    "devices with a ratio of at least 0.8": lambda stable, share: f"{np.mean(share >= 0.8):.1%}",
 }
 
 
@@ -40,11 +40,11 @@ def main() -> None:
     missed = np.mean([trial.outside for trial in trials])
     gap = np.median([abs(trial.promised - trial.share[1]) for trial in trials])
     text = [
-        f"Of {count} devices:\n",
+        f"The table contains the results for {count} devices:\n",
         *describe(trials),
         "",
-        f"What the second record was said to tell and what it told are {gap:.1%} of K_max apart in the median, and",
-        f"{missed:.1e} of all lines lie outside of their band.",
+        "The prediction of the safe wall before the second record differs from the safe wall after the second record by",
+        f"{gap:.1%} of K_max (median). A fraction of {missed:.1e} of the true responses at the lines is outside the error band.",
     ]
     print(*text, sep="\n")
     if len(sys.argv) == 1:
