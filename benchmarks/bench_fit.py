@@ -332,8 +332,8 @@ def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
         f"than 5 standard errors: {len(wrong)} of {len(sure)}.",
         f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}.",
         f"The median stiffness of a safe wall, divided by K_max of the true device, is {spread}.",
-        "Safe walls are softer than K_max, because a log cannot exclude all resonances. The devices of this test have no",
-        "resonances.",
+        "Safe walls are softer than K_max, because a log cannot exclude all resonances. The devices of this test have",
+        "no resonances.",
     ])  # fmt: skip
 
 
@@ -353,7 +353,7 @@ def report(count: int, parts: int, processes: int) -> str:
     lines = [
         "# Accuracy of fits to logs",
         "",
-        "Written by `benchmarks/bench_fit.py --write docs/fitting.md`.",
+        "The command `benchmarks/bench_fit.py --write docs/fitting.md` writes this page.",
         "",
         f"{count:,} random logs of 1,000 to 5,000 samples are fitted. The rigid devices have masses of 30 g to 1 kg",
         "and integer or fractional delays of 0 to 5 periods. The range of motion is 300 to 100,000 encoder steps,",

@@ -34,7 +34,7 @@ SOFTER = np.array([0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0])
 INTRODUCTION = """\
 # Accuracy of fits to walls at the onset of instability
 
-Written by `benchmarks/bench_onsets.py --write docs/onsets.md`.
+The command `benchmarks/bench_onsets.py --write docs/onsets.md` writes this page.
 
 `zwidth.fit_buzz` fits a rigid device to walls at the onset of instability. This benchmark simulates random devices.
 For each rigid device, four walls are measured. All other devices have an actuator lag of 0.1 to 1 ms, one or two

@@ -24,7 +24,9 @@ RESULT = Path(__file__).parent / "results" / "measured_walls.md"
 ROWS = {
     "safe walls that are unstable on the true device": lambda stable, share: f"{stable.count(False)}",
     "devices without a safe wall": lambda stable, share: f"{stable.count(None)}",
-    "stiffness of the safe wall, divided by K_max of the true device: median": lambda stable, share: f"{np.median(share):.3f}",
+    "stiffness of the safe wall, divided by K_max of the true device: median": lambda stable, share: (
+        f"{np.median(share):.3f}"
+    ),
     "the same ratio: 10 % quantile": lambda stable, share: f"{np.quantile(share, 0.1):.3f}",
     "devices with a ratio of at least 0.8": lambda stable, share: f"{np.mean(share >= 0.8):.1%}",
 }
@@ -43,8 +45,9 @@ def main() -> None:
         f"The table contains the results for {count} devices:\n",
         *describe(trials),
         "",
-        "The prediction of the safe wall before the second record differs from the safe wall after the second record by",
-        f"{gap:.1%} of K_max (median). A fraction of {missed:.1e} of the true responses at the lines is outside the error band.",
+        "The prediction of the safe wall before the second record differs from the safe wall after the second record",
+        f"by {gap:.1%} of K_max (median). A fraction of {missed:.1e} of the true responses at the lines is outside the",
+        "error band.",
     ]
     print(*text, sep="\n")
     if len(sys.argv) == 1:

@@ -30,7 +30,7 @@ def find_handle(shoulder: float, elbow: float) -> tuple[float, float]:
 
 def make_table() -> str:
     """The text of the file."""
-    lines = ["# Written by scripts/make_arm.py: mass and damping at the handle of a two-link arm, for a wall perpendicular to x.",
+    lines = ["# Written by scripts/make_arm.py: mass and damping at the handle, for a wall perpendicular to x.",
              "shoulder [deg],elbow [deg],mass [g],damping [N s/m]"]  # fmt: skip
     for elbow in ELBOWS:
         for shoulder in SHOULDERS:

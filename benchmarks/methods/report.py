@@ -55,8 +55,8 @@ def markdown(rows: Sequence[Row]) -> str:
     """Tables for people: speeds as multiples of batched NumPy eigenvalues in the same run."""
     here = environment()
     lines = [
-        f"All results were measured in one run on {here['cores']} cores ({here['processor']}) with JAX {here['jax']} and",
-        f"NumPy {here['numpy']}.",
+        f"All results were measured in one run on {here['cores']} cores ({here['processor']}) with JAX {here['jax']}",
+        f"and NumPy {here['numpy']}.",
         "",
         "| column | content |",
         "|---|---|",
@@ -65,10 +65,10 @@ def markdown(rows: Sequence[Row]) -> str:
         "| first call | additional time of the first call, mainly for compilation |",
         "| worst error | defined below; `none of N`: no error among N tested points |",
         "",
-        "The error of a stability label is measured on walls at relative distances of 1e-15 to 1e-3 from the boundary. The",
-        "labels are compared with ball arithmetic, and the worst error is the largest relative distance in alpha of a wall",
-        "with a wrong label. The worst error of all other results is the largest relative error, compared with results of at",
-        "least 40 digits. For passivity, it is the error of the required damping.",
+        "The error of a stability label is measured on walls at relative distances of 1e-15 to 1e-3 from the boundary.",
+        "The labels are compared with ball arithmetic, and the worst error is the largest relative distance in alpha",
+        "of a wall with a wrong label. The worst error of all other results is the largest relative error, compared with",
+        "results of at least 40 digits. For passivity, it is the error of the required damping.",
         "",
     ]
     lines += _questions(rows)

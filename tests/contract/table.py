@@ -57,8 +57,8 @@ def page() -> str:
     others = "".join(f"| `{name}` | {why} |\n" for name, why in sorted(OTHERS.items()))
     rest = (
         "The following functions are not covered by the tests above, because they do not compute their results\n"
-        "elementwise, or because they compile JAX code even if all arguments are numbers. The second column contains the\n"
-        "argument of each function, and the file that tests the function."
+        "elementwise, or because they compile JAX code even if all arguments are numbers. The second column contains\n"
+        "the argument of each function, and the file that tests the function."
     )
     return f"{head}{rows}\n{rest}\n\n| function | argument, and file with its tests |\n|---|---|\n{others}"
 

@@ -47,8 +47,9 @@ _LIMITS = "--resolution '20 um' --friction '50 mN'"
 def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
     """Find the cause of a device's oscillation on a wall, and the changes that stop it.
 
-    Possible causes: linear instability, steps of the encoder, limits of the motor. Required: --stiffness, --mass (or
-    --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies parameters not given as options.
+    Possible causes are instability of the linear loop, the steps of the encoder, and the limits of the motor. The
+    options --stiffness, --mass (or --device) and --rate (or --period) are required. Parameters that are not given as
+    options are taken from SCENE.yaml (or from the folder of a run).
     """
     from zwidth.analysis.diagnosis import diagnose as find_cause
 

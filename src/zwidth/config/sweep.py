@@ -188,7 +188,7 @@ OutputName = Annotated[str, GetPydanticSchema(lambda _, handler: handler.generat
 
 
 _SCENE = "that of the scene"
-_Parts: Any = make_parts_base(_SCENE, _SCENE, " Its keys may be axes, with its name and a dot.")
+_Parts: Any = make_parts_base(_SCENE, _SCENE, " Its keys can be axes of the sweep (see the table of axes).")
 
 
 @register
