@@ -67,8 +67,8 @@ def markdown(rows: Sequence[Row]) -> str:
         "",
         "The error of a stability label is measured on walls at relative distances of 1e-15 to 1e-3 from the boundary.",
         "The labels are compared with ball arithmetic, and the worst error is the largest relative distance in alpha",
-        "of a wall with a wrong label. The worst error of all other results is the largest relative error, compared with",
-        "results of at least 40 digits. For passivity, it is the error of the required damping.",
+        "of a wall with a wrong label. The worst error of all other results is the largest relative error, compared",
+        "with results of at least 40 digits. For passivity, it is the error of the required damping.",
         "",
     ]
     lines += _questions(rows)
