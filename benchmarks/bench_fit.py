@@ -328,9 +328,9 @@ def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
     return "\n".join([
         f"Logs for which the fit ends with an error: {len(rows) - len(fitted)}. Fits with a warning: {doubted}.",
         f"Fits with a status other than OK: {troubled}. {spell_widths(fitted)}",
-        "Fits without a warning and with the status OK in which an estimate differs from the true value by more",
-        f"than 5 standard errors: {len(wrong)} of {len(sure)}.",
-        f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}.",
+        f"In {len(wrong)} of {len(sure)} fits without a warning and with the status OK, an estimate differs from the",
+        "true value by more than 5 standard errors.",
+        f"On the true device, {sum(safe)} of {len(safe)} safe walls are stable.",
         f"The median stiffness of a safe wall, divided by K_max of the true device, is {spread}.",
         "Safe walls are softer than K_max, because a log cannot exclude all resonances. The devices of this test have",
         "no resonances.",

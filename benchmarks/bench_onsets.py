@@ -173,7 +173,7 @@ def report(rigid: int, others: int, processes: int) -> str:
         if row.get("safe") is False or row.get("advised") is False or row.get("held") is False:
             print(row)
     advised = [row["advised"] for row in rows if row.get("advised") is not None]
-    stable = f"Recommended walls that are stable on the true device: {sum(advised)} of {len(advised)}."
+    stable = f"On the true device, {sum(advised)} of {len(advised)} recommended walls are stable."
     return "\n".join([INTRODUCTION, *tabulate(rows), "", stable, ""])
 
 

@@ -80,7 +80,8 @@ def list_configuration() -> str:
         parts += _describe_model(name, models)
     for kind, name in studies.items():
         model = models[name]
-        parts += [f"## kind: {kind}", _join_lines(model["description"]), _describe_keys(model, models)]
+        description = re.sub("^The ", "the ", _join_lines(model["description"]))
+        parts += [f"## kind: {kind}", f"This study computes {description}", _describe_keys(model, models)]
         if kind in examples:
             file, study = examples[kind]
             text = yaml.safe_dump([study], sort_keys=False, allow_unicode=True, width=100).strip()

@@ -240,9 +240,9 @@ def excite(
 ) -> None:
     """Design the force to play before `zwidth respond`, or the torque if the units are those of a rotary device.
 
-    The options --rate (or --period), --force and --resolution are required. If they are omitted, the command uses the
-    sampling period, `max_force` and `resolution` of SCENE.yaml (or of the folder of a run). It also uses the velocity
-    estimate of this file and, instead of --response, a measured device of this file.
+    The sampling period, the largest force and the encoder step are required. Values that are not given as options
+    (--rate or --period, --force, --resolution) are taken from the scene of SCENE.yaml (or of the folder of a run). The
+    velocity estimate and a measured device (instead of --response) are also taken from this scene.
     """
     hardware = get_hardware()
     options: dict[str, Any] = {"period": loop.known_period, "force": force or hardware.get("max_force")}

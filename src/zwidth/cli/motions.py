@@ -90,9 +90,9 @@ def simulate(
     """Simulate a hit on a wall, a constant push, or the release of the device from inside the wall.
 
     In a hit the wall is unilateral; otherwise it is bilateral. Without --hit, --push and --hold the device is released
-    at a depth of 1 mm (1 mrad if rotary), or of 50 encoder steps if --resolution is given. Required: --stiffness,
-    --mass (or --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies parameters not given as
-    options.
+    at a depth of 1 mm (1 mrad if rotary), or of 50 encoder steps if --resolution is given. The options --stiffness,
+    --mass (or --device) and --rate (or --period) are required. Parameters that are not given as options are taken from
+    SCENE.yaml (or from the folder of a run).
     """
     from zwidth.analysis.diagnosis import diagnose as find_cause
     from zwidth.simulation.behavior import describe_ending
