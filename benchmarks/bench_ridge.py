@@ -25,7 +25,7 @@ import optimistix
 
 import zwidth
 from methods.clock import time_calls
-from zwidth.stability.rigid.polynomial import build_frequency_loop, find_boundary_wall
+from zwidth.stability.reference import build_loop, solve_wall
 from zwidth.stability.rigid.ridge import ridge_kernel
 
 REFERENCE = Path(__file__).resolve().parents[1] / "tests" / "reference" / "ridge_extended.json"
@@ -54,8 +54,8 @@ def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
     """Return alpha_max by optimistix' Newton method for a zero derivative of the closed form; smooth optima only."""
 
     def slope(omega: jax.Array, point: tuple[jax.Array, jax.Array]) -> jax.Array:
-        loop = build_frequency_loop(*point)
-        return jax.grad(lambda w: find_boundary_wall(w, loop).alpha)(omega)
+        loop = build_loop(*point)
+        return jax.grad(lambda w: solve_wall(w, loop)[0])(omega)
 
     # As good a start as the fast route has, which fits s = sin(omega/2): within 4 %.
     u, t = 1.0 / (d + 1.0), delta * (d + 1.0) / (delta * (d + 1.0) + 3.0)
@@ -64,7 +64,7 @@ def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
     omega = optimistix.root_find(
         slope, solver, jax.lax.stop_gradient(start), args=(delta, d), max_steps=16, throw=False
     ).value
-    return find_boundary_wall(omega, build_frequency_loop(delta, d)).alpha
+    return solve_wall(omega, build_loop(delta, d))[0]
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, float]:

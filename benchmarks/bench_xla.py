@@ -23,7 +23,7 @@ from zwidth.core import xp
 from zwidth.numerics import blocks, evaluate
 from zwidth.numerics.held_mass import ANY
 from zwidth.stability.rigid import characteristic_function as pole_step
-from zwidth.stability.rigid import crossover, exact_points, ridge, ridge_newton
+from zwidth.stability.rigid import crossover, ridge, ridge_newton
 from zwidth.stability.rigid import dominant_pole_search as radius
 from zwidth.stability.rigid import pole_count as circle
 
@@ -64,7 +64,7 @@ def compiled(kernel: Callable[..., Any], options: dict[str, Any] | None = None, 
 @contextmanager
 def replaced(names: dict[str, Any]) -> Iterator[None]:
     """Other functions in place of those of a module, while something is traced."""
-    modules = {"crossover": crossover, "kkt": exact_points, "newton": ridge_newton}
+    modules = {"crossover": crossover, "newton": ridge_newton}
     modules |= {"circle": circle, "radius": radius, "step": pole_step}
     patches = [patch.object(modules[name.split("__")[0]], name.split("__")[1], value) for name, value in names.items()]
     for each in patches:
@@ -102,32 +102,27 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     def quick(*walls: Any) -> Any:
         return radius.quick_kernel(*walls, 1e-9, True)  # pyright: ignore
 
-    def point(a: Any, b: Any) -> Any:
-        return exact_points.kkt_kernel(a, b)
-
     def top(a: Any, b: Any) -> Any:
         return ridge.ridge_kernel(a, b, ANY)
 
     wide = xp.filter_options(xp.WIDE)
     yield "WIDE, radius", compiled(quick, wide), compiled(quick), columns
     yield "WIDE, verdict", compiled(stable, wide), compiled(stable), columns
-    few = (delta[:8192], d[:8192])
-    yield (
-        "materialize, ridge kkt",
-        compiled(point),
-        compiled(point, kkt__store_once=same, newton__store_once=same),
-        few,
-    )
-    yield "materialize, ridge", compiled(top), compiled(top, newton__store_once=same), (delta, d)
+    yield "materialize, ridge", compiled(top), compiled(top, newton__materialize=same), (delta, d)
     yield "angle, alone", compiled(xp.angle), compiled(their_angle), (alpha - 1.0, beta)
-    other = {"circle__angle": their_angle, "circle__find_turn": their_turn, "radius__angle": their_angle}
+    other = {"circle__angle": their_angle, "circle__invert_haversine": their_turn, "radius__angle": their_angle}
     yield "angle and invert_haversine, radius", compiled(quick, wide), compiled(quick, wide, **other), columns
     by_rule, alone = slopes()
     yield "custom_jvp, gradient of ridge", lambda: by_rule, lambda: alone, (delta, d)
     million = tuple(np.tile(np.asarray(column), 16) for column in (delta, d))
     ridges = evaluate.compile_traced(ridge.ridge_kernel, (ANY,))
     yield "BLOCK, ridge of a million", in_blocks(ridges, 1 << 16), in_blocks(ridges, 1 << 20), million
-    yield "sine series, radius", compiled(quick, wide), compiled(quick, wide, step___half_turn=their_half_turn), columns
+    yield (
+        "sine series, radius",
+        compiled(quick, wide),
+        compiled(quick, wide, step___sine_and_cosine=their_half_turn),
+        columns,
+    )
 
 
 def in_blocks(function: Callable[..., Any], size: int) -> Make:

@@ -45,9 +45,8 @@ def main() -> None:
         f"The table contains the results for {count} devices:\n",
         *describe(trials),
         "",
-        "The prediction of the safe wall before the second record differs from the safe wall after the second record",
-        f"by {gap:.1%} of K_max (median). A fraction of {missed:.1e} of the true responses at the lines is outside the",
-        "error band.",
+        f"The predicted and the actual safe stiffness of the second record differ by {gap:.1%} of K_max in the median.",
+        f"The true response is outside the error band at {missed:.1e} of all frequencies.",
     ]
     print(*text, sep="\n")
     if len(sys.argv) == 1:

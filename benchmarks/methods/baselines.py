@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from methods.problems import Walls
-from zwidth.stability.rigid.polynomial import char_poly
+from zwidth.stability.rigid.poles import char_poly
 
 
 class Baseline(NamedTuple):

@@ -84,8 +84,8 @@ from .stability.rigid.normalization import normalize as normalize
 from .stability.rigid.passivity import is_passive as is_passive
 from .stability.rigid.passivity import passive_area as passive_area
 from .stability.rigid.passivity import passivity_margin as passivity_margin
+from .stability.rigid.poles import char_poly as char_poly
 from .stability.rigid.poles import poles as poles
-from .stability.rigid.polynomial import char_poly as char_poly
 from .stability.rigid.ridge import alpha_max as alpha_max
 from .stability.rigid.ridge import stiffness_slope as stiffness_slope
 from .stability.rigid.spectral_radius import decay_rate as decay_rate

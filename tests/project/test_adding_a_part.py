@@ -63,7 +63,7 @@ EDITS = {
         )
     },
     "__init__.pyi": {
-        "from .parts.operator": "from .parts.mount import Mount as Mount\nfrom .parts.operator",
+        "from .model.operator": "from .model.mount import Mount as Mount\nfrom .model.operator",
     },
 }
 
@@ -128,7 +128,7 @@ def copied(tmp_path_factory):
     folder = tmp_path_factory.mktemp("copy")
     package = folder / "zwidth"
     shutil.copytree(ROOT / "src" / "zwidth", package, ignore=shutil.ignore_patterns("__pycache__"))
-    (package / "parts" / "mount.py").write_text(MOUNT, encoding="utf-8")
+    (package / "model" / "mount.py").write_text(MOUNT, encoding="utf-8")
     for file, edits in EDITS.items():
         text = (package / file).read_text(encoding="utf-8")
         for old, new in edits.items():
@@ -136,7 +136,7 @@ def copied(tmp_path_factory):
             text = text.replace(old, new)
         (package / file).write_text(text, encoding="utf-8")
     (folder / "mounted.yaml").write_text(CONFIGURATION, encoding="utf-8")
-    wrong = CONFIGURATION.replace("stiffness: 0.135 N/mm, damping: 6", "stiffness: 0, dampin: 6")
+    wrong = CONFIGURATION.replace("stiffness: 0.135 N/mm, damping: 6", "stiffness: 0, dampin: 6")  # codespell:ignore
     (folder / "wrong.yaml").write_text(wrong, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     found = subprocess.run(

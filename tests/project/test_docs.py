@@ -123,7 +123,7 @@ def test_a_section_ends_where_the_next_one_begins(refresh_docs):
     assert "###" not in found
 
 
-@pytest.mark.parametrize("module", ["", "figures"])
+@pytest.mark.parametrize("module", ["", "plotting"])
 def test_every_public_name_stands_once_in_the_reference(module):
     stub = (ROOT / "src" / "zwidth" / module / "__init__.pyi").read_text(encoding="utf-8")
     public = re.findall(r"^from .* as (\w+)$", stub, re.MULTILINE)

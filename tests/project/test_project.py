@@ -127,7 +127,7 @@ def test_no_file_names(what):
 
 
 def test_scripts_can_be_executed():
-    scripts = [*(ROOT / "scripts").iterdir(), ROOT / ".ci" / "run"]
+    scripts = [*(path for path in (ROOT / "scripts").iterdir() if path.suffix != ".txt"), ROOT / ".ci" / "run"]
     assert [path.name for path in scripts if path.is_file() and not os.access(path, os.X_OK)] == []
 
 

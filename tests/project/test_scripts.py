@@ -141,15 +141,15 @@ def test_every_processor_is_tried_even_when_one_fails(project):
 
 
 STEPS = ("scripts/setup", "scripts/test", "scripts/test-processors", "scripts/test-package", "scripts/test-versions")
-TOOLS = (".venv/bin/ruff", ".venv/bin/lint-imports", ".venv/bin/pyright", "bin/chromium")
+TOOLS = tuple(f".venv/bin/{name}" for name in ("codespell", "lint-imports", "pyright", "python", "ruff"))
 
 
-@pytest.mark.parametrize("failing", [(), ("pyright",), ("test", "test-versions")])
+@pytest.mark.parametrize("failing", [(), ("pyright",), ("codespell",), ("test", "test-versions")])
 def test_every_step_of_the_checks_runs_even_when_others_fail(tmp_path, failing):
     (tmp_path / ".ci").mkdir()
     shutil.copy(ROOT / ".ci" / "run", tmp_path / ".ci")
     calls = tmp_path / "calls"
-    for name in (*STEPS, *TOOLS):
+    for name in (*STEPS, *TOOLS, "bin/chromium"):
         last = Path(name).name
         stand_in(tmp_path / name, calls, f"echo 'this is {last}'\n{'exit 3' if last in failing else ''}\n")
     done = subprocess.run(
@@ -162,14 +162,15 @@ def test_every_step_of_the_checks_runs_even_when_others_fail(tmp_path, failing):
     )
     called = calls.read_text(encoding="utf-8").splitlines()
     assert called[0] == "setup test dev"
-    tools = ["lint-imports ", "pyright ", "ruff check", "ruff format --check"]
+    tools = ["lint-imports ", "pyright ", "python scripts/check_prose.py", "ruff check", "ruff format --check"]
     tests = ["test ", "test-package ", "test-processors ", "test-versions oldest"]
-    assert sorted(called[1:]) == tools + tests
+    spelling = "codespell README.md CONTRIBUTING.md CHANGELOG.md benchmarks configs docs scripts src tests"
+    assert sorted(called[1:]) == [spelling, *tools, *tests]
     # What runs beside the tests is told as well.
-    assert all(f"this is {Path(name).name}" in done.stdout for name in (*STEPS, *TOOLS) if "chromium" not in name)
+    assert all(f"this is {Path(name).name}" in done.stdout for name in (*STEPS, *TOOLS))
     assert done.returncode == (1 if failing else 0)
-    assert done.stdout.count("FAILED (exit 3)") == len(failing)
+    assert done.stdout.count("FAILED (exit ") == len(failing)
     last = done.stdout.splitlines()[-1]
-    names = {"pyright": "types", "test": "tests", "test-versions": "oldest versions"}
+    names = {"codespell": "prose", "pyright": "types", "test": "tests", "test-versions": "oldest versions"}
     told = set(last.removeprefix("==> failed: ").split(",")) if failing else last
     assert told == ({names[name] for name in failing} if failing else "==> all steps passed")

@@ -15,6 +15,7 @@ import zwidth
 from zwidth.core import types as _types
 from zwidth.core.types import Reals, Roots
 from zwidth.numerics.polynomials import companion
+from zwidth.stability.reference import compute_poles, compute_radii, expand_loop, expand_polynomial
 from zwidth.stability.rigid.boundary import sample_lobe
 from zwidth.stability.rigid.broadcasting import find_degree
 from zwidth.stability.rigid.poles import (
@@ -23,12 +24,6 @@ from zwidth.stability.rigid.poles import (
     factor_with_pole_axis,
     pole_kernel,
     radius_by_companion,
-)
-from zwidth.stability.rigid.polynomial import (
-    build_frequency_loop,
-    compute_coefficients,
-    expand_affine,
-    find_boundary_wall,
 )
 from zwidth.stability.rigid.step_response import step_response
 
@@ -41,7 +36,7 @@ GRID = dict(zip(WALL, np.broadcast_arrays(*WALL.values()), strict=True))
 DEVICE = {"delta": GRID["delta"], "d": np.full((2, 3), 1.5)}
 HALF = find_degree(1.5)
 KERNEL = {**GRID, **DEVICE, "degree": HALF}
-LOOP = build_frequency_loop(**DEVICE)
+COLUMNS = {name: np.ravel(value) if name != "degree" else value for name, value in KERNEL.items()}
 ROOTS_FIRST = np.moveaxis(pole_kernel(**KERNEL), -1, 0)
 
 CALLS = [
@@ -55,13 +50,14 @@ CALLS = [
     (zwidth.stable_region, {"delta": 0.1, "d": 1.0, "points": 20}),
     (sample_lobe, {"delta": 0.1, "d": 1.0, "points": 20}),
     (step_response, {"alpha": 0.1, "beta": 0.2, "delta": 0.1, "d": 1.0, "periods": 20}),
-    (expand_affine, {**DEVICE, "degree": HALF}),
-    (compute_coefficients, KERNEL),
-    (companion, {"monic": compute_coefficients(**KERNEL)}),
+    (expand_polynomial, {**DEVICE, "degree": HALF}),
+    (expand_loop, KERNEL),
+    (companion, {"monic": expand_loop(**KERNEL)}),
     (pole_kernel, KERNEL),
     (aberth_kernel, KERNEL),
     (compute_discs, {"z": ROOTS_FIRST, "loop": factor_with_pole_axis(**KERNEL), "degree": HALF}),
-    (find_boundary_wall, {"omega": np.full((2, 3), 0.3), "loop": LOOP}),
+    (compute_poles, COLUMNS),
+    (compute_radii, COLUMNS),
 ]
 
 

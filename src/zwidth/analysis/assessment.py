@@ -53,7 +53,7 @@ Intervals: TypeAlias = tuple[tuple[float, float], ...]
 @compact_repr(missing=_MISSING, **_UNITS)
 @dataclass(frozen=True)
 class Assessment:
-    """Results of `assess` for any scene, in SI units except for alpha, beta, delta and d; NaN if undefined."""
+    """Assessment of the wall of a scene, in SI units except for alpha, beta, delta and d; NaN for undefined values."""
 
     alpha: float  # normalized stiffness K T^2/m, with period T and the mass m that the force of the wall acts on
     beta: float  # normalized damping B T/m
@@ -118,7 +118,8 @@ def assess(scene: SceneOptima) -> Assessment:
         >>> verdict.stable, verdict.passive
         (True, False)
     """
-    # Compute the dominant pole first, because this step raises an error if the loop has too many poles.
+    # Compute the dominant pole before the other results, because this step raises an error if the loop has too many
+    # poles.
     dominant, period = scene.loop.find_dominant(float(scene.alpha), float(scene.beta)), scene.timing.period
     margins, best, has_condition = (
         scene.margins(),
@@ -159,7 +160,7 @@ def assess(scene: SceneOptima) -> Assessment:
 
 
 def name_kind(wall: StiffestWall) -> str:
-    """Return the `RidgeKind` of a stiffest wall in lower case, such as "smooth"; "none" if no wall is stable."""
+    """Return the kind of the optimum at a stiffest wall as a word, such as "smooth"; "none" if no such wall exists."""
     return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
 
 
@@ -178,8 +179,8 @@ def round_margin(
         decibel: True to return a gain margin in dB.
     """
     value = float(getattr(margins, name))
-    # Round up the gain margin of an unstable wall if it exceeds 1, and of a stable wall if it is below 1, i.e. if a
-    # reduction of the gain destabilizes this wall.
+    # The safe direction is down, with two exceptions: a gain margin above 1 of an unstable wall (the gain must be
+    # increased to stabilize it), and one below 1 of a stable wall (a reduction of the gain destabilizes it).
     outward = name == "gain_margin" and (value > 1.0) != bool(stable)
     return round_conservatively(20.0 * math.log10(value) if decibel else value, "above" if outward else "below", digits)
 
@@ -220,7 +221,7 @@ def assess_many(scenes: Iterable[SceneOptima] | Mapping[str, SceneOptima]) -> li
 
 
 def _build_record(name: str | int, scene: SceneOptima) -> dict[str, Any]:
-    """Return the dictionary of `assess_many` for one scene: its name, status, message, parameters and results."""
+    """Return a dictionary with the assessment of one scene: its name, status, message, parameters and results."""
     head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
     try:
         if not isinstance(scene, SceneOptima):
@@ -304,7 +305,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
 
 def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima], float]) -> list[Limit]:
-    """Return one `Limit` per improvement of a scene, sorted by gain: the largest first, NaN last.
+    """Return a list with one `Limit` per improvement of a scene, sorted by gain: the largest first, NaN last.
 
     Args:
         scene: the scene to improve.
@@ -320,7 +321,7 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
 
 
 def describe_islands(scene: SceneOptima) -> list[str]:
-    """Return one line of text per island of stable walls, and another if the device is unstable without a wall."""
+    """Return a list of texts: one per island of stable walls, and one if the device is unstable without a wall."""
     lines, system = [], scene.unit_system
     least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
     if least is not None:

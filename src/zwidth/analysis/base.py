@@ -90,7 +90,7 @@ class SceneParts(Part):
             )
 
     def _shift_parts(self) -> None:
-        """Correct the fields if positional arguments omit the wall: velocity estimate third, operator fourth."""
+        """Move the parts to their own fields if the positional arguments omit the wall."""
         estimate, fourth, hand = self.wall, self.velocity, self.operator
         if isinstance(fourth, Operator) and hand is None:
             hand = fourth
@@ -281,7 +281,7 @@ def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Col
 
 
 def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], traceable: bool) -> Callable[..., Result]:
-    """Wrap one method so that its result prints in the device's units; unless traceable, it refuses traced values."""
+    """Wrap a method: its result prints in the device's units, and values traced by JAX are refused unless traceable."""
 
     @wraps(method)
     def wrapped(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:

@@ -71,7 +71,7 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
 
 
 def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
-    """Return other requirements that may yield larger margins; the keys are the command-line options for them."""
+    """Return a dictionary of other requirements that may yield larger margins, keyed by their command-line options."""
     phase = max(DEFAULT_PHASE_MARGIN, wanted.phase_margin or 0.0)
     gain = max(DEFAULT_GAIN_MARGIN, wanted.gain_margin or 0.0)
     by_phase, by_gain = f"--phase-margin {phase:g}", f"--gain-margin {gain:g}"
@@ -84,7 +84,7 @@ def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
 
 
 def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[Any], bool], otherwise: str) -> str:
-    """Return a text with the first option that solves a problem of the wall, the new wall and its loss of stiffness.
+    """Return a text that states the first option that solves a problem of the wall, with the new wall and its cost.
 
     Args:
         recommendation: the recommendation whose wall has the problem.

@@ -47,7 +47,7 @@ FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in 
 )
 @dataclass(frozen=True)
 class Diagnosis:
-    """Result of `diagnose`: the cause of the sustained oscillation of a wall, and the remedies.
+    """The cause of a sustained oscillation of a device on a wall, and the remedies.
 
     Attributes:
         cause: cause of the oscillation. "instability": the linear loop is unstable. "quantization": the steps of the
@@ -155,7 +155,7 @@ def diagnose(
     max_rate: float | str = np.inf,
     remedies: bool = True,
 ) -> Diagnosis:
-    """Find the cause of a device's oscillation on a wall, and the changes that stop it.
+    """Find the cause of a sustained oscillation of a device on a wall, and the changes that stop it.
 
     First `zwidth.Scene.is_stable` decides the stability of the linear loop. Then the wall is simulated with encoder,
     friction and motor from several initial displacements, each without external force and with the worst constant one,

@@ -113,7 +113,7 @@ class RigidVariants(Variants):
 
     @staticmethod
     def evaluate(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
-        """Evaluate a function of arrays, in pieces if NumPy is then faster than code compiled by JAX.
+        """Evaluate a function of arrays; divide them into pieces if NumPy is then faster than code compiled by JAX.
 
         A function called with at most ``FEW`` elements runs in NumPy; with more elements JAX compiles it.
         """

@@ -92,7 +92,7 @@ class LinearLoop:
     @cached_property
     def chain(self) -> AnyChain:
         """Mechanical model of the device: masses, springs and dampers, or a linear system."""
-        # Raise an error with the name of a traced parameter, because the analyses need plain numbers.
+        # Raise an error that names a parameter traced by JAX, because these analyses need plain numbers.
         for path, value in list_parameters(self.scene).items():
             as_float64(path, value)
         return build_chain(self.scene)
@@ -143,7 +143,7 @@ class LinearLoop:
             method: "auto", "crossover", "companion" or "certified".
             exact: K and B in SI units, which the method "certified" uses instead of the rounded alpha and beta.
         """
-        # Pass zeros for delta and d, because the parts of the scene were checked when they were created.
+        # Pass zeros for delta and d, because the device and the delay were already checked when the scene was created.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         if method == "certified":
@@ -194,7 +194,7 @@ class LinearLoop:
         return find_stable_dampings(self.boundary, float(*nan_beyond(WALL_RANGE, alpha)))
 
     def find_damper_intervals(self) -> np.ndarray:
-        """Return the intervals of beta, shape (n, 2), in which a wall with alpha = 0 is stable but for a pole at z = 1.
+        """Return the intervals of beta, shape (n, 2), in which a wall with alpha = 0 is stable except for a pole at 1.
 
         This pole exists unless the device has a spring to ground; all other poles lie inside the unit circle.
         """
@@ -361,7 +361,8 @@ class RigidLoop(LinearLoop):
         delta, d = self.scene.delta, self.scene.d
         ridge = alpha_max(delta, d)
         xp, below = namespace(ridge.alpha), ridge.beta < 0
-        # Compute the stiffest wall with B = 0 only if the ridge has B < 0, or if a tracer hides the sign of B.
+        # Compute the stiffest wall with B = 0 only if the ridge has B < 0, or if JAX traces B, so that its sign is
+        # unknown.
         if negative or not (is_traced(below) or below):
             return ridge
         limit = boundary_point(delta, d, beta=0.0 * delta)

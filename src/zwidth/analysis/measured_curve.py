@@ -16,8 +16,8 @@ the chords from the point before and to the point after it, this holds (M4) if a
 
     |X|^2 > rho^2 |H|^2 + (|chord before|^2 + |chord after|^2)/4
 
-which is a quadratic inequality in alpha and beta. On a line of constant alpha or beta, the undecided walls are
-therefore a union of intervals in closed form (M9). All walls between two of these intervals have the same winding
+which is a quadratic inequality in alpha and beta. At a fixed alpha or beta, the undecided walls are therefore a union
+of intervals in closed form (M9). All walls between two of these intervals have the same winding
 number, which `DecidedWalls` computes for the wall in the middle. Quantities are in units of the period and of the mass
 of the scene.
 """
@@ -35,7 +35,7 @@ from zwidth.model.circle_functions import circle_points
 from zwidth.model.velocity import Estimate
 from zwidth.stability.linear.rows import arrange_by_line, collect_by_line
 
-# Constants of the interpolation between lines (docs/theory/measured.md, M5 and M6)
+# Constants of the interpolation between adjacent lines (docs/theory/measured.md, M5 and M6).
 LEAST_DAMPING_RATIO = 0.005  # smallest damping ratio zeta of a resonance between two lines (assumption A1)
 # Factor in the bound of a resonance between two lines: if its frequency f is in the middle of the interval of length d,
 # and it changes the second difference of S by D, the height of its peak in S is D d/(16/3 zeta f).
@@ -45,7 +45,7 @@ MAX_TURN = 0.5  # rad; if the phase changes by more between two lines, S may be 
 MAX_STEP = 0.005  # largest relative change of S, or of w^2, between two interpolated points
 MAX_POINTS = 32  # largest number of interpolated points between two lines
 
-# Constants of the bounds below the first and above the last line (docs/theory/measured.md, M7 and M8)
+# Constants of the bounds of |G| below the first and above the last line (docs/theory/measured.md, M7 and M8).
 PHASE_TOLERANCE = 0.8  # rad; largest deviation of the first line's phase from that of a mass, damper or spring
 N_FIRST = 4  # smallest number of lines from which the low-frequency asymptote is identified
 EXTRAPOLATION_FACTOR = 2.0  # ratio of the bound of |G| above the last line to the root mean square of |G| below it
@@ -101,15 +101,16 @@ class ResponseCurve:
         w = 2.0 * np.pi * device.frequency * period
         if w[-1] >= np.pi:
             raise InputError(
-                f"frequency: got {device.frequency[-1]:g} Hz at a period of {period:g} s; it must be less than half "
-                f"the rate, {0.5 / period:g} Hz: remove the lines above, or correct the period"
+                f"frequency: got {device.frequency[-1]:g} Hz at a period of {period:g} s; it must be below the "
+                f"Nyquist frequency, {0.5 / period:g} Hz: remove the higher frequencies, or correct the period"
             )
         G = device.response * stiffness
         r = np.zeros(w.size) if device.deviation is None else device.deviation * stiffness
         u = _compute_u(w)
         S, R = u * G, u * r
         E = _bound_gaps(w, S)
-        # Compute the relative change of S between adjacent lines, less the part that the errors of the lines may cause.
+        # Compute the relative change of S between adjacent lines, reduced by the change that the errors of the lines
+        # may cause.
         change = np.maximum(np.abs(np.diff(S)) - 2.0 * (R[1:] + R[:-1]), 0.0)
         change = change / (np.maximum(np.abs(S[1:]), np.abs(S[:-1])) + 1e-300)
         count = np.maximum(2.0 * np.diff(w) / w[1:], change) / MAX_STEP
@@ -126,7 +127,7 @@ class ResponseCurve:
         F = estimate.jet(circle_points(angles)).value
         band, gap = np.append(np.maximum(R[:-1], R[1:])[line], R[-1]), np.append(E[line], E[-1])
         starts = np.flatnonzero(share == 0)[1:]
-        # At a line use the larger of the bounds of both adjacent intervals, because the line is an end of both.
+        # At each line, use the larger of the bounds in the two adjacent intervals, because the line is an end of both.
         for values in (band, gap):
             values[starts] = np.maximum(values[starts], values[starts - 1])
         below, above = np.linspace(0.0, w[0], N_EXTRAPOLATED), np.linspace(w[-1], np.pi, N_EXTRAPOLATED)
@@ -144,10 +145,11 @@ def _compute_u(w: np.ndarray) -> np.ndarray:
 
 
 def _lacks_asymptote(w: np.ndarray, G: np.ndarray, r: np.ndarray) -> bool:
-    """Return whether the first line does not belong to a mass, a damper or a spring (assumption A2 fails).
+    """Return whether the response at the first line differs from that of a mass, a damper or a spring.
 
-    If |G| is proportional to w^p near the first line, the phase of G must be p pi/2, with p between -2 and 0. The
-    derivative of the phase detects a long delay, which may change the phase itself by a multiple of 2 pi.
+    Theory assumes such a low-frequency asymptote (A2). If |G| is proportional to w^p near the first line, the phase of
+    G must be p pi/2, with p between -2 and 0. The derivative of the phase detects a long delay, which may change the
+    phase itself by a multiple of 2 pi.
 
     Args:
         w: angles of the lines.
@@ -169,9 +171,9 @@ def _lacks_asymptote(w: np.ndarray, G: np.ndarray, r: np.ndarray) -> bool:
 
 
 def _bound_above(w: np.ndarray, size: np.ndarray, r: np.ndarray) -> float:
-    """Return an upper bound of |G| above the last line (assumption A3); infinity if |S| rises towards a resonance.
+    """Return an upper bound of |G| above the last line; infinity if |S| increases toward a resonance above it.
 
-    The bound is computed from root mean squares of |G|, because noise can only increase them.
+    The bound is assumption A3. It is computed from root mean squares of |G|, because noise can only increase them.
 
     Args:
         w: angles of the lines.
@@ -189,10 +191,10 @@ def _bound_above(w: np.ndarray, size: np.ndarray, r: np.ndarray) -> float:
 
 
 def _bound_gaps(w: np.ndarray, S: np.ndarray) -> np.ndarray:
-    """Return a bound of the interpolation error of S between each pair of adjacent lines (M6), shape (lines - 1,)."""
+    """Return bounds of the interpolation error of S, one per interval between adjacent lines; shape (lines - 1,)."""
     step, chord = np.diff(w), np.diff(S)
-    # Compute the second derivative of S at the inner lines, and in each interval the larger second difference of its
-    # two ends.
+    # Compute the second derivative of S at the inner lines, and assign to each interval the larger second difference
+    # of those at its two ends.
     curvature = np.abs(2.0 * np.diff(chord / step) / (step[1:] + step[:-1]))
     difference = np.maximum(np.append(curvature[:1], curvature), np.append(curvature, curvature[-1:])) * step**2
     relative_step = 2.0 * step / (w[1:] + w[:-1])
@@ -205,13 +207,13 @@ def _bound_gaps(w: np.ndarray, S: np.ndarray) -> np.ndarray:
 RADIUS_FACTOR = 1.02  # factor on rho^2 |H|^2, which covers the change of rho |H| between two points of the curve
 MIN_WIDTH = 1e-9  # decided intervals shorter than this, relative to their upper end, are dropped as rounding errors
 TINY = 1e-300  # value that replaces zero denominators, to avoid division by 0
-BATCH_SIZE = 1 << 15  # number of lines in a batch times the number of points of the curve; bounds the memory
+BATCH_SIZE = 1 << 15  # fixed values of alpha or beta per batch, times points of the curve; limits the memory
 
 
 class DecidedIntervals(NamedTuple):
-    """Decided intervals of alpha on lines of constant beta, or of beta on lines of constant alpha, in ascending order.
+    """Decided intervals of alpha for each of several fixed beta, or of beta for fixed alpha, in ascending order.
 
-    The arrays have the shape (lines, intervals), with NaN if a line has fewer intervals.
+    The arrays have the shape (fixed values, intervals), with NaN if a fixed value has fewer intervals.
     """
 
     low: np.ndarray
@@ -227,7 +229,7 @@ class DecidedWalls:
 
     @cached_property
     def _forms(self) -> np.ndarray:
-        """Symmetric matrices of quadratic forms in (1, alpha, beta), shape (3, 3, points).
+        """Matrices of quadratic forms in (1, alpha, beta) that are positive for decided walls; shape (3, 3, points).
 
         The quadratic form of a point is positive for the walls that satisfy the inequality of M4 at this point.
         """
@@ -249,7 +251,7 @@ class DecidedWalls:
         return self._find_intervals(2, alpha, -most, most)
 
     def bound_alpha(self, beta: Any) -> tuple[Any, Any]:
-        """Return the lower and upper limit of alpha between which the bounds outside the measured range decide walls.
+        """Return the limits of alpha between which the bounds of |G| outside the measured range allow a decision.
 
         Below the first line |H G| > 1 is required (M7), above the last line |H G| < 1 (M8). If the lower limit exceeds
         the upper one, no wall with this beta is decided.
@@ -258,13 +260,13 @@ class DecidedWalls:
         return np.abs(beta) * c.max_F_below + 1.0 / max(c.min_G, TINY), 1.0 / c.max_G - np.abs(beta) * c.max_F_above
 
     def _find_intervals(self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray) -> DecidedIntervals:
-        """Return the intervals of decided walls on lines of constant alpha or beta, computed in batches of lines.
+        """Return the decided intervals of alpha at several fixed beta, or of beta at fixed alpha, computed in batches.
 
         Args:
-            free: index of the variable along the lines: 1 for alpha, 2 for beta.
-            fixed: value of the other variable on each line.
-            least: lower limit of the free variable on each line, from the bounds outside the measured range.
-            most: upper limit of the free variable on each line.
+            free: index of the free variable: 1 for alpha, 2 for beta.
+            fixed: fixed values of the other variable.
+            least: lower limit of the free variable at each fixed value, from the bounds outside the measured range.
+            most: upper limit of the free variable at each fixed value.
         """
         batch = max(1, BATCH_SIZE // self.curve.w.size)
         low, high, stable = collect_by_line(partial(self._list_intervals, free), batch, fixed, least, most)
@@ -273,25 +275,29 @@ class DecidedWalls:
     def _list_intervals(
         self, free: int, fixed: np.ndarray, least: np.ndarray, most: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Return the intervals of decided walls on one batch of lines; the arguments are those of `_find_intervals`.
+        """Return the decided intervals of one variable, alpha or beta, for one batch of fixed values of the other.
 
         Returns:
-            Index of the line of each interval, its lower and upper end, and the stability of its walls.
+            Index of the fixed value of each interval, its lower and upper end, and the stability of its walls.
         """
-        # Along a line, the quadratic form of a point is a x^2 + 2 half x + c in the free variable x.
+        # At a fixed value of one variable, the quadratic form of a point is a x^2 + 2 half x + c in the free variable
+        # x.
         M, other, across = self._forms, 3 - free, fixed[:, None]
         a = M[free, free]
         half = M[0, free] + across * M[free, other]
         c = M[0, 0] + 2.0 * across * M[0, other] + across * across * M[other, other]
         discriminant = half * half - a * c
-        # If a > 0, the walls between the two roots of the form are undecided; if a <= 0, those outside the roots are.
+        # If a > 0, the walls between the two roots of the form are undecided; if a <= 0, those outside the roots are
+        # undecided.
         has_roots, outer = discriminant >= 0, a <= 0
-        # A line is unusable if one point, or the bounds outside the measured range, leave all of its walls undecided.
+        # A fixed value is unusable if one point of the curve, or the bounds outside the measured range, leave all its
+        # walls undecided.
         usable = (least < most) & ~np.any(outer & (discriminant <= 0), 1) & (not self.curve.no_asymptote)
         line, point = np.nonzero(has_roots & usable[:, None])
         half, c, a = half[line, point], c[line, point], a[point]
         with np.errstate(all="ignore"):
-            # Compute the larger root from a sum without cancellation, and the other root from the product c/a of both.
+            # Compute the root of larger magnitude from a sum without cancellation, and the other root from the product
+            # c/a of both roots.
             larger = -(half + np.where(half < 0, -1.0, 1.0) * np.sqrt(discriminant[line, point]))
             ends = larger / np.where(a == 0, TINY, a), c / larger
         invalid = np.isnan(ends[0] + ends[1])
@@ -339,7 +345,7 @@ class DecidedWalls:
         return np.einsum("i,ijk,j->k", wall, self._forms, wall) <= 0
 
     def find_critical_point(self, alpha: float, beta: float) -> int:
-        """Return the index of the point at which a wall satisfies the inequality of M4 with the least margin."""
+        """Return the index of the point of the curve at which a wall satisfies the inequality with the least margin."""
         wall, c = np.array([1.0, alpha, beta]), self.curve
         size = np.abs(c.u) ** 2 + np.abs((alpha + beta * c.F) * c.S) ** 2
         return int(np.argmin(np.einsum("i,ijk,j->k", wall, self._forms, wall) / size))

@@ -1,10 +1,10 @@
 """Loop of a measured device: the analyses of `zwidth.analysis.loop.LinearLoop` that need no model of the device.
 
-A wall is stable or unstable only if every frequency response within the error bounds agrees (`measured_curve`,
+A wall is stable or unstable only if all frequency responses within the error bounds agree (`measured_curve`,
 docs/theory/measured.md); otherwise it is undecided. *Lines* are the measured frequencies; alpha and beta are the
 normalized stiffness and damping of a wall, L is the open loop, and angles are w = omega T with the period T. A wall
-counts as connected to K = 0 if it is stable and no softer wall of the same damping is certainly unstable. The stiffest
-wall is searched on lines of constant beta, and refined by golden-section search.
+counts as connected to K = 0 if it is stable and no softer wall of the same damping is unstable. The stiffest wall is
+searched on lines of constant beta, and refined by golden-section search.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from zwidth.stability.linear.rows import Island, arrange_by_line
 from zwidth.stability.results import Margins, RidgePoint, Stability
 from zwidth.stability.rigid.verdict import StabilityMethod
 
-# Settings of the search for the stiffest wall, on lines of constant beta
+# Settings of the search for the stiffest wall on a grid of beta.
 N_SIDE = 60  # values of beta on each side of beta = 0
 DENSITY = 5.0  # argument of sinh at the largest beta; larger values place more of them close to beta = 0
 N_REFINED = 49  # further values of beta in the range with stable walls
@@ -78,7 +78,7 @@ class MeasuredLoop(LinearLoop):
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod = "auto", exact: Any = ()
     ) -> Stability:
-        """Return for each wall whether it is stable, and whether the measured response is sufficient to decide this.
+        """Return for each wall whether it is stable for every admitted response, with a status.
 
         The status is UNDECIDED if the lines are too far apart, if their errors are too large, or if the range of
         measured frequencies is too narrow. ``exact`` is an argument of the base class and ignored.
@@ -92,7 +92,7 @@ class MeasuredLoop(LinearLoop):
         status[finite] = Status.UNDECIDED
         a, b = a[finite], b[finite]
         (betas, beta_index), (alphas, alpha_index) = (np.unique(values, return_inverse=True) for values in (b, a))
-        # Evaluate lines of constant beta or of constant alpha, whichever are fewer, to save time.
+        # Group the walls by equal beta or by equal alpha, whichever results in fewer groups, to save time.
         along_alpha = betas.size <= alphas.size
         decided, line = (
             (self.walls.decide_alpha(betas), beta_index)
@@ -109,19 +109,19 @@ class MeasuredLoop(LinearLoop):
         return Stability(stable.reshape(shape)[()], status.reshape(shape)[()], used[()])
 
     def find_dominant(self, alpha: float, beta: float) -> DominantPole:
-        """Return NaN in all numbers, because a measured response does not determine the poles."""
+        """Return a dominant pole with NaN in all numbers, because a measured response does not determine the poles."""
         return DominantPole(False, np.nan, np.nan, np.nan)
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
-        """Return the intervals of certainly stable alpha for each beta, shape (n, intervals, 2); NaN if fewer."""
+        """Return the intervals of stable alpha for each beta, shape (n, intervals, 2); NaN if fewer."""
         return _select_stable(self.walls.decide_alpha(beta), True)
 
     def find_stable_beta(self, alpha: float) -> np.ndarray:
-        """Return the intervals of certainly stable beta for one alpha, shape (intervals, 2)."""
+        """Return the intervals of stable beta for one alpha, shape (intervals, 2)."""
         return _select_stable(self.walls.decide_beta(np.array([alpha])), True)[0]
 
     def _find_connected_alpha(self, beta: np.ndarray) -> np.ndarray:
-        """Return the intervals of certainly stable alpha that lie below all certainly unstable alpha of the same beta.
+        """Return the intervals of stable alpha that lie below all unstable alpha of the same beta.
 
         The result has the shape (n, intervals, 2), with NaN if a beta has fewer intervals.
         """
@@ -130,7 +130,7 @@ class MeasuredLoop(LinearLoop):
         return _select_stable(intervals, intervals.low < unstable[:, None])
 
     def is_connected(self, alpha: float, beta: float) -> bool:
-        """Return whether a wall is certainly stable, and no softer wall with the same beta is certainly unstable."""
+        """Return whether a wall is stable, and no softer wall with the same beta is unstable."""
         ends = self._find_connected_alpha(np.array([beta]))[0]
         return bool(np.any((ends[:, 0] < alpha) & (alpha < ends[:, 1])))
 
@@ -176,7 +176,7 @@ class MeasuredLoop(LinearLoop):
         return [Outline(*walls, False, False)] if beta.size else []
 
     def stiffest(self, negative: bool) -> RidgePoint:
-        """Return the stiffest certainly stable wall connected to K = 0; ``negative`` allows beta < 0."""
+        """Return the stiffest stable wall connected to K = 0; ``negative`` allows beta < 0."""
         beta, top = self._tops
         top = np.where((beta < 0) & (not negative), 0.0, top)
         best = int(np.argmax(top))
@@ -189,7 +189,7 @@ class MeasuredLoop(LinearLoop):
         )
         minimum = minimize_golden_section(lambda beta: -self._find_tops(beta), low, middle, high, cost, SEARCH_STEPS)
         middle, value = float(minimum[0][0]), -float(minimum[1][0])
-        # Reduce alpha slightly below the end of its interval, because the wall at the end itself is undecided.
+        # Reduce alpha slightly below the end of its stable interval, because the wall at the end itself is undecided.
         value *= 1.0 - INSIDE
         omega = self.walls.curve.w[self.walls.find_critical_point(value, middle)]
         return RidgePoint(np.float64(value), np.float64(middle), np.float64(omega), kind, np.int32(Status.OK))
@@ -225,7 +225,7 @@ class MeasuredLoop(LinearLoop):
         return reasons
 
     def explain_limit(self) -> str:
-        """Return a text with the reasons why no wall is decided, for the wall undecided at the fewest points."""
+        """Return a text with the reasons why no wall is decided, for the wall undecided at the fewest frequencies."""
         rows = [(*self.walls.bound_alpha(beta), beta) for beta in self._tops[0].tolist()]
         walls = [(0.5 * (low + high), beta) for low, high, beta in rows if low < high]
         count = f"the {self.scene.device.frequency.size} frequencies of the response decide the stability of no wall"
@@ -263,8 +263,8 @@ class MeasuredLoop(LinearLoop):
             w, real = c.w[k] + share * np.diff(c.w)[k], L.real[k] + share * np.diff(L.real)[k]
             crossovers, sizes = w[real < 0], -real[real < 0]
             if stable and not np.any(sizes < 1.0):
-                # If no phase crossover with |L| < 1 was measured, use the bound ``most`` of |L| above the last line: a
-                # factor below 1/most on the gain cannot move a pole onto the unit circle there.
+                # If no phase crossover with |L| < 1 was measured, use the bound ``most`` of |L| above the last line,
+                # because the loop stays stable there if its gain increases by a factor below 1/most.
                 most = c.max_G * (abs(alpha) + abs(beta) * c.max_F_above)
                 crossovers, sizes = np.append(crossovers, c.w[-1]), np.append(sizes, most)
             k, share = _find_zeros(np.log(np.abs(L)))
@@ -278,12 +278,12 @@ class MeasuredLoop(LinearLoop):
 
 
 def _select_stable(intervals: DecidedIntervals, mask: np.ndarray | bool) -> np.ndarray:
-    """Return the stable intervals that a mask selects, shape (lines, intervals, 2); NaN if a line has fewer."""
+    """Return the stable intervals that a mask selects, shape (fixed values, intervals, 2), padded with NaN."""
     line, k = np.nonzero(intervals.stable & mask)
     return arrange_by_line(len(intervals.low), line, np.stack([intervals.low[line, k], intervals.high[line, k]], -1))
 
 
 def _find_zeros(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the value before each sign change, and the position of the zero after it, from 0 to 1."""
+    """Return the index of the value before each sign change, and the zero as a fraction of the step to the next one."""
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
     return k, values[k] / (values[k] - values[k + 1])

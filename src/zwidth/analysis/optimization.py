@@ -32,8 +32,8 @@ from zwidth.units.display import compact_repr
 from zwidth.units.parsing import to_float
 from zwidth.units.quantities import FIELDS, WALL
 
-# Relative tolerance by which the stable interval of K may end below K_max at the damping of the stiffest wall; covers
-# the error of K_max.
+# At the damping of the stiffest wall, the stable interval of K may end below K_max by this relative tolerance, because
+# K_max has a numerical error.
 STIFFNESS_TOLERANCE = 1e-6
 
 
@@ -57,7 +57,7 @@ def explain_missing(scene: SceneAnalysis, status: Any) -> str:
 
 
 def choose_damping(scene: SceneAnalysis, top: StiffestWall, stiffness: float) -> float:
-    """Return a damping in N s/m for a wall that is softer than the stiffest wall ``top``.
+    """Choose the damping in N s/m of a wall whose stiffness is below that of the stiffest wall ``top``.
 
     This is the damping of ``top`` if all walls with this damping between the two stiffnesses are stable. Otherwise it
     is the middle of the widest stable interval that is connected to K = 0, if one exists.
@@ -79,7 +79,7 @@ def find_connected_dampings(
     return scene.loop.find_connected_beta(stiffness / scene.units.stiffness, least)
 
 
-# Settings of `SceneOptima.required`, which finds the parameter value at which K_max equals a required stiffness
+# Settings of `SceneOptima.required`, which finds the parameter value at which K_max equals a required stiffness.
 REACH = 30.0  # default range: from the current value divided by this factor to the current value times it
 N_POINTS = 25  # grid points in the range, geometrically spaced
 MAX_PERIODS = 1000.0  # longest delay of the default range, in periods, unless the current delay is longer
@@ -187,7 +187,8 @@ def _find_crossing(surplus: Callable[[float], float], low: float, high: float) -
     try:
         root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
     except ValueError:
-        # Brent's method failed at a value at which K_max cannot be computed.
+        # Brent's method fails if it reaches a parameter value at which K_max cannot be computed. No crossing is then
+        # found.
         return None
     value = math.exp(cast("float", root))
     for distance in CONFIRMATION_DISTANCES:

@@ -150,7 +150,7 @@ class Recommendation:
         return [step for step in steps if step.gain > 1.0]
 
     def _choose_again(self, improved: SceneOptima) -> float:
-        """Return K of the wall recommended for an improved device under the same requirements; NaN if none exists."""
+        """Return the K recommended for an improved device under the same requirements; NaN if none is recommended."""
         try:
             top = improved.max_stiffness()
             near = self.stiffness * float(top.stiffness) / float(self.stiffest.stiffness)
@@ -256,7 +256,7 @@ class Recommendation:
         return f"stable in {count} reference grasps{radii}"
 
     def spell_passive(self) -> str:
-        """Return "yes" or "no" if the wall is passive or not; otherwise a text on why its passivity is not known."""
+        """Return "yes" for a passive wall, "no" for another one, and the reason as text if passivity is not known."""
         passive = None if self.verdict is None else self.verdict.passive
         if passive and self.verdict is not None and self.verdict.passivity_margin < reserve_damping(self.scene):
             return "uncertain, because the fitted damping is"
@@ -308,7 +308,7 @@ class Recommendation:
 
 
 def _describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -> list[str]:
-    """Return notes on the safe limit as a list of texts: its values and reason, then its warnings.
+    """Return a list of texts on the safe limit: its values and reason, then its warnings.
 
     Args:
         limit: the safe limit of the scene; None for none.
@@ -316,7 +316,7 @@ def _describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -
         units: unit system of the texts.
     """
     if limit is None or (limit.forbids_all and not ignored):
-        # Return no note if the limit forbids all walls, because the reason of the recommendation states this.
+        # Return no note if the safe limit excludes all walls, because the reason for recommending no wall states this.
         return []
     return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]
 

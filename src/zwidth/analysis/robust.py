@@ -74,7 +74,7 @@ class RobustWall(NamedTuple):
 def robust_max_stiffness(
     *, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain, delay: Uncertain = 0.0
 ) -> RobustStiffness:
-    """Find the smallest K_max of all devices in a box; each of them can render any wall up to it.
+    """Find the smallest K_max of all devices in a box, the largest stiffness that each of them can render.
 
     The result is the minimum of ``K_max(m, b, T, t_d)`` over the box. The virtual damping may differ from device to
     device. For one wall (K, B) that is stable on all devices use `robust_wall`, which is never stiffer.
@@ -250,13 +250,13 @@ def _place_devices(shares: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.
 
 
 def _build_grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
-    """Return all combinations of ``count`` relative positions, from 0 to 1, of each uncertain parameter of a box."""
+    """Return a grid of relative positions in a box: all combinations of ``count`` values per uncertain parameter."""
     axes = [np.linspace(0.0, 1.0, count) if b > a else np.zeros(1) for a, b in zip(low, high, strict=True)]
     return np.array(list(product(*axes)))
 
 
 def _find_weakest_device(low: np.ndarray, high: np.ndarray) -> tuple:
-    """Return the fields of `RobustStiffness` for one box, given by the lower and the upper ends of its intervals."""
+    """Find the weakest device of a box from ``low`` to ``high``, and return the fields of `RobustStiffness`."""
     device = _find_lowest(_compute_max_stiffness, low, high)
     attained = float(_compute_max_stiffness(device)[0])
     is_vertex = bool(np.all((device == low) | (device == high)))
@@ -264,25 +264,25 @@ def _find_weakest_device(low: np.ndarray, high: np.ndarray) -> tuple:
 
 
 def _find_common_limit(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
-    """Return the limit of the walls that are stable on all devices, and a function from K to their middle B."""
+    """Return a K that no wall stable on all devices reaches, and a function that returns the middle stable B at a K."""
 
     def common(stiffness: float) -> tuple[float, float]:
-        """Return the ends of the interval of B that is stable on all devices at one K; reversed if it is empty."""
+        """Return the ends of the interval of B that is stable on all devices at one K; lower > upper if it is empty."""
         lower, upper = _stable_dampings(stiffness, devices)
         return float(np.max(lower)), float(np.min(upper))
 
     def suits(stiffness: np.ndarray) -> np.ndarray:
-        """Return whether at this K some B is stable on all devices."""
+        """Return whether a wall with this K and a suitable B is stable on all devices."""
         lower, upper = common(float(stiffness))
         return np.asarray(lower < upper)
 
-    # Round the limit up, because it must be a stiffness that no wall reaches.
+    # Round the limit up, because it must be a stiffness that no wall stable on all devices reaches.
     limit = float(np.nextafter(bisect(suits, np.float64(0.0), np.min(_compute_max_stiffness(devices))), np.inf))
     return limit, lambda stiffness: 0.5 * float(np.add(*common(stiffness)))
 
 
 def _find_wall(low: np.ndarray, high: np.ndarray) -> tuple:
-    """Return the fields of `RobustWall` for one box, given by the lower and the upper ends of its intervals."""
+    """Find the stiffest wall stable on all devices of a box, and return the fields of `RobustWall`."""
     devices = _place_devices(_build_grid(low, high, 2), low, high)
     limit, middle = _find_common_limit(devices)
     for _ in range(ROUNDS):

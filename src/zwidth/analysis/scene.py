@@ -1,6 +1,6 @@
 """The public class `Scene`: device, timing, velocity estimate, operator and wall, with all analyses as methods.
 
-The parts are checked in `zwidth.analysis.base`; the analyses are in `zwidth.analysis.walls` (one wall), `stiffest`
+The parts are checked in `zwidth.analysis.base`; the analyses are in `zwidth.analysis.walls` (one wall), `optimization`
 (optimal walls) and `recommendation`. This module adds the stability boundary, the stable region and the simulation.
 """
 

@@ -67,7 +67,7 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
 
 
 def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
-    """Compute K_max in N/m from mass and period in SI units, delta and d; ``kind`` lists the classes of delays in d."""
+    """Compute K_max in N/m; ``kind`` states whether d has delays below 1, delays from 1 on, or fractional delays."""
     return ridge_kernel(delta, d, kind).alpha * (mass / period) / period
 
 
@@ -138,7 +138,7 @@ def sensitivities(
 
 
 def _sensitivities_kernel(mass, damping, period, delay, delta, d, kind) -> Sensitivities:
-    """Compute K_max and its derivatives from parameters in SI units, delta and d; ``kind``: classes of delays in d."""
+    """Compute K_max and its derivatives; ``kind`` states whether d has delays below 1, from 1 on, or fractional."""
     xp = namespace(mass, delta, d)
     # If JAX traces the quantities, compile this part separately, so that the derivatives in delta and d are computed
     # once and not again for each quantity.

@@ -40,7 +40,7 @@ class Tolerance(NamedTuple):
 )
 @dataclass(frozen=True)
 class ToleranceEstimate:
-    """Results of `simulate_tolerances`: the share of devices on which the wall is stable, and stiffness limits."""
+    """Estimated share of the devices within tolerances on which a wall is stable, and limits of the stiffness."""
 
     samples: int  # number of drawn devices
     stable: float  # share of drawn devices on which the wall of the scene is stable
@@ -148,8 +148,8 @@ def _draw_factors(generator: np.random.Generator, share: float, distribution: st
         return generator.uniform(1.0 - share, 1.0 + share, count)
     factors = generator.normal(1.0, share, count)
     while np.any(bad := factors <= 0):
-        # Draw new values for factors <= 0, at least three standard deviations below 1, because parameters must be
-        # positive.
+        # Draw a factor again if it is not positive, because parameters must be positive. This is rare: such factors are
+        # at least three standard deviations below 1.
         factors[bad] = generator.normal(1.0, share, np.count_nonzero(bad))
     return factors
 

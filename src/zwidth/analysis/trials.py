@@ -124,7 +124,7 @@ class Experiment(NamedTuple):
         # an eighth of the simulation. Require at least the square root of this trend for a sustained oscillation.
         least_trend = max(SUSTAINED, math.exp(-self.decay / 16.0) if self.decay > 0 else 0.0)
         # Treat a growing response as unbounded only if the linear loop is unstable and the motor has no limits, because
-        # other growing responses approach a limit cycle.
+        # all other growing responses approach a limit cycle.
         limited = np.minimum(columns["max_force"], columns["max_rate"]) < np.inf
         return _pick_largest(motion, least_trend, ~limited & (self.decay < 0))
 
@@ -134,7 +134,8 @@ def list_starts(scene: Any, hardware: Hardware) -> Starts:
     K, Q, period = float(scene.wall.stiffness), hardware.resolution, scene.timing.period
     position = [Q * factor for factor in DISPLACEMENTS if Q > 0]
     half_steps = [0.0] * len(position) + [1.0] * len(position)
-    # Scale these displacements with the encoder step of a trial, and add the largest once more without scaling.
+    # Let the displacements that are multiples of the encoder step change with the encoder step of a trial. Add the
+    # largest one a second time, as a displacement that does not change.
     scaled = 2 * len(position)
     position, half_steps = position * 2 + position[-1:] * 2, half_steps + [0.0, 1.0][: 2 * len(position)]
     loads = [hardware.max_force, hardware.max_rate * period]

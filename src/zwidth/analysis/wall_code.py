@@ -62,7 +62,7 @@ def find_sections(estimate: Estimate) -> list[tuple[tuple[float, ...], tuple[flo
         Numerator and denominator of each section in powers of zeta, highest power first, both of the same length 2
         (first order) or 3. The denominator starts with 1.
     """
-    # Include the roots at z = 0 as offsets ``1 - z = 1``.
+    # Add the roots at z = 0, which the estimate stores as its lag, in the form of offsets ``1 - z = 1``.
     at_zero = [1.0] * abs(estimate.lag)
     zeros = _find_factors(np.append(estimate.zeros, at_zero if estimate.lag < 0 else []))
     poles = _find_factors(np.append(estimate.poles, at_zero if estimate.lag > 0 else []))
@@ -128,7 +128,7 @@ def write_wall(
 
 
 def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: float = math.inf) -> WallProgram:
-    """Build the statements that compute the force of the wall of a scene; the arguments are those of `write_wall`."""
+    """Build the program, as statements for either language, that computes the force of the wall of a scene."""
     period = float(scene.timing.period)
     estimate = scene.velocity.estimate(period)
     count, gain = estimate.window, float(estimate.gain) / period

@@ -162,7 +162,7 @@ def measure_slack(scene: SceneOptima, wanted: Wanted, grasped: Sequence[SceneOpt
                 slacks["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
         if wanted.passive:
             margin = (np.asarray(scene.passivity_margin(stiffness, damping)) - reserve) / (device_damping or 1.0)
-            # A margin of exactly 0 must yield a negative slack, because such a wall is not passive.
+            # Use a negative slack if the passivity margin is exactly 0, because such a wall is not passive.
             slacks["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
         if grasped:
             stable_in_grasps = np.all([_is_stable_in_grasp(each, stiffness, damping) for each in grasped], axis=0)
@@ -268,7 +268,7 @@ def choose_wall(
     """
     grasps, active = list_grasped_scenes(scene, wanted), list[SceneOptima]()
     free = choice = _choose_free(scene, wanted, top, near, width, active)
-    # Require stability only in grasps that destabilize a chosen wall, because each grasp makes the search slower.
+    # Add a grasp to the requirements only if the chosen wall is unstable in it, because each grasp slows the search.
     while choice.status == Status.OK and (
         unstable := [
             grasped for grasped in grasps if not _is_stable_in_grasp(grasped, choice.stiffness, choice.damping)
@@ -289,7 +289,7 @@ def _choose_free(
     width: float,
     grasped: Sequence[SceneOptima],
 ) -> WallChoice:
-    """Choose the stiffest wall that satisfies all requirements, with stability only in the grasps of ``grasped``.
+    """Choose the stiffest wall that satisfies all requirements; of the grasps, only those in ``grasped`` are required.
 
     The other arguments are those of `choose_wall`.
     """

@@ -42,7 +42,7 @@ Wall: TypeAlias = float | str | None
     phase_margin="degrees", delay_margin="s", phase_crossover="Hz", gain_crossover="Hz", modulus_frequency="Hz"
 )
 class SceneMargins(Margins):
-    """Stability margins of walls as in `zwidth.Margins`, with the delay margin in s and the frequencies in Hz."""
+    """Gain, phase, delay and modulus margin of walls, with the delay margin in s and the frequencies in Hz."""
 
 
 class SceneAnalysis(SceneParts):
@@ -72,7 +72,7 @@ class SceneAnalysis(SceneParts):
         return namespace(*walls).broadcast_arrays(*walls)
 
     def _check_traceable(self, *values: Any) -> None:
-        """Raise `InputError` if JAX traces a value, but the methods of `loop` do not support traced values."""
+        """Raise `InputError` if JAX traces a parameter or a wall, and the loop of the scene does not support this."""
         if is_traced(*values) and not self.loop.traceable:
             raise InputError(
                 f"{self.traced_path or 'stiffness, virtual_damping'}: got a value traced by JAX, allowed only for a "

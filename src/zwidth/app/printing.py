@@ -37,13 +37,13 @@ COLORS = {"STABLE": "green", "SET": "green", "UNSTABLE": "red", "NO WALL": "red"
 COLORS |= dict.fromkeys(("MARGINAL", "UNDECIDED", "CAUTION"), "yellow")
 _NARROW = 60  # smallest width with a separate column for labels
 _COLUMN = re.compile(r" {2,}")
-# Pattern of spaces at which lines must not break: those within quantities such as "B = 3 N s/m". It also matches some
-# other spaces, which is harmless.
+# Pattern of spaces at which lines must not break, because they are part of a quantity such as "B = 3 N s/m". Matches of
+# some other spaces are harmless.
 _NO_BREAK = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
 
 
 def format_row(label: str, text: str) -> str:
-    """Return a printed line: a label in a wide column for long labels, and a text."""
+    """Return a line for printing: a label in a wide column for long labels, and a text."""
     return f"{label:<20}  {text}"
 
 
@@ -60,7 +60,7 @@ def print_json(result: Any) -> None:
 def wrap_lines(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) -> Iterator[str]:
     """Yield lines wrapped to a width, with continuation lines indented and no break between a number and its unit.
 
-    A narrow width has no separate column for labels, because the text would wrap after every word.
+    In a narrow width, labels have no separate column, because texts next to it would wrap after every word.
     """
     narrow = width < _NARROW
     wrap = textwrap.TextWrapper(max(width, 40), break_long_words=False, break_on_hyphens=False)
@@ -115,14 +115,14 @@ def get_unit(path: str) -> str:
 
 
 def name_verdict(verdict: Assessment) -> str:
-    """Return the verdict as one word: undecided, marginal, stable or UNSTABLE."""
+    """Return the verdict on a wall as one word: undecided, marginal, stable or UNSTABLE."""
     if verdict.stable is None:
         return "undecided"
     return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
 
 
 def spell_radius(radius: float) -> str:
-    """Return the spectral radius as text with six decimals, or in fewer digits if it is very large."""
+    """Return the spectral radius as text with six decimals, or with significant digits only if it is very large."""
     return f"spectral radius {f'{radius:.6f}' if radius < 1e4 else plain(radius)}"
 
 
@@ -138,7 +138,7 @@ def spell_decay(constant: float, frequency: float) -> str:
 
 
 def list_period_notes(scene: Scene) -> list[str]:
-    """Return a note if the velocity estimate was designed for a period other than that of the loop."""
+    """Return a list with a note if the velocity estimate was designed for another period than the loop's."""
     coded, period = getattr(scene.velocity, "coded_period", None), scene.timing.period
     if coded is None or abs(coded / period - 1) < 1e-9:
         return []
@@ -168,7 +168,7 @@ def compare_with_limit(scene: Scene) -> list[str]:
 
 
 def list_limit_cautions(scene: Scene) -> list[str]:
-    """Return the caution that a wall exceeds the safe limit of its scene; an empty list if it does not."""
+    """Return a list with the caution that the wall exceeds the safe limit of its scene; empty if it does not."""
     limit, wall = scene.safe_limit, scene.wall
     if limit is None or isinstance(wall, NoWall) or limit.allows(float(wall.stiffness), float(wall.virtual_damping)):
         return []
@@ -185,7 +185,7 @@ def spell_diagnosis(diagnosis: Diagnosis | None) -> list[tuple[str, str]]:
 
 
 def spell_alarm(diagnosis: Diagnosis | None, *alarms: str) -> str:
-    """Return the text appended to a headline to announce cautions: a diagnosed oscillation, if any, and ``alarms``."""
+    """Return "; CAUTION: ..." for a headline, from a diagnosed oscillation and ``alarms``; "" if there are none."""
     oscillation = [] if diagnosis is None or diagnosis.cause == "none" else [diagnosis.word.lower()]
     words = [*oscillation, *filter(None, alarms)]
     return f"; CAUTION: {', '.join(words)}" if words else ""
@@ -197,16 +197,17 @@ def format_diagnosis(diagnosis: Diagnosis | None) -> list[str]:
 
 
 def format_hardware(hardware: str) -> list[str]:
-    """Return the printed line with the hardware of a file, a phrase; an empty list if the phrase is empty."""
+    """Return a list with the printed line that states the hardware of a scene file; empty if ``hardware`` is ""."""
     return [format_line("hardware", hardware)] if hardware else []
 
 
 def list_omission_cautions(scene: Scene, omitted: Collection[str]) -> list[str]:
-    """Return cautions if the delay or the friction is 0 only because it was not given.
+    """Return a list of cautions about a delay or a friction that is 0 only because the user has not given it.
 
     ``omitted`` contains the names of options that were not given.
     """
-    # Return no caution for a measured response, because it usually contains the delay, and it cannot be simulated.
+    # Return no caution for a measured response, because it usually includes the delay, and friction cannot be simulated
+    # with it.
     if isinstance(scene.device, MeasuredDevice):
         return []
     cautions = {
@@ -224,7 +225,7 @@ def format_notes(notes: list[str]) -> list[str]:
 
 
 class Slope(NamedTuple):
-    """The derivative of K_max with respect to one parameter, and the effect of a small change in words."""
+    """The derivative of K_max with respect to one parameter, and a phrase on the effect of a small change of it."""
 
     name: str  # path of the parameter
     value: float  # derivative of K_max
@@ -249,11 +250,11 @@ def list_slopes(scene: Scene) -> list[Slope]:
     slopes, system = [], scene.unit_system
     for path, slope in per.items():
         unit, value = system[get_unit(path)], float(slope)
-        # Choose a scale: for a delay the period, because the delay may be 0; for a linear damping 1 N s/m; else the
-        # value.
+        # Choose the scale of the parameter: the period for a delay, because the delay may be 0; otherwise its value.
         size = scene.timing.period if path == "delay" else values[path]
         by_one = not size or unit == "N s/m"
-        # Choose the power of ten nearest to one percent of the scale as the step.
+        # Choose the step of the parameter whose effect is stated: the power of ten nearest to one percent of the scale;
+        # 1 N s/m for a linear damping; 1 or, for rotary devices, 1e-3 if the scale is 0.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
         effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
         if isfinite(value) and (change := value * step):

@@ -47,14 +47,14 @@ if TYPE_CHECKING:
     from zwidth.analysis.scene import Scene
 
 ROUNDED = 1e-12  # passivity margins below this fraction of the summed dampings are rounding errors
-NOTEWORTHY = 1.005  # smallest gain in stiffness printed without --verbose
-LONG = 20  # characters of the longest heading that is printed in the first line of its table
+NOTEWORTHY = 1.005  # smallest factor of increase in stiffness that is printed without --verbose
+LONG = 20  # number of characters of the longest heading that shares a line with the first row of its table
 MARGINAL_DAMPER = (
     "a pure damper: marginal only because without stiffness no force restores the position (pole at z = 1)"
 )
 MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
 
-# Phrases for the required stability in the reference grasps, that is, with hands that hold the device.
+# Phrases for the reference grasps (hands that hold the device) in which a wall is required to be stable.
 GRASP_WORDS = {
     "all": "stable in all six reference grasps",
     "soft": "stable in the soft reference grasps",
@@ -94,8 +94,8 @@ def format_check(
 ) -> list[str]:
     """Return the printed lines of `zwidth check` without notes: verdict, device, margins and remedies.
 
-    ``limits=None`` omits gains and remedies, which take longer. ``hardware`` is the encoder, friction and motor of a
-    file in words.
+    ``limits=None`` omits improvements and remedies, whose computation takes longer. ``hardware`` is a phrase that
+    states encoder, friction and motor of the scene file.
     """
     wall, word, units = scene.wall, name_verdict(verdict).upper(), scene.unit_system
     K, B = format_stiffness(wall.stiffness, units), with_unit(wall.virtual_damping, units["N s/m"])
@@ -107,8 +107,8 @@ def format_check(
     lines = [format_line(word, wall_words + (alarm if word == "STABLE" else "")), format_line("device", device_words)]
     lines += [*format_parts(scene), *format_hardware(hardware)]
     lines += [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
-    # With K = 0, print the stable dampings of a pure damper. Exclude a measured response, whose frequency is NaN
-    # because it has no poles.
+    # With K = 0, print the stable dampings of a pure damper. Exclude measured responses, which have no poles and
+    # therefore the frequency NaN.
     damper = wall.stiffness == 0 and not isnan(verdict.frequency)
     dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
     if word == "MARGINAL":
@@ -177,7 +177,7 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
 
 
 def format_margins(verdict: Assessment) -> list[str]:
-    """Return the line with the margins of a stable wall; an empty list for other walls."""
+    """Return a list with the printed line of the margins of a stable wall; empty for other walls."""
     if not verdict.stable:
         return []
     gain, phase, late, least = (
@@ -191,7 +191,7 @@ def format_margins(verdict: Assessment) -> list[str]:
 
 
 def format_decay(verdict: Assessment) -> list[str]:
-    """Return the line with the time constant of decay or growth; an empty list without poles (measured response)."""
+    """Return a list with the printed line of the time constant of decay or growth; empty for a measured response."""
     if isnan(verdict.frequency):
         return []
     constant, frequency = verdict.time_constant, verdict.frequency
@@ -248,9 +248,9 @@ def format_recommendation(
     diagnosis: Diagnosis | None = None,
     verbose: bool = False,
 ) -> list[str]:
-    """Return the printed lines of `zwidth recommend` without notes; ``hardware`` is defined as in `format_check`.
+    """Return the printed lines of `zwidth recommend` without notes, from a recommendation and its checks.
 
-    ``diagnosis`` is that of the recommended wall.
+    ``hardware`` is a phrase as in `format_check`, and ``diagnosis`` is that of the recommended wall.
     """
     scene, verdict = recommendation.scene, recommendation.verdict
     device = [format_line("device", spell_device(scene, omitted)), *format_parts(scene), *format_hardware(hardware)]

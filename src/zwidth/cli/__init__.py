@@ -20,7 +20,7 @@ from zwidth.core.errors import ZwidthError
 from zwidth.io.files import REMEDIES
 from zwidth.numerics.kernel_cache import use_compilation_cache
 
-# Import every module of the package, because each adds its commands to `cli` when it is imported.
+# Import every module of this package, because each module adds its commands to `cli` when it is imported.
 for _module in iter_modules(__path__, f"{__name__}."):
     import_module(_module.name)
 
@@ -32,13 +32,13 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line with the given arguments, by default those of the process, and exit with a code."""
     use_compilation_cache()
     try:
-        # Check NO_COLOR and terminals without colors, because click ignores both. With None, click decides about
-        # colors.
+        # Disable colors if NO_COLOR is set or the terminal has none, because click ignores both. With None, click
+        # decides whether to use colors.
         color = False if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" else None
         cli.main(args=arguments, prog_name="zwidth", standalone_mode=False, color=color)
     except SystemExit as end:
         if arguments is None and end.code in _STOPPED:
-            # Exit without the shutdown of the interpreter, which would crash if JAX is compiling in another thread.
+            # Skip the shutdown of the interpreter, because it would crash if JAX is compiling in another thread.
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(int(end.code))
@@ -75,7 +75,7 @@ def _format_fault(error: click.ClickException) -> str:
 
 
 def _describe(error: Exception) -> str:
-    """Return the message of an exception; for an error of the operating system it has the file, reason and remedy."""
+    """Return the message of an exception; for an error of the operating system, it names file, reason and remedy."""
     if not isinstance(error, OSError):
         return f"{type(error).__name__}: {error} (set ZWIDTH_TRACEBACK=1 for the traceback)"
     reason = os.strerror(error.errno) if error.errno else str(error)

@@ -45,7 +45,7 @@ from zwidth.units.quantities import SIZES, Range
 EXIT_FAILED = 1  # exit code if no wall exists or a computation fails
 EXIT_INPUT = 2  # exit code for invalid input
 _PACKAGE = Path(__file__).resolve().parents[1]
-# Pattern of a reference in a configuration to a table in the folder of the configuration.
+# Pattern of an entry of a configuration that refers to a CSV table in the same folder.
 _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
 
 
@@ -136,7 +136,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
     (alpha, beta), kind, lines = scene.normalize_walls(*wall[:2]), name_kind(wall), []
     result: dict[str, Any] = {}
     if isinstance(scene.device, Device):
-        # Add normalized parameters, which exist only for a device with a known mass.
+        # Add the normalized parameters, which exist only for a device with a known mass.
         omega = wall.frequency * (2.0 * math.pi * scene.timing.period)
         numbers = {"delta": scene.delta, "d": scene.d, "alpha_max": alpha, "beta": beta, "omega": omega}
         result = {name: float(number) for name, number in numbers.items()}
@@ -179,7 +179,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_obstacles(scene: Any) -> list[str]:
-    """Return notes on the measurements that would be required to certify a stiffer wall on a measured response."""
+    """Return notes on the measurements required before a stiffer wall can be certified on a measured response."""
     if not isinstance(scene.device, MeasuredDevice):
         return []
     from zwidth.identification.response_estimate import find_nominal_limit
@@ -210,7 +210,7 @@ def devices(name: str | None, as_json: bool) -> None:
         lines = []
         for device in chosen:
             numbers = (f"{key.replace('_', ' ')} {each.spell()}" for key, each in device.numbers.items())
-            # Omit the name "counts", because it is also the unit.
+            # Omit the name of the parameter "counts", because its unit has the same name.
             lines.append(format_row(device.name, ", ".join(number.removeprefix("counts ") for number in numbers)))
     else:
         notes = {quantity: f" ({number.note})" if number.note else "" for quantity, number in chosen[0].numbers.items()}
@@ -262,7 +262,7 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
     contents = {Path(f"{name}.yaml"): text}
     for table in map(Path, _TABLE.findall(text)):
         content = examples[example].with_name(table.name).read_text(encoding="utf-8")
-        # Do not write a table that already exists with the same content.
+        # Do not write a table that exists already and has the same content.
         if not table.is_file() or table.read_bytes() != content.encode():
             contents[table] = content
     for file in contents:

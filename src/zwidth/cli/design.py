@@ -39,16 +39,16 @@ from zwidth.units.formatting import (
 from zwidth.units.parsing import read_share
 from zwidth.units.quantities import PARAMETERS
 
-# Path in a scene of the parameter that each value of --find selects.
+# Path in a scene of the parameter that each value of the option --find selects.
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
-_TRIED = 41  # values of a parameter at which K_max is computed, to find the largest K_max in a range
+_TRIED = 41  # number of values of a parameter at which K_max is computed, to find its largest value in a range
 # Parameters whose tolerances `zwidth.analysis.robust` supports in the search for a wall that is stable on all devices.
 _BOX = ("mass", "damping", "period", "delay")
 
 
 def _read_tolerance(text: str) -> tuple[str, float]:
-    """Parse "NAME=SHARE"; return the path of a parameter and its tolerance relative to its value."""
+    """Parse a text "NAME=SHARE"; return the path of the parameter and its tolerance relative to its value."""
     name, _, share = text.partition("=")
     return name.strip(), read_share(share)
 
@@ -91,8 +91,8 @@ def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: 
         raise click.UsageError("give --find or --tolerance, or both")
     shares, uniform = tolerances, drawn["distribution"] == "uniform"
     searchable = shares and uniform and not scene.parts_beyond and all(name in _BOX for name in shares)
-    # Exclude this combination, because the search assumes independent intervals of period and delay, but a delay in
-    # periods varies with the period.
+    # Exclude a tolerance of the period if the delay is given in periods, because the delay then varies with the period,
+    # but the search assumes independent intervals of both.
     searchable = searchable and not ("period" in shares and scene.timing.in_periods)
     parts = {
         "required": _require(scene, find) if find is not None else None,
@@ -120,7 +120,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
             f"--find {find}: not a parameter of this scene; give {name_option(path)} as a starting value"
         )
     present = values[path]
-    # Search a range that covers any device if the current value is 0, because the default range is relative to this
+    # If the current value is 0, search a range that suits every device, because the default range is relative to this
     # value.
     period = scene.timing.period
     within = None if present else {"damping": (1e-6, 1e4), "delay": (1e-3 * period, 500 * period)}[path]
@@ -149,7 +149,8 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     else:
         values = [crossing.value for crossing in needed.crossings]
         text = f"{format_sufficient(needed.value, needed.enough, values, unit)}"
-        # Subtract the crossings of K_max with the goal (one or two) that the text already contains.
+        # Count the crossings of K_max with the goal that the text does not contain yet: all except one or, for an
+        # interval, two.
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
@@ -207,7 +208,7 @@ def _tolerate(
     stiffness, stiffness_best = (
         with_unit(round_conservatively(end, "below"), unit) for end in (simulation.stiffness, simulation.stiffness_max)
     )
-    # Round the result towards the safe side, so that a printed share of 100 % means all devices.
+    # Round the share and its lower bound down, its upper bound up: a printed share of 100 % must mean all devices.
     ends = (
         (simulation.stable, "below"),
         (simulation.stable_low, "below"),

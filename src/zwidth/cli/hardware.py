@@ -58,7 +58,7 @@ def hardware_options(command: Command) -> Command:
         hardware = {name: value for _, name, *_ in _HARDWARE if (value := given.pop(name)) is not None}
         if "resolution" in hardware:
             warn_implausible({"resolution": hardware["resolution"]}, given["scene"].unit_system)
-        # Ignore the hardware of the file for a measured response, which has no model to simulate with it.
+        # Ignore the hardware of the file for a measured response, because without a model it cannot be simulated.
         from_file = {} if isinstance(given["scene"].device, MeasuredDevice) else get_hardware()
         return command(hardware=from_file | hardware, **given)
 
@@ -80,7 +80,7 @@ def spell_hardware_of_file(scene: Scene) -> str:
 
 
 def diagnose_wall(scene: Scene, hardware: dict[str, Any], *, remedies: bool) -> Any:
-    """Return the result of `zwidth.diagnose` for a wall on the given hardware; None if no hardware is given.
+    """Simulate and diagnose a scene's wall on the given hardware (`zwidth.diagnose`); return None without hardware.
 
     ``remedies=False`` omits the search for remedies, which takes most of the run time.
     """

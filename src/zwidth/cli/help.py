@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-# Options that specify a complete scene, used in the examples of several commands.
+# Options that specify a complete scene, for the examples in the help of several commands.
 OF_SCENE = "--mass '100 g' --damping '10 N s/m' --rate '1 kHz' --delay '1 ms'"
 
 OWN = "This command"  # heading of the options that belong to no other group
@@ -22,7 +22,7 @@ GROUPS = {
     "Further parts of the device": ("--coupling-", "--actuator-", "--modes-"),
     "Output": ("--figure", "--code", "--verbose", "--json", "--help"),
 }
-EXACT = ("--stiffness", "--delay")  # whole names instead of prefixes, because options of other groups start with them
+EXACT = ("--stiffness", "--delay")  # matched as whole names, because other groups have options with these prefixes
 
 
 class GroupedCommand(click.Command):
@@ -49,6 +49,6 @@ def find_group(flag: str) -> str:
 
 
 def show_example(command: str, *more: str) -> dict[str, Any]:
-    """Return arguments of ``cli.command`` for a command with grouped options and an example in its help."""
+    """Return keyword arguments of ``cli.command`` for a command whose help has grouped options and an example."""
     example = "\b\nExample:\n" + " \\\n    ".join((f"  zwidth {command}", *more))
     return {"cls": GroupedCommand, "epilog": example}

@@ -48,7 +48,7 @@ _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
 
 
 def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
-    """Return K, B and f of a wall at the onset of oscillation, and if it is rotary (None without a unit)."""
+    """Return K, B and f of a wall at the onset of oscillation, and True if it is rotary (None if no unit is given)."""
     entries = _ENTRY.findall(text.replace(",", " "))
     amounts = dict(entries)
     if _ENTRY.sub("", text.replace(",", " ")).strip() or {"K", "f"} - set(amounts) or len(amounts) < len(entries):
@@ -69,7 +69,7 @@ _WALL = Parsed("WALL", _read_wall)
 _SOFTER = 50  # largest number of reductions of K until the rounded wall is stable
 
 
-# Walls of the example in the help.
+# Options with the walls of the example in the help.
 _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 
 
@@ -188,7 +188,7 @@ def fit(
 
 
 def _diagnose(device_fit: Any, motor: dict[str, float]) -> Any:
-    """Return the diagnosis of the recommended wall, simulated with fitted friction, encoder and the motor's limit.
+    """Return the diagnosis of the recommended wall, simulated with fitted friction, encoder and motor limit.
 
     Return None if none of these is known, or if no wall is recommended.
     """
@@ -383,7 +383,7 @@ def _compliance(deviation: Any, system: UnitSystem) -> str:
 
 
 def _plain(wall: Any) -> dict[str, float]:
-    """Return stiffness, damping, frequency and status of a safe wall as a dict for JSON."""
+    """Return a dict with stiffness, damping, frequency and status of a safe wall, for output as JSON."""
     return {name: float(getattr(wall, name)) for name in ("stiffness", "virtual_damping", "frequency", "status")}
 
 

@@ -48,10 +48,10 @@ _PART_NAMES = tuple(dict.fromkeys(path.rpartition(".")[0] for path in OF_PARTS))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
 # Parts that cannot be added to a linear system or a measured response, because these devices contain them.
 _CONTAINED = ("operator", "coupling", "actuator", "modes")
-# Names of the parts that are resonances: "modes.0" and so on.
+# Names of the structural modes among the parts: "modes.0", "modes.1" and so on.
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
 _BARE = {"mass", "damping"}  # parameters of a rigid device
-# Parameters of a low-pass filter, exactly one of which must be given.
+# Parameters of a low-pass filter that exclude each other; one of them must be given.
 _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
@@ -72,7 +72,7 @@ class Parsed(click.ParamType):
 
 
 def get_options_with_kind() -> dict[str, Any]:
-    """Return the options of the running command by name whose units imply a linear or a rotary device."""
+    """Return the options of the running command whose units imply a linear or a rotary device, as a dict by name."""
     return click.get_current_context().meta.get(_WITH_KIND, {})
 
 
@@ -97,8 +97,8 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
             number = text
         if periods:
             return read_span(number, allowed)
-        # Read each option in the unit system of its unit. The systems of all options are compared when the scene is
-        # built.
+        # Read each option in the unit system (linear or rotary) of its unit. The systems of all options are compared
+        # later, when the scene is built.
         dimension = DIMENSIONS[SYSTEMS[bool(detect_kind(number))][unit]]
         return read_quantity(number, dimension, allowed, counts=counts)[0]
 
@@ -188,8 +188,8 @@ def take_options(
                     from zwidth.model.devices import read_device
 
                     values["device"] = read_device(values["device"])
-                    # Ignore the unit system and the hardware of the file, because the option --device replaces its
-                    # device.
+                    # Ignore the unit system and the hardware of the scene file, because the option --device replaces
+                    # the device of the file.
                     context.meta.pop(_HARDWARE, None)
                     with_kind = context.meta.get(_WITH_KIND, {}) | {"--device": values["device"]}
                 return function(**{name: make(values, SYSTEMS[bool(find_kind(with_kind))])}, **given)
@@ -230,7 +230,7 @@ def read_scene_file(path: Path) -> Scene:
 
 
 def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *, wall: bool = False) -> Scene | None:
-    """Return the scene with the parameters ``given`` (by path); ``given["scene"]`` is a scene with all others.
+    """Return the scene with the parameters ``given`` (by path) and all other parameters from ``given["scene"]``.
 
     Return None if no option is given and ``instead`` names alternative options.
     """
@@ -251,7 +251,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
-    """Return the scene of a file after replacing the parameters that are given as options."""
+    """Return the scene of a file with the parameters replaced that are given as options."""
     from zwidth.model.devices import KnownDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}
@@ -263,7 +263,8 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
         same = "kind" not in part_values and part_values.keys() <= {item.name for item in fields(scene.velocity)}
         kept = {"kind": name_estimate(scene.velocity), **spell_part(scene.velocity)} if same else {}
         if part_values.keys() & _ONE_OF_TWO:
-            # Drop the cutoff and the time constant of the file, because a low-pass filter takes only one of them.
+            # If an option gives one of them, drop cutoff and time constant of the file, because a low-pass takes only
+            # one of them.
             kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
         changes["velocity"] = make_velocity({**kept, **part_values})
     parts = {} if device else find_parts(scene)
@@ -306,7 +307,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
         raise click.UsageError(f"give {f'either {instead} alone, or also ' if instead else ''}{', and '.join(missing)}")
 
     def select(*names: str) -> dict[str, Any]:
-        """Return the given values of the named parameters, as a dict by name."""
+        """Return the values that are given among the named parameters, as a dict by name."""
         return {name: given[name] for name in names if name in given}
 
     parts: dict[str, Any] = {
@@ -340,7 +341,7 @@ def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[
 
 
 def _list_needed(kind: Any) -> list[str]:
-    """Return the names of the fields of a part's class that have no default value."""
+    """Return the names of the fields without default value of the class ``kind`` of a part."""
     return [item.name for item in fields(kind) if item.default is MISSING]
 
 
@@ -386,7 +387,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print the re
 
 
 def find_omitted() -> frozenset[str]:
-    """Return the names among damping, delay and friction that are 0 because no option and no file gives a value.
+    """Return which of damping, delay and friction are 0 only because neither an option nor a file gives a value.
 
     Friction is included only if the command simulates an encoder.
     """

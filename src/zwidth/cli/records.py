@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from zwidth.analysis.scene import Scene
     from zwidth.model.velocity import Velocity
 
-_LONG = 2**23  # bytes; size of a log above which a message is printed before it is read
+_LONG = 2**23  # size of a log in bytes above which a message is printed before it is read
 
 
 class RecordLoop(NamedTuple):

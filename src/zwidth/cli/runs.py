@@ -101,10 +101,10 @@ def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi:
     with _interrupt_on_sigterm() as signals:
         try:
             with reporter() as progress, style_sheet(size=size, dpi=dpi):
-                # Pass the options as arguments, because they have the names of the arguments of `zwidth.run`.
+                # Pass all other options on by name, because they have the names of the arguments of `zwidth.run`.
                 result = run_studies(path, progress=progress, **options)
         except KeyboardInterrupt:
-            # Return no result, because the run was interrupted before its first study began.
+            # The run was interrupted before its first study began, so there is no result to report.
             result = None
     if result is not None:
         _report_end(result, command)
@@ -281,7 +281,7 @@ def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
     The command requires a checkout of the project, because it runs the programs in benchmarks/methods. To measure the
     errors, it also requires the extra "test".
     """
-    # Find the benchmarks in the checkout, because a wheel does not contain them.
+    # Look for the benchmarks in the checkout, because an installed package does not contain them.
     folder = Path(__file__).parents[3] / "benchmarks"
     if not (folder / "methods").is_dir():
         raise ResourceError(
@@ -316,7 +316,7 @@ def reporter() -> Iterator[Callable[[StudyEvent], None]]:
                 line = f"{done}/{total} done"
             lines = list(_lines(event))
             if bar is not None:
-                # Erase the bar before each line; `render_progress` draws it again below the lines.
+                # Erase the progress bar before each line; `render_progress` draws it again below the lines.
                 lines = [f"\r\033[K{text}" for text in lines]
                 bar.label, bar.pos, bar.length, bar.current_item = f"{event.name} ({event.kind})", done, total, state
             elif line and (due or time.monotonic() - printed >= _SECONDS_BETWEEN_LINES):

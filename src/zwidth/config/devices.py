@@ -116,7 +116,8 @@ class SystemSection(PartSection, noun="a linear system"):
             yield (), problem(f"got {given}", f"a linear system has {forms}", "write one of these")
 
     def find_faults(self) -> Iterable[LocatedProblem]:
-        # Report the problems at the path of the section instead of a key, because their messages already name the key.
+        # Report the problems with the path of the section instead of that of a key, because the messages already name
+        # the key.
         return [((), fault) for _, fault in super().find_faults()] if _is_complete(self.model_fields_set) else []
 
 
@@ -211,10 +212,10 @@ class OneKind(Strict):
 
 
 def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float:
-    """Validate the key ``period`` by ``read``; if it is absent, return the inverse of the key ``rate``, in s."""
+    """Validate the key ``period`` with the function ``read``; if it is absent, return the inverse of ``rate``, in s."""
     if value is not None:
         return read(value)
-    # Use 1 in place of a rate whose validation failed, which is absent from ``info.data``, because this problem is
+    # A rate whose validation failed is absent from ``info.data``. Use 1 in its place, because the invalid rate is
     # already reported.
     rate = info.data.get("rate", 1.0)
     if rate is None:
@@ -223,7 +224,7 @@ def read_period(value: Any, read: Callable[[Any], float], info: ValidationInfo) 
 
 
 def _validate_mass(value: Any, read: Callable[[Any], float], info: ValidationInfo) -> float | None:
-    """Validate the key ``mass`` by ``read``; return None if a linear system or a measured response replaces it."""
+    """Validate the key ``mass`` with the function ``read``; return None if a system or a response replaces it."""
     if value is not None:
         return read(value)
     if info.data.get("device", ...) is None:

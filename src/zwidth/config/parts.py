@@ -36,7 +36,8 @@ from zwidth.units.quantities import CHOICES, FIELDS, NOT_NEGATIVE
 
 PART_NAMES = ("velocity", *PARTS, "modes")
 
-# Allowed values and remedy to report if FOAW, an adaptive velocity estimate, is given but a linear one is required.
+# Texts that are reported if FOAW, an adaptive velocity estimate, is given but a linear estimate is required: reason and
+# remedy.
 NO_LINEAR_FORM = "FOAW chooses its window by the motion and has no linear form"
 SIMULATED = "use the kind 'simulate' or 'limit_cycle', or a linear estimate such as 'windowed_difference'"
 
@@ -115,7 +116,7 @@ def make_section(part: Any, owner: str, noun: str, kind: str = "") -> type[PartS
 
 
 def _head(part: Any) -> str:
-    """Return the first line of the docstring of a part."""
+    """Return the first line of the docstring of a part, which describes its section."""
     return part.__doc__.partition("\n")[0]
 
 

@@ -101,7 +101,7 @@ class Study(Strict):
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        """Return the mapping of a study, in which the scene supplies the absent keys of `from_scene`."""
+        """Return the mapping of a study, in which the scene supplies those keys of ``from_scene`` that are absent."""
         absent = cls._list_absent(raw)
         supplied: dict[str, Any] = {"delta": scene.delta, "d": scene.d}
         if isinstance(scene, PhysicalScene):
@@ -115,7 +115,7 @@ class Study(Strict):
 
     @classmethod
     def _list_absent(cls, raw: dict[str, Any]) -> list[str]:
-        """Return the keys of `from_scene` that the mapping ``raw`` does not contain; ``rate`` counts as ``period``."""
+        """Return the keys that the scene can supply and ``raw`` does not contain; ``rate`` counts as ``period``."""
         given = {*raw, "period"} if "rate" in raw else raw
         return [name for name in cls.from_scene if name not in given]
 

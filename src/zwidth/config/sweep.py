@@ -69,8 +69,8 @@ def _make_axis_field(name: str) -> tuple[Any, Any]:
         rows = "Parameters that vary together, one row per device: lists of equal length, or a CSV file."
         return TableField | None, Field(default=None, description=rows)  # pyright: ignore[reportOperatorIssue]
     axis: Any = Annotated[Axis, axis_of(name)]
-    # Replace the note of the parameter, which may state a default, because the default of an axis is the value of the
-    # scene.
+    # Replace the note of the parameter, which may state another default, because the default of an axis is the value of
+    # the scene.
     description = describe_parameter(
         replace(PARAMETERS[name], note="" if name in WALL else "default: that of the scene")
     )
@@ -320,7 +320,8 @@ class SweepStudy(_Parts, Study):
                 yield (name,), problem(f"got {name!r} with normalized axes", "parts are in SI units", "remove it")
             return
         parts = build_parts(self)
-        # Check the attributes of a linear system or measured response in place of parts, because it contains all parts.
+        # For a linear system or a measured response, check its own attributes instead of parts, because it replaces
+        # them.
         obstacle = find_unsupported_reason(**(vars(parts["device"]) if "device" in parts else parts))
         for index, name in enumerate(self.outputs):
             if name not in OUTPUTS_WITH_PARTS:

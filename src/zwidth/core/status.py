@@ -29,7 +29,7 @@ class Status(IntEnum):
 
 
 def note_failures(counts: Iterable[int], of: str = "points") -> tuple[str, ...]:
-    """Return a tuple with one sentence that counts the points without result by status; empty if all points are OK.
+    """Return a tuple with one sentence that states the number of points without result per status; empty if all are OK.
 
     Args:
         counts: number of points by status code, starting with OK.

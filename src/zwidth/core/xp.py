@@ -51,7 +51,7 @@ def compute_concretely() -> Iterator[None]:
 
 def namespace(*values: Any) -> Any:
     """Return `jax.numpy` if any argument is a JAX array, otherwise NumPy."""
-    # Repeat the code of `is_jax`, because calls of it would take half of the computation time for a single wall.
+    # Inline `is_jax`, because calls of it would take half of the computation time of a single wall.
     kind = getattr(sys.modules.get("jax"), "Array", None)
     if kind is not None:
         for value in values:
@@ -139,7 +139,7 @@ def differentiate_along(
 
 
 def expand_along(values: np.ndarray, like: Any) -> Any:
-    """Reshape a vector for broadcasting along a new last axis of ``like``, and convert it to the type of ``like``."""
+    """Return a vector in the type of ``like``, reshaped to broadcast with ``like[..., None]`` along the last axis."""
     return namespace(like).asarray(values, like.dtype).reshape((1,) * like.ndim + (-1,))
 
 
@@ -149,8 +149,8 @@ def epsilon(value: Any) -> float:
 
 
 def horner(x: Any, coefficients: Sequence[Any]) -> Any:
-    """Evaluate a polynomial at x by Horner's rule; the coefficients start with the lowest power."""
-    # Test the type first, because this avoids most calls of `is_jax` when single walls are computed.
+    """Evaluate a polynomial at x by Horner's rule; the coefficients are given from the lowest power up."""
+    # Test for NumPy and Python types first, because this avoids most calls of `is_jax` when single walls are computed.
     if not isinstance(x, _HOST_TYPES) and is_jax(x) and all(isinstance(each, float) for each in coefficients):
         return _polynomial(tuple(coefficients))(x)
     total = coefficients[-1]
@@ -196,8 +196,8 @@ def nan_beyond(limits: tuple[float, float], *values: Array) -> list[np.ndarray]:
     return [np.where(within(value, limits), value, np.nan) for value in values]
 
 
-# At an invalid point, values and derivatives must both be NaN. `where(ok, value, nan)` does not suffice, because its
-# derivative would be 0. If a kernel can compute with NaN, apply `nan_unless` to its arguments. Otherwise, as in
+# The following two functions make both values and derivatives NaN at invalid points; with `where(ok, value, nan)` the
+# derivatives would be 0. Kernels that can compute with NaN apply `nan_unless` to their arguments. Others, such as
 # solvers, replace invalid arguments by valid ones and add `nan_with_nan_derivatives` to the results.
 
 

@@ -21,12 +21,13 @@ from zwidth.units.formatting import plain, with_unit
 from zwidth.units.unit_system import UnitSystem
 
 # Constants of the regression on the weak form (`explain_motion`).
-# Lengths of the test functions, in samples. Longer ones reduce the effect of position errors, by 1/length^2.
+# Lengths of the test functions, in samples. The effect of position errors decreases as 1/length^2.
 _WINDOWS = (32, 128)
 _MIN_WINDOWS = 12  # least number of half-overlapping test functions that fit into a log
-# A wrong sign is reported if the model with a negative mass leaves less than this share of the sum of squares.
+# A wrong sign of the force or position is reported if the fitted mass is negative and the residual sum of squares is
+# less than this share of the sum of squared accelerations.
 _SIGN = 0.3
-# A spring or gravity is reported if including it reduces the residual sum of squares below this share.
+# A spring or gravity is reported if adding it to the model reduces the residual sum of squares to less than this share.
 _EXPLAINED = 0.25
 
 # Constants of the test of residuals (`explain_residuals`).
@@ -122,7 +123,7 @@ def _fit_columns(wanted: np.ndarray, columns: list[np.ndarray]) -> tuple[np.ndar
 
 
 def explain_residuals(best: FittedModel, system: UnitSystem) -> str:
-    """Identify the cause of residuals that are not white noise; return a clause, "" if no cause is identified."""
+    """Return the cause of residuals that are not white noise, as a clause for a message; "" if none is identified."""
     derivatives = best.response.derivatives
     basis = np.linalg.qr(derivatives / np.maximum(np.linalg.norm(derivatives, axis=0), 1e-300))[0]
     left = best.residuals - basis @ (basis.T @ best.residuals)
@@ -132,7 +133,7 @@ def explain_residuals(best: FittedModel, system: UnitSystem) -> str:
         return rounded
 
     def explain(*accelerations: list[np.ndarray]) -> float:
-        """Return the share of the residual sum of squares explained by the responses to the given accelerations."""
+        """Return the share of the residual sum of squares that the responses to ``accelerations`` explain."""
         columns = np.array([_simulate_accelerations(best, each) for each in accelerations]).T
         columns = columns - basis @ (basis.T @ columns)
         return 1.0 - _fit_columns(left, list(columns.T))[1] / squares
@@ -169,7 +170,7 @@ def _simulate_accelerations(best: FittedModel, accelerations: list[np.ndarray]) 
 
 
 def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float, system: UnitSystem) -> str:
-    """Test whether the rounding of the force column explains the residuals.
+    """Return a clause for a message if the rounding of the force column explains the residuals, "" otherwise.
 
     The expected effect of the rounding is the mean over random rounding errors, simulated with the fitted mass.
 

@@ -40,7 +40,7 @@ _MANY_COUNTS = 50.0  # least range (maximum minus minimum) of integer positions 
 _ROUNDING = 1e-9  # relative difference of two conversion factors below which they count as equal (rounding errors)
 _SAME_PERIOD = 1e-3  # largest relative difference between the specified period and that of the logged times
 _OTHER = 0.1  # relative difference from the logged times above which the period specified in their place is refused
-# Units of mass that scales and load cells display for a force: for each one the unit of the corresponding weight.
+# Units of mass in which scales and load cells display a force, each with the unit of force of the corresponding weight.
 _WEIGHTS = {"kg": "kgf", "g": "gf", "lb": "lbf", "oz": "ozf"}
 _EPOCH = 1e9  # s since 1970 (the year 2001); larger times without a unit are assumed to be times since 1970
 _EPOCH_UNITS = (("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3))  # possible units of times since 1970, in the order of trial
@@ -159,7 +159,7 @@ def read_log(
 
 
 def _look_like_counts(position: np.ndarray) -> bool:
-    """Return whether all positions are integers with a range of at least `_MANY_COUNTS`, as encoder counts are."""
+    """Return whether all positions are integers and have a large range, like encoder counts."""
     finite = position[np.isfinite(position)]
     return bool(np.all(finite == np.round(finite))) and float(np.ptp(finite)) >= _MANY_COUNTS
 
@@ -204,7 +204,7 @@ def _name_units(
 
 
 def _is_rotary(units: Mapping[str, str], sources: Mapping[str, Column], resolution: Any) -> bool:
-    """Return whether the axis is rotary, according to the units, else to the resolution, else to the headers."""
+    """Return whether the axis is rotary: by the units, or without units by the resolution, or else by the headers."""
     for name in ("force", "position"):
         linear, angular = DIMENSIONS[name]
         base = _integrate_unit(units[name]) or units[name]
@@ -217,7 +217,7 @@ def _is_rotary(units: Mapping[str, str], sources: Mapping[str, Column], resoluti
 
 
 def _measure(name: str, unit: str) -> float | None:
-    """Return the factor that converts a quantity (position or force) from a unit to SI; None if the unit does not fit.
+    """Return the factor that converts a position or force from a unit to SI; None if the unit has another dimension.
 
     A unit of mass stands for the corresponding weight.
     """
@@ -253,7 +253,7 @@ def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[s
 
 
 def _integrate_unit(unit: str) -> str | None:
-    """Return the unit of position that belongs to a unit of velocity, as "m" to "m/s"; None for any other unit."""
+    """Return the unit of position that belongs to a unit of velocity, e.g. "m" for "m/s"; None for any other unit."""
     if unit == "rpm":
         return "turns"
     base, per, second = unit.rpartition("/")
@@ -320,7 +320,7 @@ def _read_unit(name: str, unit: str) -> tuple[float, Dimension | None]:
 
 
 def _check_pairs(units: Mapping[str, str], dimensions: Mapping[str, Dimension | None], resolution: Any) -> float | None:
-    """Check that position, force and resolution are all linear or all rotary, and return the encoder step in SI units.
+    """Return the encoder step in SI units; raise `InputError` if position, force and step mix linear and rotary units.
 
     Args:
         units: unit of each quantity, "" if it has none.

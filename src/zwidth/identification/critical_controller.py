@@ -30,8 +30,8 @@ from zwidth.model.circle_functions import CirclePoints, Jet
 from zwidth.numerics.held_mass import Plant, discretize_mass, split_delay
 from zwidth.stability.rigid.ridge import plant_slopes
 
-# Least |zeta^2 - 1| of a pole pair with damping ratio zeta. Closer poles are moved apart, because partial fractions
-# require distinct poles.
+# Least |zeta^2 - 1| of a pole pair with damping ratio zeta. Pairs that are closer to a double pole are moved apart,
+# because partial fractions require distinct poles.
 _DOUBLE = 1e-5
 # Maximization over B on a grid that is repeatedly refined around its best point.
 _DAMPINGS = 33  # number of points of the first grid
@@ -40,7 +40,7 @@ _TIMES = 3  # number of refinements
 
 
 class CriticalController:
-    """The critical controller ``q = -1/G`` of a batch of devices; the arguments broadcast with the frequencies.
+    """The critical controller ``q = -1/G`` of a batch of devices, whose parameters broadcast with the frequencies.
 
     A rigid device has ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``, with the coefficients of `numerics.held_mass`.
 
@@ -91,7 +91,7 @@ class CriticalController:
         return (self.residues * (np.exp(-1j * (self.n_delay + 1.0) * points.w) * above / below)).sum(0)
 
     def differentiate(self, points: CirclePoints, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Differentiate q of the rigid mass.
+        """Return the derivatives of q of the rigid mass with respect to the damping delta = b T/m and the delay d.
 
         Args:
             points: points of the unit circle.
@@ -176,11 +176,11 @@ class GridLimits:
 
     @cached_property
     def damping_limits(self) -> np.ndarray:
-        """For each device the B below which walls with K -> 0+ are stable; infinite if all B are stable."""
+        """The B of each device below which walls with K -> 0+ are stable; infinite if they are stable for all B."""
         return _cross_first(self.critical * self.velocity.conj(), self.critical / self.velocity)
 
     def limit_stiffness(self, virtual_damping: np.ndarray) -> np.ndarray:
-        """Return, for each device, the stiffness up to which all walls with a given B are stable; 0 if none is stable.
+        """Return the stiffness of each device up to which all walls with a given B are stable; 0 if none is stable.
 
         Args:
             virtual_damping: B, one value for all devices or one per device.
@@ -199,7 +199,7 @@ class GridLimits:
 
 
 def find_highest(limit: Callable[[np.ndarray], np.ndarray], top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Maximize a function of B over 0 <= B <= ``top``, for a batch of devices, on a refined grid.
+    """Maximize a function of B over 0 <= B <= ``top`` for each device of a batch, on a grid that is refined repeatedly.
 
     Args:
         limit: function that returns one value per device for an array of one B per device.
@@ -219,7 +219,7 @@ def find_highest(limit: Callable[[np.ndarray], np.ndarray], top: np.ndarray) -> 
 
 @np.errstate(all="ignore")
 def _cross_first(criterion: Array, value: Array) -> np.ndarray:
-    """Return the smallest positive real part of ``value`` at the frequencies at which ``criterion`` is real.
+    """Return the smallest positive Re(``value``) at the zero crossings of Im(``criterion``) over the frequency.
 
     Rows are devices and columns frequencies. Both arrays are interpolated linearly between neighboring frequencies. At
     the last frequency, ``criterion`` counts as real, because this frequency is at or near z = -1.

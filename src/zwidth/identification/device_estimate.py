@@ -43,7 +43,7 @@ class DimensionlessDevice(NamedTuple):
     modes: Any = ()  # for each mode the frequency in rad per sample, the damping ratio and the mass ratio m/m_i
 
     def to_parameters(self, period: Any) -> np.ndarray:
-        """Convert to an array of parameters in SI units, along its first axis in the order of `name_parameters`."""
+        """Return the parameters in SI units along the first axis of an array: mass, damping, delay, lag and modes."""
         mass, units = self.mass, [period, 1.0]
         values = [mass, self.delta * mass / period, self.d * period]
         values += [part * unit for part, unit in zip(self.lag, units, strict=False)]
@@ -101,13 +101,13 @@ def name_parameters(scene: Scene) -> tuple[str, ...]:
 
 
 def differentiate_stiffness_max(scene: Scene) -> tuple[float, np.ndarray]:
-    """Return K_max of a scene, and an array of its derivatives in the parameters that `name_parameters` lists."""
+    """Return K_max of a scene, and an array of its derivatives with respect to the fitted parameters of the scene."""
     sensitivities = scene.sensitivities()
     return float(sensitivities.stiffness), np.array([sensitivities.per[path] for path in name_parameters(scene)])
 
 
 def compute_reach(freedom: int | None, upper: float = UPPER) -> float:
-    """Return the half-width of a confidence interval in standard errors, a quantile of the t or normal distribution.
+    """Return the half-width of a confidence interval in standard errors: a quantile of the t or normal distribution.
 
     Args:
         freedom: degrees of freedom with which the noise was estimated; None if the noise is known.
@@ -120,7 +120,7 @@ def compute_reach(freedom: int | None, upper: float = UPPER) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceEstimate:
-    """An estimated device with the covariance of its parameters; `zwidth.DeviceFit` describes the attributes."""
+    """An estimated device: its scene, the covariance of its parameters and, for a log, its frequency response."""
 
     nominal: Scene  # scene with the fitted parameters
     covariance: np.ndarray  # covariance of the parameters, in SI units
@@ -162,12 +162,12 @@ class DeviceEstimate:
         return compute_reach(self.freedom)
 
     def normalize(self, drawn: np.ndarray) -> DimensionlessDevice:
-        """Convert parameters of random devices, one row per device in the order of ``numbers``, to one batch."""
+        """Convert parameters, one row per device and one column per entry of ``numbers``, to a batch of devices."""
         lag = 0 if self.actuator is None else self.actuator.order
         return DimensionlessDevice.from_parameters(np.moveaxis(drawn, 1, 0), self.period, lag)
 
     def propagate_errors(self, evaluate: Callable[[Scene], Any]) -> np.ndarray:
-        """Propagate the covariance of the parameters to a quantity computed from the scene, by finite differences.
+        """Propagate the covariance of the parameters to a quantity computed from a scene, by finite differences.
 
         Args:
             evaluate: function that computes the quantity, a number or an array, from a scene.
@@ -191,7 +191,7 @@ class DeviceEstimate:
         return np.array(rows)
 
     def draw(self, count: int) -> np.ndarray | None:
-        """Draw parameters of random devices from the distribution of the estimate.
+        """Draw the parameters of random devices from the distribution of the estimate, one row per device.
 
         The logarithm of the mass and the reciprocals of modal masses are drawn, because measurements determine the mass
         to a relative error and the response of a mode is proportional to the reciprocal of its modal mass. Devices with
@@ -207,7 +207,7 @@ class DeviceEstimate:
         values = self.estimates
         if not np.all(np.isfinite(self.covariance)):
             return None
-        # Modal masses are drawn as reciprocals and may have either sign.
+        # Mark the modal masses, because their reciprocals are drawn, and because they may have either sign.
         inverse = np.array([name.endswith(".mass") for name in self.numbers])
         center, slopes = values.copy(), np.ones(values.size)
         center[inverse], slopes[inverse] = 1.0 / values[inverse], -1.0 / values[inverse] ** 2
@@ -230,7 +230,7 @@ class DeviceEstimate:
         return None
 
     def bound_measured_stiffness(self, confidence: float) -> float:
-        """Return the lower confidence limit of the K measured at the largest measured B, in N/m; 0 for a log.
+        """Return a lower confidence limit in N/m of the stiffness that was measured at the largest B; 0 for a log.
 
         Args:
             confidence: probability that the true onset K is above the limit.
@@ -240,7 +240,10 @@ class DeviceEstimate:
 
     @cached_property
     def response_scene(self) -> Scene | None:
-        """The result of `build_response_scene` that includes undetected resonances, at the default reliability."""
+        """The scene of the fitted response with a radius that covers one undetected resonance; None without a response.
+
+        It is that of `build_response_scene` with the default of 99 % of the devices.
+        """
         return self.build_response_scene(RELIABILITY, True)
 
     def build_response_scene(self, reliability: float, hidden: bool) -> Scene | None:
@@ -265,7 +268,7 @@ class DeviceEstimate:
         if self.is_structured:
             changes = self.propagate_errors(lambda scene: scene.frequency_response(1.0, 0.0, fitted.frequency))
             # To first order, the confidence region of the response at one frequency is an ellipse in the complex plane.
-            # Add its longer half-axis to the radius, so that the disk contains the ellipse.
+            # Add the longer half-axis of the ellipse to the radius, so that the disk contains the ellipse.
             square, across = np.sum(np.abs(changes) ** 2, 0), np.abs(np.sum(changes**2, 0))
             count = len(self.numbers)
             reach = count * fdtri(count, self.freedom, reliability)

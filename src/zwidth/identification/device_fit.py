@@ -28,8 +28,8 @@ from zwidth.units.formatting import to_json, with_unit
 
 _FAR = 1e3  # half-width of the initial bracket in the root search for a quantile of ln K_max, in standard errors
 VAGUE = 0.5  # relative standard error of a parameter above which a warning is issued
-# A delay is restricted to nonnegative values. If its unrestricted estimate is this many standard errors below 0, a
-# warning is issued, because noise does not explain it.
+# The fitted delay is restricted to nonnegative values. A warning is issued if its unrestricted estimate is this many
+# standard errors below 0, because noise does not explain such an estimate.
 BEYOND = 3.0
 
 # Usual range of sampling periods in s. A period outside this range causes a warning, because its unit may be wrong.
@@ -62,8 +62,8 @@ class FittedMotion(NamedTuple):
     time: np.ndarray  # time of each sample, s
     force: np.ndarray  # commanded force, N
     position: np.ndarray  # measured position, m
-    # Modeled position in m. It is NaN at the start and after gaps, because past forces are unknown there, and after
-    # 200,000 samples.
+    # Modeled position in m. It is NaN at the start and after gaps, because the forces that act there were not
+    # logged, and after the first 200,000 samples, because these are not fitted.
     modelled: np.ndarray
 
 
@@ -152,7 +152,7 @@ class DeviceFit(DeviceEstimate):
 
     @cached_property
     def errors(self) -> dict[str, float]:
-        """The standard error of each fitted parameter and force, by name or path."""
+        """The standard errors of the fitted parameters and forces as a dictionary, by name or path."""
         errors = np.sqrt(np.diag(self.covariance)).tolist()
         return dict(zip(self.numbers, errors, strict=True)) | self.errors_of_log
 
@@ -207,7 +207,7 @@ class DeviceFit(DeviceEstimate):
         return float(np.sqrt(np.sum(self.propagate_errors(lambda scene: scene.max_stiffness().virtual_damping) ** 2)))
 
     def value_of(self, name: str) -> float:
-        """Return the value of a key of ``errors``: an attribute of the fit, or the parameter with this path."""
+        """Return the value to which the entry ``name`` of ``errors`` belongs: an attribute, or a device parameter."""
         return float(self.nominal.parameters()[name] if "." in name else getattr(self, name))
 
     @cached_property
@@ -361,7 +361,7 @@ class DeviceFit(DeviceEstimate):
 
 
 def check_period_unit(period: float) -> list[str]:
-    """Return a list with a warning that the unit may be wrong if the sampling period is unusual; else an empty list."""
+    """Return a list with a warning if the sampling period probably has a wrong unit; otherwise an empty list."""
     if _SHORTEST_PERIOD <= period <= _LONGEST_PERIOD:
         return []
     unit = "in ms or us" if period > _LONGEST_PERIOD else "in s"

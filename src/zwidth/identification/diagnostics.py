@@ -29,7 +29,7 @@ _SHARE = 0.25  # largest lag relative to the number of samples of the log
 
 
 def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = ()) -> dict[str, dict[str, Any]]:
-    """Return all tables of a fit by name, in the form that `zwidth.plotting.draw_device_fit` requires.
+    """Return a dictionary of all tables of a fit by name, as required for its plots and files.
 
     Args:
         fit: the fit.
@@ -100,7 +100,7 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return the stiffness up to which all walls are stable, 0 if none is, for random devices and values of B.
+    """Return the K up to which all walls are stable, 0 if none is, as an array over random devices and values of B.
 
     Args:
         fit: the fit.

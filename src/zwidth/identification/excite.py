@@ -3,7 +3,8 @@
 At frequencies at which the response decides the stability of walls, the frequencies are dense and the amplitudes large.
 The record consists of five *stretches*, whose sines have different phases. A stretch is three equal periods of the
 force, the first of which contains the transient. The standard errors of the response are computed from the differences
-between the stretches. A frequency is called *line* if it is counted in cycles per period of the force.
+between the stretches. The *lines* are the frequencies of the sines, each an integer number of cycles per period of the
+force.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ _HIGHEST = 0.98  # highest frequency of the force, relative to the Nyquist frequ
 _LOWEST = 1.0  # Hz; lowest frequency of the force
 _FIRST = 3  # least value of the lowest frequency, in cycles per period of the force
 _SOFT = 20.0  # Hz; below this frequency the amplitudes decrease in proportion to the frequency, to limit the motion
-# Second record, designed from the response measured with a first one.
+# Constants of a second record, which is designed from the response that a first record measured.
 # Largest uncertainty of the response between two frequencies, relative to its distance from the onset of instability.
 _GAP = 0.03
 _WEAKEST = 0.01  # smallest amplitude of a sine, relative to the largest
 # Stiffnesses of the walls whose stability the record is designed to decide, relative to the stiffest wall.
 _SHARES = np.linspace(0.3, 0.9, 7)
-# Reduction of the peaks of the force by repeated clipping.
+# Constants of the reduction of the peaks of the force by repeated clipping.
 _CLIPS = 60  # number of iterations
 _CUT = 0.75  # clipping level, relative to the peak of the force
 _FEWEST_SAMPLES = 600  # least number of samples per period of the force
@@ -154,7 +155,7 @@ def _design(
     seed: int,
     system: UnitSystem,
 ) -> Excitation:
-    """Design the force as `excite` does, for arguments in the given unit system."""
+    """Design the multisine force, for arguments in the given unit system."""
     period, most = check_number("period", period), check_number("force", force, system["N"], POSITIVE)
     step, length = (
         check_number("resolution", resolution, system["m"]),
@@ -189,7 +190,7 @@ def _design(
 
 
 def _build_frequency_grid(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
-    """Build the grid of lines of the force, in cycles per period of the force.
+    """Return the lines of the force, whose spacing is prescribed, as integer numbers of cycles per period of the force.
 
     Args:
         count: number of samples per period of the force.
@@ -232,7 +233,8 @@ def _design_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.nd
     wall = limit.stiffness + limit.virtual_damping * units.stiffness / units.virtual_damping * F
     distance = np.min([np.abs(1.0 / (share * wall) + response) for share in _SHARES], axis=0)
     spacing = _SPACING * np.minimum(1.0, np.sqrt(_GAP * distance / np.maximum(gap, 1e-300)))
-    # Limit the ratio of neighboring spacings to 2, so that the grid becomes dense before it reaches a narrow feature.
+    # Limit the ratio of neighboring spacings to 2, so that the grid becomes dense before it reaches a narrow range
+    # that requires small spacings.
     spacing = np.minimum(spacing, np.minimum(np.roll(spacing, 1), np.roll(spacing, -1)) * 2.0)
     lines = _build_frequency_grid(count, period, np.append(spacing[:1], spacing))
     shape = distance.min() / distance[lines - 1]

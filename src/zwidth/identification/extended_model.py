@@ -69,11 +69,11 @@ class Recordings:
     resolution: float = 0.0
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
-        """Weight columns with one row per sample by `MeasurementNoise.weigh`; without a noise model return them."""
+        """Weight columns with one row per sample according to the noise model; without one, return them unchanged."""
         return columns if self.noise is None else self.noise.weigh(columns)
 
     def truncate(self, count: int) -> Recordings:
-        """Return a copy with logs shortened to ``count`` positions by `Recording.truncate`, and with equal weights."""
+        """Return a copy with equal weights and logs cut off ``count`` positions after the first change of the force."""
         return replace(self, logs=tuple(log.truncate(count) for log in self.logs), noise=None)
 
     @property
@@ -138,7 +138,8 @@ class Recordings:
         """Simulate the device with parameters theta under the forces of log ``k``."""
         late, by_late = _limit_lag_delay(theta, self.lag, self.logs[k])
         v0 = self.velocity_indices[k]
-        # List the indices in theta of the parameters of `Recording.move`, in their order.
+        # List the indices in theta of the parameters of the rigid mass, in the order of the arguments of
+        # `Recording.move`.
         rigid_indices = np.array([0, 1, 2, v0 - 1, v0, -2, -1])
         rigid = self.logs[k].move(*(theta[rigid_indices] + late * np.eye(7)[2]).tolist())
         parts = self.simulate_parts(theta, k) if self.lag or self.modes else None
@@ -175,8 +176,9 @@ class Recordings:
                 place += (decay * amplitude).real
                 free_responses.append((j, decay, by_theta, amplitude))
         if self.lag:
-            # Subtract the linear response of the rigid mass with the delay d + late, which `simulate_log` uses because
-            # of the friction, and add that with the delay d, which the partial fractions require.
+            # `simulate_log` simulates the rigid mass with the delay d plus the low-frequency delay of the lag,
+            # ``late``, because of the friction. Replace its linear part by that with the delay d, which the partial
+            # fractions require.
             late, by_late = _limit_lag_delay(theta, self.lag, log)
             by_total = unit[2] + by_late @ unit[3 : 3 + self.lag]
             for gain, by_delay, delay in ((g, unit[2], d), (-g, by_total, d + late)):
@@ -207,7 +209,7 @@ class Recordings:
         return ModelResponse(place, differentiate)
 
     def _find_poles(self, thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute the poles of lag and modes with nonnegative imaginary part, and their weights.
+        """Compute those poles of the lag and the modes that have a nonnegative imaginary part, and their weights.
 
         Args:
             thetas: parameter vectors along the first axis, shape (size, count).
@@ -232,7 +234,8 @@ class Recordings:
         """
         moving = np.r_[0, 1, self.parts]
         steps, count = _STEP * np.abs(theta[moving]), moving.size
-        # Use an absolute step for delta and the step of T^2/m for all T^2/m_i, because these parameters may be 0.
+        # Use an absolute step for delta, and the step of T^2/m for T^2/m_i with the modal masses m_i, because delta and
+        # T^2/m_i may be 0.
         steps[1], steps[4 + self.lag :: 3] = max(_STEP, steps[1]), steps[0]
         thetas = np.tile(theta[:, None], 1 + 2 * count)
         thetas[moving, 1 + np.arange(count)] += steps
@@ -273,8 +276,8 @@ def _filter_force(log: Recording, pole: complex, d: float) -> ModelResponse:
     n_delay = int(np.floor(d))
     f, pole, first = d - n_delay, pole if pole.imag else pole.real, log.skip - n_delay
     with_positions = slice(first, first + log.position.size)
-    # Compute the gains from the newer and from the older force of a period to E_p at the next sample: at p and, for the
-    # derivative, at p plus and minus a step.
+    # Compute the gains with which the two forces of a period, before and after the delayed change, contribute to E_p at
+    # the next sample. Compute them at p and, for the derivative in p, at p plus and minus a step.
     near = pole + _STEP * np.array([[0.0], [1.0], [-1.0]])
     near = np.where(near == 0, 1e-300, near)
     gains = np.expm1(np.array([1.0 - f, f]) * near) / near * np.exp([0.0, 1.0 - f] * near)
@@ -290,7 +293,7 @@ def _filter_force(log: Recording, pole: complex, d: float) -> ModelResponse:
 
 
 def _integrate_velocity(log: Recording, delta: float, d: float, velocity: ModelResponse) -> ModelResponse:
-    """Integrate the velocity of a mass without friction and with T^2/m = 1 to its displacement.
+    """Integrate the velocity of a mass with T^2/m = 1 and without friction, and return its displacement.
 
     Args:
         log: the log; the displacement is relative to the first sample with a position.
@@ -305,7 +308,8 @@ def _integrate_velocity(log: Recording, delta: float, d: float, velocity: ModelR
     spans, now = np.array([d - n_delay, 1.0 - d + n_delay, 1.0]), log.skip - n_delay
     phi = phi_functions((delta + _STEP * np.array([[0.0], [1.0], [-1.0]])) * spans)
     by_velocity, by_force = (phi.phi1 * spans).T, (phi.phi2 * spans**2).T
-    # Compute the displacement per period caused by the velocity at its start, by the older and by the newer force.
+    # Compute the displacements in one period that are caused by the velocity at the start of the period, by the force
+    # before the delayed change, and by the force after this change.
     factors = np.array([by_velocity[2], by_force[0] + by_velocity[0] * by_velocity[1], by_force[1]])
     terms = np.vstack([velocity.position[:-1], log.recent_forces[::-1, now + 1 : now + log.position.size]])
 

@@ -85,7 +85,8 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
     if recommended.status == Status.OK:
         rows.append(("margins", f"{recommended.spell_margins()}; passive: {recommended.spell_passive()}"))
         rows += [*checks, *(("CAUTION", caution) for caution in recommended.cautions)]
-    # Describe the status only if it is NOT_CONVERGED, because the warnings of the fit describe every other status.
+    # Add a warning about the status only if it is NOT_CONVERGED, because the fit itself has warnings about every other
+    # status.
     unconverged = [f"NOT_CONVERGED: {describe_status(fit)}"] if fit.status == Status.NOT_CONVERGED else []
     rows += [("WARNING", text) for text in (*unconverged, *fit.doubts)] or [("warnings", "none")]
     rows += [("note", note) for note in fit.notes]
@@ -163,7 +164,7 @@ def _describe_next(fit: DeviceFit) -> str:
 
 
 def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
-    """Return pairs (label, text) with the details of a fit that `summarize_fit` omits.
+    """Return pairs (label, text) with the details of a fit that its summary omits.
 
     Args:
         fit: the fit.

@@ -8,7 +8,7 @@ with the mass m, the damping b, the delay d in sampling periods T, a constant fo
 and v0 are the position and velocity at the first sample. In each period the delayed force F(t - d) changes once, at the
 fractional part f of the delay. The period therefore has two *parts* of durations f and 1 - f in which a is constant.
 
-Within a part the velocity approaches a/delta exponentially, so it reaches 0 at most once. At such a *stop* the mass
+Within a part the velocity approaches a/delta exponentially, so it reaches 0 at most once. At this *stop* the mass
 sticks if ``|g F + o| <= c``; otherwise it reverses. The time of the stop follows from a logarithm. Before and after it
 the velocity and position have a closed form in the phi-functions of `zwidth.numerics.held_mass`. The derivatives in the
 parameters are exact, too: a change dv of the velocity near the stop shifts its time by -dv/a.
@@ -78,7 +78,7 @@ class Recording:
 
     @cached_property
     def recent_forces(self) -> np.ndarray:
-        """The forces that act during the period before each sample k if the integer delay is 0.
+        """The later and the earlier one of the two forces that act in the period before each sample k if 0 <= d < 1.
 
         The first row contains the force commanded at sample k - 1, the second row that at sample k - 2; forces before
         the log are 0. Two further columns repeat the last force, because a search may evaluate negative delays.
@@ -159,7 +159,8 @@ def _integrate_with_friction(
     )
     acceleration = acceleration.T.ravel()
     gained = {s: s * by_forces - by_friction for s in (1.0, -1.0)}
-    # List the parts in which the forces exceed the friction, because a sticking mass starts to move in the next one.
+    # List the parts in which the forces exceed the friction, because a sticking mass starts to move in the next of
+    # these.
     able = np.flatnonzero(np.abs(acceleration) > friction)
     decay = np.exp(-delta * np.arange(count // 2 + 1))
     # Tabulate the decay e^(-delta t) over the time t since the start of a first part, and of a second part.
@@ -177,7 +178,8 @@ def _integrate_with_friction(
             m, v = int(able[after]), 0.0
             s = 1.0 if acceleration[m] > 0 else -1.0
             changes.append((m, s))
-        # Search for the next part at whose end s v <= 0, in windows of increasing size, because most stops follow soon.
+        # Search for the next part at whose end s v <= 0, in windows of increasing size, because the next stop is
+        # usually near.
         gain, decay, first, size = gained[s], decays[m % 2], m + 1, 128
         ahead = s * v - gain.item(m)  # the term s v_m - G_m of the formula above
         while first <= count:
@@ -231,7 +233,7 @@ def _integrate_positions(
     delta: float,
     c: float,
 ) -> tuple[np.ndarray, Callable[[], np.ndarray]]:
-    """Integrate the velocities of the mass to displacements, and provide the derivatives of the positions.
+    """Integrate the velocities of the mass to displacements; also return a function that computes their derivatives.
 
     Args:
         parts: velocities in the parts of all periods, and stops.

@@ -49,7 +49,7 @@ _INSTEAD = {
 # Words in a header that stand for a unit of time.
 _UNIT_WORDS = {"millis": "ms", "micros": "us", "nanos": "ns", "secs": "s", "seconds": "s"}
 # A time may be split into two columns: whole seconds and fractions. The header of the column of fractions ends with one
-# of these words; the values are its unit.
+# of these words, each of which implies the unit of the fractions.
 _PARTS: dict[str, str] = dict.fromkeys(("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds", "ns"), "ns")
 _PARTS |= dict.fromkeys(("usec", "usecs", "microsec", "microseconds", "us"), "us")
 # Words with which the header of the column of whole seconds may end.

@@ -1,7 +1,7 @@
 """Fit a device to a log of its free motion under a commanded force.
 
 The steps are: read and repair the logs (`identification.recordings`); fit the positions by least squares
-(`identification.output_error`) with the model structure that Schwarz's criterion selects
+(`identification.output_error`) with the model structure that the Bayesian information criterion (BIC) selects
 (`identification.model_selection`); refuse logs whose motion the force does not explain; test the residuals for white
 noise; and bound undetected resonances and actuator lags (`identification.unmodeled_dynamics`,
 `identification.unmodeled_lag`). ``theta`` is the parameter vector of `identification.extended_model`. A *stretch* is a
@@ -52,7 +52,7 @@ _FEWEST = 20  # least number of fitted positions per stretch; shorter stretches 
 _FEW = 60  # number of fitted positions below which a warning is issued, because very different devices may fit them
 # Largest number of fitted positions of all logs. More would need gigabytes of memory and only reduce the errors.
 _MOST = 200_000
-_FINER = 0.3  # an encoder step is excluded if the residuals are smaller than its quantization noise by this factor
+_FINER = 0.3  # an encoder step is excluded if the residuals are at most this share of its quantization noise (RMS)
 _SEEN = 5.0  # least effect of the force on the positions, in standard errors; smaller effects are refused
 # A log is refused if its residuals exceed both of the following limits.
 _UNEXPLAINED = 0.01  # residual sum of squares, relative to that of a model without forces
@@ -77,8 +77,8 @@ def fit_log(
     The model is ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, with zero-order hold of the force; the positions
     are fitted by least squares. The constant force f0 and the friction F_c are always fitted. This increases the errors
     of the other parameters, but omitting f0 or F_c when they are hardly visible could bias the other parameters by many
-    standard errors. An actuator lag of first or second order and resonances are added if Schwarz's criterion requires
-    them.
+    standard errors. An actuator lag of first or second order and resonances are added if the Bayesian information
+    criterion (BIC) requires them.
 
     Args:
         time: times of the samples in s, evenly spaced, or only the sampling period. The parts before and after missing
@@ -146,7 +146,7 @@ def _fit(
     resolution: Any,
     system: UnitSystem,
 ) -> DeviceFit:
-    """Fit a device to logs that are read and repaired.
+    """Fit a device to logs that have already been read and repaired.
 
     Args:
         read: the logs.
@@ -163,8 +163,8 @@ def _fit(
         if not parts:
             most = max((each.stop - each.start for each in find_even(places[k], 1)), default=1)
             raise InputError(
-                f"time: log {k + 1} has {most} samples without a gap, of which the first {skip} only provide past "
-                f"forces; at least {skip + _FEWEST} are needed: record longer, or give a shorter max_delay"
+                f"time: log {k + 1} has {most} samples without a gap; at least {skip + _FEWEST} are needed, "
+                f"because the first {skip} only provide past forces: record longer, or give a shorter max_delay"
             )
     count = sum(map(len, stretches))
     recordings = tuple(
@@ -257,7 +257,7 @@ def _find_unexplained(best: FittedModel, pole: HiddenPole | None, period: float,
 
 
 def _convert_force(best: FittedModel, k: int) -> tuple[float, float]:
-    """Convert the acceleration at index ``k`` of theta, by the constant force or by friction, to a force in N.
+    """Convert entry ``k`` of theta, the acceleration by the constant force or by friction, to a force in N.
 
     Returns:
         The force and its standard error.
@@ -297,7 +297,7 @@ def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[li
 
 
 def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[float]) -> tuple[float, Choice]:
-    """Fit the device with one encoder step after another, until the residuals do not exclude the step.
+    """Fit the device with one candidate of the encoder step after another, until the residuals do not exclude it.
 
     Args:
         recordings: the logs.
@@ -316,8 +316,8 @@ def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[
 def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:
     """Raise `InputError` if the commanded force explains too little of the motion, or the fitted mass is negative."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
-    # Fit the positions by a free motion from the initial states alone, without any force. The reduction of its
-    # residuals is the effect of the forces.
+    # Fit the positions by the free motion from the initial states, without any force. The amount by which the fitted
+    # model reduces the residuals of the free motion is the effect of the forces.
     alone = model.simulate(np.append(theta[:-2], [0.0, 0.0])).derivatives[:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]

@@ -1,11 +1,11 @@
-"""Select the structure of a device by Schwarz's criterion: a rigid mass, or one with an actuator lag and resonances.
+"""Select the structure of a device by the BIC: a rigid mass, or a mass with an actuator lag and resonances.
 
 Starting from the rigid mass, a score test of the residuals (`zwidth.identification.unmodeled_dynamics`,
 `identification.unmodeled_lag`)
 decides whether the model lacks a pole or a lag. If so, all models with one *part* more are fitted: an actuator lag of
-the next order, or a resonance (*mode*) at one of the frequencies with the highest scores. Schwarz's criterion (BIC,
-Schwarz 1978) selects the model with the lowest sum of the *misfit*, -2 log(likelihood), and log(N) per parameter, for N
-positions. Then the residuals are tested again. ``theta`` is the parameter vector of
+the next order, or a resonance (*mode*) at one of the frequencies with the highest scores. The Bayesian information
+criterion (BIC, Schwarz 1978) selects the model with the lowest sum of the *misfit*, -2 log(likelihood), and log(N) per
+parameter, for N positions. Then the residuals are tested again. ``theta`` is the parameter vector of
 `zwidth.identification.extended_model.Recordings`.
 """
 
@@ -57,8 +57,8 @@ def choose_structure(best: FittedModel) -> Choice:
     rigid = best, pole, bank, lags = _test_residuals(best)
     rival = None
     for _ in range(_MAX_PARTS):
-        # Use the test for lags as well, because it detects lags that the score of a pole does not: the amplitude of
-        # their effect is known and need not be estimated.
+        # Use the test for lags as well, because it detects lags that the scores of the poles do not reveal: it does not
+        # estimate the amplitude of their effect, which is known.
         has_lag = lags is not None and lags.projection.max() ** 2 > 2.0 * np.log(best.count)
         if bank is None or rival or (pole is None and not has_lag):
             break
@@ -74,7 +74,7 @@ def choose_structure(best: FittedModel) -> Choice:
 
 
 def _test_residuals(best: FittedModel) -> Choice:
-    """Test the residuals of a model for a missing pole and, if the model lacks neither pole nor lag, for lags.
+    """Test the residuals for a missing pole and, if none is detected and the model has no lag, for a missing lag.
 
     Returns:
         The model, the missing pole, the scores of all poles, and the test for lags, as in `choose_structure`.
@@ -84,7 +84,7 @@ def _test_residuals(best: FittedModel) -> Choice:
 
 
 def _add_part(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, HiddenPole | None]:
-    """Fit all models with one part more than ``best``, and return the one that Schwarz's criterion selects.
+    """Fit all models with one part more than ``best``, and return the one that the BIC selects.
 
     A weak resonance has nearly the same effect on the positions as a lag, which has fewer parameters, but its K_max is
     very different. Therefore a resonance that fits significantly better than the selected lag is returned as well.
@@ -131,7 +131,7 @@ def _list_starts(best: FittedModel, bank: PoleBank) -> Iterator[tuple[int, int, 
                 yield 2, modes, np.r_[start, _DAMPING_RATIO, theta[3:]]
     elif lag == 1:
         yield 2, modes, np.r_[theta[:4], _DAMPING_RATIO, theta[4:]]
-    # Start with mass ratio 0 and zero free response of the new mode, so that the model reproduces ``best`` exactly.
+    # Start with a mass ratio and a free response of 0 for the new mode, so that the model reproduces ``best`` exactly.
     rigid_states, states = np.split(theta[first:-2], [2 * logs])
     states = np.concatenate([states.reshape(logs, -1), np.zeros((logs, 2))], 1).ravel()
     complex_poles = bank.select(bank.ratio < 1.0)

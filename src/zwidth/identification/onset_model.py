@@ -25,7 +25,7 @@ from zwidth.model.circle_functions import circle_points
 from zwidth.model.velocity import Estimate, Velocity
 from zwidth.units.unit_system import LINEAR, UnitSystem
 
-# Newton iteration that solves the imaginary part of the equation for the frequency w, in rad per sample.
+# Constants of the Newton iteration, which solves the imaginary part of the equation for w, in rad per sample.
 STEPS = 25  # largest number of Newton steps
 LONGEST = 0.15  # largest Newton step, relative to w, so that the iteration stays close to the measured frequency
 CONVERGED = 1e-9  # relative Newton step at which the iteration ends; the convergence is quadratic, so w is then exact
@@ -79,7 +79,8 @@ class Onsets:
             )
             step = np.clip(-residual / slope, -LONGEST * w, LONGEST * w)
             w = np.minimum(w + step, 0.5 * (w + np.pi))
-            # A wall whose Newton step is NaN does not prolong the iteration, because its step stays NaN.
+            # This condition also ends the iteration for walls whose step is NaN, because it then stays NaN and the
+            # comparison is false.
             if not np.any(np.abs(step) > CONVERGED * w):
                 break
         points = circle_points(w)

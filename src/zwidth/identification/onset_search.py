@@ -91,7 +91,7 @@ def _solve(
         walls = onsets.predict_walls(trial)
         ratios = np.stack([np.log(walls.kappa / onsets.kappa), np.log(walls.w / onsets.w)], -1)
         valid = walls.converged & np.all(np.isfinite(ratios), -1)
-        # If the device has no onset of instability at a measured B, assign a large constant to the residuals there.
+        # If the device has no onset of instability at a measured B, use a large constant as the residuals of this wall.
         return trial, np.where(valid[:, None], ratios, 10.0) * weights, walls, valid
 
     @np.errstate(all="ignore")
@@ -118,7 +118,7 @@ def _solve(
 
 
 def _refine(onsets: Onsets, weights: np.ndarray, first: Candidate, start: np.ndarray) -> list[Candidate]:
-    """Return the minima of the final search that have a nonnegative damping and delay.
+    """Repeat the search with the final tolerance, and return the minima whose damping and delay are nonnegative.
 
     Args:
         onsets: the measured walls.

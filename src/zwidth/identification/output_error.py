@@ -1,8 +1,8 @@
 """Fit a device model to logged positions by least squares, with the output-error method (Ljung 1999, section 4.2).
 
-The parameter vector theta of `fitting.structure.Recordings` contains g = T^2/m, delta = b T/m, the delay d, the
-parameters of an actuator lag and of resonances (*modes*), the initial position x0 and velocity v0 of each log, and the
-accelerations o and c by a constant force and by friction. The sum of the squared residuals, measured minus modeled
+The parameter vector theta of `identification.extended_model.Recordings` contains g = T^2/m, delta = b T/m, the delay d,
+the parameters of an actuator lag and of resonances (*modes*), the initial position x0 and velocity v0 of each log, and
+the accelerations o and c by a constant force and by friction. The sum of the squared residuals, measured minus modeled
 positions, is minimized by Levenberg-Marquardt steps with exact derivatives. Friction causes local minima, one for each
 missed stop of the mass. Therefore the search starts from several initial values with different frictions, and refines
 the best ones on more and more positions of the logs.
@@ -28,43 +28,44 @@ from zwidth.identification.extended_model import Recordings
 from zwidth.identification.friction_model import ModelResponse, Recording
 from zwidth.identification.quantization_noise import MeasurementNoise
 
-# Grid of initial values.
+# Grid of initial values of the search.
 _DELTAS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0)  # damping delta = b T/m
-# Friction, relative to the largest force.
+# Initial values of the friction, relative to the largest force.
 _FRICTIONS = np.array([0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.35])
-# Least friction of the search, relative to the largest force. It is not 0, because the derivative in the friction
-# vanishes there.
+# Least friction of the search, relative to the largest force. It is not 0, because the derivative of the positions in
+# the friction is 0 at this value.
 MIN_FRICTION = 1e-12
 _N_LEADING = 600  # number of leading positions of each log from which the initial values are computed
 _BATCH_SIZE = 32  # number of delays per batch, to limit the memory
-# Selection of the best initial value in several rounds. Each round has a number of leading positions of each log, and a
-# number of initial values that are kept for the next round.
+# Rounds of the selection of the best initial value: number of leading positions of each log that are fitted, and number
+# of initial values that are kept for the next round.
 _ROUNDS = ((300, 4), (600, 3), (1200, 2), (2500, 1))
 _STEPS_PER_ROUND = 12  # largest number of Levenberg-Marquardt steps from each initial value per round
 
-# Tolerances of the search: it ends if the predicted reduction of the sum of squares by the next step, relative to this
-# sum, is smaller.
+# Tolerances of the search. It ends if the next step is predicted to reduce the sum of squares by less than this share.
 _NEAR = 1e-3  # tolerance in the selection of an initial value
 CLOSELY = 2e-5  # tolerance in the comparison of device structures
 _CONVERGED = 1e-14  # tolerance of the final fit
 # Tolerance of fits from which only the noise is estimated. A search that ends because no step decreases the sum of
 # squares also counts as converged if it satisfies this tolerance.
 NEARLY = 1e-6
-# Levenberg-Marquardt method. The damping is the number that is added to the diagonal of the normalized equations.
+# Constants of the Levenberg-Marquardt method. Its damping is the number that is added to the diagonal of the normalized
+# normal equations.
 _MAX_STEPS = 100  # largest number of steps by default
 _INITIAL_DAMPING = 1e-4  # damping of the first step
 _NEGLIGIBLE_DAMPING = 1e-6  # value below which a decreasing damping is set to 0
 _MAX_DAMPING = 1e12  # damping above which the search ends
 
-# Ambiguity of friction and constant force.
-# A motion counts as one in a single direction if its path backward is shorter than this share of the whole path.
+# Limits that decide whether the log can distinguish friction from a constant force.
+# A motion counts as one in a single direction if the path traveled backward is less than this share of the whole path.
 _BACKWARD_SHARE = 0.1
-# A fit without friction is tried as a rival if the squared ratio of the friction to its standard error is smaller.
+# A fit without friction is tried as a rival if the squared ratio of the friction to its standard error is below this
+# number.
 _NEARLY_FRICTIONLESS = 900.0
-_EXCLUDED = 25.0  # difference in misfit from the best fit from which on a rival does not enlarge the covariance
+_EXCLUDED = 25.0  # a rival whose misfit exceeds that of the best fit by this much does not enlarge the covariance
 # An initial motion counts as invisible if its length is below this number of standard deviations of the noise.
 _INVISIBLE_DISTANCE = 3.0
-# Numerical limits and levels.
+# Numerical limits and a significance level.
 _MAX_CONDITION = 1e7  # condition number of the derivatives above which some parameters are not determined
 _ROUNDING = 1e-13  # relative rounding error of a sum of squares, and of the positions
 _SIGNIFICANCE = 1e-3  # significance level of the chi-square test for the excess
@@ -96,7 +97,7 @@ class FittedModel:
 
     @property
     def count(self) -> int:
-        """The number of fitted positions; if they are weighted, the effective number `MeasurementNoise.count`."""
+        """The number of fitted positions; if they are weighted, the effective number according to the noise model."""
         return self.model.measured.size if self.model.noise is None else self.model.noise.count
 
     @cached_property
@@ -162,17 +163,17 @@ class FittedModel:
         return self.count * np.log(ratio)
 
     def fits_as_well_as(self, other: FittedModel) -> bool:
-        """Return whether Schwarz's criterion (BIC) prefers this model to ``other``, which has more parameters."""
+        """Return whether the BIC (Schwarz 1978) prefers this model to ``other``, which has more parameters."""
         return self.compare_misfit(other) < max(1, other.inverse.rank - self.inverse.rank) * np.log(self.count)
 
     @cached_property
     def excess(self) -> float:
-        """The autocorrelation of the residuals, as a factor of variance; 1 for white noise or if not significant.
+        """The factor by which autocorrelation increases the variance of sums of residuals; 1 if it is not significant.
 
         The value is the mean square of sums of successive residuals, divided by that expected from the noise model.
         """
-        # Add 2 N^(1/3) of the N residuals per sum, which is a usual bandwidth for errors of unknown autocorrelation
-        # (Newey, West 1987).
+        # Form sums of 2 N^(1/3) successive residuals, with N their number. This is a usual bandwidth for errors with
+        # unknown autocorrelation (Newey, West 1987).
         from scipy.special import chdtri
 
         weights, total = self.model.noise or self.noise, self.residuals.size
@@ -207,7 +208,7 @@ class FittedModel:
             predicted = float(steps @ np.linalg.lstsq(correlation, steps, rcond=None)[0])
             actual = max(rival.compare_misfit(self) / self.excess, 1.0)
             # The misfit may increase less between the minimum and the rival than the derivatives predict, because the
-            # sum of squares has a kink between them. Then enlarge the covariance in this direction until both agree.
+            # sum of squares has a kink between them. If so, enlarge the covariance in this direction until both agree.
             if actual < min(predicted, _EXCLUDED):
                 covariance[block] += (1.0 / actual - 1.0 / predicted) * np.outer(away, away)
         return covariance
@@ -228,7 +229,8 @@ def fit_model(model: Recordings) -> FittedModel:
     direction = float(np.sign(steps.sum()))
     if -np.sum(steps, where=direction * steps < 0) * direction < _BACKWARD_SHARE * np.abs(steps).sum():
         g, total = best.theta[0], best.theta[-2] - direction * best.theta[-1]
-        # Attribute the sum to the constant force if it acts in the direction of motion, and to friction otherwise.
+        # Attribute the sum of both forces to the constant force if it acts in the direction of motion, and to friction
+        # otherwise.
         if direction * total > 0:
             parts, omitted = (total, MIN_FRICTION * abs(g) * model.largest_force), -1
         else:
@@ -251,7 +253,7 @@ def fit_model(model: Recordings) -> FittedModel:
 
 
 def _list_starts(model: Recordings) -> list[np.ndarray]:
-    """Compute initial values of theta: one without friction, and one for each friction of `_FRICTIONS`.
+    """Compute initial values of theta: one without friction, and one for each value of a grid of frictions.
 
     For each friction, the damping and the delay are those with the least sum of squares on a grid, evaluated on the
     first `_N_LEADING` positions of each log.
@@ -289,15 +291,15 @@ def _list_starts(model: Recordings) -> list[np.ndarray]:
     base[-2] = starts[0][-2] / starts[0][0]
     for friction in _FRICTIONS * model.largest_force:
         base[-1] = friction
-        # Omit dampings above the last one, because a larger friction explains more of the energy loss. Allow one grid
-        # step more as a margin.
+        # Omit dampings above that found for the previous, smaller friction, because friction then explains more of the
+        # energy loss. Allow one grid step more as a margin.
         delta, d = search(_DELTAS[: _DELTAS.index(delta) + 2])
         starts.append(minimize_squares(model, start(delta, d), (-1,), tolerance=_NEAR)[0])
     return starts
 
 
 def _simulate_rows(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.ndarray:
-    """Simulate the basis functions of the linear least squares: positions for g = 1, and their linear derivatives.
+    """Simulate the positions for g = 1 and their derivatives in the linear parameters, as basis of a linear fit.
 
     Args:
         model: the logs, with a model without lag and modes.
@@ -343,7 +345,7 @@ def _select_start(model: Recordings, starts: list[np.ndarray]) -> np.ndarray:
 
 
 def _fit(model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: float = _CONVERGED) -> FittedModel:
-    """Fit a model from one initial value, with initial velocities of exactly 0 if that fits as well.
+    """Fit a model from one initial value; set initial velocities to exactly 0 if the model then fits equally well.
 
     Args:
         model: the logs and the structure of the model.
@@ -371,7 +373,7 @@ def _fit(model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: fl
 def fit_nonnegative(
     model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: float = _CONVERGED
 ) -> FittedModel:
-    """Fit a model by `minimize_squares`; if the damping or the delay becomes negative, fix it at 0 and fit again."""
+    """Fit a model by least squares; if the damping or the delay becomes negative, fix it at 0 and fit again."""
     best = minimize_squares(model, start, fixed, tolerance=tolerance)
     while negative := tuple(k for k in (1, 2) if best[0][k] < 0):
         best[0][list(negative)] = 0.0
@@ -433,7 +435,8 @@ def minimize_squares(
                 return theta, squares, True
             damping = max(10.0 * damping, _INITIAL_DAMPING)
         if not better:
-            # End the search, because no step decreases the sum of squares, as at a kink or at the rounding error.
+            # End the search, because no step decreases the sum of squares: theta is at a kink, or the possible decrease
+            # is below the rounding error.
             break
         theta, response, residuals, squares, before = trial, trial_response, trial_residuals, trial_squares, squares
         # Decrease the damping if the sum of squares decreased about as predicted, and increase it if the reduction was

@@ -24,11 +24,13 @@ import numpy as np
 # Truncation of the Fourier series of the covariance.
 _WAVES = 40  # number of terms h; the omitted ones, about 1.5 % of q^2/12, are treated as white noise
 _MIN_WEIGHT = 1e-6  # smallest w_h that is included, relative to the variance of a sample
-# Detection of the encoder step: all positions are integer multiples of it, plus a common offset.
+# Constants of the detection of the encoder step. Positions are integer multiples of it, plus a common offset.
 _MAX_OFFSET = 0.02  # largest distance of a position from an integer multiple of the encoder step, in steps
-# The same for the rounding step of a column, which is smaller because only rounding errors of float64 contribute.
+# The same distance for the rounding step of a column, in rounding steps. It is smaller, because only rounding errors of
+# float64 contribute to it.
 _MAX_ROUNDING_OFFSET = 1e-4
-# Least encoder step that is detected, in rounding steps of the column, because smaller ones are hidden by the rounding.
+# Least encoder step that is detected, in rounding steps of the column. Smaller encoder steps are hidden by the
+# rounding.
 _ROUNDINGS = 5.0
 _MAX_STEPS = 1e7  # largest range of the positions for which a step is accepted, in steps
 _CHANCE = 1e-6  # largest probability, for an accepted step, that random positions are as close to its multiples
@@ -42,7 +44,7 @@ def find_steps(position: np.ndarray) -> tuple[float, float]:
     column contains encoder counts, both steps are equal.
     """
     values = np.unique(position)
-    # Tolerate rounding errors of this size, because the subtraction of a common offset causes them.
+    # Tolerate this rounding error, because the subtraction of the common offset from the positions causes it.
     error = 16.0 * float(np.spacing(np.abs(values).max()))
     column = _find_lattice(values, _MAX_ROUNDING_OFFSET, error)
     return _find_lattice(values, _MAX_OFFSET, max(column, error)) or column, column
@@ -54,7 +56,7 @@ def find_resolution(position: np.ndarray) -> float:
 
 
 def _find_lattice(values: np.ndarray, off: float, slack: float) -> float:
-    """Return the largest step of which all values are integer multiples plus a common offset; 0 if there is none.
+    """Return the largest step such that all values are integer multiples of it plus a common offset; 0 if none exists.
 
     The method is Euclid's algorithm with tolerances, applied to the differences of neighboring values.
 
@@ -107,7 +109,7 @@ class MeasurementNoise:
 
     @cached_property
     def _rests(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The stretches within one encoder step whose mean has a larger variance than it would have with white noise.
+        """The stretches whose mean has a larger variance than it would have with white noise, as four arrays.
 
         The four arrays are: the sample indices of all these stretches, joined; and for each stretch the offset in the
         first array, the number of samples, and the variance of its mean divided by that with white noise.
@@ -131,11 +133,11 @@ class MeasurementNoise:
 
     @property
     def count(self) -> int:
-        """The effective number of samples: the expected sum of squares of the weighted errors, divided by variance."""
+        """The effective number of samples: expected sum of squares of the weighted errors over ``variance``."""
         return int(self.position.size + np.sum(1.0 - self._rests[-1]))
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
-        """Weight columns with one row per sample: scale the mean of each stretch of `_rests` to white-noise variance.
+        """Weight columns with one row per sample: scale the mean of each stretch to the variance of white noise.
 
         Deviations from the mean of a stretch do not change.
         """
@@ -160,7 +162,7 @@ class MeasurementNoise:
         return total
 
     def spread_each(self, columns: np.ndarray) -> np.ndarray:
-        """Return the variances of linear combinations of the errors: the diagonal of the matrix of `spread`."""
+        """Return the variances of linear combinations of the errors, without computing their covariances."""
         white = np.sum(columns**2, 0)
         total = self.variance * white
         for wave, weight in self._waves():

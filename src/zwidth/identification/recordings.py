@@ -28,7 +28,8 @@ _SAME = 1e-5  # relative to the period
 _SURE = 5.0  # number of standard errors
 # A warning is issued if position or force is constant at its maximum or minimum for this number of samples.
 _STUCK = 25
-# A force counts as varying if the number of its values inside the range exceeds this share of those at the maximum.
+# A force that stays at its maximum or minimum counts as varying elsewhere if the number of its other distinct values
+# exceeds this share of the number of samples.
 _MANY = 0.1
 _MISSING = 1.5  # ratio of a time step to the median time step above which samples are missing
 

@@ -33,30 +33,31 @@ _ROLLOVERS = {
 }
 # Largest time step across a rollover, in median time steps. It exceeds 1, because samples may be missing at a rollover.
 _GAP = 50
-_TWICE = 0.01  # share of rows with a repeated time up to which these rows are omitted as faulty
+_TWICE = 0.01  # largest share of rows with a repeated time that are omitted as faulty; above it, the clock is coarse
 # Largest time between a position and the force that is paired with it, in periods. It is below 0.5, so that no force is
 # paired with two positions.
 _PAIRED = 0.45
 _UNPAIRED = 0.02  # share of positions without a force within this time up to which the log is accepted
 
-# Detection of glitches of the position.
-_WILD = 0.02  # share of positions omitted as glitches up to which a log is accepted
+# Constants of the detection of glitches of the position.
+_WILD = 0.02  # largest share of positions that are omitted as glitches; a log with more is refused
 _REACH = 3  # largest length of a glitch, and half-width of the running median, in samples
 # Least distance of a glitch from the line through its neighbors: the sum of two terms.
 _FAR = 10.0  # first term, in typical second differences (their 90 % quantile)
 _STEPS = 4.0  # second term, in smallest second differences, which are encoder steps
 _RETURN = 0.2  # largest distance from this line of the first position after a glitch, relative to the glitch
 
-# Wraps of the position. A wrap is accepted if the second differences next to it, after unwrapping, are below one of two
-# limits.
+# Constants of the detection of wraps. A wrap is accepted if the second differences next to it, after unwrapping, are
+# below one of two limits.
 _SMOOTH = 8.0  # first limit, in typical second differences (their 99 % quantile)
 _NEAR_WRAP = 0.05  # second limit, relative to the modulus; also the relative tolerance of jumps of equal size
 _SPAN = 0.5  # least jump that counts as a wrap if the modulus is unknown, relative to the range of the positions
 
-# Detection of times that a coarse clock has rounded to its ticks.
-_FEW_ODD = 5  # least number of time steps unequal to the median step with which times are recognized as rounded
-# Number of such steps from which on the errors of the times may have a range of 1.1 instead of 1.02 ticks, because
-# jitter adds to the rounding.
+# Detection of times that a coarse clock has rounded to its ticks. They are recognized by time steps that differ from
+# the median time step.
+_FEW_ODD = 5  # least number of such steps; fewer may be caused by missing samples
+# Number of such steps that proves the rounding. The errors of the times may then have a range of 1.1 instead of 1.02
+# ticks, because timestamp jitter can add to the rounding errors.
 _MANY_ODD = 20
 _COARSEST = 10.0  # largest tick of a clock whose times are repaired, in sampling periods
 
@@ -136,7 +137,7 @@ def _count(number: int, noun: str, ending: str = "s") -> str:
 
 
 def _first_gap(row: np.ndarray) -> int:
-    """Return the index of the first row that is missing in a sorted array of row indices."""
+    """Return the first index 0, 1, 2, ... that is missing from a sorted array of row indices."""
     late = np.flatnonzero(row != np.arange(row.size))
     return int(late[0]) if late.size else row.size
 
@@ -293,7 +294,7 @@ def _list_moduli(position: np.ndarray, step: float, system: UnitSystem) -> Itera
 
 
 def _measure_modulus(moves: np.ndarray, span: float, step: float, system: UnitSystem) -> float:
-    """Measure the modulus of a counter with an arbitrary range by the size of its jumps; 0 if their sizes differ.
+    """Return the modulus of a counter with an arbitrary range, measured by the size of its jumps; 0 if sizes differ.
 
     Args:
         moves: differences of successive positions.
@@ -336,7 +337,7 @@ def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
     wild = np.zeros(position.size, bool)
     if position.size < 4 * _REACH or not moving.size:
         return wild
-    # Add some encoder steps to the limit, because these cause most second differences in slow motion.
+    # Add some encoder steps to the limit, because single steps cause most of the second differences in slow motion.
     limit = _FAR * float(np.quantile(moving, 0.9)) + _STEPS * float(moving.min())
     # Estimate the usual difference of successive positions by a running median, on which glitches have no effect.
     usual = _filter_median(moves, _REACH + 1)
@@ -397,7 +398,8 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
         middle = float(np.mean(clock[first:last] - period * offset))
         place[first:last] = offset + (np.round((middle - start) / period) if first != begins[longest] else 0.0)
         late[first:last] = clock[first:last] - period * place[first:last]
-    # Count the steps that differ from the median. Several are required, because missing samples cause some, too.
+    # Count the time steps that differ from the median step. A few of them may be caused by missing samples instead of
+    # rounding.
     usual = np.median(steps)
     odd = int(np.sum(np.abs(steps - usual) > 0.5 * tick))
     allowed = 1.0 + (0.1 if odd >= _MANY_ODD else 0.02)
@@ -405,8 +407,8 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
         if odd >= _FEW_ODD and period > 1.5 * tick:
             _refuse_left_out(steps, tick)
         return None
-    # Interpret a tick that is no power of ten as the sampling period of the loop, because clocks are rounded to powers
-    # of ten.
+    # Interpret a tick that is not a power of ten as the sampling period of the loop, because clocks round to powers of
+    # ten.
     if not np.isclose(np.log10(tick), np.round(np.log10(tick)), rtol=0, atol=1e-3) and period > 1.5 * tick:
         _refuse_left_out(steps, tick)
     ticks, apart = with_unit(tick, "s", 3), with_unit(period, "s")
@@ -415,7 +417,7 @@ def even_coarse_times(clock: np.ndarray) -> EvenTimes | None:
 
 
 def _refuse_left_out(steps: np.ndarray, tick: float) -> None:
-    """Raise `InputError` if all time steps are 1 to 20 ticks, because the loop then logs only some of its samples.
+    """Raise `InputError` if each time step is a whole number of 1 to 20 ticks, which indicates omitted samples.
 
     Args:
         steps: time steps in s.

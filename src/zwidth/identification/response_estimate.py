@@ -32,8 +32,8 @@ from zwidth.units.quantities import POSITIVE
 from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 # Deviation, in standard errors of the complex response: 4.5 standard errors of the real or of the imaginary part, each
-# of which has half of the variance. With this factor the true response is within the deviation at all of some thousand
-# lines.
+# of which has half of the variance. With this factor, the true response is within the deviation at all of several
+# thousand lines, with high probability.
 SURE = 4.5 / np.sqrt(2.0)
 # Constants of the analysis of periodic forces.
 # Largest difference between forces one period apart that count as equal, relative to the range of the force.
@@ -133,7 +133,7 @@ def respond(
 def _respond(
     time: ArrayLike, position: ArrayLike, force: ArrayLike, cycle: Any, resolution: Any, system: UnitSystem
 ) -> ResponseEstimate:
-    """Estimate the response as `respond` does, for arguments in the given unit system."""
+    """Estimate the frequency response, for arguments in the given unit system."""
     read = read_logs(time, position, force, system, resolution=resolution)
     period, notes = read.period, list(read.notes)
     logs = tuple(_fill(log, place, k, notes) for k, (log, place) in enumerate(zip(*read[:2], strict=True), start=1))
@@ -159,7 +159,7 @@ def _respond(
 
 
 def _fill(log: Recording, place: np.ndarray, number: int, notes: list[str]) -> Recording:
-    """Interpolate the missing samples of a log, if they are few.
+    """Return a log with its missing samples interpolated; raise `InputError` if too many samples are missing.
 
     Args:
         log: the log, whose arrays do not contain the missing samples.
@@ -336,7 +336,8 @@ def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list
     sums = [np.zeros(size // 2 + 1, complex) for _ in range(3)]
     pieces = 0
     for log in logs:
-        # Omit the force of the first sample, because this sample has no difference from a previous one.
+        # Use the differences of successive positions. Omit the force of the first sample, because no previous position
+        # exists for it.
         f, x = log.force[1:], np.diff(log.position)
         segments = 2 * f.size // size - 1
         pieces += segments

@@ -46,13 +46,13 @@ _SLOWEST = 1e-4  # lowest frequency of the grid
 _SLOW = 60  # number of frequencies of the logarithmic part, which slow loops require
 _EVEN = 400  # number of frequencies of the uniform part
 _EVEN_PER_PERIOD = 40  # additional number of frequencies of the uniform part per sampling period of delay
-# Largest delay of a random device that is computed, in sampling periods: the first number plus the second one times the
-# estimated delay. Devices with larger delays count as unstable.
+# Coefficients (a, b) of the largest delay of a random device, a + b times the estimated delay, in sampling periods.
+# Devices with larger delays count as unstable.
 _FARTHEST = (20.0, 1.5)
-# Confirmation of a wall by eigenvalues.
+# Constants of the confirmation of a wall by eigenvalues.
 _SOFTER = (1.0, 0.5, 0.1)  # stiffnesses of the checked walls, relative to K
-# Share of the devices by which the proportion confirmed by eigenvalues may be smaller than required, because the grid
-# of frequencies has errors.
+# Largest accepted difference between the required proportion of devices and the proportion on which eigenvalues confirm
+# the wall. It is not 0, because the stability limits on the grid of frequencies have errors.
 _MAX_CONTRADICTED = 2e-3
 
 
@@ -74,7 +74,7 @@ _UNDECIDED = SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
 
 
 def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> SafeWall:
-    """Search for the safe wall of an estimated device, as `zwidth.DeviceFit.safe_wall` describes.
+    """Search for the safe wall of an estimated device, for a required proportion of devices.
 
     Args:
         fit: the estimate.
@@ -248,7 +248,7 @@ class _SearchedDevices:
         return float(stable.sum()) / (stable.size + self.unstable_limits.size)
 
     def _take_quantile(self, limits: np.ndarray, reliability: float) -> float:
-        """Return the quantile of stability limits that the required proportion of devices reaches or exceeds.
+        """Return the quantile of ``limits`` that the required proportion of devices reaches or exceeds.
 
         Args:
             limits: stability limits of the devices in range; those of the other devices are 0.
@@ -294,7 +294,7 @@ def _are_stable(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtua
 
 
 def _build_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
-    """Convert devices to a batch of `Chain` models with unit mass, damping, modes, actuator lag, delay and estimate."""
+    """Convert dimensionless devices with a common velocity estimate to a batch of open loops (`Chain`)."""
     modes = tuple(Resonance(frequency, ratio, 1.0 / mass_ratio) for frequency, ratio, mass_ratio in devices.modes)
     lag = 1.0 / devices.lag[0] if devices.lag else None
     if len(devices.lag) == 2:

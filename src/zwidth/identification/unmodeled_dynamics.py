@@ -2,9 +2,11 @@
 
 Model. The weighted residuals of a fit are ``e = r s + n``: s is the signature of one missing pole, r its size, and n
 noise of variance ``sigma^2``. The *signature* of a mode or lag is the part of its effect on the positions that no
-change of the fitted parameters ``theta`` reproduces. A mode of *mass ratio* r has the modal mass
-``m/(r sqrt(1 - zeta^2))``, with the mass m of the device and the damping ratio zeta of the mode; r is negative if
-actuator and sensor are on opposite sides of a node. A *unit mode* has mass ratio 1.
+change of the fitted parameters ``theta`` (`identification.extended_model.Recordings`) reproduces. A mode of *mass
+ratio* r has the modal mass ``m/(r sqrt(1 - zeta^2))``, with the mass m of the device and the damping ratio zeta of the
+mode; r is negative if actuator and sensor are on opposite sides of a node. A *unit mode* has mass ratio 1. J are the
+derivatives of the positions in theta, W the weights of the samples. Unless stated otherwise, times are in sampling
+periods and frequencies are relative to the sampling rate.
 
 The candidates are a bank of poles: a grid of frequencies for each of a few damping ratios, and real poles for actuator
 lags. No model with a candidate is fitted. A pole is *absorbed* if a change of ``theta`` reproduces nearly all of its
@@ -12,18 +14,14 @@ effect. K_max is the maximum stiffness of a wall. The steps are explained in doc
 
 1. Score: the reduction of the sum of squares, in sigma^2, if the real and imaginary part of the force filtered by the
    pole are added to the model (Rao 1948). It is a chi-square variable if no pole is missing.
-2. Detection: `detect_missing_pole` returns the pole of the highest score if it satisfies Schwarz's criterion (BIC,
-   Schwarz 1978) for white noise and for the autocorrelated errors of the encoder.
+2. Detection: `detect_missing_pole` returns the pole of the highest score if it satisfies the Bayesian information
+   criterion (BIC, Schwarz 1978) for white noise and for the autocorrelated errors of the encoder.
 3. Bound: if no pole is detected, |r| is at most ``(sqrt(score) + 4)/size``, with ``size = |s|/sigma`` of the unit mode.
    `bound_response` computes the largest change of the response by such a mode, a radius that limits the safe walls.
 4. Averaging: with ``t = s'e/(sigma^2 size)``, the likelihood ratio of a device with one more mode to one without it is
    ``exp(t r size - (r size)^2/2)``. Its mean over the prior is the posterior odds; `sample_resonances` draws modes from
    the posterior and computes K_max with each (Bayesian model averaging, Hoeting et al. 1999).
 5. Lags: `bound_lag` returns the longest first-order actuator lag that the data cannot distinguish from pure delay.
-
-Unless stated otherwise, times are in sampling periods, frequencies are relative to the sampling rate, and ``theta`` is
-the parameter vector of `fitting.structure.Recordings`. J are the derivatives of the positions in theta, W the weights
-of the samples.
 
 References:
     Rao 1948, Proc. Cambridge Philos. Soc. 44, 50-57 (score test). Schwarz 1978, Annals of Statistics 6, 461-464
@@ -55,8 +53,8 @@ MAX_FREQUENCY = 0.49  # highest natural frequency in the bank, just below the Ny
 # (actuator lags).
 FREQUENCY_SPACING = {LEAST_DAMPING_RATIO: 1.01, 0.03: 1.06, 0.2: 1.06, 1.0: 1.06}
 BOUNDED_RATIOS = (LEAST_DAMPING_RATIO, 0.03)  # damping ratios of the undetected modes that `bound_response` considers
-# A pole counts as absorbed if the part of the filtered force orthogonal to the columns of W J is smaller than this
-# share of its norm.
+# A pole counts as absorbed if the part of the filtered force that is orthogonal to the weighted derivatives of the
+# positions in theta is smaller than this share of its norm.
 ABSORBED_NORM = 1e-6
 
 # Constants of the detection of a missing pole.
@@ -75,7 +73,8 @@ N_NEIGHBORS = 15  # number of poles on each side whose scores determine the loca
 MIN_RESPONSE_FREQUENCY = 2e-4  # lowest frequency of the grid
 N_BELOW_BANK = 40  # number of grid frequencies below the lowest frequency of the bank
 BAND_PHASE_STEP = 0.3  # rad; largest phase change by the delay between neighboring frequencies in `bound_response`
-# The same in `sample_resonances`, whose linear interpolation between frequencies requires a finer grid, in rad.
+# Largest such phase change in `sample_resonances`, in rad. It is smaller, because the linear interpolation between the
+# frequencies requires a finer grid.
 INTERPOLATION_PHASE_STEP = 0.06
 # Distances of the additional grid points from a resonance frequency, in half-widths of the resonance.
 RESONANCE_OFFSETS = np.sinh(np.linspace(-4.0, 4.0, 61))
@@ -142,7 +141,7 @@ def detect_missing_pole(fit: FittedModel) -> tuple[HiddenPole | None, PoleBank]:
         fit: The fitted model, at the minimum of its sum of squares.
 
     Returns:
-        The pole with the highest score that satisfies Schwarz's criterion (BIC), or None; and the scores of all poles.
+        The pole with the highest score that satisfies the BIC, or None; and the scores of all poles.
     """
     fit = truncate_logs(fit)
     basis, residuals = fit.inverse.basis, fit.model.weigh(fit.residuals)
@@ -150,7 +149,7 @@ def detect_missing_pole(fit: FittedModel) -> tuple[HiddenPole | None, PoleBank]:
     noise_variance = fit.variance * fit.excess
     bank = _score_poles(fit, basis, residuals, noise_variance)
     squares = float(residuals @ residuals)
-    # Schwarz's criterion (BIC) requires that each further parameter reduces -2 log(likelihood) by log(count). A complex
+    # The BIC requires that each further parameter reduces -2 log(likelihood) by log(count). A complex
     # pole adds two real parameters for the pole and two amplitudes, a real pole one of each. Both therefore add two
     # parameters per amplitude.
     threshold_per_amplitude = 2.0 * np.log(fit.count)
@@ -348,7 +347,8 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
         residuals: Weighted residuals, orthogonal to ``basis``.
         noise_variance: Variance sigma^2 of the noise.
     """
-    # Filter with the pole -inf, whose decay factor is 0, to obtain the latest force, on which the unit modes depend.
+    # Filter with the pole -inf, whose decay factor is 0, to obtain the latest force, because the positions of the unit
+    # modes depend on it.
     last = _filter_forces(fit, np.array([-np.inf]))[0]
     last_in_basis = basis.T @ last
     last_outside = last - basis @ last_in_basis
@@ -384,7 +384,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
 
 
 def _expand_unit_modes(fit: FittedModel, poles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the coefficients that express the position of each unit mode by the filtered forces of `_filter_forces`.
+    """Compute the coefficients that express the position of each unit mode as a combination of filtered forces.
 
     Let p be the pole, f the fractional part of the delay and g = T^2/m. If all forces acted for a whole period, the
     response of the pole would be ``(e^p - 1) e^(-f p)/p`` times the filtered force. The latest force has acted for
@@ -397,7 +397,7 @@ def _expand_unit_modes(fit: FittedModel, poles: np.ndarray) -> tuple[np.ndarray,
     """
     unit, delayed = fit.theta[0] / np.abs(poles) / poles, np.exp(-(fit.theta[2] % 1.0) * poles)
     gain = unit * np.expm1(poles) * delayed
-    # The imaginary part of gain (x + j y) is Im(gain) x + Re(gain) y.
+    # The imaginary part of gain (x + j y) is Im(gain) x + Re(gain) y, for the filtered force x + j y of a complex pole.
     return np.array([gain.imag, gain.real] if np.iscomplexobj(poles) else [gain.imag]), (unit * (1.0 - delayed)).imag
 
 

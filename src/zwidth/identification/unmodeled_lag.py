@@ -3,9 +3,9 @@
 At low frequencies a first-order lag with time constant ``tau`` is equivalent to a pure delay ``tau``. The test replaces
 part of the fitted delay by an equal time constant. The *signature* of this lag is the part of the resulting change of
 the positions that no change of the other parameters reproduces; the residuals are projected onto it. ``theta`` is the
-parameter vector of `fitting.structure.Recordings`, K_max the maximum stiffness of a wall. Further terms are those of
-`zwidth.identification.unmodeled_dynamics` and docs/theory/hidden.md. Times are in sampling periods unless stated
-otherwise.
+parameter vector of `identification.extended_model.Recordings`, K_max the maximum stiffness of a wall. Further terms are
+those of `zwidth.identification.unmodeled_dynamics` and docs/theory/hidden.md. Times are in sampling periods unless
+stated otherwise.
 """
 
 from __future__ import annotations

@@ -52,7 +52,8 @@ class NamedColumns:
     # Function of column indices, a type (float by default, or complex) and ``gaps``, which returns these columns as
     # arrays. With gaps=True, missing numbers become NaN; otherwise they raise an error.
     numbers: Callable[..., list[np.ndarray]]
-    # Error message for callers that need column names, if the file has none and ``heads`` are "1", "2", ...
+    # Error message for callers that need column names; empty if the file has names. Without names, ``heads`` are "1",
+    # "2", ...
     nameless: str = ""
 
 
@@ -336,7 +337,7 @@ def _find_layout(lines: list[str]) -> _Layout:
         return _Layout(above[0], None, begin, separator)
     cells = len(_split(lines[begin], separator))
     named = [k for k in above if len(_trim(_split(lines[k], separator))) == width]
-    # If no line matches and the first sample ends with empty cells, count these, because each may have a column name.
+    # If no line matches, also count empty cells at the end of the first sample, because their columns may have names.
     named = named or [k for k in above if len(_split(lines[k], separator)) == cells]
     if not named:
         plain = [k for k in above if holds_data(lines[k])]
@@ -366,7 +367,7 @@ def _read_with_numpy(lines: list[str], layout: _Layout, count: int, indices: Seq
     begin, separator = layout.begin, layout.separator
     time_columns = _find_time_columns(lines, layout, indices)
     if separator != "," and all(any(sign in line for line in islice(lines, begin, None)) for sign in ",."):
-        # If commas and points occur, `_read_cells` must check that all numbers have the same decimal sign.
+        # Leave a table with commas and points to `_read_cells`, which checks that all decimal signs are the same.
         return None
     if separator == " ":
         width = max(len(line.split()) for line in lines[begin:])

@@ -34,7 +34,8 @@ def to_periods(delay: Array, period: Array) -> Array:
     quotient = delay / period
     nearest = xp.round(quotient)
     near = xp.abs(quotient - nearest) <= 4 * np.finfo(quotient.dtype).eps * xp.maximum(nearest, 1.0)
-    # Subtract the rounding error as a constant, so that the derivatives remain those of the quotient.
+    # Subtract the rounding error as a constant (without gradient), so that the derivatives remain those of the
+    # quotient.
     return quotient - stop_gradient(xp.where(near & (nearest > 0), quotient - nearest, 0.0), xp)
 
 
@@ -66,7 +67,7 @@ def read_span(value: Any, allowed: Range) -> Span:
     return Span(amount, "periods" if unit == "periods" else "s")
 
 
-# Names and units of both kinds of devices for messages. The index is False for linear and True for rotary devices.
+# Names and units of linear and of rotary devices for messages, in this order: ``rotary`` (False or True) is the index.
 _KINDS = ("linear", "rotary")
 _UNITS = ("kg, N s/m and N/m", "kg m^2, N m s/rad and N m/rad")
 
@@ -159,8 +160,8 @@ class Part:
 
     def __post_init__(self) -> None:
         """Convert all fields to SI units; raise `InputError` for a value out of the range in `units.quantities`."""
-        # Fields whose default is None are optional, so that None needs no check. If a unit determines the kind of
-        # device, the attribute ``rotary`` stores it.
+        # Do not check the value None of a field whose default is None, because this field is optional. If a unit
+        # determines the kind of device, store the kind in the attribute ``rotary``.
         items = {f"{self._owner}.{item.name}".lstrip("."): item for item in fields(self)}  # pyright: ignore[reportArgumentType]
         kind = find_kind({path: getattr(self, item.name) for path, item in items.items()})
         if kind is not None:
@@ -195,7 +196,7 @@ class Part:
 
 
 def _flatten(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield pairs of name and value; for a list that contains texts, one pair per entry with the name of the list."""
+    """Yield the items of a dictionary as pairs (name, value); a list that contains texts yields one pair per entry."""
     for name, value in given.items():
         if isinstance(value, list | tuple) and _has_text(value):
             for each in value:
@@ -205,7 +206,7 @@ def _flatten(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _kind_of(value: Any) -> bool | None:
-    """Return the kind of device to which a text with a unit, or a part, belongs; None if it determines no kind."""
+    """Return the kind of device that a text with a unit, or a part, requires: True for rotary; None if it fits both."""
     return detect_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
 
 
@@ -233,7 +234,7 @@ def find_kind(given: dict[str, Any]) -> bool | None:
 
 
 def check_kind(rotary: bool, given: dict[str, Any]) -> None:
-    """Raise `InputError` if a quantity or part in ``given``, by name, belongs to the other kind of device."""
+    """Raise `InputError` if a quantity or part in the dictionary ``given`` belongs to the other kind of device."""
     for name, value in given.items():
         kind = _kind_of(value)
         if kind is not None and bool(kind) != rotary:
@@ -283,7 +284,7 @@ def check_limit(name: str, value: Any, unit: str) -> float:
 
 
 def check_span(field: str, value: Any) -> Any:
-    """Convert a duration to a `Span` in its original unit, s or periods; return a value that JAX traces unchanged."""
+    """Convert a duration to a `Span` that keeps its unit, s or periods; return a value that JAX traces unchanged."""
     return value if is_traced(value) else _read(field, value, lambda duration: read_span(duration, NOT_NEGATIVE))
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from zwidth.core.types import Array
 from zwidth.core.xp import namespace, stop_gradient
 
-# A root counts as a root on the unit circle, like that of an undamped mode, if its distance from the circle is at most
-# _ON_CIRCLE (_AT_ONE + |offset|). This limit decreases with the offset, because near z = 1 even a very small distance
-# is meaningful: it determines the decay time of the root.
+# A root is treated as a root on the unit circle, such as that of an undamped mode, if its distance from the circle is
+# at most _ON_CIRCLE (_AT_ONE + |offset|). This limit is smaller near z = 1, because there even a very small distance
+# from the circle is significant: it determines the decay time.
 _ON_CIRCLE = 1e-12  # relative tolerance
 _AT_ONE = 1e-3  # value added to the offset, so that the tolerance at z = 1 is not 0
 # Largest distance of a root from the circle, relative to its offset, that rounding errors of the offset can explain.
@@ -71,7 +71,8 @@ def _exactly_at_pi(w: Array, exact: complex, value: Array, xp: Any) -> Array:
     """Return ``value`` with its entries at w = pi replaced by their exact value."""
     if xp is np:
         return np.where(w >= np.pi, exact, value)
-    # Subtract the rounding error as a constant, so that the derivative at pi remains that of ``value``.
+    # Subtract the rounding error as a constant (without gradient), so that the derivative at pi remains that of
+    # ``value``.
     return value - stop_gradient(xp.where(w >= np.pi, value - exact, 0.0), xp)
 
 

@@ -140,7 +140,7 @@ class KnownDevice:
         return Timing(period=period, rate=rate, delay=0.0 if delay is None else delay)
 
     def list_missing(self, given: Collection[str]) -> list[str]:
-        """Return those of "mass" and "damping" that are neither published nor in ``given``."""
+        """Return a list of the names "mass" and "damping" without those that are published or in ``given``."""
         return [name for name in ("mass", "damping") if name not in given and getattr(self, name) is None]
 
     def _choose(self, name: str, given: Any) -> Any:
@@ -161,7 +161,7 @@ class KnownDevice:
 
 @dataclass(frozen=True)
 class KnownHand:
-    """Published parameters of a hand: mass in kg, damping in N s/m and stiffness in N/m, both to ground."""
+    """Published parameters of a hand: a mass in kg, connected to ground by a damper in N s/m and a spring in N/m."""
 
     name: str
     title: str

@@ -67,7 +67,7 @@ def differentiate(polynomial: Polynomial) -> Polynomial:
 
 
 def shift(polynomial: Polynomial) -> Polynomial:
-    """Return the coefficients of p(1 - x) for the coefficients of a polynomial p(x)."""
+    """Return the coefficients of the polynomial p(1 - x), given those of p(x)."""
     # Horner's scheme (synthetic division) yields p(1 + x); reverse the sign of odd powers afterwards.
     values = list(polynomial)
     for k in range(1, len(values)):
@@ -91,7 +91,7 @@ def find_common_factor(one: Polynomial, other: Polynomial) -> Polynomial:
     """Return the monic greatest common divisor of two polynomials, by Euclid's algorithm."""
     a, b = _to_integers(one), _to_integers(other)
     while b:
-        # Compute pseudo-remainders, because they need no fractions. Divide each of them by the common factor of its
+        # Compute pseudo-remainders, because they need only integers. Divide each by the greatest common divisor of its
         # coefficients, because the integers would otherwise grow fast.
         while len(a) >= len(b):
             a = [x * b[0] - a[0] * y for x, y in zip(a, b + [0] * (len(a) - len(b)), strict=True)][1:]
@@ -101,7 +101,7 @@ def find_common_factor(one: Polynomial, other: Polynomial) -> Polynomial:
 
 
 def _to_integers(polynomial: Polynomial) -> list[int]:
-    """Multiply a polynomial by a number such that its coefficients become integers without a common factor."""
+    """Scale the coefficients of a polynomial to integers without a common divisor."""
     scale = lcm(*(value.denominator for value in polynomial))
     return _without_content([int(value * scale) for value in polynomial])
 
@@ -249,7 +249,7 @@ def iterate_roots(coefficients: list[Decimal]) -> tuple[list[Complex], list[Deci
 
 
 def _newton(coefficients: list[Decimal], x: Complex) -> tuple[Complex, Decimal]:
-    """Return the Newton step p/p' of a polynomial at x, and a bound on its magnitude despite rounding errors of p."""
+    """Return the Newton step p/p' of a polynomial at x, and an upper bound on |p/p'| despite rounding errors of p."""
     # Evaluate p and p' by Horner's scheme. ``total``, the sum of the magnitudes of all terms, bounds the rounding error
     # of p.
     value, derivative, total = Complex(Decimal(0), Decimal(0)), Complex(Decimal(0), Decimal(0)), Decimal(0)

@@ -60,7 +60,7 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
 
 
 def is_rounding(coefficients: tuple[float, ...]) -> bool:
-    """Return whether rounding errors of the coefficients of a section can cause all its roots of magnitude >= 1.
+    """Return whether all roots of a section on or outside the unit circle may be artifacts of rounded coefficients.
 
     The result is False if there is no such root.
     """

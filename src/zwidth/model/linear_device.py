@@ -95,7 +95,7 @@ class LinearDevice(ResponseDevice):
         return f"LinearDevice({self.spell_form()!r})"
 
     def spell_form(self) -> str | dict[str, Any]:
-        """Return the value of the key ``device`` in a configuration, with the coefficients rounded to float64."""
+        """Return the value of the key ``device`` of a configuration, with the coefficients rounded to float64."""
         numerator, denominator = ([float(c) for c in part] for part in self.system[:2])
         if self.dt:
             return {"numerator": numerator, "denominator": denominator, "sampled": self.dt}
@@ -133,14 +133,14 @@ class LinearDevice(ResponseDevice):
 
     @cached_property
     def mass(self) -> float:
-        """The unit of mass in normalized parameters, in kg: a mass whose response is about as large as the device's."""
+        """The unit of mass of normalized parameters in kg: a mass with about the same response as the device."""
         relative_degree = self.poles.size - self.zeros.size
         if self.dt is None and relative_degree == 2 and self.gain > 0:
             return 1.0 / self.gain
         magnitudes = np.abs(self.poles)[np.abs(self.poles) > 0]
         w = float(np.exp(np.mean(np.log(magnitudes)))) if magnitudes.size else 1.0
-        # Evaluate the response at a point off the imaginary axis or the unit circle, because undamped devices have
-        # poles there.
+        # Evaluate the response at a point off the imaginary axis (off the unit circle in discrete time), because
+        # undamped devices have poles there.
         point, unit = (w * (0.3 + 1j), w) if self.dt is None else (0.3 + 1j, 1.0 / self.dt)
         size = abs(self.gain) * np.prod(np.abs(point - self.zeros)) / np.prod(np.abs(point - self.poles))
         return float(1.0 / (size * unit * unit))
@@ -251,7 +251,7 @@ def _reduce(numerator: Polynomial, denominator: Polynomial) -> tuple[Polynomial,
 
 
 def _take_channel(part: Any) -> Any:
-    """Return the coefficients of the only input and output from the nested lists of python-control."""
+    """Return the coefficients of a system with one input and one output from the nested lists of python-control."""
     while len(part) == 1 and np.ndim(part[0]) > 0:
         part = part[0]
     if np.ndim(part) != 1:

@@ -18,7 +18,7 @@ from zwidth.core.errors import InputError
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.velocity import Estimate
 
-# Beyond these limits, e^A cannot be computed accurately.
+# Beyond these limits, the matrix exponential of the state equation cannot be computed accurately.
 FASTEST = 1e4  # largest magnitude of a pole in rad per period
 STRONGEST = 1e10  # largest decay rate that a damper causes, damping/mass, per period
 
@@ -36,7 +36,7 @@ class Realization(NamedTuple):
 
 @dataclass(frozen=True)
 class System:
-    """A linear device, normalized by the sampling period and a unit of mass; a sampled one includes its hold."""
+    """The plant of a linear device, in units of the sampling period and a mass; a sampled device includes its hold."""
 
     device: LinearDevice
     period: Any  # T in s
@@ -57,11 +57,11 @@ class System:
         return sum(denominator) == 0 if self.sampled else denominator[-1] == 0
 
     def state_units(self, speed: float, force: float) -> list[float]:
-        """Return a list with 1 for each state, because the states have no known units; arguments as for `Chain`."""
+        """Return 1 as the unit of each state, because the units are unknown; the arguments have no effect."""
         return [1.0] * self.device.poles.size
 
     def realize(self) -> Realization:
-        """Return the state equation in units of the period and the mass; for a sampled device, that of x[k+1]."""
+        """Return the state equation, in units of the period and the mass: of x' or, for a sampled device, of x[k+1]."""
         A, B = _realize_companion(self.device) if hasattr(self.mass, "mid") else _realize_sections(self.device)
         if self.sampled:
             B = B * (self.mass / self.period**2)
@@ -70,7 +70,7 @@ class System:
         return Realization(A * self.period, B, B)
 
     def check(self) -> None:
-        """Raise `InputError` if a sampled device does not match period or delay, or if another one has a fast pole."""
+        """Raise `InputError` if a sampled device does not fit the loop's period or delay, or if a pole is too fast."""
         if self.sampled:
             dt, period = self.device.dt or 0.0, float(self.period)
             if abs(dt - period) > 1e-9 * period:
@@ -80,7 +80,7 @@ class System:
                 )
             if self.d != self.n_delay:
                 raise InputError(
-                    f"delay: got {float(self.d):g} periods; a sampled device allows only whole periods; include the "
+                    f"delay: got {float(self.d):g} periods; a sampled device allows only an integer delay; include the "
                     "fraction in the device"
                 )
             return

@@ -155,7 +155,7 @@ class MeasuredDevice(ResponseDevice):
         return cls(*_read_table(file))
 
     def save(self, file: str | Path, *remarks: str) -> None:
-        """Write the response to a text file for `read`, in full precision; the first lines are the remarks, after #."""
+        """Write the response to a text file for `read`, in full precision, after comment lines with ``remarks``."""
         unit = "rad/(N m)" if self.rotary else "m/N"
         heads = ["frequency [Hz]", f"real [{unit}]", f"imag [{unit}]"]
         columns = [self.frequency, np.real(self.response), np.imag(self.response)]

@@ -86,7 +86,7 @@ class Chain:
 
     @property
     def drives_body_only(self) -> bool:
-        """True without modes and actuator lag: a commanded force then acts exactly like an external force."""
+        """True if the device has no modes and no actuator lag; a commanded force then acts like an external force."""
         return not self.modes and self.actuator is None
 
     @property
@@ -117,15 +117,15 @@ class Chain:
         count, actuator_states = bodies + modes, 0 if lag is None else 2 if isinstance(lag, Resonance) else 1
         size = 2 * count + actuator_states
         zero = xp.asarray(0.0 * (self.bodies[0].mass + self.bodies[-1].damping + sum(mode.rate for mode in self.modes)))
-        # Every quantity is a linear combination of the states, the command and the external force, stored as a row of
-        # coefficients. The unit vectors in ``axes`` represent the states and both inputs themselves.
+        # Represent every quantity, a linear combination of states, command and external force, by its row of
+        # coefficients. The rows of the states and of both inputs are the unit vectors in ``axes``.
         axes = xp.asarray(np.eye(size + 2).astype(zero.dtype)).reshape(size + 2, size + 2, *[1] * zero.ndim)
         command, external = axes[size:]
         actuator_force = command if lag is None else axes[2 * count]
         forces = [
             link.stiffness * axes[k] + link.damping * axes[count + k] for k, link in enumerate(self.links, start=1)
         ]
-        # Add zero forces at both ends, because no link is in front of the first body or after the last one.
+        # Add a zero force at both ends of the row, because no link precedes the first body or follows the last one.
         forces = [zero, *forces, zero]
         accelerations = []
         for k, body in enumerate(self.bodies):
@@ -166,7 +166,7 @@ class Chain:
         return _find_roots(np.trim_zeros(numerator, "f")), np.concatenate(poles).astype(complex)
 
     def check(self) -> None:
-        """Raise `InputError` for a resonance or damper that is so fast that e^A would be inaccurate."""
+        """Raise `InputError` if a resonance or damper is too fast to compute the matrix exponential e^A accurately."""
         smallest_mass = min(float(body.mass) for body in self.bodies)
         rates = {"coupling.stiffness: the link": [float(link.stiffness / smallest_mass) ** 0.5 for link in self.links]}
         rates["modes.frequency: the mode"] = [float(mode.rate) for mode in self.modes]
@@ -208,7 +208,8 @@ def build_chain(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Es
     d, n_delay = delay or (timing.d, int(np.floor(timing.d)))
     estimate = estimate or scene.velocity.estimate(period)
     if isinstance(device, LinearDevice):
-        # If the period is a ball, convert the mass to an exact ball, too, because `System` then uses ball arithmetic.
+        # If the period is a ball (interval), convert the mass to a ball of radius 0, because `System` then uses ball
+        # arithmetic.
         mass = type(period)(device.mass) if hasattr(period, "mid") else device.mass
         return System(device, period, mass, d, n_delay, estimate)
     masses = [(device.mass, device.damping, 0.0)]
@@ -225,7 +226,8 @@ def build_chain(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Es
         links.append((hand.coupling_stiffness, hand.coupling_damping))
     unit = masses[0][0]
     stiffness_factor, damping_factor = period * period / unit, period / unit
-    # Do not multiply a zero stiffness, because `is_zero` would return False for the product with a traced period.
+    # Keep a zero stiffness as a plain 0, because its product with a traced period would no longer be recognized as
+    # zero.
     bodies = tuple(
         Body(m / unit, b * damping_factor, 0.0 if is_zero(k) else k * stiffness_factor) for m, b, k in masses
     )
@@ -273,8 +275,8 @@ def expand_compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
         if numerator.size:
             link = np.array([chain.links[k].damping, chain.links[k].stiffness], float)
             denominator = np.polyadd(np.convolve(link, denominator), numerator)
-            # The link in series with the bodies added so far has the dynamic stiffness link * numerator/denominator,
-            # where the denominator is the new one.
+            # Connect the link in series with the bodies added so far: their joint dynamic stiffness is link * numerator
+            # / (link * denominator + numerator). This sum is the new denominator.
             numerator = np.polyadd(np.convolve(dynamic_stiffness, denominator), np.convolve(link, numerator))
             sensor_numerator = denominator if k == chain.sensor else np.convolve(link, sensor_numerator)
         else:

@@ -39,7 +39,7 @@ class Operator(Part):
     """
 
     _owner = "operator"
-    # Arguments of the presets in the explorer, by name of the preset.
+    # Presets of this part in the explorer: arguments of the constructor by name of the preset.
     usual: ClassVar[dict[str, dict[str, float]]] = {
         "rigid": _HAND,
         "grasp": {**_HAND, "coupling_stiffness": 1e3, "coupling_damping": 5.0},
@@ -54,9 +54,9 @@ class Operator(Part):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.rigid:
-            # Check the mass after the base class has converted it to SI.
+            # Check the mass only now, because the base class has converted it to SI units.
             check_number("operator.mass", self.mass, self.unit_system["kg"], POSITIVE)
-        # Treat any JAX value as nonzero, because the value of a traced one is unknown.
+        # Treat a damping that is a JAX array as nonzero, because the value of a traced array is unknown.
         if self.rigid and (is_jax(self.coupling_damping) or self.coupling_damping):
             raise InputError(
                 f"operator.coupling_damping: got {self.coupling_damping!r} without a coupling spring; pass "

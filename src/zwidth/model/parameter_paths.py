@@ -25,7 +25,7 @@ from zwidth.model.wall import NoWall, VirtualWall
 
 
 class Parts(Protocol):
-    """Interface of a scene for annotations in modules that `zwidth.Scene` imports and that cannot import `Scene`."""
+    """The fields of a scene, for type annotations in modules that cannot import `zwidth.Scene` (circular import)."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]  # allows calls of `dataclasses.replace`
 
@@ -60,7 +60,7 @@ def find_parts(scene: Parts) -> dict[str, Any]:
 
 
 def _parts(scene: Parts) -> list[tuple[str, str, Any]]:
-    """Return a tuple (prefix of the paths of its parameters, name, part) for each part of a scene, the wall last."""
+    """Return a tuple (path prefix of the parameters, name, part) for each part of a scene, with the wall last."""
     *bare, wall = (("", name, getattr(scene, name)) for name in _BARE)
     return [*bare, *((f"{name}.", name, part) for name, part in find_parts(scene).items()), wall]
 
@@ -98,7 +98,7 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 
 
 def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
-    """Return a copy of a scene with new values by path; raise `InputError` for a path that the scene does not have."""
+    """Return a copy of a scene with the new values in ``changes``, by path; raise `InputError` for an unknown path."""
     parts = {name: part for _, name, part in _parts(scene)}
     owners = {prefix + item.name: (name, item.name) for prefix, name, part in _parts(scene) for item in fields(part)}
     owners |= {name: ("", name) for name in (*_BARE, *_NAMED, *_WHOLE)}

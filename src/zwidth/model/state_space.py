@@ -36,9 +36,9 @@ class StateSpace(NamedTuple):
 
 
 def _realize_filter(estimate: Estimate) -> StateSpace:
-    """Return the filter of a velocity estimate, without the difference over its window, in controllable canonical form.
+    """Return the filter part of a velocity estimate (without the difference) in controllable canonical form.
 
-    The form is that of the polynomials in z - 1, so that 1 is added to the diagonal of A.
+    The canonical form uses the polynomials in z - 1. Therefore 1 is added to the diagonal of A.
     """
     # The factor z^-lag adds poles or zeros at z = 0, whose offset 1 - z is 1. With these, the filter has at least as
     # many poles as zeros, because it is causal.

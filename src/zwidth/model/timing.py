@@ -66,7 +66,7 @@ class Timing(Part):
 
     @property
     def kept_delay(self) -> str:
-        """The delay as text, "1 period" or "1 ms", in the unit in which it remains constant if the period changes."""
+        """The delay as text in the unit in which it stays constant if the period changes: "1 period" or "1 ms"."""
         if self._periods is None:
             return with_unit(float(self.delay), "s")
         return format_periods(self._periods)

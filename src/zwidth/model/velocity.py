@@ -72,12 +72,12 @@ class Estimate:
 
     @property
     def degree(self) -> int:
-        """The sum of window, abs(lag) and the numbers of zeros and poles; larger than ``window`` if F has a filter."""
+        """Order of F: window + abs(lag) + number of zeros and poles; larger than ``window`` if F has a filter."""
         return self.window + abs(self.lag) + self.zeros.size + self.poles.size
 
 
 class _Checked(Part):
-    """Base class of the estimates whose fields have ranges in `units.quantities`."""
+    """Base class of the estimates whose parameters are checked against the ranges in `units.quantities`."""
 
     _owner = "velocity"
 
@@ -242,8 +242,8 @@ class VelocityFilter(Part):
         if largest < 1.0:
             return
         got = f"velocity.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
-        # Rounding errors of the coefficients move poles far enough only if several poles are near z = 1. A single pole
-        # there is probably an intended integrator.
+        # Report rounding errors of the coefficients as the cause only if several poles are near z = 1, because they
+        # hardly move a single pole; a single pole at z = 1 is probably an intended integrator.
         slow = np.abs(poles) < NEXT_TO_ONE
         if np.sum(slow) != 1 and any(is_rounding(section) for section in self._sections[1]):
             cause = "Cause: rounding errors of the coefficients; use sections in series (scipy.signal: output='sos')"
@@ -326,7 +326,7 @@ ESTIMATES = {
 
 
 def name_estimate(velocity: Velocity) -> str:
-    """Return the name of the kind of an estimate in configurations; raise `InputError` for other classes."""
+    """Return the name of the class of an estimate in configurations; raise `InputError` for classes without a name."""
     for kind, part in ESTIMATES.items():
         if type(velocity) is part:
             return kind
@@ -337,7 +337,7 @@ def name_estimate(velocity: Velocity) -> str:
 
 
 def is_plain(velocity: Velocity, period: Any) -> bool:
-    """Return whether an estimate is a backward difference without any parameter, divided by the period of the loop."""
+    """Return whether an estimate is the backward difference, divided by the loop's period, with no parameter set."""
     if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
         return False
     estimate = velocity.estimate(period)
@@ -360,7 +360,7 @@ def _ratio(period: Any, coded: Any) -> Any:
     return 1.0 if coded is None else period / coded
 
 
-# The following operations differ between floats, JAX arrays and balls.
+# The functions below implement operations that differ between floats, JAX arrays and balls.
 
 
 def _pi(like: Any) -> Any:

@@ -42,7 +42,7 @@ def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any, system
     # Convert integers that overflow float64 to infinity, which the range checks of the caller reject.
     both = stiffness, virtual_damping
     stiffness, virtual_damping = (to_float(v) if isinstance(v, int) and v.bit_length() > 1023 else v for v in both)
-    # Test for numbers first, because the search for texts would slow down most calls.
+    # Search for texts with units only if an argument is not a number, because the search would slow down most calls.
     if not (isinstance(stiffness, int | float) and isinstance(virtual_damping, int | float | None)):
         stiffness = read_texts("stiffness", stiffness, system["N/m"])
         virtual_damping = read_texts("virtual_damping", virtual_damping, system["N s/m"])

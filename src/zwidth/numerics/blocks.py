@@ -60,8 +60,8 @@ def map_blocks(
         tree_map(lambda to, leaf: np.copyto(to[start:stop], leaf[: stop - start]), whole, result)
 
     store(0, first)
-    # Evaluate the first block alone, because it compiles the function. Threads evaluate the others in parallel, because
-    # JAX releases the interpreter lock.
+    # Evaluate the first block before starting threads, because this call compiles the function. Threads evaluate the
+    # others in parallel, because JAX releases the interpreter lock.
     run_in_threads(lambda start: store(start, run(start)), range(size, count, size), threads)
     return whole
 
@@ -77,5 +77,5 @@ def _cut_block(column: np.ndarray, start: int, size: int) -> np.ndarray:
     missing = size - part.size
     if not missing:
         return part
-    # Pad with the last element, because no constant is a valid argument of every kernel.
+    # Pad with the last element and not with a constant, because no constant is a valid argument of every function.
     return np.concatenate([part, np.full(missing, part[-1] if part.size else 0.0)])

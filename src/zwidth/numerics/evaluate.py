@@ -33,12 +33,12 @@ _NUMBERS = (int, float, np.floating, np.integer)
 
 
 def are_numbers(*values: ArrayLike) -> bool:
-    """Return whether all values are plain numbers, which convert to float64 without a check."""
+    """Return whether all values are plain numbers, which can be converted to float64 without a check."""
     return _PLAIN.issuperset(map(type, values))
 
 
 def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
-    """Raise `InputError` if a plain number is larger or smaller in magnitude than the limits of its name in `SIZES`.
+    """Raise `InputError` if the magnitude of a plain number is outside the range of its parameter in `SIZES`.
 
     Other invalid numbers and arrays pass, because results report them by a status.
     """
@@ -72,7 +72,8 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     try:
         # Convert Python integers to float first, because NumPy converts large ones to arrays of objects.
         array = np.asarray(float(value) if isinstance(value, int) else value)
-        # Reject the type void but not the kind "V", because number types such as bfloat16 have this kind as well.
+        # Reject the type void by its class and not by its kind "V", because number types such as bfloat16 also have
+        # kind "V".
         if array.dtype.kind in "OSUcmM" or array.dtype.type is np.void:
             raise TypeError(array.dtype)
         return array.astype(np.float64, copy=False)
@@ -242,8 +243,8 @@ def evaluate_columns(
     def at_once(*parts: np.ndarray) -> Any:
         with np.errstate(all="ignore"):
             result = kernel(*(part[0] if part.size == 1 else part for part in parts), *static)
-        # Copy the results, because a view of an argument or of a broadcast value may be read-only. If there is only one
-        # point, add its axis.
+        # Copy the results, because a result that is a view of an argument or of a broadcast value may be read-only. If
+        # there is only one point, add the missing axis of the points.
         shape = (count_points(parts),)
         if shape == (1,):
             return tree_map(lambda leaf: np.array(leaf)[None], result)
@@ -254,7 +255,7 @@ def evaluate_columns(
 
 
 def _plain(leaf: Any) -> Any:
-    """Convert one leaf of the result at a single point to a NumPy scalar."""
+    """Convert one leaf of the result at a single point, a zero-dimensional array, to a NumPy scalar."""
     return leaf if isinstance(leaf, np.generic) else np.asarray(leaf)[()]
 
 
@@ -279,7 +280,7 @@ def compile_traced(
         return kernel(*arrays, *static)
 
     def by_argument(active: tuple[bool, ...], *arrays: Any) -> tuple[Any, Any]:
-        """Return the values of the kernel, and their derivatives in the active arguments along a new first axis."""
+        """Return the kernel's values, and their derivatives in the ``active`` arguments along a new first axis."""
         moving = [k for k, moves in enumerate(active) if moves]
 
         def of_moving(*values: Any) -> Any:
@@ -294,8 +295,8 @@ def compile_traced(
         sides = tuple(
             side.reshape(-1, *(1,) * ones.ndim) * ones[None] for side in np.eye(len(moving), dtype=ones.dtype)
         )
-        # Compute the values once, not once per direction of differentiation, and materialize the derivatives, because
-        # several products use them.
+        # Compute the values once, not once per argument, and make XLA store the derivatives, because several products
+        # use them.
         value, slopes = jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
         return value, tree_map(
             lambda leaf: leaf if leaf.dtype == jax.dtypes.float0 else materialize(leaf, leaf), slopes
@@ -305,9 +306,9 @@ def compile_traced(
 
     @cache
     def sloped(active: tuple[bool, ...]) -> Callable[..., Any]:
-        """Return `by_argument`, compiled for a choice of active arguments."""
-        # Give the compiled function a derivative rule of its own. Without this rule `jax.grad` splits each equation of
-        # the function into a part that is linear in the tangents and the rest, which takes twice as long.
+        """Return a compiled function for the kernel's values and their derivatives in the ``active`` arguments."""
+        # Define a derivative rule for the compiled function as well. Without it, `jax.grad` would separate the terms
+        # that are linear in the tangents in each equation of the function, which takes twice as long.
         compiled = jax.jit(partial(by_argument, active))
         whole = jax.custom_jvp(compiled)
         whole.defjvp(lambda primals, tangents: jax.jvp(compiled, primals, tangents))
@@ -332,7 +333,8 @@ def compile_traced(
         def change(leaf: Any, by: Any) -> Any:
             if not jax.numpy.issubdtype(leaf.dtype, np.inexact):
                 return _no_change(leaf)
-            # Use the product of jax.lax, because that of jax.numpy compiles a program even if an argument is constant.
+            # Multiply by `jax.lax.mul`, because the product of `jax.numpy` compiles a program even if an argument is
+            # constant.
             parts = [jax.lax.mul(by[k], tangent) for k, tangent in enumerate(moving)]
             return sum(parts[1:], parts[0])
 
@@ -352,7 +354,7 @@ def _as_precise(leaf: Any, argument: Any) -> Any:
 
 
 def _no_change(leaf: Any) -> Any:
-    """Return the zero tangent of a result that is constant, or whose type has no derivative."""
+    """Return a zero tangent of the right type, for a constant result or one whose type has no derivative."""
     import jax
 
     if jax.numpy.issubdtype(leaf.dtype, np.inexact):

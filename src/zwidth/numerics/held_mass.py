@@ -57,13 +57,13 @@ def phi_functions(x: Array) -> PhiFunctions:
     small = x < SERIES_BELOW
     factor = xp.exp(-0.5 * x)
     c = factor * factor
-    # Give each branch a valid argument also where it is not selected, because its NaN would make the derivatives of the
-    # selected branch NaN as well.
+    # Replace the argument of each branch of `where` by a valid one where the branch is not selected, because a NaN in
+    # that branch would make the derivatives of the result NaN.
     half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, SERIES_BELOW, x)
     half_squared = half * half
     low1, low_gap = factor * horner(half_squared, PHI1), factor * (2.0 * half) * horner(half_squared, GAP)
-    # Compute 1 - c as a difference, because it does not cancel above `SERIES_BELOW`. Its derivative has a small
-    # relative error, unlike that of expm1.
+    # Compute 1 - c as a difference and not by expm1. It does not cancel above `SERIES_BELOW`, and its derivative has a
+    # small relative error, unlike that of expm1.
     inverse = 1.0 / high
     high1 = (1.0 - c) * inverse
     return PhiFunctions(
@@ -80,7 +80,7 @@ Functions = Callable[[Any], Any]
 
 
 class Plant(NamedTuple):
-    """Coefficients of the discretized device: those of its numerator N(z), and its pole c."""
+    """The discretized device: the coefficients of its numerator N(z), and its pole c."""
 
     c: Array  # e^-delta, the pole besides z = 1
     em: Array  # 1 - c, without cancellation
@@ -93,7 +93,7 @@ class Plant(NamedTuple):
 def discretize_mass(
     delta: Any, fraction: Any = None, functions: Functions = phi_functions, phi: Any = None, phi_t: Any = None
 ) -> Plant:
-    """Compute the discrete transfer function of a damped mass with a fractional delay, in any arithmetic.
+    """Compute the discrete transfer function of a damped mass with a fractional delay, for floats, JAX arrays or balls.
 
     Args:
         delta: normalized damping.

@@ -27,7 +27,7 @@ from zwidth.numerics.evaluate import join_shapes, to_caller
 
 # Number of loops that one NumPy call evaluates, chosen so that the intermediate arrays fit in the cache.
 BLOCK_SIZE = 1 << 9
-# Bound of the rounding error of one factor, one sum and one logarithm, in units of eps: twice the count of operations.
+# Bound on the rounding error of a factor, a sum or a logarithm, in units of eps: twice its number of operations.
 ROUNDINGS = 8.0
 # Relative difference of r^2 and |root|^2, in units of eps, below which rounding errors leave open whether a complex
 # root lies inside the circle.
@@ -238,9 +238,9 @@ def _scale_parts(
     uncertainty = 2.0 * (xp.abs(log_gain) + xp.abs(log_power) + xp.abs(logs).sum((-2, -1)) + roots.shape[-1] + 1.0)
     weight = xp.stack([xp.exp(-xp.maximum(excess, 0.0)), -xp.exp(xp.minimum(excess, 0.0))], axis=-1)
 
-    # Rotations by multiples of 90 degrees have no rounding error. |T| and |B| must differ at z = -r, where t is
-    # infinite, so choose the rotation with the largest ratio there. Ratios above a limit count as equal, so that the
-    # first rotation, none, is preferred: unrotated real data keep their relative accuracy at small w.
+    # Choose the rotation for which the ratio of |T| and |B| at z = -r, where t is infinite, differs most from 1.
+    # Multiples of 90 degrees have no rounding error. Ratios above a limit are treated as equal, which favors the first
+    # candidate, no rotation, because unrotated real data keep their relative accuracy at small w.
     units = xp.asarray([1.0, -1.0, 1j, -1j])
     far = xp.log(xp.abs(r[..., None] + roots[..., None] * units.reshape((1,) * roots.ndim + (4,))) / scale[..., None])
     score = xp.abs(excess[..., None] + 2.0 * (far[..., 1, :, :] - far[..., 0, :, :]).sum(-2))
@@ -255,7 +255,7 @@ def _scale_parts(
 
 
 def _find_dominant(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array, Array]:
-    """Return whether T, and whether B, is provably larger on the whole circle, by bounds of every factor.
+    """Return two masks: |T| > |B|, and |B| > |T|, proved on the whole circle by bounds on every factor.
 
     Such loops need no crossovers, whose disks are wide if many roots coincide.
     """
@@ -337,7 +337,8 @@ def _enclose_crossovers(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array,
     disk = safe[..., None] * (xp.abs(correction) + noise)
     proved = proved & xp.isfinite(disk).all(-1)
     is_real = xp.abs(guess.imag) <= disk
-    # Sorting both ends separately may pair them differently, but the union of the intervals is the same.
+    # Sort the lower and the upper ends separately. This may change the pairs of ends but not the union of the
+    # intervals.
     low = xp.sort(xp.where(is_real, guess.real - disk, xp.inf), axis=-1)
     high = xp.sort(xp.where(is_real, guess.real + disk, xp.inf), axis=-1)
     return low, high, leading, proved
@@ -412,7 +413,7 @@ def _compare_parts(
     clear = xp.abs(value) > noise
     # Between two intervals with equal m the comparison need not be certain, because it does not affect the count.
     certain = (clear[..., :split] | ~gaps | (m[..., :-1] == m[..., 1:])).all(-1)
-    # The points after those of the gaps are the roots on the circle, first those of T, then those of B.
+    # The entries after those of the gaps belong to the roots on the circle: first the roots of T, then those of B.
     half = split + near.shape[-1]
     certain = certain & (~on_circle[..., 0, :] | (clear[..., split:half] & (value[..., split:half] < 0))).all(-1)
     certain = certain & (~on_circle[..., 1, :] | (clear[..., half:] & (value[..., half:] > 0))).all(-1)

@@ -9,7 +9,7 @@ from zwidth.core.xp import namespace
 
 
 class Affine(NamedTuple):
-    """The characteristic polynomial ``P = D + alpha N1 + beta N2``, affine in the wall (alpha, beta).
+    """The characteristic polynomial ``P = D + alpha N1 + beta N2`` of a loop; the wall is (alpha, beta).
 
     The three coefficient vectors have the same length.
     """

@@ -7,6 +7,7 @@ when all points have converged. The result of a point does not depend on the oth
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ Sloped = Callable[[Array], tuple[Array, Array]]
 HALVINGS = 60  # bisection to the last digit of float64, also of the logarithm of a range of 32 decades
 CONVERGED_STEP = 1e-11  # relative step after which the error of Newton's method is rounding, also near a double zero
 ZERO_VALUE = 1e-15  # largest |value| of a zero in `false_position`: rounding error of a phase in rad, its main use
+BISECTIONS = 52  # halvings of a bracket; they reduce it to one unit in the last place of a float64
 MAX_NEWTON_STEPS = 16  # largest number of Newton steps in `polish_root`
 
 
@@ -109,7 +111,7 @@ def minimize_golden_section(
     return middle, value
 
 
-# Search for the global minimum
+# Settings of the search for the global minimum.
 N_MINIMA = 3  # lowest local minima of the samples that are refined
 MAX_GOLDEN_STEPS = 52  # largest number of steps of the golden-section search
 SMALL_SHARE = 1e-9  # argument next to 0, relative to the first sample, that shows if the function rises from 0
@@ -227,7 +229,7 @@ def false_position(
     return state[1].best
 
 
-# Search for zeros between nodes
+# Settings of the search for zeros between nodes.
 MAX_BETWEEN_STEPS = 120  # largest number of steps of false position
 BETWEEN_WIDTH = 4e-16  # relative width of the final bracket
 
@@ -327,6 +329,21 @@ def integrate(function: Callable[[Array], Array], edges: Sequence[Array], nodes:
         pieces.append((low[..., None] + half * (node + 1.0), half * weight))
     points, weights = (xp.concatenate(parts, axis=-1) for parts in zip(*pieces, strict=True))
     return xp.sum(function(points) * weights, axis=-1)
+
+
+def bracket_root(function: Callable[..., Array], lower: Array, upper: Array, *args: Any) -> tuple[Array, Array]:
+    """Return a zero of ``function(x, *args)`` between two points by bisection, and whether the signs there differ."""
+    import jax
+
+    with warnings.catch_warnings():
+        # Suppress the notice that jaxopt is no longer maintained, because a user of zwidth cannot act on it.
+        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+        from jaxopt import Bisection
+
+    lower, upper, args = jax.lax.stop_gradient((lower, upper, args))
+    solver = Bisection(function, lower, upper, BISECTIONS, tol=0.0, check_bracket=False, unroll=False)
+    root, state = solver.run(None, *args)
+    return jax.lax.stop_gradient(root), state.sign != 0
 
 
 def polish_root(residual: Callable[[Array, Any], Array], start: Array, args: Any, usable: Array) -> Array:

@@ -1,7 +1,8 @@
 """Color scales of outputs of sweeps, and the levels of their contours.
 
-The look of an output (`units.quantities`) determines the scale: "diverging" has a favorable and an unfavorable side of
-a center, such as a margin around 0; "steep" is logarithmic and grows without bound; others are linear or logarithmic.
+The field ``color_scale`` of an output (`units.quantities`) determines the scale: "diverging" has a favorable and an
+unfavorable side of a center, such as a margin around 0; "steep" is logarithmic and grows without bound; others are
+linear or logarithmic.
 """
 
 from __future__ import annotations
@@ -30,12 +31,13 @@ class ColorScale(NamedTuple):
 
 
 def choose_scale(output: Output, finite: np.ndarray) -> ColorScale:
-    """Choose the color scale of an output from its finite values, for figures and reports."""
+    """Choose the color scale of an output from its kind and its finite values, for figures and reports."""
     finite = finite[finite >= LEAST_POSITIVE] if output.logarithmic else finite
     usual = (1.0, 10.0) if output.logarithmic else (0.0, 1.0)
     least, most = (float(finite.min()), float(finite.max())) if finite.size else usual
     if output.color_scale == "diverging":
-        # Both sides get the range of the favorable side, if it has values; values beyond it share one color.
+        # Make both sides of the center as wide as the favorable side, if it has values. Values beyond the ends of the
+        # scale share one color.
         sides = [output.center - least, most - output.center]
         good, bad = sides if output.below else reversed(sides)
         span = max(good if good > 0 else bad, 1e-6)
@@ -69,10 +71,10 @@ def make_norm(output: Output, scale: ColorScale) -> Any:
 
 
 def choose_levels(values: Any, output: Output, norm: Any) -> np.ndarray:
-    """Choose round values for contours between the smallest and the largest value of an output."""
+    """Choose round numbers between the smallest and the largest value of an output as the levels of its contours."""
     low, high = float(values.min()), float(values.max())
     if output.logarithmic:
-        # Omit levels where a steep output grows without bound, unless all values are close together.
+        # Omit high levels of a steep output, where its contours would be crowded, unless its values have a small range.
         end = min(high, max(norm.vmax / 2.0, (low * high) ** 0.5)) if output.color_scale == "steep" else high
         levels = np.asarray(LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, end))
         levels = levels[levels <= end]

@@ -89,10 +89,9 @@ def draw_curves(
 
 
 def find_family(data: xarray.Dataset) -> tuple[str, str] | None:
-    """Return the output to draw as a family of stability boundaries, and the parameter of this family.
+    """Return the output whose contours are the stability boundaries of several devices, and the parameter that varies.
 
-    The boundaries are contours of the output over stiffness and damping. Return None if the data do not contain the
-    boundaries of several devices.
+    The contours are drawn over stiffness and damping. Return None if the data do not contain several devices.
     """
     planes = {name: grid.choose_axes(data, name) for name in (*SMOOTH, "stable") if name in data}
     name = next((name for name, axes in planes.items() if len(axes) == 2 and axes[1] in WALL), None)
@@ -135,7 +134,7 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
 
 
 def _list_looks(family: str, count: int) -> list[dict[str, Any]]:
-    """Return color and line style of each of ``count`` curves.
+    """Return a list with the color and line style of each of ``count`` curves.
 
     The colors of curves are ordered by the value of the parameter ``family``. Devices have no order; their curves
     differ in color and in line style.

@@ -28,7 +28,7 @@ from zwidth.units.quantities import PARAMETERS
 
 _STIFFNESS = SI_COLUMNS[0]  # name of the column of K_max
 _NOISE = "velocity_noise_m_per_s"  # name of the column of the velocity noise
-# Column and axis label of the parameter of each kind of filter, over which K_max is drawn.
+# Column and axis label of the parameter over which K_max is drawn, for each kind of filter.
 _OVER = {
     "low_pass": ("cutoff_Hz", "cut-off of the low-pass  $f_c$  in Hz"),
     "windowed_difference": ("samples", "length of the window  $n$  in periods"),
@@ -108,7 +108,7 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
 
 
 def _scale(table: Table) -> tuple[dict[float, Any], float, str]:
-    """Return the color of each physical damping, and the scaling factor and the label of the stiffness axis."""
+    """Return the color of each physical damping b, and the scaling factor and the label of the stiffness axis."""
     factor, unit = style.si_unit(table[_STIFFNESS], "N/m")
     words = f"maximum stable stiffness  $K_{{\\max}}$  in {unit}"
     return style.color_by_value(table["damping_N_s_per_m"]), factor, words
@@ -139,7 +139,7 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float]) 
 
 
 def _dots(rows: Table) -> dict[str, Any]:
-    """Return line properties that mark each point with a dot if there are few points; {} otherwise."""
+    """Return line properties that mark each point of a curve with a dot; {} if the curve has many points."""
     return {"marker": "o", "markersize": 3.5} if len(rows[_STIFFNESS]) <= 24 else {}
 
 
@@ -213,7 +213,7 @@ def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[f
     digits = count_digits_apart(np.asarray(required[SI_COLUMNS[0]]).tolist(), 3)
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
         words = f"{wanted * factor:.{digits}g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
-        # Round down, because 100 % must not be printed if even one device is unstable.
+        # Round the percentage down, because 100 % must not be printed if even one device is unstable.
         percent = f"{round_conservatively(100.0 * share, 'below', 3):.3g}"
         yield wanted * reserve, words + (f": stable on {percent} % of devices" if np.isfinite(share) else "")
 

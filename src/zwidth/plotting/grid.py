@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 MISSING = "#D9D9D9"  # color of cells without a value
 
-# Largest numbers of values and panels in a figure. If a sweep has more values, evenly spaced ones are drawn.
+# Largest numbers of values and panels in a figure. If a sweep has more, only evenly spaced ones are drawn.
 _MAX_VALUES = 1000  # number of values along an axis, in a figure with a single panel
 _MAX_VALUES_OF_MANY = 500  # number of values along an axis, in a figure with several panels
 _MAX_COLUMNS = 3  # number of columns of panels, and of values per parameter if two parameters vary between panels
@@ -38,15 +38,15 @@ _MAX_TITLE_VALUES = 3  # number of parameter values that fit into the title of o
 # Settings of axes.
 _MIN_RATIO = 5.0  # least ratio of the ends of a logarithmic axis if its values have unequal ratios, as 1, 2, 5, 10
 _FEW_DECADES = 50.0  # ratio of the ends of a logarithmic axis; below it, 2 and 5 times powers of ten have ticks, too
-# Order in which parameters become the axes of a plane: the first two that vary. The others vary between panels.
+# The first two varying parameters in the following order become the axes of a plane. The others vary between panels.
 _WALL_PARAMETERS = ("alpha", "stiffness", "beta", "virtual_damping")
 _PARTS = tuple(parameter.variable for parameter in VARIABLES.values() if parameter.name in OF_PARTS)
 _ORDER = (*_WALL_PARAMETERS, *_PARTS, "delta", "damping", "d", "delay", "rate", "period", "mass")
 
 # Settings of contour labels.
 _LABEL_FONT = 7.0  # font size, in points
-# Factor by which the later layout shrinks a panel to make room for axis labels and color bar. Labels are placed before
-# the layout, therefore their sizes are divided by this factor.
+# Factor by which the layout shrinks a panel to make space for axis labels and color bar. Contour labels are placed
+# before the layout; therefore their sizes are divided by this factor.
 _LAYOUT_SHRINKAGE = 0.72
 _LINE_DISTANCE = 0.6  # least distance of the center of a label from other lines, relative to the size of the label
 _LABEL_DISTANCE = 1.2  # least distance between the centers of two labels, relative to their mean size
@@ -111,13 +111,15 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
         data[name] = values
     for name, values in data.coords.items():
         if name in VARIABLES:
-            # If the axis is logarithmic, choose the unit for the geometric mean of its ends, not for the largest value.
+            # On a logarithmic axis, choose the unit that suits the geometric mean of both ends instead of the largest
+            # value.
             numbers_along = values.values
             numbers_along = (
                 np.sqrt(numbers_along.min() * numbers_along.max()) if logarithmic(numbers_along) else numbers_along
             )
             factor, unit = style.si_unit(numbers_along, str(values.attrs.get("units", "1")))
-            # Assign NumPy arrays, because a DataArray would bring its unscaled coordinates back into the dataset.
+            # Assign NumPy arrays, because assigning a DataArray would replace scaled coordinates of the dataset by
+            # unscaled ones.
             numbers = values.values * factor
             digits = count_digits_apart(numbers.ravel().tolist())
             scaled = (values.dims, numbers, {**values.attrs, "units": unit, "factor": factor, "digits": digits})
@@ -128,7 +130,7 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
 def panels(
     data: xarray.Dataset, over: list[str], plane: Sequence[str] = (), col: str | None = None
 ) -> tuple[list[xarray.Dataset], int]:
-    """Return the part of a dataset for each panel, and the number of columns of panels.
+    """Return a list with the part of a dataset for each panel, and the number of columns of panels.
 
     Args:
         data: Results that `prepare` returns.
@@ -155,7 +157,7 @@ def panels(
 
 
 def spell(value: xarray.DataArray) -> str:
-    """Return a parameter value as text with its symbol and unit; a device as its label.
+    """Return a parameter value as text with symbol and unit; for a device, return its label.
 
     The text has enough digits to distinguish the values of the parameter.
     """
@@ -164,13 +166,13 @@ def spell(value: xarray.DataArray) -> str:
     number = f"{float(value):.{value.attrs.get('digits', 4)}g}"
     unit = style.write_unit(value.attrs["units"]).removeprefix("sampling ")
     unit = unit.removesuffix("s") if unit == "periods" and number == "1" else unit
-    # Set the unit upright and keep its spaces, because TeX mathematics is italic and drops spaces.
+    # Use \mathrm and ~ for the unit, because TeX mathematics is italic and drops spaces.
     unit = rf"\,\mathrm{{{unit.replace(' ', '~').replace('$', '')}}}" if unit else ""
     return rf"${VARIABLES[str(value.name)].symbol_in(style.units())} = {number}{unit}$"
 
 
 def name_panels(axes: np.ndarray, parts: Sequence[xarray.Dataset]) -> None:
-    """Write the parameter values of each panel as its title; if there are too many, only those that differ."""
+    """Write each panel's parameter values as its title; if they are too many, only those that differ between panels."""
     first = parts[0]
     names = [name for name in ("device", *VARIABLES) if name in first.coords and not first[name].ndim]
     if len(names) > _MAX_TITLE_VALUES and len(parts) > 1:
@@ -196,10 +198,10 @@ def _in_unit(data: xarray.Dataset, name: str) -> str:
 
 
 def logarithmic(values: np.ndarray) -> bool:
-    """Return whether an axis with the given values should be logarithmic.
+    """Return whether the given values of a parameter suggest a logarithmic axis.
 
-    It should if successive values have equal ratios, or if their ratios are nearly equal and the ends of the axis have
-    a large ratio, as for 1, 2, 5, 10.
+    They do if successive values have equal ratios, or if the ratios are nearly equal and that of the last to the first
+    value is large, as for 1, 2, 5, 10.
     """
     values = np.asarray(values, dtype=np.float64)
     if values.size < 3 or not (values > 0).all():
@@ -329,7 +331,7 @@ def _place_label(
         room = away.max(axis=2).min(axis=1) / _LINE_DISTANCE
     for center, other in labels:
         room = np.minimum(room, (np.abs(inside - center) / (0.5 * (size + other))).max(axis=1) / _LABEL_DISTANCE)
-    # Clip the clearance at 2, because beyond that a position near the middle of the frame is preferable.
+    # Clip the clearance at 2, because among points with a larger one those near the middle of the frame are preferred.
     off_middle = np.hypot(*((inside - 0.5 * (low + high)) / (high - low)).T)
     best = int(np.argmax(np.minimum(room, 2.0) - 0.2 * off_middle))
     return inside[best] if room[best] >= 1.0 else None

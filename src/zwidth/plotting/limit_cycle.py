@@ -31,7 +31,7 @@ AXES = {
 }
 _MAX_DOTS = 12  # largest number of points of a curve for which each point is drawn as a large dot
 _CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")  # names of the arrays with one value per wall
-# Colors and hatching of walls with an amplitude above the upper bound.
+# Colors and hatching of the walls whose motion has an amplitude above the upper bound.
 _BEYOND: dict[str, Any] = {"facecolor": grid.MISSING, "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
 _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # formatter of tick labels without powers of ten
 
@@ -131,11 +131,11 @@ def draw_limit_cycle_curves(
     cycles = {name: values.swapaxes(1, 2) if names[-1] == family else values for name, values in grids.items()}
     oscillating = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
     factor, meter = style.si_unit(cycles["amplitude_m"][oscillating], "m")
-    # Choose the ticks by the amplitudes of all panels, because the panels of a row share the axis.
+    # Choose the ticks from the amplitudes of all panels, because the panels of a row share the axis.
     amplitudes = cycles["amplitude_m"][oscillating] * factor
     quantities = (("amplitude_m", factor, f"amplitude  in {meter}"), ("frequency_Hz", 1.0, "frequency  in Hz"))
     looks = _list_looks(arrays, family, cycles["linearly_stable"])
-    # Draw dots in addition to lines, because a single limit cycle between two walls at rest has no line.
+    # Draw dots in addition to lines, because a wall with a limit cycle between two walls at rest has no line segment.
     dots = {"marker": "o", "markersize": 3.5 if arrays[over].size <= _MAX_DOTS else 1.25, "clip_on": False}
     largest = format_short(bounds[1], style.units()["m"])
     for row, (name, scaling, words) in enumerate(quantities):
@@ -163,7 +163,7 @@ def draw_limit_cycle_curves(
 
 
 def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest: np.ndarray, widest: str) -> None:
-    """Write into a panel the labels of the curves without any limit cycle, with the reason.
+    """Write the labels of the curves without any limit cycle into a panel, with the reason.
 
     Args:
         ax: Axes of the panel.
@@ -192,7 +192,7 @@ def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest
 
 
 def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarray) -> list[dict[str, Any]]:
-    """Return line properties and label of each curve.
+    """Return a list of line properties, including the label, with one entry per curve.
 
     The label states the value of the parameter, and whether all walls of the curve are unstable.
 

@@ -24,7 +24,7 @@ _TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder":
 _DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}  # dots of residuals
 _LOW = "stiffness_low_N_per_m"  # name of the column with the lower end of the 95 % band of the boundary
 _HIGH = "stiffness_high_N_per_m"  # name of the column with the upper end of the 95 % band of the boundary
-# Color of the boundary, color of its band, and line style, for the first and for the second fit.
+# For the first and for the second fit: color of the boundary, color of its band, and line style.
 _FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))
 _ROWS = ("position", "residuals", "autocorrelation", "walls")  # names of the panels on the left, from top to bottom
 
@@ -137,7 +137,7 @@ def _draw_correlation(ax: Axes, correlation: Table) -> None:
 
 
 def _put_above(ax: Axes, handles: Any = None) -> None:
-    """Add a legend in one row above a panel, to the right of its title; by default with the labeled lines."""
+    """Add a legend in one row above a panel, to the right of its title; by default it lists all labeled lines."""
     entries = handles or ax.get_legend_handles_labels()[0]
     place = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "borderaxespad": 0.0}
     ax.legend(handles=entries, ncols=len(entries), columnspacing=1.2, **place)
@@ -172,7 +172,8 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
         K, low, up = (columns[name] * to_spring for name in (SI_COLUMNS[0], _LOW, _HIGH))
         B = columns[SI_COLUMNS[1]] * to_damper
         ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {source}")
-        # Draw the part of the boundary with K > 0, and one more point at each end, so that it reaches the line K = 0.
+        # Draw the part of the boundary with K > 0 and one more point at each end, so that the curve reaches the line K
+        # = 0.
         ends = np.flatnonzero(K > 0)
         shown = slice(max(int(ends[0]) - 1, 0), int(ends[-1]) + 2) if ends.size else slice(0)
         ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)
@@ -182,7 +183,7 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     colors = colors if len(colors) > 1 else dict.fromkeys(colors, style.BLACK)
     handles += _mark_walls(ax, walls, colors, (to_spring, spring), (to_damper, damper))
     ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to_spring)
-    # Extend the axis upwards by the height of the legend.
+    # Extend the axis of B upwards by the height of the legend.
     highest = float(np.max(dampings)) * to_damper
     ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
     name_axes(ax, spring, damper)
@@ -211,7 +212,7 @@ def _mark_walls(
         for fit, K, B in zip(selected["fitted_to"], *values, strict=True):
             color = colors.get(fit, style.BLACK)
             mark_wall(ax, (K, B), kind, kind=mark, color=color)
-            # Round K down, because the printed wall must be stable, too.
+            # Round K down, because the wall with the printed K must be stable, too.
             numbers = f"$K = {round_conservatively(K, 'below'):.4g}$ {stiffness[1]}, $B = {B:.4g}$ {damping[1]}"
             handles.append(style.line(f"{words}: {numbers}", "", color=color, **MARKS[mark]))
     if not kinds["set"][1].size:
@@ -223,7 +224,8 @@ def _mark_walls(
         ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
         middle = float(np.max(kinds["stiffest"][2]))
         for x, y, frequency in zip(K, B, selected["frequency_Hz"], strict=True):
-            # Write the frequency of an onset outside the region of stable walls, where the background is white.
+            # Write the frequency of an onset outside of the shaded region of stable walls: below the onset in the lower
+            # half of the region, above it in the upper half.
             place = (11, -10) if y < middle else (11, 5)
             ax.annotate(f"{frequency:.3g} Hz", (x, y), xytext=place, color=style.VERMILION, **_TEXT)
         handles.append(style.line("onset of instability, with frequency", "", **look))

@@ -21,10 +21,10 @@ from zwidth.plotting.table import Table, curves, draws_tables
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}  # mark of the settling time
 _ZERO_ORDER_HOLD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}  # line of the sampled wall force
-# Limit of an axis if a motion grows without bound, as a multiple of the largest value of the smallest motion.
+# If a motion grows without bound, the axis ends at this multiple of the largest value of the smallest motion.
 _CLIP = 8.0
-# A motion grows without bound if the largest value in the last quarter of its time exceeds the largest value before by
-# this factor. It must be above 4/3, the ratio for a motion of constant velocity.
+# A motion is taken to grow without bound if the ratio of the largest value in the last quarter of its time to the
+# largest value before exceeds this factor. The factor must be above 4/3, the ratio for a constant velocity.
 _GROWTH = 1.5
 # Length of the time axis if all motions leave the wall, as a multiple of the time at which the last contact ends.
 _WINDOW = 3.0
@@ -80,7 +80,7 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     handles = [line for line in panels[0].lines if not line.get_label().startswith("_")]
     if any(each.settled for each in responses):
         handles.append(Line2D([], [], color=style.GRAY, label="settled to 2 %", **_DOT))
-    # Put the legend outside, because responses oscillate over the whole panel.
+    # Put the legend outside of the panels, because oscillating responses fill a whole panel.
     style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels
 
@@ -94,7 +94,8 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
     clock, unit, factor, length = 1.0, "", 1.0, ""
     if physical:
         clock, unit = style.si_unit([each.time[-1] for each in responses], "s")
-        # Choose the unit by the final positions, because the largest position of an unstable response is arbitrary.
+        # Choose the unit of the axis that suits the final positions, because the largest position of an unstable
+        # response depends only on the simulated time.
         finals = [abs(each.final_position) for each in responses if np.isfinite(each.final_position)]
         largest = max(float(np.nanmax(np.abs(each.position))) for each in responses)
         factor, length = style.si_unit(max(finals, default=largest), "m")
@@ -222,7 +223,7 @@ def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 def _read_motions(table: Table, time: str = "time_s") -> list[Any]:
     """Return the motions of a table as objects with the columns and the line properties (``look``) as attributes."""
     columns = {str(name): np.asarray(table[name]) for name in table}
-    # Separate the motions by their start at time 0, because the labels of two motions may be equal.
+    # Separate the motions at each row with time 0, because the labels of two motions may be equal.
     motions = curves({**columns, "number": np.cumsum(columns[time] == 0.0)}, "number")
     for k, each in enumerate(motions):
         each.label = style.literal(each.label[0])
@@ -252,7 +253,7 @@ def _begin_at_zero(ax: Axes, end: float) -> None:
 
 
 def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[float, str]:
-    """Set the range of an axis, and return its scaling factor and unit; motions that grow without bound are clipped.
+    """Set the range of an axis so that it clips motions that grow without bound; return its scaling factor and unit.
 
     Args:
         ax: Axes to change.

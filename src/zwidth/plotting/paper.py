@@ -67,7 +67,7 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
         _shade(ax, interval, style.VERMILION)
         for name in ("beta_lower", "beta_upper"):
             ax.plot(interval.delta, getattr(interval, name), label=f"passive {name}, d = {interval.d:g}", **look)
-    # Draw one lower bound, because it is the same for all delays.
+    # Draw only one lower bound, because beta = -delta is the lower bound for all delays.
     lower, middle = stable[0].beta_lower, int(0.55 * stable[0].delta.size)
     ax.plot(stable[0].delta, lower, color=style.BLACK, label="beta_lower", zorder=2.5)
     text = r"$\beta = -\delta$ for every $d$" if len(colors) > 1 else r"$\beta = -\delta$"
@@ -112,7 +112,7 @@ def _shade(ax: Axes, interval: Any, color: Any, **keywords: Any) -> None:
 
 @draws_tables
 def draw_ridge(table: Table, axes: style.AnyAxes | None = None, *, two_scalings: bool = False) -> np.ndarray:
-    """Draw alpha_max over delta, one curve per delay; below a curve, some wall with this alpha is stable.
+    """Draw alpha_max over delta, one curve per delay; for each alpha below a curve some wall is stable.
 
     Args:
         table: Columns of a ridge study: d, delta, alpha_max; or of a study of kind paper_fig10, which also has
@@ -246,7 +246,8 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     style.label_ends(maxima, costs, [cost.alpha_max[-1] for cost in costs], colors)
     maxima.set_ylabel(style.label_quantity("alpha"))
     stable = style.line(r"stiffest stable wall, $\alpha_{\max}$")
-    # Place the legend away from the data: single points are in the middle of the panel, and curves rise to the right.
+    # Place the legend where it does not cover data: a single point is in the middle of the panel; curves rise to the
+    # right.
     place = "upper left" if costs[0].delta.size > 1 else "center left"
     maxima.legend(handles=[stable, style.line("stiffest passive wall", style.DASH_DOTTED)], loc=place)
     for ax in shares:
@@ -374,7 +375,7 @@ def _mark_maximum(ax: Axes, edge: Any, scale: tuple[float, float] | None) -> Non
 
 
 def _legend_handles(table: Table, colors: dict[float, Any]) -> list[Line2D]:
-    """Return legend entries for the color of each delta and for the line styles that occur in a table."""
+    """Return legend entries for the color of each delta, and for the line styles of the curves in a table."""
     edges = curves(table, "d", "delta", curve="boundary")
     handles = [style.line(rf"$\delta = {delta:g}$", color=color) for delta, color in colors.items()]
     if any(np.count_nonzero(edge.omega >= np.pi) >= 2 for edge in edges):

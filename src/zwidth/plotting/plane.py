@@ -31,13 +31,14 @@ if TYPE_CHECKING:
 Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, stable_set.Outlines]]"
 """Returns the outlines of the "stable" and the "passive" walls of a panel in its units, stiffness first."""
 
-# Outputs with a contour at the boundary of the stable walls, which is smoother than that of the output "stable".
+# Outputs that have a contour along the boundary of the stable walls. It is smoother than the contour of the Boolean
+# output "stable".
 SMOOTH = ("margin", "spectral_radius")
-# Smooth outputs whose contour is the boundary of a region, by the output of the region.
+# Smooth outputs that have a contour along the boundary of the region of each Boolean output.
 _SMOOTH_OUTPUTS = {"stable": SMOOTH, "passive": ("passivity_margin",)}
 # Outputs that are finite for stable walls only.
 _FINITE_IF_STABLE = ("settling_time", "delay_margin")
-# Names of the stiffest stable wall and its damping, by the name of the stiffness.
+# Names of the outputs with the stiffness and the damping of the stiffest stable wall, by the name of the stiffness.
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
 _FEW_TICKS = 1000.0  # ratio of largest to smallest value below which a color bar also has ticks at 2 and 5
 _LABELLED = 0.1  # fraction of a panel that a region must fill for contour labels
@@ -129,7 +130,7 @@ def _select_drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
 
 
 def _add_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> xarray.Dataset:
-    """Return ``drawn`` with the stiffest stable wall of each panel, if the plane is one of walls and has them."""
+    """Return the dataset ``drawn`` with the stiffest stable walls added, if the axes are K and B and they are known."""
     names = dict(zip((x, y), _PEAKS.get(x, ()), strict=False))
     if y not in ("beta", "virtual_damping") or not names or not all(name in data for name in names.values()):
         return drawn
@@ -165,7 +166,7 @@ def draw_panels(axes: np.ndarray, panels: Sequence[Panel], name: str, label: str
             shown = panel.variables[name]
             image = grid.draw_cells(ax, panel.x, panel.y, shown, cmap=find_colormap(output), norm=norm)
             if min(shown.shape) > 1 and shown.count():
-                # Draw the boundary first, because contour labels keep away from it.
+                # Draw the boundary first, because contour labels must not be too close to it.
                 others = draw_edge(ax, panel, name, **_EDGE) + ([np.array([panel.peak])] if panel.peak else [])
                 draw_contours(ax, panel.x, panel.y, shown, output, norm, others)
             corner = np.ma.filled(panel.variables.get("kind", np.zeros(1)) == 1, False)
@@ -188,7 +189,7 @@ def _draw_regions(ax: Axes, panel: Panel, name: str) -> Any:
         shown = variables[each]
         edge = next((edge for edge in _SMOOTH_OUTPUTS[each] if edge in variables), each)
         smooth, level = variables[edge], boundary_level(edge)
-        # If cells are missing, draw single cells, because a filled contour would hide the gaps.
+        # If some cells have no value, draw cell by cell, because a filled contour would hide the gaps.
         whole = min(smooth.shape) > 1 and shown.count() == smooth.count() == shown.size
         outside = "white" if image is None else (0, 0, 0, 0)
         shades = ListedColormap([outside, outside if whole else SHADES[each]])
@@ -218,11 +219,11 @@ def _draw_line(ax: Axes, panel: Panel, name: str, look: Mapping[str, Any]) -> An
 def draw_contours(
     ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, output: Output, norm: Any, others: Sequence[np.ndarray] = ()
 ) -> None:
-    """Draw labeled contours at round values; the labels keep away from the points of other lines."""
+    """Draw contours at round values, with labels that are not too close to the points of other lines."""
     levels = choose_levels(values, output, norm)
     if not levels.size:
         return
-    # Use light lines on dark colors and dark lines on light ones.
+    # Draw contours light on dark colors and dark on light colors, so that they are visible.
     shades = find_colormap(output)(norm(levels))
     luminance = shades[:, :3] @ np.array([0.299, 0.587, 0.114])
     colors = [("white" if dark < 0.5 else "#303030") for dark in luminance]
@@ -281,7 +282,7 @@ def _add_legend(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any
     crossed = finite.size and finite.min() < output.center < finite.max()
     if crossed if output.color_scale == "diverging" else (exact and output.color_scale != "truth"):
         walls = "passive" if name == "passivity_margin" else "stable"
-        handles.append(style.line(f"edge of what is {walls}", width=1.3, color=style.BLACK))
+        handles.append(style.line(f"boundary of the {walls} walls", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):
         handles.append(Patch(facecolor=MISSING, label="unstable"))
     elif any(np.ma.is_masked(panel.variables[name]) for panel in panels):
@@ -315,11 +316,11 @@ def draw_workspace(
             the column.
     """
     (ax,) = panels = style.panels(axes, 1, 5.9, 4.3)
-    # Use the last match, because the coordinates precede it and may have any name.
+    # Use the last column whose name begins with "stiffness_", because the coordinates precede it and may have any name.
     wanted = [str(name) for name in table if str(name).startswith("stiffness_")][-1]
     x, y, stiffness = (np.asarray(table[name], float) for name in (across, up, wanted))
     factor, unit = style.si_unit(stiffness, "N/m")
-    # Smooth shading cannot leave undecided poses empty.
+    # Shade cell by cell if the stiffness of some poses is undecided, because smooth shading cannot leave them empty.
     stiffness = np.ma.masked_invalid(stiffness)
     shading = "nearest" if np.ma.is_masked(stiffness) else "gouraud"
     norm, weakest = LogNorm(factor * stiffness.min(), factor * stiffness.max()), int(stiffness.argmin())

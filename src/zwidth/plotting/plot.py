@@ -49,7 +49,8 @@ from zwidth.units.formatting import format_wall
 from zwidth.units.quantities import PARAMETERS
 
 N_ANGLES = 181  # number of points on the outline of the passive walls
-# Number of frequencies of an open loop on a logarithmic grid, and again on a linear grid up to the Nyquist frequency.
+# Number of frequencies of an open loop on each of two grids up to the Nyquist frequency, a logarithmic and a linear
+# one.
 N_FREQUENCIES = 2000
 MIN_PERIODS = 100  # least number of sampling periods in the step response of a recommended wall
 MAX_PERIODS = 20_000  # largest number of sampling periods in the step response of a recommended wall
@@ -77,7 +78,7 @@ def _with_house_style(function: Callable[Parameters, Result]) -> Callable[Parame
 def _with_checked_scene(
     function: Callable[Concatenate[Scene, Parameters], Result],
 ) -> Callable[Concatenate[Scene, Parameters], Result]:
-    """Wrap a function so that it raises an error if its first argument is no scene, and draws in the house style."""
+    """Wrap a function so that it raises an error if its first argument is not a scene, and draws in the house style."""
     return wrap_function(_with_house_style(function))
 
 
@@ -160,7 +161,7 @@ def recommendation(
         response: Columns of a step study of this wall, in SI units. Default: computed at the samples.
     """
     scene, verdict, recommended = found.scene, found.verdict, found.as_dict()["recommended"]
-    # Leave out the response of a measured device, because no model exists from which it could be computed.
+    # Omit the step response of a measured device, because it can only be computed from a model.
     has_model = not isinstance(scene.device, MeasuredDevice)
     if axes is None:
         axes = (
@@ -187,7 +188,7 @@ def recommendation(
     look = {"color": style.GRAY, "linewidth": 1.0, "label": "virtual_damping_interval"}
     panels[0].plot([K * spring] * 2, interval * damper, **look)
     if response is None and has_model:
-        # Choose a duration of one and a half times the decay time of the dominant pole, within bounds.
+        # Simulate one and a half times the decay time of the dominant pole, within MIN_PERIODS and MAX_PERIODS.
         periods = int(
             min(max(MIN_PERIODS, 1.5 * (recommended["decay_time"] or 0.0) / scene.timing.period), MAX_PERIODS)
         )
@@ -331,8 +332,8 @@ def bode(
         upper.plot([phase_crossover] * 2, [1.0, 1.0 / gain], label=f"gain margin {rounded['gain']:.3g}", **bar)
     if np.isfinite(phase):
         angle = float(np.interp(gain_crossover, hertz, angles))
-        # Start the bar at the odd multiple of 180 degrees nearest to the phase, because L is real and negative at this
-        # phase.
+        # Start the bar at the odd multiple of 180 degrees that is nearest to the phase, because there L is real and
+        # negative.
         foot = angle - (angle + 180.0 + 180.0) % 360.0 + 180.0
         lower.plot([gain_crossover] * 2, [foot, angle], label=f"phase margin {rounded['phase']:.3g}°", **bar)
     upper.set(yscale="log", ylabel="$|L|$")

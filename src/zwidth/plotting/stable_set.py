@@ -26,10 +26,11 @@ if TYPE_CHECKING:
 
 # Points (x, y) of each outline, of shape (n, 2), and True if it is the outline of a hole.
 Outlines: TypeAlias = Sequence[tuple[np.ndarray, bool]]
-# Colors of regions, light because labels and curves drawn over them must stay legible. In a gray print, that of the
-# passive walls is the darker one.
+# Colors of regions. They are light, because labels and curves drawn over them must stay legible. In a gray print the
+# color of the passive walls is the darker one.
 SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
-# Number of points by which each straight line of an outline is replaced on a logarithmic axis, where it is curved.
+# Number of points by which each straight segment of an outline is replaced on a logarithmic axis, on which it is
+# curved.
 _INTERPOLATION = 32
 # Marks of walls by kind, in panels and legends.
 MARKS: dict[str, dict[str, Any]] = {
@@ -135,7 +136,7 @@ def name_axes(ax: Axes, spring: str, damper: str) -> None:
 
 
 def agrees(outlines: Outlines, x: np.ndarray, y: np.ndarray, good: np.ndarray) -> bool:
-    """Return whether cells agree with outlines: all cells inside are ``good`` and all others are not.
+    """Return whether cells agree with outlines: ``good`` is True for all cells inside, False for all others.
 
     Cells next to the boundary are not compared.
 
@@ -205,7 +206,7 @@ def _changes(cells: np.ndarray) -> np.ndarray:
 
 
 def fit_axes(outlines: Outlines, ax: Axes) -> Outlines:
-    """Return outlines that can be drawn on the scales of an Axes.
+    """Return outlines in coordinates that can be drawn on the scales of an Axes.
 
     On a logarithmic axis, zero and negative coordinates become small positive ones below the limits of the axis.
     """
@@ -235,7 +236,7 @@ def tabulate_walls(scene: Scene, stiffness: Any, virtual_damping: Any) -> dict[s
 
 
 def tabulate_sets(scenes: Mapping[str, Scene]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return two tables for `draw_stable_set`: the outlines of scenes, by label, and the stiffest wall of each."""
+    """Return two tables for `draw_stable_set`: the outlines of the stable sets of scenes, and their stiffest walls."""
     outlines = stack(piece for label, scene in scenes.items() for piece in trace_outlines(scene, label=label))
     tops = {label: tabulate_walls(scene, *scene.max_stiffness()[:2]) for label, scene in scenes.items()}
     return outlines, stack({"label": label, "wall": "stiffest", **wall} for label, wall in tops.items())
@@ -276,7 +277,7 @@ def draw_stable_set(
     right_margin, most = 0.28 * max(1.0, 5.6 / width), max(rows[names[0]], default=np.nan) * factors[0]
     rows = {"digits": np.full(len(rows["wall"]), 4), **rows}
     for kind, label, digits, *wall in zip(*(rows[name] for name in ("wall", "label", "digits", *names)), strict=True):
-        # Round K down, because the printed wall must be stable.
+        # Round K down, because the wall with the printed K must be stable.
         read = round_conservatively(wall[0], "below", digits), wall[1]
         wall = [value * factor for value, factor in zip(wall, factors, strict=True)]
         which = kind.split()[0]

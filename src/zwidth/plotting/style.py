@@ -41,7 +41,7 @@ PURPLE = "#CC79A7"
 GRAY = "#6E6E6E"
 DISTINCT = (BLUE, ORANGE, BLACK, GREEN, VERMILION, SKY, PURPLE)  # colors of curves that are not ordered by a value
 
-# Line styles, which have the same meanings as in the figures of the paper and are legible in gray prints, too.
+# Line styles. They have the same meanings as in the figures of the paper and can be distinguished in gray prints.
 SOLID = "-"
 DASHED = (0, (5.0, 2.2))
 DASH_DOTTED = (0, (6.0, 1.8, 1.2, 1.8))
@@ -50,7 +50,7 @@ STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED, (0, (11.0, 2.5)), (0, (6.0, 1.8, 1
 # Markers that distinguish curves if their line styles already have a meaning.
 MARKERS = ("o", "s", "^", "v", "P", "X", "*")
 
-# Units whose spelling in labels differs from that in datasets (UDUNITS).
+# Spelling in labels of units for which it differs from the spelling in datasets (UDUNITS).
 _WRITTEN = {"1": "", "degree": "degrees", "g cm^2": "g cm$^2$"}
 
 # Line properties for curves over an integer parameter: points without lines between them.
@@ -65,7 +65,7 @@ LIGHTEST = 0.6  # position of the lightest curve color in the colormap viridis; 
 _DENSE_TICKS = 5.0  # ratio of the ends of a logarithmic axis, below which ticks at 1, 2 and 5 are too few
 _SINGLE_VALUE_RANGE = 2.0  # factor between a single value and each end of its logarithmic axis
 
-# Metadata to leave out, because the same figure must always have the same bytes.
+# Metadata to be omitted by file format, because the same figure must always have the same bytes.
 _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 _RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_default_template=False))
@@ -74,7 +74,7 @@ _ONE_COLUMN = 5.0  # least width of a figure with several columns of panels, in 
 
 
 class _FigureSettings(NamedTuple):
-    """Settings of figures in the current context, in addition to matplotlib's rcParams."""
+    """Settings of figures in the current context: rcParams of a style sheet, and further settings."""
 
     style: Mapping[Any, Any] = {}  # rcParams of a style sheet, which override the house style
     size: Size | None = None  # size of new figures in inches
@@ -139,7 +139,7 @@ def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **k
     if up is None:
         narrow = across < _ONE_COLUMN and columns > 1 and not {"width_ratios", "height_ratios"} & set(keywords)
         rows, columns, height = (rows * columns, 1, height * columns) if narrow else (rows, columns, height)
-        # Reduce the height by less than the width, because the height of labels does not change.
+        # Scale the height by at least 0.9 in a narrower figure, because the height of labels does not change.
         up = height * min(1.0, max(across * (2.0 if narrow else 1.0) / width, 0.9))
     figure = Figure(figsize=(across, up), layout=engine)
     return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
@@ -149,7 +149,7 @@ def panels(given: AnyAxes | None, count: int, width: float, height: float, colum
     """Return a 1-D array of the Axes to draw into: the given ones, or those of a new figure.
 
     Args:
-        given: Existing Axes, of which the first ``count`` are returned; None for a new figure.
+        given: Existing Axes; the first ``count`` of them are returned. None for a new figure.
         count: Number of panels.
         width: Width of a new figure in inches.
         height: Height of a new figure in inches.
@@ -218,7 +218,8 @@ def legend(
     if not handles:
         return
     if not outside:
-        # Pass ``loc`` even if it is "best", because with the default location matplotlib warns if the search is slow.
+        # Always pass ``loc``, even "best": if it is not passed, matplotlib warns when the search for the best place is
+        # slow.
         axes[0].legend(handles=handles, loc=loc)
         return
     figure, columns = figure_of(axes), keywords.pop("ncols", 1)
@@ -358,7 +359,8 @@ def save(
             kind = {"format": file.suffix[1:], "metadata": _METADATA[file.suffix]}
             figure.savefig(drawing := BytesIO(), dpi=dpi or _settings.get().dpi or usual, **kind)
             write_atomically(file, drawing.getvalue())
-            # Keep the layout of the first format for the others, because computing it takes half the run time.
+            # Compute the layout only for the first format and keep it for the others, because it takes half the run
+            # time.
             figure.set_layout_engine(None)
     figure.set_layout_engine(engine)
     return files
@@ -377,7 +379,7 @@ def color_by_value(values: Sequence[float]) -> dict[float, Any]:
 
 
 def look(k: int) -> dict[str, Any]:
-    """Return the color and the line style of the k-th curve, by which the first six curves differ from each other."""
+    """Return the color and the line style of the k-th curve; those of the first six curves differ from each other."""
     return {"color": DISTINCT[k % len(DISTINCT)], "linestyle": STYLES[k % len(STYLES)]}
 
 
@@ -396,7 +398,7 @@ def spread(positions: Sequence[float], gap: float) -> np.ndarray:
     """Move positions to be at least ``gap`` apart, by as little as possible and without changing their order."""
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(len(positions))
-    # Isotonic regression (least squares): positions that would be too close form a group, centered at their mean.
+    # Solve by isotonic regression (least squares): positions that would be too close form a group around their mean.
     groups: list[list[float]] = []
     for place in np.asarray(positions, dtype=np.float64)[order] - steps:
         groups.append([place])

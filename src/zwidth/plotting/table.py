@@ -55,7 +55,7 @@ def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters,
 
 
 def is_of_rotary(data: Any) -> bool:
-    """Return whether an object is the dataset of a sweep with units of rotary devices."""
+    """Return whether an object is the dataset of a sweep over rotary devices, as shown by its units."""
     variables = getattr(data, "variables", {})
     return any(str(each.attrs.get("units", "")) in _ROTARY_UNITS for each in variables.values())
 

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
 _PLANES = ({"alpha", "beta"}, {"stiffness", "virtual_damping"})  # dimensions of a plane of walls
 FOLDER = "figures"  # default name of the folder of the figures, next to the stores
-# Smallest number of values along both axes for which an output of devices is drawn as a plane; fewer become curves.
+# Smallest number of values along both axes with which an output of devices is drawn as a plane. With fewer values, it
+# is drawn as curves.
 _MIN_SURFACE = 6
 
 
@@ -66,14 +67,14 @@ def make_edges(store: Store) -> Edges:
 
 
 def _find_index(values: np.ndarray, coordinate: xarray.DataArray) -> int:
-    """Return the index of a scalar coordinate of a part among the values of this parameter in the sweep."""
+    """Return the index of the scalar coordinate of a part in the array of all values of this parameter in the sweep."""
     if values.dtype.kind == "U":
         return values.tolist().index(str(coordinate.values))
     return int(np.argmin(np.abs(values - float(coordinate) / coordinate.attrs["factor"])))
 
 
 def _compute_outlines(store: Store, indices: tuple[int, ...]) -> dict[str, Outlines]:
-    """Compute the edges of the device with the given index along each device dimension; {} if the device is invalid."""
+    """Compute the edges of the device with the given index along each device dimension; {} for an invalid device."""
     parameters = store.plan.grid.scene_block(tuple(slice(k, k + 1) for k in indices)).parameters
     try:
         return find_edges(store.study.make_scene({name: float(values[0]) for name, values in parameters.items()}))
@@ -145,14 +146,14 @@ def draw_stores(
 
 
 def _explain_absence(data: xarray.Dataset) -> str:
-    """Return the reason why a sweep has no figure."""
+    """Return a phrase with the reason why a sweep has no figure."""
     # Use the order of `VARIABLES`, because the order in which a store lists its variables differs between file systems.
     varied = [name for name in ("device", *VARIABLES) if data.sizes.get(name, 0) > 1]
     return f"no figure shows its outputs over {', '.join(varied)}" if varied else "it is a single point"
 
 
 def list_figures(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Yield the name of each figure of a sweep or slice, and the function that draws it."""
+    """Yield pairs: the name of each figure of a sweep or slice, and the function that draws it."""
     # Use the order of `OUTPUTS`, because the order in which a store lists its variables differs between file systems.
     for name in OUTPUTS:
         if name not in data or name == "kind" or (name == "passive" and "stable" in data):
@@ -213,7 +214,8 @@ def _find_nearest(data: xarray.Dataset, dim: str, value: float | str) -> tuple[i
         raise InputError(f"at: {dim}: got {value!r}; write a finite number")
     values = np.asarray(data[dim].values, dtype=float)
     index, ordered = int(np.argmin(np.abs(values - wanted))), np.sort(values)
-    # Accept values up to half a step of the grid outside its range, for a single value only the value itself.
+    # Accept requested values up to half a grid step outside the range; if the sweep has a single value, only this
+    # value.
     steps = np.diff(ordered) if values.size > 1 else np.zeros(1)
     slack = 1e-9 * abs(wanted)
     if not ordered[0] - 0.5 * steps[0] - slack <= wanted <= ordered[-1] + 0.5 * steps[-1] + slack:

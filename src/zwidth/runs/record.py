@@ -4,7 +4,7 @@ The record contains one *entry* per study. It is written again after every study
 time leaves a correct record. The files of a study are created in a hidden folder, then entered in the record, and only
 then moved to their names in the folder of the run. So no file of a run is ever incomplete under its name, and a file
 that is not in the record, a file *of the user*, is never replaced or removed. *Inputs* of a study are its configuration
-and the files that this configuration reads, of which the folder ``inputs`` contains copies.
+and the files that this configuration reads; the folder ``inputs`` contains copies of them.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ class Record:
         if checksum is not None and hash_json(content) != checksum:
             self.damaged = True
             if content.get("format") == RUN_FORMAT:
-                # Mark all studies as unfinished, so that they are computed again. Keep only the lists of their files,
-                # which a run must have in order to replace these files.
+                # Mark all studies as unfinished, so that they are computed again. Keep only entries with a list of
+                # files, because a run replaces no files that its record does not list.
                 entries = [entry for entry in content["studies"] if isinstance(entry, dict)]
                 content["studies"] = [
                     {**entry, "state": "open"}
@@ -108,8 +108,8 @@ class Record:
         check_folder(self.folder)
         if resume or not self.folder.is_dir():
             return
-        # Accept the files that a run leaves if its record is lost. Stores are checked later (`check_stores`), because
-        # each of them contains its study.
+        # The record may be lost: accept a folder that contains only files that a run writes. The stores are checked
+        # later (`check_stores`), because each store contains its own study.
         names, expected = [path.name for path in self.folder.iterdir()], (LOCKS, CONFIG_FILE, "figures")
         strange = [name for name in names if not name.endswith((SUFFIX, ".partial")) and name not in expected]
         fault = ""
@@ -125,7 +125,7 @@ class Record:
             raise StoreExistsError(f"out: {self.folder} {fault}")
 
     def _contains_config(self, text: str) -> bool:
-        """Return whether the folder contains a configuration file with the given text."""
+        """Return whether the configuration file in the folder exists and has the given text."""
         with suppress(OSError):
             return (self.folder / CONFIG_FILE).read_bytes() == text.encode("utf-8")
         return False
@@ -143,8 +143,8 @@ class Record:
                 f"with --overwrite, or {ELSEWHERE}"
             )
         if self.damaged:
-            # Skip the comparison of a damaged record, because all studies are computed again, and each sweep is
-            # compared with the study in its store.
+            # Do not compare a damaged record: all studies are computed again, and sweeps are compared with the study in
+            # their store.
             return
         where = self.folder / RUN_FILE
         for name, now in inputs.items():
@@ -154,7 +154,7 @@ class Record:
         refuse_versions(where, self.content.get("versions", {}))
 
     def start(self, **about: Any) -> None:
-        """Record the start of a run: the time, the package versions, and the attributes ``about``."""
+        """Record the start of a run: its time, the package versions, and the further entries ``about``."""
         about |= {"format": RUN_FORMAT, "started": datetime.now(UTC).isoformat(timespec="seconds")}
         about |= {"precision": "float64", "versions": list_versions(*_PACKAGES)}
         self._update({**about, "started": self.content.get("started", about["started"])})
@@ -190,15 +190,15 @@ class Record:
             write_atomically(path, text.encode("utf-8"))
 
     def note(self, entry: dict[str, Any]) -> None:
-        """Record the entry of a study in place of its earlier entry."""
+        """Write the entry of a study to the record, in place of an earlier entry of this study."""
         self._update({}, entry)
 
     def _update(self, about: dict[str, Any], entry: dict[str, Any] | None = None) -> None:
         """Update the record and write its file.
 
         Args:
-            about: Attributes of the run to be set.
-            entry: Entry of a study, which replaces an earlier entry of the same study; None for no change.
+            about: Entries of the record to be set, apart from those of the studies. entry: Entry of a study, which
+                replaces an earlier entry of the same study; None for no change.
         """
         content = {**self.content, **about}
         studies = [old for old in content.get("studies", ()) if entry is None or old["name"] != entry["name"]]
@@ -208,7 +208,7 @@ class Record:
         write_atomically(self.folder / RUN_FILE, text.encode())
 
     def faults(self, name: str) -> list[str]:
-        """Return the damaged and missing files of a study, each with its fault."""
+        """Return a list of texts that state the damaged and missing files of a study, each with its fault."""
         entry = self.entry(name)
         files = entry["files"] if entry else {}
         return [
@@ -234,7 +234,7 @@ class Record:
         for file in files:
             if (self.folder / file).exists() and file not in self.files() and not self.content.get("lost"):
                 raise StoreExistsError(f"out: {self.folder / file} was not written by this run; {_MOVE}")
-        # Record the names before moving the files, so that the record of a run that is killed meanwhile is complete.
+        # Record the names before moving the files, so that the record is complete even if the run is killed in between.
         both = {**before.get("files", {}), **files}
         self.note({**entry, "state": "open", "files": both})
         for file in files:
@@ -283,7 +283,7 @@ class Record:
 
 
 def _find_fault(content: Any) -> str:
-    """Return the reason why a JSON value is not a record of a run; "" if it is a record."""
+    """Return a phrase with the reason why a JSON value is not a record of a run; "" if it is a record."""
     kinds = {"studies": list, "versions": dict, "inputs": dict}
     if not all(isinstance(content.get(key, kind()), kind) for key, kind in kinds.items()):
         return "no record of a run"

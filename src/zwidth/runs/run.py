@@ -50,7 +50,7 @@ class StudyResult:
     notes: tuple[str, ...] = ()  # remarks that affect the use of the results, such as points without a result
     answer: tuple[str, ...] = ()  # main result in one or two lines; empty if it is longer
     error: str = ""  # type and message of the exception that ended the study; empty if there was none
-    # Exception that ended a computed study.
+    # Exception that ended a computed study; None if there was none.
     exception: Exception | None = field(default=None, repr=False, compare=False)
     sweep: SweepResult | None = None  # outcome of the chunks; None for a computed study
 
@@ -66,7 +66,7 @@ class RunResult:
     hopeless: str = ""  # error that ended the run, because it affects every study, such as a full disk
     interrupted: bool = False  # True if the user stopped the run with Ctrl-C; earlier results are kept
     lost: str = ""  # error of the cluster that ended the run; earlier results are kept
-    whole: int = 0  # number of computed studies in the configuration
+    whole: int = 0  # number of studies in the configuration that are not sweeps
 
     @property
     def failed(self) -> tuple[StudyResult, ...]:
@@ -86,7 +86,7 @@ class RunResult:
 
 @dataclass(frozen=True)
 class StudyEvent:
-    """Event that a run reports: start or end of a study, completion of a part of it, or of a chunk of a sweep."""
+    """Event that a run reports: start or end of a study, or completion of a part of it or of a chunk of a sweep."""
 
     index: int  # number of the study, from 1
     total: int  # number of studies
@@ -204,7 +204,7 @@ def run(
 
 
 def plan_run(config: AnyConfig, *, memory: int = MEMORY) -> list[Study | Plan]:
-    """Return the studies that `run` would compute, a sweep as its plan, without computing anything.
+    """Return what `run` would compute, without computing it: each study, or the plan of a study that is a sweep.
 
     Raises:
         ConfigError: The configuration has faults.
@@ -214,7 +214,7 @@ def plan_run(config: AnyConfig, *, memory: int = MEMORY) -> list[Study | Plan]:
 
 
 class _Run:
-    """A run in progress; the caller holds the lock of its folder.
+    """A run in progress; its caller must hold the lock of the folder.
 
     Args:
         config: The configuration.
@@ -306,8 +306,8 @@ class _Run:
         """
         clock = time.perf_counter()
         number = {plan.study.name: len(self.results) + k for k, plan in enumerate(plans, start=1)}
-        # Assign the time between two completed chunks to the sweep of the second chunk, because workers compute chunks
-        # of several sweeps in parallel.
+        # Count the time between two completed chunks as computing time of the second chunk's sweep, because workers
+        # compute chunks of several sweeps in parallel.
         spent = dict.fromkeys(number, 0.0)
 
         def report_chunk(progress: Progress) -> None:
@@ -326,7 +326,7 @@ class _Run:
         try:
             sweeps = compute_sweeps(plans, self.record.folder, about, progress=report_chunk, **options)
         except KeyboardInterrupt:
-            # Handle an interrupt before the first chunk; `compute_sweeps` handles later ones itself.
+            # Record an interrupt before the first chunk; `compute_sweeps` handles later interrupts itself.
             self.interrupted = True
             return
         self.hopeless, self.interrupted, self.lost = sweeps.fatal_error, sweeps.interrupted, sweeps.lost
@@ -354,7 +354,7 @@ class _Run:
 
 
 def _list_inputs(config: Config, names: dict[str, str], files: dict[str, bytes]) -> dict[str, dict[str, Any]]:
-    """Return all inputs that determine the results of each study, by name of the study.
+    """Return a dictionary, by name of the study, of all inputs that determine its results.
 
     In the inputs, the name of a file is replaced by the path and the checksum of its copy.
 

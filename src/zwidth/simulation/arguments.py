@@ -139,7 +139,7 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
     with compute_concretely(), jax.numpy_rank_promotion("allow"):
         try:
             hash(force)
-            # Trace the law twice, because a law that keeps values between calls yields a different program the second
+            # Trace the law twice, because a law that stores values between calls then yields another program the second
             # time, or fails.
             for _ in range(2):
                 # Wrap the law in a new function for each trace, because JAX would reuse the cached trace of the same
@@ -155,8 +155,8 @@ def trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
                 "jax.numpy, jnp.where in place of if"
             ) from error
     program, inputs, result = traces[0]
-    # Reject a law with a fourth input, because JAX passes a value that the law kept from an earlier trace as such an
-    # input.
+    # Reject a law whose program has more than three inputs, because JAX adds an input for each value that the law has
+    # stored during an earlier trace.
     if traces[1] != traces[0] or inputs != 3:
         raise memory
     kind = getattr(result, "dtype", np.dtype(object)).kind
@@ -259,7 +259,7 @@ def _unit(name: str) -> str:
 
 
 def _spell(name: str) -> str:
-    """Return the name of an argument as users write it, "start_position" for "start_position.position"."""
+    """Return the name of an argument as users write it, e.g. "start_position" for "start_position.position"."""
     return name.removesuffix(".position")
 
 

@@ -49,7 +49,7 @@ def find_structure(scene: Parts) -> tuple[Any, ...]:
 
 
 def name_bodies(scene: Parts) -> tuple[str, ...]:
-    """Return the fields of `Motion` with the positions of the bodies: position and, if present, tip and hand."""
+    """Return the names of the position fields in `Motion`: device and, if present, mass after a coupling and hand."""
     tip = ("tip_position",) if scene.device.coupling is not None else ()
     hand = ("hand_position",) if scene.operator is not None and not scene.operator.rigid else ()
     return "position", *tip, *hand
@@ -68,7 +68,7 @@ class Model(NamedTuple):
 
 
 def build_model(scene: Any) -> Model:
-    """Build the simulation model of a scene."""
+    """Build the simulation model of a scene, with its chain, delay and velocity estimate."""
     estimate, period, mass = scene.velocity, float(scene.timing.period), float(scene.mass)
     # For FOAW, build the chain with another velocity estimate and keep the FOAW parameters separately, because FOAW is
     # not a linear filter.
@@ -105,8 +105,8 @@ def run_scenes(
         record=settings.record,
         law=settings.law,
     )
-    # Compute the lengths of the rings of positions and of commands. Use at least the same minimum length in all calls,
-    # because each length needs a compilation, and a ring that is longer than necessary costs no time.
+    # Compute the lengths of the rings of positions and of commands. Round them up to a few common lengths, because each
+    # length needs a compilation, and a ring that is longer than necessary costs no time.
     rings = (
         round_up(max(3, *(model.window for model in models)) + 1),
         round_up(max(5, *(model.late for model in models)) + 3),
@@ -239,8 +239,9 @@ def draw_instants(
     k = np.arange(periods)[:, None]
     effective = []
     for age in (1, 0, -1):
-        # Compute the time within the period at which a command takes effect, for each age (number of samples since it
-        # was computed). Clip the index of its sample, because no command exists before the first sample.
+        # Compute the time within the period at which each command takes effect. The age of a command is the number of
+        # samples by which it precedes that of sample k - whole. Clip the index of its sample, because no command
+        # exists before the first sample.
         sample = np.clip(k - whole - age, 0, periods)
         effective.append(fractions - age + np.take_along_axis(late, sample, 0) - late[:-1])
     durations = cut_period(1.0 + np.diff(late, axis=0), effective, settings.substeps)

@@ -5,8 +5,9 @@ the index of a sample. One compiled *block* simulates a fixed number of periods,
 further compilation. A period is divided into *substeps*, at whose starts a *frame* is recorded, and a substep into
 *pieces* with constant force; a *reading* is the result of the control program at one sample. A *ring* is a circular
 buffer of positions or commands, indexed by k modulo its length. The *tail* is the last part of a simulation, in which
-its behavior is classified. ``x`` is the state of the bodies, of which the rows ``params.place`` and ``params.motion``
-compute their positions and velocities. FOAW is the adaptive velocity estimate of Janabi-Sharifi et al. 2000.
+its behavior is classified. ``x`` is the state of the bodies; its products with the rows of ``params.place`` and
+``params.motion`` are their positions and velocities. FOAW is the adaptive velocity estimate of Janabi-Sharifi et al.
+2000.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ class PeriodInputs(NamedTuple):
 
 
 def _write(rows: Array, row: Array, index: Array) -> Array:
-    """Return a copy of an array in which one row (index along the first axis) is replaced."""
+    """Return a copy of an array in which the row with an index along the first axis is replaced."""
     return jax.lax.dynamic_update_index_in_dim(rows, row, index, 0, allow_negative_indices=False)
 
 
@@ -307,8 +308,8 @@ def _simulate_period(
             body, work = carry
             return propagate(params, options, body, work, force, inputs.push, (j, number), read(lasting, number)), None
 
-        # With friction or jitter, loop over the pieces by `scan`, so that the long program of a piece is compiled only
-        # once.
+        # With friction or jitter, loop over the pieces by `scan`, because the program of one piece is then long and
+        # should be compiled only once.
         if options.friction or options.jitter:
             return jax.lax.scan(one, carry, (np.arange(options.pieces), jnp.stack(forces)))[0], frame
         for piece in enumerate(forces):

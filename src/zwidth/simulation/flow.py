@@ -49,7 +49,7 @@ def build_mechanics(chains: Sequence[Any]) -> Mechanics:
 
     Args:
         chains: open loops of the scenes (`model.mechanism`), with equal numbers of bodies, links, modes and actuator
-            states; or one linear system (`parts.system.System`) with several delays.
+            states; or one linear system (`model.linear_plant.System`) with several delays.
     """
     first: Any = chains[0]
     if isinstance(first, System):
@@ -72,8 +72,8 @@ def build_mechanics(chains: Sequence[Any]) -> Mechanics:
     motion = np.roll(place, count, axis=1)
     axes = np.eye(size)
     stretch, swing = axes[1:first_mode], axes[first_mode:count]
-    # Compute the energies with the absolute values of the modal masses. They are exact for a mode whose displacements
-    # at the actuator and at the sensor are equal.
+    # Compute the energies with the absolute values of the modal masses. These energies are exact for a mode whose
+    # displacements at the actuator and at the sensor are equal.
     inertia = [np.abs(mode.mass) for mode in modes]
     springs = [mass * mode.rate**2 for mass, mode in zip(inertia, modes, strict=True)]
     dampers = [2.0 * mass * mode.damping_ratio * mode.rate for mass, mode in zip(inertia, modes, strict=True)]
@@ -89,8 +89,8 @@ def build_mechanics(chains: Sequence[Any]) -> Mechanics:
     energy = energy + weigh(differentiate(swing), inertia)
     drain = weigh(motion, [body.damping for body in bodies]) + weigh(differentiate(swing), dampers)
     drain = drain + weigh(differentiate(stretch), [link.damping for link in links])
-    # Add the holding force that makes the acceleration of the first body 0 (T4). It acts like the last of the forces.
-    # No division by a mass is needed, because the mass of the first body is 1.
+    # Add the holding force, which makes the acceleration of the first body 0 (T4). It acts at the same place as the
+    # last of the forces u. No division by a mass is needed, because the mass of the first body is 1.
     held = rate - rate[..., -1:] * (motion[0] @ rate)[:, None, :]
     wide = (0, len(forces))
     return Mechanics(rate, held, place, motion, 0.5 * energy, np.pad(drain, ((0, 0), wide, wide)))

@@ -20,8 +20,8 @@ from zwidth.model.state_space import realize_estimate
 from zwidth.model.velocity import FOAW
 from zwidth.simulation.flow import DIGITS, Flow, Mechanics, flow
 
-# Longest step with friction: the angle in rad by which the fastest motion advances. A longer step could contain two
-# events (T5).
+# Longest step with friction, as the angle in rad by which the fastest oscillation advances. A longer step could contain
+# two events, i.e. changes between slipping and holding (T5).
 LONGEST_ANGLE = 0.25
 MOST_STEPS = 256  # largest number of steps per period with friction, to limit the run time
 
@@ -116,8 +116,8 @@ class Parameters(NamedTuple):
     motion: Array  # rows of the velocities of the bodies, (bodies, n, batch)
     energy: Array  # quadratic form in x of the kinetic and elastic energy, (n, n, batch)
     durations: Array  # durations of the pieces without jitter, (substeps, pieces, batch)
-    # Flows over the durations above, (1 or 2, substeps, pieces, ..., batch): while the first body slips and, with
-    # friction, while it is held.
+    # Flows over the durations of the pieces, (1 or 2, substeps, pieces, ..., batch): while the first body slips and,
+    # with friction, while it is held.
     pieces: Flow
     # Flows over the binary digits of time, (1 or 2, DIGITS, ..., batch): while the first body slips and, with friction,
     # while it is held.
@@ -152,7 +152,8 @@ def build_estimators(estimates: Sequence[Any], which: np.ndarray) -> Estimator:
     ``estimates`` contains the estimate of each scene, ``which`` the index of the scene of each simulation.
     """
     count, adapts = len(estimates), isinstance(estimates[0], FOAW)
-    # Realize the estimate without its window, because the engine keeps the last measured positions in a ring.
+    # Realize the velocity filter without the difference over a window, because the engine computes this difference from
+    # a ring of the last measured positions.
     filters = {
         k: realize_estimate(replace(each, window=0))
         for k, each in enumerate(estimates)

@@ -61,7 +61,7 @@ def advance(
     keep: Callable[[Array], Array] | None = None,
     which: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Propagate by decreasing binary digits of time; omit a step if the condition ``keep`` is false at its end.
+    """Propagate by decreasing binary digits of time; skip a digit if the condition ``keep`` would be false after it.
 
     This bisects to the instant at which the condition becomes false, or propagates up to ``limit`` if it stays true.
 
@@ -163,8 +163,8 @@ class _Joint(NamedTuple):
             stopped: mask of the batch entries whose first body has stopped; the others are left unchanged.
         """
         push = self.pressed(x)
-        # Set the velocity of the stopped first body to exactly 0 by an impulse on it, because the search for the event
-        # leaves a rounding error.
+        # Set the velocity of a stopped first body to exactly 0, as by an impulse on it, because the search for the
+        # event leaves a small velocity as a rounding error.
         x = jnp.where(stopped, x - self.rate[:, -1] * self.speed(x), x)
         return BodyState(x, jnp.where(stopped, jnp.where(jnp.abs(push) > self.static, jnp.sign(push), 0.0), slip))
 
@@ -223,8 +223,8 @@ class _Joint(NamedTuple):
             calm = (self.reserve(far, slip, side) >= 0) & monotone & (state.left > 0) & (state.left <= self.longest)
             return far, dot(z, times(loss, z)), calm
 
-        # Skip the computation if no simulation has a remaining duration. In addition, the conditional prevents XLA from
-        # computing the mask again at each use.
+        # Skip the computation if no simulation has a remaining duration. The conditional also prevents XLA from
+        # computing the mask ``calm`` again at each use.
         far, lost, calm = jax.lax.cond(
             jnp.any(state.left > 0), go, lambda _: (x, 0.0 * state.left, state.left < 0), None
         )
@@ -251,8 +251,8 @@ class _Joint(NamedTuple):
             """
             side = self.find_side(x, trip.far)
             wanted = jnp.stack([self.dips(x, slip, trip.far, side), self.reserve(trip.x, slip, side) < 0])
-            # Search 0 propagates all batch entries. Its index turn - 1 = -1 is not an index of ``wanted``, but has no
-            # effect, because ``turn == 0`` is true for all entries.
+            # Search 0 propagates all batch entries. For it, the index turn - 1 = -1 is out of range, but has no effect,
+            # because ``turn == 0`` is true for all entries.
             wanted = (turn == 0) | read(wanted, turn - 1)
 
             def keep(after: Array) -> Array:

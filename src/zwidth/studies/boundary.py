@@ -90,7 +90,7 @@ class BoundaryStudy(CurvesStudy):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Return the mapping with delta and d of its device.
+        """Return the mapping of the study, with the delta and d of its device added.
 
         For an invalid device both are 0, because the validation of the field ``device`` reports the errors.
         """
@@ -176,7 +176,7 @@ def tabulate_boundary(delta: float, d: float) -> dict[str, Any]:
 
 
 def tabulate_stable_intervals(deltas: np.ndarray, delays: np.ndarray) -> list[dict[str, Any]]:
-    """Return the lower and upper end of the stable interval of beta for alpha -> 0 over delta.
+    """Return tables of both ends of the stable interval of beta for alpha -> 0 over delta, one table per delay.
 
     Args:
         deltas: values of delta, shape (n,).

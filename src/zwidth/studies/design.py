@@ -362,8 +362,8 @@ class FiltersStudy(ComputedStudy):
         if self.resolution is not None:
             limit = np.nan if self.noise_limit is None else self.noise_limit
             quiet = [row for row in rows if row["velocity_noise_m_per_s"] <= limit and np.isfinite(row[SI_COLUMNS[0]])]
-            # Mark the row with the largest K_max for each damping. `groupby` needs no sorting before, because rows of
-            # equal damping are adjacent.
+            # Mark the row with the largest K_max for each damping. The rows need not be sorted for `groupby`, because
+            # rows with equal damping are adjacent.
             groups = groupby(quiet, itemgetter("damping_N_s_per_m"))
             best = {id(max(group, key=itemgetter(SI_COLUMNS[0]))) for _, group in groups}
             rows = [{**row, "best": id(row) in best} for row in rows]

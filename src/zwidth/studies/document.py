@@ -64,7 +64,7 @@ def _find_model(kind: Any) -> type[Study] | None:
 
 
 def _read_study(raw: Any) -> Any:
-    """Validate a study with the model of its kind, and return it; raise ``raw`` if it is a problem of `_fill_study`."""
+    """Validate a study with the model of its kind, and return it; raise ``raw`` itself if it already is a problem."""
     if isinstance(raw, Study):
         return raw
     if isinstance(raw, PydanticCustomError):
@@ -129,7 +129,7 @@ class FigureLook(Strict, noun="the look of figures"):
 
     @property
     def size(self) -> tuple[float, None] | None:
-        """Width in inches, and None for a height that follows from the width; None for the usual size of figures."""
+        """Pair of the width in inches and None (the height follows from the width); None for the default size."""
         return None if self.width is None else (self.width / 0.0254, None)
 
 

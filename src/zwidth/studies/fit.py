@@ -1,9 +1,9 @@
-"""Study "fit": mass, damping and delay of a device from logs of its motion, from walls at the onset of instability
-("buzz"), or from both.
+"""Study "fit": mass, damping and delay of a device from logs of its motion, from walls at the onset, or from both.
 
-Fits to logs and to walls are computed separately (`zwidth.identification`); if both are given, a chi-squared test
-compares their parameters. The study writes a table of the fitted parameters, tables that show the quality of the fits
-(such as residuals and stability boundaries), and a scene file for each fit.
+The walls are at the onset of instability ("buzz"). Fits to logs and to walls are computed separately
+(`zwidth.identification`); if both are given, a chi-squared test compares their parameters. The study writes a table of
+the fitted parameters, tables that show the quality of the fits (such as residuals and stability boundaries), and a
+scene file for each fit.
 """
 
 from __future__ import annotations
@@ -265,7 +265,7 @@ def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
 
 
 def _compare(one: DeviceFit, other: DeviceFit) -> str:
-    """Test if two fits of one device agree, by a chi-squared test, and return a line of text with the result.
+    """Return a line of text that states whether two fits of one device agree, by a chi-squared test.
 
     The statistic is e' C^-1 e, with the difference e of mass, damping and delay between the fits, and the sum C of
     their covariances.

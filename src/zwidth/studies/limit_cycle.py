@@ -76,7 +76,7 @@ class CycleAxes(Strict, noun="the axes of a limit_cycle study"):
 
     @property
     def given(self) -> dict[str, Axis]:
-        """Given axes, with one or several values, by the name of the parameter."""
+        """Dictionary of the axes in the configuration, with one or several values, by the name of the parameter."""
         return {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
 
     @property
@@ -136,7 +136,8 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
         for index, (condition, faults) in enumerate(zip(self.conditions, problems, strict=True)):
             for path, message in faults:
                 is_overridden = getattr(condition, str(path[0])) is not None
-                # Report a fault of a value of the study itself only once, because it is the same in every condition.
+                # Report a fault in a value of the study itself only for the first condition, because it is the same in
+                # all of them.
                 if is_overridden or index == 0:
                     yield (("conditions", index, *path) if is_overridden else path), message
 

@@ -88,7 +88,7 @@ class ComputedStudy(Study):
     with the decorator `zwidth.studies.register`.
     """
 
-    # True if the results depend on the scene in addition to the values that `fill` takes from it.
+    # True if the results depend on the scene not only through the values that `fill` copies from it into the study.
     reads_scene: ClassVar[bool] = False
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:

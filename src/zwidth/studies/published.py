@@ -118,7 +118,7 @@ def published_numbers() -> list[Comparison]:
 def _with_lag() -> str:
     """Return a text with K_max and its B without and with `FILTER_LAG`, for the undamped device of section VIII."""
     scene = Scene(Device(MASS), Timing(period=PERIOD, delay=DELAY_FACTOR * PERIOD))
-    # Use a window of 2 lag/T differences, because the mean of n differences lags by n/2 periods.
+    # Use a window of 2 FILTER_LAG/T differences, because the mean of n differences lags by n/2 sampling periods T.
     walls = [scene, scene.replace(velocity=WindowedDifference(round(2 * FILTER_LAG / PERIOD)))]
     before, after = (wall.max_stiffness() for wall in walls)
     return (
@@ -135,9 +135,10 @@ def _maximize_alpha(delta: float, d: float) -> tuple[float, float]:
 
 
 def line_appears() -> float:
-    """Compute the delta above which, for d = 0, the line of walls with a real pole at z = -1 bounds the stable set."""
-    # The boundary curve ends at omega = pi, in the corner where two poles are at z = -1. The line starts at this
-    # corner, so it bounds the stable set (alpha > 0) above the delta at which the corner crosses alpha = 0.
+    """Compute the delta above which, for d = 0, walls with a real pole at z = -1 bound the stable set."""
+    # In the plane of alpha and beta, the walls with a real pole at z = -1 form a straight line. It starts at the
+    # corner, where the boundary curve ends with two poles at z = -1. The line therefore bounds the stable set (alpha >
+    # 0) above the delta at which the alpha of the corner becomes positive.
     # Import scipy.optimize here, because it loads slowly and no other study needs it.
     from scipy.optimize import root_scalar
 

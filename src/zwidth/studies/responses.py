@@ -230,8 +230,8 @@ class RecommendStudy(ResponseStudy):
         summary, notes, response = recommendation.as_dict(), list(recommendation.notes), None
         lines = (*recommendation.lines(), *self._simulate(recommendation, scene))
         if not bare.parts_beyond and recommendation.verdict is not None:
-            # Use the normalized wall of the verdict instead of the wall in SI units, because a conversion has rounding
-            # errors.
+            # Use the normalized wall of the assessment instead of the wall in SI units, because a conversion has
+            # rounding errors.
             wall = recommendation.verdict.alpha, recommendation.verdict.beta
             columns, note = self.respond(self.device, *wall, label=label, physical=True)
             summary["recommended"]["settling_time"] = to_json(float(columns["settling_time_s"]))
@@ -272,8 +272,8 @@ def draw(recommendation: Recommendation, response: Table | None = None) -> Any:
 
     The figure is not registered with pyplot, so that the caller need not close it.
     """
-    # Omit the panel of the step response for a measured device, whose verdict has no frequency, because there is no
-    # model to simulate.
+    # Omit the panel of the step response for a measured device, because no model exists that could be simulated. Its
+    # verdict has no frequency.
     columns = 1 if recommendation.verdict is None or math.isnan(recommendation.verdict.frequency) else 2
     _, axes = new_figure(WIDTH if columns == 2 else 5.6, 3.5, 1, columns)
     return plotting.plot.recommendation(recommendation, axes, response=response)

@@ -199,12 +199,12 @@ class Poses(Strict, noun="a table of poses"):
         return read_table({"csv": self.csv})
 
     def tabulate(self) -> dict[str, np.ndarray]:
-        """Return the two coordinates of all poses as columns of a table, that of ``across`` first."""
+        """Return the coordinates of all poses as two columns of a table, the horizontal one (``across``) first."""
         return {header(name, unit): np.array(values) for name, unit, values in self._coordinates}
 
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of name and unit of the two coordinates, that of ``across`` first."""
+        """Pairs of name and unit of the two coordinates, the horizontal one (``across``) first."""
         return tuple((name, unit) for name, unit, _ in self._coordinates)
 
     def spell(self, pose: int) -> str:

@@ -38,16 +38,16 @@ from zwidth.units.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIU
 Columns: TypeAlias = list[np.ndarray]
 Leaves: TypeAlias = Sequence[np.ndarray]
 
-# Numbers of points per piece. Expensive kernels have small pieces, because even a single point costs a full piece.
+# Numbers of points per piece. Slow kernels have small pieces, because a single point takes as long as a full piece.
 _PIECE = 1 << 9  # points per piece for the ridge and the stability margins
 _LINE_PIECE = 1 << 12  # lines per piece for the largest stable alpha of each line
 _WALL_PIECE = 1 << 12  # walls per piece for the passivity margin
 MAX_EXPANDED = 1 << 20  # largest number of points whose parameters are expanded to full arrays at once, to limit memory
-# Largest number of walls or lines in the whole grid that NumPy computes; it is then faster than importing JAX and
-# compiling the kernel.
+# Largest number of walls or lines in the whole grid for which NumPy is used, because it is then faster than importing
+# JAX and compiling the kernel.
 MAX_NUMPY = 1 << 20
-# Smallest number of walls per device for which the dominant poles are computed by series over the grid (`pole_map`).
-# For fewer walls they are computed one by one.
+# Smallest number of walls per device for which the dominant poles are computed by power series over cells of the grid
+# (`stability.rigid.dominant_pole_grid`). For fewer walls they are computed one by one.
 MIN_GRID_WALLS = 1 << 8
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
@@ -72,7 +72,7 @@ def compute_block(family: Family, outputs: tuple[str, ...], block: Block, accura
 
 
 def _compute_devices(block: Block) -> dict[str, np.ndarray]:
-    """Return the wall of maximum stiffness of each device and its status, as outputs by name, of shape (D,)."""
+    """Return the stiffest stable wall of each device and its status, as a dictionary of arrays of shape (D,)."""
     alpha, beta, _, kind, status = _map_pieces(alpha_max, (block.delta, block.d), _PIECE)
     rate = block.mass / block.period
     return {
@@ -110,7 +110,8 @@ def _compute_walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> d
             )
             radius, certified, rate = _apply_to_walls(listed, block, shape, leaves=3)
         values["spectral_radius"], not_certified = radius, certified == 0
-        # Compute these outputs from the decay rate, because the spectral radius rounds to 1 for slow decay.
+        # Compute these outputs from the logarithmic decay rate and not from the spectral radius, which rounds to 1 for
+        # slow decay.
         values |= {"decay_rate": rate / period, "margin": -np.expm1(-rate), "settling_time": decay_time(rate) * period}
     if MARGIN_OUTPUTS & set(outputs):
         compute = partial(_compute_margins, "delay_margin" in outputs, "modulus_margin" in outputs)
@@ -121,7 +122,8 @@ def _compute_walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> d
     if {"passive", "passivity_margin"} & set(outputs):
         (margin,) = _apply_to_walls(_compute_passivity, block, shape, one_delay=True)
         values |= {"passivity_margin": margin, "passive": margin > 0}
-    # Leave out the stability margins, because they are NaN for unstable walls, although the computation succeeded.
+    # Do not derive the status from the stability margins, because they are NaN for unstable walls even if the
+    # computation succeeds.
     numbers = [values[name] for name in outputs if OUTPUTS[name].dtype == "float64" and name not in MARGIN_OUTPUTS]
     device = block.delta[:, None, None], block.d[:, None, None]
     walls = block.alpha[:, :, None], block.beta[:, None, :]
@@ -156,10 +158,10 @@ def _compute_limits(block: Block) -> np.ndarray:
     """Return the largest stable alpha of every line, of shape (D, B)."""
     columns = [part.ravel() for part in np.broadcast_arrays(block.beta, block.delta[:, None], block.d[:, None])]
     limit = np.empty(block.beta.size)
-    # Compute d < 1 and d >= 1 separately, because `row_limits` has one kernel for each. The batch sizes of both kernels
-    # would vary if a piece contained delays of both ranges.
+    # Compute delays d < 1 and d >= 1 separately, because `row_limits` has one kernel for each range. If a piece
+    # contained delays of both ranges, the batch sizes of the kernels would not be constant.
     for long in (False, True):
-        # Write the comparison as `row_limits` does, so that d = NaN counts as a short delay in both.
+        # Write the comparison as in `row_limits`, so that both functions treat d = NaN as a short delay.
         index = np.flatnonzero((columns[2] >= 1) == long)
         if index.size:
             by_rows = partial(row_limits, route=_choose_route(block.lines))

@@ -66,13 +66,13 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
     check_installed()
     import xarray
 
-    # Import `sweep.checked` only here, because it loads Zarr, whose absence `check_installed` reports.
+    # Import `sweep.checked` only after `check_installed`, which reports a missing Zarr, because the import loads Zarr.
     from zwidth.sweep.checked import CheckedStore
 
     checked = CheckedStore(store)
     with silence_zarr():
         dataset = xarray.open_zarr(checked, consolidated=store.has_checksums, chunks={})
-    # Select the variables, because stores of the old format also contain arrays with checksums.
+    # Select the variables of the plan, because stores of the old format also contain arrays with checksums.
     dataset = dataset[[name for family in store.plan.families for name in family.variables]]
     if "device" in dataset.coords:
         # Convert the labels, because netCDF and pandas do not support NumPy's strings of variable length.

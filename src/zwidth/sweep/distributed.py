@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _CONNECT_SECONDS = 30  # timeout for connecting to the scheduler, in s
-# If no job ends for this time in s, the scheduler is queried, and must reply within the same time.
+# Time in s without a finished job after which the scheduler is queried; the scheduler must reply within the same time.
 _REPLY_SECONDS = 15
 # Longest time in s without any worker, because workers may have to wait in the queue of a batch system.
 _NO_WORKER_SECONDS = 600
@@ -80,8 +80,8 @@ def _silence_logs() -> Iterator[None]:
 
 def run_on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[Finished]:
     """Run jobs on the workers of a cluster and yield their outcomes, in the order of completion."""
-    # Repeat the jobs whose workers died, one at a time after all others, before reporting a failure, because dask
-    # abandons a job after several deaths of its worker even if another job on the same worker was the cause.
+    # Before reporting a failure, repeat each job that dask has abandoned, one at a time after all others. Dask abandons
+    # a job if its worker dies several times, even if another job on this worker is the cause.
     given_up = []
     for finished in _submit_jobs(client, jobs, perform):
         if finished.error.startswith(_KILLED):
@@ -128,7 +128,8 @@ def _submit_jobs(client: Client, jobs: list[Job], perform: Perform) -> Generator
         job, _ = jobs_by_key.pop(future.key)
         if future.status == "cancelled":
             raise LostSchedulerError(_GONE)
-        # Ignore the result of the future, which is None; `sweep.engine` checks in the stores which chunks are done.
+        # Do not fetch the result of the future, which is None; `sweep.engine` checks in the stores which chunks are
+        # done.
         yield _describe_error(job, future.exception()) if future.status == "error" else Finished(job)
         with_workers = time.monotonic()
         submit_next()

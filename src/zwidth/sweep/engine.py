@@ -210,12 +210,12 @@ def _collect_outcomes(
     except KeyboardInterrupt:
         sweeps.interrupted = True
     finally:
-        # Close the generator, because this ends the worker processes.
+        # Close the generator of the outcomes, because this ends the worker processes.
         results.close()
 
 
 def _count_chunks(jobs: list[Job], stores: dict[str, Store], sweeps: Sweeps) -> None:
-    """Count the computed chunks of each sweep by the files in its store, not by the outcomes that jobs report.
+    """Count the computed chunks of each sweep from the files in its store, not from the outcomes of the jobs.
 
     Args:
         jobs: All jobs of the run.
@@ -228,7 +228,8 @@ def _count_chunks(jobs: list[Job], stores: dict[str, Store], sweeps: Sweeps) -> 
         sweep = sweeps.results[store.study.name]
         if store.is_visible(task):
             sweep.computed += 1
-            # Discard the error, because another process has computed the chunk, for example a worker believed dead.
+            # Discard the error of the job, because the chunk is done: another process has computed it, such as a worker
+            # that was assumed dead.
             sweep.failed.pop(store.label(task), None)
         elif not over:
             sweep.failed.setdefault(store.label(task), "reported as computed but missing from the store")
@@ -275,8 +276,8 @@ def refuse_changes(where: Path, name: str, noun: str, old: Any, new: Any) -> Non
 def refuse_versions(where: Path, old: dict[str, str]) -> None:
     """Raise `StoreError` if results were computed by other releases of zwidth or of the packages it computes with.
 
-    No single set of releases could reproduce results of mixed origin. ``where`` is the file that records the releases
-    ``old``, by package.
+    The reason is that no set of releases could reproduce results of mixed origin. ``where`` is the file that records
+    the releases ``old``, by package.
     """
     for key, now in list_versions().items():
         if key != "python" and old.get(key) != now:

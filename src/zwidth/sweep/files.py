@@ -127,8 +127,8 @@ def lock_folder(folder: Path) -> Iterator[None]:
     try:
         since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")
         who = f"process {os.getpid()} on {socket.gethostname()}, since {since} UTC"
-        # Ignore errors, because the file with the holder of the lock is used only in messages. Remove an existing file
-        # first, because it may be a link.
+        # Ignore errors, because the file that names the holder of the lock is used only in messages. Remove an existing
+        # file first, because it may be a link.
         with suppress(OSError):
             holder.unlink(missing_ok=True)
             holder.write_text(who, encoding="utf-8")

@@ -47,7 +47,7 @@ class Block(NamedTuple):
 
 
 class SceneBlock(NamedTuple):
-    """The parameters of a block as specified in the configuration: D devices with A x B walls each."""
+    """The parameters of a block in the units of the configuration: D devices with A x B walls each."""
 
     parameters: dict[str, np.ndarray]  # parameters of the devices by name, each of shape (D,)
     stiffness: np.ndarray  # stiffness in N/m or N m/rad; alpha in a normalized sweep; shape (D, A)
@@ -121,7 +121,7 @@ class Grid:
         return SceneBlock(parameters, *(np.broadcast_to(part, (math.prod(shape), part.shape[1])) for part in walls))
 
     def block(self, slices: tuple[slice, ...]) -> Block:
-        """Return a block with normalized parameters, including the walls of the whole grid.
+        """Return a block with normalized parameters; it also stores every alpha and beta of the whole grid.
 
         ``slices`` has the same meaning as for `scene_block`.
         """
@@ -141,7 +141,7 @@ class Grid:
         rate = given.parameters.get("rate")
         period = given.parameters["period"] if rate is None else 1.0 / rate
         in_periods = self.axes.delay_in_periods
-        # Suppress NumPy's warnings, because the status of a point reports parameters that overflow.
+        # Suppress NumPy's warnings of overflow, because the status of a point reports it.
         with np.errstate(all="ignore"):
             device = normalize(mass=mass, damping=damping, period=period, delay=zeros if in_periods else delay)
             units = {"mass": mass[:, None], "period": period[:, None]}
@@ -166,7 +166,7 @@ class Grid:
         return np.broadcast_to(values, shape or (1,)).ravel()
 
     def _wall_values(self, name: str, by_dim: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
-        """Return the values of a wall parameter of a block, for the same arguments as `_device_values`.
+        """Return the values of a parameter of the walls in a block; the arguments are those of `_device_values`.
 
         The shape is (1, number of values) if the parameter is a dimension of the walls, otherwise (D, 1).
         """

@@ -46,7 +46,7 @@ _STOP_TIMEOUT = 3.0  # longest time in s for a worker to end by itself, after wh
 
 
 class LostSchedulerError(ZwidthError):
-    """Error if the cluster is lost during a run.
+    """Error that the scheduler of the cluster no longer replies during a run.
 
     Its message continues a sentence that begins with the address of the scheduler.
     """
@@ -102,7 +102,8 @@ def perform(path: str, family: str, index: int) -> None:
         family: "wall" or "device".
         index: Index of the chunk among those of the family.
     """
-    # Identify the store by its description and not by an inode number, because a later store may have the same number.
+    # Identify the store in the cache by its description and not by an inode number, because a later store may have the
+    # same number.
     store = _open_store(path, read_or_empty(Path(path) / "zarr.json"))
     task = Task(plan := store.plan.family(family), index)
     if store.is_done(task):
@@ -115,7 +116,7 @@ def perform(path: str, family: str, index: int) -> None:
         from zwidth.sweep.compute import compute_block
 
         values = compute_block(plan.family, plan.outputs, store.plan.grid.block(task.slices), store.study.accuracy)
-    # Check again, because a restarted scheduler or a resumed run may have assigned the chunk twice.
+    # Check once more before writing, because a restarted scheduler or a resumed run may have assigned the chunk twice.
     if not store.is_done(task):
         store.write(task, values)
 
@@ -169,7 +170,7 @@ class _Worker:
     def start(self, job: Job) -> None:
         """Send a job to the process."""
         self.job = job
-        # Ignore the error if the process is dead, because `run_in_workers` detects this by the sentinel of the process.
+        # Ignore the error of sending to a dead process, because `run_in_workers` detects its death by its sentinel.
         with suppress(OSError):
             self.pipe.send(job)
 
@@ -207,7 +208,7 @@ def _run_worker(pipe: Connection, number: int, count: int, perform: Perform) -> 
     """
     # Ignore Ctrl-C, which the terminal sends to all processes of the group, because the parent ends the workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Exit normally on SIGTERM, so that Python's resource tracker does not report leaked semaphores.
+    # Exit by `sys.exit` on SIGTERM, so that Python's resource tracker does not report leaked semaphores.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # Restrict the worker to a subset of the processors, because otherwise JAX starts one thread per processor in each
@@ -233,7 +234,7 @@ def _end_with_parent() -> None:
 
 @lru_cache(maxsize=64)
 def _reuse_equal_scene(scene: Scene) -> Scene:
-    """Return an equal scene from the cache if there is one, whose stability boundary is then already computed."""
+    """Return an equal scene from the cache if it contains one, because its stability boundary is already computed."""
     return scene
 
 
@@ -300,8 +301,8 @@ def _compute_walls(
     alpha, beta = scene.normalize_walls(stiffness, virtual_damping)
     status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
     if "stable" in outputs:
-        # Transpose the walls, so that all walls of a row have the same damping, because `decide` computes the stable
-        # intervals of K once per row. The status reports walls of a measured response that remain undecided.
+        # Transpose the walls, so that all walls of a row have the same damping: `decide` computes the stable intervals
+        # of K once per row. With a measured response, walls may remain undecided, which the status reports.
         labels = scene.loop.decide(alpha.T, beta.T, "auto", (stiffness.T, virtual_damping.T))
         results["stable"], status = np.asarray(labels.stable).T, np.asarray(labels.status).T
     unknown = np.zeros(status.shape, bool)

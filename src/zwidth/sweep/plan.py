@@ -155,7 +155,7 @@ class Plan:
 def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     """Plan a sweep.
 
-    The size of chunks follows from the memory and from the computing speed of each output (`words.quantities.OUTPUTS`).
+    The size of chunks follows from the memory and from the computing speed of each output (`units.quantities.OUTPUTS`).
 
     Args:
         study: The sweep.
@@ -176,8 +176,8 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
         families.append(FamilyPlan(family, outputs, grid.dims_of(family), shape, chunk_shape(shape, target)))
         seconds += size * slowness
     largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
-    # Estimate the size on disk: compression does not shrink float64 values, booleans are packed to 1 bit, and a status
-    # takes at most 1 bit, because nearly all statuses are 0.
+    # Estimate the size on disk per point: 64 bits for a float64, which compression does not shrink; 1 bit for a
+    # Boolean; at most 1 bit for the status, which is 0 for nearly all points and therefore compressed.
     bits = [1 + sum(64 if OUTPUTS[name].dtype == "float64" else 1 for name in plan.outputs) for plan in families]
     disk = sum(math.prod(plan.shape) * each for plan, each in zip(families, bits, strict=True)) // 8 + 2**16
     longest, model = study.axes.most_periods, "device with parts, held delay"
@@ -203,7 +203,7 @@ def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
     chunks, room = [], target
     for size in reversed(shape):
         chunk = max(1, min(size, room))
-        # Divide the dimension into equal parts, so that no chunk is much smaller than the others.
+        # Divide the dimension into nearly equal parts, so that no chunk is much smaller than the others.
         chunk = -(-size // -(-size // chunk)) if size else 1
         chunks.append(chunk)
         room = room // chunk if chunk == size else 1
@@ -258,7 +258,7 @@ def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collec
 def _available_memory() -> int:
     """Return the memory available to this process in bytes: that of the machine, or the limit of its container."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    # Ignore errors, because the file does not exist outside containers, and contains "max" if there is no limit.
+    # Ignore errors, because the file does not exist outside of containers and contains "max" if no limit is set.
     with suppress(OSError, ValueError):
         return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
     return total

@@ -96,7 +96,7 @@ class Store:
 
     @property
     def has_checksums(self) -> bool:
-        """True unless the store has the old format, whose files do not end with checksums."""
+        """True if the files of the store end with checksums; False for the old format."""
         return self.attributes["zwidth_format"] != OLD_FORMAT
 
     @cached_property
@@ -117,7 +117,8 @@ class Store:
         with silence_zarr():
             group = zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=True)
             arrays: dict[str, Any] = {name: group[name] for family in self.plan.families for name in family.variables}
-        # Also write chunks that contain only the fill value, because Zarr takes longer to detect than to write them.
+        # Let Zarr also write chunks that contain only the fill value, because detecting them takes longer than writing
+        # them.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
 
     def label(self, task: Task) -> str:
@@ -138,7 +139,7 @@ class Store:
         return self.status_file(task).exists()
 
     def is_visible(self, task: Task) -> bool:
-        """Return whether a chunk is marked as done, even if another machine has only just written it."""
+        """Return whether a chunk is marked as done, even if another machine wrote it a moment ago."""
         if not self.is_done(task):
             # List the folders to refresh the cache of a network file system, which may still report a new file as
             # missing.
@@ -156,8 +157,8 @@ class Store:
         shape = tuple(part.stop - part.start for part in task.slices)
         with silence_zarr():
             for name, file in zip(task.plan.variables, self.files(task), strict=True):
-                # Remove an old file first. Zarr reads an existing file before it overwrites a chunk that extends beyond
-                # the grid, and would fail if that file is damaged.
+                # Remove an old file first: Zarr would read it before overwriting a chunk that extends beyond the grid,
+                # and fail if the file is damaged.
                 remove_quietly(file)
                 self._arrays[name][task.slices or ...] = np.ascontiguousarray(values[name]).reshape(shape)
 
@@ -169,7 +170,8 @@ class Store:
             if self.is_done(task) and not self.find_fault(self.status_file(task)):
                 with silence_zarr():
                     status = np.asarray(self._arrays[name][task.slices or ...])
-                # Apply bincount only to nonzero statuses, because nearly all are 0 and can be counted faster.
+                # Apply bincount only to nonzero statuses, because nearly all statuses are 0, which are counted faster
+                # by subtraction.
                 failed = status[status.view(bool)]
                 counts[task.family][Status.OK] += status.size - failed.size
                 counts[task.family] += np.bincount(failed, minlength=NOT_COMPUTED)
@@ -222,7 +224,7 @@ class Store:
 
 
 def create_store(path: Path, attributes: dict[str, Any]) -> Store:
-    """Create a store without values; the folder appears under its name only when it is complete."""
+    """Create a store without values; its folder receives its final name only when it is complete."""
     with _temporary_store(path, attributes) as fresh:
         os.rename(fresh, path)
     return Store(path)
@@ -274,8 +276,8 @@ def _write_arrays(path: Path, plan: Plan) -> None:
             chunks=values.shape,
             dtype=values.dtype,
             compressors=[ZstdCodec(level=3), Crc32cCodec()],
-            # Use a fill value that no coordinate has, because Zarr does not write chunks that contain only the fill
-            # value, and such a chunk would later be reported as missing.
+            # Use a fill value that no coordinate has. Zarr does not write chunks that contain only the fill value, and
+            # such chunks would later be reported as missing.
             fill_value="" if values.dtype.kind == "T" else np.nan,
             dimension_names=dims,
             attributes=attributes,

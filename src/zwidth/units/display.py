@@ -19,7 +19,7 @@ Kind = TypeVar("Kind", bound=type)
 Result = TypeVar("Result")
 Unit = str | type[IntEnum]  # unit of a field as text, or the enumeration to which the codes of a field belong
 
-# Units on linear devices of fields that several result types have, by name of the field.
+# Default units, on linear devices, of fields that occur in several result types; by name of the field.
 _DEFAULT_UNITS: dict[str, Unit] = {"stiffness": "N/m", "virtual_damping": "N s/m", "status": Status}
 _BARE = ("", "1", "degrees", "periods")  # units without SI prefixes
 _FEW = 4  # largest number of entries of an array that is displayed with all entries
@@ -112,7 +112,7 @@ def with_units(result: Result, system: UnitSystem | None) -> Result:
     JAX does not pass the unit system on: results of `jit`, `vmap` and `tree.map` are displayed without unit symbols.
     """
     for each in result if isinstance(result, list) else [result]:
-        # Skip objects such as scenes that define their unit system themselves.
+        # Set the unit system only where the class has the default None; objects such as scenes define their own.
         if getattr(type(each), "unit_system", "") is None:
             object.__setattr__(each, "unit_system", system)
     return result

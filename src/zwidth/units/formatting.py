@@ -175,12 +175,12 @@ def to_cell(value: Any) -> Any:
 
 
 def from_cell(cell: str) -> str:
-    """Return the text from which `to_cell` made a CSV cell, without the apostrophe that `to_cell` added."""
+    """Convert a CSV cell written by `to_cell` back to its text, without the apostrophe that `to_cell` added."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
-# Pattern of the start of a formula, also in full-width characters, which East Asian versions of spreadsheets accept.
-# Apostrophes may precede it, so that `to_cell` adds a further one to such a text and `from_cell` removes only this one.
+# Pattern of a text that a spreadsheet would evaluate as a formula; East Asian versions also accept full-width
+# characters. It allows leading apostrophes: `to_cell` then adds one more, and `from_cell` removes only that one.
 _FORMULA = re.compile(r"'*\s*[=+\-@\uff1d\uff0b\uff0d\uff20\t\r\n]")
 
 

@@ -41,7 +41,8 @@ class Dimension:
 
     names: str  # usual units, separated by commas, the base unit first; "" for ratios
     example: str  # a quantity, for messages
-    # Factors to the base unit for units with other exponents of kg, m, s and rad, such as rad/s for frequencies in Hz.
+    # Conversion factors to the base unit for additional units with other exponents of kg, m, s and rad, such as rad/s
+    # for frequencies in Hz.
     factors: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -61,7 +62,7 @@ class Dimension:
         return None if size is None else size.exponents
 
     def measure(self, unit: str) -> UnitSize | None:
-        """Return the size of a unit; None for a unit of another dimension."""
+        """Return the conversion factor of a unit to SI as a `UnitSize`; None for a unit of another dimension."""
         return measure_unit(unit, self.exponents) if self.exponents and unit else None
 
     def in_base(self, mantissa: str, exponent: int, unit: str) -> float | None:
@@ -120,7 +121,7 @@ def detect_kind(value: Any) -> bool | None:
         return True
     size = measure_unit(unit) if unit else None
     if size is None:
-        # Classify an unknown unit by its denominator: a unit per angle is rotary.
+        # Classify a unit that cannot be parsed by its denominator: a unit per angle is rotary.
         return True if _canonical(unit).endswith(("/rad", "/deg", "/°", "/turn", "/rev")) else None
     return _KIND_OF_EXPONENTS.get(size.exponents, True if size.exponents[3] else None)
 
@@ -180,7 +181,7 @@ def _canonical(unit: str) -> str:
     return re.sub(r"N[\s*·⋅.]*(?=[scm])", "N ", unit)
 
 
-# True for rotary units and False for linear ones, by exponents of kg, m, s and rad.
+# Kind of device (True: rotary, False: linear) to which a unit belongs, by the unit's exponents of kg, m, s and rad.
 _KIND_OF_EXPONENTS = {
     DIMENSIONS[base].exponents: kind == 1 for pair in UNIT_PAIRS for kind, base in enumerate(pair) if base in DIMENSIONS
 }

@@ -302,8 +302,8 @@ OF_LOGS = {
 }
 
 Family: TypeAlias = Literal["wall", "device"]  # an output has one value per wall, or one value per device and delay
-# Kinds of color scales: for truth values, for numbers with a good and a bad side, for other numbers, for positive
-# numbers, and for positive numbers that may be infinite.
+# Kinds of color scales, in this order: for truth values; for numbers with a good and a bad side of a center; for other
+# numbers; for positive numbers; for positive numbers that may be infinite.
 ColorScale: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
 NOT_COMPUTED = 255  # status of points whose chunk does not exist yet; the other codes are those of `zwidth.Status`
 
@@ -420,11 +420,11 @@ _OUTPUTS = (
 OUTPUTS = {output.name: output for output in _OUTPUTS}
 
 RADIUS_OUTPUTS = frozenset(name for name, output in OUTPUTS.items() if "spectral_radius" in (name, output.source))
-# Outputs that are NaN for a wall without such a margin (see `zwidth.margins`).
+# Stability margins (`zwidth.margins`), which are NaN for a wall without such a margin even if no error occurred.
 MARGIN_OUTPUTS = frozenset({"gain_margin", "phase_margin", "delay_margin", "modulus_margin"})
 OUTPUTS_WITH_PARTS = tuple(name for name, output in OUTPUTS.items() if output.with_parts)
 
-# Names of the status variables of both families.
+# Names of the status variables: of the outputs per wall, and of the outputs per device and delay.
 STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
 
 

@@ -62,7 +62,7 @@ _SYMBOLS: dict[str, tuple[int, float, Exponents, str]] = {
     **dict.fromkeys(("deg", "°", "degree", "degrees"), (0, math.pi / 180, _ANGLE, "")),
     **dict.fromkeys(("rev", "turn", "turns", "revolution", "revolutions"), (0, 2 * math.pi, _ANGLE, "")),
 }
-# Sizes of all symbols, without prefix and with each allowed prefix.
+# Conversion factors and exponents of all symbols, without prefix and with each allowed prefix.
 _READINGS = {
     prefix + symbol: UnitSize(power + _PREFIXES[prefix], factor, exponents)
     for symbol, (power, factor, exponents, prefixes) in _SYMBOLS.items()

@@ -14,7 +14,7 @@ from zwidth.studies.document import Config, load_config
 _PARTS = re.split(r"^=== (\w+)\n", (Path(__file__).parent / "bad_configs.txt").read_text(encoding="utf-8"), flags=re.M)
 FILES = {name: text.encode() for name, text in zip(_PARTS[1::2], _PARTS[2::2], strict=True)} | {
     "control_character": b"version: 1\nname: bad\ndescription: a\x07b\n",
-    "not_utf8": b"version: 1\nname: bad\ndescription: caf\xe9\n",
+    "not_utf8": b"version: 1\nname: bad\ndescription: caf\xe9\n",  # codespell:ignore
     "tab": b"version: 1\nname: bad\nscene:\n\tmass: 0.1 kg\n\tperiod: 1 ms\n",
     "too_many_values": b"version: 1\nname: bad\nstudies: [" + 50_001 * b"1," + b"]\n",
     "utf16": "version: 1\nname: bad\nstudies:\n  - kind: ridge\n    name: r\n    delta: [0, 1]\n    d: 1\n".encode(

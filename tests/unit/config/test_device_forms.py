@@ -98,7 +98,7 @@ def test_a_response_is_read_beside_the_file_and_kept_by_its_numbers(load, table,
         ("'1 / 0.1 10 0'", "period: 1 ms, mass: 1 kg", "scene.mass", "remove one"),
         ("'1 / 0.1 10 0'", "period: 1 ms, operator: {mass: 1}", "scene.operator", "remove one"),
         ("response.csv", "period: 1 ms, delay: 1 ms", "scene.delay", "includes all delays"),
-        ("response.csv", "period: 2 ms", "scene.device.frequency", "less than half the rate"),
+        ("response.csv", "period: 2 ms", "scene.device.frequency", "below the Nyquist frequency"),
         ("{frequency: [1, 2], real: [1, 2], imag: [1, 2]}", "period: 1 ms", "scene.device.frequency", "at least 8"),
     ],
 )

@@ -104,7 +104,7 @@ PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
         ("delta: 1, d: 1", "", "axes", "alpha missing"),
         (NORMAL, ", outputs: [alpha_max]", "axes.alpha", "changes no output"),
         ("delta: 1, d: 1", ", outputs: [stiffness_max]", "outputs[0]", "SI units"),
-        (NORMAL, ", outputs: [stabel]", "outputs[0]", "did you mean 'stable'?"),
+        (NORMAL, ", outputs: [stabel]", "outputs[0]", "did you mean 'stable'?"),  # codespell:ignore
         (NORMAL, ", accuracy: 0", "accuracy", "at least"),
         (NORMAL, ", accuracy: 1e-13", "accuracy", "at least 1e-12"),
         (NORMAL, ", accuracy: tight", "accuracy", "one number"),

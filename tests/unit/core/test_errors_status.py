@@ -42,7 +42,7 @@ def test_a_choice_names_the_nearest():
 def test_a_choice_is_checked():
     check_choice("side", "upper", ("lower", "upper"))
     with pytest.raises(errors.InputError, match=r"side: got 'uper', allowed are 'lower', 'upper'; did you mean"):
-        check_choice("side", "uper", ("lower", "upper"))
+        check_choice("side", "uper", ("lower", "upper"))  # codespell:ignore
 
 
 @pytest.mark.parametrize("status", Status)

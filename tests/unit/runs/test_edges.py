@@ -148,7 +148,7 @@ def test_times_to_settle_end_at_the_edge(folder):
     for ax in axes:
         assert ax.get_xscale() == "log"
         assert len(exact_lines(ax)) == 1
-    assert "edge of what is stable" in [text.get_text() for text in axes[0].figure.legends[0].get_texts()]
+    assert "boundary of the stable walls" in [text.get_text() for text in axes[0].figure.legends[0].get_texts()]
 
 
 def test_a_plane_without_an_edge_names_none(tmp_path):
@@ -159,4 +159,4 @@ def test_a_plane_without_an_edge_names_none(tmp_path):
         data, edges = opened(tmp_path / name, name)
         (ax,) = draw_plane(data, "decay_rate", edges=edges)
         legend = ax.figure.legends[0].get_texts() if ax.figure.legends else []
-        assert ("edge of what is stable" in [text.get_text() for text in legend]) == told
+        assert ("boundary of the stable walls" in [text.get_text() for text in legend]) == told

@@ -118,13 +118,13 @@ def test_a_stiffness_that_every_value_reaches_is_told_with_units():
 
 REFUSED = {
     "num: 5": "add 'find: damping', or another",
-    "find: dampin": "did you mean 'damping'",
+    "find: dampin": "did you mean 'damping'",  # codespell:ignore
     "find: velocity.cutoff": "this device has",
     "find: velocity.samples": "allowed are 'period'",
     "find: delay": "add 'within: [0.1, 100]'",
     "find: damping, within: [2, 1]": "write the lower end first",
     "find: damping, within: [1 kg, 2 kg]": "kg",
-    "find: dampin, within: [1 N s/m, 2 N s/m]": "got a list of 2 items; its unit is that of the parameter in 'find'",
+    "find: dmping, within: [1 N s/m, 2 N s/m]": "got a list of 2 items; its unit is that of the parameter in 'find'",
     "find: damping, tolerances: {mas: 0.1}": "this device has",
     "find: damping, tolerances: 0.1": "got 0.1; it must be a mapping; write 'key: value' lines, or {key: value}",
     "find: damping, tolerances: {mass: 1.1}": "write 75 % as 0.75",

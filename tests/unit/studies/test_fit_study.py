@@ -196,7 +196,7 @@ FAULTS = {
     "nothing to fit": ("    noise: 0.1\n", "log or buzz is missing"),
     "no file": ("    log: {csv: nowhere.csv}\n", "studies[0].log.csv: "),
     "no column": ("    log: {csv: log.csv, position: z}\n", "has no column 'z'"),
-    "a key": ("    log: {csv: log.csv, positon: x}\n", "did you mean 'position'?"),
+    "a key": ("    log: {csv: log.csv, positon: x}\n", "did you mean 'position'?"),  # codespell:ignore
     "a study's key": ("    log: {csv: log.csv}\n    max_dely: 1 ms\n", "did you mean 'max_delay'?"),
     "a resolution": ("    log: {csv: log.csv, resolution: 1 kg}\n", "got '1 kg'"),
     "an empty list": ("    log: []\n", "got an empty list"),

@@ -99,7 +99,7 @@ def test_the_scene_gives_period_and_delay(tmp_path):
     "change, said",
     [
         (
-            ("shoulder, up", "sholder, up"),
+            ("shoulder, up", "sholder, up"),  # codespell:ignore
             "across: got 'sholder'; it must be a column of the file; did you mean 'shoulder'",
         ),
         ((", up: elbow", ""), r"write {csv: arm.csv, across: shoulder, up: elbow}"),

@@ -83,7 +83,8 @@ def _make_slider(parameter: Parameter, system: UnitSystem) -> Slider:
 _SHOWN = {"kg": ("g", 1e3), "s": ("ms", 1e3)}
 # Units of the page for rotary devices, by the SI unit of linear devices.
 _ROTARY_UNITS = {"kg": ("g cm^2", 1e7), "N s/m": ("mN m s/rad", 1e3), "N/m": ("N m/rad", 1.0)}
-# Typical ratios of rotary to linear parameters in SI units, for masses at a radius of about 3 cm.
+# Typical ratio of a rotary to a linear parameter in SI units, for a mass at a radius of about 3 cm; by the SI unit of
+# linear devices.
 _SMALLER = {"kg": 1e-3, "N s/m": 1e-3, "N/m": 1e-3}
 _BARE = ("device", "timing", "wall")  # parts whose parameters have no prefix in a path
 _DEVICE = ("mass", "damping", "period", "delay", "delta", "d")
@@ -93,7 +94,7 @@ _WALL = ("stiffness", "virtual_damping", "alpha", "beta")
 _WITH_SLIDER = [name for name in (*_DEVICE, *_WALL, *OF_PARTS) if PARAMETERS[name].slider]
 SLIDERS = {name: _make_slider(PARAMETERS[name], LINEAR) for name in _WITH_SLIDER}
 ROTARY_SLIDERS = {name: _make_slider(PARAMETERS[name], ROTARY) for name in _WITH_SLIDER}
-# Parameters of a scene with m = 1 and T = 1, by the normalized parameter that they equal.
+# Parameters of a scene with m = 1 and T = 1, by the normalized parameter whose value they have.
 _NORMALIZED = {"delta": "damping", "d": "delay", "alpha": "stiffness", "beta": "virtual_damping"}
 CHOICES = {
     "mode": {"physical": "physical", "normalized": "normalized"},
@@ -120,8 +121,8 @@ class Controls:
 
     scene: Scene = _SMALL_DEVICE
     normalized: bool = False
-    # Mass in kg, period in s and kind (True if rotary) of the scene before its normalization. `_convert` uses these
-    # values to convert a normalized scene back to SI units.
+    # Mass in kg, period in s and kind (True if rotary) of the scene before its normalization, from which a normalized
+    # scene is converted back to SI units.
     scale: tuple[float, float, bool] = (0.1, 1e-3, False)
 
     @property
@@ -139,25 +140,26 @@ class Controls:
         return ROTARY_SLIDERS if self.rotary else SLIDERS
 
     def shown(self) -> dict[str, Any]:
-        """Return the values of all sliders and choices of the scene, in the units of the page."""
+        """Return the values of all sliders and choices by name, in the units of the page."""
         scene, values = self.scene, self.scene.parameters()
         if self.normalized:
             return {"mode": "normalized"} | {name: values[path] for name, path in _NORMALIZED.items()}
         forms = {name: _find_form(part) for name, part in find_parts(scene).items() if name in PARTS}
         numbers = {name: value * self.sliders[name].per_si for name, value in values.items() if name in SLIDERS}
         for part, form in forms.items():
-            # Hide parameters that have no effect in this form of the part. Example: a parallel damper without a spring.
+            # Hide the sliders of parameters that have no effect in this form of the part, for example the damper
+            # parallel to a spring if there is no spring.
             idle = {f"{part}.{item.name}" for item in fields(PARTS[part]) if item.name not in PARTS[part].usual[form]}
             numbers = {name: value for name, value in numbers.items() if name not in idle}
         choices = {"mode": "physical", "motion": "rotary" if self.rotary else "linear"}
         choices |= {"velocity": type(scene.velocity).__name__}
         if isinstance(scene.device, LinearDevice):
-            # Return no choices of hand, coupling or actuator, because the linear system already contains these parts.
+            # Omit the choices of hand, coupling and actuator, because a linear system already contains these parts.
             return numbers | choices
         return numbers | choices | {name: forms.get(name, "none") for name in PARTS}
 
     def change(self, shown: Mapping[str, Any]) -> Controls:
-        """Return the controls after changes of values in the units of the page; raise `InputError` for other names."""
+        """Return the controls after changes of the values ``shown``, in the units of the page, by name."""
         new = self
         for name, value in shown.items():
             if name in CHOICES:
@@ -170,7 +172,8 @@ class Controls:
                     new = change()
                 continue
             if name not in new.shown():
-                # Reject the change, because the slider was just hidden by a choice, or never existed.
+                # Reject the change, because the page has no slider with this name: a choice has just hidden it, or it
+                # never existed.
                 raise InputError(f"{str(name)[:40]!r}: the page has no such parameter now")
             if isinstance(value, bool) or not isinstance(value, int | float) or not -_LARGEST <= value <= _LARGEST:
                 raise InputError(f"{new.sliders[name].label}: got {str(value)[:40]!r}; a finite number is needed")
@@ -181,8 +184,8 @@ class Controls:
         return new.check()
 
     def check(self) -> Controls:
-        """Return the controls; raise `InputError` if the loop has too many poles for the page."""
-        # Build the loop, which also checks combinations of parts, such as a cutoff above the Nyquist frequency.
+        """Return the controls unchanged; raise `InputError` if the loop has too many poles for the page."""
+        # Build the loop, because this also checks combinations of parts, such as a cutoff above the Nyquist frequency.
         order = self.scene.loop.roots.order
         if order > _MOST_POLES:
             raise InputError(
@@ -197,13 +200,13 @@ class Controls:
             raise InputError(f"{name}: not available, because the device is a linear system that contains all parts")
 
     def _change_motion(self) -> Controls:
-        """Return the controls with a default device of the other kind, linear or rotary, at the same rate and delay."""
+        """Return the controls with a default device of the other kind, linear or rotary; rate and delay are kept."""
         self._refuse_change("motion")
         other = _SMALL_DEVICE if self.rotary else _SMALL_ROTARY
         return Controls(replace(other, timing=self.scene.timing))
 
     def _choose_part(self, name: str, kind: str) -> Controls:
-        """Return the controls after choosing a usual form of a part, or a class of the velocity estimate."""
+        """Return the controls after choosing a preset of a part, or a class of the velocity estimate."""
         scene = self.scene
         if name in PARTS:
             self._refuse_change(name)
@@ -218,7 +221,7 @@ class Controls:
         return replace(self, scene=scene.replace(velocity=estimates[kind]))
 
     def _make_usual(self, name: str, kind: str) -> Any:
-        """Return a part in one of its usual forms, with typical values for linear or rotary devices."""
+        """Return a part with the values of one of its presets, converted to typical values of this kind of device."""
         given = dict(PARTS[name].usual[kind])
         for key, value in given.items():
             unit = get_unit(f"{name}.{key}")
@@ -253,7 +256,7 @@ def _round(value: float, digits: int) -> float:
 
 
 def _find_form(part: Any) -> str:
-    """Return the name of the usual form of a part: the one with the same values in all fields that are not floats."""
+    """Return the name of the preset of a part that has the same values in all fields that are not floats."""
 
     def shape(part: Any) -> dict[str, Any]:
         values = {item.name: getattr(part, item.name) for item in fields(part)}
@@ -311,7 +314,7 @@ def to_link(controls: Controls) -> str:
 
 
 def read_link(link: str) -> Controls:
-    """Return the controls for a fragment written by `to_link`."""
+    """Return the controls for the fragment of an address, as written by `to_link`."""
     try:
         section = {name: _read_value(text) for name, text in parse_qsl(link, strict_parsing=True, max_num_fields=99)}
     except (ValueError, RecursionError):

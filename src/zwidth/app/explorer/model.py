@@ -32,12 +32,12 @@ from zwidth.units.formatting import format_interval, plain, round_conservatively
 
 Curve = tuple[np.ndarray, np.ndarray]
 Range = tuple[float, float]
-# Results for the page: by name, the columns of a data source or a text.
+# Results for the page by name: the columns of a data source, or a text.
 Update = dict[str, Any]
 
 LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)  # spectral radii of the contours
 # Grids of K and B for the contours: for each largest number of poles, the points in K and in B. The grids are small
-# enough for NumPy, because compiling with JAX would take seconds (`arrays.evaluate.FEW`).
+# enough for NumPy, because compiling with JAX would take seconds (`numerics.evaluate.FEW`).
 _GRIDS = ((1, (72, 56)), (12, (48, 40)), (inf, (36, 30)))
 _DIRECTIONS = 181  # points on the boundary of the passive walls
 _RIDGE_POINTS = 61  # points on the ridge
@@ -49,7 +49,7 @@ _APPROACH = 5.0  # sampling periods of motion before contact
 
 
 def show_outlines(scene: Scene) -> Update:
-    """Return the outlines of the stable region as data of a line and of an area with holes, and labels of islands."""
+    """Return the outlines of the stable region: the data of lines, of areas with holes, and of labels of islands."""
     pieces = scene.stable_region()
     lines = [piece.stiffness for piece in pieces], [piece.virtual_damping for piece in pieces]
     xs, ys = ([np.append(line, line[:1]) for line in each] for each in lines)
@@ -58,7 +58,7 @@ def show_outlines(scene: Scene) -> Update:
 
 
 def choose_ranges(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
-    """Return rounded axis ranges that contain a curve, and the wall unless it is beyond two sizes of the curve."""
+    """Return rounded axis ranges that contain a curve, and the wall unless it is very far (two ranges) from it."""
     ranges = []
     for axis in (0, 1):
         values = np.append(curve[axis][np.isfinite(curve[axis])], 0.0)
@@ -104,7 +104,7 @@ def compute_open_loop(scene: Scene, verdict: Assessment) -> dict[str, dict[str, 
     # two grid points. Subtract this phase again afterwards.
     delayed = 2.0 * np.pi * frequency * scene.timing.delay
     phase = np.unwrap(np.angle(curve * np.exp(1j * delayed))) - delayed
-    # Shift the phase by a multiple of 360 degrees, so that it lies between -270 and 90 degrees at the lowest frequency.
+    # Shift the phase by a multiple of 360 degrees, so that at the lowest frequency it lies between -270 and 90 degrees.
     phase = np.degrees(phase - 2.0 * np.pi * np.floor((phase[0] / np.pi + 1.5) / 2.0))
     with np.errstate(divide="ignore"):
         gain = 20.0 * np.log10(np.abs(curve))
@@ -147,8 +147,8 @@ def compute_ridge(scene: Scene) -> Curve:
 
 def simulate_hit(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
     """Return times, positions and wall forces of a simulated hit, and a phrase on its final behavior."""
-    # Start the hit five periods of motion before contact, or at half of the distance in which the damping of the device
-    # would stop it if this is shorter.
+    # Start the hit at the distance that the device covers in five periods. If damping would stop the device within
+    # twice this distance, start at half of its stopping distance.
     start = -_APPROACH * _IMPACT * scene.timing.period / max(1.0, 2.0 * _APPROACH * float(scene.delta))
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
     return hit.time, hit.position, hit.wall_force, f"({describe_ending(hit)})"
@@ -166,9 +166,9 @@ def find_contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]
     for k, level in enumerate(LEVELS):
         lines: Any = generator.lines(level)
         for line in sorted(lines, key=len, reverse=True):
-            # Label only the longest contour line of a level, at its point with large K and small B: the largest K minus
-            # weighted B, both relative to the ranges of the axes. The weight decreases with the level, which moves the
-            # labels of higher levels toward larger K and so separates them.
+            # Label only the longest contour line of a level, at a point with large K and small B: where K minus a
+            # multiple of B is largest, both relative to the ranges of the axes. The multiple decreases with the level,
+            # which separates the labels of different levels.
             named = line[np.argmax(line[:, 0] / np.ptp(across) - (2.0 - 0.35 * k) * line[:, 1] / np.ptp(up))]
             text = f"{level:g}" if line is max(lines, key=len) else ""
             # Drop unlabeled lines smaller than two cells of the grid, because the grid does not resolve them.
@@ -235,7 +235,7 @@ def format_normalized_verdict(verdict: Assessment) -> list[str]:
     return [format_row(*each) for each in rows.items()]
 
 
-# Lock held during the import of JAX, because another thread that imports it at the same time would get a partial
+# Lock held during the import of JAX, because a thread that imports it at the same time would receive an incomplete
 # module.
 IMPORTING = Lock()
 
@@ -271,7 +271,8 @@ def compute_details(
         yield {"passive": {"x": x, "y": y}, "contours": find_contours(scene, across, up)}
     if not normalized_text:
         yield {"verdict": write_check(scene, verdict, limits_of(scene))}
-    # Omit ridge and hit for a linear system, because its damping is not a parameter and it has no body with a velocity.
+    # Omit ridge and hit for a linear system, because it has no damping parameter, which the ridge varies, and no body
+    # whose velocity the hit could set.
     bodies = isinstance(scene.device, Device)
     if of_device:
         x, y = compute_ridge(scene) if bodies else (np.empty(0), np.empty(0))

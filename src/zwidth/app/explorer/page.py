@@ -34,9 +34,9 @@ from zwidth.model.wall import VirtualWall
 from zwidth.plotting import style
 
 _LONGEST_MESSAGE = 16_000  # characters; a message contains some dozen numbers, or an address
-# Properties of a glyph whose values are names of columns of its data source, except the value "center".
+# Properties of a glyph whose value, unless it is "center", is the name of a column of the data source.
 _FROM_SOURCE = ("x", "y", "xs", "ys", "text", "angle", "text_align")
-# Data sources of slow results that depend only on the device. They are emptied at once if the device changes.
+# Data sources of slow results that depend only on the device. If the device changes, they are emptied immediately.
 _OF_DEVICE = ("contours", "passive", "ridge", "best")
 # Roles of colors in the figures, followed by the colors of these roles on light and on dark pages.
 _INKS = ("paper", "ink", "faint", "edge", "passive", "ridge")
@@ -63,7 +63,7 @@ class Page:
         self.answer = ColumnDataSource({"json": []}, name="answer")
         self.inputs.on_change("data", lambda _, __, data: self.receive(data))
         self.inks: list[tuple[Any, str, str]] = []
-        # Store the curves of each figure: name of the data source, and its columns for the horizontal and the vertical
+        # The curves of each figure: name of the data source, column of the horizontal axis, column of the vertical
         # axis.
         self.curves: dict[figure, list[tuple[str, str, str]]] = {}
         self.frame: tuple[model.Range, model.Range] | None = None
@@ -84,7 +84,7 @@ class Page:
         for axis in (self.plots["plane"].x_range, self.plots["plane"].y_range):
             for end in ("start", "end"):
                 axis.on_change(end, lambda attr, old, new: self._point_at_wall())
-        # Freeze the document, because Bokeh would otherwise collect all models after each added figure.
+        # Freeze the document, because Bokeh would otherwise search it for all its models after each added figure.
         with document.models.freeze():
             for name, plot in self.plots.items():
                 plot.name = name
@@ -98,7 +98,7 @@ class Page:
         plot.toolbar.logo, plot.toolbar.autohide, plot.toolbar.active_drag = None, True, None  # pyright: ignore
         plot.outline_line_color = None  # pyright: ignore
         for axis in plot.axis:
-            # Write small numbers such as 0.001 without an exponent.
+            # Set the tick labels so that small numbers such as 0.001 have no exponent.
             if isinstance(axis.formatter, BasicTickFormatter):
                 axis.formatter.power_limit_low = -6
         self.inks += [(plot, "background_fill_color", "paper"), (plot, "border_fill_color", "paper")]
@@ -118,7 +118,7 @@ class Page:
     def _draw_plane(self) -> figure:
         """Return the chart of walls: stable and passive region, contours, ridge, and the wall of the user."""
         plot = self._new(460, x_range=(0, 1), y_range=(0, 1))
-        # Fill areas with low opacity, because the lines carry the meaning.
+        # Fill areas with low opacity, so that the lines remain visible.
         area = {"line_color": None, "fill_alpha": 0.13}
         self._add(plot, "multi_polygons", "area", "edge", parts="fill", xs="xs", ys="ys", legend_label="stable", **area)
         self._add(plot, "multi_line", "contours", "faint", xs="xs", ys="ys", legend_label="spectral radius")
@@ -270,7 +270,8 @@ class Page:
         except Exception as error:
             self.send({"error": _explain(error), "state": self.controls.shown(), "busy": False})
             return
-        # Cancel older computations after the checks above, because a refused change keeps the state for which they run.
+        # Cancel older computations only after the checks above, because after a refused change their results are still
+        # valid.
         self.generation += 1
         if rest:
             assert self.frame is not None, "it has just been shown"
@@ -314,7 +315,7 @@ class Page:
             self._fill({"away": arrow})
 
     def table(self, name: str) -> str:
-        """Return the points of a figure as CSV text: curve, number of the piece of the curve, and coordinates."""
+        """Return the points of a figure as CSV text: name of the curve, number of its piece, and coordinates."""
         plot, buffer = self.plots[name], io.StringIO()
         writer = csv.writer(buffer, lineterminator="\n")
         writer.writerow(["curve", "piece", plot.xaxis.axis_label, plot.yaxis.axis_label])
@@ -338,7 +339,7 @@ class Page:
         self.answer.data = {"json": [json.dumps({"serial": self.serial, **texts})]}
 
     def _compute(self, generation: int, scene: Scene, *frame: model.Range, **wanted: bool) -> None:
-        """Compute the slow results one by one in the worker's thread, until a newer change cancels the computation."""
+        """Compute the slow results one by one in the worker thread, until a newer change cancels the computation."""
         try:
             for update in compute_details(scene, *frame, **wanted):
                 if generation != self.generation:
@@ -346,7 +347,7 @@ class Page:
                 self._schedule_update(generation, update)
             self._schedule_update(generation, {"busy": False})
         except Exception as error:
-            # Clear the verdict, because it belongs to the previous wall.
+            # Clear the verdict together with reporting the error, because the verdict belongs to the previous wall.
             self._schedule_update(generation, {"error": _explain(error), "verdict": "", "busy": False})
 
     def close(self) -> None:
@@ -363,7 +364,8 @@ class Page:
             return
         self._fill({name: columns for name, columns in update.items() if name in self.sources})
         texts = {name: text for name, text in update.items() if name not in self.sources}
-        # Note that the results of the device are complete, because the sensitivities are the last of them.
+        # If the update contains the sensitivities, all curves of the device are drawn, because the sensitivities are
+        # computed last.
         self.drawn = self.drawn or "slopes" in update
         if texts:
             self.send(texts)

@@ -80,12 +80,12 @@ class GuardedServer(BokehTornado):
         """Return the handler of a request: one that answers with status 403 if token, path, host or origin is wrong."""
         first, _, rest = request.path.lstrip("/").partition("/")
         valid = hmac.compare_digest(first.encode("utf-8", "replace"), self.token.encode())
-        # Refuse paths with unprintable characters, which the page never requests. The token without a slash is valid,
-        # because it is redirected to the page.
+        # Refuse paths with unprintable characters, which the page never requests. Accept the token without a slash
+        # after it, because such a request is redirected to the page.
         valid = valid and rest.partition("/")[0] in _SERVED and unquote(rest).isprintable()
         origin = request.headers.get("Origin", f"http://{self.host}")
-        # Compare the host, too, because another host name that resolves to this address is a different origin (DNS
-        # rebinding).
+        # Also compare the host, because a page of another host name that resolves to this address (DNS rebinding) must
+        # have no access.
         if not valid or request.host != self.host or origin != f"http://{self.host}":
             return self.get_handler_delegate(request, ErrorHandler, {"status_code": 403})
         return super().find_handler(request, **keywords)

@@ -129,7 +129,7 @@ def _write_page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]
     versions = content["versions"]
     rows = [f'<th scope="row">{escape(name)}</th><td>{escape(str(each))}</td>' for name, each in versions.items()]
     facts = {name: content[name] for name in ("name", "description", "precision", "config_sha256")}
-    # Print the start of the run to the minute. The page states that the time is UTC, as in the record.
+    # Print the start of the run without seconds, in UTC as in the record; the page states the time zone.
     facts["started"] = content["started"][:16].replace("T", " at ")
     # Create an entry for each planned study without one, because an interrupted run did not begin all studies.
     begun = {entry["name"]: entry for entry in content["studies"]}
@@ -161,7 +161,7 @@ def _write_section(where: Path, entry: dict[str, Any]) -> str:
     """Return the HTML section of a study, from the folder of the run and the entry of the study."""
     kind, name = str(entry["kind"]), escape(str(entry["name"]))
     remarks = [*entry.get("answer", ()), *entry.get("notes", ())]
-    notes = f'<div class="told">{"".join(f"<p>{escape(str(each))}</p>" for each in remarks)}</div>' if remarks else ""
+    notes = f'<div class="notes">{"".join(f"<p>{escape(str(each))}</p>" for each in remarks)}</div>' if remarks else ""
     method = f'<p class="soft">{escape(KINDS[kind].method)}</p>' if kind in KINDS and KINDS[kind].method else ""
     body = "".join(_write_contents(where, entry))
     listed = ", ".join(escape(file) for file in sorted(entry.get("files", {})))
@@ -233,7 +233,7 @@ def _write_comparison(content: dict[str, Any]) -> str:
 
 
 def _write_table(name: str, rows: list[str], head: str = "") -> str:
-    """Return an HTML table that scrolls horizontally on narrow pages, by mouse and by keyboard.
+    """Return an HTML table that can be scrolled horizontally on narrow pages, by mouse and by keyboard.
 
     Args:
         name: Accessible name of the table.
@@ -257,7 +257,8 @@ def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[st
         if len(axes) == 2 and "device" not in axes:
             values = data[name]
             if OUTPUTS[name].dtype == "bool":
-                # Set undecided walls to NaN, because False would mean that they are unstable.
+                # Set the Boolean values of undecided walls to NaN, because False would mean that the walls are
+                # unstable.
                 values = values.astype(np.float32).where(data[STATUS_OF[OUTPUTS[name].family]] == Status.OK)
             yield _write_map(values, name, (axes[0], axes[1]), edges or (lambda part: {}))
 
@@ -328,7 +329,7 @@ def _list_colors(colormap: str) -> list[str]:
 
 
 def _explain_colors(scale: ColorScale, unit: str) -> str:
-    """Return the sentence that states the range of the color bar and the meaning of its arrows."""
+    """Return a sentence on the range of the color bar and, if it has arrows at its ends, on their meaning."""
     ends = {
         "neither": "",
         "min": "; lower values: arrow",

@@ -37,14 +37,14 @@ from zwidth.stability.linear.curve import (
 )
 from zwidth.stability.linear.roots import LoopRoots
 
-# Newton's method for a crossing
+# Newton's method for the angle w of a crossing. The first constant is the largest number of steps.
 MAX_STEPS = 120
 CONVERGED_STEP = 1e-10  # relative to w; the error after it is of the order of its square
 
 # Relative changes of beta, tried in this order if rounding errors make the crossings of a line ambiguous (V15).
 SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
-# Distance from an angle at which the curve is undefined to an additional point of the curve, relative to the distance
-# of the next node.
+# Distance between an end of an interval, where the curve may be infinite, and an additional point of the curve,
+# relative to the distance of the next node.
 PROBE_DISTANCE = 1e-6
 # Ratio of radial to total displacement below which a pole leaves a zero of G along the unit circle (V14).
 TANGENT_TOLERANCE = 1e-9
@@ -53,7 +53,7 @@ BLOCK_SIZE = 1 << 17  # pairs of lines and arcs per batch; its arrays fit in the
 
 
 class Crossings(NamedTuple):
-    """Crossings of lines of constant B with the boundary: shape (rows, columns), NaN if a line misses a column."""
+    """Crossings of lines of constant B with the boundary: shape (rows, columns), NaN where a line misses a column."""
 
     alpha: np.ndarray
     w: np.ndarray
@@ -97,7 +97,7 @@ class Boundary:
         return cls(loop, w, tuple(arcs), tuple(lines), asymptotes, limits, lossless)
 
     def are_lossless(self, beta: np.ndarray) -> np.ndarray:
-        """Return a mask of the dampings that make the loop lossless, so that no wall is stable (`find_lossless`)."""
+        """Return a mask of the dampings beta at which the loop is lossless and no wall is stable (`find_lossless`)."""
         with np.errstate(invalid="ignore"):
             return np.abs(beta - self.lossless) <= EQUAL_DAMPING * np.abs(self.lossless)
 
@@ -118,14 +118,14 @@ class Boundary:
         return out
 
     def find_alpha(self, column: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return the alpha at which each line of constant B crosses its column.
+        """Return the alpha at which each line of constant B crosses a column, one column per line.
 
         Args:
             column: column of each line, shape (rows,).
             beta: damping of each line, shape (rows,).
 
         Returns:
-            Array of shape (rows,); NaN if a line misses its column.
+            Array of shape (rows,); NaN if a line does not cross its column.
         """
         joined, alpha = self._joined, np.full(beta.shape, np.nan)
         for index, line in enumerate(self.lines, len(self.arcs)):
@@ -139,7 +139,7 @@ class Boundary:
 
     @cached_property
     def ends(self) -> np.ndarray:
-        """Alpha and beta (first axis) at both ends (second axis) of each column; NaN for crossing lines."""
+        """Alpha and beta (first axis) at both ends (second axis) of each arc; NaN in the columns of crossing lines."""
         w = np.array([arc.w[[0, -1]] for arc in self.arcs]).T
         alpha = evaluate_curve(self.loop, w.ravel()).alpha.reshape(w.shape)
         for angle, (limit, _) in self.limits.items():
@@ -158,9 +158,9 @@ class Boundary:
         Returns:
             Angle and alpha of each crossing.
         """
-        # Solve ``ratio(w) = 0``. Im(q - beta F) increases with w at the crossing if a pair leaves the circle (V11);
-        # ``ratio`` is Im(q - beta F) divided by factors with the signs ``signs``. Converged crossings leave the
-        # iteration.
+        # Solve ``ratio(w) = 0``, where ``ratio`` is Im(q - beta F) divided by factors with the signs ``signs``. It is
+        # rising or falling at the crossing: Im(q - beta F) increases with w if a pole pair leaves the circle (V11).
+        # Converged crossings are removed from the iteration.
         joined, nodes = self._joined, self._node_values
         lower = np.where(joined.w[k - 1] < joined.w[k], k - 1, k)
         upper = 2 * k - 1 - lower
@@ -169,7 +169,7 @@ class Boundary:
         signs = [np.sign(middle - np.cos(w)) for w in self._pair_angles]
         rising = joined.leaving[arc] * np.prod(signs, axis=0) > 0
         first, last = nodes.select(lower).evaluate_rows(beta), nodes.select(upper).evaluate_rows(beta)
-        # Skip the iteration for a line of constant B through an end of the arc, because the crossing is this end.
+        # If the line of constant B passes through a node, the node is the crossing; otherwise estimate the crossing.
         angle = np.where(
             last.ratio == 0, above, np.where(first.ratio == 0, below, _estimate_crossing(below, above, first, last))
         )
@@ -199,7 +199,7 @@ class Boundary:
         return angle, alpha
 
     def _evaluate_loop(self, w: np.ndarray) -> _LoopValues:
-        """Return q, F and their derivatives at angles w, from which `_RowValues` follow for every damping."""
+        """Return q, F and their derivatives at angles w, which do not depend on the damping."""
         points, common, slope = circle_points(w), np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
         for angle in self._pair_angles:
             factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
@@ -229,7 +229,7 @@ class Boundary:
 
     @cached_property
     def alpha_nodes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Angles between which alpha is monotone along the curve, and alpha there; NaN where the curve is infinite."""
+        """Angles between which alpha is monotone along the curve, and alpha at them; NaN where it is infinite."""
         nodes = np.union1d(self.w, self.alpha_extrema)
         pieces, values = [], []
         for a, b in pairwise(sorted(self.limits)):
@@ -269,11 +269,11 @@ class Boundary:
         return beta, mismatch == 0
 
     def _count_mismatch(self, beta: np.ndarray) -> np.ndarray:
-        """Return `count_below` plus the sum of ``leaving`` minus `count_above` of each line; 0 if consistent."""
+        """Return per line: count below all crossings + sum of ``leaving`` - count above; 0 if consistent."""
         return self.count_below(beta) - self.count_above(beta) + self._sum_leaving(beta)
 
     def _sum_leaving(self, beta: np.ndarray, limit: float = np.inf) -> np.ndarray:
-        """Return the sum of ``leaving``, limited to ``limit`` from above, over all crossings of each line."""
+        """Return the sum of min(``leaving``, ``limit``) over all crossings of each line of constant B."""
         joined = self._joined
         total = joined.sum_crossed(np.minimum(joined.leaving, limit), beta)
         return total + sum(np.minimum(line.count_leaving(beta), limit) for line in self.lines)
@@ -332,7 +332,8 @@ class Boundary:
         arc, block = self.find_arc(w), max(1, BLOCK_SIZE // max(1, len(self.arcs)))
         for part in np.array_split(np.flatnonzero(result), 1 + result.sum() // block):
             sums, consistent = self._sum_below(curve.alpha[part], curve.beta[part], arc[part])
-            # Use ``leaving`` of the whole arc, because at a single angle rounding errors may change its sign.
+            # Use the value of ``leaving`` that holds for the whole arc, because its sign at a single angle may be wrong
+            # by rounding errors.
             below = self.count_below(curve.beta[part])
             result[part] = consistent & (below + sums == np.where(self._joined.leaving[arc[part]] > 0, 0, 2))
         return result
@@ -356,7 +357,7 @@ class Boundary:
 
     @cached_property
     def _far_counts(self) -> dict[float, tuple[int, int]]:
-        """Number of poles outside as alpha -> -inf (key -1) and inf (key 1), below and above the lossless damping."""
+        """Counts of poles outside as alpha -> -inf (key -1) or inf (1), for beta below and above ``lossless``."""
         return {side: (self._far_outside(side, -1.0), self._far_outside(side, 1.0)) for side in (-1.0, 1.0)}
 
     def _far_outside(self, side: float, excess: float) -> int:
@@ -383,15 +384,15 @@ class Boundary:
                 # lossless damping moves it off the circle: x becomes x (1 - (beta - lossless) F/alpha).
                 leaving += int(np.sum(side * excess * loop.estimate.jet(points).value.imag * x.real > 0))
                 continue
-            # If x is real, the pole leaves the zero along the circle. The next term of its expansion, -e x^2/order,
-            # then decides by its sign if the pole is outside.
+            # If x is real, the pole leaves the zero along the circle. The imaginary part of the next term of its
+            # expansion, -e x^2/order, then decides whether the pole is outside.
             bend = -(rest.slope / rest.value + 0.5j * order) * x * x / order
             leaving += int(np.sum(np.where(np.abs(x.imag) > TANGENT_TOLERANCE * np.abs(x), x.imag, bend.imag) < 0))
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on_circle] < 0)) + leaving
 
 
 class _RowValues(NamedTuple):
-    """Im(q - beta F) and alpha at one angle per line of constant B; a crossing is a zero of ``ratio``."""
+    """Im(q - beta F), scaled, and alpha, at one angle per line of constant B; a crossing is a zero of ``ratio``."""
 
     ratio: np.ndarray  # Im(q - beta F)/common, with ``common`` of `_LoopValues`
     ratio_slope: np.ndarray  # its derivative in w
@@ -414,7 +415,7 @@ class _LoopValues(NamedTuple):
         return _LoopValues(*(part[index] for part in self))
 
     def evaluate_rows(self, beta: np.ndarray) -> _RowValues:
-        """Return the `_RowValues`, that is, ``ratio``, alpha and their derivatives, for one damping per angle."""
+        """Return ``Im(q - beta F)/common``, alpha and their derivatives in w, for one damping beta per angle."""
         with np.errstate(all="ignore"):
             value, slope = self.q - beta * self.f, self.q_slope - beta * self.f_slope
             is_zero = self.common == 0
@@ -436,8 +437,8 @@ def _estimate_crossing(below: np.ndarray, above: np.ndarray, first: _RowValues, 
     share = -first.ratio / rise
     bends = rise * (1.0 - share) / first.ratio_slope, rise * share / last.ratio_slope
     cubic = below + share * (share * (3.0 - 2.0 * share) * width + (1.0 - share) * (bends[0] - bends[1]))
-    # The parabola has the values of ``ratio`` at both angles, and its derivative at the angle where this is smaller.
-    # Near an extremum of beta the derivative is 0, and the cubic interpolation fails.
+    # The cubic interpolation fails near an extremum of beta, where the derivative of ``ratio`` is 0. Use a parabola
+    # with the values at both angles and the derivative at the angle where it is smaller in magnitude.
     flat = np.abs(first.ratio_slope) < np.abs(last.ratio_slope)
     start, slope = np.where(flat, first.ratio, last.ratio), np.where(flat, first.ratio_slope, -last.ratio_slope) * width
     rise = np.where(flat, rise, -rise)

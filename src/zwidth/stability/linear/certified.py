@@ -33,7 +33,7 @@ from zwidth.numerics.balls import BITS, available
 if TYPE_CHECKING:
     import flint
 
-# Placeholder for the velocity estimate in the chain of the device, because F is expanded separately.
+# Placeholder for the velocity estimate when the plant is built without it, because F is expanded separately.
 NO_ESTIMATE = Estimate(0, 0.0)
 
 
@@ -63,7 +63,7 @@ def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tupl
 
 
 def _decide(polynomials: Callable[[int], Any], stiffness: float, damping: float) -> tuple[bool, Status]:
-    """Return True if one wall is stable, and the `Status` of this result."""
+    """Return whether one wall is stable, and the `Status` of this result."""
     import flint
 
     if not (np.isfinite(stiffness) and np.isfinite(damping)):
@@ -130,7 +130,7 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
 def _convert_exactly(part: Any) -> Any:
     """Return a copy of a scene, or of one of its parts, in which every float is an exact ball (radius 0).
 
-    Constructors are bypassed, because they accept only floats.
+    The copies are created without calling the constructors, because these accept only floats.
     """
     import flint
 
@@ -182,7 +182,7 @@ def _expand_response(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
 
 
 def _exact_estimate(exact: Any, velocity: Any, period: float) -> Estimate:
-    """Return the velocity estimate in balls; in floats, which count as exact, if its class supports only floats."""
+    """Return the velocity estimate in balls; if its class supports only floats, in floats, which are taken as exact."""
     try:
         return exact.velocity.estimate(exact.timing.period)
     except (ArithmeticError, AttributeError, TypeError, ValueError):

@@ -23,9 +23,9 @@ from zwidth.model.circle_functions import are_on_circle, circle_points
 from zwidth.numerics.root_finding import find_zeros_between
 from zwidth.stability.linear.roots import LoopRoots
 
-# Nodes
+# Settings of the nodes.
 NODE_SPACING = 0.08  # relative change of q and F between neighboring nodes, estimated
-MAX_ROUNDS = 60  # of halving the intervals
+MAX_ROUNDS = 60  # largest number of rounds in which intervals between nodes are halved
 LAST_NODE = 1e-4  # pi - w of the last node, for a loop without delay and without roots near z = -1
 
 
@@ -81,7 +81,7 @@ def place_nodes(loop: LoopRoots) -> np.ndarray:
 
 
 def find_field_zeros(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
-    """Return the angles at which a field of `CurvePoints` is 0, by a search between nodes at which its signs differ.
+    """Return the angles at which one quantity of the curve is 0, found between neighboring nodes with different signs.
 
     Args:
         loop: the loop without a wall.
@@ -93,9 +93,9 @@ def find_field_zeros(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: 
     return find_zeros_between(lambda angles: getattr(evaluate_curve(loop, angles), field), w, values, k)
 
 
-# Crossing lines
+# Tolerances for crossing lines.
 REAL_TOLERANCE = 1e-11  # |Im q| of a real q, relative to |q|; smaller values are rounding errors
-MIN_ESTIMATE_SLOPE = 1e-12  # |Im F'| below which F does not vary to first order at a crossing line
+MIN_ESTIMATE_SLOPE = 1e-12  # |Im F'| up to which the boundary curve does not meet a crossing line
 
 
 class CrossingLine(NamedTuple):
@@ -137,8 +137,8 @@ def find_lines(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
         q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
         real = is_end | (np.abs(q.value.imag) <= REAL_TOLERANCE * np.abs(q.value))
     values = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
-    # Treat a zero of G as located at an angle if their distance is at most ``reach``, because of rounding errors.
-    # ``reach`` is smallest at z = 1, because the offsets of zeros near z = 1 have a small relative error.
+    # Treat a zero of G as located at e^(jw) if its distance is at most ``reach``, because zeros have rounding errors.
+    # ``reach`` is smallest at z = 1, because the offsets of zeros near z = 1 have small errors.
     reach = np.where(w == 0.0, 1e-15, np.where(is_end, 1e-12, 1e-9))
     near = np.abs(points.z_minus_1[:, None] + loop.zeros) <= reach[:, None]
     selected = np.flatnonzero(real & ~near.any(1) & np.isfinite(values).all(1))
@@ -228,7 +228,7 @@ def cut_arcs(
     return arcs
 
 
-# Tests for a lossless loop
+# Tolerances of the test for a lossless loop.
 LOSSLESS_ERROR = 1e-12  # of Im(q - beta F), relative to its terms and their conditioning; smaller values are 0
 LOSSLESS_ANGLE = 1e-2  # rad; at smaller angles, rounding errors of poles at z = 1 dominate Im(q - beta F)
 
@@ -260,7 +260,7 @@ def find_lossless(loop: LoopRoots, w: np.ndarray, curve: CurvePoints, damping: f
 
 
 def build_level_arc(w: np.ndarray, curve: CurvePoints, beta: float) -> Arc:
-    """Return the curve of a lossless loop as one arc of constant damping, which no line of constant B crosses."""
+    """Return the curve of a loop that is lossless at ``beta`` as one arc of constant damping, which no line crosses."""
     blank, level = np.full(w.size + 2, np.nan), np.full(w.size + 2, beta)
     alpha = np.concatenate([[np.nan], curve.alpha, [np.nan]])
     return Arc(np.concatenate([[0.0], w, [np.pi]]), level, alpha, blank, blank, blank, 2.0)
@@ -284,11 +284,11 @@ def bound_interpolation(
     Returns:
         Two arrays of shape (nodes,); an entry describes the step from the previous node.
     """
-    # Interpolate alpha linearly in beta if d beta/dw changes by less than a factor of 2 over the step. If alpha(w) and
-    # beta(w) are quadratic, the error is at most the sum of two terms: step/8 times the change of d alpha/dw, because
-    # alpha(w) is curved, and |ratio - 1|/6 times the change of alpha, because beta(w) is curved. The returned bound is
-    # at least four times this sum. If alpha is not interpolated, the bound exceeds the difference of alpha between both
-    # nodes.
+    # Interpolate alpha linearly in beta if d beta/dw changes by less than a factor of 2 over the step from node to
+    # node. If alpha(w) and beta(w) are quadratic, the error is at most the sum of two terms: step/8 times the change of
+    # d alpha/dw, because alpha(w) is curved, and |ratio - 1|/6 times the change of alpha, because beta(w) is curved.
+    # The returned bound is at least four times this sum. If alpha is not interpolated, the bound exceeds the difference
+    # of alpha between both nodes.
     with np.errstate(all="ignore"):
         ratio = beta_slope / np.roll(beta_slope, 1)
         straight = (ratio > 0.5) & (ratio < 2.0)
@@ -299,7 +299,7 @@ def bound_interpolation(
 
 
 class JoinedArcs(NamedTuple):
-    """The nodes of all arcs in one sequence; the step of a node is the interval between the previous node and it."""
+    """The nodes of all arcs, joined into one sequence; a *step* is the interval from one node to the next."""
 
     w: np.ndarray
     beta: np.ndarray

@@ -31,7 +31,7 @@ from zwidth.numerics.held_mass import Plant, discretize_mass, factor_numerator
 from zwidth.stability.linear.roots import LoopRoots, compute_aberth_step
 from zwidth.stability.linear.sampled_zeros import find_sampled_zeros
 
-# Zeros of G
+# Settings for the zeros of G.
 SLOW_ZERO = 0.1  # |zeta| below which a zero starts from its continuous-time counterpart
 MAX_STEPS = 30  # Aberth steps
 CONVERGED_STEP = 1e-13  # last Aberth step, relative to |zeta|
@@ -40,17 +40,18 @@ RESPONSE_TOLERANCE = 1e-11  # relative difference of q by roots and by matrices,
 TEST_ANGLE = 0.5  # rad per sample at which the two are compared
 FAR_ZERO = 1e-17  # inverse |zeta| beyond which a zero is dropped
 
-# Matrix exponential
+# Settings of the matrix exponential: number of terms of its series, largest number of doublings.
 SERIES_TERMS = 15
 MAX_DOUBLINGS = 36  # 2^36 exceeds twice the largest rate that `Chain.check` allows
 
 
 def compute_transition(A: Any, B: Any, time: Any) -> tuple[Any, Any]:
     """Return ``e^(A t) - 1`` and Gamma(t), the state after a unit force held for time t from rest."""
-    # Evaluate the series for the time divided by a power of 2, then double: y(2 t) = y(t) (2 + y(t)) for y = e^(A t) -
-    # 1, and similarly Gamma. This keeps the relative accuracy of slow and of strongly damped modes. Two separate loops
-    # keep the program short, because compiling its derivatives takes time proportional to its length: with JAX's own
-    # exponential, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to compile.
+    # Evaluate the series for the time divided by a power of 2, then double the time repeatedly: y(2 t) = y(t) (2 +
+    # y(t)) for y = e^(A t) - 1, and similarly Gamma. This keeps the relative accuracy of slow and of strongly damped
+    # modes. Use two loops, because they make the program short and the compile time of derivatives is proportional to
+    # its length: with JAX's own exponential, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long
+    # to compile.
     xp = namespace(A)
     norm = stop_gradient(xp.abs(A * time).sum(0).max(), xp)
     doublings = xp.ceil(xp.log2(xp.maximum(2.0 * norm, 1.0)))
@@ -145,8 +146,8 @@ def find_roots(chain: AnyChain) -> LoopRoots:
         lag += 1
     numerator = np.trim_zeros(numerator, "f")
     if numerator.size > 1 and abs(numerator[0]) < FAR_ZERO * abs(numerator[1]):
-        # For a delay just below an integer, one zero is so far from the unit circle that it has no effect there, and
-        # Aberth's method would not find it.
+        # Drop one zero if the delay is just below an integer, because this zero is then so far from the unit circle
+        # that it has no effect on the circle and Aberth's method would not converge to it.
         numerator = numerator[1:]
     # Rounding errors of the coefficients hide zeros near the poles of a slow mode. Start the iteration for these zeros
     # from the zeros of the continuous-time response, which approximate them.
@@ -156,11 +157,11 @@ def find_roots(chain: AnyChain) -> LoopRoots:
     zeros = np.roots(numerator).astype(complex)
     zeros[np.argsort(np.abs(zeros))[: slow.size]] = slow
     candidates = []
-    # Modes that decay within a period leave a cluster of zeros near z = 0. If the determinant does not separate them,
-    # keep the roots of ``numerator`` there, which are accurate as a group.
+    # Refine all zeros first. Modes that decay within a period have a cluster of zeros near z = 0, which the determinant
+    # may not separate; then keep the roots of ``numerator`` in this cluster, because they are accurate as a group.
     for is_refined in (np.full(zeros.shape, True), np.abs(1.0 + zeros) > CLUSTER_RADIUS):
-        # Move the initial values off the real axis. Aberth's steps would keep them real, but two real zeros of the
-        # coefficients may be a complex pair of the determinant.
+        # Move real starting values off the real axis, because Aberth's steps keep real values real, and two zeros that
+        # are real according to the coefficients may be a complex pair.
         off_axis = 1.0 + 1e-6j * (1.0 - 2.0 * (np.arange(zeros.size) % 2)) * is_refined
         refined = -_refine_zeros(discretized, zeros * off_axis, is_refined)
         loop = LoopRoots(float(numerator[0]), lag, refined, poles, chain.estimate)
@@ -222,7 +223,7 @@ def _log_derivative(matrix: np.ndarray, change: np.ndarray) -> complex:
 
 
 def _factor_rigid_loop(chain: Chain) -> LoopRoots:
-    """Return the open loop of a rigid device by zeros, poles and gain, in closed form."""
+    """Return the zeros, poles and gain of the open loop of a rigid device, in closed form."""
     delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.n_delay)
     plant = discretize_mass(delta, fraction if fraction else None)
     if fraction:

@@ -35,12 +35,12 @@ from zwidth.stability.linear.rows import label_walls
 from zwidth.stability.results import Margins
 from zwidth.units.quantities import WALL_RANGE
 
-# Refinement of the nodes near a zero of the controller
+# Refinement of the nodes near a zero of the controller: largest number of halvings, and criterion.
 MAX_HALVINGS = 40
-MAX_CONTROLLER_CHANGE = 0.25  # of the controller between nodes, relative to its magnitude
+MAX_CONTROLLER_CHANGE = 0.25  # largest change of the controller between neighboring nodes, relative to its magnitude
 
-POLE_AT_ONE = 1e-13  # |offset| of a pole at z = 1
-ZERO_OF_L = 1e-10  # |L| of a zero of L, relative to w |dL/dw|
+POLE_AT_ONE = 1e-13  # distance from z = 1 below which a pole counts as a pole at z = 1
+ZERO_OF_L = 1e-10  # value of |L| below which L counts as 0, relative to w |dL/dw|
 
 
 class OpenLoop(NamedTuple):
@@ -54,7 +54,7 @@ class OpenLoop(NamedTuple):
 
     @classmethod
     def tabulate(cls, loop: LoopRoots, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
-        """Return L with a wall, tabulated at the nodes of the loop and, near zeros of the controller, between them."""
+        """Return L for one wall, tabulated at the nodes and, near zeros of the controller, between them."""
         w = np.append(nodes[nodes < np.pi], np.pi)
         n_integrators = int(np.count_nonzero(np.abs(loop.poles) <= POLE_AT_ONE))
         first_gain = abs(alpha * loop.evaluate_response(circle_points(w[:1])).value[0])
@@ -107,7 +107,7 @@ class OpenLoop(NamedTuple):
         # Add the angle pi, because L is always real there.
         w = np.append(self._find_zeros(phase_sine, stop=-1), np.pi)
         L = self.evaluate(w)
-        # Exclude zeros of L, at which the phase jumps, because no factor of the gain puts a pole there.
+        # Exclude zeros of L, at which the phase jumps, because no change of the gain moves a pole to these points.
         return w[(L.value.real < 0) & (np.abs(L.value) > ZERO_OF_L * w * np.abs(L.slope))]
 
     def _find_zeros(
@@ -135,11 +135,11 @@ class OpenLoop(NamedTuple):
         value: np.ndarray,
         slope: np.ndarray,
     ) -> np.ndarray:
-        """Return the angles of minima of |function| between nodes of equal sign whose tangents reach the other sign."""
+        """Return the angles of minima of |function| between nodes with equal signs at which a tangent crosses zero."""
         step, sign = np.diff(w), np.sign(value[:-1])
         approaching = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
         size, descent = np.abs(value), np.abs(slope)
-        # Ignore NaN, because L may be 0 at the Nyquist frequency, where the tangent of its logarithm is undefined.
+        # Ignore NaN, which occurs because L may be 0 at the Nyquist frequency, where log|L| has no tangent.
         with np.errstate(invalid="ignore"):
             lowest = np.minimum(size[:-1] - descent[:-1] * step, size[1:] - descent[1:] * step)
         k = np.flatnonzero(approaching & (lowest < 0))
@@ -237,29 +237,29 @@ def select_phase_margin(stable: bool, w: np.ndarray, phases: Array) -> tuple[flo
     return float(degrees[nearest] * (1.0 if stable else -1.0)), float(w[nearest])
 
 
-# Delays at which crossovers are computed
-N_PARTS = 8  # per period
-# Largest error of a starting value of the delay, in units of 1/N_PARTS periods, if the number of crossovers changes
-# near it.
+# Delays at which the gain crossovers are computed for the delay margin.
+N_PARTS = 8  # number of these delays per period
+# The number of crossovers may differ between two neighboring delays. The crossovers at both delays whose m (see the
+# module docstring) differs from an integer by at most START_ERROR/N_PARTS are then starting points of Newton's method.
 START_ERROR = 1.5
-# Distances of additional delays below an integer delay, in time constants of the fastest pole. A strongly damped device
-# tolerates less delay within ln 2 time constants below the integer than at the integer itself.
+# Further delays just below each integer: their distances from it, in time constants of the fastest pole. They are
+# needed because a strongly damped device tolerates less delay within ln 2 time constants below an integer than at it.
 EARLY_DELAYS = np.array([1.0, 0.5, 0.25, 0.1])
-FAST_RATE = 2.0  # per period; the parts resolve slower poles
+FAST_RATE = 2.0  # decay rate of the fastest pole, per period, above which these delays are added
 
-# Newton's method for the delay, in periods
+# Settings of Newton's method for the delay, in periods.
 DIFFERENCE_STEP = 1e-5  # step of the finite difference in the delay
 RELATIVE_STEP = 1e-9  # additional step, relative to the delay
 MAX_STEPS = 30
 LOG_TOLERANCE = 1e-9  # largest |log(-L)| at a solution
 
-# Additional delays that confirm a delay margin by pole counts, relative to the margin
+# Added delays, relative to the computed delay margin, at which pole counts must confirm this margin.
 STABLE_MULTIPLES = (0.25, 0.5, 0.75, 1.0 - 1e-5)  # the wall must be stable
 UNSTABLE_MULTIPLE = 1.0 + 1e-5  # the wall must be unstable
 
 
 def build_delayed_loops(chain: AnyChain) -> dict[float, tuple[LoopRoots, np.ndarray]]:
-    """Return loops and their nodes by delay in periods, ascending from the delay of the chain to one period more."""
+    """Return a dictionary of loops and nodes by delay in periods, from the chain's delay to one period more."""
     d = float(chain.d)
     fastest = -float(np.linalg.eigvals(chain.realize().A).real.min())
     early = 1.0 - EARLY_DELAYS / fastest if fastest > FAST_RATE else np.empty(0)
@@ -313,21 +313,21 @@ def find_delay_margin(
 def _list_starts(
     delays: list[float], crossovers: list[np.ndarray], phases: list[np.ndarray]
 ) -> Iterator[tuple[float, float]]:
-    """Yield pairs of angle and delay near which a pole is on the unit circle, as starts of Newton's method.
+    """Yield starting values of Newton's method: pairs of angle and delay near which a pole is on the unit circle.
 
     Args:
         delays: delays of the loops.
         crossovers: gain crossovers of each loop.
         phases: arg(-L) at these crossovers, in [0, 2 pi).
     """
-    # After m = phase/w more periods of delay, L would be -1 at the crossover, and an integer m does not change |L|. So
-    # a solution exists near each integer that m passes between two tabulated delays. Near a local minimum of m, the
-    # integer below may also be reached.
+    # After m = phase/w more periods of delay, L would be -1 at the crossover w if |L| did not change, as is the case
+    # for an integer m. So a solution exists near each integer through which m passes between two tabulated delays. Near
+    # a local minimum of m, the integer below the minimum may also be reached.
     more = [phase / w for phase, w in zip(phases, crossovers, strict=True)]
     for k, (w, after) in enumerate(pairwise(crossovers)):
         if w.size != after.size:
-            # Two crossovers appear or merge between these delays, and one of them may have an integer m there. Start
-            # from all crossovers of both loops whose m is nearly an integer.
+            # Two crossovers appear or merge between these delays, and m of one of them may pass through an integer.
+            # Start from all crossovers of both loops whose m is nearly an integer.
             for i, turn in product((k, k + 1), (0.0, 2.0 * np.pi)):
                 m = (phases[i] - turn) / crossovers[i]
                 integer = np.round(m)
@@ -373,7 +373,7 @@ def _solve_delay(chain: AnyChain, wall: tuple[float, float], w: float, delay: fl
 
 
 def _is_first_loss(chain: AnyChain, alpha: float, beta: float, margin: float) -> bool:
-    """Return whether the spectral radius is below 1 at delays below the margin and above 1 just above the margin."""
+    """Return whether the wall is stable at added delays below the margin and unstable just above the margin."""
     wall = np.array([alpha]), np.array([beta])
     delays = [float(chain.d) + multiple * margin for multiple in (*STABLE_MULTIPLES, UNSTABLE_MULTIPLE)]
     logs = [compute_log_radius(change_delay(chain, delay), *wall)[0] for delay in delays]

@@ -24,13 +24,13 @@ from zwidth.core.types import Array
 from zwidth.model.circle_functions import circle_points
 from zwidth.model.velocity import Estimate
 
-# Search for the maximum
+# Settings of the search for the maximum of N.
 N_NODES = 129  # initial angles
-MAX_INTERVALS = 1 << 18  # intervals that are still undecided in one round
+MAX_INTERVALS = 1 << 18  # largest number of undecided intervals in one round
 N_PARTS = 16  # parts into which an interval is divided
-MAX_ROUNDS = 20  # rounds of division
+MAX_ROUNDS = 20  # largest number of rounds in which the undecided intervals are divided
 SHARES = np.arange(1, N_PARTS)[:, None] / N_PARTS  # inner points of a divided interval, relative to its width
-CERTIFIED_ERROR = 1e-13  # relative error of the maximum
+CERTIFIED_ERROR = 1e-13  # largest relative error of the maximum
 
 
 # Fields of a device for which no passivity condition is available, each with a description, a reason and a remedy.
@@ -55,7 +55,7 @@ UNSUPPORTED = {
 
 
 def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
-    """Return the reason why no passivity condition is available for a device; "" if one is.
+    """Return the reason why no passivity condition is available for a device; "" if a condition is available.
 
     The condition requires that the force acts on the point whose position is sensed.
 
@@ -90,7 +90,7 @@ class PassivityCondition:
         n = int(np.floor(d))
         if estimate.window:
             return cls(estimate, 0.0, n, float(d - n))
-        # Represent polynomials by their coefficients in zeta = z - 1, lowest power first.
+        # Represent the polynomials in z by their coefficients in zeta = z - 1, lowest power first.
         polynomial = np.polynomial.polynomial
         lag = max(estimate.lag, 0)
         numerator = (
@@ -98,8 +98,8 @@ class PassivityCondition:
         )
         denominator = polynomial.polyfromroots([*-estimate.poles, *[-1.0] * lag]).real
         spring = numerator[0] / denominator[0]
-        # Divide the numerator of F - F(1) by zeta to get that of E: drop the constant coefficient, which is 0. If F is
-        # constant, no coefficient remains.
+        # Compute the numerator of E by dividing that of F - F(1) by zeta: drop the constant coefficient, which is 0. If
+        # F is constant, no coefficient remains.
         quotient = np.trim_zeros(polynomial.polysub(numerator, spring * denominator)[1:], "b")
         quotient = quotient if quotient.size else np.zeros(1)
         E = Estimate(0, quotient[-1], lag, -polynomial.polyroots(quotient) + 0j, estimate.poles)
@@ -136,8 +136,8 @@ class PassivityCondition:
         bound = alpha * n * (n + 1) * (2 * n + 1) / 3.0 + 2.0 * abs(beta) * damper[2]
         late = _multiply_bounds(_multiply_bounds(damper, difference), _bound_power(1, low))[2]
         bound = bound + 2.0 * f * (alpha * (n + 1) ** 2 + abs(beta) * late)
-        # ``wall`` bounds the second derivative of z^-n (z - 1) E. Use it for that of C/beta, too, because the factor
-        # z^-n only increases the bound.
+        # ``wall`` bounds the second derivative of z^-n (z - 1) E. Use it as a bound for the second derivative of
+        # C/beta, too, because the factor z^-n can only increase the bound.
         return 0.5 * (bound + np.sqrt(f * (1.0 - f)) * abs(beta) * wall)
 
     def _bound_quotient(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -154,7 +154,8 @@ class PassivityCondition:
         for pole in f.poles:
             middle = 0.5 * (low + high)
             distance = np.abs(circle_points(middle).z_minus_1 + pole) - 0.5 * (high - low)
-            # Use at least 1 - |pole|, because no point of the unit circle is closer to the pole.
+            # Increase the computed distance to at least 1 - |pole|, because no point of the unit circle is closer to
+            # the pole.
             depth = 1.0 - abs(1.0 - pole)
             distance = np.maximum(distance, depth)
             value = _multiply_bounds(value, (1.0 / distance, 1.0 / distance**2, 2.0 / distance**3 + 1.0 / distance**2))
@@ -197,7 +198,8 @@ def find_needed_damping(condition: PassivityCondition, alpha: float, beta: float
         if not undecided.any():
             return best
         if undecided.sum() > MAX_INTERVALS:
-            # Return the upper bound, which is conservative, because N is so flat that too many intervals remain.
+            # Stop and return the upper bound, a conservative result: N is so flat that too many intervals remain
+            # undecided.
             break
         (low, high), needs = ends[:, undecided], needs[:, undecided]
         angles = low + (high - low) * SHARES

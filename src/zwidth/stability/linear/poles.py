@@ -33,12 +33,12 @@ MAX_STEPS = 60
 CONVERGED_STEP = 4e-16  # relative to |zeta|
 LONGEST_STEP = 0.5
 
-# Restart of poles that did not converge
+# Limits for the restart of poles that did not converge.
 NEAR_ONE = 1e-6  # |zeta| below which eigenvalues have no significant digits
 UNCONVERGED_STEP = 1e-3  # relative to |zeta|
 MAX_RESTARTS = 4
 
-REAL_TOLERANCE = 1e-13  # imaginary part of a real pole, relative to |zeta|; smaller ones are rounding errors
+REAL_TOLERANCE = 1e-13  # imaginary part of a real pole, relative to |zeta|; smaller imaginary parts are rounding errors
 BLOCK_SIZE = 1 << 20  # values per block of walls; eigenvalues and pole differences take order^2 values per wall
 
 
@@ -104,9 +104,9 @@ def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
     monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
     zeta = np.linalg.eigvals(companion(monic)) - 1.0 + 0j
     _refine_poles(loop, alpha, beta, zeta, np.arange(len(zeta)))
-    # Aberth's steps keep real approximations real and complex pairs complex. They do not converge if rounding errors
-    # split a nearly double real pole into a complex pair of eigenvalues, or vice versa. Perturb unconverged
-    # approximations by complex factors and repeat.
+    # Aberth's steps keep real approximations real and complex pairs complex. If rounding errors have split a nearly
+    # double real pole into a complex pair of eigenvalues, or vice versa, they do not converge. Therefore multiply
+    # approximations that have not converged by different complex factors, and repeat.
     for restart in range(MAX_RESTARTS):
         P = evaluate_polynomial(loop, alpha[:, None], beta[:, None], zeta)
         with np.errstate(all="ignore"):
@@ -166,8 +166,8 @@ def compute_poles_minus_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array
         for k in range(0, walls.size, block):
             part = walls[k : k + block]
             out[part] = _find_poles(loop, alpha[part], beta[part]) if damped else _find_spring_poles(loop, alpha[part])
-    # Set imaginary parts to 0 where they are rounding errors of real poles. A complex pair that has just left the real
-    # axis has larger imaginary parts, about 1e-8.
+    # Set imaginary parts to 0 where they are rounding errors of real poles. Complex pairs are not affected, because
+    # even just off the real axis their imaginary parts are about 1e-8.
     out = np.where(np.abs(np.imag(out)) <= REAL_TOLERANCE * np.abs(out), np.real(out) + 0j, out)
     return out.reshape(*shape, order)
 
@@ -195,8 +195,8 @@ def is_marginal(loop: LoopRoots, alpha: float, beta: float) -> bool:
     wall = np.array([alpha]), np.array([beta])
     P = evaluate_polynomial(loop, *wall, np.zeros(1, complex))
     undamped = evaluate_polynomial(loop, wall[0], 0.0 * wall[1], np.zeros(1, complex))
-    # Treat P'(1) as 0 if it is a rounding error, because the negative damping of the wall may cancel that of the
-    # device, and then the pole at z = 1 is double.
+    # Treat P'(1) as 0 if it is not larger than its rounding error. The pole at z = 1 is then double, because the
+    # negative damping of the wall cancels the damping of the device.
     terms = np.abs(undamped.slope[0]) + np.abs(P.slope[0] - undamped.slope[0])
     if P.value[0] != 0 or np.abs(P.slope[0]) <= CANCELLATION * terms:
         return False
@@ -204,19 +204,19 @@ def is_marginal(loop: LoopRoots, alpha: float, beta: float) -> bool:
     return bool(np.all(log_modulus(np.delete(zeta, np.argmin(np.abs(zeta)))) < 0))
 
 
-# With more poles than this, counting them in circles is faster than computing all of them. With a window above
-# MAX_COUNTED_WINDOW samples counting is slower, because the window adds as many zeros.
+# If a loop has more poles than MAX_COMPUTED_POLES, counting them in circles is faster than computing all of them,
+# except for a velocity window above MAX_COUNTED_WINDOW samples: it adds as many zeros, which makes counting slow.
 MAX_COMPUTED_POLES = 150
 MAX_COUNTED_WINDOW = 40
 
-# Bracket of the log radius
+# Search for the log radius by counts of the poles in circles.
 N_CIRCLES = 16  # circles per call
 MAX_ROUNDS = 24
 BRACKET_WIDTH = 4e-16  # target width, relative to max(1, |log radius|)
 MAX_BRACKET_WIDTH = 1e-6  # a wider final bracket, caused by inconclusive counts, means NaN
 
-# Largest |log radius| that may contradict the verdict on stability. Beyond it the result is NaN, because either the
-# radius or the verdict may be wrong.
+# Largest |log radius| at which the radius may contradict the verdict on stability. For a larger contradiction the
+# result is NaN, because either the radius or the verdict may be wrong.
 VERDICT_TOLERANCE = 1e-7
 
 

@@ -23,12 +23,12 @@ from zwidth.stability.linear.curve import evaluate_curve, find_field_zeros
 from zwidth.stability.linear.rows import Island, are_connected, find_stable_intervals
 from zwidth.units.display import compact_repr
 
-# Initial lines of constant B
+# Initial lines of constant B.
 N_ACROSS = 65  # equidistant lines across the stable set
-BEYOND = 0.05  # distance of the first and last of them from the stable nodes, relative to the range of dampings
+BEYOND = 0.05  # distance in beta of the first and last line from the stable nodes, relative to the range of their betas
 
-# Refinement near meetings. Offsets in beta of new lines of constant B near a meeting, relative to the gap between the
-# lines that enclose it.
+# Refinement near meetings. New lines of constant B have these offsets in beta from a meeting, relative to the gap
+# between the two lines that enclose the meeting.
 MEETING_OFFSETS = np.array([-1e-3, -1e-7, 1e-7, 1e-3])
 # Largest final gap between two lines that enclose a meeting, relative to the gap before refinement.
 ENCLOSED_GAP = 3e-7
@@ -36,10 +36,10 @@ MAX_ROUNDS = 60  # rounds in which lines are added
 MAX_CORNER_STEPS = 60  # steps of false position for a corner
 DAMPING_TOLERANCE = 1e-13  # relative accuracy of the damping of a corner
 
-# Edges
-MIN_NODES = 5  # nodes of the curve; an edge with fewer is tabulated at N_FILLED points instead
-N_FILLED = 33  # points of such an edge
-NEAR_EDGE = 1e-9  # relative distance in beta within which a wall may be on a neighboring edge
+# Tabulation of edges.
+MIN_NODES = 5  # least number of nodes of the curve on an edge; an edge with fewer nodes is tabulated at N_FILLED points
+N_FILLED = 33  # number of points of such an edge
+NEAR_EDGE = 1e-9  # relative distance in beta from a meeting within which rounding errors may select a neighboring edge
 
 
 class Edge(NamedTuple):
@@ -55,7 +55,7 @@ class Edge(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Ends of stable intervals on lines of constant B: shape (rows, columns), NaN if a column bounds no interval.
+    """Ends of stable intervals on lines of constant B: shape (rows, columns), NaN where a column bounds no interval.
 
     The rows are in ascending order of beta. ``alpha`` and ``w`` are those of the end that lies in the column.
     """
@@ -63,15 +63,15 @@ class _Rows(NamedTuple):
     beta: np.ndarray  # shape (rows,)
     alpha: np.ndarray
     w: np.ndarray
-    upper: np.ndarray  # at the lower end of an interval: the column of its upper end; else -1
+    upper: np.ndarray  # in the column of the lower end of an interval: the column of its upper end; otherwise -1
 
 
 class _Meetings(NamedTuple):
-    """The meetings of two columns each, in the gaps between neighboring lines of constant B."""
+    """The meetings, each of two columns, that lie in the gaps between neighboring lines of constant B."""
 
     gap: np.ndarray  # index of the line above
     columns: np.ndarray  # shape (meetings, 2)
-    walls: np.ndarray  # alpha and beta of each meeting, shape (meetings, 2); a guess if not enclosed
+    walls: np.ndarray  # alpha and beta of each meeting, shape (meetings, 2); only an estimate if not ``enclosed``
     enclosed: np.ndarray  # True if the wall of the meeting has been computed and two close lines enclose it
 
 
@@ -83,7 +83,7 @@ class StableSet:
 
     @cached_property
     def _nodes(self) -> np.ndarray:
-        """Angle, alpha and beta (first axis) at the nodes of the curve and the extrema of alpha: shape (3, nodes)."""
+        """Angle, alpha and beta (first axis) at the curve's nodes and at its extrema of alpha, shape (3, nodes)."""
         w = np.union1d(self.boundary.w, self.boundary.alpha_extrema)
         return np.stack([w, *evaluate_curve(self.boundary.loop, w)[:2]])
 
@@ -107,10 +107,10 @@ class StableSet:
             return reached
         margin = BEYOND * (np.ptp(reached) + abs(reached[0]) + 1e-300)
         across = np.linspace(reached.min() - margin, reached.max() + margin, N_ACROSS)
-        # If no node is on an edge, the set may still contain walls with beta = 0, because on a device that comes to
-        # rest by itself all sufficiently soft walls are stable.
+        # If no node is on an edge, add the line beta = 0. The set may contain such walls, because on a device that
+        # comes to rest by itself all sufficiently soft walls are stable.
         across = across if is_edge.any() else np.union1d(across, 0.0)
-        # Drop nodes outside the range of ``across``, because they may lie near an asymptote of the curve.
+        # Drop lines outside the range of ``across``, because they may lie near an asymptote of the curve.
         return np.union1d(across, near[(near > across[0]) & (near < across[-1])])
 
     def _scan_rows(self, beta: np.ndarray) -> _Rows:
@@ -131,7 +131,7 @@ class StableSet:
 
     @cached_property
     def _enclosed(self) -> tuple[_Rows, _Meetings]:
-        """Stable intervals on lines of constant B that enclose all meetings closely, and these meetings."""
+        """Stable intervals on lines of constant B, two of which closely enclose each meeting, and the meetings."""
         if np.isfinite(self._triangle_beta):
             one, other = self.boundary.lines
             corner = (one.q - other.q) / (one.f - other.f)
@@ -167,13 +167,13 @@ class StableSet:
             Dampings of further lines near these meetings, and the located corners as in `_pair_ends`.
         """
         b, columns, beta = self.boundary, meetings.columns[left], rows.beta
-        # Add a gap below the first and above the last line of constant B, because the set may extend beyond them.
+        # Add a gap below the first and above the last line of constant B, because a meeting may lie beyond them.
         size = np.ptp(beta[np.isfinite(rows.alpha).any(1)]) + np.spacing(np.abs(beta).max())
         low, high = np.concatenate([[beta[0] - size], beta, [beta[-1] + size]])[
             meetings.gap[left] + np.array([[0], [1]])
         ]
-        # Locate a meeting at an end of an arc in the gap or, if there is none, at the corner of the two columns,
-        # provided that their difference in alpha changes its sign. If neither exists, halve the gap.
+        # Locate a meeting at an end of an arc, if one lies in the gap; otherwise at the corner of the two columns, if
+        # their difference in alpha changes its sign. Always halve the gap as well, in case neither exists.
         ends = np.moveaxis(b.ends[..., columns], -1, 1).reshape(2, -1, left.size)
         inside = (ends[1] > low) & (ends[1] < high)
         alpha, damping = np.where(inside.any(0), ends[:, inside.argmax(0), np.arange(left.size)], np.nan)
@@ -196,7 +196,7 @@ class StableSet:
         )
 
     def _subtract_columns(self, columns: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return the difference in alpha of two columns on each line; NaN if the line does not cross both."""
+        """Return alpha of the crossing with one column minus that with another, per line; NaN unless both exist."""
         return np.subtract(*self.boundary.find_alpha(columns.T.ravel(), np.tile(beta, 2)).reshape(2, -1))
 
     @cached_property
@@ -207,7 +207,7 @@ class StableSet:
             return self._triangle if meetings.gap.size else []
         bounds = np.pad(np.isfinite(rows.alpha.T), ((0, 0), (1, 1)))
         begins, ends = bounds[:, 1:-1] & ~bounds[:, :-2], bounds[:, 1:-1] & ~bounds[:, 2:]
-        # Assign two edges to the same piece if they bound the same interval of a line or meet.
+        # Assign two edges to the same piece if they bound the same stable interval or if they end at the same meeting.
         number = np.cumsum(begins).reshape(begins.shape).T - 1
         row, below = np.nonzero(rows.upper >= 0)
         pairs = [number[row, below], number[row, rows.upper[row, below]]]
@@ -226,7 +226,7 @@ class StableSet:
 
     @property
     def _triangle(self) -> list[Edge]:
-        """The edges of a triangular stable set: two crossing lines, and the curve at the damping `_triangle_beta`."""
+        """The three edges of a triangular stable set: two crossing lines, and the curve at the lossless damping."""
         b, ends, edges = self.boundary, [], []
         corner = next(wall[1] for wall in self._enclosed[1].walls[self._enclosed[1].enclosed].tolist())
         for k, line in enumerate(b.lines):
@@ -285,15 +285,15 @@ class StableSet:
         return frozenset([min(stiff, key=lambda piece: (piece not in damped, np.min(ends[piece])))])
 
     def find_softest(self, least: float) -> float:
-        """Return the lowest alpha with beta >= ``least`` on the edges of `main` pieces; NaN if there is none."""
+        """Return the lowest alpha of the edges of `main` pieces (connected to K = 0) with beta >= ``least``, or NaN."""
         walls = [edge.alpha[edge.beta >= least] for edge in self.main_edges(least)]
         return float(min((alpha.min() for alpha in walls if alpha.size), default=np.nan))
 
     def is_in_main(self, alpha: float, beta: float) -> bool:
-        """Return whether a wall lies in a `main` piece, one that is connected to K = 0."""
-        # Find the edge at the upper end of the wall's stable interval, and compare it with the edges of main pieces.
-        # Near a meeting, rounding errors may select a neighboring edge, so also search two lines of constant B close to
-        # the wall.
+        """Return whether a wall lies in a piece that is connected to K = 0."""
+        # Find the column at the upper end of the wall's stable interval, and search the edges of main pieces for an
+        # edge in this column. Near a meeting, rounding errors may select a neighboring edge; therefore also test two
+        # lines of constant B close to the wall.
         rows = beta + NEAR_EDGE * (abs(beta) + self.width) * np.array([0.0, -1.0, 1.0])
         intervals = find_stable_intervals(self.boundary, rows)
         row, k = np.nonzero((intervals.low < alpha) & (alpha < intervals.high))
@@ -302,12 +302,12 @@ class StableSet:
         return any(edge.beta[0] <= row <= edge.beta[-1] and edge.column == end for edge in edges for row, end in above)
 
     def main_edges(self, least: float) -> list[Edge]:
-        """Return the edges of `main` pieces whose largest damping exceeds ``least`` by more than rounding errors."""
+        """Return the edges of `main` pieces (connected to K = 0) whose largest damping clearly exceeds ``least``."""
         main = [edge for edge in self.edges if edge.piece in self.main]
         return [edge for edge in main if edge.beta[-1] - least > DAMPING_TOLERANCE * np.ptp(edge.beta)]
 
     def find_highest(self, least: float) -> float:
-        """Return the largest stable alpha on lines with beta >= ``least``, in `main` pieces; -inf if none is stable."""
+        """Return the largest stable alpha for beta >= ``least`` in pieces connected to K = 0; -inf if there is none."""
         rows, highest = self._enclosed[0], -np.inf
         for edge in self.main_edges(least):
             alpha = rows.alpha[edge.rows, edge.column]
@@ -320,7 +320,8 @@ class StableSet:
         for piece in {edge.piece for edge in self.edges} - self.main:
             walls = np.concatenate([edge[-2:] for edge in self.edges if edge.piece == piece], 1)
             islands.append(Island(*(tuple(pair) for pair in np.stack([walls.min(1), walls.max(1)], 1).tolist())))
-        # Drop islands of walls with K <= 0, whose largest alpha is positive only by rounding errors.
+        # Drop islands that consist of walls with K <= 0, although rounding errors may make their largest alpha
+        # positive.
         islands = [one for one in islands if one.stiffness[1] > NEAR_EDGE * np.ptp(one.stiffness)]
         islands = [one for one in islands if one.virtual_damping[1] > least]
         return sorted(islands, key=lambda one: -one.stiffness[1])
@@ -375,9 +376,9 @@ def _pair_ends(rows: _Rows, corners: np.ndarray) -> _Meetings:
     Args:
         rows: stable intervals on the lines.
     """
-    # A column that bounds an interval on one line but not on the next takes part in a meeting between these lines,
-    # together with a second column, because an interval begins, ends, splits, or changes a column. In order of alpha,
-    # these columns form pairs.
+    # Find the columns that bound an interval on one line but not on the next. Each of them has a meeting with another
+    # one between these lines, where an interval begins, ends, splits, or changes a column. In order of alpha, two
+    # successive columns form a pair.
     alpha = np.pad(rows.alpha, ((1, 1), (0, 0)), constant_values=np.nan)
     bounds = np.isfinite(alpha)
     gap, column = np.nonzero(bounds[1:] != bounds[:-1])

@@ -36,20 +36,20 @@ from zwidth.stability.linear.rows import find_stable_intervals
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import WALL
 
-# Corners
+# Settings of the search for corners.
 CORNER_TOLERANCE = 1e-8  # difference of the two crossings in alpha at a corner, relative to alpha
-NEAR_CORNER = 1e-5  # largest distance of a first guess, relative to beta; or to alpha for an end of the curve
+NEAR_CORNER = 1e-5  # largest relative distance from the start, in beta; for an end of the curve, in alpha
 MAX_STEPS = 4  # Newton steps
 CONVERGED_STEP = 1e-15  # relative to beta
 
 ON_LOSSLESS = 1e-9  # tolerance of the lossless damping, relative to the width of the stable set in beta
-# Relative excess in alpha of a stable wall over the ridge, above which the ridge is rejected; smaller ones are rounding
-# errors.
+# If the alpha of a stable wall exceeds the computed maximum by more than this fraction, the result is rejected. Smaller
+# differences are rounding errors.
 CONTRADICTION = 1e-7
 
-# Test of a maximum on lines of constant B at these offsets, relative to the width of the stable set plus |beta|.
-NEIGHBOR_OFFSETS = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3])  # in beta, relative to its scale
-REACHED_FRACTION = 0.99  # of alpha, up to which one of these lines must be stable
+# Test of a maximum on nearby lines of constant B. The scale of the offsets is the width of the stable set plus |beta|.
+NEIGHBOR_OFFSETS = np.array([0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3])  # offsets in beta / scale
+REACHED_FRACTION = 0.99  # fraction of the maximum alpha that a stable interval of one line must reach
 
 
 class Condition(IntEnum):
@@ -79,7 +79,7 @@ class RidgeSolution(NamedTuple):
 
     @property
     def kind(self) -> RidgeKind:
-        """The kind of the maximum: smooth, a corner, or at the limit beta = 0 of the allowed dampings."""
+        """The kind of the maximum: smooth, a corner, or on the line beta = 0 that bounds the allowed dampings."""
         if self.second == Condition.NO_DAMPING:
             return RidgeKind.NO_DAMPING
         smooth = self.first == Condition.PAIR and self.second == Condition.STATIONARY
@@ -112,8 +112,8 @@ def find_ridge(stable_set: StableSet, negative_damping: bool) -> RidgeSolution |
     ridge = None if top is None else _identify_conditions(stable_set, top, least)
     lossless = stable_set.boundary.lossless
     if ridge is not None and abs(ridge.beta - lossless) <= ON_LOSSLESS * stable_set.width:
-        # Set beta to the lossless damping, at which no wall is asymptotically stable. With the rounding error of the
-        # corner some walls would appear stable.
+        # Set beta to exactly the lossless damping, at which no wall is asymptotically stable. At a beta with a rounding
+        # error some walls would appear stable.
         ridge = ridge._replace(beta=lossless)
     highest = stable_set.find_highest(least)
     if highest > (0.0 if ridge is None else ridge.alpha) * (1.0 + CONTRADICTION):
@@ -128,11 +128,11 @@ class _Maximum(NamedTuple):
     beta: float
     w: float
     column: int
-    inner: bool  # inside its edge, not at an end
+    inner: bool  # the maximum lies inside its edge, not at an end
 
 
 def _list_maxima(stable_set: StableSet, least: float) -> Iterator[_Maximum]:
-    """Yield the local maxima of alpha along the edges of main pieces, for beta >= ``least``."""
+    """Yield the local maxima of alpha for beta >= ``least`` along the edges of main pieces."""
     edges = stable_set.main_edges(least)
     for edge in edges:
         padded = np.pad(np.where(edge.beta >= least, edge.alpha, -np.inf), 1, constant_values=-np.inf)
@@ -149,7 +149,7 @@ def _list_maxima(stable_set: StableSet, least: float) -> Iterator[_Maximum]:
 
 
 def _is_reached(stable_set: StableSet, top: _Maximum, least: float) -> bool:
-    """Return whether a stable interval on a line of constant B next to a maximum reaches nearly the same alpha."""
+    """Return whether a stable interval on a line of constant B near a maximum extends to nearly the same alpha."""
     scale = stable_set.width + abs(top.beta)
     intervals = find_stable_intervals(stable_set.boundary, np.maximum(top.beta + scale * NEIGHBOR_OFFSETS, least))
     bounded = (intervals.above == top.column) | (intervals.below == top.column)
@@ -167,7 +167,7 @@ def _identify_conditions(stable_set: StableSet, top: _Maximum, least: float) -> 
 
 
 def _classify_angle(w: float) -> Condition:
-    """Return the active constraint of poles at the angle w: a pole pair, or a real pole at z = 1 or z = -1."""
+    """Return the type of the active constraint at the angle w: a pole pair, or a real pole at z = 1 or z = -1."""
     if w == 0.0:
         return Condition.PLUS_ONE
     return Condition.MINUS_ONE if w == np.pi else Condition.PAIR
@@ -175,8 +175,8 @@ def _classify_angle(w: float) -> Condition:
 
 def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> RidgeSolution:
     """Compute the corner close to a wall by Newton's method, and its two active constraints."""
-    # Solve for the beta at which two crossings have the same alpha. Do not use the end of an edge, because near an
-    # undamped mode it is only as accurate as the last digit of its angle.
+    # Solve for the beta at which two crossings have the same alpha. Do not use the tabulated end of an edge, because
+    # near an undamped mode a rounding error of its angle changes alpha considerably.
     (w, other), heights, slopes, step = _find_nearest_two(stable_set.boundary, alpha, beta)
     for _ in range(MAX_STEPS):
         if not CONVERGED_STEP * abs(beta) < abs(step) <= NEAR_CORNER * abs(beta):
@@ -184,8 +184,8 @@ def _solve_corner(stable_set: StableSet, alpha: float, beta: float) -> RidgeSolu
         alpha, beta = heights[0] + slopes[0] * step, beta + step
         (w, other), heights, slopes, step = _find_nearest_two(stable_set.boundary, alpha, beta)
     w, other = sorted((w, other))
-    # Weight the remaining gap in alpha by ``flatness``, because an error in beta changes alpha of the corner only by
-    # the smaller of the two derivatives d alpha/d beta.
+    # Multiply the remaining difference of the two alphas by ``flatness``, because an error of beta changes the alpha of
+    # the corner only in proportion to the smaller of the two derivatives d alpha/d beta.
     difference, gap = abs(slopes[0] - slopes[1]), abs(heights[1] - heights[0]) / abs(alpha)
     flatness = min(1.0, min(map(abs, slopes)) / difference) if difference > 0 else 1.0
     if (
@@ -258,10 +258,10 @@ def _stack_equations(value: np.ndarray, slope: np.ndarray) -> np.ndarray:
     return np.array([value[0].real, value[0].imag, value[1].real, value[1].imag, slope[0].imag])
 
 
-DIFFERENCE_STEP = 1e-3  # relative to the parameter; its sixth power is the truncation error
+DIFFERENCE_STEP = 1e-3  # step relative to the parameter; the truncation error is of the order of its sixth power
 COMPLEX_STEP = 1e-30  # imaginary step; its square is negligible
-# Below this fraction of its unit, a parameter takes steps relative to the unit. Steps relative to such a small value
-# caused errors of the derivative of up to 3e-6 by rounding.
+# Fraction of its unit below which the step of a parameter is relative to the unit and not to the value, because steps
+# relative to such small values caused rounding errors of the derivative of up to 3e-6.
 SMALL_PARAMETER = 1e-5
 # Sixth-order finite differences: pairs of offset (in steps) and weight of the central difference, and the weights of
 # the one-sided difference at 0, 1, ... 6 steps.
@@ -311,7 +311,7 @@ def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> floa
                 for value, weight in weights
             ]
         except InputError:
-            # Try the next difference, toward the other side, because the parameter is at the end of its range.
+            # Try the next, one-sided difference, because the value of the parameter is at an end of its range.
             continue
         d_unit, d_delay, d_A, d_B, d_f, d_f_slope = (np.sum(part, axis=0) for part in zip(*states, strict=True))
         q, q_slope = _differentiate_controller(scene, n, points, d_A, d_B, d_delay)
@@ -329,7 +329,7 @@ def _collect_dependencies(scene: Any, n: int, points: CirclePoints) -> tuple[Any
     delay = scene.timing.delay / scene.timing.period
     chain = build_chain(scene, (delay, n))
     if chain.sampled:
-        # Raise an error if the period differs from that of the sampled system.
+        # Raise an error if the loop's period differs from that of a sampled system.
         chain.check()
     return (scene.units.stiffness, delay, *chain.realize()[:2], *chain.estimate.jet(points))
 
@@ -392,8 +392,8 @@ def _list_differences(scene: Any, path: str) -> Iterator[list[tuple[float, float
     period = float(scene.timing.period)
     units = {"mass": scene.mass, "damping": scene.mass / period, "stiffness": scene.mass / period**2, "delay": period}
     unit = float(next((unit for name, unit in units.items() if path.endswith(name)), 0.0))
-    # A step of the scale of the unit is accurate, because A and B are linear in dampings and stiffnesses, and smooth in
-    # the delay. Only a mass varies on the scale of its value, even if this is small.
+    # A step relative to the unit is accurate, because A and B are linear in dampings and stiffnesses and smooth in the
+    # delay. For a mass the step must be relative to the value, because A and B depend on its inverse.
     least = 0.0 if path.endswith("mass") else SMALL_PARAMETER * unit
     step = DIFFERENCE_STEP * (abs(value) if abs(value) > least else unit)
     yield from ([[(value + k * step, weight / step) for k, weight in CENTRAL_DIFFERENCE]] if value > 3.0 * step else [])

@@ -79,7 +79,7 @@ class LoopRoots:
         # Compute the zeros of F/(z - 1) as offsets 1 - z. For a window of n samples they are the n-th roots of 1, but
         # not 1 itself.
         angles = 2.0 * np.pi * np.arange(1, f.window) / max(f.window, 1)
-        # Set the offset of z = -1 to exactly 2, so that it equals the offset of a zero of the device at z = -1.
+        # Set the offset of z = -1 to exactly 2, so that it is equal to that of a zero of the device at z = -1.
         window = np.where(angles == np.pi, 2.0, -2j * np.sin(0.5 * angles) * np.exp(0.5j * angles))
         lag = self.lag + f.lag + f.window
         velocity = f.zeros if f.window else np.delete(f.zeros, estimate_zeros[0])
@@ -88,7 +88,7 @@ class LoopRoots:
         return LoopRoots(self.gain * float(f.gain) / max(f.window, 1), max(lag, 0), zeros, poles, Estimate())
 
     def contract_powers(self) -> tuple[LoopRoots, int]:
-        """Return the loop with z^k replaced by z, for the largest k for which G and F are functions of z^k, and this k.
+        """Return the loop in the variable z^k, for the largest k for which G and F are functions of z^k, and this k.
 
         Returns:
             The loop whose poles are the k-th powers of the poles of this one, and k. For most loops k is 1.
@@ -110,8 +110,8 @@ class LoopRoots:
         z_minus_1 = circle_points(w).z_minus_1[..., None]
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         distance = np.abs(z_minus_1 + roots) - reach[..., None]
-        # Limit the resolution near a root on the unit circle. The phase of its factor z - root hardly varies near the
-        # root (V16), and only the modulus needs to be resolved.
+        # Use at least a small distance from a root on the unit circle, because near the root the phase of the factor z
+        # - root hardly varies (V16) and only the modulus must be resolved.
         floor = np.where(are_on_circle(roots), np.where(roots == 0, 1e-9, 1e-5), 0.5 * np.abs(distances_inside(roots)))
         by_roots = (1.0 / np.maximum(distance, floor)).sum(-1)
         return by_roots + self.lag + self.estimate.window + abs(self.estimate.lag) + 1.0

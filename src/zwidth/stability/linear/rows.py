@@ -24,7 +24,8 @@ from zwidth.units.quantities import WALL_RANGE
 # Sizes of batches, chosen so that their arrays fit in the cache.
 BATCH_LINES = 1 << 12  # lines of constant B per batch
 BATCH_PAIRS = 1 << 16  # pairs of lines and arcs per batch, which allows more lines if there are few arcs
-# Walls per line of constant B below which counting the poles of each wall is faster than solving for all crossings.
+# Number of walls per line of constant B below which it is faster to count the unstable poles of each wall than to solve
+# for all crossings of the line.
 FEW_WALLS = 4
 
 
@@ -68,7 +69,7 @@ def collect_by_line(find: Callable[..., tuple[np.ndarray, ...]], batch: int, *li
 
 
 def _list_intervals(boundary: Boundary, beta: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return all stable intervals of some lines of constant B as columns for `collect_by_line`.
+    """Return all stable intervals of some lines of constant B as columns, one entry per interval.
 
     The columns are the row, and for the lower and the upper end: alpha, angle and column of the crossing.
     """
@@ -112,7 +113,7 @@ def arrange_by_line(lines: int, line: np.ndarray, values: np.ndarray) -> np.ndar
 
 
 def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Return True for each stable wall, for arrays that broadcast; crossings of equal dampings are solved once."""
+    """Return a mask of the stable walls, for arrays that broadcast; crossings are solved once per damping."""
     shape = np.broadcast_shapes(alpha.shape, beta.shape)
     dampings, row = np.unique(beta, return_inverse=True)
     scattered = dampings.size * FEW_WALLS > np.prod(shape)
@@ -129,7 +130,7 @@ def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.n
 
 
 def _count_poles(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Return True for each wall with no pole outside the unit circle, by counting, for arrays of one shape.
+    """Return a mask of the walls without poles outside the unit circle, by counting, for arrays of one shape.
 
     Most walls are so far from all crossings that the count does not require the exact crossings.
     """
@@ -149,17 +150,18 @@ def _count_poles(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.
     return stable.reshape(shape)
 
 
-# The labels of walls must change within this relative distance from each end of an interval of beta. It exceeds the
-# rounding errors of labels, which are errors in alpha: where the boundary is nearly parallel to the line of constant K,
-# they correspond to larger errors in beta.
+# Relative distance from an end of a stable interval of beta within which walls must change from stable to unstable. It
+# is much larger than the rounding errors of the test, which are errors in alpha: they correspond to larger errors in
+# beta where the boundary is nearly parallel to the line of constant K.
 END_TOLERANCE = 1e-7
 
 
 def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     """Return the stable intervals of beta on a line of constant K, ascending, as an array of shape (intervals, 2)."""
-    # Compute the intersections of the line with the boundary. All of them are found, because the nodes include the
-    # extrema of alpha along the curve, so alpha is monotone between nodes. Between two intersections, all walls have
-    # the label of the middle one. If labels next to an end contradict this, compute the end by bisection of labels.
+    # Compute the intersections of the line with the boundary. All of them are found, because alpha is monotone between
+    # the nodes, which include its extrema along the curve. Between two intersections, the walls are all stable or all
+    # unstable; test the middle one. If walls next to an end contradict this, bisect for the end with the stability
+    # test.
     on_lines = np.array([(line.q - alpha) / line.f for line in boundary.lines if line.f != 0.0])
     w, node_alpha = boundary.alpha_nodes
     above = node_alpha - alpha
@@ -173,7 +175,7 @@ def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
         return np.zeros((0, 2))
 
     def label(beta: np.ndarray) -> np.ndarray:
-        """Return the labels of the walls with this alpha and the given beta: True if stable."""
+        """Return a mask of the stable walls among those with the given betas and this alpha."""
         return label_walls(boundary, np.full(beta.size, alpha), beta)
 
     reach = np.ptp(crossed) + np.abs(crossed).max() + 1.0
@@ -186,7 +188,7 @@ def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     # Do not refine an end at the lossless damping, because this damping is exact.
     wrong &= crossed[k] != boundary.lossless
     k, low, high = k[wrong], middle[:-1][k[wrong]], middle[1:][k[wrong]]
-    # Bisect twice, because the first bracket may be so wide that its resolution is too coarse for an end near 0.
+    # Bisect twice, because in a very wide first bracket the last bisection step is too coarse for an end near 0.
     for _ in range(2 if k.size else 0):
         crossed[k] = bisect(lambda beta: label(beta) == stable[k], low, high)
         low, high = crossed[k] - 1e-12 * (high - low), crossed[k] + 1e-12 * (high - low)
@@ -194,8 +196,8 @@ def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     return np.stack([ends[:-1][stable], ends[1:][stable]], -1)
 
 
-# An interval that starts below this fraction of its upper end counts as starting at K = 0. Rounding errors of the
-# coefficients of a sampled device may move its pole at z = 1 outside the circle, so the softest walls are unstable;
+# An interval counts as starting at K = 0 if its lower end is below this fraction of its upper end. Rounding errors of
+# the coefficients of a sampled device may move its pole at z = 1 outside the circle, so the softest walls are unstable;
 # starts of up to 3e-8 were observed for devices of 12th order.
 CONNECTED_START = 1e-6
 

@@ -19,7 +19,8 @@ from zwidth.core.errors import InputError
 from zwidth.model.exact_polynomials import DIGITS, EXPONENT, Complex, Polynomial, iterate_roots, magnitude
 from zwidth.model.linear_device import LinearDevice
 
-# Largest relative difference between the results of two precisions that agree: a tenth of the resolution of float64.
+# Largest relative difference between the results of two precisions that counts as agreement: a tenth of the resolution
+# of float64.
 PRECISION_TOLERANCE = 1e-17
 # With n decimal digits, leading coefficients below 10^(-2n/NEGLIGIBLE_DIGITS) of the largest are rounding errors of 0.
 NEGLIGIBLE_DIGITS = 3
@@ -64,7 +65,7 @@ def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> 
 
 
 def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits: int) -> Any:
-    """Return leading coefficient and zeros with ``digits`` digits; None if all coefficients are 0 by rounding."""
+    """Return leading coefficient and zeros, computed with ``digits`` digits; None if all coefficients round to 0."""
     denominator, numerator = (_as_decimals(part) for part in (device.system.denominator, device.system.numerator))
     rest = 1 - Decimal(fraction)
     transition, full, output = _discretize(denominator, numerator, Decimal(period))
@@ -88,7 +89,7 @@ def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits:
         (-1) ** power * sum(response[order - k] * comb(k, power) for k in range(power, order + 1))
         for power in range(order, -1, -1)
     ]
-    # Set the zero to exactly z = 1 if the system has a zero at s = 0, that is, no static response to a constant force.
+    # Set one zero to exactly z = 1 if the system has a zero at s = 0, i.e. no static response to a constant force.
     has_zero_at_one = device.system.numerator[-1] == 0
     if has_zero_at_one:
         shifted = shifted[:-1]

@@ -32,12 +32,12 @@ from zwidth.stability.linear.discretization import discretize_chain, evaluate_co
 from zwidth.stability.linear.ridge import Condition, list_ridge_parameters
 from zwidth.stability.results import RidgePoint
 
-# Finite values for batch entries without a ridge: alpha, beta, w1, w2, both conditions and the kind of ridge.
+# Finite placeholders for batch entries without a ridge: alpha, beta, w1, w2, codes of both conditions, kind of ridge.
 PLACEHOLDER = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.NONE))
 
 
 class Structure(NamedTuple):
-    """The static part of a scene with traced parameters, for each of which one program is compiled."""
+    """The static part of a scene with traced parameters; one program is compiled per structure."""
 
     template: Any  # the scene, with placeholders for the traced parameters
     paths: tuple[str, ...]  # of the traced parameters
@@ -106,7 +106,7 @@ def compute_ridge(structure: Structure, *values: Array) -> RidgePoint:
 
 
 def _search_on_host(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> np.ndarray:
-    """Compute the ridge in NumPy; return the quantities listed at `PLACEHOLDER` and the status, as bits."""
+    """Compute the ridge in NumPy; return alpha, beta, w1, w2, both conditions, the kind and the status, as bits."""
     values = np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()
     try:
         ridge, status = _fill_template(structure, values).loop.ridge(structure.negative)
@@ -150,8 +150,8 @@ def _solve_conditions(
     begin = start / scales
     args = (jax.tree.map(jnp.asarray, discretize_chain(chain)), traced, start, conditions, scales)
     end = polish_root(partial(_residual, chain), begin, args, exists)
-    # Report if the solution is close to the start, because Newton's method may converge to a different solution. Half
-    # of the digits must agree, because a double root is not more accurate.
+    # Return whether the solution is close to the start, because Newton's method may converge to a different solution.
+    # Only half of the digits must agree, because a double root is not more accurate.
     close = jnp.all(jnp.abs(end - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
     return *(end * scales), close
 
@@ -180,7 +180,7 @@ def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
         stationary = (jnp.conj(f) * slope).imag
         size = jax.lax.stop_gradient(jnp.abs(f) * jnp.abs(slope))
         stationary = stationary / jnp.where(size > 0, size, 1.0)
-        # For a real pole at z = -1 use Im dr/dw itself, because F is real there and may be 0.
+        # For a real pole at z = -1 use Im dr/dw itself and do not divide by F, because F may be 0 there.
         return r, jnp.where(conditions[0] == Condition.PAIR, stationary, slope.imag)
 
     # Evaluate both angles in one vmap, so that the function is compiled only once.

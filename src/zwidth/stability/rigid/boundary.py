@@ -25,7 +25,7 @@ from zwidth.core.types import Array, ArrayLike, Vertices
 from zwidth.core.xp import materialize, namespace, nan_with_nan_derivatives, stop_gradient, tree_map
 from zwidth.model.checks import check_integer
 from zwidth.numerics.evaluate import as_number, check_scalars, evaluate
-from zwidth.numerics.held_mass import DelayClasses, classify_delays, is_valid_device
+from zwidth.numerics.held_mass import DelayClasses, classify_delays, discretize_mass, is_valid_device, split_delay
 from zwidth.numerics.root_finding import attach_root_derivatives, integrate
 from zwidth.stability.rigid.curve import (
     build_lobe,
@@ -37,11 +37,17 @@ from zwidth.stability.rigid.curve import (
     find_row_end,
 )
 from zwidth.stability.rigid.normalization import wall_status
-from zwidth.stability.rigid.polynomial import Wall, build_frequency_loop, find_boundary_wall
-from zwidth.stability.rigid.ridge import ridge_kernel
+from zwidth.stability.rigid.ridge_newton import evaluate_wall, evaluate_wave_at, expand_curve
 from zwidth.units.display import compact_repr
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
+
+
+class Wall(NamedTuple):
+    """The normalized stiffness and damping of a wall, or arrays of them."""
+
+    alpha: Array
+    beta: Array
 
 
 def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Wall:
@@ -83,8 +89,9 @@ def _boundary_kernel(omega: Array, delta: Array, d: Array) -> Wall:
     ok = is_valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
     nan_if_invalid = nan_with_nan_derivatives(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
-    curve = find_boundary_wall(omega, build_frequency_loop(delta, d))
-    return Wall(curve.alpha + nan_if_invalid, curve.beta + nan_if_invalid)
+    n, fraction = split_delay(d)
+    wall = evaluate_wall(evaluate_wave_at(omega, n), expand_curve(discretize_mass(delta, fraction)))
+    return Wall(*(value + nan_if_invalid for value in wall))
 
 
 @compact_repr()
@@ -152,15 +159,15 @@ def boundary_point(
     line = side if beta is None else "row"
     arguments = {"delta": delta, "d": d, name: value}
     if method == "optimistix":
-        # Import only if requested, because importing the solvers takes a second.
+        # Import the solvers only if this method is requested, because the import takes a second.
         from zwidth.stability.rigid.exact_points import point_kernel
 
-        return BoundaryPoint(*evaluate(point_kernel, arguments, line, ridge_kernel, route="jax"))
+        return BoundaryPoint(*evaluate(point_kernel, arguments, line, route="jax"))
     return evaluate(_point_kernel, arguments, line, classify_delays(d))
 
 
 def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -> BoundaryPoint:
-    """Return the boundary point at a given beta or alpha.
+    """Return the point of the stability boundary at a given beta (a line of constant beta) or at a given alpha.
 
     Args:
         delta: Normalized physical damping.
@@ -181,7 +188,8 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
             lambda x, curve, b: evaluate_lobe(x, curve).b - b, x, lambda *_: True, curve, number + delta
         )
         point = evaluate_lobe(x, curve)
-        # Return the limit of alpha that `zwidth.is_stable` uses, but let its derivatives be those of the lobe's point.
+        # Return exactly the limit of alpha that `zwidth.is_stable` compares with, but take the derivatives from the
+        # point of the lobe, because the limit has been computed without derivatives.
         alpha = (
             limit.alpha if xp is np else stop_gradient(limit.alpha, xp) + (point.alpha - stop_gradient(point.alpha, xp))
         )
@@ -196,24 +204,26 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
             lambda x, curve, alpha: evaluate_lobe(x, curve).alpha - alpha, x, lambda *_: True, curve, number
         )
         point = evaluate_lobe(x, curve)
-        # Take no further Newton step, because near the ridge the step would be a quotient of rounding errors.
+        # Do not refine x by a further Newton step, because near the ridge the step would be a quotient of rounding
+        # errors.
         alpha, beta = number, point.b - delta
     omega = compute_frequency(x, curve)
     if curve.short_curve is not None and line != "lower":
-        # On the line of walls with a pole at z = -1, alpha + 2 beta is constant.
+        # If the point is not on the lobe, it is on the line of walls with a pole at z = -1, where alpha + 2 beta is
+        # constant.
         line_value = compute_corner_line(curve) - (2.0 * number if is_row else number)
         alpha = xp.where(on_lobe, alpha, line_value) if is_row else alpha
         beta = beta if is_row else xp.where(on_lobe, beta, 0.5 * line_value)
         omega = xp.where(on_lobe, omega, np.pi)
     status = xp.where(exists, int(Status.OK), int(Status.NO_BOUNDARY))
     status = xp.where(input_status == int(Status.OK), status, input_status)
-    # Values and derivatives are NaN if the point does not exist.
+    # Make values and derivatives NaN if the point does not exist.
     nan_if_missing = nan_with_nan_derivatives(status == int(Status.OK), delta, d, number)
     return BoundaryPoint(alpha + nan_if_missing, beta + nan_if_missing, omega + nan_if_missing, status.astype(np.int32))
 
 
 class Piece(IntEnum):
-    """The pole that is on the unit circle along one part of the outline."""
+    """Code of the pole that is on the unit circle along one part of the outline of the stable set."""
 
     COMPLEX_PAIR = 0
     MINUS_ONE = 1
@@ -222,7 +232,7 @@ class Piece(IntEnum):
 
 @compact_repr()
 class StableRegion(NamedTuple):
-    """Closed outline of the stable set: vertex k lies on ``piece[k]``, and alpha = 0 joins the last to the first."""
+    """Closed outline of the stable set: vertex k lies on the part ``piece[k]``, and the line alpha = 0 closes it."""
 
     alpha: Vertices
     beta: Vertices
@@ -253,7 +263,7 @@ def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices,
         if first < last
         else last * half_grid
     )
-    # Limit omega to the end of the lobe, because the rounding error of the last product may exceed it.
+    # Limit omega to the end of the lobe, because the last product may exceed it by a rounding error.
     omega = np.minimum(omega, last)
     wall = boundary(omega, delta, d)
     return omega, np.asarray(wall.alpha), np.asarray(wall.beta)
@@ -285,7 +295,7 @@ def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     omega, alpha, beta = sample_lobe(delta, d, points=points)
     piece = np.full(omega.shape, Piece.COMPLEX_PAIR)
     if omega[-1] == np.pi and alpha[-1] > 0:
-        # Add the straight part from the corner along alpha + 2 beta = const to alpha = 0.
+        # Add the straight part of the outline, from the corner along alpha + 2 beta = const to alpha = 0.
         omega, piece = np.append(omega, np.pi), np.append(piece, Piece.MINUS_ONE)
         beta = np.append(beta, beta[-1] + 0.5 * alpha[-1])
         alpha = np.append(alpha, 0.0)
@@ -326,16 +336,17 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
 
 
 def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
-    """Compute the area of the stable set, elementwise: the integral of alpha d(b) along the lobe, plus a triangle."""
+    """Compute the area of the stable set: the integral of alpha db along the lobe and, beyond a corner, a triangle."""
     xp = namespace(delta, d)
     curve = build_lobe(delta, d, kind)
     end = stop_gradient(curve.end, xp)
-    # If the lobe ends in the corner, the outline continues to alpha = 0 along alpha + 2 beta = const.
+    # If the lobe ends in the corner, add the triangle below the line alpha + 2 beta = const, on which the outline
+    # continues to alpha = 0.
     point = evaluate_lobe(end, curve)
     corner_alpha = xp.where(curve.to_corner, point.alpha, 0.0)
     if xp is not np:
-        # Without a corner, alpha is 0 at the end of the lobe. Add one Newton step, because second derivatives of the
-        # area need the derivative of this end.
+        # Without a corner, alpha is 0 at the end of the lobe. Add one Newton step for this end, because second
+        # derivatives of the area depend on the derivative of the end.
         end = end - xp.where(
             curve.to_corner, 0.0, point.alpha / stop_gradient(xp.where(curve.to_corner, 1.0, point.d_alpha), xp)
         )

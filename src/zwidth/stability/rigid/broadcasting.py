@@ -31,25 +31,14 @@ from zwidth.numerics.evaluate import (
     join_shapes,
     to_caller,
 )
+from zwidth.stability.reference import Degree
 from zwidth.units.quantities import LONGEST_DELAY
 
 NAMES: tuple[str, ...] = ("alpha", "beta", "delta", "d")
 
 
-class Degree(NamedTuple):
-    """The integer part of a delay, and whether it has a fractional part; both determine the degree of P."""
-
-    n: int  # integer part of the delay
-    fractional: bool  # the delay has a fractional part
-
-    @property
-    def poles(self) -> int:
-        """Degree of P: 3 + d for integer d, 4 + n otherwise."""
-        return self.n + (4 if self.fractional else 3)
-
-
 def find_degree(d: float) -> Degree:
-    """Return the `Degree` for one delay (a plain number); for an invalid delay, that for d = 0."""
+    """Return the properties of one delay that determine the degree of P; for an invalid delay, those of d = 0."""
     if not (np.isfinite(d) and d >= 0):
         return Degree(0, False)
     n = int(np.floor(d))
@@ -89,7 +78,7 @@ def map_by_degree(
         delays = arrays[-1]
     shape = np.shape(arrays[0])
     columns: list[Any] = [xp.reshape(array, -1) for array in arrays]
-    # Treat delays out of range as 0, because they must not determine the length of the result.
+    # Replace delays out of range by 0, so that they do not affect the length of the result.
     defined = np.broadcast_to(np.where((delays >= 0) & (delays <= LONGEST_DELAY), delays, 0.0), shape).reshape(-1)
     vectors, indices = [], []
     for delay, group, index in group_by_value(tuple(columns), 0.5 * (np.floor(defined) + np.ceil(defined))):
@@ -98,7 +87,8 @@ def map_by_degree(
             with np.errstate(all="ignore"):
                 vectors.append(kernel(*group, degree, *static))
         else:
-            # Computing cost per point: an eighth of the number of poles, rounded down to a power of two, at least 1.
+            # Estimate the cost per point as an eighth of the number of poles, rounded down to a power of two, but at
+            # least 1.
             weight = 1 << max(0, degree.poles.bit_length() - 4)
             vectors.append(evaluate_columns(kernel, group, degree, *static, weight=weight))
         indices.append(np.arange(columns[0].size)[index])
@@ -115,7 +105,7 @@ def _pad_vectors(part: Any, longest: int, lead: bool, xp: Any) -> Any:
     missing = longest - part.shape[1]
     if not lead:
         return xp.pad(part, ((0, 0), (0, missing)), constant_values=xp.nan)
-    # Insert leading zeros before the coefficients of a valid polynomial, and NaN if the point is invalid.
+    # Insert zeros before the coefficients of a polynomial; if the point is invalid, insert NaN.
     front = xp.where(xp.isnan(part[:, :1]), xp.nan, 0.0)
     return xp.concatenate([xp.repeat(front, missing, axis=1), part], axis=1)
 
@@ -128,8 +118,8 @@ def count_uncompiled_points(degree: Degree) -> int:
 # Smallest size of an argument whose values are compared to detect repetition; for fewer values a comparison takes
 # longer than folding saves.
 MIN_COMPARED_SIZE = 2048
-# Smallest grid that is compiled in its own shape. Smaller grids are flattened into columns and padded to common sizes,
-# so that they share one compiled program.
+# Smallest number of points of a grid for which a program is compiled in the shape of the grid. Smaller grids are
+# flattened into columns and padded to common sizes, so that they share one program.
 MIN_DENSE_SIZE = 1 << 16
 
 
@@ -163,7 +153,7 @@ class Points(NamedTuple):
 
 
 def fold_arguments(values: tuple[Any, Any, Any, Any]) -> tuple[Points, tuple[int, ...]]:
-    """Check plain (untraced) arguments and fold them; return the points and the shape to which they broadcast."""
+    """Check and fold arguments that JAX does not trace; return the points and the shape to which they broadcast."""
     arrays = [as_float64(name, value) for name, value in zip(NAMES, values, strict=True)]
     shape = join_shapes(zip(NAMES, (array.shape for array in arrays), strict=True))
     aligned = [array.reshape((1,) * (len(shape) - array.ndim) + array.shape) for array in arrays]
@@ -177,7 +167,7 @@ def restore_shape(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def fold(array: np.ndarray) -> np.ndarray:
     """Return the array with every axis along which its values are constant reduced to length 1."""
-    # Decide by the size before folding whether values are compared, because folding one axis reduces the size.
+    # Decide before folding whether values are compared, because folding an axis reduces the size of the array.
     compare = array.size >= MIN_COMPARED_SIZE
     for axis in range(array.ndim):
         if array.shape[axis] > 1 and _is_constant(array, axis, compare):
@@ -186,7 +176,7 @@ def fold(array: np.ndarray) -> np.ndarray:
 
 
 def _is_constant(array: np.ndarray, axis: int, compare: bool) -> bool:
-    """Return whether the values are constant along an axis: by the stride and, if ``compare``, by comparing values."""
+    """Return whether values are constant along an axis, as shown by a stride of 0 or, if ``compare``, by the values."""
     if array.strides[axis] == 0:
         return True
     if not compare:
@@ -208,9 +198,11 @@ def group_by_value(
     Yields:
         The value; the arguments of its points; and the index of these points in the broadcast shape.
     """
-    # If the key varies along one axis only, each group keeps its layout; otherwise its points are flattened.
+    # If the key varies along one axis only, slice the arguments along this axis; otherwise flatten the points of a
+    # group.
     key = fold(key)
-    # Handle a single value separately, because it is the most frequent case; without any point, yield the value 0.
+    # Handle a key with a single value separately, because this case is the most frequent one. If there are no points,
+    # yield the value 0.
     values = np.unique(key) if key.size else np.zeros(1)
     varying = [axis for axis, length in enumerate(key.shape) if length > 1]
     if values.size == 1:

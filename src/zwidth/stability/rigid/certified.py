@@ -49,12 +49,12 @@ if TYPE_CHECKING:
     import flint
 
 # Error bounds, relative to the size of a number. Steps C1 to C6 of docs/theory/certified.md derive them.
-TOLERANCE = 2.0**-35  # largest error of a number that depends on the gain crossover u
+TOLERANCE = 2.0**-35  # largest error of a number that is computed from u
 CROSSOVER_WIDTH = 2.0**-39  # largest relative error of the gain crossover u = 1 - cos omega
 CUBIC_TOLERANCE = 2.0**-45  # largest error of the cubic H whose zero is u
 TINY = 2.0**-960  # added to each size; TOLERANCE * TINY exceeds what XLA flushes to zero
 
-# Codes of walls returned by `compute_wall_codes`.
+# Codes of walls, the results of the test with the static error bound.
 UNSTABLE = 0
 STABLE = 1
 OPEN = 2  # the error bound permits both verdicts
@@ -79,7 +79,7 @@ class Sized:
     def __add__(self, other: Any) -> Sized:
         other = other if isinstance(other, Sized) else Sized(other)
         value = self.value + other.value
-        # A sum of two exact numbers has no error but its own rounding error.
+        # If both terms are exact, the size is that of the sum, because its rounding error is the only error.
         return Sized(value, abs(value) + TINY if self.exact and other.exact else self.size + other.size)
 
     __radd__ = __add__
@@ -107,7 +107,7 @@ class Sized:
     def sqrt(self) -> Sized:
         """Return the square root, with NaN if ``value`` is negative."""
         root = square_roots(self.value)[0]
-        # The size follows from |sqrt x - sqrt v| = |x - v|/(sqrt x + sqrt v), with v the value and x the exact number.
+        # With the value v and the exact number x, the size follows from |sqrt x - sqrt v| = |x - v|/(sqrt x + sqrt v).
         return Sized(root, self.size / root)
 
     def __gt__(self, other: Any) -> Array:
@@ -127,9 +127,9 @@ def compute_wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: 
     if kind.long:
         verdicts.append(decide_long_delay(*wall, plant.whole, plant, enclose_root, size_phase))
     stable, unstable = (xp.where(plant.whole < 1, *pair) for pair in zip(verdicts[0], verdicts[-1], strict=True))
-    # At alpha = 0 the verdict applies to the poles other than z = 1 and requires beta > delta (docs/theory, S15b). For
-    # alpha > 0 the stable set lies above beta = -delta (L16). If alpha < 0, a real pole is above 1, because
-    # P(1) = phi1 alpha < 0.
+    # For alpha = 0 the verdict applies to the poles other than z = 1 and requires beta > delta (S15b of
+    # one-crossover.md). For alpha > 0 no wall with beta <= -delta is stable (L16 of one-lobe.md). For alpha < 0 all
+    # walls are unstable: P(1) = phi1 alpha < 0, so a real pole is above 1.
     b, edge = wall[1] + plant.delta, alpha == 0
     valid = (edge & (beta > delta)) | ((alpha > 0) & (b > 0))
     code = xp.where(stable & valid, xp.where(edge, EDGE, STABLE), OPEN)
@@ -145,7 +145,7 @@ def size_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
     sized = DiscretePlant(*(Sized(value, abs(value) + TINY) for value in plant))
     sized = sized._replace(delta=Sized(plant.delta), f=Sized(plant.f), whole=plant.whole, a0=None)
     if kind.fractional:
-        # Increase the size of a0, because the rounding error of f changes a0 by up to 2^-52 a1.
+        # Increase the size of a0 by a part of a1, because the rounding error of f changes a0 by up to 2^-52 a1.
         a0 = Sized(plant.a0, plant.a0 + plant.a1 / 16.0 + TINY)
         return sized._replace(a0=a0, gap=sized.a2 - sized.a1 + a0)
     return sized
@@ -162,7 +162,7 @@ def enclose_root(coefficients: tuple[Sized, ...]) -> tuple[Sized, Array]:
 def size_phase(u: Sized, n: Array) -> DelayPhase:
     """Return the phase lag (n + 1/2) w at the gain crossover u = 1 - cos w, with the sizes of its sine and cosine."""
     phase = evaluate_phase(u.value, n)
-    # Half the phase lag, h, is at most pi/2, so h <= pi/2 sin h bounds the error of the sine.
+    # The error of the sine is proportional to half the phase lag, h. Because h <= pi/2, h is at most (pi/2) sin h.
     cosine, sine = Sized(phase.cosine, 1.0), Sized(phase.sine, 4.0 * square_roots(phase.half_sine_squared)[0] + TINY)
     return DelayPhase(
         cosine, sine, Sized(phase.half_sine_squared, 5.0 * phase.half_sine_squared + TINY), phase.within, phase.beyond
@@ -182,7 +182,7 @@ def certify_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
 
 
 def filter_walls(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return the code of each wall (`compute_wall_codes`); OPEN if it is out of range."""
+    """Return UNSTABLE, STABLE, OPEN or EDGE for each wall; OPEN if it is out of range."""
     # Replace negative delta and d by NaN in NumPy, because XLA treats numbers below 2^-1022 as 0.
     device = (np.where(value < 0, np.nan, value) for value in (delta, d))
     return evaluate_columns(compute_wall_codes, [*nan_beyond(WALL_RANGE, alpha, beta), *device], classify_delays(d))
@@ -191,7 +191,7 @@ def filter_walls(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.n
 def _decide_rest(
     code: np.ndarray, alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return labels and statuses of the walls that are at alpha = 0, out of range, or left open by `filter_walls`."""
+    """Return labels and statuses of the walls that the static bound does not decide (OPEN, EDGE or out of range)."""
     code, alpha, beta, delta, d = np.broadcast_arrays(code, alpha, beta, delta, d)
     status = wall_status(alpha, beta, delta, d)
     in_range, stable = status == Status.OK, np.zeros(code.shape, bool)
@@ -199,7 +199,9 @@ def _decide_rest(
     # |beta N| <= |beta| phi1 <= 1 - c <= |z - c| on the circle.
     edge = (alpha == 0) & ((code == EDGE) | (np.abs(beta) <= delta))
     status[in_range & edge] = Status.ON_BOUNDARY
-    # Walls with beta <= -delta are unstable, because P(1) = 0 and P'(1) = phi1 (delta + beta) < 0, or by L16.
+    # Do not test walls with beta <= -delta: they are not stable. For alpha = 0, P(1) = 0 and P'(1) = phi1 (delta +
+    # beta) <= 0, so a further pole is at or above z = 1; for alpha > 0, the stable set lies above beta = -delta (L16 of
+    # one-lobe.md).
     open_walls = np.flatnonzero(in_range & ~edge & (beta > -delta))
     status[open_walls] = Status.UNDECIDED
     if open_walls.size and available():
@@ -236,7 +238,7 @@ def device(delta: float, d: float, bits: int) -> DiscretePlant:
     """Return the discretized device of exact delta and d in balls, cached because all walls of a grid share it."""
     import flint
 
-    # Use 64 more bits, because the phi-functions amplify the rounding error of delta (1 - f).
+    # Use 64 additional bits, because the phi-functions amplify the rounding error of their argument delta (1 - f).
     with flint.ctx.workprec(bits + 64):
         x, f = flint.arb(delta), flint.arb(d - int(d))
         phis_delta, phis_late, plant = _phi(x), _phi(x * (1 - f)), discretize_mass(x, f if f != 0 else None, _phi)
@@ -246,7 +248,7 @@ def device(delta: float, d: float, bits: int) -> DiscretePlant:
 
 
 def _phi(x: flint.arb) -> PhiFunctions:
-    """Return the phi-functions of x >= 0, with more precision for small x, where their quotients cancel."""
+    """Return the phi-functions of x >= 0 in balls, with additional bits for small x, where their quotients cancel."""
     import flint
 
     if x == 0:

@@ -1,6 +1,6 @@
 """Evaluate the characteristic polynomial P and its derivatives at a point, and take Newton or Halley steps to a pole.
 
-The polynomial is evaluated in factored form (`loops.rigid.circle.LoopFactors`),
+The polynomial is evaluated in factored form (`stability.rigid.pole_count.LoopFactors`),
 
     P = z^p A + D      p = 1 + n      A = (z - 1)(z - c)      D = (a2 z + h)(s z - beta)
 
@@ -61,8 +61,8 @@ class Pair:
 
 def make_complex(re: Array, im: Array) -> Array:
     """Return the complex array re + j im."""
-    # Under JAX, XLA computes one complex array in a single loop, but two real arrays in two loops, which repeat the
-    # operations that they share.
+    # For JAX, create one complex array, which XLA computes in a single loop. It would compute two real arrays in two
+    # loops that both repeat the shared operations.
     if namespace(re) is not np:
         from jax.lax import complex as make_complex
 
@@ -84,15 +84,16 @@ class PolynomialValue(NamedTuple):
 def _sine_and_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
     """Return sine and cosine for |x| <= pi/2."""
     if xp is np:
-        # Convert single numbers to plain floats, because arithmetic with NumPy scalars is slower.
+        # Convert single results to plain floats, because arithmetic with NumPy scalars is slower.
         return (float(np.sin(x)), float(np.cos(x))) if type(x) is float else (np.sin(x), np.cos(x))
     square = x * x
     return x * horner(square, SINE), horner(square, COSINE)
 
 
 def _store_pair(value: Any, witness: Array) -> Any:
-    """Return a pair that XLA computes only once, although several of its loops use the pair."""
-    # Otherwise five loops would each repeat the series of this pair; computing it once saves 30 % of a step's time.
+    """Return the pair unchanged, but make XLA compute it only once, although several loops use it."""
+    # Without this, each of five loops would repeat the power series of the pair, and a step would take 1.4 times as
+    # long.
     return Pair(*materialize((value.real, value.imag), witness))
 
 
@@ -109,7 +110,8 @@ def evaluate_polynomial(re: Array, im: Array, loop: LoopFactors, fractional: boo
     sine, cosine = _sine_and_cosine(0.5 * im, xp)
     z_minus_1 = number(expm1_re - 2.0 * r * sine * sine, 2.0 * r * sine * cosine)
     log_power = power * re
-    # Select by the sign and do not use abs(), because its derivative at 0 belongs to neither of the two scales below.
+    # Compute -|log_power| by the sign and not by abs(), because the derivative of abs() at 0 would be that of neither
+    # of the two scales below.
     smaller = xp.exp(xp.where(log_power < 0, log_power, -log_power))
     device_scale, wall_scale = xp.where(log_power < 0, smaller, 1.0), xp.where(log_power < 0, 1.0, smaller)
     phase = power * im
@@ -142,7 +144,8 @@ def evaluate_polynomial(re: Array, im: Array, loop: LoopFactors, fractional: boo
         + FACTOR_ROUNDING * wall_size
     )
     values = delay * device + d, t1 + d1, t2 + d2
-    # Convert to NumPy's type, because Python's complex numbers raise an error on division by zero.
+    # Convert single results to NumPy's complex type, because Python's complex numbers raise an error on division by
+    # zero.
     return PolynomialValue(
         *(map(np.complex128, values) if number is complex else values), rounding=epsilon(re) * rounding
     )
@@ -163,7 +166,7 @@ def newton_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> Ne
     value = evaluate_polynomial(re, im, loop, fractional)
     norm = abs2(value.first)
     step = value.p * value.first.conjugate() * (-1.0 / norm)
-    # A polynomial of degree N has a zero within N |P/P'| of every point.
+    # Compute the radius from the theorem that a polynomial of degree N has a zero within N |P/P'| of every point.
     degree, slope = loop.n_plus_1 + (3.0 if fractional else 2.0), xp.sqrt(norm)
     rounding_error = value.rounding / slope
     # Estimate the error after the step from the second derivative; near a double pole the error is half the step.

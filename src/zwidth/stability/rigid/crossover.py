@@ -64,7 +64,7 @@ NEWTON_STEPS = 4
 
 
 class Verdict(NamedTuple):
-    """Definite results of a stability test; both fields are false if the test is inconclusive."""
+    """Result of a stability test: ``stable`` and ``unstable`` are true only if certain, so both may be false."""
 
     stable: Any
     unstable: Any
@@ -132,7 +132,7 @@ def expand_long_delay_curve(plant: Any) -> LongDelayCurve:
     E = em * p1, (p1 + total * em - difference * 2.0) * -2.0, a0 * 8.0
     H = p1 * (p1 + plant.f * em), a0 * -4.0
     V = p1 * p1, (a1 * total + product) * -4.0, product * 4.0
-    # The constant terms of delta V - E cancel exactly, because em = delta phi1. Divide the other terms by y.
+    # Expand (delta V - E)/y: the constant terms of delta V - E cancel exactly, because em = delta phi1.
     excess0 = p1 * 2.0 - difference * 4.0 + plant.delta * (total * (total - a1) - product * 2.0) * 2.0
     excess1 = a0 * (1.0 - plant.delta * a2 * 2.0) * -8.0
     return LongDelayCurve(E, H, V, (excess0, excess1))
@@ -160,8 +160,8 @@ def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]
 
 def decide_short_delay(alpha: Any, beta: Any, plant: Any) -> Verdict:
     """Decide stability for d < 1, alpha > 0 and beta > -delta, by comparing alpha with the boundary at this beta."""
-    # |L(-1)| < 1 is necessary: otherwise there is no gain crossover. On lines of constant beta that miss the lobe, this
-    # condition alone limits alpha.
+    # Require |L(-1)| < 1, because otherwise there is no gain crossover. On lines of constant beta that miss the lobe,
+    # this condition alone limits alpha.
     wall_at_nyquist, device_at_nyquist = plant.gap * (alpha + beta * 2.0), (plant.c + 1.0) * 2.0
     crosses = (wall_at_nyquist < device_at_nyquist) & (wall_at_nyquist > -device_at_nyquist)
     crosses_nowhere = (wall_at_nyquist > device_at_nyquist) | (wall_at_nyquist < -device_at_nyquist)
@@ -269,7 +269,7 @@ def find_first_root(coefficients: tuple[Array, ...]) -> Array:
     # Start from the quadratic in which the cubic term h3 u^3 is replaced by (h3/2) u^2.
     negative_h2 = -(h2 + 0.5 * rest[0]) if rest else -h2
     discriminant_root = xp.sqrt(xp.maximum(h1 * h1 + 4.0 * negative_h2 * h0, 0.0))
-    # Choose the form of the quadratic formula that adds two terms of the same sign.
+    # Choose the form of the quadratic formula that adds terms of equal sign, to avoid cancellation.
     falling = h1 < 0
     root = xp.where(falling, 2.0 * h0, h1 + discriminant_root) / xp.where(
         falling, discriminant_root - h1, 2.0 * negative_h2
@@ -363,8 +363,8 @@ def decide_in_floats(alpha: Array, beta: Array, plant: DiscretePlant, kind: Dela
         plant = integer_plant
     short = decide_short_delay(alpha, beta, plant).stable if kind.short else None
     if short is not None and kind.fractional:
-        # For d = 0 the formula without y is more accurate next to the corner, where the lobe meets the line of poles at
-        # z = -1.
+        # For d = 0 use the formula without y, which is more accurate near the corner, where the lobe meets the line of
+        # walls with a pole at z = -1.
         short = namespace(plant.f).where(plant.f == 0, decide_short_delay(alpha, beta, integer_plant).stable, short)
     if kind.long:
         long = decide_long_delay(alpha, beta, plant.whole, plant, _find_crossover, evaluate_phase).stable

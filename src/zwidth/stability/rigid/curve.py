@@ -35,12 +35,12 @@ from zwidth.stability.rigid.stiffness_limit import (
     limit_short_delay,
 )
 
-CUBIC_STEPS = 4  # steps to the point with a given alpha for n = 0; the start is within 28 % of x
-COLUMN_STEPS = 3  # Newton steps to the point with a given alpha for n >= 1; the start is within 0.3 % of x
+CUBIC_STEPS = 4  # steps to the point with a given alpha for n = 0; the relative error of the start is at most 28 %
+COLUMN_STEPS = 3  # the same for n >= 1, Newton steps; the relative error of the start is at most 0.3 %
 
 
 class Lobe(NamedTuple):
-    """The stability lobe of one device; fields that no delay of the batch needs are None."""
+    """The stability lobe of each device; the fields for d < 1 or d >= 1 are None if no delay is in that range."""
 
     plant: DiscretePlant
     d: Array
@@ -68,7 +68,7 @@ class Peak(NamedTuple):
 
 
 def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
-    """Return the lobe of each device; ``kind`` states which classes of delays (short, long, fractional) occur."""
+    """Return the lobe of each device; ``kind`` states if delays d < 1, delays d >= 1 and fractional delays occur."""
     xp = namespace(delta, d)
     plant = materialize(discretize_plant(delta, d, kind), delta)
     is_short = plant.whole < 1
@@ -79,8 +79,8 @@ def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
         root, to_corner = _find_short_end(stop_gradient(short_curve, xp))
         ends.append(root)
     if kind.long:
-        # Compute the last five fields, the end of the lobe and starting values, without derivatives, because solvers
-        # only start from them.
+        # Compute the last five fields (end of the lobe, starting values of Newton's method) without derivatives,
+        # because the solution does not depend on its starting values.
         frozen_lobe = build_long_lobe(stop_gradient(plant, xp))
         long_lobe = frozen_lobe if xp is np else LongLobe(*expand_long_lobe(plant)[:-5], *frozen_lobe[-5:])
         ends.append(long_lobe.end)
@@ -90,7 +90,7 @@ def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
 
 
 def _find_short_end(short_curve: Any) -> tuple[Array, Array]:
-    """Return y at the zero of alpha that ends the lobe for n = 0, at most 1; and whether alpha > 0 up to y = 1."""
+    """Return, for n = 0, y at the end of the lobe (where alpha is 0, or 1), and whether alpha > 0 up to y = 1."""
     a, s, t = short_curve[2]
     xp = namespace(a)
     discriminant = s * s - 4.0 * a * t
@@ -106,7 +106,8 @@ def evaluate_lobe(x: Array, lobe: Lobe) -> LobePoint:
     if lobe.short_curve is None:
         return _evaluate_long(x, lobe.long_lobe)
     xp = namespace(x, lobe.d)
-    # Evaluate the form that is not selected at a valid x, because its NaN would spoil the derivatives of the other one.
+    # Evaluate the form that is not selected at a valid x, because a NaN in it would make the derivatives of the
+    # selected one NaN, too.
     low = _evaluate_short(xp.where(lobe.is_short, x, 0.25), lobe.short_curve)
     high = _evaluate_long(xp.where(lobe.is_short, xp.minimum(1.0, 1.0 / lobe.long_lobe.k), x), lobe.long_lobe)
     return LobePoint(
@@ -137,7 +138,7 @@ def _evaluate_long(omega: Array, long_lobe: LongLobe) -> LobePoint:
 
 
 def compute_frequency(x: Array, lobe: Lobe) -> Array:
-    """Return omega at x. At the corner its derivative is 0, because the corner remains at omega = pi."""
+    """Return omega at x, with the derivative 0 at the corner, because the corner is always at omega = pi."""
     if lobe.short_curve is None:
         return x
     xp = namespace(x)
@@ -149,21 +150,21 @@ def compute_frequency(x: Array, lobe: Lobe) -> Array:
 
 
 def compute_corner_line(lobe: Lobe) -> Array:
-    """Return ``alpha + 2 beta`` on the line of poles at z = -1; arbitrary if the lobe does not end in the corner."""
+    """Return ``alpha + 2 beta`` of the walls with a pole at z = -1; arbitrary if the lobe ends without a corner."""
     return 1.0 / namespace(lobe.d).where(lobe.to_corner, lobe.plant.minus_one_coefficient, 1.0)
 
 
 class RowLimit(NamedTuple):
-    """The largest stable alpha at one beta: on the lobe or, beyond the corner, on the line of poles at z = -1."""
+    """The largest stable alpha at one beta: on the lobe or, beyond the corner, on the line of poles at -1."""
 
     x: Array  # the nearer end of the lobe if no point of the lobe has this beta
     meets_lobe: Array  # a point of the lobe has this beta
-    beyond: Array  # the limit is on the line of poles at z = -1
+    beyond: Array  # the limit is on the line of walls with a pole at z = -1
     alpha: Array  # the value that `zwidth.is_stable` compares alpha with
 
 
 def find_row_end(beta: Array, lobe: Lobe) -> RowLimit:
-    """Return the largest stable alpha at one beta, from the only zero of ``b - beta - delta`` on the lobe."""
+    """Return the largest stable alpha at one beta, from the only point of the lobe with ``b = beta + delta``."""
     xp = namespace(beta, lobe.d)
     b = beta + lobe.plant.delta
     limits = []
@@ -184,7 +185,7 @@ def find_row_end(beta: Array, lobe: Lobe) -> RowLimit:
 
 
 def find_peak(lobe: Lobe, kind: DelayClasses) -> Peak:
-    """Return the point of largest alpha, i.e. of maximum stiffness; it may be the corner."""
+    """Return the point of the lobe with the largest alpha, i.e. of maximum stiffness; it may be the corner."""
     plant = lobe.plant
     start = guess_start(plant.delta, lobe.d, plant.f, kind)
     ridge = solve_ridge(plant, plant.whole, start, kind)
@@ -196,7 +197,7 @@ def find_peak(lobe: Lobe, kind: DelayClasses) -> Peak:
 
 
 def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
-    """Return x of the point of the lobe with a given alpha, and whether no such point exists because of the corner.
+    """Return x of the point of the lobe with a given alpha, and whether the lobe ends in the corner before this point.
 
     Args:
         alpha: Normalized stiffness, 0 < alpha < ``top.alpha``.
@@ -219,17 +220,18 @@ def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[A
 
 
 def _find_short_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
-    """Return y of the point with a given alpha before or after the peak, a zero of the cubic ``(alpha(y) - alpha) V``.
+    """Return y of the point with a given alpha before or after the peak, as a zero of a cubic, for n = 0.
 
-    The cubic is ``-c0 + c1 y + c2 y^2 + c3 y^3``. The second value is that of `find_column_end`.
+    The cubic ``(alpha(y) - alpha) V`` is ``-c0 + c1 y + c2 y^2 + c3 y^3``. The second value is that of
+    `find_column_end`.
     """
     xp = namespace(alpha, lobe.d)
     _, (v0, v1, v2), (a, s, t) = lobe.short_curve
     c0, c1, c2, c3 = alpha * v0, 4.0 * a - alpha * v1, 4.0 * s - alpha * v2, 4.0 * t
     y = 2.0 * c0 / (c1 + xp.sqrt(xp.maximum(c1 * c1 + 4.0 * c2 * c0, 0.0)))
     y = xp.minimum(y, top.x)
-    # In each step, find the zero of the quadratic that has the cubic's value and first two derivatives at y, because
-    # near the peak two zeros of the cubic are close together.
+    # In each step, solve for the zero of the quadratic with the value and first two derivatives of the cubic at y.
+    # Newton's method would converge slowly near the peak, where two zeros of the cubic are close together.
     for _ in range(CUBIC_STEPS):
         value, slope = -c0 + y * (c1 + y * (c2 + y * c3)), c1 + y * (2.0 * c2 + 3.0 * y * c3)
         curvature = 2.0 * c2 + 6.0 * y * c3
@@ -237,7 +239,8 @@ def _find_short_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> 
         y = xp.minimum(xp.maximum(y, 0.0), top.x)
     if not upper:
         return y, alpha < 0
-    # Divide the cubic by its linear factor with the first zero; the quotient is c3 y^2 + e y + k.
+    # For the zero after the peak, divide the cubic by its linear factor with the first zero and solve the quotient c3
+    # y^2 + e y + k = 0.
     k, e = c0 / y, c2 + c3 * y
     discriminant = e * e - 4.0 * c3 * k
     second = 2.0 * k / (xp.sqrt(xp.maximum(discriminant, 0.0)) - e)
@@ -262,7 +265,8 @@ def _find_long_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> A
             return xp.minimum(xp.maximum(x - xp.where(point.d_alpha < 0, step, 0.0), top.x), lobe.end)
 
         return iterate(COLUMN_STEPS, outwards, x, xp)
-    # Near omega = 0, alpha is alpha_rate omega^2 + .... The start interpolates between this parabola and the peak.
+    # Near omega = 0, alpha is approximately alpha_rate omega^2. Start from an interpolation between this parabola and
+    # the peak.
     long_lobe = lobe.long_lobe
     alpha_rate = ((long_lobe.k + 0.5) * long_lobe.E0 + long_lobe.H0) / long_lobe.V0
     start_ratio = 2.0 * top.alpha / (alpha_rate * top.x * top.x)

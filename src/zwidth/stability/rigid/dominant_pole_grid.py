@@ -44,18 +44,19 @@ from zwidth.stability.rigid.pole_count import LoopFactors, count_poles_in_cell, 
 
 # Sides of the cells of a square grid, in walls. Cells of other grids have as many walls and the grid's proportions.
 CELL_SIDES = (128, 64, 32, 16, 8)
-# Batch sizes, such that the working arrays stay in the cache.
+# Batch sizes, chosen such that the working arrays stay in the cache.
 CELLS_PER_LIST = 1 << 9
-CELLS_PER_BATCH = 1 << 7  # cells whose sums are computed at once
+CELLS_PER_BATCH = 1 << 7  # cells whose series are computed at once
 WALLS_PER_WRITE = 1 << 16
-# Number of Halley steps from each starting point.
+# Number of Halley steps from each starting point of the search for the two largest poles at the center of a cell.
 HALLEY_STEPS = 5
-# Distance relative to that between neighboring poles of a long delay. A sequence of Halley steps has converged if its
-# last step was shorter; two sequences that end closer together have found the same pole.
+# Distance in log z, relative to the distance between neighboring poles of a long delay. A sequence of Halley steps has
+# converged if its last step is shorter. Two sequences have found the same pole if their ends are closer together.
 SAME_POLE_DISTANCE = 1e-2
-# Longest axis for which powers and interpolation weights are cached, in walls.
+# Largest number of walls along an axis for which powers and interpolation weights are cached.
 MAX_CACHED = 1 << 14
-# Distances from the groups' poles to the circles on which poles are counted, relative to the poles' motion in the cell.
+# Circles on which poles are counted: distances in log |z| below the lower bound of the groups' poles, relative to the
+# distance between this bound and the poles at the center of the cell.
 COUNT_CIRCLES = (0.3, 1.5, 6.0)
 
 
@@ -86,12 +87,12 @@ class Area(NamedTuple):
 
 @cache
 def _list_chebyshev_nodes(order: int) -> np.ndarray:
-    """Return the nodes for interpolating a function of a series of this order: zeros of a Chebyshev polynomial."""
+    """Return the Chebyshev nodes for interpolating the exponential of a series of the given order."""
     return chebpts1(order + EXTRA_NODES)
 
 
 def _compute_interpolation_weights(positions: np.ndarray, order: int) -> np.ndarray:
-    """Return the weights of the values at the nodes in the value interpolated at each position: (..., nodes)."""
+    """Return the weights by which the values at the nodes are multiplied to interpolate at positions: (..., nodes)."""
     nodes = _list_chebyshev_nodes(order)
     polynomials = chebvander(nodes, nodes.size - 1).T * (2.0 / nodes.size)
     polynomials[0] *= 0.5
@@ -112,7 +113,7 @@ class _AxisPieces:
         self._tables: dict[Any, np.ndarray] = {}
 
     def table(self, function: Callable[[np.ndarray, int], np.ndarray], order: int, pieces: Any) -> np.ndarray:
-        """Return powers or interpolation weights (``function``) at the walls of some pieces: (pieces, walls, ...)."""
+        """Return ``function`` (powers or interpolation weights) at all walls of some pieces: (pieces, walls, ...)."""
         if self._positions.size > MAX_CACHED:
             return function(self._positions[pieces], order)
         if (function, order) not in self._tables:
@@ -126,7 +127,7 @@ def pad_to_16(index: np.ndarray) -> np.ndarray:
 
 
 def _bound_on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return log radii minus and plus an error, moved if needed to one side of the unit circle and away from it."""
+    """Return bounds: log radii minus and plus an error, but kept at a distance on one side of the unit circle."""
     gap = 2.0 * VERDICT_WIDTH
     return (
         np.where(re > 0, np.maximum(re - error, gap), re - error),
@@ -135,7 +136,7 @@ def _bound_on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.nda
 
 
 def _find_two_poles(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest pole reached from the starting points and the largest other pole reached: (2, cells)."""
+    """Return re and im of the two largest distinct poles that Halley's method finds in each cell: (2, cells)."""
     previous = re, im = list_starts(loop, fractional)
     distance = SAME_POLE_DISTANCE / loop.n_plus_1
     for _ in range(HALLEY_STEPS):
@@ -152,7 +153,7 @@ def _find_two_poles(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np
 
 
 class GridPoles(NamedTuple):
-    """Spectral radii (devices, betas, alphas), and decay rates if requested; NaN for open walls."""
+    """Spectral radii and, if requested, decay rates, of shape (devices, betas, alphas); NaN for open walls."""
 
     radius: np.ndarray
     rate: np.ndarray
@@ -160,7 +161,7 @@ class GridPoles(NamedTuple):
 
 
 class _ResultArrays:
-    """Result arrays of a window, extended to whole cells, and a list of the walls that need special treatment."""
+    """Result arrays of a window that is extended to whole cells, and a list of the special walls."""
 
     def __init__(self, area: Area, sides: tuple[int, int], with_rate: bool) -> None:
         # Extend the window to whole cells of the largest size.
@@ -181,16 +182,16 @@ class _ResultArrays:
         radius, rate = (values[:, rows, columns] for values in (self.radius, self.rate))
         index = np.concatenate([np.empty((3, 0), int), *self.special], axis=1) - [[0], [rows.start], [columns.start]]
         is_inside = (index[1:] >= 0).all(0) & (index[1] < radius.shape[1]) & (index[2] < radius.shape[2])
-        # Remove duplicates, because walls at which two groups were compared may occur twice.
+        # Remove duplicates, because walls for which two groups were compared may be listed twice.
         is_special = np.zeros(radius.shape, bool)
         is_special[tuple(index[:, is_inside])] = True
         return GridPoles(radius, rate, np.unravel_index(np.flatnonzero(is_special), radius.shape))
 
 
 def _list_cell_sizes(rows: int, columns: int) -> list[tuple[int, int]]:
-    """Return rows and columns of the cells, the largest size first; each is a power of 2."""
+    """Return the sizes of the cells as pairs (rows, columns), the largest first; all numbers are powers of 2."""
     log_aspect, all_sides = 0.5 * np.log2(columns / rows), []
-    # In cells larger than a tenth of the grid another pole would usually become dominant somewhere.
+    # Use no cells with a side above a tenth of the grid, because in such cells another pole usually becomes dominant.
     for side in (side for side in CELL_SIDES if side < 0.1 * max(rows, columns) or side == CELL_SIDES[-1]):
         rows_per_cell = int(2.0 ** np.clip(np.round(np.log2(side) - log_aspect), 0.0, 2.0 * np.log2(side)))
         all_sides.append((rows_per_cell, side**2 // rows_per_cell))
@@ -215,7 +216,7 @@ class _CellGrid:
         self.first = results.first // self.steps
 
     def split(self, positions: np.ndarray, sides: tuple[int, int]) -> np.ndarray:
-        """Divide cells of the given size into cells of this size, without those outside the window."""
+        """Divide cells with the given sides into cells of this size; return those that meet the window."""
         counts = np.array([1, *sides]) // self.steps[:, 0]
         offsets = np.indices(counts.tolist()).reshape(3, 1, -1)
         positions = ((positions * counts[:, None])[:, :, None] + offsets).reshape(3, -1)
@@ -223,7 +224,7 @@ class _CellGrid:
         return positions[:, ((low < stop[:, None]) & (low + self.steps[1:] > start[:, None])).all(0)]
 
     def solve_all(self, positions: np.ndarray, fractional: bool) -> np.ndarray:
-        """Apply `solve` to all cells, in lists of limited length."""
+        """Store the poles of all cells that can be certified, in batches; return the positions of the other cells."""
         lists = (positions[:, start : start + CELLS_PER_LIST] for start in range(0, positions.shape[1], CELLS_PER_LIST))
         return np.concatenate([positions[:, :0], *(self.solve(some, fractional) for some in lists)], axis=1)
 
@@ -246,7 +247,7 @@ class _CellGrid:
                     re[0, index], positions[:, index], select_cells(cells, index), fractional
                 )
         enclosed = (single.order < len(ORDERS)) | certified
-        # If another pole may become dominant in the cell, expand both as two groups; near a double pole, expand a pair.
+        # Expand two poles: as two groups if the other may become dominant; as a pair if no circle encloses one alone.
         for mask, poles in ((enclosed & ~certified, 1), (~enclosed, 2)):
             index = pad_to_16(np.flatnonzero(mask))
             if not index.size:
@@ -264,7 +265,7 @@ class _CellGrid:
         return positions[:, :count][:, ~certified[:count]]
 
     def _evaluates_logarithms(self, k: int) -> bool:
-        """Return whether a series is evaluated at each wall and not interpolated: for rates, and in small cells."""
+        """Return whether series are evaluated at each wall (for rates, in small cells) instead of interpolated."""
         return self.errors.with_rate or min(self.sides) <= _list_chebyshev_nodes(ORDERS[k]).size
 
     def _index_axes(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -276,7 +277,7 @@ class _CellGrid:
         ]
 
     def _certify(self, groups: list[Group], positions: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
-        """Store the cells whose groups provably include the dominant pole of every wall; return a mask (C4 to C6)."""
+        """Store the poles of cells whose groups provably contain all dominant poles; return a mask (C4 to C6)."""
         enclosed = np.logical_and.reduce([group.order < len(ORDERS) for group in groups])
         if len(groups) == 2:
             enclosed &= groups[0].is_disjoint(groups[1])
@@ -287,7 +288,7 @@ class _CellGrid:
         ]
         counts = [sum(group.n_poles for group in groups)] * len(circles)
         if self.errors.is_coarse:
-            # Accept other poles larger than those of the groups by the reserve, on the same side of the unit circle.
+            # Accept slightly larger other poles, too: up to the reserve, and on the same side of the unit circle.
             low = np.maximum.reduce([group.low for group in groups])
             circles.append(_bound_on_one_side(low, self.errors.reserve)[1])
             counts.append(0 * counts[0])
@@ -303,7 +304,7 @@ class _CellGrid:
         return certified
 
     def _certify_uniform(self, re: np.ndarray, positions: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
-        """Store one value for all walls of each cell in which all spectral radii agree within the accuracy (C6)."""
+        """Store one radius per cell if all its spectral radii agree within the accuracy (C6); return a mask."""
         loop, a, b = select_cells(cells, np.tile(np.arange(re.size), 2))
         circles = np.concatenate(_bound_on_one_side(re, self.errors.accuracy))
         outside, certain = (part.reshape(2, -1) for part in count_poles_in_cell(circles, loop, (a, b), fractional))
@@ -337,8 +338,8 @@ class _CellGrid:
     def _write(self, positions: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
         """Store the poles of all walls of some cells; with ``merge``, only those larger than the stored ones."""
         size, log_error = max(1, WALLS_PER_WRITE // (self.sides[0] * self.sides[1])), group.log_error[k]
-        # Interpolate the differences from the radius at the center, because the rounding error of interpolation is
-        # relative to the largest value.
+        # Interpolate the differences from the radius at the center and not the radii, because the rounding error is
+        # proportional to the largest interpolated value.
         center = np.exp(group.re)[:, None, None]
         if len(sums) == 1:
             (logarithms,) = sums
@@ -348,10 +349,10 @@ class _CellGrid:
             else:
                 powers = polyvander(_list_chebyshev_nodes(ORDERS[k]), ORDERS[k])
                 polynomials = [(np.exp(powers @ logarithms @ powers.T) - center, _compute_interpolation_weights)]
-            # Lower bound of |log radius| in each cell: the constant term minus all other terms.
+            # Bound |log radius| from below by the magnitude of the constant term minus those of all other terms.
             sizes = np.abs(logarithms)
             least_log = np.maximum(2.0 * sizes[:, 0, 0] - sizes.sum((1, 2)), 0.0)
-            # Find the cells in which some wall may be special or its error too large.
+            # Select the cells in which a wall may be special, i.e. too close to the unit circle or not accurate enough.
             is_close = (least_log < 2.0 * self.errors.uncertain_width) | (log_error > self.errors.limit(least_log))
         else:
             polynomials, is_close = [(x, polyvander) for x in sums], np.ones(log_error.size, bool)
@@ -381,7 +382,7 @@ class _CellGrid:
                 array[index] = choose(array[index], new) if merge else new
 
     def _select_larger(self, sums: list[np.ndarray], group: Group, k: int) -> list[np.ndarray]:
-        """Return radius and rate of the larger of two poles from their sums; NaN if they are not accurate enough."""
+        """Return the radius and rate of the larger of two poles from the sums over both; NaN if not accurate enough."""
         re, disk, error = (x[:, None, None] for x in (group.re, group.disk, group.error[k] + ROUNDING))
         values, discriminant = compute_larger(sums[0], sums[1], disk)
         values += re
@@ -404,7 +405,7 @@ class _CellGrid:
         axis_indices = zip(self.axes, self._index_axes(positions), strict=True)
         xi, eta = (axis.table(basis, ORDERS[k], position) for axis, position in axis_indices)
         xi = xi.transpose(0, 2, 1)
-        # Multiply along the longer side last, because that product is the larger one.
+        # Multiply along the longer side last, because the second product then expands to the full size of the cell.
         first, second = (eta @ values, xi) if self.sides[0] < self.sides[1] else (eta, values @ xi)
         return np.matmul(first, second, out=buffer[: positions.shape[1]])
 
@@ -422,9 +423,8 @@ class _CellGrid:
 
 
 def compute_grid_poles(area: Area, accuracy: float, with_rate: bool = False) -> GridPoles:
-    """Compute the dominant poles of a window of a grid; NaN if no cell certifies them with sufficient accuracy."""
-    # The result of a wall does not depend on the window, because the cells are those of the whole grid, and each is
-    # computed separately.
+    """Compute the dominant poles of a window of a grid; NaN for walls that no cell certifies accurately enough."""
+    # Compute each cell of the whole grid separately, so that the result of a wall does not depend on the window.
     sizes, errors = _list_cell_sizes(area.beta.shape[1], area.alpha.shape[1]), AllowedErrors(accuracy, with_rate)
     is_fractional = area.d != np.floor(area.d)
     results = _ResultArrays(area, sizes[0], with_rate)

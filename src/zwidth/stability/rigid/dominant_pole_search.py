@@ -50,32 +50,33 @@ STEPS_ON_LARGER = 3  # then on the larger of the two
 STEPS_AGAIN = 6  # without a certificate: on the result, and on the starting point that is farther from it
 STEPS_ON_ALL = 10  # without a certificate again: on four starting points
 
-# Distance in log z from a pole below which a sequence of steps has converged.
+# Distance in log z between a point and a pole below which a sequence of steps has converged.
 CONVERGED_RADIUS = 1e-6
-# Largest factor by which a Newton step increases the bound R of the distance to a pole. Before the step, R = N |P/P'|
-# with the degree N >= 3 of P, and the step has the length R/N.
+# Largest ratio of the distance to a pole after a Newton step to the bound R before the step. R = N |P/P'| with the
+# degree N >= 3 of P, and the step has the length R/N.
 RADIUS_AFTER_STEP = 1.4
-# Distance in log r from a pole to the circle on which poles are counted, see `certification_width`.
+# Distance in log r from a pole to the circle on which poles are counted: the larger of the following two, but at most
+# the tolerance of the radius.
 COUNT_ROUNDING = 4096.0  # rounding error of a count, in rounding units of log r
-RATE_WIDTH = 2e-11  # relative to |re|, for the accuracy of decay rates
+RATE_WIDTH = 2e-11  # relative to |re|; small enough for accurate decay rates
 
 # Bisection of the radius to full precision. The last digits matter if many poles have nearly the same modulus, because
-# the angles of the crossovers depend on them.
+# then the angles of the crossovers on the circle depend on them.
 MIN_LOG_RADIUS = -690.0  # e^-690 = 2e-300 is close to the smallest float64
 BISECTIONS = 62
 POLISHING_STEPS = 6  # Halley steps after the bisection
 NEWTON_STEPS = 3  # Newton steps after those, in `_find_in_rounds`
-BISECTIONS_PER_COUNT = 3  # in NumPy, where counting on 7 circles at once takes as long as on one, for few walls
-# Number of circles tried by the last certificate, each ten times as far from the pole as the previous one, because on a
-# close circle the rounding error of the count may be too large.
+BISECTIONS_PER_COUNT = 3  # per call in NumPy; for few walls, counting on 7 circles takes as long as on one
+# Largest number of circles on which the last certificate counts poles, each ten times as far from the pole as the
+# previous one, because on a closer circle the rounding error of the count may be too large.
 MAX_TRIALS = 6
 
-# Inside a JAX transformation, walls are divided into at most this many parts of at least this many walls.
+# Inside a JAX transformation, the walls are divided into at most MAX_PARTS parts with at least MIN_PART_SIZE walls.
 MAX_PARTS = 16
 MIN_PART_SIZE = 1 << 9
-# Angles of the third and fourth starting point, relative to the angle of the first pair.
+# Angles of the third and of the fourth starting point, relative to the angle of the first pair.
 OFF_AXIS_RATIO = 0.1  # close to the real axis, but not on it
-BETWEEN_RATIO = 0.5  # a third pole of short delays lies near there
+BETWEEN_RATIO = 0.5  # near a third pole that exists for short delays
 
 
 class DominantPoles(NamedTuple):
@@ -83,7 +84,7 @@ class DominantPoles(NamedTuple):
 
     re: Array
     im: Array
-    error: Array  # of the radius; infinite without a certificate
+    error: Array  # certified relative error of the radius; infinite without a certificate
     pole_error: Array  # bound of |re - true re|; infinite if only the radius is certified
 
     @property
@@ -93,7 +94,7 @@ class DominantPoles(NamedTuple):
 
 
 def _bound_log_radius(loop: LoopFactors) -> Array:
-    """Return the logarithm of a radius larger than the moduli of all poles, because |T| > |B| on larger circles."""
+    """Return the logarithm of a radius above the moduli of all poles: |T| > |B| on every larger circle."""
     xp = namespace(loop.alpha)
     wall_bound = (loop.a2 + loop.h) * (1.0 + loop.q) * (xp.abs(loop.alpha) + 2.0 * xp.abs(loop.beta))
     bound_root = xp.sqrt(wall_bound)
@@ -130,14 +131,14 @@ def approximate_slow_pole(loop: LoopFactors) -> tuple[Array, Array]:
 
 
 def approximate_first_pair(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
-    """Approximate the first pair: its angle follows from the delay, its radius r from |T| = |B| with r only in r^(1+n).
+    """Approximate the first pair: its angle from the delay, its radius r from |T| = |B| with r only in r^(1+n).
 
     All other factors of T and B are evaluated on the unit circle.
     """
     xp = namespace(loop.alpha)
     im = np.pi / (loop.d_plus_1 + 1.0)
-    # If beta is so negative that W is nearly a negative multiple of z - 1, arg T and arg B agree half a turn later.
-    # Therefore double the angle.
+    # If beta is so negative that W is nearly a negative multiple of z - 1, arg B changes by pi. The angle of the first
+    # pair is then about twice as large.
     im = xp.where((loop.alpha < -loop.beta * im) & (loop.n_plus_1 > 1), 2.0 * im, im)
     x = xp.sin(0.5 * im) ** 2
     device_factors = [(1.0 - zero) * (1.0 - zero) + 4.0 * zero * x for zero in (1.0, loop.c)]
@@ -189,10 +190,10 @@ def certify_pole(
         tolerance: Relative error of the radius.
         loop: Factors of P.
         fractional: Whether any delay is fractional.
-        single: Count with a single crossover, see `circle.count_poles`.
+        single: Count with a single crossover, see `pole_count.count_poles`.
     """
     xp = namespace(re, loop.alpha)
-    # Without stiffness one pole is exactly 1.
+    # Set the pole to exactly 1 if alpha = 0 and no pole is larger, because one pole is then exactly 1.
     at_one = (loop.alpha == 0) & ~(re > tolerance)
     step = newton_step(re, im, loop, fractional)
     re, im = (xp.where(at_one, 0.0, part) for part in shift_pole(re, im, step.re, step.im))
@@ -211,7 +212,8 @@ def quick_kernel(
     return certify_pole(*find_candidate(loop, fractional), tolerance, loop, fractional, fractional)
 
 
-# The following NumPy functions certify walls that `quick_kernel` does not certify; ``loop`` includes only these walls.
+# The following NumPy functions certify the walls that `quick_kernel` leaves without a certificate; ``loop`` contains
+# only these.
 
 
 def _certify_largest(
@@ -257,7 +259,7 @@ def certify_starts(_: DominantPoles, tolerance: float, loop: LoopFactors, fracti
 
 def bisect_radius(_: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
     """Find the dominant pole by bisecting the radius with counts, then by a few Halley steps."""
-    # Count on several circles at once, because for few walls this takes as long as a single count.
+    # Count on several circles at once, because for few walls this does not take longer than on one circle.
     parts = 2**BISECTIONS_PER_COUNT
 
     def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -279,7 +281,7 @@ def bisect_radius(_: DominantPoles, tolerance: float, loop: LoopFactors, fractio
         im, least_distance = np.where(distance < least_distance, angle_guess, im), np.minimum(distance, least_distance)
     point = iterate(POLISHING_STEPS, lambda point: halley_step(*point, loop, fractional), (radius, im), np)
     poles = certify_pole(*point, tolerance, loop, fractional, False)
-    # Near multiple poles the steps do not converge; keep the bisected radius.
+    # Keep the bisected radius if the steps have not converged, as is usual near multiple poles.
     return poles._replace(re=np.where(poles.certified, poles.re, radius))
 
 
@@ -299,8 +301,8 @@ def _find_traced(loop: LoopFactors, fractional: bool) -> tuple[Array, Array, Arr
 
     The method is that of `quick_kernel`, then of `bisect_radius`.
     """
-    # Divide the walls into parts and run the first round on each part. Then collect the walls without a certificate
-    # into parts of the same size for the other rounds; thus a single compiled program serves both.
+    # Divide the walls into parts and run the first round on each part. Then collect the walls without a certificate in
+    # parts of the same size for the other rounds, so that one compiled program runs all rounds.
     import jax.numpy as xp
     from jax.lax import while_loop
 
@@ -328,23 +330,23 @@ def _find_traced(loop: LoopFactors, fractional: bool) -> tuple[Array, Array, Arr
 
 
 def _find_in_rounds(begin: Any, end: Any, loop: LoopFactors, fractional: bool) -> tuple[Array, Array, Array]:
-    """Run the rounds ``begin`` to ``end - 1`` of the search on some walls, while any of them has no certificate.
+    """Run the rounds ``begin`` to ``end - 1`` of the search on some walls, until all of them are certified.
 
     Round 0 refines and certifies the larger pole, round 1 bisects the radius, and round 2 refines and certifies the
     pole on the bisected circle.
     """
-    # A pole step and a count take long to compile. Therefore each occurs only once, in a loop whose range depends on
-    # the round.
+    # Call the Newton step and the count only once each, in a loop whose range depends on the round, because both take
+    # long to compile.
     import jax.numpy as xp
     from jax.lax import fori_loop, while_loop
 
     tolerance = epsilon(loop.c) ** 0.58
     high = _bound_log_radius(loop)
-    # Candidates for the angle of the pole: 0, pi and the crossovers on the circle.
+    # The candidates for the angle of the pole are 0, pi and the angles of the crossovers on the circle.
     n_candidates = 5 if fractional else 4
     n_steps = n_candidates + POLISHING_STEPS + NEWTON_STEPS
-    # Ranges of the steps and of the counts, for each round. In round 2 the first steps evaluate the candidates; the
-    # counts after the bisections are trials of the certificate.
+    # Ranges of the indices of steps and of counts in each round. In round 2 the first steps evaluate the candidates.
+    # The counts after the bisections try the certificate on different circles.
     steps = xp.asarray([(n_candidates + POLISHING_STEPS - STEPS_ON_LARGER, n_steps), (n_steps, n_steps), (0, n_steps)])
     first_trial = BISECTIONS + 1
     counts = xp.asarray([(first_trial, first_trial + 1), (0, first_trial), (first_trial, first_trial + MAX_TRIALS)])
@@ -360,14 +362,14 @@ def _find_in_rounds(begin: Any, end: Any, loop: LoopFactors, fractional: bool) -
             newton = newton_step(re, argument, loop, fractional)
             moves = halley_step(re, argument, loop, fractional), shift_pole(re, argument, newton.re, newton.im)
             to_re, to_im = (xp.where(k < n_steps - NEWTON_STEPS, *pair) for pair in zip(*moves, strict=True))
-            # Keep the candidate that is nearest to a pole.
+            # Keep the previous candidate unless the new one is nearer to a pole.
             keeps_previous = is_candidate & ~(newton.radius < distance)
             im = xp.where(keeps_previous, im, xp.where(is_candidate, argument, to_im))
             return xp.where(is_candidate, re, to_re), im, xp.where(keeps_previous, distance, newton.radius)
 
         start = xp.where(round_index == 0, state.re, state.high), state.im, xp.full_like(high, np.inf)
         re, im, distance = fori_loop(steps[round_index, 0], steps[round_index, 1], step, start)
-        # Without stiffness one pole is exactly 1, so the logarithm of this pole is 0.
+        # Set log z to 0 if alpha = 0 and no pole is larger, because one pole is then exactly 1.
         at_one = (loop.alpha == 0) & ~(re > tolerance)
         re, im = xp.where(at_one, 0.0, re), xp.where(at_one, 0.0, im)
 

@@ -36,28 +36,29 @@ from zwidth.stability.rigid.normalization import wall_status
 from zwidth.stability.rigid.pole_cells import VERDICT_WIDTH
 from zwidth.stability.rigid.pole_count import count_poles, factor_loop
 
-# Factors by which the error bound is increased if a count is uncertain at the required accuracy because of rounding
-# errors; bounds above `MAX_ERROR` are not tried.
+# If a count is uncertain because of rounding errors, it is repeated with error bounds that are larger than the required
+# accuracy by these factors, up to `MAX_ERROR`.
 ERROR_FACTORS = 10.0 ** np.arange(12)
 MAX_ERROR = 0.1  # largest relative error of a radius that is certified
-# Largest float64 below 1, reported for stable walls whose radius rounds to 1.
+# Largest float64 below 1: radius of stable walls whose computed radius rounds to 1.
 BELOW_ONE = 1.0 - 2.0**-53
-# Rounding error of a computed radius: without stiffness, a radius that exceeds 1 by less than this is exactly 1.
+# Rounding error of a computed radius. For alpha = 0, a radius that exceeds 1 by less is set to exactly 1.
 RADIUS_ROUNDING = 1e-13
 # Largest certified relative error of a decay rate; with a larger error the rate is NaN.
 MAX_RATE_ERROR = 1e-3
 # Value of |sin(im)| below which a pole is counted as real, i.e. without a conjugate.
 REAL_AXIS_WIDTH = 1e-6
-# Smallest number of walls per device for which a grid is computed by cells; smaller grids are faster wall by wall.
+# Smallest number of walls per device with which a grid is computed by cells; for fewer walls, computing them one by one
+# is faster.
 SMALLEST_MAP = 1 << 11
-# Walls per batch in NumPy; smaller batches take longer per wall.
+# Number of walls per batch in NumPy, because smaller batches take longer per wall.
 BATCH_SIZE = 1 << 13
 # Largest number of walls that are computed one by one without testing whether they form a grid.
 FEW_FOR_CELLS = 1 << 13
-# Walls per compiled batch; all large batches have this size, so that they share one program.
+# Number of walls per compiled batch. All large batches have this size, so that they share one compiled program.
 PIECE = BLOCK >> 3
 
-# Default bound of the relative error of radii and rates.
+# Default of the largest relative error of radii and rates.
 ACCURACY = 1e-9
 NO_RATE = np.empty(0)  # placeholder for rates that are not requested
 
@@ -82,7 +83,7 @@ def compute_dominant_poles(columns: list[np.ndarray], accuracy: float, route: Ro
 
 
 def _compute_by_kind(columns: list[np.ndarray], accuracy: float, fractional: bool, route: Route) -> DominantPoles:
-    """Return the dominant poles of walls whose delays are all fractional or all integer."""
+    """Return the dominant poles of walls whose delays are all fractional or all integer, as ``fractional`` states."""
     size = columns[0].size
     arguments = [*columns, np.full(size, accuracy)]
     with np.errstate(all="ignore"):
@@ -107,7 +108,7 @@ def _compute_by_kind(columns: list[np.ndarray], accuracy: float, fractional: boo
 def _certify_open_walls(
     columns: list[np.ndarray], poles: DominantPoles, accuracy: float, fractional: bool
 ) -> DominantPoles:
-    """Certify the poles without a certificate, in place: from other starts, by bisection, then with larger errors."""
+    """Certify the open poles in place: from other starting points, by bisection, then with larger error bounds."""
     open_walls = np.flatnonzero(~poles.certified)
     # Skip invalid walls, which cannot be certified.
     open_walls = open_walls[np.asarray(wall_status(*(column[open_walls] for column in columns))) == Status.OK]
@@ -150,7 +151,7 @@ def arrange_as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, .
     shape, wall_axes = points.shape, []
     for name in ("beta", "alpha"):
         varying = [axis for axis, length in enumerate(getattr(points, name).shape) if length > 1] or [0]
-        # Identify the other arguments by name, because the same array may be passed twice.
+        # Compare the arguments by name and not by identity, because the same array may be passed for two of them.
         others = [array for other, array in points._asdict().items() if other != name]
         if len(varying) > 1 or any(other.shape[varying[0]] > 1 for other in others):
             return None
@@ -170,7 +171,7 @@ class WallPoles(NamedTuple):
     """Spectral radii of walls, and their decay rates if requested."""
 
     radius: np.ndarray  # NaN without a certified error bound
-    certified: np.ndarray  # the requested accuracy is certified
+    certified: np.ndarray  # True if the requested accuracy is certified
     rate: np.ndarray  # NaN if fewer than three digits are certified
 
     def map(self, function: Callable[[np.ndarray], np.ndarray]) -> WallPoles:
@@ -179,7 +180,7 @@ class WallPoles(NamedTuple):
 
 
 def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPoles:
-    """Compute the dominant poles of a grid by Taylor series in cells of walls, and one by one where these fail.
+    """Compute the dominant poles of a grid by Taylor series in cells of walls; walls where these fail, one by one.
 
     Nothing is compiled, and the result of a wall does not depend on the window of the grid.
     """
@@ -213,7 +214,7 @@ def find_dominant_pole(wall: tuple[float, float, float, float]) -> tuple[float, 
 def _find_listed(
     columns: list[np.ndarray], accuracy: float, with_rate: bool, route: Route
 ) -> tuple[WallPoles, DominantPoles]:
-    """Return the radii of columns of walls and, if requested, the rates; and the dominant poles."""
+    """Return the radii of walls given as columns (1-D arrays) and, if requested, the rates; and the dominant poles."""
     dominant = compute_dominant_poles(columns, accuracy, route)
     rate = compute_rates(dominant, columns, accuracy) if with_rate else NO_RATE
     radius = np.exp(np.where(np.isinf(dominant.error), np.nan, dominant.re))
@@ -246,9 +247,9 @@ def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = Fals
 def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: float) -> np.ndarray:
     """Return the decay rates of dominant poles; NaN if the certified relative error exceeds `MAX_RATE_ERROR`."""
     rate, allowed, width = 0.0 - poles.re, MAX_RATE_ERROR * np.abs(poles.re), certification_width(poles.re, accuracy)
-    # Allow for other poles that are larger by up to ``width``, because the count does not exclude them.
+    # Add ``width`` to the error, because the count does not exclude other poles that are larger by up to this distance.
     error = np.minimum(poles.error, poles.pole_error + width)
-    # If both stiffness and total damping are 0, both poles near 1 are exactly 1, so the rate 0 has no error.
+    # If alpha and beta + delta are 0, both poles near 1 are exactly 1, so that the rate 0 has no error.
     error[(poles.re == 0) & (columns[0] == 0) & (columns[1] == -columns[2])] = 0.0
     is_fractional = columns[3] != np.floor(columns[3])
     with np.errstate(all="ignore"):
@@ -257,8 +258,8 @@ def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: flo
             if not index.size:
                 continue
             loop = factor_loop(*(column[index] for column in columns), fractional=fractional)
-            # Count the poles outside a smaller circle. If no other pole is nearly as large, the error of the rate is
-            # that of the dominant pole.
+            # Count the poles outside a slightly smaller circle. If only the dominant pole is outside, the error of the
+            # rate is that of this pole.
             poles_outside = count_poles(poles.re[index] - width[index], loop, fractional)
             is_only = poles_outside.certain & (
                 poles_outside.outside == np.where(np.sin(poles.im[index]) < REAL_AXIS_WIDTH, 1, 2)
@@ -274,6 +275,7 @@ def _place_by_verdict(radius: np.ndarray, columns: list[np.ndarray]) -> np.ndarr
     alpha, beta, delta, d = columns
     with np.errstate(all="ignore"):
         stable = np.asarray(stable_kernel(alpha, beta, delta, d, classify_delays(d)))
-    # Without stiffness one pole is exactly 1. Limit the radius of a stable wall to the largest float64 below 1.
+    # For alpha = 0 one pole is exactly 1: remove the rounding error of the radius. Limit the radius of a stable wall to
+    # the largest float64 below 1.
     outside = np.where((alpha == 0) & (radius < 1.0 + RADIUS_ROUNDING), 1.0, np.maximum(radius, 1.0))
     return np.where(stable, np.minimum(radius, BELOW_ONE), outside)

@@ -38,7 +38,7 @@ class Normalized(NamedTuple):
 
 @compact_repr(mass="kg", damping="N s/m", period="s", delay="s")
 class Physical(NamedTuple):
-    """The device, its loop and the wall in SI units: kg, N s/m, s, s, N/m, N s/m."""
+    """Mass and damping of the device, period and delay of the loop, stiffness and damping of the wall, in SI."""
 
     mass: Array
     damping: Array
@@ -49,12 +49,12 @@ class Physical(NamedTuple):
 
 
 def _find_magnitude_range(name: str) -> tuple[float, float]:
-    """Return the smallest and the largest allowed magnitude of a quantity, apart from 0."""
+    """Return the smallest and the largest allowed magnitude of the nonzero values of a quantity."""
     return SIZES.get(name, SI_RANGE)
 
 
 def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
-    """Return ``value`` as float64; raise `InputError` for a scalar out of range. Traced values are not checked."""
+    """Return ``value`` as float64; raise `InputError` for a scalar out of range. Traced values stay unchecked."""
     if is_traced(value):
         return value
     number = as_float64(name, value)
@@ -76,7 +76,7 @@ def _is_valid(name: str, value: Array) -> Array:
 
 
 def quantity_status(**values: Array) -> Array:
-    """Return the `Status` of quantities named as in `normalize`, elementwise; INVALID_INPUT precedes OUT_OF_RANGE."""
+    """Return the `Status` of quantities, given by name, elementwise; INVALID_INPUT has priority over OUT_OF_RANGE."""
     xp = namespace(*values.values())
     valid = inside = True
     for name, value in values.items():
@@ -86,7 +86,7 @@ def quantity_status(**values: Array) -> Array:
 
 
 def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """Return whether a wall and its device are valid and in the range of the model."""
+    """Return a mask of the walls that are valid and in range, together with their device."""
     return is_valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
 
 
@@ -114,7 +114,8 @@ def status_of_results(
     status = np.full(shape, Status.OK, np.uint8)
     for values in results:
         status[np.isnan(values)] = Status.NOT_CONVERGED
-    # First test whether all arguments are in range, which is usual and takes less time than a status per point.
+    # First test if all arguments are in range, because this is the usual case and the test is faster than a status per
+    # point.
     if not (is_valid_device(*device).all() and all(within(part, WALL_RANGE).all() for part in walls)):
         input_status = wall_status(*walls, *device)
         np.copyto(status, input_status, where=input_status != Status.OK, casting="unsafe")
@@ -122,7 +123,7 @@ def status_of_results(
 
 
 def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
-    """Check the arguments, replace array entries out of range by NaN, and return the results of ``formula``."""
+    """Check the quantities, and return the results of ``formula`` for them, with NaN for array entries out of range."""
     checked = {name: _check_quantity(name, value) for name, value in values.items()}
     join_shapes((name, np.shape(value)) for name, value in checked.items())
     if any(map(is_jax, values.values())):
@@ -133,7 +134,7 @@ def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: Arr
 
 
 def _apply_formula(*arguments: Any) -> tuple[Array, ...]:
-    """Apply a formula to quantities, with NaN if out of range; the last two arguments are the formula and the names."""
+    """Apply a formula to quantities, with NaN for those out of range; the last two arguments are formula and names."""
     *values, formula, names = arguments
     valid_masks = (
         _is_valid(name, value) & within(value, _find_magnitude_range(name))

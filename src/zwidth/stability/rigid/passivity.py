@@ -230,8 +230,8 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
     return float(alpha[0]), float(beta[0])
 
 
-# Numbers of Gauss-Legendre nodes on the three parts of the range of directions, on each of which the integrand is
-# analytic.
+# Numbers of Gauss-Legendre nodes on the three parts of the range of directions; the integrand is analytic on each
+# part.
 AREA_NODES = (64, 64, 32)
 # Computing cost of a point relative to other kernels, because the integrand is evaluated at all nodes.
 AREA_WEIGHT = 64

@@ -26,40 +26,40 @@ from zwidth.stability.rigid.pole_count import LoopFactors
 
 # Orders of the series in xi and eta that are tried; each group uses the lowest order that is accurate enough.
 ORDERS = (2, 4, 8, 12, 20)
-# Number of Chebyshev nodes per axis in addition to the order of a series. The radius, the exponential of a series, is
-# interpolated between these nodes.
+# Number of Chebyshev nodes per axis minus the order of the series. The radius, which is the exponential of the series
+# of log |z|, is interpolated between these nodes.
 EXTRA_NODES = 6
 # Order of the Taylor series of A in u.
 N_TERMS = 36
-# Number of points per pole on the circle; the integrals are means over these points.
+# Number of points on the circle per pole of the group. The integrals of C1 are computed as means over these points.
 POINTS_PER_POLE = 48
-# Accuracy of radii above which poles whose radii agree within the accuracy need not be separated (C6).
+# Required relative error of radii above which poles with radii that agree within this error need not be separated (C6).
 COARSE_ACCURACY = 1e-5
 # Value of |log radius| below which the closed-form verdict, instead of the computed radius, decides on which side of
 # the unit circle a pole is. Within 1e-10 of the stability boundary, one in ten computed radii is on the wrong side.
 VERDICT_WIDTH = 1e-7
-# Factor by which the errors allowed for the sums over two poles are reduced, because each pole depends on the square
-# root of a difference of these sums.
+# Ratio of the error allowed for the sums over two poles to that allowed for one pole. It is small, because each of two
+# poles depends on the square root of a difference of the sums.
 PAIR_FACTOR = 1e-3
 # Largest relative error of decay rates from series; walls with a larger error are computed one by one.
 RATE_ACCURACY = 1e-6
-# Smallest |log radius| of a cell with which the order of its series is chosen; the few walls closer to the unit circle
-# may have to be computed one by one.
+# Lower limit of the |log radius| for which the order of the series of a cell is chosen. The few walls closer to the
+# unit circle may have to be computed one by one.
 MIN_LOG_RADIUS = 1e-5
-# Value of |sin(im)| below which a pole is real.
+# Value of |sin(im)| below which a pole counts as real.
 REAL_AXIS_WIDTH = 1e-7
-# Newton steps to the center of a group of two poles.
+# Number of Newton steps to the center of a group of two poles.
 NEWTON_STEPS = 4
 # Radii of the circles that are tried, relative to the largest radius.
 CIRCLE_RADII = 2.0 ** (-0.5 * np.arange(14))
-# Distance, in indices of `CIRCLE_RADII`, from a circle to the two neighboring circles on which the error of its means
-# is bounded, for groups of one and of two poles.
+# Distance, in indices of `CIRCLE_RADII`, from the chosen circle to the smaller and the larger circle that bound the
+# error of its means (C3), for each number of poles in a group.
 CIRCLE_OFFSET = {1: 2, 2: 1}
-# Ratio R above which the choice between circles does not depend on R, because the truncation error is negligible.
+# Ratio R above which the choice of a circle does not depend on R, because the truncation error is then negligible.
 AMPLE_RATIO = 100.0
 # Rounding error of the series, relative to the bound G of C3.
 ROUNDING = 1e-14
-# binomial(k, j)/k of C1 with k = i + j, for the coefficient of xi^i eta^j; the first index is j.
+# Weights binomial(k, j)/k of C1, with k = i + j, for the coefficients of xi^i eta^j; the first index is j.
 BINOMIAL_WEIGHTS = np.array(
     [[comb(i + j, j) / max(i + j, 1) for i in range(ORDERS[-1] + 1)] for j in range(ORDERS[-1] + 1)]
 )
@@ -78,12 +78,12 @@ class AllowedErrors(NamedTuple):
 
     @property
     def reserve(self) -> float:
-        """Part of the accuracy that is reserved for poles outside the groups, which may be slightly larger."""
+        """Part of the allowed error that is reserved for slightly larger poles outside the groups."""
         return 0.5 * self.accuracy if self.is_coarse else 0.0
 
     @property
     def uncertain_width(self) -> float:
-        """Largest |log radius| at which the side of the unit circle may be wrong."""
+        """Largest |log radius| of a computed pole that may be on the wrong side of the unit circle."""
         return VERDICT_WIDTH + min(self.accuracy, COARSE_ACCURACY)
 
     def limit(self, size: np.ndarray) -> Any:
@@ -122,14 +122,14 @@ class Group(NamedTuple):
 
     @property
     def log_error(self) -> np.ndarray:
-        """Bound of the error of log |z| for one pole, or of the sum of u over two poles, of shape (orders, cells).
+        """Bound on the error of log |z| of one pole, or of the sum of u over two poles, of shape (orders, cells).
 
         The sum of u^2/U over two poles has at most twice this error.
         """
         return (self.error + ROUNDING) * (self.disk / (1.0 - self.disk)) + ROUNDING * np.abs(self.re)
 
     def is_disjoint(self, other: Group) -> np.ndarray:
-        """Return whether no pole can be in both groups."""
+        """Return a mask of the cells in which the circles around both groups are disjoint."""
         centers = [np.exp(group.re + 1j * group.im) for group in (self, other)]
         return np.abs(centers[0] - centers[1]) > np.abs(centers[0]) * self.disk + np.abs(centers[1]) * other.disk
 
@@ -142,7 +142,7 @@ def select_cells(tree: Any, index: Any) -> Any:
 
 
 def _expand_taylor(re: np.ndarray, im: np.ndarray, loop: LoopFactors, fractional: bool, terms: int) -> tuple[Any, ...]:
-    """Return the Taylor coefficients of A around centers, f and 1/z there, and the moduli of the factors of A there."""
+    """Return the Taylor coefficients of A in u around centers, and f, 1/z and the moduli of A's factors there."""
     expm1_re, sine = np.expm1(re), np.sin(0.5 * im)
     r = 1.0 + expm1_re
     z_minus_1 = make_complex(expm1_re - 2.0 * r * sine * sine, 2.0 * r * sine * np.cos(0.5 * im))
@@ -220,7 +220,7 @@ def enclose_poles(
     limit = 1.0 / np.maximum(1.0, np.maximum(rho, abs_late) if fractional else rho)
     largest = np.minimum(2.0 / loop.n_plus_1, 0.4 * limit)
     disk = largest * CIRCLE_RADII[:, None]
-    # Bound the remainder of the Taylor series by the moduli of the factors of A on a wider disk.
+    # Bound the remainder of the Taylor series of A by the moduli of the factors of A on a wider disk.
     wider_disk = np.minimum(4.0 * disk, 0.5 * (disk + limit))
     majorant = (
         abs_q0
@@ -240,11 +240,11 @@ def enclose_poles(
     low = 2.0 * main_term - total - remainder
     ratio = low / (cells.a + cells.b * (abs_f + abs_w * disk / (1.0 - disk)))
     score = np.where(ratio > 1.02, ratio / (1.0 + 1e3 / errors.accuracy * remainder / low), 0.0)
-    # Bound the error of a mean over the points of a circle by the values of the integrand on two neighboring circles,
-    # between which no pole may lie (C3).
+    # Bound the error of a mean over the points of a circle by the values of the integrand on a smaller and a larger
+    # circle; no pole may lie between these two (C3).
     offset, cell_index = CIRCLE_OFFSET[poles], np.arange(re.size)
-    # If R is so large that the truncation error is negligible for every order, prefer a smaller circle, because it is
-    # farther from singularities outside.
+    # If R is so large that the truncation error is negligible for every order, prefer a smaller circle, which is
+    # farther from the singularities outside.
     rank = np.minimum(score, AMPLE_RATIO) * (1.0 + 0.01 * np.arange(CIRCLE_RADII.size)[:, None])
     best = (rank[offset:-offset] * (score[: -2 * offset] > 0) * (score[2 * offset :] > 0)).argmax(0) + offset
     chosen, spread, alias = (
@@ -255,20 +255,21 @@ def enclose_poles(
     for step in (offset, offset + 1):
         outer, inner = np.maximum(best - step, 0), np.minimum(best + step, CIRCLE_RADII.size - 1)
         between = (outer + inner == 2 * best) & (np.minimum(score[outer, cell_index], score[inner, cell_index]) > 0)
-        # Bound the error of the means of powers of tau/A. The error of the mean for the poles at the center of the cell
-        # may be larger by a factor up to the number of points.
+        # Bound the error of the means of powers of tau/A. For the mean that yields the poles at the center of the cell,
+        # the error may be larger by a factor of up to the number of points.
         missed = 2.0 ** (-0.5 * step * points) * (1 + points)
         missed = missed * (4.5 * spread[outer, cell_index] + spread[inner, cell_index])
         alias = np.where(between, np.fmin(alias, missed), alias)
     is_enclosed = score[chosen] > 0
     if poles == 1:
-        # A single pole inside a circle around a real center is real. Otherwise the circle must not reach the real axis.
+        # Require that a circle around a complex center does not reach the real axis. A single pole in a circle around a
+        # real center is real.
         is_enclosed &= (im == 0.0) | (im == np.pi) | (np.sin(im) > disk[chosen])
     inverse, power = 1.0 / ratio[chosen], np.array(ORDERS)[:, None] + 1
     remainder_share = remainder[chosen] / (low[chosen] * (1.0 - inverse))
     error = inverse**power / (power * (1.0 - inverse)) + remainder_share / (1.0 - remainder_share)
     if poles == 1:
-        # Add the error of interpolating the radii between nodes, bounded with the Lebesgue constant of the nodes.
+        # Add the error of interpolating the radii between nodes, which the Lebesgue constant of the nodes bounds.
         nodes = power + (EXTRA_NODES - 1)
         error = error + (1.0 + (1.0 + np.log(nodes) / 1.57) ** 2) * inverse**nodes / (1.0 - inverse) ** 2
     error = np.where(is_enclosed & (remainder_share < 0.5), error + alias, np.inf)
@@ -306,7 +307,7 @@ def _compute_powers(x: Any, count: int, factor: Any = 1.0) -> np.ndarray:
 
 @cache
 def _list_points(poles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points on the unit circle and their weights: all around for one pole, the upper half for two."""
+    """Return points on the unit circle, or on its upper half for two poles, and their weights in the mean."""
     count = POINTS_PER_POLE * poles
     points = np.exp(2j * np.pi * np.arange(count) / count)
     weights = np.full(count, 1.0 / count)
@@ -332,7 +333,7 @@ def expand_sums(group: Group, cells: Cells, order: int) -> list[np.ndarray]:
     for k in range(1, poles + 1):
         weight = weights * (u / (1.0 + u) if poles == 1 else k * points**k)
         series = _compute_powers(powers_eta, order + 1, weight) @ powers_xi * binomials
-        # Replace the constant term by the value for the poles at the center of the cell.
+        # Replace the constant term, which is the value for the poles of the wall at the center of the cell.
         center_sum = (log_derivative * (weights * points**k)).sum(1)
         series[:, 0, 0] = np.log1p(group.disk * center_sum).real if poles == 1 else center_sum.real
         sums.append(series)
@@ -349,10 +350,10 @@ def compute_larger(first: np.ndarray, second: np.ndarray, disk: Any) -> tuple[np
 
 
 def is_larger_accurate(discriminant: np.ndarray, disk: Any, error: Any, limit: Any) -> np.ndarray:
-    """Return whether the larger pole is accurate to ``limit``, if the sums have the errors ``error`` and twice that."""
+    """Return whether the larger pole is accurate to ``limit``, if the sums have errors of ``error`` and 2 ``error``."""
     discriminant_error = 2.01 * error
-    # The error of the square root of D is at most the square root of the error of D, and at most the error of D divided
-    # by the square root of D.
+    # Bound the error of sqrt(D) by two values: the square root of the error of D, and the error of D divided by
+    # sqrt(D).
     remaining = np.maximum(limit * ((1.0 - disk) ** 2 / disk) - 0.5 * error - discriminant_error, 0.0)
     return np.abs(discriminant) * remaining**2 >= np.where(
         discriminant_error <= remaining**2, -1.0, discriminant_error**2

@@ -29,18 +29,18 @@ from zwidth.numerics.held_mass import discretize_mass, factor_numerator, split_d
 from zwidth.stability.rigid.crossover import find_first_root
 from zwidth.stability.rigid.normalization import valid_wall
 
-# Maximum number of steps of the bracketed iteration for a zero of the cubic |T|^2 - |B|^2.
+# Largest number of steps of the bracketed iteration for a zero of the cubic |T|^2 - |B|^2.
 CUBIC_STEPS = 6
 # Factor by which the bounds of a cell are widened, to cover their rounding errors.
 WIDENING = 1.0 + 1e-12
 # If the wall varies within a cell, the angle w of a crossover varies within an interval. This interval is divided into
-# four equal pieces, on each of which the phase change is bounded separately. These are the positions in the interval,
-# from 0 to 1, of the ends of the pieces (even indices) and of their midpoints (odd indices).
+# four equal pieces, and the phase change is bounded on each piece. The positions are those of the ends of the pieces
+# (even indices) and of their midpoints (odd indices), from 0 to 1 in the interval.
 PIECE_POINTS = np.arange(9)[:, None, None] / 8.0
 
 
 class LoopFactors(NamedTuple):
-    """The factors of P for one loop; all NaN if an input is out of range."""
+    """The factors of P for each loop; all NaN for a loop with an argument out of range."""
 
     alpha: Array
     beta: Array
@@ -55,7 +55,7 @@ class LoopFactors(NamedTuple):
 
 
 def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> LoopFactors:
-    """Return the factors of P; ``fractional`` states whether any delay is fractional."""
+    """Return the factors of P; ``fractional`` is True if any delay is fractional."""
     xp = namespace(alpha, beta, delta, d)
     valid = valid_wall(alpha, beta, delta, d)
     delta, d = xp.where(valid, delta, 1.0), xp.where(valid, d, 0.0)
@@ -80,10 +80,10 @@ class _Circle(NamedTuple):
     h: tuple[Array, Array, Array, Array]  # |T|^2 - |B|^2, lowest power of x first
     at_start: tuple[Array, Array]  # |T| and |B| at x = 0, i.e. z = r
     at_end: tuple[Array, Array]  # |T| and |B| at x = 1, i.e. z = -r
-    terms: tuple[Array, ...]  # coefficients of |T|^2 and of an upper bound of |B|^2, for rounding errors
+    terms: tuple[Array, ...]  # coefficients in x of |T|^2 and of an upper bound on |B|^2, for error bounds
 
     def sum_magnitudes(self, x: Array) -> Array:
-        """Return |T|^2 plus a bound of |B|^2 at x, which scales the rounding error of |T|^2 - |B|^2."""
+        """Return |T|^2 plus an upper bound on |B|^2 at x, as the scale of the rounding error of |T|^2 - |B|^2."""
         t0, t1, c0, c1, m0, w0, w1 = self.terms
         return (t0 + t1 * x) * (c0 + c1 * x) + m0 * (w0 + w1 * x)
 
@@ -128,7 +128,7 @@ def _find_quadratic_zeros(h0: Array, h1: Array, h2: Array, xp: Any) -> list[Arra
     root = xp.sqrt(h1 * h1 - 4.0 * h0 * h2)
     half = -0.5 * (h1 + xp.where(h1 < 0, -root, root))
     one, other = half / h2, h0 / half
-    # If h2 = 0, one zero is infinite; if h1 = 0 as well, both are.
+    # Set one zero to infinity if h2 = 0, and both zeros if h1 = 0 as well.
     one = xp.where(h2 == 0, np.inf, one)
     other = xp.where(half == 0, one, other)
     return [xp.minimum(one, other), xp.maximum(one, other)]
@@ -148,7 +148,7 @@ def _find_cubic_zeros(circle: _Circle, xp: Any) -> list[Array]:
 def _find_zero_between(piece: tuple[Array, ...], circle: _Circle, xp: Any) -> Array:
     """Return the zero of the cubic |T|^2 - |B|^2 on an interval on which it is monotone; NaN if it has none there.
 
-    Each step solves for the zero of the parabola with the value, slope and second derivative of the cubic.
+    In each step, the next iterate is the zero of the parabola with the value and first two derivatives of the cubic.
 
     Args:
         piece: Both ends of the interval, and the values of the cubic there.
@@ -182,8 +182,8 @@ def _find_only_zero(circle: _Circle, xp: Any) -> tuple[Array, Array]:
     h0, h1, h2, h3 = circle.h
     sign = xp.where(h0 > 0, 1.0, -1.0)
     x = find_first_root(tuple([sign * h for h in circle.h]))
-    # The cubic has a single zero in (0, 1) if it is monotone there, or has only one extremum there. In addition, the
-    # iteration must have converged.
+    # Given different signs at 0 and 1, the cubic has a single zero in (0, 1) if it is monotone or has only one extremum
+    # there. Require in addition that the iteration has converged.
     is_only_zero = (
         (h2 * h2 < 3.0 * h1 * h3)
         | (h1 * circle.differentiate(1.0) < 0)
@@ -196,10 +196,10 @@ def _find_only_zero(circle: _Circle, xp: Any) -> tuple[Array, Array]:
 def _evaluate_phase_difference(
     x: Array, circle: _Circle, loop: LoopFactors, fractional: bool, xp: Any
 ) -> tuple[Array, Array, Array]:
-    """Return arg T - arg B at a crossover x, the angle w of the crossover, and a bound of the derivative in w.
+    """Return arg T - arg B at a crossover x, the angle w of the crossover, and a bound on d(arg T - arg B)/dw.
 
     Returns:
-        ``arg T - arg B``, continuous from w = 0; w; and a bound of the derivative of the difference in w.
+        ``arg T - arg B``, continued from w = 0; w; and a bound on the magnitude of its derivative in w.
     """
     y = 1.0 - x
     im, drop = 2.0 * circle.r * xp.sqrt(x * y), 2.0 * circle.r * x
@@ -207,8 +207,8 @@ def _evaluate_phase_difference(
     sign = xp.where(loop.s < 0, -1.0, 1.0)
     wall_re, wall_im = sign * (circle.wall - loop.s * drop), sign * loop.s * im
     numerator_re, numerator_im = circle.numerator - loop.a2 * drop, loop.a2 * im
-    # The argument of (z - 1)/(a2 z + h) is in (0, pi) and that of (z - c)/W in (-pi, pi), so the principal value of
-    # their sum may have to be increased by 2 pi.
+    # Add 2 pi to the principal value of the sum if necessary: arg((z - 1)/(a2 z + h)) is in (0, pi) and arg((z - c)/W)
+    # in (-pi, pi).
     p_re, p_im = re_z_minus_1 * numerator_re + im * numerator_im, im * numerator_re - re_z_minus_1 * numerator_im
     q_re, q_im = re_z_minus_c * wall_re + im * wall_im, im * wall_re - re_z_minus_c * wall_im
     v_re, v_im = p_re * q_re - p_im * q_im, p_re * q_im + p_im * q_re
@@ -220,7 +220,7 @@ def _evaluate_phase_difference(
         # Subtract arg(1 + q/z) = arg(z + q) - w, which is in [-pi, 0].
         ratio = loop.q / circle.r
         theta = theta - angle(1.0 + ratio - 2.0 * ratio * x, -ratio * im / circle.r)
-    # Bound the derivative. For the argument of a factor z - a it is the real part of z/(z - a) = 1 + a/(z - a).
+    # Bound the derivative in w. That of arg(z - a) is the real part of z/(z - a) = 1 + a/(z - a).
     rate = loop.n_plus_1 + 0.0 * x
     parts = [
         (1.0, re_z_minus_1, im),
@@ -234,10 +234,10 @@ def _evaluate_phase_difference(
 
 
 class PoleCount(NamedTuple):
-    """The number of poles that are not inside a circle, and whether it is certain."""
+    """The number of poles on and outside a circle, and whether this count is certain."""
 
     outside: Array  # number of poles that are not inside
-    certain: Array  # rounding errors cannot have changed the count
+    certain: Array  # True if rounding errors cannot have changed the count
     crossovers: list[Array]  # w of the crossovers; arbitrary for those that do not exist
 
     @property
@@ -278,11 +278,11 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
 
     def evaluate_phase(x: Array) -> tuple[Array, Array, Array]:
         theta, w, rate = _evaluate_phase_difference(x, circle, loop, fractional, xp)
-        # If |T| and |B| cross at a small angle, rounding errors shift the crossover x considerably. The last value
-        # returned is the resulting shift of theta = arg T - arg B, in rounding units.
+        # Also return the change of theta = arg T - arg B by a rounding error of the crossover x, in rounding units.
+        # This change is large if |T| and |B| have nearly the same slope at the crossover.
         return theta, w, rate * circle.sum_magnitudes(x) / (xp.abs(circle.differentiate(x)) * xp.sqrt(x * (1.0 - x)))
 
-    # For three zeros, trace the function only once, which halves the compile time. For two zeros a single trace would
+    # For three zeros, let JAX trace the function only once, which halves the compile time. For two zeros this would
     # double the run time.
     phases = list(map(evaluate_phase, zeros)) if len(zeros) < 3 else apply_each(evaluate_phase, zeros, xp)
     for valid, (theta, w, shift) in zip(valid_masks, phases, strict=True):
@@ -292,7 +292,8 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
         device_larger = device_larger != valid
         certain = certain & (~valid | (0.5 - xp.abs(turns - nearest) > tolerance + 4.0 * eps * shift))
         crossovers.append(w)
-    # The count is uncertain if the number of crossovers contradicts which of |T| and |B| is larger at z = -r.
+    # Mark the count as uncertain if the parity of the number of crossovers contradicts the larger of |T| and |B| at z =
+    # -r.
     certain = certain & (device_larger == device_larger_at_end)
     return PoleCount(loop.n_plus_1 + 2.0 - (stop - start + 2.0 * full_turns), certain, crossovers)
 
@@ -309,13 +310,13 @@ def count_poles_in_cell(
         fractional: Whether any delay is fractional.
 
     Returns:
-        The number of poles outside, and whether it certainly holds for every wall of the cell.
+        The number of poles outside, and whether it is certified for every wall of the cell.
     """
     circle = _evaluate_on_circle(log_r, loop, fractional, np)
     a, b = half
     r, abs_r_minus_1, power = circle.r, np.abs(circle.r_minus_1), loop.n_plus_1 * log_r
-    # Bound the changes within the cell, for all its walls: that of W = alpha z + beta (z - 1) at x = 0, and those of
-    # the coefficients w0 and w1 of |W|^2 = w0 + w1 x.
+    # Bound the changes of three quantities over the walls of the cell: W = alpha z + beta (z - 1) at x = 0, and the
+    # coefficients w0 and w1 of |W|^2 = w0 + w1 x.
     wall_change, w1 = a * r + b * abs_r_minus_1, 4.0 * r * loop.s * loop.beta
     e0 = (2.0 * np.abs(circle.wall) * wall_change + wall_change * wall_change) * WIDENING + 1e-14 * circle.wall**2
     e1 = 4.0 * r * (np.abs(loop.s) * b + (np.abs(loop.beta) + b) * (a + b)) * WIDENING + 1e-14 * np.abs(w1)
@@ -342,7 +343,8 @@ def count_poles_in_cell(
     (device_larger, device_larger_at_end, low), (other_larger, other_larger_at_end, high) = bounds
     certain = (device_larger == other_larger) & (device_larger_at_end == other_larger_at_end)
     start, stop, wall_at_end = _evaluate_end_arguments(circle, loop, device_larger, device_larger_at_end)
-    # If |B| > |T| at z = r or z = -r, W must have the same sign there for all walls of the cell.
+    # At z = r and z = -r, require that W has the same sign for all walls of the cell, unless |T| is larger than |B|
+    # there.
     certain &= (device_larger | (np.abs(circle.wall) > wall_change)) & (
         device_larger_at_end | (np.abs(wall_at_end) > a * r + b * (1.0 + r))
     )
@@ -376,7 +378,7 @@ def count_poles_in_cell(
 def _evaluate_end_arguments(
     circle: _Circle, loop: LoopFactors, device_larger: Array, device_larger_at_end: Array
 ) -> tuple[Array, Array, Array]:
-    """Return arg P/pi at z = r and z = -r, which is that of the larger of T and B; and W at z = -r."""
+    """Return arg P/pi at z = r and at z = -r, where arg P is that of the larger of T and B; and W at z = -r."""
     xp = namespace(circle.r)
     half = xp.where(loop.s < 0, -1.0, 1.0)
     start = xp.where(
@@ -390,5 +392,5 @@ def _evaluate_end_arguments(
 
 
 def _may_cancel(sizes: tuple[Array, Array], tolerance: Array) -> Array:
-    """Return whether T + B may be 0 within rounding error at a point where the circle meets the real axis."""
+    """Return whether T + B may be 0 within rounding errors at z = r or z = -r, given |T| and |B| there."""
     return namespace(tolerance).abs(sizes[0] - sizes[1]) <= tolerance * sizes[1]

@@ -1,7 +1,7 @@
 """Compute all closed-loop poles: by eigenvalues, or by Aberth's iteration for many walls at once.
 
-The eigenvalues are those of the companion matrix of the characteristic polynomial P. Newton's method on the factors of
-P (`loops.rigid.circle.LoopFactors`) then refines them.
+The eigenvalues are those of the companion matrix of the characteristic polynomial P (`stability.reference`). Newton's
+method on the factors of P (`stability.rigid.pole_count.LoopFactors`) then refines them.
 
 Aberth's iteration (Ehrlich 1967, Aberth 1973) updates all approximations z_i of a wall together. With P monic of
 degree N, q_i the product of z_i - z_j over all j != i, and q_i' its derivative in z_i, one step subtracts
@@ -27,16 +27,16 @@ import numpy as np
 
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.status import Status
-from zwidth.core.types import Array, ArrayLike, Radii, RadiiFirst, Reals, Roots, RootsFirst
+from zwidth.core.types import Array, ArrayLike, Coefficients, Radii, RadiiFirst, Reals, Roots, RootsFirst
 from zwidth.core.xp import epsilon, is_traced, iterate, materialize, namespace, nan_with_nan_derivatives
 from zwidth.numerics.blocks import map_blocks
 from zwidth.numerics.evaluate import as_float64, to_caller
 from zwidth.numerics.polynomials import abs2, companion
-from zwidth.stability.rigid.broadcasting import Degree, count_uncompiled_points, find_degree, map_by_degree
+from zwidth.stability.reference import Degree, compute_poles, expand_loop
+from zwidth.stability.rigid.broadcasting import count_uncompiled_points, find_degree, map_by_degree
 from zwidth.stability.rigid.characteristic_function import Pair, make_complex
 from zwidth.stability.rigid.normalization import valid_wall, wall_status
 from zwidth.stability.rigid.pole_count import LoopFactors, factor_loop
-from zwidth.stability.rigid.polynomial import compute_coefficients
 from zwidth.units.quantities import LONGEST_DELAY, MOST_POLES
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
@@ -181,11 +181,19 @@ def aberth_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Deg
     return z, radius, disjoint & converged
 
 
+def _replace_invalid(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> tuple[Reals, ...]:
+    """Replace arguments out of range by valid numbers; the caller sets the results of these walls to NaN."""
+    xp, ok = namespace(alpha, beta, delta, d), valid_wall(alpha, beta, delta, d)
+    return *(xp.where(ok, value, 0.0) for value in (alpha, beta, delta)), xp.where(ok, d, float(degree.n))
+
+
 def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
     """Return all poles along a new last axis, from the eigenvalues of companion matrices."""
-    matrices = companion(compute_coefficients(alpha, beta, delta, d, degree))
-    xp = namespace(matrices)
-    z = _eigenvalues(matrices) if xp is np else xp.linalg.eigvals(matrices)
+    walls = _replace_invalid(alpha, beta, delta, d, degree)
+    if namespace(*walls) is np:
+        z = _eigenvalues(companion(expand_loop(*walls, degree)))
+    else:
+        z = compute_poles(*walls, degree)
     return _polish_poles(z, alpha, beta, delta, d, degree)
 
 
@@ -252,15 +260,14 @@ def _compute_by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, deg
         # Compile a single program, because JAX would otherwise compile every operation separately when it
         # differentiates outside `jit`.
         return _compile_by_degree(pole_kernel, degree)(*columns)
-    # Do not compile for few walls, or for large matrices, whose eigenvalues take most of the time.
     few = alpha.size <= count_uncompiled_points(degree)
 
+    # Do not compile for few walls, or for large matrices, whose eigenvalues take most of the time.
+    compiled = None if few or degree.poles > MAX_ABERTH_POLES else _compile_by_degree(pole_kernel, degree)
+
     def compute_block(*walls: Any) -> np.ndarray:
-        if few or degree.poles > MAX_ABERTH_POLES:
-            with np.errstate(all="ignore"):
-                return pole_kernel(*walls, degree=degree)
-        z = _eigenvalues(companion(np.asarray(_compile_by_degree(compute_coefficients, degree)(*walls))))
-        return np.asarray(_compile_by_degree(_polish_poles, degree)(z, *walls))
+        with np.errstate(all="ignore"):
+            return np.asarray(compiled(*walls) if compiled else pole_kernel(*walls, degree=degree))
 
     return compute_block(*columns) if few else map_blocks(compute_block, columns, max(1, BLOCK_SIZE // degree.poles**2))
 
@@ -271,6 +278,47 @@ def _compile_by_degree(kernel: Callable[..., Any], degree: Degree) -> Any:
     import jax
 
     return jax.jit(lambda *arrays: kernel(*arrays, degree))
+
+
+def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Coefficients:
+    """Return the coefficients of the monic characteristic polynomial, highest power first.
+
+    ``P(z) = z^(2+n) (z - 1)(z - c) + (z n0(z) + n1(z)) (alpha z + beta (z - 1))``, d = n + f, ``c = e^-delta``; for
+    integer d the paper's (17) over ``-delta^2``, also for delta = 0. The loop is stable if all zeros lie inside the
+    unit circle.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, integer or fractional; concrete also inside `jit`, because it determines the degree.
+            All four broadcast.
+
+    Returns:
+        Array of the broadcast shape with one more axis at the end: 4 + d coefficients for integer d, 5 + n otherwise.
+        If degrees are mixed, shorter polynomials have leading zeros. A point out of range is NaN.
+
+    Raises:
+        InputError: an argument is no real number or a scalar out of range, or shapes do not broadcast.
+        TracedDelayError: d is traced.
+
+    Numerics:
+        Each coefficient is a sum; its error is a few rounding errors of the terms of this sum, for all delta.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (15), (17).
+
+    Example:
+        >>> import numpy as np, zwidth
+        >>> print(np.array2string(zwidth.char_poly(0.5, 0.5, 0.0, 0), precision=2))
+        [ 1.   -1.5   1.25 -0.25]
+    """
+    return map_by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True)
+
+
+def _char_poly_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
+    nan_if_invalid = nan_with_nan_derivatives(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    return expand_loop(*_replace_invalid(alpha, beta, delta, d, degree), degree) + nan_if_invalid[..., None]
 
 
 def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, method: PoleMethod = "auto") -> Roots:

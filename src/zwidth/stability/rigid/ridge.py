@@ -48,7 +48,7 @@ from zwidth.stability.rigid.ridge_newton import (
 
 
 def _compute_chi(x: Array, gap: Array) -> Array:
-    """Return chi = ``gap/x = -phi2'``, which is 1/6 at x = 0; it also yields ``psi' = chi - psi``."""
+    """Return chi = ``gap/x = -phi2'``, with the limit 1/6 at x = 0. The derivative of psi is ``chi - psi``."""
     xp = namespace(x)
     is_small = x < 2.5
     half = xp.where(is_small, 0.5 * x, 0.0)
@@ -61,7 +61,7 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
     c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
     phi_t, phi_f = phi_functions(delta * t), phi_functions(delta * f)
     chi_t, chi_f = _compute_chi(delta * t, phi_t.gap), _compute_chi(delta * f, phi_f.gap)
-    # Each term of a1 decreases with delta, so no digits cancel in the sum of their derivatives.
+    # No digits cancel in the sum below, because each term of a1 decreases with delta.
     a2 = -t * t * t * chi_t
     a1 = t * t * t * (phi_t.psi - chi_t) + f * f * f * chi_f
     a1 = -(
@@ -74,16 +74,16 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
 
 
 def recompute_ridge(s: Array, plant: Plant, n: Array, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
-    """Recompute alpha, beta, omega and s at a ridge such that their derivatives in ``plant`` and n are correct."""
-    # Differentiate one step of Newton's method, which has the derivative of the solution if it starts at the solution.
-    # A corner stays at s = 1. At a maximum the derivative of alpha in s is 0, so alpha is computed with a fixed s.
+    """Recompute alpha, beta, omega and s at a ridge with correct derivatives in ``plant`` and n."""
+    # Take one step of Newton's method from the solution, because the derivative of this step is that of the solution. A
+    # corner stays at s = 1. Compute alpha with a fixed s, because its derivative in s is 0 at a maximum.
     xp = namespace(s, plant.a2, n)
     undelayed, curve, is_corner = not kind.long, expand_curve(plant), s >= 1.0
     s_inside = xp.where(is_corner, 0.5, s)
     T, T1 = evaluate_stationarity(s_inside, curve, n, undelayed)
     s_inside = xp.where(is_corner, 0.5, s_inside - T / xp.where(is_corner, 1.0, T1))
     s_moved = xp.where(is_corner, 1.0, s_inside)
-    # Compute omega without the series of `evaluate_wave`, because the derivative of the series has fewer digits.
+    # Compute omega from s by arctan and not by the series in `evaluate_wave`, whose derivative has fewer digits.
     omega = xp.where(is_corner, np.pi, 2.0 * xp.arctan(s_inside / xp.sqrt((1.0 - s_inside) * (1.0 + s_inside))))
     alpha, beta = (evaluate_wall(evaluate_wave(s_value, n, undelayed), curve) for s_value in (s, s_moved))
     return alpha[0], beta[1], omega, s_moved
@@ -116,13 +116,14 @@ def _jax_plant() -> Any:
 
 @cache
 def _jax_ridge() -> Any:
-    """Return `solve_ridge` as a JAX function with the derivatives of `recompute_ridge`."""
+    """Return a JAX function that solves for the ridge, with a custom rule for its derivatives in plant and n."""
     import jax
 
     function = jax.custom_jvp(solve_ridge, nondiff_argnums=(3,))
 
     def rule(kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
-        # Let the derivative of s follow from the same rule, so that derivatives of every order are exact.
+        # Call the function with this rule again, so that s has exact derivatives and derivatives of every order are
+        # exact.
         ridge = function(*primals, kind)
 
         def moving(plant: Plant, n: Array) -> Ridge:
@@ -176,8 +177,8 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
     check_choice("method", method, get_args(RidgeMethod))
     arguments = {"delta": delta, "d": d}
     if method == "kkt":
-        # Import only if requested, because importing the solvers takes a second. Compile them, because they iterate
-        # long formulas.
+        # Import the solvers only if this method is requested, because the import takes a second. Let JAX compile them,
+        # because they iterate long formulas.
         from zwidth.stability.rigid.exact_points import kkt_kernel
 
         return RidgePoint(*evaluate(kkt_kernel, arguments, route="jax"))
@@ -185,14 +186,14 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
 
 
 def ridge_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgePoint:
-    """Compute `alpha_max` elementwise, for the classes of delays ``kind``."""
+    """Compute the point of maximum stiffness elementwise, for the classes of delays ``kind``."""
     return _make_point(*_solve_point(delta, d, kind)[:2])
 
 
 def differentiate_point(
     delta: Array, d: Array, kind: DelayClasses = ANY
 ) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
-    """Return `alpha_max` and its derivatives in delta and in d, elementwise."""
+    """Return the point of maximum stiffness and its derivatives in delta and in d, elementwise."""
     ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
     point, has_converged = _make_point(ridge, status), converged(ridge)
 
@@ -217,7 +218,7 @@ class RidgeSlopes(NamedTuple):
 
 
 def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlopes:
-    """Return `alpha_max` and the derivatives of its alpha, elementwise; those in d from the right at integer d."""
+    """Return the point of maximum stiffness, and d alpha/d delta and d alpha/dd (from the right at integer d)."""
     ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
     xp, wave = namespace(ridge.s), evaluate_wave(ridge.s, n, not kind.long)
 
@@ -244,7 +245,7 @@ def stiffness_slopes(
 
 
 def _solve_point(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
-    """Return the ridge, its status, the plant, the integer delay n, and delta with the fraction f of the delay."""
+    """Return the ridge, its status, the plant, the integer delay n, and the pair (delta, fraction f of the delay)."""
     status = device_status(delta, d)
     delta, d = nan_unless(status == Status.OK, delta, d)
     n, f = split_delay(d)
@@ -259,7 +260,8 @@ def _solve_point(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Arr
 
 def converged(ridge: Ridge) -> Array:
     """Return a mask of the points at which the solver has converged."""
-    # Convergence is quadratic, so only rounding errors are left after a step of sqrt(eps).
+    # Compare the last step with sqrt(eps): convergence is quadratic, so that after such a step only rounding errors
+    # remain.
     return namespace(ridge.s).abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s
 
 
@@ -309,11 +311,12 @@ def stiffness_slope(d: ArrayLike) -> Array:
 
 
 def slope_kernel(d: Array, kind: DelayClasses = ANY) -> Array:
-    """Compute `stiffness_slope` elementwise, for the classes of delays ``kind``."""
+    """Compute the limit g(d) of alpha_max/delta for strong damping elementwise, for the classes of delays ``kind``."""
     (d,) = nan_unless(is_valid_device(0.0 * d, d), d)
     zero = 0.0 * d
     n, f = split_delay(d)
-    # Use the limit of delta N(z) for delta -> infinity, where the velocity is proportional to the force and c = 0.
+    # Use the plant in the limit delta -> infinity: N(z) is multiplied by delta, because the velocity is proportional to
+    # force/delta, and c = 0.
     plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
     start = guess_start(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
     ridge = differentiable_ridge(plant, n, start, kind)

@@ -37,7 +37,7 @@ class Curve(NamedTuple):
 
 
 def expand_curve(plant: Plant | DiscretePlant) -> Curve:
-    """Return the coefficients of E, H and V of one plant; none of them cancels in the range of the ridge."""
+    """Return the coefficients of E, H and V of one plant, in a form without cancellation in the range of the ridge."""
     c, em, a2, a1, a0, gap = plant.c, plant.em, plant.a2, plant.a1, plant.a0, plant.gap
     sigma = a2 + a0
     at_one = sigma + a1
@@ -60,11 +60,15 @@ class Wave(NamedTuple):
 
 
 def evaluate_wave(s: Array, n: Array, undelayed: bool) -> Wave:
-    """Return the `Wave` at s, with finite derivatives up to the corner; ``undelayed`` if D = 1 for all points."""
+    """Return y, q, tau, kappa and d tau/dy at s, with derivatives that are finite up to the corner.
+
+    ``undelayed`` is True if D = 1 for all points.
+    """
     xp = namespace(s, n)
     y, q = s * s, (1.0 - s) * (1.0 + s)
     cos_w = q - y
-    # At the corner (y = 1) replace cos(omega/2) by 1 to avoid a division by 0; D = 1 there, so no quotient is used.
+    # Replace cos(omega/2) by 1 at the corner (y = 1) to avoid a division by 0. The quotients are not used there,
+    # because D is 1.
     cos_half = xp.sqrt(xp.where(s < 1.0, q, 1.0))
     is_low = y < 0.5
     small = xp.where(is_low, s, cos_half)
@@ -73,14 +77,15 @@ def evaluate_wave(s: Array, n: Array, undelayed: bool) -> Wave:
     per_sin = 0.5 / (s * cos_half)
     if undelayed:
         return Wave(y, q, 1.0, cos_w, half_omega, per_sin, 0.0)
-    # Write D omega as omega + n omega, so that nothing cancels near pi and the derivatives in D at D = 1 are kept.
+    # Expand sine and cosine of D omega = omega + n omega, which avoids cancellation near pi and has the right
+    # derivatives in D at D = 1.
     D, x = n + 1.0, n * half_omega
     square = x * x
     sine, cosine = x * horner(square, SINE), horner(square, COSINE)
     sine_ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
     sin2 = 4.0 * y * q
     tau, kappa = cosine + cos_w * sine_ratio, cos_w * cosine - sin2 * sine_ratio
-    # Write tau1 so that it is exactly 0 for D = 1, where kappa = cos omega and D kappa - tau cos omega = 0.
+    # Use a form of tau1 that is exactly 0 for D = 1, where kappa = cos omega and D kappa - tau cos omega = 0.
     tau1 = (n * cos_w * cosine - sine_ratio * (D * sin2 + cos_w * cos_w)) * (2.0 * per_sin * per_sin)
     return Wave(y, q, tau, kappa, half_omega, per_sin, tau1)
 
@@ -91,7 +96,8 @@ def evaluate_wave_at(omega: Array, n: Array) -> Wave:
     s, cos_half = xp.sin(0.5 * omega), xp.abs(xp.cos(0.5 * omega))
     y, q = s * s, cos_half * cos_half
     D = n + 1.0
-    # For omega > 2 use pi - omega. Add the low-order part of pi separately, because pi is not a float64.
+    # For omega > 2 use pi - omega, with the low-order digits of pi added separately, because np.pi has a rounding
+    # error.
     sign, near_pi = 1.0 - 2.0 * xp.mod(D, 2.0), omega > 2.0
     x = xp.where(near_pi, (np.pi - omega) + 1.2246467991473532e-16, omega)
     tau = xp.where(near_pi, -sign, 1.0) * D * _compute_cardinal_sine(D * x) / _compute_cardinal_sine(x)
@@ -107,11 +113,11 @@ def _compute_cardinal_sine(x: Array) -> Array:
 
 
 def _evaluate_polynomials(wave: Wave, curve: Curve) -> tuple[Array, Array, Array, Array]:
-    """Return E, H, m and V at one s, from the terms and coefficients of the curve."""
+    """Return E, H, m and V at one frequency, from its terms and the coefficients of the curve."""
     xp = namespace(wave.y, curve.sigma)
     E = curve.E[0] + wave.y * (curve.E[1] + wave.y * curve.E[2])
     H = curve.H[0] + wave.y * curve.H[1]
-    # Choose the form of m that has no cancellation.
+    # Choose the form of m without cancellation.
     m = xp.where(wave.y < 0.5, curve.at_one - 2.0 * curve.sigma * wave.y, 2.0 * curve.sigma * wave.q - curve.gap)
     return E, H, m, m * m + curve.mu * curve.mu * (4.0 * wave.y * wave.q)
 
@@ -146,12 +152,12 @@ class Corner(NamedTuple):
 
     alpha: Array
     beta: Array
-    reached: Array  # the lobe ends in the corner
-    is_ridge: Array  # the corner is the wall of maximum stiffness
+    reached: Array  # True if the lobe ends in the corner
+    is_ridge: Array  # True if the corner is the wall of maximum stiffness
 
 
 def find_corner(curve: Curve, n: Array) -> Corner:
-    """Return the corner, in which the lobe may end; it is the ridge if alpha still increases there."""
+    """Return the corner, in which the lobe may end; it is the ridge if alpha increases up to the corner."""
     # The lobe ends in the corner only if D = 1 and arg M increases up to pi, i.e. gap > 0 and mu > 0.
     xp = namespace(curve.sigma, n)
     E = sum(curve.E[1:], curve.E[0])
@@ -160,7 +166,8 @@ def find_corner(curve: Curve, n: Array) -> Corner:
     V, dV = curve.gap**2, 4.0 * (curve.sigma * curve.gap - curve.mu**2)
     reached = (n <= 0.0) & (curve.gap > 0.0) & (curve.mu > 0.0) & (value > 0.0)
     is_ridge = reached & (V * (value + slope) - value * dV >= 0.0)
-    # For other devices replace V by 1, because the derivatives of an overflow would be NaN and spoil those selected.
+    # Replace V by 1 for devices without corner, because an overflow would have NaN derivatives, which would make the
+    # selected derivatives NaN, too.
     V = xp.where(reached, V, 1.0)
     alpha = 4.0 * value / V
     return Corner(alpha, E / V - 0.5 * alpha, reached, is_ridge)
@@ -175,13 +182,14 @@ class Start(NamedTuple):
     corner: Array  # 1: (delta, d) implies that the ridge is the corner; -1: that it is smooth; 0: unknown
 
 
-# For d = 0 the ridge is the corner above this delta; the exact threshold 3.6593616274217835070 is 4e-18 larger. The
-# comparison is made with delta, because rounded coefficients of the curve would decide differently for its neighbors.
+# Value of delta above which, for d = 0, the ridge is the corner. The exact threshold, 3.6593616274217835070, is 4e-18
+# larger. The code compares delta, because a comparison of rounded coefficients of the curve would be wrong for
+# neighboring float64 values of delta.
 CORNER_DELTA = 3.6593616274217835
 
-# Start of Newton's method: s/u as a polynomial in t = r/(r + 3), with r = delta (d + 1), and u = 1/(d + 1), fitted over
-# all devices. The error is at most 0.8 % for d < 1 and 1.1 % for d >= 1. Each row is a polynomial in u, the coefficient
-# of a power of t.
+# Start of Newton's method: s/u as a polynomial in t and u, with t = r/(r + 3), r = delta (d + 1), u = 1/(d + 1), fitted
+# over all devices. The error is at most 0.8 % for d < 1 and 1.1 % for d >= 1. Each row contains the coefficients of a
+# polynomial in u, which is the coefficient of one power of t.
 SHORT_START = (
     (0.3748, 0.6572, -0.7317, -0.01088, 0.2558),
     (-0.1878, 3.83, -4.872, 1.835),
@@ -190,8 +198,8 @@ SHORT_START = (
     (-0.4501,),
 )
 LONG_START = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
-# Exponent of s in T s^power, to which Newton's method is applied for d < 1, because T is more curved there. It is
-# fitted in the same form as the start.
+# Exponent ``power`` for d < 1, where Newton's method is applied to T s^power, because T alone is more curved. The
+# exponent is fitted in the same form as the start.
 SHORT_POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
 # Number of Newton steps; after two steps the error would be 5e-9.
 NEWTON_STEPS = 3
@@ -205,7 +213,10 @@ def _evaluate_bivariate(t: Array, u: Array, rows: tuple[tuple[float, ...], ...])
 def guess_start(
     delta: Array, d: Array, fraction: Array, kind: DelayClasses = ANY, strength: Array | None = None
 ) -> Start:
-    """Return the starting point of Newton's method from a fit over delta and d; ``strength`` = 1: delta -> infinity."""
+    """Return the starting point of Newton's method from a fit over delta and d.
+
+    ``strength``, if given, replaces t of `SHORT_START`; 1 is the limit delta -> infinity.
+    """
     xp = namespace(delta, d)
     delta, d, f = stop_gradient((delta, d, fraction), xp)
     r = delta * (d + 1.0)
@@ -231,7 +242,7 @@ class Ridge(NamedTuple):
 
 
 def _find_stationary(curve: Curve, n: Array, start: Start, undelayed: bool) -> tuple[Array, Array]:
-    """Return s at the smooth maximum and the last step, by Newton's method in a bracket that encloses every ridge."""
+    """Return s at the smooth maximum and the last step in s, by Newton's method in a bracket around all ridges."""
     xp = namespace(curve.sigma, n)
     lower, upper = 0.5 * start.scale, xp.minimum(1.3 * start.scale, 1.0)
     s = xp.minimum(xp.maximum(start.s, lower), upper)

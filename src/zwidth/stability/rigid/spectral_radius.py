@@ -22,7 +22,8 @@ from zwidth.stability.rigid.poles import radius_by_companion
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
 
-# Smallest accuracy that can be required. For smaller ones the rounding errors of the counts on two circles overlap.
+# Smallest relative error that may be required. For smaller ones, the circles on which poles are counted would be closer
+# to each other than the rounding errors of the counts.
 MIN_ACCURACY = 1e-12
 
 

@@ -27,16 +27,16 @@ from zwidth.stability.rigid.broadcasting import Points, group_by_value
 from zwidth.stability.rigid.crossover import expand_long_delay_curve, expand_short_delay_curve
 from zwidth.units.quantities import WALL_RANGE
 
-# Newton steps. Each doubles the number of correct digits.
-END_STEPS = 6  # to the end of a lobe; the last one only confirms
-ROW_STEPS = 2  # to the frequency of a limit; they leave a relative error of 2e-9, which a last step in alpha squares
+# Numbers of Newton steps. Each step doubles the number of correct digits.
+END_STEPS = 6  # to the end of a lobe; the last step only confirms convergence
+ROW_STEPS = 2  # to the frequency of a limit; the relative error is then 2e-9, and a last step in alpha squares it
 
 # Coefficients of arctan(t)/t in powers of t^2; error 1e-5 on [0, 1] (Abramowitz, Stegun 1964, eq. (4.4.47)).
 ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
 
 
 class LongLobe(NamedTuple):
-    """The boundary curve of a device with d >= 1, in powers of y = sin^2(w/2), and the starting values for Newton."""
+    """The boundary curve of a device with d >= 1, in powers of y = sin^2(w/2), and starts of Newton's method."""
 
     delta: Array
     k: Array  # n + 1/2
@@ -52,7 +52,8 @@ class LongLobe(NamedTuple):
     excess2: Array
     end: Any = None  # w at the end of the lobe
     end_b: Any = None  # b at the end of the lobe
-    # Newton's method starts from sqrt(b/end_b) = sin(start_angle w/end)/start_sine plus a correction.
+    # Newton's method for w at a given b starts from the solution of sqrt(b/end_b) = sin(start_angle w/end)/start_sine,
+    # plus a correction.
     start_angle: Any = None
     start_sine: Any = None
     start_correction: Any = None
@@ -65,7 +66,7 @@ def _compute_sine_and_cosine(x: Array) -> tuple[Array, Array]:
 
 
 def find_on_short_lobe(b: Array, curve: Any) -> tuple[Array, Array]:
-    """Return y of the lobe's point with a given b, the first root of a quadratic, and whether the root is real."""
+    """Return y of the lobe's point with a given b (the first root of a quadratic), and whether this root is real."""
     (u0, u1), (v0, v1, v2), _ = curve
     xp = namespace(b, u0)
     linear = u0 - b * v1
@@ -74,7 +75,7 @@ def find_on_short_lobe(b: Array, curve: Any) -> tuple[Array, Array]:
 
 
 def limit_short_delay(beta: Array, plant: DiscretePlant) -> Array:
-    """Return the limit of alpha for d < 1: on the lobe, or beyond the corner on the line of poles at z = -1.
+    """Return the limit of alpha for d < 1: on the lobe or, beyond the corner, on the line of poles at z = -1.
 
     It is 0 if no alpha is stable, and NaN for invalid input.
     """
@@ -85,12 +86,13 @@ def limit_short_delay(beta: Array, plant: DiscretePlant) -> Array:
     integer_limit = p1 * b * (1.0 - psi * beta) / (psi * (p1 + plant.p2 * b))
     (u0, u1), modulus_terms, stiffness_terms = curve = expand_short_delay_curve(plant)
     y, meets_curve = find_on_short_lobe(b, curve)
-    # Use |V|, because V is 0 where the curve goes to infinity, and rounding errors must not change its sign there.
+    # Divide by |V|, because V >= 0 is 0 where the curve goes to infinity, and a rounding error must not make it
+    # negative.
     limit = 4.0 * y * horner(y, stiffness_terms) / xp.abs(horner(y, modulus_terms))
     corner_reached = (minus_one_coefficient > 0) & (stiffness_terms[0] + stiffness_terms[1] + stiffness_terms[2] > 0)
     beyond = xp.where(corner_reached, xp.inf, 0.0)
-    # Beyond the lobe the curve returns from infinity, with b < 0 at first. A line of constant beta above the whole lobe
-    # may meet that part of the curve, but not at a stability limit.
+    # Ignore intersections of the line of constant beta with the part of the curve beyond the lobe, which returns from
+    # infinity with b < 0: they are not stability limits.
     fractional = xp.where(meets_curve & (y <= 1) & (u0 + u1 * y > 0), limit, beyond)
     limit = xp.where(plant.f == 0, integer_limit, fractional)
     line_limit = 1.0 / xp.where(minus_one_coefficient > 0, minus_one_coefficient, 1.0) - 2.0 * beta
@@ -111,26 +113,27 @@ def expand_long_lobe(plant: DiscretePlant) -> LongLobe:
 
 
 def build_long_lobe(plant: DiscretePlant) -> LongLobe:
-    """Expand E, H and V of one device in powers of y; find the end of its lobe and the starting values of Newton."""
+    """Expand E, H and V of one device in powers of y; find the end of its lobe and starts of Newton's method."""
     lobe = expand_long_lobe(plant)
     em, p1, n, f = plant.em, plant.p1, plant.whole, plant.f
     xp = namespace(lobe.delta)
     end = _find_lobe_end(lobe, em / (p1 + f * em), n + f)
     numerator, d_numerator, denominator, d_denominator = evaluate_offset(LobeTerms(end, lobe))
     end_b = numerator / denominator
-    # Start from sqrt(b/end_b) = sin(start_angle w/end)/sin(start_angle). It has the curve's derivative at the end of
-    # the lobe, where strong damping makes the curve nearly flat; `start_correction` adds the derivative at w = 0. The
-    # error is at most 0.4 %. start_angle/tan(start_angle), the relative derivative at the end, is inverted by a
-    # rational function.
+    # Approximate the lobe by sqrt(b/end_b) = sin(start_angle w/end)/sin(start_angle). This curve has the right
+    # derivative at w = ``end``, where strong damping makes the lobe nearly flat; `start_correction` corrects the
+    # derivative at w = 0. The error is at most 0.4 %. The relative derivative at the end is
+    # start_angle/tan(start_angle); a rational function inverts it.
     flat = xp.clip(1.0 - 0.5 * end * (d_numerator / numerator - d_denominator / denominator), 0.0, 1.0)
     start_angle = xp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
     start_sine = xp.sin(start_angle)
-    # Invert the sine with the same approximation as the start, so that the start is exact at the end of the lobe. For
-    # strong damping and long delays db/dw vanishes there, and Newton's method would only halve an error.
+    # Replace start_angle by the approximate arcsine that also computes the start, so that the start is exact at the end
+    # of the lobe. For strong damping and long delays db/dw vanishes there, and each Newton step would only halve an
+    # error.
     start_angle = _approximate_arcsine(start_sine)
     d_b = (0.25 * lobe.excess1 + 0.5 * lobe.E0 * (lobe.k * lobe.k - 0.25) + lobe.k * lobe.H0) / lobe.V0
     start_correction = xp.sqrt(end_b / d_b) / end - start_sine / start_angle
-    # Stack the fields into one array, so that XLA computes them once per device and not again for every line.
+    # Stack the fields into one array, so that XLA computes them once per device and not once per line of constant beta.
     return LongLobe(*xp.stack([*lobe[:-5], end, end_b, start_angle, start_sine, start_correction]))
 
 
@@ -142,7 +145,8 @@ class LobeTerms:
         self.k = k
         s4, c4 = _compute_sine_and_cosine(0.25 * omega)
         sk4, ck4 = _compute_sine_and_cosine(0.25 * k * omega)
-        # Compute differences of cosines from half angles, which keeps their relative accuracy for small w.
+        # Compute sines of half angles first, because differences of cosines computed from them keep their relative
+        # accuracy for small w.
         s_half = 2.0 * sk4 * ck4
         self.s, self.c = 2.0 * s4 * c4, 1.0 - 2.0 * s4 * s4
         self.sin_k = 2.0 * s_half * (1.0 - 2.0 * sk4 * sk4)
@@ -151,7 +155,7 @@ class LobeTerms:
         self.cosine_drop = 2.0 * (s_half * s_half - s4 * s4)
         y = self.s * self.s
         self.E, self.H, self.V = E0 + y * (E1 + y * E2), H0 + y * H1, V0 + y * (V1 + y * V2)
-        # Differentiate with respect to w, with dy/dw = sin(w/2) cos(w/2).
+        # Compute the derivatives with respect to w, where dy/dw = sin(w/2) cos(w/2).
         dy = self.s * self.c
         self.dE, self.dH, self.dV = dy * (E1 + 2.0 * y * E2), dy * H1, dy * (V1 + 2.0 * y * V2)
         self.excess, self.d_excess = y * (excess1 + y * excess2), dy * (excess1 + 2.0 * y * excess2)
@@ -184,7 +188,7 @@ def evaluate_offset(terms: LobeTerms) -> tuple[Array, Array, Array, Array]:
 
 
 class AlphaTerms(NamedTuple):
-    """Numerator of alpha on the curve, and the terms from which it is computed."""
+    """The numerator of alpha on the boundary curve, and the terms from which alpha and its derivative are computed."""
 
     projection: Array  # sin((n + 1) w) E + cos((n + 1) w) F, proportional to alpha
     quadrature: Array  # cos((n + 1) w) E - sin((n + 1) w) F
@@ -208,9 +212,9 @@ def evaluate_alpha_terms(terms: LobeTerms) -> AlphaTerms:
 
 
 def _find_lobe_end(lobe: LongLobe, start_ratio: Array, d: Array) -> Array:
-    """Return the first w at which alpha is 0 again: there the phase of ``e^(j (n+1) w) (E + j H sin w)`` reaches pi."""
-    # Solve for this phase by Newton's method, because the phase is nearly linear in w. ``start_ratio`` = E/H at w = 0
-    # selects a start between pi/(2 (n+1)), for an undamped device, and pi/(n+1).
+    """Return the first w > 0 at which alpha is 0: the phase of ``e^(j (n+1) w) (E + j H sin w)`` reaches pi there."""
+    # Solve for the w with the phase pi by Newton's method, because the phase is nearly linear in w. ``start_ratio``,
+    # which is E/H at w = 0, determines the start between pi/(2 (n+1)), for an undamped device, and pi/(n+1).
     n_plus_1 = lobe.k + 0.5
     xp = namespace(n_plus_1)
     limit = np.pi / (d + 0.5)
@@ -219,15 +223,14 @@ def _find_lobe_end(lobe: LongLobe, start_ratio: Array, d: Array) -> Array:
         terms = LobeTerms(omega, lobe)
         alpha_terms = evaluate_alpha_terms(terms)
         size = terms.E * terms.E + alpha_terms.F * alpha_terms.F
-        # If the remaining phase is less than a quarter turn, approximate it by the product of its sine and cosine;
-        # otherwise limit the step.
+        # If the phase differs from pi by less than pi/2, approximate the difference by the product of its sine and
+        # cosine; otherwise take a limited step.
         remaining = xp.where(alpha_terms.quadrature < 0, alpha_terms.projection * alpha_terms.quadrature, -0.2 * size)
         return xp.minimum(
             omega - remaining / (n_plus_1 * size + (terms.E * alpha_terms.dF - alpha_terms.F * terms.dE)), limit
         )
 
-    # Use a loop, which compiles five times faster than unrolled steps. Its slower execution does not matter, because
-    # each device is solved once.
+    # Use a loop, which compiles five times faster than unrolled steps. It runs more slowly, but only once per device.
     start = 0.5 * np.pi / n_plus_1 * (1.0 + 0.7 * start_ratio / (start_ratio + 1.0 / n_plus_1))
     return iterate(END_STEPS, step, start, xp)
 
@@ -237,9 +240,9 @@ def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
 
     The limit is 0 if no alpha is stable, and NaN for invalid input.
     """
-    # Apply Newton's method to sqrt(b), which is nearly linear in w. Because b increases with w along the lobe, no other
-    # bracket than the lobe is needed. Clip to the lobe and do not bisect, because a midpoint near convergence would
-    # undo the last step.
+    # Apply Newton's method to sqrt(b), which is nearly linear in w. The lobe itself is the bracket, because b increases
+    # with w along it. If a step leaves the lobe, clip it and do not bisect, because near convergence a midpoint would
+    # be a worse approximation.
     delta, end, end_b, start_angle, start_sine, start_correction = lobe.delta, *lobe[-5:]
     xp = namespace(beta, delta)
     b = beta + delta
@@ -255,7 +258,7 @@ def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
     terms = LobeTerms(omega, lobe)
     alpha_terms = evaluate_alpha_terms(terms)
     numerator, denominator = 2.0 * terms.s * alpha_terms.projection, terms.c * terms.V
-    # Take the last step in alpha.
+    # Apply the last Newton step in w to the numerator of alpha, to first order.
     step = _compute_newton_step(target_b, terms)
     numerator -= step * (terms.c * alpha_terms.projection + 2.0 * terms.s * alpha_terms.d_projection)
     denominator -= step * (terms.c * terms.dV - 0.5 * terms.s * terms.V)
@@ -263,7 +266,7 @@ def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
 
 
 def _approximate_arcsine(x: Array) -> Array:
-    """Approximate arcsin x for 0 <= x <= 1 to three or four digits, from its half-angle tangent."""
+    """Approximate arcsin x for 0 <= x <= 1 to three or four digits, from the tangent of half the angle."""
     xp = namespace(x)
     t = x / (1.0 + xp.sqrt(xp.maximum((1.0 - x) * (1.0 + x), 0.0)))
     return 2.0 * t * horner(t * t, ARCTAN)
@@ -274,7 +277,8 @@ def _compute_newton_step(target_b: Array, terms: LobeTerms) -> Array:
 
     The step is ``2 (b - sqrt(target_b b))/b'``, with sqrt(r) approximated by (1 + 3 r)/(3 + r).
     """
-    # XLA fuses a chain of such steps into one loop over the lines only if no quotient is used twice.
+    # Divide only once, because XLA fuses successive steps into one loop over the lines only if no quotient is used
+    # twice.
     numerator, d_numerator, denominator, d_denominator = evaluate_offset(terms)
     target_numerator = target_b * denominator
     return (
@@ -286,15 +290,16 @@ def _compute_newton_step(target_b: Array, terms: LobeTerms) -> Array:
     )
 
 
-# Smallest number of points, and of lines of constant beta, of a grid whose labels are copied from a pattern; for
-# smaller grids comparing is faster.
+# Smallest number of points, and of lines of constant beta, with which the labels of a grid are copied from a pattern.
+# For smaller grids it is faster to compare each point with its limit.
 MIN_PATTERN_SIZE = 1 << 16
 MIN_PATTERN_ROWS = 8
 
 
 def label_grid(points: Points) -> np.ndarray:
     """Return whether each point of a grid is stable, i.e. ``0 < alpha < limit`` of its line; False if out of range."""
-    # The relative error of a limit is about 1e-15. Near the end of the lobe the error is 1e-15 of the largest limit.
+    # The comparison is exact up to rounding errors: a limit has a relative error of about 1e-15 or, near the end of the
+    # lobe, an error of 1e-15 of the largest limit.
     alpha, beta = nan_beyond(WALL_RANGE, points.alpha, points.beta)
     return _compare_with_limits(alpha, row_limits(beta, points.delta, points.d))
 
@@ -306,7 +311,7 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, route: Route 
     for long, points, index in group_by_value((beta, delta, d), d >= 1):
         kernel = _long_limit if long else _short_limit
         if route == "numpy" or (route == "auto" and limits.size <= FEW):
-            # Keep the shape of beta, so that each device is computed only once.
+            # Broadcast only delta and d and not beta, so that each device is computed only once for all its lines.
             with np.errstate(all="ignore"):
                 limits[index] = kernel(points[0], *np.broadcast_arrays(*points[1:]))
         else:
@@ -337,8 +342,8 @@ def _compare_with_limits(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
         stable = alpha < limit
         stable &= alpha > 0
         return stable
-    # Along a line of constant beta, the labels are True up to the limit. Copy them at memory speed from a pattern that
-    # is True in its first half and False in the second.
+    # Copy the labels of each line of constant beta from a pattern whose first half is True and whose second half is
+    # False: the labels are True up to the limit, and copying is as fast as memory access.
     pattern = np.arange(2 * values.size) < values.size
     # Replace NaN by -inf, because searchsorted treats NaN as the largest value.
     count = np.searchsorted(values, np.where(np.isnan(limit), -np.inf, limit).reshape(-1))

@@ -31,8 +31,8 @@ from zwidth.stability.rigid.stiffness_limit import label_grid
 StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
 STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
 
-# Error of the computed eigenvalues at a double pole, about the square root of the rounding unit. The companion method
-# reports spectral radii closer to 1 than this as UNDECIDED.
+# Error of computed eigenvalues at a double pole, about the square root of the rounding unit. The companion method
+# reports a wall as UNDECIDED if its spectral radius is closer to 1.
 DOUBLE_POLE_ERROR = 2e-8
 
 
@@ -134,13 +134,13 @@ def decide_stability(
 
 
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
-    """Return labels, the method that decided them, and their statuses, or None if all statuses are OK."""
+    """Return labels, the code of the method that decided them, and their statuses (None if all are OK)."""
     if method == "companion":
         radius = np.asarray(radius_by_companion(*points))
         inconclusive = (np.abs(radius - 1.0) < DOUBLE_POLE_ERROR) & (np.asarray(points[0]) != 0)
         return radius < 1.0, Method.COMPANION, np.where(inconclusive, Status.UNDECIDED, Status.OK)
     if method == "certified":
-        # Import only if requested, because most programs never certify.
+        # Import the module only if the method is requested, because most programs never certify.
         from zwidth.stability.rigid.certified import certify_labels
 
         stable, status = certify_labels(points)

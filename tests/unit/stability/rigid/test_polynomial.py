@@ -11,8 +11,8 @@ from mpmath import mp, mpf
 import oracles
 import zwidth
 from zwidth.numerics.held_mass import discretize_mass
+from zwidth.stability.reference import expand_polynomial
 from zwidth.stability.rigid.broadcasting import find_degree
-from zwidth.stability.rigid.polynomial import expand_affine
 
 WALLS = [(0.5, 0.5), (1e-8, -0.3), (40.0, -7.0), (-0.1, 0.0), (0.0, 1.0)]
 DAMPINGS = [1e-300, 1e-12, 1e-8, 1e-3, 0.1, 1.0, 2.31, 30.0, 700.0, 1e4, 1e6]
@@ -82,7 +82,7 @@ def test_a_delay_of_hundreds_of_periods():
 
 def test_affine_parts_add_up_to_the_polynomial(x64):
     for d in (0.0, 3.0, 2.25):
-        parts = expand_affine(jax.numpy.float64(0.7), jax.numpy.float64(d), find_degree(d))
+        parts = expand_polynomial(jax.numpy.float64(0.7), jax.numpy.float64(d), find_degree(d))
         with mp.workdps(oracles.DIGITS):
             free = oracles.polynomial(0, 0, 0.7, d)
             spring = [left - right for left, right in zip(oracles.polynomial(1, 0, 0.7, d), free, strict=True)]
