@@ -103,9 +103,9 @@ def fitted_once():
 def early_compiler(monkeypatch):
     """Of some thousand points a compiler is asked, as a user's are who has many more."""
     from zwidth.numerics import evaluate
-    from zwidth.stability.rigid import broadcasting, dominant_poles, passivity, stiffness_limit
+    from zwidth.stability.rigid import broadcasting, dominant_poles, stiffness_limit
 
-    for module in (evaluate, broadcasting, dominant_poles, passivity, stiffness_limit):
+    for module in (evaluate, broadcasting, dominant_poles, stiffness_limit):
         monkeypatch.setattr(module, "FEW", 1 << 11)
 
 
