@@ -72,13 +72,18 @@ def measure_all(points: int, runs: int) -> str:
     """Return the page with the table."""
     devices = {device.platform: device for kind in ("cpu", jax.default_backend()) for device in jax.devices(kind)[:1]}
     walls = draw_walls(points)
-    head = [part for device in devices.values() for part in (f"{name_of(device)}: M walls/s", "s to compile", "apart")]
+    head = [
+        part for device in devices.values() for part in (f"{name_of(device)}: M walls/s", "s to compile", "difference")
+    ]
     lines = [
         "# Inside `jit`, by device",
         "",
-        f"Written by `benchmarks/bench_device.py --write`: {points:,} scattered walls, each of a device and a delay",
-        f"(0 to 8 periods) of its own, float64, JAX {jax.__version__}, Python {platform.python_version()}; the best of",
-        f"{runs} runs. Apart: the largest difference of {SAMPLE:,} values from a direct call's, over 1 or the value.",
+        "The command `benchmarks/bench_device.py --write` writes this table. Each function is called inside `jit` in",
+        f"float64 with a batch of {points:,} random walls. Each wall has a different device and a different delay of",
+        f"0 to 8 periods. The speed is the largest of {runs} runs, with JAX {jax.__version__} and Python",
+        f'{platform.python_version()}. The column "difference" contains the largest difference of {SAMPLE:,} values',
+        "from the values of a direct call. The difference is relative for values above 1 in magnitude, and absolute",
+        "for smaller values.",
         "",
         f"| function | {' | '.join(head)} |",
         f"|---|{'--:|' * len(head)}",

@@ -315,7 +315,7 @@ def spell_widths(rows: list[dict[str, Any]]) -> str:
     widths = [row["width"] for row in rows if np.isfinite(row["width"])]
     middle, high = 100 * np.quantile(widths, [0.5, 0.9])
     median = f"The median width of the intervals of K_max is {middle:.1f} % of K_max"
-    return f"{median}; one in ten is wider than {high:.0f} %."
+    return f"{median}; a tenth of the intervals are wider than {high:.0f} %."
 
 
 def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
@@ -324,16 +324,17 @@ def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
     wrong = [row for row in sure if max(row["away"].values()) > 5]
     safe = [row["safe"] for row in fitted if row["safe"] is not None]
     low, middle, high = np.quantile([row["share"] for row in fitted if row["safe"] is not None], [0.1, 0.5, 0.9])
-    spread = f"{middle:.2f}; it is less than {low:.2f} for one wall in ten and more than {high:.2f} for one in ten"
+    spread = f"{middle:.2f}; the 10 % quantile is {low:.2f}, and the 90 % quantile is {high:.2f}"
     warned, troubled = sum(bool(row["warnings"]) for row in fitted), sum(row["status"] != 0 for row in fitted)
     return "\n".join([
-        f"Logs that the fit refuses: {len(rows) - len(fitted)}. Fits with a warning: {warned}.",
+        f"Logs for which the fit ends with an error: {len(rows) - len(fitted)}. Fits with a warning: {warned}.",
         f"Fits with a status other than OK: {troubled}. {spell_widths(fitted)}",
-        "Fits without a warning and with the status OK in which an estimate differs from the true value by more",
-        f"than 5 standard errors: {len(wrong)} of {len(sure)}.",
-        f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}.",
+        f"In {len(wrong)} of {len(sure)} fits without a warning and with the status OK, an estimate differs from the",
+        "true value by more than 5 standard errors.",
+        f"On the true device, {sum(safe)} of {len(safe)} safe walls are stable.",
         f"The median stiffness of a safe wall, divided by K_max of the true device, is {spread}.",
-        "Safe walls are softer than K_max, because a log does not exclude all resonances. These devices have none.",
+        "Safe walls are softer than K_max, because a log cannot exclude all resonances. The devices of this test have",
+        "no resonances.",
     ])  # fmt: skip
 
 
@@ -353,13 +354,13 @@ def report(count: int, parts: int, processes: int) -> str:
     lines = [
         "# Accuracy of fits to logs",
         "",
-        "Written by `benchmarks/bench_fit.py --write docs/fitting.md`.",
+        "The command `benchmarks/bench_fit.py --write docs/fitting.md` writes this page.",
         "",
         f"{count:,} random logs of 1,000 to 5,000 samples are fitted. The rigid devices have masses of 30 g to 1 kg",
         "and integer or fractional delays of 0 to 5 periods. The range of motion is 300 to 100,000 encoder steps,",
-        "and the noise is 0.15 to 3 steps. Two thirds of the devices have friction of 0.2 to 30 % of the effective",
-        "force, and a fifth of them have a constant force. There are four kinds of logs, with a quarter of the logs",
-        "each:",
+        "and the noise is 0.15 to 3 steps. Two thirds of the devices have friction of 0.2 to 30 % of the RMS",
+        "force, and a fifth of them have a constant force. There are four kinds of logs, and each kind makes up a",
+        "quarter of the logs:",
         "",
         "- to and fro: the force consists of steps, a chirp or random values;",
         "- single push: the device is pushed once;",
@@ -380,20 +381,20 @@ def report(count: int, parts: int, processes: int) -> str:
         "",
         tell_rest(noisy, fitted),
         "",
-        f"{len(silent):,} further logs have only the quantization error of the encoder,",
+        f"In {len(silent):,} further logs, the positions have no noise except the quantization error of the encoder,",
         "which is autocorrelated.",
         "",
         *tabulate(quiet),
         "",
         tell_rest(silent, quiet),
         "",
-        f"{parts:,} further logs are from devices that can have an actuator lag of 0.1 to 1 ms, and one or two",
+        f"{parts:,} further logs are those of devices that can have an actuator lag of 0.1 to 1 ms, and one or two",
         "resonances with frequencies of 30 to 400 Hz and damping ratios of 0.5 to 10 %. The devices are moved to",
         "and fro. The encoder steps are 1 to 40 µm, and the noise is as above. The table reports K_max for fits",
-        "without a warning. Each fit includes the actuator lag and the resonances that the log shows. The interval",
-        "of K_max also includes devices with one more resonance; before the log is considered, one more resonance",
-        "and none are equally likely. The interval width is a median, relative to the fitted K_max. The stiffness",
-        "is the median stiffness of the safe walls, relative to K_max of the true device.",
+        "without a warning. Each fit includes the actuator lag and the resonances that are detected in the log. The",
+        "interval of K_max also includes devices with one additional resonance; the prior probability of this",
+        "resonance is 50 %. The interval width is a median, relative to the fitted K_max. The stiffness is the median",
+        "stiffness of the safe walls, relative to K_max of the true device.",
         '"Stable safe walls" are the walls of `safe_wall()` that are stable on the true device. These walls',
         'are computed for devices that may have a resonance hidden in the log. "Rigid safe walls" are the walls of',
         "`safe_wall(rigid=True)` that are stable on the true device. These walls are computed without hidden",

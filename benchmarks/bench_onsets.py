@@ -34,7 +34,7 @@ SOFTER = np.array([0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0])
 INTRODUCTION = """\
 # Accuracy of fits to walls at the onset of instability
 
-Written by `benchmarks/bench_onsets.py --write docs/onsets.md`.
+The command `benchmarks/bench_onsets.py --write docs/onsets.md` writes this page.
 
 `zwidth.fit_buzz` fits a rigid device to walls at the onset of instability. This benchmark simulates random devices.
 For each rigid device, four walls are measured. All other devices have an actuator lag of 0.1 to 1 ms, one or two
@@ -173,7 +173,7 @@ def report(rigid: int, others: int, processes: int) -> str:
         if row.get("safe") is False or row.get("advised") is False or row.get("held") is False:
             print(row)
     advised = [row["advised"] for row in rows if row.get("advised") is not None]
-    stable = f"Recommended walls that are stable on the true device: {sum(advised)} of {len(advised)}."
+    stable = f"On the true device, {sum(advised)} of {len(advised)} recommended walls are stable."
     return "\n".join([INTRODUCTION, *tabulate(rows), "", stable, ""])
 
 

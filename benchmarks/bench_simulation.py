@@ -82,7 +82,7 @@ def report() -> str:
     lines = [
         "# Run times of simulations",
         "",
-        "This page is written by `benchmarks/bench_simulation.py --write docs/simulation.md`.",
+        "The command `benchmarks/bench_simulation.py --write docs/simulation.md` writes this page.",
         "",
         "## Linear loops",
         "",
@@ -129,7 +129,7 @@ def report_parts() -> list[str]:
         "",
         "One device is simulated with 1,000 walls for 1,000 periods, without recording the trajectories. The last",
         "column is the time of one simulation with one wall and a recorded trajectory. The first call includes",
-        "the compilation, unless a scene above uses the same compiled program.",
+        "the compilation, unless a scene in a row above uses the same compiled program.",
         "",
         "| scene | first call | time per sample, 1,000 walls | one recorded simulation |",
         "|---|--:|--:|--:|",

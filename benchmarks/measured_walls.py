@@ -23,10 +23,12 @@ from measured_devices import KINDS, Trial, measure
 RESULT = Path(__file__).parent / "results" / "measured_walls.md"
 ROWS = {
     "safe walls that are unstable on the true device": lambda stable, share: f"{stable.count(False)}",
-    "undecided": lambda stable, share: f"{stable.count(None)}",
-    "stiffness of the safe wall over K_max of the true device, median": lambda stable, share: f"{np.median(share):.3f}",
-    "a tenth of the devices below": lambda stable, share: f"{np.quantile(share, 0.1):.3f}",
-    "at least 0.8": lambda stable, share: f"{np.mean(share >= 0.8):.1%}",
+    "devices without a safe wall": lambda stable, share: f"{stable.count(None)}",
+    "stiffness of the safe wall, divided by K_max of the true device: median": lambda stable, share: (
+        f"{np.median(share):.3f}"
+    ),
+    "the same ratio: 10 % quantile": lambda stable, share: f"{np.quantile(share, 0.1):.3f}",
+    "devices with a ratio of at least 0.8": lambda stable, share: f"{np.mean(share >= 0.8):.1%}",
 }
 
 
@@ -40,7 +42,7 @@ def main() -> None:
     missed = np.mean([trial.outside for trial in trials])
     gap = np.median([abs(trial.promised - trial.share[1]) for trial in trials])
     text = [
-        f"Of {count} devices:\n",
+        f"The table contains the results for {count} devices:\n",
         *describe(trials),
         "",
         f"The predicted and the actual safe stiffness of the second record differ by {gap:.1%} of K_max in the median.",

@@ -31,7 +31,7 @@ def find_handle(shoulder: float, elbow: float) -> tuple[float, float]:
 
 def make_table() -> str:
     """Return the text of the file."""
-    lines = ["# Written by scripts/make_arm.py: a two-link arm, what a wall across x meets at its handle.",
+    lines = ["# Written by scripts/make_arm.py: mass and damping at the handle, for a wall perpendicular to x.",
              "shoulder [deg],elbow [deg],mass [g],damping [N s/m]"]  # fmt: skip
     for elbow in ELBOWS:
         for shoulder in SHOULDERS:

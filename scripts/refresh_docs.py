@@ -119,7 +119,7 @@ def _show_configuration(path: Path) -> str:
         study = max((name for name in kinds if picture.stem.startswith(name)), key=len)
         shown += [
             f"![{path.stem}: {picture.stem}](figures/{path.stem}/{picture.name})",
-            f"*`{picture.stem}`, of the study `{study}` (`kind: {kinds[study]}`)*",
+            f"*Figure `{picture.stem}` of the study `{study}` (`kind: {kinds[study]}`)*",
         ]
     head = f"## {path.stem.replace('_', ' ')}" + (f"\n\n{config['description']}" if "description" in config else "")
     code = f"```yaml\n{text.strip()}\n```"

@@ -104,17 +104,17 @@ def report(delays: tuple[float, ...] = DELAYS) -> str:
     lines = [
         "# Validity of the methods at extreme parameters",
         "",
-        "Each table lists the number of wrong labels (stable or unstable) of the methods of `zwidth.is_stable`. The",
+        "Each table contains the number of wrong labels (stable or unstable) of the methods of `zwidth.is_stable`. The",
         'reference is `method="certified"`, which returns a label only if the label is guaranteed to be correct.',
-        "The walls are those of devices with the normalized physical damping",
+        "The devices have the following values of the normalized physical damping:",
         f"delta = {', '.join(map(_shortest, DELTAS))}.",
         "",
         'A cell contains the number of wrong labels and the number of walls, for example "1 of 364". If the',
-        "distances of the walls from the stability boundary are known and some labels are wrong, the cell also",
+        "distances of the walls from the stability boundary are known and if labels are wrong, the cell also",
         "contains the largest distance of a wall with a wrong label, relative to alpha. A cell is empty if the",
         "method is not measured at this delay. The delay `1 - ulp` is the largest float64 number below 1.",
         "",
-        "This page is written by `scripts/refresh_extremes.py`.",
+        "The script `scripts/refresh_extremes.py` writes this page.",
         "",
     ]
     for name in dict.fromkeys(outcome.group for outcome in found):

@@ -55,12 +55,20 @@ def markdown(rows: Sequence[Row]) -> str:
     """Return Markdown tables; speeds are relative to batched NumPy eigenvalues of the same run."""
     here = environment()
     lines = [
-        f"Measured in one run on {here['cores']} cores ({here['processor']}) with JAX {here['jax']} and NumPy",
-        f"{here['numpy']}. Times faster: points a second over those of batched `np.linalg.eigvals` at the same delay.",
-        "Layouts: a map has alpha and beta as axes, scattered points have a device each, and one is a single number.",
-        "First call: what it takes longer, compilation above all. Errors: of a label, against ball arithmetic on walls",
-        "1e-15 to 1e-3 from the boundary, the largest relative distance in alpha at which one was wrong; of a number,",
-        "the largest relative one, against 40 digits or more (of passivity, that of the damping that is needed).",
+        f"All results were measured in one run on {here['cores']} cores ({here['processor']}) with JAX {here['jax']}",
+        f"and NumPy {here['numpy']}.",
+        "",
+        "| column | content |",
+        "|---|---|",
+        "| layout | map: a grid of alpha and beta; scattered: each point has its own device; one: a single point |",
+        "| times faster | points per second, divided by those of batched `np.linalg.eigvals` at the same delay |",
+        "| first call | additional time of the first call, mainly for compilation |",
+        "| worst error | defined below; `none of N`: no error among N tested points |",
+        "",
+        "The error of a stability label is measured on walls at relative distances of 1e-15 to 1e-3 from the boundary.",
+        "The labels are compared with ball arithmetic, and the worst error is the largest relative distance in alpha",
+        "of a wall with a wrong label. The worst error of all other results is the largest relative error, compared",
+        "with results of at least 40 digits. For passivity, it is the error of the required damping.",
         "",
     ]
     lines += _questions(rows)
@@ -88,20 +96,20 @@ def markdown(rows: Sequence[Row]) -> str:
 # Quantities of a map, from the cheapest to the most expensive, with the method of each.
 _QUESTIONS = {
     "stable or not": ("stable", "crossover", "map"),
-    "stable or not, each label proved": ("stable", "certified", "map"),
+    "stable or not, each label certified": ("stable", "certified", "map"),
     "passive or not": ("passive", "worst frequency", "map"),
-    "the largest pole, to 1e-9, proved": ("spectral_radius", "map to 1e-09", "map"),
-    "the largest pole, to 1e-2, proved": ("spectral_radius", "map to 0.01", "map"),
+    "spectral radius, certified to 1e-9": ("spectral_radius", "map to 1e-09", "map"),
+    "spectral radius, certified to 1e-2": ("spectral_radius", "map to 0.01", "map"),
     "all poles": ("spectral_radius", "aberth", "map"),
     "all poles, by eigenvalues": ("spectral_radius", "companion", "map"),
-    "the stiffest wall of as many devices": ("alpha_max", "newton", "scattered"),
+    "stiffest wall, one per device": ("alpha_max", "newton", "scattered"),
 }
 
 
 def _questions(rows: Sequence[Row]) -> list[str]:
     """Return a table of the time per million points of each quantity."""
     delays = sorted({row.d for row in rows})
-    lines = ["### What each question costs", "", "Seconds for a million points, compilation apart.", ""]
+    lines = ["### What each question costs", "", "Run time in seconds per million points, without compilation.", ""]
     lines += [f"| question | {' | '.join(f'd = {d:,.10g}' for d in delays)} |", "|---|" + "--:|" * len(delays)]
     for question, key in _QUESTIONS.items():
         cells = []

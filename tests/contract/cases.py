@@ -26,7 +26,7 @@ class Case:
     beyond: dict[str, float] = field(default_factory=dict)
     # Columns of the table in docs/contract.md: domain, value at bad points, derivatives.
     domain: str = ""
-    value: str = "NaN where bad"
+    value: str = "NaN"
     # Highest order of the guaranteed derivatives; None for results without derivatives.
     derivatives: int | None = 2
     # Arguments that must not be traced.
@@ -88,9 +88,9 @@ BEYOND_SI = {"mass": 1e31, "period": 1e-31, "damping": 1e31, "delay": 1e31}
 INTEGER_WALL = {"delta": 8}
 INTEGER_SI = {"mass": 2, "damping": 8}
 DOMAINS = {
-    (WALLS := "walls"): "a device, and alpha and beta 0 or 1e-60 to 1e60 in magnitude",
-    (DEVICES := "devices"): "delta 0 to 1e12, d 0 to 1e5",
-    (QUANTITIES := "quantities"): "in SI units, 0 or 1e-30 to 1e30, mass and period above 0",
+    (WALLS := "walls"): "those of devices; alpha and beta: 0, or 1e-60 to 1e60 in magnitude",
+    (DEVICES := "devices"): "delta: 0 to 1e12; d: 0 to 1e5",
+    (QUANTITIES := "quantities"): "SI quantities: 0, or 1e-30 to 1e30; mass and period: above 0",
 }
 
 
@@ -137,21 +137,21 @@ CASES = [
     make_wall_case(zwidth.poles, concrete=("d",), extra_axes=1, derivatives=1, domain=f"{WALLS}, at most 4,000 poles"),
     make_wall_case(zwidth.spectral_radius, single=1e-5),
     make_wall_case(zwidth.decay_rate),
-    make_wall_case(zwidth.is_stable, derivatives=None, value="False where bad"),
-    make_wall_case(zwidth.decide_stability, derivatives=None, value="False where bad, and why", refuses_tracing=True),
-    make_wall_case(zwidth.is_passive, derivatives=None, value="False where bad"),
+    make_wall_case(zwidth.is_stable, derivatives=None, value="False"),
+    make_wall_case(zwidth.decide_stability, derivatives=None, value="False, with a status", refuses_tracing=True),
+    make_wall_case(zwidth.is_passive, derivatives=None, value="False"),
     make_wall_case(zwidth.passivity_margin),
     make_wall_case(
-        zwidth.margins, value="NaN where bad or alpha <= 0", gradient_in="tests/unit/stability/rigid/test_margins.py"
+        zwidth.margins, value="NaN, also for alpha <= 0", gradient_in="tests/unit/stability/rigid/test_margins.py"
     ),
     make_device_case("boundary", zwidth.boundary, {"omega": [0.0, 0.5, 3.0]}),
     make_device_case(
-        "boundary_point of a row",
+        "boundary_point at constant beta",
         lambda beta, delta, d: zwidth.boundary_point(delta, d, beta=beta),
         {"beta": [0.3, 0.1, 0.05]},
     ),
     make_device_case(
-        "boundary_point of a column",
+        "boundary_point at constant alpha",
         lambda alpha, delta, d: zwidth.boundary_point(delta, d, alpha=alpha),
         {"alpha": [0.3, 0.1, 0.05]},
     ),
@@ -159,7 +159,7 @@ CASES = [
     make_device_case("stable_area", zwidth.stable_area),
     make_device_case("passive_area", zwidth.passive_area, single=1e-5),
     Case(
-        "stiffness_slope", zwidth.stiffness_slope, {"d": [0.0, 1.0, 2.5]}, {"d": -1.0}, {"d": 1e6}, domain="d 0 to 1e5"
+        "stiffness_slope", zwidth.stiffness_slope, {"d": [0.0, 1.0, 2.5]}, {"d": -1.0}, {"d": 1e6}, domain="d: 0 to 1e5"
     ),
     make_quantity_case(zwidth.max_stiffness),
     make_quantity_case(zwidth.sensitivities, derivatives=1),
@@ -169,8 +169,8 @@ CASES = [
         {"gain": [0.01, 0.02, -0.1], "lag": [3.0, 20.0, 0.0], "radius": [1.0, 0.95, 1.1]},
         {"gain": np.nan, "lag": -1.0, "radius": 0.0},
         {"lag": 2.0**53},
-        domain="lag whole, 0 to 2^52; radius above 0; gain finite",
-        value="-1 where bad or float64 cannot tell",
+        domain="lag: integer, 0 to 2^52; radius: above 0; gain: finite",
+        value="-1, also if float64 cannot decide",
         derivatives=None,
         strict=True,
     ),

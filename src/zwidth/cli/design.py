@@ -80,11 +80,12 @@ _TOLERANCE = Parsed("NAME=SHARE", _read_tolerance, "write NAME=SHARE, such as ma
 def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: bool, **drawn: Any) -> None:
     """Compute the parameter that a given stiffness requires, or the effect of tolerances.
 
-    With --find: the value of one parameter at which K_max reaches --stiffness; with --find virtual_damping, the damping
-    with which a wall of --stiffness settles fastest. With --tolerance: the share of random devices on which the wall
-    (--stiffness, --virtual-damping) is stable, the stiffness up to which 99 % of them are stable, and, for uniform
-    tolerances of a rigid device, the stiffest wall, found by search, that is stable on all devices.
-    SCENE.yaml (or the folder of a run) supplies parameters not given as options; options override it.
+    With --find, the command computes the value of one parameter at which K_max reaches --stiffness. With --find
+    virtual_damping, it computes the virtual damping with which a wall of --stiffness settles fastest. With --tolerance,
+    the command computes the percentage of random devices on which the wall (--stiffness, --virtual-damping) is stable,
+    and the stiffness up to which 99 % of the devices are stable. For uniform tolerances of a rigid device, it also
+    searches for the stiffest wall that is stable on all devices. Parameters that are not given as options are taken
+    from SCENE.yaml (or from the folder of a run).
     """
     if find is None and not tolerances:
         raise click.UsageError("give --find or --tolerance, or both")

@@ -116,13 +116,16 @@ def fit(
 ) -> None:
     """Identify mass, damping and delay of a device, and recommend a wall.
 
-    With LOG.csv: from its free motion under the force commanded by a computer; also identifies friction. If several
-    logs are given, they must come from the same device and have the same columns. Units are in the headers, as 'encoder
-    [counts]', or follow a colon. With --buzz: from walls, at two or more values of B, at which the device began to
-    oscillate while K was raised, and their frequencies.
-    SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, the motor's largest force, and
-    the period of walls and of logs without a column of times; options override it. --max-force limits the force in the
-    program of --code and in the simulation. Exit code 1: no wall is recommended (0 with --yaml).
+    With LOG.csv, the command identifies a device, including its friction, from a log of its motion under a commanded
+    force. If you pass several logs, they must come from the same device and have the same columns. Write the unit of a
+    column into its header, as in 'encoder [counts]', or after a colon in the option. With --buzz, the command
+    identifies a device from walls at the onset of oscillation: for two or more values of B, increase K until the device
+    begins to oscillate, and pass K, B and the frequency of the oscillation.
+
+    The velocity estimate, the encoder step and the largest force of the motor are taken from SCENE.yaml (or from the
+    folder of a run) if they are not given as options. The sampling period is also taken from this file for walls, and
+    for logs without a time column. --max-force limits the force in the code of --code and in the simulation. The exit
+    code is 1 if no wall is recommended, but 0 with --yaml.
     """
     from zwidth.identification.fit_report import list_units, write_scene
 
@@ -237,9 +240,9 @@ def excite(
 ) -> None:
     """Design the force to play before `zwidth respond`, or the torque if the units are those of a rotary device.
 
-    Required: --rate (or --period), --force and --resolution. SCENE.yaml (or the folder of a run) supplies those not
-    given as options: its period, max_force and resolution; also its velocity estimate, and a measured device as
-    --response.
+    The sampling period, the largest force and the encoder step are required. Values that are not given as options
+    (--rate or --period, --force, --resolution) are taken from the scene of SCENE.yaml (or of the folder of a run). The
+    velocity estimate and a measured device (instead of --response) are also taken from this scene.
     """
     hardware = get_hardware()
     options: dict[str, Any] = {"period": loop.known_period, "force": force or hardware.get("max_force")}
@@ -306,10 +309,11 @@ def respond(
 ) -> None:
     """Measure the frequency response of a device, and compute a safe wall from it.
 
-    No model is required; the response has an error band. The logs contain a force designed by `zwidth excite`, or any
-    other force. The other commands accept the file of --save, or the table of an analyzer, as a device: `zwidth ridge
-    --device FILE.csv`. SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, and
-    the period of logs without a column of times; options override it.
+    The command requires no model of the device, and computes the response with an error band. The logs can contain a
+    force that `zwidth excite` has designed, or any other force. Other commands accept the file of --save, or a table
+    from a network analyzer, as a device: `zwidth ridge --device FILE.csv`. The velocity estimate, the encoder step and,
+    for logs without a time column, the sampling period are taken from SCENE.yaml (or from the folder of a run) if they
+    are not given as options.
     """
     if not logs:
         raise click.UsageError("give one LOG.csv or several")

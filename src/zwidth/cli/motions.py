@@ -47,8 +47,9 @@ _LIMITS = "--resolution '20 um' --friction '50 mN'"
 def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
     """Find the cause of a device's oscillation on a wall, and the changes that stop it.
 
-    Possible causes: linear instability, steps of the encoder, limits of the motor. Required: --stiffness, --mass (or
-    --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies parameters not given as options.
+    Possible causes are instability of the linear loop, the steps of the encoder, and the limits of the motor. The
+    options --stiffness, --mass (or --device) and --rate (or --period) are required. Parameters that are not given as
+    options are taken from SCENE.yaml (or from the folder of a run).
     """
     from zwidth.analysis.diagnosis import diagnose as find_cause
 
@@ -92,7 +93,8 @@ def simulate(
 
     In a hit the wall is unilateral; otherwise it is bilateral. Without --hit, --external-force and --hold the
     device is released at a depth of 1 mm (1 mrad if rotary), or of 50 encoder steps if --resolution is given. Required:
-    --stiffness, --mass (or --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies parameters
+    --stiffness, --mass (or --device) and --rate (or --period) are required. Parameters that are not given as options are taken from
+    SCENE.yaml (or from the folder of a run) supplies parameters
     not given as options.
     """
     from zwidth.analysis.diagnosis import diagnose as find_cause

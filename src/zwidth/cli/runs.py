@@ -1,7 +1,7 @@
 """Commands on runs: ``zwidth run`` with its progress on stderr, ``verify``, ``export``, ``figures`` and ``bench``.
 
 A run computes the studies of a configuration file and writes their results into one folder. A sweep is a study of up to
-10^11 points; it is computed in chunks, each of which is saved in the store DIR/STUDY.zarr, so that a stopped run can be
+10^12 points; it is computed in chunks, each of which is saved in the store DIR/STUDY.zarr, so that a stopped run can be
 resumed.
 """
 
@@ -84,8 +84,8 @@ _FIGURE_SIZE = Parsed(
 def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi: int | None, **options: Any) -> None:
     """Run the studies of a CONFIG file.
 
-    Write data, figures and a record of the run into one folder, and the results of each sweep into DIR/STUDY.zarr.
-    After Ctrl-C the results so far are kept; continue with --resume.
+    The command writes data, figures and a record of the run into one folder, and the results of each sweep into
+    DIR/STUDY.zarr. If you stop the run with Ctrl-C, the results so far are kept, and --resume continues the run.
     """
     from zwidth.plotting.style import style_sheet
     from zwidth.runs.run import run as run_studies
@@ -190,7 +190,7 @@ def _report_end(result: RunResult, command: str) -> None:
 def verify(folder: Path, as_json: bool) -> None:
     """Verify the checksums of all files of the sweeps in DIR.
 
-    Exit code 1 if a file is damaged or missing; `zwidth run --resume` repairs it.
+    The exit code is 1 if a file is damaged or missing; `zwidth run --resume` then repairs the file.
     """
     from zwidth.sweep.dataset import verify as verify_stores
 
@@ -250,8 +250,9 @@ def figures(folder: Path, selection: dict[str, str], out: Path | None, as_json: 
     """Draw the sweeps in DIR, as PNG and SVG.
 
     The figures show stable and passive walls with their boundaries, contours of margins and decay times, and the
-    stiffest wall as a surface. --at selects the nearest value in the sweep; values without a unit have the unit of the
-    store. Without --at, each of up to three values of a parameter has a panel.
+    stiffest wall as a surface. --at selects the value of the sweep that is nearest to the given value; values without a
+    unit have the unit of the store. Without --at, the figure has one panel for each of up to three values of a
+    parameter.
     """
     from zwidth.runs.draw import draw_stores
 
@@ -278,7 +279,8 @@ def figures(folder: Path, selection: dict[str, str], out: Path | None, as_json: 
 def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
     """Measure speed and error of every method, and of comparable tools.
 
-    Required: a checkout of the project, whose benchmarks/methods it runs, and the extra "test" for the errors.
+    The command requires a checkout of the project, because it runs the programs in benchmarks/methods. To measure the
+    errors, it also requires the extra "test".
     """
     # Look for the benchmarks in the checkout, because an installed package does not contain them.
     folder = Path(__file__).parents[3] / "benchmarks"

@@ -54,7 +54,7 @@ _RIDGE_POINTS = 101  # values of delta on the path of maximum stiffness
 
 @register
 class BoundaryStudy(CurvesStudy):
-    """Boundary of the stable virtual walls for each delta and d, or for a device with parts such as an actuator."""
+    """The boundary of the stable walls for each delta and d, or for a device with parts such as an actuator."""
 
     method = "Closed form of the boundary, to a few rounding errors; the stable side by counting poles."
     reads_scene = True
@@ -194,7 +194,7 @@ def tabulate_stable_intervals(deltas: np.ndarray, delays: np.ndarray) -> list[di
 
 @register
 class CompareStudy(ComputedStudy):
-    """Stable walls of several devices in one figure, and the stiffest stable wall of each device in a table."""
+    """The stable walls of several devices in one figure, and the stiffest wall of each device in a table."""
 
     method = "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge."
     from_scene = ()
@@ -262,7 +262,7 @@ _OUTPUTS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive": 
 
 @register
 class MapStudy(ComputedStudy):
-    """Stability, spectral radius and passivity on a grid of alpha, beta, delta and d."""
+    """The stability, spectral radius and passivity of walls on a grid of alpha, beta, delta and d."""
 
     method = "Stability by the phase at the gain crossover; radii by Newton's method, to some rounding errors."
     reads_scene = True

@@ -70,7 +70,7 @@ Count = Annotated[int, Quantity(allowed=Range(2, 100_000), whole=True)]
 
 @register
 class DesignStudy(ComputedStudy):
-    """Parameter value at which K_max reaches a required stiffness, and the stable share of devices with tolerances."""
+    """The value of a parameter at which K_max reaches a required stiffness, and the effect of tolerances."""
 
     method = "The maximum stable stiffness, solved for the parameter to a relative error of 1e-11."
     from_scene = ("device", "stiffness")
@@ -277,7 +277,7 @@ class DesignStudy(ComputedStudy):
 
 @register
 class FiltersStudy(ComputedStudy):
-    """K_max and velocity noise versus cut-off frequency of a low-pass filter or window length of a difference."""
+    """K_max and the velocity noise for low-pass filters and windowed differences of the velocity."""
 
     method = "The maximum over all boundary curves of the stable set, for each filter, to about 1e-13."
     from_scene = ("device",)

@@ -118,7 +118,7 @@ class _Fitted(NamedTuple):
 
 @register
 class FitStudy(ComputedStudy):
-    """Mass, damping and delay of a device, fitted to logs or to walls at the onset of instability."""
+    """The mass, damping and delay of a device, fitted to logs or to walls at the onset of instability."""
 
     method = "Least squares with exact derivatives; the band of the boundary by 200 devices drawn from the covariance."
     from_scene = ()

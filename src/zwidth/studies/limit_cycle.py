@@ -92,7 +92,7 @@ class CycleAxes(Strict, noun="the axes of a limit_cycle study"):
 
 @register
 class LimitCycleStudy(SimulatedStudy, SimulationConditions):
-    """Amplitude and frequency of simulated limit cycles over one or two parameters, under one or more conditions."""
+    """The amplitude and frequency of limit cycles over one or two parameters, under one or more conditions."""
 
     method = "Simulations, exact between samples; amplitude and frequency as observed in the last quarter."
     point_bytes = 8 * (1 + len(_OUTPUTS))

@@ -108,7 +108,7 @@ class ResponseStudy(ComputedStudy):
 
 @register
 class StepStudy(WallsStudy, ResponseStudy):
-    """Response of the position to a step of the external force, for one or more devices and walls."""
+    """The response of the position to a step of the external force, for one or more devices and walls."""
 
     method = "Exact solution between changes of the force; rounding errors only."
     from_scene = ("devices",)
@@ -186,7 +186,7 @@ _DEVICE_NAMES = ("mass", "damping", "period", "delay", "delta", "d")
 
 @register
 class RecommendStudy(ResponseStudy):
-    """Recommended virtual wall of a device at required margins, the limits of this wall, and its step response."""
+    """The recommended wall of a device with the required margins, its limits, and its step response."""
 
     method = "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings."
     from_scene = ("device",)

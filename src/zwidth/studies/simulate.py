@@ -114,7 +114,7 @@ class SimulatedStudy(ComputedStudy):
 
 @register
 class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
-    """Simulated motions of a device on one or several walls over time."""
+    """The motions of a device in one or several walls, by simulation."""
 
     method = "Matrix exponentials between events; transitions of friction located to rounding errors."
     remedy_if_too_large = "shorten the duration, lower substeps, or use fewer walls"
