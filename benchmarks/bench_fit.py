@@ -319,7 +319,7 @@ def spell_widths(rows: list[dict[str, Any]]) -> str:
 
 
 def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
-    """Return a text on warned, fits with warnings, and wrong fits without warnings."""
+    """Return a text on rejected fits, fits with warnings, and wrong fits without warnings."""
     sure = [row for row in fitted if row["status"] == 0 and not row["warnings"]]
     wrong = [row for row in sure if max(row["away"].values()) > 5]
     safe = [row["safe"] for row in fitted if row["safe"] is not None]

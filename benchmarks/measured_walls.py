@@ -1,4 +1,4 @@
-"""Measure safety and stiffness of walls recommended from two records of devices without a known modeled.
+"""Measure safety and stiffness of walls recommended from two records of devices without a known model.
 
     .venv/bin/python benchmarks/measured_walls.py [DEVICES] [FIRST]
 

@@ -138,7 +138,7 @@ def summary(rows: Sequence[Row]) -> str:
 
 
 def _faster(row: Row, references: dict[float, float]) -> str:
-    """Return the speed relative to batched NumPy, except for single calls, which are competitor comparable."""
+    """Return the speed relative to batched NumPy, except for single calls, which are not comparable."""
     return f"{row.rate / references[row.d]:,.3g}" if row.d in references and row.layout != "one" else ""
 
 

@@ -91,11 +91,10 @@ def simulate(
 ) -> None:
     """Simulate a hit on a wall, a constant external force, or the release of the device from inside the wall.
 
-    In a hit the wall is unilateral; otherwise it is bilateral. Without --hit, --external-force and --hold the
-    device is released at a depth of 1 mm (1 mrad if rotary), or of 50 encoder steps if --resolution is given. Required:
-    --stiffness, --mass (or --device) and --rate (or --period) are required. Parameters that are not given as options are taken from
-    SCENE.yaml (or from the folder of a run) supplies parameters
-    not given as options.
+    In a hit the wall is unilateral; otherwise it is bilateral. Without --hit, --external-force and --hold the device is
+    released at a depth of 1 mm (1 mrad if rotary), or of 50 encoder steps if --resolution is given. The options
+    --stiffness, --mass (or --device) and --rate (or --period) are required. Parameters that are not given as options
+    are taken from SCENE.yaml (or from the folder of a run).
     """
     from zwidth.analysis.diagnosis import diagnose as find_cause
     from zwidth.simulation.behavior import describe_ending

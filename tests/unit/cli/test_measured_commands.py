@@ -192,7 +192,9 @@ def test_rotary_device_from_excitation_to_safe_wall(tmp_path):
         assert next(played) == "time [s],torque [N m]\n"
     time, torque = np.genfromtxt(tmp_path / "play.csv", delimiter=",", skip_header=1).T
     knob = zwidth.Scene(zwidth.Device("60 g cm^2", "0.02 mN m s/rad"), zwidth.Timing("1 ms"))
-    position = zwidth.simulate(knob, 0.0, 0.0, external_force_history=torque, periods=torque.size).position[: torque.size]
+    position = zwidth.simulate(knob, 0.0, 0.0, external_force_history=torque, periods=torque.size).position[
+        : torque.size
+    ]
     # The encoder wraps after each revolution.
     counts = np.mod(np.round(position * 2000 / (2 * np.pi)), 2000)
     rows = [f"{1e3 * t:.6g},{count:.0f},{f:.7g}" for t, count, f in zip(time, counts, torque, strict=True)]

@@ -63,10 +63,10 @@ def test_study_with_required_margins(run):
     assert "no wall: no passive wall exists" in " ".join(output.split())
 
 
-def test_a_scene_that_no_device_has_causes_a_warning_before_anything_is_computed(tmp_path, monkeypatch, unpainted):
+def test_implausible_scene_has_warnings_before_the_computation(tmp_path, monkeypatch, unpainted):
     monkeypatch.chdir(tmp_path)
 
-    def warnings_of(scene):
+    def list_warnings(scene):
         (tmp_path / "small.yaml").write_text(HEAD + f"scene: {scene}\n" + STUDY % 0.5, encoding="utf-8")
         result = CliRunner().invoke(cli, ["run", "small.yaml", "--dry-run"], catch_exceptions=False)
         # Older versions of click's runner merge stderr and stdout.
@@ -74,16 +74,16 @@ def test_a_scene_that_no_device_has_causes_a_warning_before_anything_is_computed
         assert plan
         return [line.removeprefix("zwidth: small.yaml: scene.") for line in warnings.splitlines()]
 
-    assert warnings_of("{mass: 100, damping: 10, rate: 1, delay: 1}") == [
+    assert list_warnings("{mass: 100, damping: 10, rate: 1, delay: 1}") == [
         "mass is 100 kg, an implausible value; did you mean 'mass: 100 g'?",
         "delay is 1 s, an implausible value; did you mean 'delay: 1 ms' or 'delay: 1 periods'?",
         "rate is 1 Hz, an implausible value; did you mean 'rate: 1 kHz'?",
     ]
-    (operator_warning,) = warnings_of("{mass: 1, rate: 1 kHz, operator: {mass: 70, stiffness: 100}}")
+    (operator_warning,) = list_warnings("{mass: 1, rate: 1 kHz, operator: {mass: 70, stiffness: 100}}")
     assert operator_warning == "operator.mass is 70 kg, an implausible value; did you mean 'operator.mass: 70 g'?"
-    (rotary_warning,) = warnings_of("{rotary: true, mass: 50, rate: 1 kHz}")
+    (rotary_warning,) = list_warnings("{rotary: true, mass: 50, rate: 1 kHz}")
     assert rotary_warning == "mass is 50 kg m^2, an implausible value; check its unit"
-    assert warnings_of("{mass: 0.1, damping: 10, period: 1e-3, delay: 2 periods, stiffness: 5 kN/m}") == []
+    assert list_warnings("{mass: 0.1, damping: 10, period: 1e-3, delay: 2 periods, stiffness: 5 kN/m}") == []
 
 
 def test_terminal_shows_a_progress_bar_and_lines(tmp_path):
