@@ -32,9 +32,9 @@ from zwidth.units.quantities import LARGEST_DAMPING, LONGEST_DELAY
 
 SERIES_BELOW = 2.5  # x below which the series are used
 SERIES_TERMS = 11  # the first omitted term is below 1.25^22/23! = 6e-21 of the sum and of its first two derivatives
-# phi1 = e^(-x/2) sum_k (x/2)^(2k) / (2k + 1)!
+# Coefficients of the series phi1 = e^(-x/2) sum_k (x/2)^(2k) / (2k + 1)!
 PHI1 = [1.0 / factorial(2 * k + 1) for k in range(SERIES_TERMS)]
-# gap = -x phi2' = e^(-x/2) x sum_k (k + 1) (x/2)^(2k) / (2k + 3)!
+# Coefficients of the series gap = -x phi2' = e^(-x/2) x sum_k (k + 1) (x/2)^(2k) / (2k + 3)!
 GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(SERIES_TERMS)]
 
 
