@@ -60,8 +60,9 @@ def place_nodes(loop: LoopRoots) -> np.ndarray:
     from_one, from_minus_one = np.abs(roots), np.abs(roots - 2.0)
     delay_angle = 1.0 / (loop.lag + loop.estimate.window + 1.0)
     first = 1e-3 * min([delay_angle, *from_one[from_one > 1e-13]])
-    # Let x = pi - w. Near z = -1, imaginary parts have a relative rounding error of eps/x, and beta changes in
-    # proportion to (x/from_minus_one)^2. Place the last node as close to pi as the resulting error of d beta/dw allows.
+    # Let x = pi - w, and let rho be the smallest distance of a root from z = -1. Near z = -1, imaginary parts have a
+    # relative rounding error of eps/x, and beta changes in proportion to (x/rho)^2. Place the last node as close to pi
+    # as the resulting error of d beta/dw allows.
     last = LAST_NODE * min([delay_angle, *from_minus_one[from_minus_one > 1e-13]]) ** (2.0 / 3.0)
     w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - last, 32)[1:]])
     nodes, low, high = [w], w[:-1], w[1:]
@@ -155,7 +156,7 @@ def list_circle_zeros(loop: LoopRoots) -> np.ndarray:
 # Parts of the error bound of alpha between two nodes, relative to `CurvePoints.size`. If linear interpolation is not
 # accurate, the bound is COARSE_TOLERANCE plus 1.5 times the difference of alpha between the nodes.
 COARSE_TOLERANCE = 0.02
-ROUNDING_TOLERANCE = 1e-6  # bound of the rounding errors
+ROUNDING_TOLERANCE = 1e-6  # bound on the rounding errors
 
 
 class Arc(NamedTuple):
@@ -217,7 +218,7 @@ def cut_arcs(
         parts = [np.concatenate([[end[0]], part, [end[1]]]) for part, end in zip(parts, edges, strict=True)]
         if not rising:
             parts = [part[::-1] for part in parts]
-        # Drop nodes at which rounding errors break the monotone order of beta. Such nodes lie near the ends of the arc.
+        # Drop nodes near the ends of the arc at which rounding errors break the monotone order of beta.
         beta = parts[1]
         ordered = np.maximum.accumulate(beta) == beta
         ordered &= np.minimum.accumulate(beta[::-1])[::-1] == beta
@@ -269,10 +270,10 @@ def build_level_arc(w: np.ndarray, curve: CurvePoints, beta: float) -> Arc:
 def bound_interpolation(
     w: np.ndarray, alpha: np.ndarray, alpha_slope: np.ndarray, beta_slope: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a mask of the steps over which alpha may be interpolated linearly in beta, and bounds of its error.
+    """Return a mask of the steps between nodes over which alpha is nearly linear in beta, and bounds on its error.
 
     A step is the interval between two neighboring nodes. Where the mask is False, alpha is approximated by the mean of
-    both ends, with the returned bound of the error.
+    both ends, with the returned bound on the error.
 
     Args:
         w: angles of the nodes of all arcs, joined, shape (nodes,).
@@ -305,7 +306,7 @@ class JoinedArcs(NamedTuple):
     beta: np.ndarray
     alpha: np.ndarray
     straight: np.ndarray  # of each step: alpha may be interpolated linearly in beta; else use the mean of both ends
-    room: np.ndarray  # of each step: bound of the error of this alpha
+    room: np.ndarray  # of each step: bound on the error of this alpha
     keys: np.ndarray  # of each node: index of its arc times the number of dampings, plus index of its damping
     dampings: np.ndarray  # of all nodes, sorted
     first: np.ndarray  # of each arc: its first node

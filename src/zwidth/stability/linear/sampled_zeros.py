@@ -50,7 +50,7 @@ def find_sampled_zeros(device: LinearDevice, period: float, fraction: float) -> 
 
 
 def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> bool:
-    """Return whether the gains and the zeros of two precisions differ by at most `PRECISION_TOLERANCE`."""
+    """Return whether gains and zeros from computations in two precisions differ by at most `PRECISION_TOLERANCE`."""
     (gain, zeros), (gain2, zeros2) = one, other
     if len(zeros) != len(zeros2) or abs(gain - gain2) > Decimal(PRECISION_TOLERANCE) * abs(gain2):
         return False

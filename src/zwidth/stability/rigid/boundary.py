@@ -303,7 +303,7 @@ def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     return StableRegion(alpha, beta, omega, piece)
 
 
-LOBE_NODES = 48  # Gauss-Legendre nodes along the lobe; the integrand alpha d(beta) is analytic there
+LOBE_NODES = 48  # number of Gauss-Legendre nodes along the lobe, on which the integrand alpha d(beta) is analytic
 LOBE_WEIGHT = 16  # computing time and memory per point of `stable_area`, relative to other kernels
 
 

@@ -79,7 +79,8 @@ class Sized:
     def __add__(self, other: Any) -> Sized:
         other = other if isinstance(other, Sized) else Sized(other)
         value = self.value + other.value
-        # If both terms are exact, the size is that of the sum, because its rounding error is the only error.
+        # If both terms are exact, the size is the magnitude of the sum, because the rounding error of the sum is the
+        # only error.
         return Sized(value, abs(value) + TINY if self.exact and other.exact else self.size + other.size)
 
     __radd__ = __add__
@@ -141,7 +142,7 @@ def size_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
     """Return the discretized device of exact delta and d as `Sized` numbers, NaN if out of range."""
     plant = discretize(delta, d, kind)
     if kind.fractional and kind.long:
-        plant = materialize(plant, delta)  # because several loops of the compiled program use it
+        plant = materialize(plant, delta)  # compute it once, although several loops of the program use it
     sized = DiscretePlant(*(Sized(value, abs(value) + TINY) for value in plant))
     sized = sized._replace(delta=Sized(plant.delta), f=Sized(plant.f), whole=plant.whole, a0=None)
     if kind.fractional:
@@ -152,7 +153,7 @@ def size_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
 
 
 def enclose_root(coefficients: tuple[Sized, ...]) -> tuple[Sized, Array]:
-    """Return the zero u of the cubic, and whether sign changes of the cubic prove its error to be `CROSSOVER_WIDTH`."""
+    """Return the zero u of the cubic, and whether a sign change proves the error bound `CROSSOVER_WIDTH`."""
     u = find_first_root(tuple(h.value for h in coefficients))
     low, high = (horner(Sized(u * (1.0 + side)), coefficients) for side in (-CROSSOVER_WIDTH, CROSSOVER_WIDTH))
     changes_sign = (low.value > CUBIC_TOLERANCE * low.size) & (high.value < -CUBIC_TOLERANCE * high.size)

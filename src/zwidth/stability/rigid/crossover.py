@@ -142,7 +142,7 @@ def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]
     """Expand |B|^2 - |T|^2 in powers of u, in any arithmetic.
 
     There are three coefficients if a0 is None, i.e. for integer d, otherwise four. For alpha > 0 the polynomial is
-    positive at u = 0 and has at most one root in (0, 2), the gain crossover, beyond which it is negative.
+    positive at u = 0 and has at most one root in (0, 2), the gain crossover, above which it is negative.
     """
     p1_squared, cross, alpha_squared = plant.p1 * plant.p1, beta * (alpha + beta) * 2, alpha * alpha
     # Compute bend = cross/2 - delta^2 in factored form, which avoids cancellation near beta = delta. The code uses

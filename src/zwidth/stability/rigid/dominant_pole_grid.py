@@ -44,10 +44,10 @@ from zwidth.stability.rigid.pole_count import LoopFactors, count_poles_in_cell, 
 
 # Sides of the cells of a square grid, in walls. Cells of other grids have as many walls and the grid's proportions.
 CELL_SIDES = (128, 64, 32, 16, 8)
-# Batch sizes, chosen such that the working arrays stay in the cache.
-CELLS_PER_LIST = 1 << 9
-CELLS_PER_BATCH = 1 << 7  # cells whose series are computed at once
-WALLS_PER_WRITE = 1 << 16
+# Sizes of batches, chosen such that the working arrays stay in the cache.
+CELLS_PER_LIST = 1 << 9  # number of cells whose poles are searched at once
+CELLS_PER_BATCH = 1 << 7  # number of cells whose series are computed at once
+WALLS_PER_WRITE = 1 << 16  # number of walls whose poles are evaluated and stored at once
 # Number of Halley steps from each starting point of the search for the two largest poles at the center of a cell.
 HALLEY_STEPS = 5
 # Distance in log z, relative to the distance between neighboring poles of a long delay. A sequence of Halley steps has
@@ -127,7 +127,7 @@ def pad_to_16(index: np.ndarray) -> np.ndarray:
 
 
 def _bound_on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds: log radii minus and plus an error, but kept at a distance on one side of the unit circle."""
+    """Return ``re - error`` and ``re + error``, limited so that both are on the same side of the unit circle as re."""
     gap = 2.0 * VERDICT_WIDTH
     return (
         np.where(re > 0, np.maximum(re - error, gap), re - error),
@@ -136,7 +136,7 @@ def _bound_on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.nda
 
 
 def _find_two_poles(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return re and im of the two largest distinct poles that Halley's method finds in each cell: (2, cells)."""
+    """Return re and im of the two largest distinct poles that Halley's method finds per cell, of shape (2, cells)."""
     previous = re, im = list_starts(loop, fractional)
     distance = SAME_POLE_DISTANCE / loop.n_plus_1
     for _ in range(HALLEY_STEPS):
@@ -265,7 +265,7 @@ class _CellGrid:
         return positions[:, :count][:, ~certified[:count]]
 
     def _evaluates_logarithms(self, k: int) -> bool:
-        """Return whether series are evaluated at each wall (for rates, in small cells) instead of interpolated."""
+        """Return whether series of the order ``ORDERS[k]`` are evaluated at each wall instead of interpolated."""
         return self.errors.with_rate or min(self.sides) <= _list_chebyshev_nodes(ORDERS[k]).size
 
     def _index_axes(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -288,7 +288,8 @@ class _CellGrid:
         ]
         counts = [sum(group.n_poles for group in groups)] * len(circles)
         if self.errors.is_coarse:
-            # Accept slightly larger other poles, too: up to the reserve, and on the same side of the unit circle.
+            # Also accept other poles that are larger by at most `AllowedErrors.reserve` and on the same side of the
+            # unit circle.
             low = np.maximum.reduce([group.low for group in groups])
             circles.append(_bound_on_one_side(low, self.errors.reserve)[1])
             counts.append(0 * counts[0])

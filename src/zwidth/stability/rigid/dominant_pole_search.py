@@ -44,11 +44,11 @@ from zwidth.stability.rigid.characteristic_function import (
 from zwidth.stability.rigid.normalization import valid_wall
 from zwidth.stability.rigid.pole_count import LoopFactors, count_poles, factor_loop
 
-# Halley steps.
-STEPS_ON_BOTH = 2  # on both starting points
-STEPS_ON_LARGER = 3  # then on the larger of the two
-STEPS_AGAIN = 6  # without a certificate: on the result, and on the starting point that is farther from it
-STEPS_ON_ALL = 10  # without a certificate again: on four starting points
+# Numbers of Halley steps.
+STEPS_ON_BOTH = 2  # from both starting points
+STEPS_ON_LARGER = 3  # then from the larger of both results
+STEPS_AGAIN = 6  # without a certificate: from the result, and from the starting point that is farther from it
+STEPS_ON_ALL = 10  # without a certificate again: from four starting points
 
 # Distance in log z between a point and a pole below which a sequence of steps has converged.
 CONVERGED_RADIUS = 1e-6
@@ -131,9 +131,9 @@ def approximate_slow_pole(loop: LoopFactors) -> tuple[Array, Array]:
 
 
 def approximate_first_pair(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
-    """Approximate the first pair: its angle from the delay, its radius r from |T| = |B| with r only in r^(1+n).
+    """Approximate the first pair: its angle from the delay, and its radius r from |T| = |B| with simplified factors.
 
-    All other factors of T and B are evaluated on the unit circle.
+    Only the factor r^(1+n) depends on r; all other factors of T and B are evaluated on the unit circle.
     """
     xp = namespace(loop.alpha)
     im = np.pi / (loop.d_plus_1 + 1.0)
@@ -335,8 +335,8 @@ def _find_in_rounds(begin: Any, end: Any, loop: LoopFactors, fractional: bool) -
     Round 0 refines and certifies the larger pole, round 1 bisects the radius, and round 2 refines and certifies the
     pole on the bisected circle.
     """
-    # Call the Newton step and the count only once each, in a loop whose range depends on the round, because both take
-    # long to compile.
+    # Newton step and count take long to compile. Therefore each of them is called at a single place, inside a program
+    # loop, and the number of the round determines the first and the last iteration of this loop.
     import jax.numpy as xp
     from jax.lax import fori_loop, while_loop
 

@@ -49,7 +49,7 @@ N_FRACTIONS = 64
 GRADING = 50.0
 # Value of delta below which the samples are practically evenly spaced.
 LIGHT_DAMPING = 1e-3
-# Golden-section steps to a local minimum between these samples.
+# Number of golden-section steps to a local minimum between these samples.
 GOLDEN_SECTION_STEPS = 24
 # A stable wall (alpha, beta, delta, d and an arbitrary phase), which replaces unstable ones in the delay margin search.
 STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
@@ -57,7 +57,7 @@ STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
 LEAST_MARGIN = float(np.finfo(np.float32).tiny)
 # Phase in rad below which the sign of a computed phase may be wrong because of rounding errors.
 SMALL_PHASE = 0.1
-# Value of delta whose square underflows in float64.
+# Values of delta below this one are set to 0, because their squares underflow in float64.
 NEGLIGIBLE_DAMPING = 1e-150
 # Phase in rad assumed if |L| is above 1 at every frequency; negative, because the loop is then unstable.
 NO_CROSSOVER_PHASE = -1e-3
@@ -164,7 +164,7 @@ def _place_by_verdict(margin: Array, edge: float, least: float, stable: Array, x
         xp: Array namespace.
     """
     nearest = xp.where(stable, edge + least, edge)
-    # Add a difference that is 0, because it keeps the derivatives of the margin.
+    # Add a difference whose value is 0 but whose derivatives are those of the margin.
     return xp.where((margin < nearest) == stable, nearest + (margin - stop_gradient(margin, xp)), margin)
 
 

@@ -48,7 +48,7 @@ RATE_ACCURACY = 1e-6
 MIN_LOG_RADIUS = 1e-5
 # Value of |sin(im)| below which a pole counts as real.
 REAL_AXIS_WIDTH = 1e-7
-# Number of Newton steps to the center of a group of two poles.
+# Number of Newton steps to the center of a group of two poles, the zero of A' between them.
 NEWTON_STEPS = 4
 # Radii of the circles that are tried, relative to the largest radius.
 CIRCLE_RADII = 2.0 ** (-0.5 * np.arange(14))
@@ -333,7 +333,8 @@ def expand_sums(group: Group, cells: Cells, order: int) -> list[np.ndarray]:
     for k in range(1, poles + 1):
         weight = weights * (u / (1.0 + u) if poles == 1 else k * points**k)
         series = _compute_powers(powers_eta, order + 1, weight) @ powers_xi * binomials
-        # Replace the constant term, which is the value for the poles of the wall at the center of the cell.
+        # Compute the constant term separately, because the weights of C1 do not apply to it. It is the value for the
+        # poles of the wall at the center of the cell.
         center_sum = (log_derivative * (weights * points**k)).sum(1)
         series[:, 0, 0] = np.log1p(group.disk * center_sum).real if poles == 1 else center_sum.real
         sums.append(series)

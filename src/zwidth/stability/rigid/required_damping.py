@@ -25,9 +25,10 @@ from zwidth.core.xp import ARCSINE, COSINE, SINE, epsilon, horner, namespace, st
 from zwidth.numerics.held_mass import ANY, DelayClasses, split_delay
 from zwidth.numerics.root_finding import newton
 
-# Newton steps to the peak, from a start that is within a few percent.
+# Number of Newton steps to the peak; the error of the starting value is a few percent.
 PEAK_STEPS = 3
-# Newton steps to the smallest direction beta/alpha with a peak; the start is at most twice the solution.
+# Number of Newton steps to the smallest direction beta/alpha with a peak; the starting value is at most twice the
+# solution.
 DIRECTION_STEPS = 12
 
 
@@ -136,7 +137,7 @@ def evaluate_condition(u: Array, a: Array, beta: Array, delay: DelayTerms) -> Pe
 
 
 def _compute_cosine_and_sine(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:
-    """Return the cosine and sine of ``k w`` in [0, pi], for u in (0, 1]."""
+    """Return cos(k w) and sin(k w) for u in (0, 1] and 0 < k w <= pi."""
     if xp is np:
         x = 2.0 * k * np.arcsin(np.sqrt(0.5 * u))
         return np.cos(x), np.sin(x)

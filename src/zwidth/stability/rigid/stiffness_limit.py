@@ -27,7 +27,7 @@ from zwidth.stability.rigid.broadcasting import Points, group_by_value
 from zwidth.stability.rigid.crossover import expand_long_delay_curve, expand_short_delay_curve
 from zwidth.units.quantities import WALL_RANGE
 
-# Numbers of Newton steps. Each step doubles the number of correct digits.
+# Numbers of Newton steps, each of which doubles the number of correct digits.
 END_STEPS = 6  # to the end of a lobe; the last step only confirms convergence
 ROW_STEPS = 2  # to the frequency of a limit; the relative error is then 2e-9, and a last step in alpha squares it
 
