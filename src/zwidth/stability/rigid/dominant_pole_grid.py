@@ -113,7 +113,7 @@ class _AxisPieces:
         self._tables: dict[Any, np.ndarray] = {}
 
     def table(self, function: Callable[[np.ndarray, int], np.ndarray], order: int, pieces: Any) -> np.ndarray:
-        """Return ``function`` (powers or interpolation weights) at all walls of some pieces: (pieces, walls, ...)."""
+        """Return ``function`` (powers or interpolation weights) at the walls of pieces, shape (pieces, walls, ...)."""
         if self._positions.size > MAX_CACHED:
             return function(self._positions[pieces], order)
         if (function, order) not in self._tables:
