@@ -367,8 +367,7 @@ def _read_with_numpy(lines: list[str], layout: _Layout, count: int, indices: Seq
     begin, separator = layout.begin, layout.separator
     time_columns = _find_time_columns(lines, layout, indices)
     if separator != "," and all(any(sign in line for line in islice(lines, begin, None)) for sign in ",."):
-        # Leave a table with decimal commas and points to `_read_cells`, which requires that all decimal signs are the
-        # same.
+        # Leave a table with decimal commas and points to `_read_cells`, which requires equal decimal signs.
         return None
     if separator == " ":
         width = max(len(line.split()) for line in lines[begin:])

@@ -46,8 +46,7 @@ SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
 # Distance of an additional point of the curve from an end of an interval, at which the curve may be infinite, relative
 # to the distance of the nearest node from this end.
 PROBE_DISTANCE = 1e-6
-# Ratio of the radial part to the whole displacement of a pole from a zero of G. Below this ratio the pole leaves the
-# zero along the unit circle (V14).
+# A pole leaves a zero of G along the circle if the radial part of its displacement is below this fraction (V14).
 TANGENT_TOLERANCE = 1e-9
 EQUAL_DAMPING = 1e-12  # dampings with a smaller relative difference are equal up to rounding errors
 BLOCK_SIZE = 1 << 17  # pairs of lines and arcs per batch; its arrays fit in the cache
@@ -295,7 +294,7 @@ class Boundary:
     def _sum_below(
         self, alpha: np.ndarray, beta: np.ndarray, excluded: np.ndarray | int = -1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Sum ``leaving`` over the crossings below each wall, except in the column ``excluded``.
+        """Sum ``leaving`` over the crossings below each wall, except the crossing in the column ``excluded``.
 
         Returns:
             The sums, and whether the crossings of each wall's line of constant B are consistent.
@@ -381,8 +380,8 @@ class Boundary:
             power = -side / (rest.value * (1j * points.z) ** order)
             x = power ** (1.0 / order) * np.exp(2j * np.pi * np.arange(order) / order)
             if np.isfinite(self.lossless):
-                # In a lossless loop, a change of alpha moves the pole along the circle. Only a difference of beta from
-                # the lossless damping moves the pole off the circle: x becomes x (1 - (beta - lossless) F/alpha).
+                # In a lossless loop, alpha moves the pole along the circle. Only a difference of beta from the lossless
+                # damping moves the pole off the circle: x becomes x (1 - (beta - lossless) F/alpha).
                 leaving += int(np.sum(side * excess * loop.estimate.jet(points).value.imag * x.real > 0))
                 continue
             # If x is real, the pole leaves the zero along the circle. The imaginary part of the next term of its

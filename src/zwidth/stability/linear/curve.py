@@ -23,7 +23,7 @@ from zwidth.model.circle_functions import are_on_circle, circle_points
 from zwidth.numerics.root_finding import find_zeros_between
 from zwidth.stability.linear.roots import LoopRoots
 
-# Settings of the nodes.
+# Settings for the placement of the nodes.
 NODE_SPACING = 0.08  # relative change of q and F between neighboring nodes, estimated
 MAX_ROUNDS = 60  # largest number of rounds in which intervals between nodes are halved
 LAST_NODE = 1e-4  # pi - w of the last node, for a loop without delay and without roots near z = -1

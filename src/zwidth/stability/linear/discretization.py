@@ -38,9 +38,9 @@ CONVERGED_STEP = 1e-13  # last Aberth step, relative to |zeta|
 CLUSTER_RADIUS = 1e-2  # |z| of zeros near z = 0 that rounding errors may make inseparable
 RESPONSE_TOLERANCE = 1e-11  # relative difference of q by roots and by matrices, above which the cluster is not refined
 TEST_ANGLE = 0.5  # angle in rad per sample at which the two are compared
-FAR_ZERO = 1e-17  # inverse |zeta| beyond which a zero is dropped
+FAR_ZERO = 1e-17  # 1/|zeta| of a zero below which the zero is dropped
 
-# Settings of the matrix exponential: number of terms of its series, largest number of doublings.
+# Number of terms of the series for the matrix exponential, and largest number of doublings of the time.
 SERIES_TERMS = 15
 MAX_DOUBLINGS = 36  # 2^36 exceeds twice the largest rate that `Chain.check` allows
 

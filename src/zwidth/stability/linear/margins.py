@@ -108,7 +108,7 @@ class OpenLoop(NamedTuple):
         # Add the angle pi, because L is always real there.
         w = np.append(self._find_zeros(phase_sine, stop=-1), np.pi)
         L = self.evaluate(w)
-        # Exclude zeros of L, at which the phase jumps, because no change of the gain moves a pole to these points.
+        # Exclude zeros of L, at which the phase jumps, because no change of the gain puts a pole at these points.
         return w[(L.value.real < 0) & (np.abs(L.value) > ZERO_OF_L * w * np.abs(L.slope))]
 
     def _find_zeros(
@@ -136,7 +136,7 @@ class OpenLoop(NamedTuple):
         value: np.ndarray,
         slope: np.ndarray,
     ) -> np.ndarray:
-        """Return the angles of minima of |function| between nodes with equal signs at which a tangent crosses zero."""
+        """Return the angles of minima of |function| between nodes where it has equal signs and a tangent reaches 0."""
         step, sign = np.diff(w), np.sign(value[:-1])
         approaching = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
         size, descent = np.abs(value), np.abs(slope)

@@ -167,7 +167,7 @@ def boundary_point(
 
 
 def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -> BoundaryPoint:
-    """Return the point of the stability boundary at a given beta (a line of constant beta) or at a given alpha.
+    """Return the point of the stability boundary at a given beta or at a given alpha, elementwise.
 
     Args:
         delta: Normalized physical damping.

@@ -184,7 +184,7 @@ def certify_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
 
 def filter_walls(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Return UNSTABLE, STABLE, OPEN or EDGE for each wall; OPEN if it is out of range."""
-    # Replace negative delta and d by NaN in NumPy, because XLA treats numbers below 2^-1022 as 0.
+    # Replace negative delta and d by NaN in NumPy, because XLA would treat negative numbers above -2^-1022 as 0.
     device = (np.where(value < 0, np.nan, value) for value in (delta, d))
     return evaluate_columns(compute_wall_codes, [*nan_beyond(WALL_RANGE, alpha, beta), *device], classify_delays(d))
 
@@ -239,7 +239,8 @@ def device(delta: float, d: float, bits: int) -> DiscretePlant:
     """Return the discretized device of exact delta and d in balls, cached because all walls of a grid share it."""
     import flint
 
-    # Use 64 additional bits, because the phi-functions amplify the rounding error of their argument delta (1 - f).
+    # Compute with 64 additional bits, because the phi-functions amplify the rounding error of their argument delta (1 -
+    # f).
     with flint.ctx.workprec(bits + 64):
         x, f = flint.arb(delta), flint.arb(d - int(d))
         phis_delta, phis_late, plant = _phi(x), _phi(x * (1 - f)), discretize_mass(x, f if f != 0 else None, _phi)

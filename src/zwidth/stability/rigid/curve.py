@@ -61,7 +61,7 @@ class LobePoint(NamedTuple):
 
 
 class Peak(NamedTuple):
-    """The point of the lobe with the largest alpha, i.e. of maximum stiffness."""
+    """The point of the lobe with the largest alpha."""
 
     x: Array
     alpha: Array

@@ -171,9 +171,9 @@ def find_candidate(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
 
 
 def certification_width(re: Array, tolerance: Any) -> Array:
-    """Return the distance of the counting circle from a pole.
+    """Return the distance, in log |z|, from a pole to the circle on which poles are counted.
 
-    It is as small as the rounding error of the count permits, because decay rates depend on it.
+    The distance is as small as the rounding error of the count permits, because it adds to the error of decay rates.
     """
     xp = namespace(re)
     return xp.minimum(tolerance, xp.maximum(COUNT_ROUNDING * epsilon(re), RATE_WIDTH * xp.abs(re)))
@@ -258,7 +258,7 @@ def certify_starts(_: DominantPoles, tolerance: float, loop: LoopFactors, fracti
 
 
 def bisect_radius(_: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
-    """Find the dominant pole by bisecting the radius with counts, then by a few Halley steps."""
+    """Find the dominant pole by bisecting the radius by means of counts, and refine the pole by a few Halley steps."""
     # Count on several circles at once, because for few walls this does not take longer than on one circle.
     parts = 2**BISECTIONS_PER_COUNT
 

@@ -123,7 +123,8 @@ def margins_kernel(
     nan_if_invalid = nan_with_nan_derivatives(ok, alpha, beta, delta, d)
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
-    # Set delta to 0 if its square or its inverse under- or overflows, because it then has no effect on the margins.
+    # Set delta to 0 if its square underflows or its inverse overflows, because so small a delta has no effect on the
+    # margins.
     delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), NEGLIGIBLE_DAMPING)), 0.0, delta)
     plant = materialize(discretize_plant(delta, d), delta)
     w, phase, crosses = evaluate_at_crossover(alpha, beta, plant)

@@ -67,7 +67,8 @@ def evaluate_at_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tu
 # Computing cost of a wall, relative to other kernels, because |1 + L| is sampled at many frequencies. The kernel is not
 # compiled, because compiling takes many seconds and the compiled kernel is not faster.
 SAMPLES_WEIGHT = 8
-# Numbers of sampled frequencies: evenly spaced over the whole range, and logarithmically below and above the crossover.
+# Numbers of sampled frequencies: evenly spaced over the whole range, and logarithmically spaced below and above the
+# gain crossover.
 SAMPLES_PER_TURN = 48
 SAMPLES_BELOW = 32
 SAMPLES_ABOVE = 48

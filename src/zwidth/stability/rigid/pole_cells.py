@@ -287,7 +287,7 @@ def enclose_poles(
 
 
 def _compute_powers(x: Any, count: int, factor: Any = 1.0) -> np.ndarray:
-    """Return factor x^k, k = 0, 1, ..., for points x on circles.
+    """Return ``factor x^k``, k = 0, 1, ..., for points x on circles.
 
     Args:
         x: Points (cells, points).
@@ -353,8 +353,7 @@ def compute_larger(first: np.ndarray, second: np.ndarray, disk: Any) -> tuple[np
 def is_larger_accurate(discriminant: np.ndarray, disk: Any, error: Any, limit: Any) -> np.ndarray:
     """Return whether the larger pole is accurate to ``limit``, if the sums have errors of ``error`` and 2 ``error``."""
     discriminant_error = 2.01 * error
-    # Bound the error of sqrt(D) by two values: the square root of the error of D, and the error of D divided by
-    # sqrt(D).
+    # Two values bound the error of sqrt(D): the square root of the error of D, and the error of D divided by sqrt(D).
     remaining = np.maximum(limit * ((1.0 - disk) ** 2 / disk) - 0.5 * error - discriminant_error, 0.0)
     return np.abs(discriminant) * remaining**2 >= np.where(
         discriminant_error <= remaining**2, -1.0, discriminant_error**2
