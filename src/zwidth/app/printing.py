@@ -256,10 +256,10 @@ def list_slopes(scene: Scene) -> list[Slope]:
         # Choose the step of the parameter whose effect is stated: the power of ten nearest to one percent of the scale;
         # 1 N s/m for a linear damping; 1 or, for rotary devices, 1e-3 if the scale is 0.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
-        effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
+        effect = "no change" if isfinite(value) else "not computed"
         if isfinite(value) and (change := value * step):
-            effect = f"{'buys' if change > 0 else 'costs'} {with_unit(abs(change), system['N/m'], 3)}"
-        note = f" (the delay stays {scene.timing.kept_delay})" if path == "period" and scene.timing.delay else ""
-        words = f"{with_unit(step, unit, 1)} more {effect}{note}"
+            effect = f"{'+' if change > 0 else '-'}{with_unit(abs(change), system['N/m'], 3)}"
+        note = f" (the delay stays {scene.timing.delay_text})" if path == "period" and scene.timing.delay else ""
+        words = f"{effect} for {with_unit(step, unit, 1)} more{note}"
         slopes.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))
     return slopes

@@ -35,7 +35,7 @@ from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 if TYPE_CHECKING:
     from zwidth.analysis.scene import Scene
-    from zwidth.model.devices import KnownDevice
+    from zwidth.model.devices import PublishedDevice
 
 # Keys under which data are stored in the click context of a command.
 _WITH_KIND = "zwidth.with_kind"  # options whose units determine the kind of device, linear or rotary
@@ -223,7 +223,7 @@ def read_scene_file(path: Path) -> Scene:
 
     file = find_config(path) if path.is_dir() else path
     given = load_config(file).scene
-    for line in getattr(given, "doubts", ()):
+    for line in getattr(given, "warnings", ()):
         click.echo(f"zwidth: {line}", err=True)
     click.get_current_context().meta[_HARDWARE] = getattr(given, "hardware", {})
     return load_scene(file)
@@ -252,11 +252,11 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
     """Return the scene of a file with the parameters replaced that are given as options."""
-    from zwidth.model.devices import KnownDevice
+    from zwidth.model.devices import PublishedDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}
     device = changes.get("device")
-    if isinstance(device, KnownDevice):
+    if isinstance(device, PublishedDevice):
         _check_published(device, given)
         changes["device"] = device.to_device(**{name: changes.pop(name) for name in _BARE & changes.keys()})
     if part_values := _select_part(given, "velocity"):
@@ -294,10 +294,10 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
 def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scene:
     """Return the scene built from options, without a scene file."""
     from zwidth.analysis.scene import Scene
-    from zwidth.model.devices import KnownDevice
+    from zwidth.model.devices import PublishedDevice
 
     device = given.pop("device", None)
-    published = device if isinstance(device, KnownDevice) else None
+    published = device if isinstance(device, PublishedDevice) else None
     timed = {"period", "rate"} & given.keys() or (published and published.period)
     requirements = {"--mass or --device": device or "mass" in given, "--rate or --period": timed}
     missing = [flags for flags, given_any in requirements.items() if not given_any]
@@ -320,7 +320,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
     timing = Timing
     if device is None:
         device = Device(**select("mass", "damping"), rotary=system.rotary)
-    elif isinstance(device, KnownDevice):
+    elif isinstance(device, PublishedDevice):
         timing, device = device.to_timing, device.to_device(**select("mass", "damping"))
     else:
         for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _CONTAINED):
@@ -332,7 +332,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
     return Scene(device, timing(**select("period", "rate", "delay")), wall, velocity).replace(**parts)
 
 
-def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[str] = ()) -> None:
+def _check_published(device: PublishedDevice, given: dict[str, Any], more: Sequence[str] = ()) -> None:
     """Raise an error if parameters of a device are unpublished and not given as options; list these options."""
     remedies = {"mass": "--mass", "damping": "--damping (0 if unknown)"}
     flags = [*(remedies[name] for name in device.list_missing(given)), *more]

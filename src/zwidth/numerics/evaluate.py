@@ -104,14 +104,14 @@ def broadcast(arguments: Mapping[str, ArrayLike]) -> list[np.ndarray]:
     return list(np.broadcast_arrays(*arrays.values()))
 
 
-def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], what: str = "shapes") -> tuple[int, ...]:
+def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], noun: str = "shapes") -> tuple[int, ...]:
     """Return the common shape to which named shapes broadcast; raise `InputError` if they do not broadcast."""
     named = list(named)
     try:
         return np.broadcast_shapes(*(shape for _, shape in named))
     except ValueError:
         shapes = ", ".join(f"{name} {shape}" for name, shape in named)
-        raise InputError(f"{what} do not broadcast: {shapes}; make each axis equal or 1") from None
+        raise InputError(f"{noun} do not broadcast: {shapes}; make each axis equal or 1") from None
 
 
 def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:
@@ -220,8 +220,8 @@ def evaluate(
             pass  # ignore an integer that overflows; `broadcast` reports it by name
         else:
             with np.errstate(all="ignore"):
-                found = kernel(*numbers, *static)
-            return found if isinstance(found, np.generic) else tree_map(_plain, found)
+                result = kernel(*numbers, *static)
+            return result if isinstance(result, np.generic) else tree_map(_plain, result)
     if is_traced(*values):
         return compile_traced(kernel, static, slopes)(*broadcast_traced(arguments))
     arrays = broadcast(arguments)
@@ -285,8 +285,8 @@ def compile_traced(
         moving = [k for k, moves in enumerate(active) if moves]
 
         def of_moving(*values: Any) -> Any:
-            known = dict(zip(moving, values, strict=True))
-            return plain(*(known.get(k, array) for k, array in enumerate(arrays)))
+            varied = dict(zip(moving, values, strict=True))
+            return plain(*(varied.get(k, array) for k, array in enumerate(arrays)))
 
         points = tuple(arrays[k] for k in moving)
         ones = jax.numpy.ones_like(points[0])

@@ -34,7 +34,7 @@ _MAX_PANELS = 6  # largest number of motions in a figure of energies; if there a
 _ENERGIES = {
     "energy_J": ("energy of the bodies", style.BLACK, style.SOLID),
     "wall_work_J": ("work of the wall", style.VERMILION, style.DASHED),
-    "push_work_J": ("work of the hand", style.GREEN, style.DOTTED),
+    "external_work_J": ("work of the external force", style.GREEN, style.DOTTED),
     "damping_loss_J": ("dissipated by dampers", style.BLUE, style.DASH_DOTTED),
     "friction_loss_J": ("dissipated by friction", style.PURPLE, style.SOLID),
 }

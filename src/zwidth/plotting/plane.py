@@ -280,7 +280,7 @@ def _add_legend(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any
         if output.logarithmic:
             style.use_logarithmic(bar.ax, "y", (image.norm.vmin, image.norm.vmax), _FEW_TICKS)
         bar.ax.tick_params(labelsize=8)
-    exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
+    exact = any(line.get_label() == "exact boundary" for ax in axes for line in ax.lines)
     crossed = finite.size and finite.min() < output.center < finite.max()
     if crossed if output.color_scale == "diverging" else (exact and output.color_scale != "truth"):
         walls = "passive" if name == "passivity_margin" else "stable"
@@ -288,7 +288,7 @@ def _add_legend(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any
     if name in ("settling_time", "delay_margin"):
         handles.append(Patch(facecolor=MISSING, label="unstable"))
     elif any(np.ma.is_masked(panel.variables[name]) for panel in panels):
-        handles.append(Patch(facecolor=MISSING, label="no answer"))
+        handles.append(Patch(facecolor=MISSING, label="no result"))
     if any(np.mean(panel.variables["kind"] == 1) > _SEEN for panel in panels if "kind" in panel.variables):
         handles.append(Patch(facecolor="white", hatch="////", edgecolor="#606060", linewidth=0, label="corner optimum"))
     if any(panel.peak for panel in panels):

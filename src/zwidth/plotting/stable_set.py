@@ -193,7 +193,7 @@ def draw_exact(
     fitted = fit_axes(outlines, ax)
     shade_region(ax, fitted, face, zorder=1.5)
     for points, _ in fitted:
-        ax.plot(*_close(points).T, label="exact edge", **look)
+        ax.plot(*_close(points).T, label="exact boundary", **look)
     return fitted
 
 
@@ -303,7 +303,7 @@ def draw_stable_set(
         mark = {**MARKS["stiffest"], "marker": markers[label]}
         handles.append(style.line(style.literal(label), color=color, **mark))
     handles += [style.line(name, dash) for name, dash in _DASHES.items() if name in pieces and name != "outline"]
-    handles += [] if alone else [style.line("stiffest wall", "", **MARKS["stiffest"])]
+    handles += [] if alone else [style.line("stiffest stable wall", "", **MARKS["stiffest"])]
     style.legend(panels, handles, outside=axes is None, ncols=3, loc="upper right")
     return panels
 

@@ -164,7 +164,7 @@ _PARAMETERS = (
     ),
     Parameter(
         "velocity.cutoff", "cut-off frequency of the velocity filter", "f_c", POSITIVE, "Hz", (1.0, 5e3),
-        "below half the sampling rate", "cut-off",
+        "below half the sampling rate", "cut-off frequency",
     ),
     Parameter(
         "velocity.time_constant", "time constant of the velocity filter", r"\tau", POSITIVE, "s", (2e-5, 0.2),
@@ -211,7 +211,7 @@ _PARAMETERS = (
     Parameter("coupling.damping", "damping of the coupling", "c", NOT_NEGATIVE, "N s/m", (0.0, 50.0), "default: 0"),
     Parameter(
         "actuator.cutoff", "corner frequency of the actuator", "f_a", POSITIVE, "Hz", (10.0, 5e3),
-        short_name="corner of the actuator",
+        short_name="corner frequency of the actuator",
     ),
     Parameter(
         "actuator.time_constant", "time constant of the actuator", r"\tau_a", POSITIVE, "s", (2e-5, 0.02),
@@ -254,14 +254,14 @@ _OF_MOTIONS = (
         note="the surface of the wall is at 0, and positions inside the wall are positive",
     ),
     Parameter("start_velocity", "initial velocity", "v_0", ANY, "m/s"),
-    Parameter("push", "constant external force on the device", "F", ANY, "N"),
+    Parameter("external_force", "constant external force on the device", "F", ANY, "N"),
     Parameter(
         "resolution", "resolution of the encoder, one count", r"\Delta", NOT_NEGATIVE, "m",
         short_name="resolution of the encoder",
     ),
     Parameter("noise", "standard deviation of the noise of the measured position", r"\sigma", NOT_NEGATIVE, "m"),
     Parameter(
-        "coulomb", "Coulomb friction while the device moves", "F_c", NOT_NEGATIVE, "N", short_name="dry friction"
+        "coulomb", "Coulomb friction while the device moves", "F_c", NOT_NEGATIVE, "N", short_name="Coulomb friction"
     ),
     Parameter(
         "static", "static friction, the largest friction force at rest", "F_s", NOT_NEGATIVE, "N",
@@ -366,7 +366,6 @@ _OUTPUTS = (
     Output(
         "decay_rate", "decay rate of the dominant pole, -ln(spectral radius); negative for an unstable wall",
         r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", source="spectral_radius",
-        label="rate of decay",
     ),
     Output(
         "gain_margin", "common factor of stiffness and damping at the limit of stability; below 1 for an unstable wall",
@@ -402,7 +401,7 @@ _OUTPUTS = (
     ),
     Output(
         "beta_at_max", "normalized virtual damping of the wall with alpha_max", r"\beta", "sequential", "device",
-        source="alpha_max", label="virtual damping of that wall",
+        source="alpha_max", label="virtual damping of the stiffest wall",
     ),
     Output(
         "kind", "kind of the optimum at alpha_max: smooth, or a corner with a double pole at z = -1", family="device",
@@ -415,7 +414,8 @@ _OUTPUTS = (
     ),
     Output(
         "virtual_damping_at_max", "virtual damping B of the wall with stiffness_max", "B", "sequential", "device",
-        units="N s/m", physical_only=True, with_parts=True, source="alpha_max", label="virtual damping of that wall",
+        units="N s/m", physical_only=True, with_parts=True, source="alpha_max",
+        label="virtual damping of the stiffest wall",
     ),
 )  # fmt: skip
 OUTPUTS = {output.name: output for output in _OUTPUTS}

@@ -352,7 +352,7 @@ def to_yaml(controls: Controls) -> str:
     """Return a configuration with the scene and studies of its stable walls and, if rigid, its step response."""
     scene = controls.scene
     studies: list[dict[str, Any]] = [{"kind": "boundary", "name": "stable_walls"}]
-    if not scene.parts_beyond:
+    if not scene.nonrigid_parts:
         studies[0] |= {"passivity": True} if scene.operator is None else {}
         studies.append({"kind": "step", "name": "response"})
     return write_yaml({"version": 1, "name": "explored", "scene": _spell_section(controls), "studies": studies})

@@ -220,7 +220,7 @@ def _certify_largest(
     starts: tuple[np.ndarray, np.ndarray], steps: int, tolerance: float, loop: LoopFactors, fractional: bool
 ) -> DominantPoles:
     """Certify the largest of the poles to which starting points lead, by a count with any number of crossovers."""
-    re, im = iterate(steps, lambda at: halley_step(*at, loop, fractional), starts, np)
+    re, im = iterate(steps, lambda point: halley_step(*point, loop, fractional), starts, np)
     converged = newton_step(re, im, loop, fractional).radius < CONVERGED_RADIUS
     best = np.where(converged, re, -np.inf).argmax(0), np.arange(re.shape[1])
     return certify_pole(re[best], im[best], tolerance, loop, fractional, False)
