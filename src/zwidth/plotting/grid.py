@@ -227,7 +227,7 @@ def find_edges(values: np.ndarray) -> np.ndarray:
 
 
 def scale_axis(ax: Axes, which: str, values: Any) -> None:
-    """Set the range of an axis ("x" or "y") to that of the values; make it logarithmic if `logarithmic` is True."""
+    """Set the range of an axis ("x" or "y") to that of its values; make it logarithmic if the values suggest it."""
     low, high = float(np.min(values)), float(np.max(values))
     if logarithmic(values):
         style.use_logarithmic(ax, which, values, _FEW_DECADES)

@@ -229,7 +229,7 @@ class Boundary:
 
     @cached_property
     def alpha_nodes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Angles between which alpha is monotone along the curve, and alpha at them; NaN where it is infinite."""
+        """Angles between which alpha is monotone along the curve, and alpha at these angles (NaN if infinite)."""
         nodes = np.union1d(self.w, self.alpha_extrema)
         pieces, values = [], []
         for a, b in pairwise(sorted(self.limits)):

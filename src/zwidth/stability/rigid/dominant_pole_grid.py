@@ -277,7 +277,7 @@ class _CellGrid:
         ]
 
     def _certify(self, groups: list[Group], positions: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
-        """Store the poles of cells whose groups provably contain all dominant poles; return a mask (C4 to C6)."""
+        """Store the poles of cells whose groups provably contain all dominant poles (C4 to C6); return their mask."""
         enclosed = np.logical_and.reduce([group.order < len(ORDERS) for group in groups])
         if len(groups) == 2:
             enclosed &= groups[0].is_disjoint(groups[1])
@@ -305,7 +305,7 @@ class _CellGrid:
         return certified
 
     def _certify_uniform(self, re: np.ndarray, positions: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
-        """Store one radius per cell if all its spectral radii agree within the accuracy (C6); return a mask."""
+        """Store one radius for each cell whose spectral radii agree within the accuracy (C6); return a mask of them."""
         loop, a, b = select_cells(cells, np.tile(np.arange(re.size), 2))
         circles = np.concatenate(_bound_on_one_side(re, self.errors.accuracy))
         outside, certain = (part.reshape(2, -1) for part in count_poles_in_cell(circles, loop, (a, b), fractional))

@@ -52,8 +52,8 @@ STEPS_ON_ALL = 10  # without a certificate again: from four starting points
 
 # Distance in log z between a point and a pole below which a sequence of steps has converged.
 CONVERGED_RADIUS = 1e-6
-# Largest ratio of the distance to a pole after a Newton step to the bound R before the step. R = N |P/P'| with the
-# degree N >= 3 of P, and the step has the length R/N.
+# Before a Newton step, the distance to the nearest pole is at most R = N |P/P'|, with the degree N >= 3 of P. After the
+# step, of length R/N, this pole is at a distance of at most RADIUS_AFTER_STEP R.
 RADIUS_AFTER_STEP = 1.4
 # Distance in log r from a pole to the circle on which poles are counted: the larger of the following two, but at most
 # the tolerance of the radius.

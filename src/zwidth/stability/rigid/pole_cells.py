@@ -351,7 +351,7 @@ def compute_larger(first: np.ndarray, second: np.ndarray, disk: Any) -> tuple[np
 
 
 def is_larger_accurate(discriminant: np.ndarray, disk: Any, error: Any, limit: Any) -> np.ndarray:
-    """Return whether the larger pole is accurate to ``limit``, if the sums have errors of ``error`` and 2 ``error``."""
+    """Return whether the larger pole is accurate to ``limit``, for errors ``error`` and 2 ``error`` of the two sums."""
     discriminant_error = 2.01 * error
     # Two values bound the error of sqrt(D): the square root of the error of D, and the error of D divided by sqrt(D).
     remaining = np.maximum(limit * ((1.0 - disk) ** 2 / disk) - 0.5 * error - discriminant_error, 0.0)
