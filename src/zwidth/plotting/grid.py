@@ -102,7 +102,8 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
         if output.dtype == "bool":
             values = values.astype(float).where(data[status] == Status.OK)
         elif output.dtype == "float64":
-            # Choose the unit for the median of the first plane, because reading all values of a large store is slow.
+            # Choose a unit that suits the median of the first plane only, because reading all values of a large store
+            # is slow.
             part = values.isel({dim: slice(0, 1) for dim in values.dims[:-2]}).values
             part = np.abs(part[np.isfinite(part) & (part != 0)])
             middle = np.median(part) if part.size else 1.0

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, stable_set.Outlines]]"
 """Returns the outlines of the "stable" and the "passive" walls of a panel in its units, stiffness first."""
 
-# Outputs that have a contour along the boundary of the stable walls. It is smoother than the contour of the Boolean
+# Outputs that have a contour along the boundary of the stable walls. This contour is smoother than that of the Boolean
 # output "stable".
 SMOOTH = ("margin", "spectral_radius")
 # Smooth outputs that have a contour along the boundary of the region of each Boolean output.
