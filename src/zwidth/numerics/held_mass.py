@@ -62,8 +62,8 @@ def phi_functions(x: Array) -> PhiFunctions:
     half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, SERIES_BELOW, x)
     half_squared = half * half
     low1, low_gap = factor * horner(half_squared, PHI1), factor * (2.0 * half) * horner(half_squared, GAP)
-    # Compute 1 - c as a difference and not by expm1. It does not cancel above `SERIES_BELOW`, and its derivative has a
-    # small relative error, unlike that of expm1.
+    # Compute 1 - c as a difference and not by expm1. The difference does not cancel above `SERIES_BELOW`, and its
+    # derivative has a small relative error, unlike that of expm1.
     inverse = 1.0 / high
     high1 = (1.0 - c) * inverse
     return PhiFunctions(
