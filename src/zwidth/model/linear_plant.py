@@ -171,7 +171,7 @@ def _output_as_first_state(A: Any, B: Any, C: Any) -> tuple[Any, Any]:
     best = max(range(len(C)), key=lambda k: abs(float(C[k])))
     order = [best, *(k for k in range(len(C)) if k != best)]
     A, B, C = A[order][:, order], B[order], C[order]
-    # Substitute x1 = (y - c2 x2 - c3 x3 - ..)/c1.
+    # Replace the state x1 by y: substitute x1 = (y - c2 x2 - c3 x3 - ..)/c1.
     columns = A[:, :1] / C[0]
     A = np.concatenate([columns, A[:, 1:] - columns * C[None, 1:]], 1)
     first = C @ A

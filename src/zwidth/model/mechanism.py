@@ -276,7 +276,7 @@ def expand_compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
             link = np.array([chain.links[k].damping, chain.links[k].stiffness], float)
             denominator = np.polyadd(np.convolve(link, denominator), numerator)
             # Connect the link in series with the bodies added so far: their joint dynamic stiffness is link * numerator
-            # / (link * denominator + numerator). This sum is the new denominator.
+            # / (link * denominator + numerator). The divisor is the new denominator.
             numerator = np.polyadd(np.convolve(dynamic_stiffness, denominator), np.convolve(link, numerator))
             sensor_numerator = denominator if k == chain.sensor else np.convolve(link, sensor_numerator)
         else:
