@@ -332,8 +332,8 @@ class Boundary:
         arc, block = self.find_arc(w), max(1, BLOCK_SIZE // max(1, len(self.arcs)))
         for part in np.array_split(np.flatnonzero(result), 1 + result.sum() // block):
             sums, consistent = self._sum_below(curve.alpha[part], curve.beta[part], arc[part])
-            # Use the value of ``leaving`` that holds for the whole arc, because its sign at a single angle may be wrong
-            # by rounding errors.
+            # Use the value of ``leaving`` that holds for the whole arc, because rounding errors may change its sign at
+            # a single angle.
             below = self.count_below(curve.beta[part])
             result[part] = consistent & (below + sums == np.where(self._joined.leaving[arc[part]] > 0, 0, 2))
         return result

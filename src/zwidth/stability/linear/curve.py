@@ -68,7 +68,7 @@ def place_nodes(loop: LoopRoots) -> np.ndarray:
     nodes, low, high = [w], w[:-1], w[1:]
     for _ in range(MAX_ROUNDS):
         half = 0.5 * (high - low)
-        # Estimate the change of q and F over each interval from two bounds of their derivatives: over the whole
+        # Estimate the change of q and F over each interval from two bounds on their derivatives: over the whole
         # interval (first row) and at its midpoint (second row). Accept a 16 times larger change by the first bound,
         # because this bound overestimates the change near roots.
         change = 2.0 * half * loop.bound_variation(low + half, half * np.array([[1.0], [0.0]]))
@@ -138,8 +138,8 @@ def find_lines(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
         q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
         real = is_end | (np.abs(q.value.imag) <= REAL_TOLERANCE * np.abs(q.value))
     values = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
-    # Treat a zero of G as located at e^(jw) if its distance is at most ``reach``, because zeros have rounding errors.
-    # ``reach`` is smallest at z = 1, because the offsets of zeros near z = 1 have small errors.
+    # Treat a zero of G as located at e^(jw) if its distance from this point is at most ``reach``, because zeros have
+    # rounding errors. ``reach`` is smallest at z = 1, because the offsets of zeros near z = 1 have small errors.
     reach = np.where(w == 0.0, 1e-15, np.where(is_end, 1e-12, 1e-9))
     near = np.abs(points.z_minus_1[:, None] + loop.zeros) <= reach[:, None]
     selected = np.flatnonzero(real & ~near.any(1) & np.isfinite(values).all(1))

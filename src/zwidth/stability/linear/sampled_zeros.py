@@ -22,7 +22,8 @@ from zwidth.model.linear_device import LinearDevice
 # Largest relative difference between the results of two precisions that counts as agreement: a tenth of the resolution
 # of float64.
 PRECISION_TOLERANCE = 1e-17
-# With n decimal digits, leading coefficients below 10^(-2n/NEGLIGIBLE_DIGITS) of the largest are rounding errors of 0.
+# With n decimal digits, leading coefficients below 10^(-2n/NEGLIGIBLE_DIGITS) of the largest one are regarded as
+# rounding errors of 0.
 NEGLIGIBLE_DIGITS = 3
 
 

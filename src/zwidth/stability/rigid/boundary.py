@@ -159,7 +159,7 @@ def boundary_point(
     line = side if beta is None else "row"
     arguments = {"delta": delta, "d": d, name: value}
     if method == "optimistix":
-        # Import the solvers only if this method is requested, because the import takes a second.
+        # Import the solvers only if the method "optimistix" is requested, because the import takes a second.
         from zwidth.stability.rigid.exact_points import point_kernel
 
         return BoundaryPoint(*evaluate(point_kernel, arguments, line, route="jax"))

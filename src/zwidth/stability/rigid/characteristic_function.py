@@ -61,8 +61,8 @@ class Pair:
 
 def make_complex(re: Array, im: Array) -> Array:
     """Return the complex array re + j im."""
-    # For JAX, create one complex array, which XLA computes in a single loop. It would compute two real arrays in two
-    # loops that both repeat the shared operations.
+    # For JAX, create one complex array, which XLA computes in a single loop. XLA would compute two real arrays in two
+    # loops, both of which repeat the shared operations.
     if namespace(re) is not np:
         from jax.lax import complex as make_complex
 
@@ -92,7 +92,8 @@ def _sine_and_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
 
 def _store_pair(value: Any, witness: Array) -> Any:
     """Return the pair unchanged, but make XLA compute it only once, although several loops use it."""
-    # Otherwise, each of five loops would repeat the power series of the pair, and a step would take 1.4 times as long.
+    # Without `materialize`, five loops would each repeat the power series of the pair, and a step would take 1.4 times
+    # as long.
     return Pair(*materialize((value.real, value.imag), witness))
 
 

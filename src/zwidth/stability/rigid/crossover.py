@@ -58,8 +58,8 @@ from zwidth.numerics.held_mass import ANY, DelayClasses, DiscretePlant, discreti
 from zwidth.numerics.root_finding import attach_root_derivatives
 from zwidth.units.quantities import WALL_RANGE
 
-# Newton steps for the cubic. The starting value is within 11 % of the root and each step squares the relative error:
-# 0.11^16 < 5e-16.
+# Number of Newton steps for the cubic. The starting value is within 11 % of the root, and each step squares the
+# relative error: 0.11^16 < 5e-16.
 NEWTON_STEPS = 4
 
 

@@ -164,7 +164,7 @@ class _ResultArrays:
     """Result arrays of a window that is extended to whole cells, and a list of the special walls."""
 
     def __init__(self, area: Area, sides: tuple[int, int], with_rate: bool) -> None:
-        # Extend the window to whole cells of the largest size.
+        # Extend the window to whole cells of the largest size, because only whole cells are computed.
         windows = list(zip(area.window, sides, strict=True))
         starts = [part.start // side * side for part, side in windows]
         sizes = [-(-part.stop // side) * side - start for (part, side), start in zip(windows, starts, strict=True)]

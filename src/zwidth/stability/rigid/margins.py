@@ -172,12 +172,12 @@ def _place_by_verdict(margin: Array, edge: float, least: float, stable: Array, x
 def _find_gain_margin(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> tuple[Array, Array]:
     """Return the factor on alpha and beta at which the loop becomes unstable, and the frequency of this onset."""
     # The phase does not depend on a common factor of alpha and beta, and the gain crossover increases with it. So the
-    # loop is stable until the crossover reaches the first zero of the phase; if the phase has no zero below z = -1,
-    # until ``|L(-1)| = 1``.
+    # loop is stable until the crossover reaches the first zero of the phase or, if the phase has no zero below the
+    # Nyquist frequency (z = -1), until ``|L(-1)| = 1``.
 
     def evaluate_phase(log_w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Array:
         # Multiply the phase by a positive factor that makes it of order 1 on both sides of w = sqrt(em), because for
-        # light damping it is smaller than its rounding error long before its sign changes.
+        # light damping the phase is smaller than its rounding error even far from its zero.
         w, n, em = xp.exp(log_w), plant.whole, plant.em
         (u0, u1), modulus_terms, stiffness_terms = expand_short_delay_curve(plant)
         phase_at_w = evaluate_gain_and_phase(w, alpha, beta, plant)[1]
@@ -266,7 +266,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
         return xp.where(exists, phase - n_lost * w, NO_CROSSOVER_PHASE)
 
     high, excess_high = sample(grid, index), xp.minimum(sample(excesses, index), 0.0)
-    # Stop at the rounding error of the total delay.
+    # Stop if the bracket is as narrow as the rounding error of the total delay.
     width = 4e-16 * (1.0 + n_lost)
     f = false_position(
         lambda f: excess(f, n_lost, *frozen_wall), low, high, excess_low, excess_high, FALSE_POSITION_STEPS, width
