@@ -54,7 +54,7 @@ MARGINAL_DAMPER = (
 )
 MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
 
-# Phrases for the reference grasps (hands that hold the device) in which a wall is required to be stable.
+# Phrases for the reference grasps (models of a hand on the device) in which a wall is required to be stable.
 GRASP_WORDS = {
     "all": "stable in all six reference grasps",
     "soft": "stable in the soft reference grasps",
@@ -139,7 +139,7 @@ def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | Non
 
 
 def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
-    """Return a phrase with the stable intervals of K at the B of the wall, and of B at its K."""
+    """Return a phrase with the stable interval of K at the wall's B, and that of B at the wall's K."""
     units = verdict.unit_system
     rooms = (("K", verdict.stable_stiffness, units["N/m"], "B"), ("B", dampings, units["N s/m"], "K"))
     return "; ".join(_spell_intervals(*room) for room in rooms)
@@ -226,7 +226,7 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
 
 
 def format_gains(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:
-    """Return the lines of a table of improvements of a device and their gains; ``verbose`` includes small gains."""
+    """Return the lines of a table of improvements of a device and the factors by which they raise K_max."""
     shown = [limit for limit in limits if isfinite(limit.gain) and (verbose or limit.gain > NOTEWORTHY)]
     if not shown:
         return []

@@ -179,7 +179,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_obstacles(scene: Any) -> list[str]:
-    """Return notes on the measurements required before a stiffer wall can be certified on a measured response."""
+    """Return notes on the measurements that are required to certify a stiffer wall on a measured response."""
     if not isinstance(scene.device, MeasuredDevice):
         return []
     from zwidth.identification.response_estimate import find_nominal_limit
@@ -257,8 +257,8 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
     if not re.fullmatch("[a-z0-9_-]{1,64}", name):
         raise InputError(f"NAME: got {name!r}; write 1 to 64 of a-z, 0-9, _ and -, such as my_device")
     text = examples[example].read_text(encoding="utf-8")
-    # Remove the line with the path of the schema, which exists only in a checkout. Set the name in the configuration to
-    # that of the new file, because the results of a run have this name.
+    # Remove the line with the path of the schema, because the schema exists only in a checkout. Set the name in the
+    # configuration to that of the new file, because the results of a run have this name.
     text = re.sub(r"\A# yaml-language-server:.*\n(?:#\n)?", "", text)
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", text, count=1)
     contents = {Path(f"{name}.yaml"): text}

@@ -39,7 +39,7 @@ from zwidth.units.formatting import (
 from zwidth.units.parsing import read_share
 from zwidth.units.quantities import PARAMETERS
 
-# Path in a scene of the parameter that each value of the option --find selects.
+# Path of a parameter in a scene, by the value of the option --find that selects the parameter.
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
 _TRIED = 41  # number of values of a parameter at which K_max is computed, to find its largest value in a range
@@ -120,8 +120,8 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
             f"--find {find}: not a parameter of this scene; give {name_option(path)} as a starting value"
         )
     present = values[path]
-    # If the current value is 0, search a range that suits every device, because the default range is relative to this
-    # value.
+    # If the current value is 0, search a range that suits every device, because the default range is proportional to
+    # the current value.
     period = scene.timing.period
     within = None if present else {"damping": (1e-6, 1e4), "delay": (1e-3 * period, 500 * period)}[path]
     wanted = float(scene.wall.stiffness)
@@ -149,8 +149,8 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     else:
         values = [crossing.value for crossing in needed.crossings]
         text = f"{format_sufficient(needed.value, needed.sufficient_side, values, unit)}"
-        # Count the crossings of K_max with the goal that the text does not contain yet: all except one or, for an
-        # interval, two.
+        # Count the values at which K_max equals the goal and that the text does not contain yet. It contains one or, if
+        # it states an interval, two of them.
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""

@@ -66,7 +66,7 @@ def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
 
 
 _WALL = Parsed("WALL", _read_wall)
-_SOFTER = 50  # largest number of reductions of K until the rounded wall is stable
+_SOFTER = 50  # largest number of reductions of K to make the rounded wall stable
 
 
 # Options with the walls of the example in the help.

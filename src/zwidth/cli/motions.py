@@ -118,7 +118,7 @@ def simulate(
     force = max(abs(float(motion.command.min())), abs(float(motion.command.max())))
     depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}, "
     depth += f"{load} up to {with_unit(force, units['N'], 3)}; "
-    # Omit the largest depth and force of a growing motion, because they depend only on the simulated time.
+    # Omit the largest depth and force of a growing motion, because they grow with the simulated time.
     depth = "" if int(motion.outcome) == MotionKind.GROWING else depth
     lines = [
         format_row("start", ", ".join(filter(None, start)) or "at rest"),

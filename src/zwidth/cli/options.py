@@ -43,10 +43,10 @@ _HARDWARE = "zwidth.hardware"  # encoder, friction and motor of the scene file
 BOTH_PERIODS = "--period and --rate are both given; give only one of them"
 Command: TypeAlias = Callable[..., Any]
 
-# Names of the parts of a scene, and the paths of the parameters of all parts, sorted by part.
+# Names of the parts of a scene; and the paths of the parameters of all parts, sorted by part.
 _PART_NAMES = tuple(dict.fromkeys(path.rpartition(".")[0] for path in OF_PARTS))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
-# Parts that cannot be added to a linear system or a measured response, because these devices contain them.
+# Parts that cannot be added to a linear system or a measured response, because such a device includes them.
 _CONTAINED = ("operator", "coupling", "actuator", "modes")
 # Names of the structural modes among the parts: "modes.0", "modes.1" and so on.
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
@@ -56,7 +56,7 @@ _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
 class Parsed(click.ParamType):
-    """Type of a click option whose text ``read`` converts; ``remedy`` completes the message of its `ValueError`."""
+    """Type of a click option: ``read`` converts its text; ``remedy`` completes the message for an invalid text."""
 
     def __init__(self, name: str, read: Callable[[str], Any], remedy: str = "") -> None:
         self.name, self.read, self.remedy = name, read, remedy
@@ -263,8 +263,8 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
         same = "kind" not in part_values and part_values.keys() <= {item.name for item in fields(scene.velocity)}
         kept = {"kind": name_estimate(scene.velocity), **spell_part(scene.velocity)} if same else {}
         if part_values.keys() & _ONE_OF_TWO:
-            # If an option gives one of them, drop cutoff and time constant of the file, because a low-pass takes only
-            # one of them.
+            # A low-pass has either a cutoff or a time constant. If an option gives one of the two, drop both values of
+            # the file.
             kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
         changes["velocity"] = make_velocity({**kept, **part_values})
     parts = {} if device else find_parts(scene)

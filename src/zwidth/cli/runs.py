@@ -44,7 +44,7 @@ def _read_size(text: str) -> int:
 
 
 def _read_slice(text: str) -> tuple[str, str]:
-    """Return NAME and VALUE of a text "NAME=VALUE", both as texts."""
+    """Split a text "NAME=VALUE" into NAME and VALUE, both as texts."""
     name, _, value = (part.strip() for part in text.partition("="))
     if not name or not value:
         raise ValueError
@@ -282,7 +282,7 @@ def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
     The command requires a checkout of the project, because it runs the programs in benchmarks/methods. To measure the
     errors, it also requires the extra "test".
     """
-    # Look for the benchmarks in the checkout, because an installed package does not contain them.
+    # Search the checkout for the benchmarks, because an installed package does not contain them.
     folder = Path(__file__).parents[3] / "benchmarks"
     if not (folder / "methods").is_dir():
         raise ResourceError(

@@ -146,7 +146,7 @@ class PublishedDevice:
         return [name for name in ("mass", "damping") if name not in given and getattr(self, name) is None]
 
     def _choose(self, name: str, given: Any) -> Any:
-        """Return the passed value, or the published one if None is passed; raise `InputError` if none is published."""
+        """Return the passed value or, if it is None, the published one; raise `InputError` if both are missing."""
         if given is not None:
             return given
         published = getattr(self, name)
@@ -231,7 +231,7 @@ def find_device(name: str) -> PublishedDevice:
 
 
 def read_device(text: str) -> PublishedDevice | LinearDevice | MeasuredDevice:
-    """Return the device that an option ``--device`` selects.
+    """Return the device that the text of an option ``--device`` describes by name, transfer function or file.
 
     Args:
         text: the name of a device for `find_device`; a transfer function ``"NUMERATOR / DENOMINATOR"`` with the

@@ -24,7 +24,7 @@ _TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder":
 _DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}  # dots of residuals
 _LOW = "stiffness_low_N_per_m"  # name of the column with the lower end of the 95 % band of the boundary
 _HIGH = "stiffness_high_N_per_m"  # name of the column with the upper end of the 95 % band of the boundary
-# For the first and for the second fit: color of the boundary, color of its band, and line style.
+# Color of the boundary, color of its band, and line style, for the first and for the second fit.
 _FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))
 _ROWS = ("position", "residuals", "autocorrelation", "walls")  # names of the panels on the left, from top to bottom
 
@@ -183,7 +183,7 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     colors = colors if len(colors) > 1 else dict.fromkeys(colors, style.BLACK)
     handles += _mark_walls(ax, walls, colors, (to_spring, spring), (to_damper, damper))
     ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to_spring)
-    # Extend the axis of B upwards by the height of the legend.
+    # Extend the axis of B upwards by the height of the legend, so that the legend covers no wall.
     highest = float(np.max(dampings)) * to_damper
     ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
     name_axes(ax, spring, damper)

@@ -49,8 +49,8 @@ from zwidth.units.formatting import format_wall
 from zwidth.units.quantities import PARAMETERS
 
 N_ANGLES = 181  # number of points on the outline of the passive walls
-# Number of frequencies of an open loop on each of two grids up to the Nyquist frequency, a logarithmic and a linear
-# one.
+# Number of frequencies of an open loop on each of two grids up to the Nyquist frequency, one logarithmic and one
+# linear.
 N_FREQUENCIES = 2000
 MIN_PERIODS = 100  # least number of sampling periods in the step response of a recommended wall
 MAX_PERIODS = 20_000  # largest number of sampling periods in the step response of a recommended wall

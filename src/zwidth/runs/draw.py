@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 _PLANES = ({"alpha", "beta"}, {"stiffness", "virtual_damping"})  # dimensions of a plane of walls
 FOLDER = "figures"  # default name of the folder of the figures, next to the stores
-# Smallest number of values along both axes with which an output of devices is drawn as a plane. With fewer values, it
-# is drawn as curves.
+# Smallest number of values along both axes for which an output of devices is drawn as a plane. With fewer values, the
+# output is drawn as curves.
 _MIN_SURFACE = 6
 
 

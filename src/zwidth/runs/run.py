@@ -46,7 +46,7 @@ class StudyResult:
     kind: str
     state: Literal["done", "kept", "failed", "open"]
     seconds: float = 0.0  # computing time in s; for a sweep, its part of the time in which all sweeps were computed
-    files: tuple[str, ...] = ()  # names of the files written in the folder of the run; for a sweep, that of its store
+    files: tuple[str, ...] = ()  # names of the files written in the folder of the run; for a sweep, of its store
     notes: tuple[str, ...] = ()  # remarks that affect the use of the results, such as points without a result
     answer: tuple[str, ...] = ()  # main result in one or two lines; empty if it is longer
     error: str = ""  # type and message of the exception that ended the study; empty if there was none
@@ -306,8 +306,8 @@ class _Run:
         """
         clock = time.perf_counter()
         number = {plan.study.name: len(self.results) + k for k, plan in enumerate(plans, start=1)}
-        # Count the time between two completed chunks as computing time of the second chunk's sweep, because workers
-        # compute chunks of several sweeps in parallel.
+        # Count the time between two completed chunks as computing time of the second chunk's sweep. Workers compute
+        # chunks of several sweeps in parallel, so the times of sweeps cannot be measured separately.
         spent = dict.fromkeys(number, 0.0)
 
         def report_chunk(progress: Progress) -> None:

@@ -55,7 +55,7 @@ LONGEST_DELAY = 1e5  # longest delay d, in periods
 # Smallest and largest magnitude of the nonzero values of each normalized parameter.
 SIZES = {"alpha": WALL_RANGE, "beta": WALL_RANGE, "delta": (0.0, LARGEST_DAMPING), "d": (0.0, LONGEST_DELAY)}
 MAX_DELAY_PERIODS = 10_000.0  # longest delay in files, in periods; a longer one indicates a wrong unit
-MOST_POLES = 4000  # largest number of poles that are computed, because this many already take minutes and 0.3 GB
+MOST_POLES = 4000  # largest number of poles that are computed; so many take minutes and 0.3 GB
 RECOMMENDED_SHARE = 0.75  # stiffness of a recommended wall, relative to the stiffest stable wall
 
 
@@ -273,7 +273,8 @@ _OF_MOTIONS = (
     ),
 )  # fmt: skip
 OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
-# Parameters of encoder, friction and motor: arguments of `zwidth.diagnose` and `zwidth.simulate`.
+# Names of the parameters of encoder, friction and motor, which are arguments of `zwidth.diagnose` and
+# `zwidth.simulate`.
 HARDWARE = ("resolution", "coulomb", "static", "max_force", "max_rate")
 FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
@@ -302,8 +303,8 @@ OF_LOGS = {
 }
 
 Family: TypeAlias = Literal["wall", "device"]  # an output has one value per wall, or one value per device and delay
-# Kinds of color scales, in this order: for truth values; for numbers with a good and a bad side of a center; for other
-# numbers; for positive numbers; for positive numbers that may be infinite.
+# Kinds of color scales: "truth" for truth values, "diverging" for numbers with a good and a bad side of a center,
+# "logarithmic" for positive numbers, "steep" for positive numbers that may be infinite, "sequential" for other numbers.
 ColorScale: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
 NOT_COMPUTED = 255  # status of points whose chunk does not exist yet; the other codes are those of `zwidth.Status`
 
