@@ -172,7 +172,7 @@ def list_units() -> str:
             units = ", ".join(f"`{unit}`" for unit in dimension.units)
             lines.append(f"| {dimension.base} | {units} | `{dimension.example}` |")
     words = ", ".join(f"`{word}`" for word in PERIOD_WORDS), ", ".join(f"`{word}`" for word in COUNTS)
-    text = f"Delays can also have the units {words[0]}, and encoder positions the units {words[1]}."
+    text = f"Delays can also be given in {words[0]}. Encoder positions can also be given in {words[1]}."
     return "\n".join([*lines, "", text])
 
 

@@ -116,7 +116,7 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
             ax.axhline(
                 end * factor, color=style.BLACK, linestyle=style.DASHED, linewidth=0.8, label="half an encoder step"
             )
-        ax.set(xlabel=f"time  in {second}", ylabel=f"measured minus\nmodelled  in {length}", xlim=(0.0, time[-1]))
+        ax.set(xlabel=f"time  in {second}", ylabel=f"measured minus\nmodeled  in {length}", xlim=(0.0, time[-1]))
         if step:
             _put_above(ax, [style.line("half an encoder step", style.DASHED, 0.8, style.BLACK)])
             far = factor * max(0.62 * step, float(np.nanmax(np.abs(rest))))
