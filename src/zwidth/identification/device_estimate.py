@@ -130,7 +130,7 @@ class DeviceEstimate:
     damping_tried: float | None = None  # largest B of the measured walls, N s/m; None for a log
     stiffness_tried: float | None = None  # K measured at the largest B, N/m; None for a log
 
-    # Shortcuts to attributes of the scene with the fitted parameters.
+    # Attributes of the fitted scene (``nominal``) as attributes of the estimate.
     mass = property(attrgetter("nominal.device.mass"))
     damping = property(attrgetter("nominal.device.damping"))
     delay = property(attrgetter("nominal.timing.delay"))
@@ -147,12 +147,12 @@ class DeviceEstimate:
 
     @property
     def numbers(self) -> tuple[str, ...]:
-        """The paths of the fitted parameters, in the order of the covariance."""
+        """The dotted paths of the fitted parameters, such as "modes.0.frequency", in the order of the covariance."""
         return name_parameters(self.nominal)
 
     @cached_property
     def estimates(self) -> np.ndarray:
-        """The values of the fitted parameters in SI units, in the order of ``numbers``."""
+        """The values of the fitted parameters in SI units, in the order of the covariance."""
         parameters = self.nominal.parameters()
         return np.array([parameters[name] for name in self.numbers])
 
@@ -162,7 +162,10 @@ class DeviceEstimate:
         return compute_reach(self.freedom)
 
     def normalize(self, drawn: np.ndarray) -> DimensionlessDevice:
-        """Convert parameters, one row per device and one column per entry of ``numbers``, to a batch of devices."""
+        """Convert parameters in SI units to a batch of dimensionless devices.
+
+        ``drawn`` has one row per device and one column per fitted parameter, in the order of the covariance.
+        """
         lag = 0 if self.actuator is None else self.actuator.order
         return DimensionlessDevice.from_parameters(np.moveaxis(drawn, 1, 0), self.period, lag)
 
@@ -230,7 +233,7 @@ class DeviceEstimate:
         return None
 
     def bound_measured_stiffness(self, confidence: float) -> float:
-        """Return a lower confidence limit in N/m of the stiffness that was measured at the largest B; 0 for a log.
+        """Return a lower confidence limit in N/m of the K at the onset of instability, at the largest B; 0 for a log.
 
         Args:
             confidence: probability that the true onset K is above the limit.
@@ -242,7 +245,7 @@ class DeviceEstimate:
     def response_scene(self) -> Scene | None:
         """The scene of the fitted response with a radius that covers one undetected resonance; None without a response.
 
-        It is that of `build_response_scene` with the default of 99 % of the devices.
+        The radius covers the responses of 99 % of the devices that agree with the fitted parameters.
         """
         return self.build_response_scene(RELIABILITY, True)
 

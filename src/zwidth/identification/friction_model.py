@@ -78,7 +78,7 @@ class Recording:
 
     @cached_property
     def recent_forces(self) -> np.ndarray:
-        """The later and the earlier one of the two forces that act in the period before each sample k if 0 <= d < 1.
+        """The two forces that act in the period before each sample k if 0 <= d < 1, the later one in the first row.
 
         The first row contains the force commanded at sample k - 1, the second row that at sample k - 2; forces before
         the log are 0. Two further columns repeat the last force, because a search may evaluate negative delays.
@@ -104,7 +104,7 @@ class Recording:
         offset: float = 0.0,
         friction: float = 0.0,
     ) -> ModelResponse:
-        """Simulate the mass under the forces of the log, and return its positions at the samples with positions.
+        """Simulate the mass under the forces of the log, and return its positions from sample ``skip`` on.
 
         The derivatives of the result have the columns `G` to `FRICTION`. The arguments are the symbols of the module,
         with times in sampling periods; ``offset`` is the acceleration o and ``friction`` the deceleration c.
@@ -159,11 +159,11 @@ def _integrate_with_friction(
     )
     acceleration = acceleration.T.ravel()
     gained = {s: s * by_forces - by_friction for s in (1.0, -1.0)}
-    # List the parts in which the forces exceed the friction, because a sticking mass starts to move in the next of
-    # these.
+    # List the parts in which the forces exceed the friction, because a sticking mass starts to move in the next one.
     able = np.flatnonzero(np.abs(acceleration) > friction)
     decay = np.exp(-delta * np.arange(count // 2 + 1))
-    # Tabulate the decay e^(-delta t) over the time t since the start of a first part, and of a second part.
+    # Tabulate the decay e^(-delta t) at all later starts of parts, with the time t counted from the start of the first
+    # or of the second part of a period.
     decays = [np.outer(decay, [1.0, each]).ravel() for each in slow]
     # In the loop, part m starts with velocity v in the direction s. `changes` collects the parts at whose start the
     # direction changes, with the new direction.
@@ -178,8 +178,8 @@ def _integrate_with_friction(
             m, v = int(able[after]), 0.0
             s = 1.0 if acceleration[m] > 0 else -1.0
             changes.append((m, s))
-        # Search for the next part at whose end s v <= 0, in windows of increasing size, because the next stop is
-        # usually near.
+        # Search for the next part at whose end s v <= 0. Test parts in blocks of increasing size, because the next stop
+        # is usually near.
         gain, decay, first, size = gained[s], decays[m % 2], m + 1, 128
         ahead = s * v - gain.item(m)  # the term s v_m - G_m of the formula above
         while first <= count:
@@ -194,22 +194,23 @@ def _integrate_with_friction(
         v, forced, part = s * max(0.0, gain.item(k) + ahead * decay.item(k - m)), acceleration.item(k), k % 2
         m, h, a = k + 1, spans.item(part), forced - s * friction
         if not (a * s < 0.0 and h > 0.0):
-            # Continue without a stop if the mass does not decelerate, because the sign of s v at the end of the part is
-            # then a rounding error.
+            # Continue without a stop if the mass does not decelerate, because s v <= 0 at the end of the part is then a
+            # rounding error.
             v = slow[part] * v + rates[part] * a
             continue
         # Compute the time from the start of the part to the stop: first without damping, then corrected for damping.
         before = -v / a
         before = min(log1p(delta * before) / delta if delta else before, h)
         rest, s = h - before, -s if abs(forced) > friction else 0.0
-        # Compute the velocity at the end of the part, starting from rest at the stop.
+        # Compute the velocity at the end of the part of a mass that starts from rest at the stop.
         v = (-expm1(-delta * rest) / delta if delta else rest) * (forced - s * friction) if s else 0.0
         stops.append((k, before, s, v))
         changes.append((k + 1, s))
     starts, directions = np.array(changes).T
     direction = np.repeat(directions, np.diff(np.append(starts, count)).astype(int))
     sticks = direction == 0
-    # Recompute all velocities by a linear recursion, now that the directions and stops are known.
+    # Recompute all velocities by a linear recursion, because the loop has computed only those at starts of motion and
+    # at stops.
     factors = np.where(sticks, 0.0, np.tile(slow, count // 2))
     added = np.tile(rates, count // 2) * (acceleration - direction * friction)
     added[sticks] = 0.0

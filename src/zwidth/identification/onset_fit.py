@@ -250,7 +250,7 @@ def _read_points(
         )
         rows = kept
     table = np.array(rows)
-    # Compare differences of B with K/w, the typical size of B, because all measured B may be 0 or close to 0.
+    # Compare differences of B with K/(2 pi f), a typical size of B, because all measured B may be 0 or close to 0.
     unit = table[0, 0] / (2 * np.pi * table[0, 2])
     if np.ptp(table[:, 1]) <= SAME * max(unit, np.abs(table[:, 1]).max()):
         count = "one wall does" if len(table) == 1 else f"{len(table)} walls of one damping do"
@@ -334,7 +334,7 @@ def _propose_measurement(
     onsets, theta = rigid_fit.onsets, rigid_fit.best.theta
     scene, period = rigid_fit.scene(theta), onsets.period
     w = np.linspace(0.0, np.pi, ANGLES + 2)[1:-1]
-    # Add low frequencies, because the stability boundary of a slow loop extends to them.
+    # Extend the uniform grid to low frequencies, because loops with long delay or strong damping become unstable there.
     w = np.concatenate([np.geomspace(1e-4, w[0], 60)[:-1], w])
     stiffness, damping = scene.boundary(w / period)
     # Exclude walls softer than a tenth of K_max, because their onset of instability is hard to measure.

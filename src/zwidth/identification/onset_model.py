@@ -79,8 +79,8 @@ class Onsets:
             )
             step = np.clip(-residual / slope, -LONGEST * w, LONGEST * w)
             w = np.minimum(w + step, 0.5 * (w + np.pi))
-            # This condition also ends the iteration for walls whose step is NaN, because it then stays NaN and the
-            # comparison is false.
+            # Walls with a NaN step do not prolong the iteration, because comparisons with NaN are false. Their step
+            # stays NaN.
             if not np.any(np.abs(step) > CONVERGED * w):
                 break
         points = circle_points(w)
@@ -107,7 +107,8 @@ class Onsets:
             longest: largest delay d in the grid.
             count: largest number of initial values.
         """
-        # At fixed delta and d, the cost is quadratic in ln m, so that the mean of the real parts is the optimal ln m.
+        # At fixed delta and d, the cost is quadratic in ln m, so that the optimal ln m is the mean of the real parts of
+        # the logarithms.
         from scipy.ndimage import minimum_filter
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)

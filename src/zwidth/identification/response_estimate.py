@@ -218,7 +218,7 @@ def _find_period(force: np.ndarray) -> int | None:
 
 
 def _find_repeats(force: np.ndarray, count: int) -> list[tuple[int, int]]:
-    """Find the stretches of the force in which a period of ``count`` samples occurs at least twice.
+    """Find the stretches of the force in which a period of ``count`` samples repeats at least twice in succession.
 
     Returns:
         For each stretch the index of its first sample, and that of its last sample plus 1.
@@ -349,8 +349,8 @@ def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list
     w = 2.0 * np.pi * np.arange(2, size // 2) / size
     G = both / forces / (1.0 - np.exp(-1j * w))
     error = np.abs(G) * np.sqrt((1.0 - np.minimum(coherence, 1.0)) / np.maximum(coherence, 1e-300) * _OVERLAP / pieces)
-    # Add the error of the averaging over neighboring lines by the window. It is proportional to the second difference
-    # of the response of the acceleration, u G, with u = |1 - e^(-jw)|^2.
+    # Add the bias that the window causes, because it averages the response over neighboring lines. This bias is
+    # proportional to the second difference of u G, the response of the acceleration, with u = |1 - e^(-jw)|^2.
     u = 4.0 * np.sin(0.5 * w) ** 2
     bend = np.abs(np.diff(u * G, 2))
     deviation = SURE * error + np.pad(bend, 1, mode="edge") / u

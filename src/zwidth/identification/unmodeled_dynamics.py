@@ -73,8 +73,8 @@ N_NEIGHBORS = 15  # number of poles on each side whose scores determine the loca
 MIN_RESPONSE_FREQUENCY = 2e-4  # lowest frequency of the grid
 N_BELOW_BANK = 40  # number of grid frequencies below the lowest frequency of the bank
 BAND_PHASE_STEP = 0.3  # rad; largest phase change by the delay between neighboring frequencies in `bound_response`
-# Largest such phase change in `sample_resonances`, in rad. It is smaller, because the linear interpolation between the
-# frequencies requires a finer grid.
+# The same limit for `sample_resonances`, in rad: the largest phase change by the delay between neighboring frequencies.
+# It is smaller than `BAND_PHASE_STEP`, because the response is interpolated linearly between the frequencies.
 INTERPOLATION_PHASE_STEP = 0.06
 # Distances of the additional grid points from a resonance frequency, in half-widths of the resonance.
 RESONANCE_OFFSETS = np.sinh(np.linspace(-4.0, 4.0, 61))
@@ -199,7 +199,7 @@ def bound_response(fit: FittedModel, scene: Scene, bank: PoleBank) -> MeasuredDe
     response, derivatives = _evaluate_response(fit, scene.timing.period, grid)
     deviation = np.zeros(grid.size)
     for poles in banks:
-        # Subtract the change of the response by the bias of theta, because an undetected mode has biased the fit.
+        # Subtract the change of the response that the bias of theta causes, because an undetected mode biases the fit.
         bias = poles.absorbed[:, : fit.model.parts.stop] @ derivatives.T
         change = _evaluate_unit_modes(fit, grid, poles.frequency[:, None], poles.ratio[:, None]) - bias
         deviation = np.maximum(deviation, np.max(np.abs(change) * poles.bound_mass_ratios()[:, None], 0))
@@ -207,7 +207,7 @@ def bound_response(fit: FittedModel, scene: Scene, bank: PoleBank) -> MeasuredDe
 
 
 def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenResonances | None:
-    """Compute the posterior odds of one undetected resonance, and K_max for samples of it.
+    """Compute the posterior odds of one undetected resonance, and K_max of the device with each of its samples.
 
     Args:
         fit: The fitted model.
@@ -219,7 +219,7 @@ def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenR
     """
     odds, modes, mass_ratio = _draw_modes(bank.select(bank.ratio < 1.0))
     # The first sample has mass ratio 0 and represents the device without a further mode. Its K_max is the reference for
-    # those of the other samples.
+    # the K_max of the other samples.
     frequency, damping_ratio = modes.frequency[:, None], modes.ratio[:, None]
     # Evaluate the response of each sample on a common grid joined with a fine grid around its resonance.
     common = _build_frequency_grid(scene, INTERPOLATION_PHASE_STEP)[None]
@@ -228,7 +228,7 @@ def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenR
     responses, period = [], scene.timing.period
     for grid in (common, local):
         response, derivatives = _evaluate_response(fit, period, grid)
-        # Subtract the change of the response by the bias of theta, because an undetected mode has biased the fit.
+        # Subtract the change of the response that the bias of theta causes, because an undetected mode biases the fit.
         bias = (derivatives @ modes.absorbed[:, : fit.model.parts.stop, None])[..., 0]
         change = _evaluate_unit_modes(fit, grid, frequency, damping_ratio) - bias
         responses.append(response + mass_ratio[:, None] * change)
