@@ -43,11 +43,11 @@ class Variants:
             yield self.scene.replace(**{name: float(values[k]) for name, values in self.drawn.items()})
 
     def labels(self, stiffness: float, damping: float) -> np.ndarray:
-        """Return a boolean array that states for each variant whether a wall is stable."""
+        """Return a boolean array with one entry per variant: True if the wall is stable on this variant."""
         return np.array([bool(scene.is_stable(stiffness, damping)) for scene in self.scenes()])
 
     def find_stiffness_limits(self, damping: np.ndarray) -> np.ndarray:
-        """Return the upper end of the stable interval of K for each variant and each B; 0 if no wall is stable.
+        """Return the upper end of the lowest stable interval of K for each variant and each B; 0 if no wall is stable.
 
         The interval is the one that starts at K = 0. If the device is unstable without a wall, it is the interval with
         the softest walls of K > 0.
@@ -113,7 +113,7 @@ class RigidVariants(Variants):
 
     @staticmethod
     def evaluate(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
-        """Evaluate a function of arrays; divide them into pieces if NumPy is then faster than code compiled by JAX.
+        """Evaluate a function of arrays, in small pieces if NumPy then takes less time than compilation by JAX.
 
         A function called with at most ``FEW`` elements runs in NumPy; with more elements JAX compiles it.
         """

@@ -61,7 +61,7 @@ from zwidth.stability.rigid.verdict import StabilityMethod, decide_stability, is
 from zwidth.units.quantities import WALL_RANGE
 
 # Largest log|z| of poles of a lossless loop that are treated as poles on the unit circle. It exceeds 1e-8, because a
-# rounding error of 1e-16 moves a double pole by its square root.
+# rounding error of 1e-16 moves a double pole by the square root of this error.
 ON_CIRCLE = 1e-7
 
 
@@ -76,7 +76,7 @@ class DominantPole(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LinearLoop:
-    """Analyses of a scene whose device has a model; alpha and beta are arrays of equal shape unless stated."""
+    """Analyses of a scene whose device has a model; by default, alpha and beta are arrays of equal shape."""
 
     scene: Any
     # Cache of computed ridges; the key is True if negative damping is allowed.
@@ -86,7 +86,8 @@ class LinearLoop:
     draws: ClassVar[int] = 200
     # True if the methods with arguments alpha and beta work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
-    # Largest velocity window and delay, in periods, that other modules try; the run time increases with their square.
+    # Largest velocity window and delay, in periods, that searches in other modules try. It is limited, because the run
+    # time increases with the square of window and delay.
     most_periods: ClassVar[float] = 128
 
     @cached_property
@@ -124,7 +125,7 @@ class LinearLoop:
 
     @cached_property
     def poles_sought(self) -> int:
-        """Number of poles to compute for one spectral radius."""
+        """Number of closed-loop poles that have to be computed to determine the spectral radius of one wall."""
         return self.roots.order
 
     def labels(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
@@ -186,7 +187,7 @@ class LinearLoop:
         return DominantPole(False, float(self.radius(*wall)[0]), -float(log_modulus(dominant)), float(angle))
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
-        """Return the stable intervals of alpha for each beta, shape (n, intervals, 2); NaN if a beta has fewer."""
+        """Return the stable intervals of alpha for each beta, shape (n, intervals, 2), padded with NaN."""
         return np.stack(find_stable_intervals(self.boundary, *nan_beyond(WALL_RANGE, beta))[:2], -1)
 
     def find_stable_beta(self, alpha: float) -> np.ndarray:
@@ -213,7 +214,7 @@ class LinearLoop:
         return ""
 
     def find_connected_beta(self, alpha: float, least: float) -> list[tuple[float, float]]:
-        """Return for one alpha the intervals of beta >= ``least`` of stable walls that are connected to K = 0."""
+        """Return for one alpha the intervals of beta >= ``least`` in which walls are stable and connected to K = 0."""
         intervals = np.maximum(self.find_stable_beta(alpha), least).tolist()
         return [(low, high) for low, high in intervals if low < high and self.is_connected(alpha, 0.5 * (low + high))]
 
@@ -256,7 +257,7 @@ class LinearLoop:
         return RidgePoint(alpha, beta, omega, np.int32(ridge.kind), np.int32(status))
 
     def ridge(self, negative: bool) -> tuple[RidgeSolution | None, Status]:
-        """Return the stiffest wall with its active constraints, or None, and a status; JAX cannot trace this method."""
+        """Return the stiffest stable wall with its active constraints, None if no wall is stable; and a status code."""
         stable_set = self.stable_set
         if negative not in self._ridges:
             try:
