@@ -136,8 +136,8 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
         for index, (condition, faults) in enumerate(zip(self.conditions, problems, strict=True)):
             for path, message in faults:
                 is_overridden = getattr(condition, str(path[0])) is not None
-                # Report a fault in a value of the study itself only for the first condition, because it is the same in
-                # all of them.
+                # Report a fault in a value of the study itself only once, for the first condition, because all
+                # conditions share this value.
                 if is_overridden or index == 0:
                     yield (("conditions", index, *path) if is_overridden else path), message
 

@@ -88,7 +88,7 @@ class ComputedStudy(Study):
     with the decorator `zwidth.studies.register`.
     """
 
-    # True if the results depend on the scene not only through the values that `fill` copies from it into the study.
+    # True if `compute` uses the scene itself, and not only the values that `fill` copies from the scene into the study.
     reads_scene: ClassVar[bool] = False
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
@@ -142,7 +142,7 @@ _WALL_KEYS = ("stiffness_fraction", "walls")
 def add_si_columns(
     table: dict[str, np.ndarray], delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None
 ) -> dict[str, np.ndarray]:
-    """Return a table of walls with columns in SI units added, if delta and d are those of a rigid device.
+    """Return a table of walls, to which columns in SI units are added if delta and d are those of a rigid device.
 
     Args:
         table: columns, with alpha and beta of the walls among them.
