@@ -46,7 +46,7 @@ LocatedProblem: TypeAlias = tuple[FieldPath, PydanticCustomError]
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault of a configuration; line and column are None if it has no position, e.g. for a missing file."""
+    """One fault of a configuration; line and column are None for a fault without a position, such as a missing file."""
 
     file: str  # path as given by the user; empty for a configuration passed as a mapping
     line: int | None  # line number, counted from 1
@@ -105,7 +105,7 @@ _REMOVED_KEYS = ("delay_model", "delay_models")  # keys that studies had in earl
 
 
 def list_problems(error: ValidationError | PydanticCustomError, *above: str) -> list[LocatedProblem]:
-    """Convert an error to a list of pairs (path, problem), one pair for each invalid field.
+    """Convert a validation error to a list of pairs (path, problem), one pair for each invalid field.
 
     Errors that pydantic itself detected, such as a wrong type, are converted to a `problem` with allowed values and a
     remedy.
