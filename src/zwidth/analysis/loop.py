@@ -410,13 +410,13 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
         stiffness, *derivatives = stiffness_slopes(slopes, scene.mass, scene.timing.period, *values)
     per = dict(zip(("mass", "damping", "period", "delay"), derivatives, strict=True))
     if scene.timing.in_periods and scene.timing.d:
-        # If the delay is given in periods, t_d = d T increases with T. By the chain rule, the derivative of K_max in T
-        # at constant d is that at constant t_d, plus d times the derivative in t_d.
+        # If the delay is given in periods, t_d = d T increases with T. By the chain rule, the derivative of K_max with
+        # respect to T at constant d is the derivative at constant t_d, plus d times the derivative with respect to t_d.
         per["period"] = per["period"] + scene.timing.d * per["delay"]
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
-        # Differentiate the active constraints of the stiffest wall implicitly, because the derivative of K_max in the
-        # stiffness of the operator has no closed form.
+        # Differentiate the active constraints of the stiffest wall implicitly, because the derivative of K_max with
+        # respect to the stiffness of the operator has no closed form.
         ridge = scene.loop.ridge(negative)[0]
         per["operator.stiffness"] = (
             math.nan if ridge is None else differentiate_stiffness(scene, ridge, "operator.stiffness")

@@ -140,8 +140,8 @@ def sensitivities(
 def _sensitivities_kernel(mass, damping, period, delay, delta, d, kind) -> Sensitivities:
     """Compute K_max and its derivatives in SI units; ``kind`` is that of `max_stiffness_kernel`."""
     xp = namespace(mass, delta, d)
-    # If JAX traces the quantities, compile the derivatives in delta and d as a separate function, so that JAX computes
-    # them once instead of once per quantity.
+    # If JAX traces the quantities, compile the derivatives with respect to delta and d as a separate function, so that
+    # JAX computes them once instead of once per quantity.
     slopes = slopes_kernel(delta, d, kind) if xp is np else compile_traced(slopes_kernel, (kind,))(delta, d)
     # Compute the status of entries out of range from the quantities in SI units, because delta or d is NaN there.
     input_status = quantity_status(mass=mass, damping=damping, period=period, delay=delay)

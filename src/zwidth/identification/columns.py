@@ -206,7 +206,7 @@ def _name_units(
 
 
 def _is_rotary(units: Mapping[str, str], sources: Mapping[str, Column], resolution: Any) -> bool:
-    """Return whether the axis is rotary: by the units, or without units by the resolution, or else by the headers."""
+    """Return whether the axis is rotary, by the units; without units by the resolution; else by the headers."""
     for name in ("force", "position"):
         linear, angular = DIMENSIONS[name]
         base = _integrate_unit(units[name]) or units[name]

@@ -77,7 +77,7 @@ class CriticalController:
         return rigid / (1.0 - rigid * self.evaluate_parts(points)) if self.has_parts else rigid
 
     def evaluate_rigid(self, points: CirclePoints) -> Jet:
-        """Return q of the rigid mass alone, and its derivative in the frequency w."""
+        """Return q of the rigid mass alone, and its derivative with respect to the frequency w."""
         plant, turn = self.plant, 1j * points.z
         numerator, z_minus_c = _evaluate_numerator(plant, points), points.z_minus_1 + plant.em
         q = -np.exp(1j * self.n_delay * points.w) * points.z_minus_1 * z_minus_c / numerator
@@ -99,7 +99,7 @@ class CriticalController:
             q: value of q of the rigid mass at these points.
 
         Returns:
-            The derivatives in delta and in d.
+            The derivatives with respect to delta and to d.
         """
         by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
         numerator = _evaluate_numerator(self.plant, points)

@@ -7,7 +7,7 @@ The actuator lag A(s) and the resonances (*modes*) are linear. They therefore ad
 
     A(s)/(s (s + delta)) = 1/(s (s + delta)) + sum_j (r_j/p_j)/(p_j + delta) (1/(s - p_j) - 1/(s + delta)).
 
-The derivative of E_p in p is E_p filtered once more by the same pole; the derivative in the delay d is ``-E_p'``.
+The derivative of E_p with respect to p is E_p filtered once more by the same pole; that with respect to d is -E_p'.
 
 Friction is not linear. The times at which friction stops the mass are approximated by those of a rigid mass whose delay
 is increased by the delay of the lag at low frequencies, -A'(0). This approximation neglects that the lag also smooths
@@ -188,9 +188,9 @@ class Recordings:
                 exchanged.append((gain, by_delay, velocity.position, displacement))
 
         def differentiate() -> np.ndarray:
-            # Collect the derivatives of the positions in theta as terms (a, b): each term is the real part of the
-            # product of an array a over the samples and an array b over theta. The derivative of E_p in the delay is
-            # -E_p' = -p E_p - F.
+            # Collect the derivatives of the positions with respect to theta as terms (a, b): each term is the real part
+            # of the product of an array a over the samples and an array b over theta. The derivative of E_p with
+            # respect to the delay is -E_p' = -p E_p - F.
             force = log.recent_forces[0, log.skip - int(np.floor(d)) + samples]
             terms: list[tuple[Any, Any]] = [(force, -unit[2] * weights.sum())]
             poles_by_theta, weights_by_theta = self._differentiate_poles(theta)
@@ -228,7 +228,7 @@ class Recordings:
         return poles[height >= 0], weights[height >= 0], states[height >= 0]
 
     def _differentiate_poles(self, theta: np.ndarray) -> np.ndarray:
-        """Differentiate the poles and their weights in theta by central differences.
+        """Differentiate the poles and their weights with respect to theta by central differences.
 
         Returns:
             An array of shape (2, poles, size): the derivatives of the poles, and those of their weights.
@@ -248,7 +248,7 @@ class Recordings:
 
 
 def _limit_lag_delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.ndarray]:
-    """Return the low-frequency delay of the lag, limited so that its sum with d does not require forces before the log.
+    """Return the low-frequency delay of the lag, limited so that the total delay requires no forces before the log.
 
     Args:
         theta: parameter vector.
@@ -256,7 +256,7 @@ def _limit_lag_delay(theta: np.ndarray, order: int, log: Recording) -> tuple[flo
         log: the log.
 
     Returns:
-        The delay, and its derivatives in the parameters of the lag.
+        The delay, and its derivatives with respect to the parameters of the lag.
     """
     late, by = theta[3:4].sum() if order else 0.0, np.eye(2)[0, :order]
     most = log.skip - 1.5 - theta[2]
@@ -272,13 +272,13 @@ def _filter_force(log: Recording, pole: complex, d: float) -> ModelResponse:
         d: delay.
 
     Returns:
-        E_p as positions, and its derivative in p as derivatives of the response.
+        E_p as positions, and its derivative with respect to p as derivatives of the response.
     """
     n_delay = int(np.floor(d))
     f, pole, first = d - n_delay, pole if pole.imag else pole.real, log.skip - n_delay
     with_positions = slice(first, first + log.position.size)
     # Within a period the delayed force changes once. Compute the gains from the forces before and after this change to
-    # E_p at the next sample, at the pole p and, for the derivative in p, at p plus and minus a step.
+    # E_p at the next sample, at the pole p and, for the derivative with respect to p, at p plus and minus a step.
     near = pole + _STEP * np.array([[0.0], [1.0], [-1.0]])
     near = np.where(near == 0, 1e-300, near)
     gains = np.expm1(np.array([1.0 - f, f]) * near) / near * np.exp([0.0, 1.0 - f] * near)
@@ -303,7 +303,7 @@ def _integrate_velocity(log: Recording, delta: float, d: float, velocity: ModelR
         velocity: velocity of the mass, E_p for p = -delta.
 
     Returns:
-        The displacement, and its derivative in delta.
+        The displacement, and its derivative with respect to delta.
     """
     n_delay = int(np.floor(d))
     spans, now = np.array([d - n_delay, 1.0 - d + n_delay, 1.0]), log.skip - n_delay

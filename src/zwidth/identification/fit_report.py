@@ -99,7 +99,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
 
 
 def _assume_rigid(fit: DeviceFit) -> Recommendation | None:
-    """Return the wall recommended for a device without undetected resonances; None unless it is the stiffer one."""
+    """Return the wall recommended without undetected resonances; None if it is not stiffer than the recommended one."""
     recommended = replace(fit.scene, safe_limit=limit_walls(fit, rigid=True)).recommend()
     return recommended if recommended.stiffness > STIFFER * fit.recommended.stiffness else None
 

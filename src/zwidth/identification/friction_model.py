@@ -10,8 +10,8 @@ fractional part f of the delay. The period therefore has two *parts* of duration
 
 Within a part the velocity approaches a/delta exponentially, so it reaches 0 at most once. At this *stop* the mass
 sticks if ``|g F + o| <= c``; otherwise it reverses. The time of the stop follows from a logarithm. Before and after it
-the velocity and position have a closed form in the phi-functions of `zwidth.numerics.held_mass`. The derivatives in the
-parameters are exact, too: a change dv of the velocity near the stop shifts its time by -dv/a.
+the velocity and position have a closed form in the phi-functions of `zwidth.numerics.held_mass`. The derivatives with
+respect to the parameters are exact, too: a change dv of the velocity near the stop shifts its time by -dv/a.
 
 Stops are computed one after another in Python; all other steps are vectorized, and linear recursions are solved by
 LAPACK. JAX is not used, because it would compile for seconds for every new length of a log.
@@ -29,7 +29,7 @@ import numpy as np
 
 from zwidth.numerics.held_mass import PhiFunctions, phi_functions
 
-# Column indices of the parameters in the derivatives of `Recording.move`.
+# Columns of the derivatives that `Recording.move` computes: index of each parameter.
 G = 0  # reciprocal mass g = T^2/m
 DELTA = 1  # damping delta = b T/m
 DELAY = 2  # delay d, in sampling periods
@@ -54,7 +54,7 @@ class SlipParts(NamedTuple):
 
 @dataclass(frozen=True)
 class ModelResponse:
-    """Sampled positions of a model, and their derivatives in the parameters; the derivatives are computed on demand."""
+    """Sampled positions of a model, and their derivatives with respect to the parameters, computed on demand."""
 
     position: np.ndarray
     differentiate: Callable[[], np.ndarray]
@@ -264,8 +264,8 @@ def _integrate_positions(
     def differentiate() -> np.ndarray:
         # The axes of ``by`` are: displacement or end velocity; parameter; part; period.
         by = _differentiate_segment(phi, delta, span, v, a, force, direction, sticks)
-        # Compute the derivatives of the end velocity and of the displacement in the start velocity, and the
-        # acceleration v' at the end. The end velocity of a sticking mass does not depend on its start velocity.
+        # Compute the derivatives of the end velocity and of the displacement with respect to the start velocity, and
+        # the acceleration v' at the end. The end velocity of a sticking mass does not depend on its start velocity.
         velocity_by_v, moved_by_v, rate = np.where(sticks, 0.0, phi.c), by[1, OFFSET].copy(), a - delta * end
         if t.size:
             rate[k] = a_after - delta * end[k]
@@ -279,8 +279,9 @@ def _integrate_positions(
                 phi_after, delta, r, 0.0 * r, a_after, force[k], direction_after, sticks_after
             )
             by[0][:, *k], by[1][:, *k] = before[0] + shift * before[1] + after[0], velocity_shift * before[1] + after[1]
-        # A longer delay extends the first part and shortens the second one. Therefore the derivatives in the delay are
-        # the velocity and the acceleration at the end of the part, negative for the second part.
+        # A longer delay extends the first part and shortens the second one. Therefore the derivatives of displacement
+        # and end velocity with respect to the delay are the velocity and the acceleration at the end of the part, with
+        # a negative sign for the second part.
         by[:, DELAY] = np.array([end, rate]) * [[1.0], [-1.0]]
         # Combine the derivatives of the two parts of each period, and compute those of the velocities at the start of
         # all periods by a recursion.
@@ -306,7 +307,7 @@ def _differentiate_segment(phi: PhiFunctions, delta: float, t: np.ndarray, *segm
 
     Returns:
         An array of shape (2, 7, ...). The first axis is displacement and end velocity, the second the parameters `G` to
-        `FRICTION`. The derivatives in the delay and in the initial state are 0.
+        `FRICTION`. The derivatives with respect to the delay and the initial state are 0.
     """
     v, a, force, direction, sticks = segment
     minus_phi2_slope = np.where(delta * t == 0, 1.0 / 6.0, phi.gap / np.where(delta * t == 0, 1.0, delta * t))

@@ -284,7 +284,7 @@ def _estimate_delay_step(derivatives: np.ndarray, best: Candidate) -> float:
     """Return the delay that least squares would choose if it were not fixed at 0, in standard errors.
 
     Args:
-        derivatives: weighted derivatives of the residuals in theta, one row per residual.
+        derivatives: weighted derivatives of the residuals with respect to theta, one row per residual.
         best: fit with the delay fixed at 0; its residuals are assumed to have variance 1.
     """
     inverse = np.linalg.pinv(derivatives)[2]
@@ -297,7 +297,7 @@ def _require_identifiability(
     """Raise `InputError` if the walls do not determine mass, damping and delay.
 
     Args:
-        derivatives: weighted derivatives of the residuals in theta, one row per residual.
+        derivatives: weighted derivatives of the residuals with respect to theta, one row per residual.
         theta: parameters of the best device.
         table: walls, shape (walls, 3), with the columns K, B and f.
         on_boundary: True if the walls are on the stability boundary of the best device.
@@ -328,7 +328,7 @@ def _propose_measurement(
         rigid_fit: the fit to the measured walls.
         stiffness_max: K_max of the fitted device in N/m.
         information: information matrix of theta from the measured walls.
-        wanted: derivatives of K_max in theta.
+        wanted: derivatives of K_max with respect to theta.
         precision: inverse variances of ln K and ln f.
     """
     onsets, theta = rigid_fit.onsets, rigid_fit.best.theta

@@ -40,7 +40,7 @@ class PredictedWalls(NamedTuple):
     converged: np.ndarray  # mask of the walls for which the iteration converged
     differentiate: Callable[
         [], np.ndarray
-    ]  # function that returns the derivatives of ln kappa and ln w in theta, shape (walls, 2, 3)
+    ]  # function that returns the derivatives of ln kappa and ln w with respect to theta, shape (walls, 2, 3)
 
 
 @dataclass(frozen=True)

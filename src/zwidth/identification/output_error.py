@@ -33,7 +33,7 @@ _DELTAS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0)  # damping delta = b T/m
 # Initial values of the friction, relative to the largest force.
 _FRICTIONS = np.array([0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.35])
 # Least friction of the search, relative to the largest force. It is not exactly 0, because the model then omits
-# friction, so that the derivative of the positions in the friction would be 0.
+# friction, so that the derivative of the positions with respect to the friction would be 0.
 MIN_FRICTION = 1e-12
 _N_LEADING = 600  # number of leading positions of each log from which the initial values are computed
 _BATCH_SIZE = 32  # number of delays per batch, to limit the memory
@@ -73,7 +73,7 @@ _Fixed = tuple[int, ...]  # indices of the parameters in theta that keep their i
 
 
 class ColumnsInverse(NamedTuple):
-    """Pseudo-inverse of the normalized derivatives of the positions in theta, with results of the decomposition."""
+    """Pseudo-inverse of the normalized derivatives of the positions with respect to theta, and their column space."""
 
     matrix: np.ndarray  # pseudo-inverse, one row per parameter
     undetermined: np.ndarray  # mask of the parameters that the positions do not determine
@@ -102,7 +102,7 @@ class FittedModel:
 
     @cached_property
     def response(self) -> ModelResponse:
-        """The modeled positions of all logs and their derivatives in theta."""
+        """The modeled positions of all logs and their derivatives with respect to theta."""
         return self.model.simulate(self.theta)
 
     @cached_property
@@ -129,7 +129,7 @@ class FittedModel:
     def columns(self) -> tuple[np.ndarray, np.ndarray]:
         """The weighted derivatives of the positions in theta, each column divided by its norm, and these norms.
 
-        A column that is zero, such as the derivative in v0 of a sticking mass, is divided by 1 instead.
+        A zero column, such as the derivative with respect to v0 for a sticking mass, stays zero; its norm is set to 1.
         """
         columns = self.model.weigh(self.response.derivatives)
         sizes = np.linalg.norm(columns, axis=0)
@@ -299,7 +299,7 @@ def _list_starts(model: Recordings) -> list[np.ndarray]:
 
 
 def _simulate_rows(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.ndarray:
-    """Simulate the positions for g = 1 and their derivatives in the linear parameters, as basis of a linear fit.
+    """Simulate the positions for g = 1, and their derivatives with respect to x0, v0 and o, as basis of a linear fit.
 
     Args:
         model: the logs, with a model without lag and modes.
@@ -308,8 +308,8 @@ def _simulate_rows(model: Recordings, delta: float, d: float, base: np.ndarray) 
         base: a theta that contains the initial states, o and c, divided by g.
 
     Returns:
-        An array with one sample per column. The rows are the positions, their derivatives in x0 and v0 of each log, and
-        that in o.
+        An array with one sample per column. The rows are the positions, and their derivatives with respect to x0 and v0
+        of each log and to o.
     """
     response = model.simulate(np.array([1.0, delta, d, *base[3:]]))
     return np.vstack([response.position, response.derivatives[:, 3:-1].T])
@@ -353,8 +353,8 @@ def _fit(model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: fl
         fixed: indices of the parameters that keep their initial values.
         tolerance: tolerance of the search, as in `minimize_squares`.
     """
-    # Treat initial motions that end within the noise of the positions separately: the derivative of the positions in
-    # such an initial velocity is almost 0, so that the search converges slowly.
+    # Treat initial motions that end within the noise of the positions separately: the derivative of the positions with
+    # respect to such an initial velocity is almost 0, so that the search converges slowly.
     best = fit_nonnegative(model, start, fixed, tolerance)
     speed, (_, delta, *_, friction) = np.abs(best.theta[model.velocity_indices]), best.theta
     # Approximate the distance to the stop by a formula that is exact without damping, v^2/(2 c), and without friction,

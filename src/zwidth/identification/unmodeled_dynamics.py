@@ -5,7 +5,8 @@ noise of variance ``sigma^2``. The *signature* of a mode or lag is the part of i
 change of the fitted parameters ``theta`` (`identification.extended_model.Recordings`) reproduces. A mode of *mass
 ratio* r has the modal mass ``m/(r sqrt(1 - zeta^2))``, with the mass m of the device and the damping ratio zeta of the
 mode; r is negative if actuator and sensor are on opposite sides of a node. A *unit mode* has mass ratio 1. J are the
-derivatives of the positions in theta, W the weights of the samples. Unless stated otherwise, times are in sampling
+derivatives of the positions with respect to theta, W the weights of the samples. Unless stated otherwise, times are in
+sampling
 periods and frequencies are relative to the sampling rate.
 
 The candidates are a bank of poles: a grid of frequencies for each of a few damping ratios, and real poles for actuator

@@ -155,7 +155,7 @@ def linear_from() -> float:
     limit = np.array([limit_slope(d) for d in FIG10_DELAYS])
 
     def excess(delta: np.ndarray) -> np.ndarray:
-        """Return the largest relative difference of d alpha_max/d delta from g of all curves, minus `LINEAR_WITHIN`."""
+        """Return the largest relative difference of d alpha_max/d delta from g on all curves, minus the tolerance."""
         step = 0.008  # step of delta in fourth-order central differences, whose errors move the root by 2e-10
         deltas = np.asarray(delta)[..., None] + step * np.array([-2.0, -1.0, 1.0, 2.0])
         values = np.array([maximize_alpha(deltas, d)[0] for d in FIG10_DELAYS])
