@@ -83,7 +83,8 @@ class RigidVariants(Variants):
         with np.errstate(all="ignore"):
             self.rate = mass / self.period
             self.delta = damping / self.rate
-            # Vary d with the period only if the delay was given in seconds.
+            # Vary d with the period only if the delay was given in seconds, because a delay given in periods stays
+            # constant.
             relevant = {"delay"} if scene.timing.in_periods else {"delay", "period"}
             self.d = delay / self.period if relevant & set(drawn) else np.full(self.count, float(scene.d))
 

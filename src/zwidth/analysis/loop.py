@@ -82,7 +82,8 @@ class LinearLoop:
     # Cache of computed ridges; the key is True if negative damping is allowed.
     _ridges: dict[bool, RidgeSolution | None] = field(default_factory=dict, init=False, repr=False)
 
-    # Default number of random devices in tolerance estimates; small, because K_max of one device takes 10 to 50 ms.
+    # Default number of random devices in tolerance estimates. It is small, because K_max of one device takes 10 to 50
+    # ms.
     draws: ClassVar[int] = 200
     # True if the methods with arguments alpha and beta work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False

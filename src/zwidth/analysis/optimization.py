@@ -158,7 +158,7 @@ def _choose_range(
 
 
 def _find_extrema(surplus: Callable[[float], float], grid: list[float], values: list[float]) -> list[float]:
-    """Return the parameter values of local extrema of the surplus at which its sign may differ from that on the grid.
+    """Return the parameter values at local extrema of the surplus that may differ in sign from nearby grid points.
 
     These are maxima close to grid points with negative surplus, and minima close to those with nonnegative surplus.
     ``values`` holds the surplus at the parameter values ``grid``.

@@ -267,7 +267,7 @@ def _convert_force(best: FittedModel, k: int) -> tuple[float, float]:
     value, indices = best.theta[k] / g, [0, k]
     slope = np.array([-value / g, 1.0 / g])
     error = float(np.sqrt(slope @ best.covariance[np.ix_(indices, indices)] @ slope))
-    # Report a friction at the lower bound of the search as 0, because the search does not reach 0 itself.
+    # Report a friction at the lower bound of the search as 0, because this bound is slightly above 0.
     is_zero = k == -1 and value <= 2.0 * MIN_FRICTION * best.model.largest_force
     return 0.0 if is_zero else float(value), error
 

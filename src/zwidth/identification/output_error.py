@@ -127,7 +127,7 @@ class FittedModel:
 
     @cached_property
     def columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """The weighted derivatives of the positions in theta, each column divided by its norm, and these norms.
+        """The weighted derivatives of the positions with respect to theta, in normalized columns, and their norms.
 
         A zero column, such as the derivative with respect to v0 for a sticking mass, stays zero; its norm is set to 1.
         """
@@ -229,8 +229,8 @@ def fit_model(model: Recordings) -> FittedModel:
     direction = float(np.sign(steps.sum()))
     if -np.sum(steps, where=direction * steps < 0) * direction < _BACKWARD_SHARE * np.abs(steps).sum():
         g, total = best.theta[0], best.theta[-2] - direction * best.theta[-1]
-        # Attribute the sum of both forces to the constant force if it acts in the direction of motion, and to friction
-        # otherwise.
+        # Attribute the sum of both forces to the constant force if the sum acts in the direction of motion, and to
+        # friction otherwise.
         if direction * total > 0:
             parts, omitted = (total, MIN_FRICTION * abs(g) * model.largest_force), -1
         else:

@@ -54,8 +54,8 @@ MAX_FREQUENCY = 0.49  # highest natural frequency in the bank, just below the Ny
 # (actuator lags).
 FREQUENCY_SPACING = {LEAST_DAMPING_RATIO: 1.01, 0.03: 1.06, 0.2: 1.06, 1.0: 1.06}
 BOUNDED_RATIOS = (LEAST_DAMPING_RATIO, 0.03)  # damping ratios of the undetected modes that `bound_response` considers
-# A pole counts as absorbed if the part of the filtered force that is orthogonal to the weighted derivatives of the
-# positions in theta is smaller than this share of its norm.
+# A pole counts as absorbed if the part of the filtered force that is orthogonal to the weighted derivatives J is
+# smaller than this share of the norm of the filtered force.
 ABSORBED_NORM = 1e-6
 
 # Constants of the detection of a missing pole.
@@ -305,7 +305,7 @@ def _evaluate_unit_modes(fit: FittedModel, grid: np.ndarray, frequency: np.ndarr
 
 
 def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frequency response of the fitted device, and its derivatives in the device parameters of theta.
+    """Return the frequency response of the fitted device, and its derivatives with respect to the device parameters.
 
     Args:
         fit: The fitted model.
