@@ -334,7 +334,7 @@ def _propose_measurement(
     onsets, theta = rigid_fit.onsets, rigid_fit.best.theta
     scene, period = rigid_fit.scene(theta), onsets.period
     w = np.linspace(0.0, np.pi, ANGLES + 2)[1:-1]
-    # Extend the uniform grid to low frequencies, because loops with long delay or strong damping become unstable there.
+    # Extend the uniform grid to low frequencies, because loops with long delay or weak damping become unstable there.
     w = np.concatenate([np.geomspace(1e-4, w[0], 60)[:-1], w])
     stiffness, damping = scene.boundary(w / period)
     # Exclude walls softer than a tenth of K_max, because their onset of instability is hard to measure.

@@ -107,14 +107,14 @@ class Onsets:
             longest: largest delay d in the grid.
             count: largest number of initial values.
         """
-        # At fixed delta and d, the cost is quadratic in ln m, so that the optimal ln m is the mean of the real parts of
-        # the logarithms.
         from scipy.ndimage import minimum_filter
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)
         points = circle_points(self.w)
         q = CriticalController(deltas[:, None, None], delays[:, None]).evaluate_rigid(points).value
         errors = np.log((self.kappa + self.scaled_damping * self._estimate.jet(points).value) / q)
+        # At fixed delta and d, the cost is quadratic in ln m, so that the optimal ln m is the mean of the real parts of
+        # the logarithms.
         log_mass = errors.real.mean(-1)
         cost = (errors.imag**2).sum(-1) + ((errors.real - log_mass[..., None]) ** 2).sum(-1)
         lowest = np.argwhere(cost == minimum_filter(cost, 3, mode="constant", cval=np.inf))

@@ -57,7 +57,7 @@ _NEGLIGIBLE_DAMPING = 1e-6  # value below which a decreasing damping is set to 0
 _MAX_DAMPING = 1e12  # damping above which the search ends
 
 # Limits that decide whether the log can distinguish friction from a constant force.
-# A motion counts as one in a single direction if the path traveled backward is less than this share of the whole path.
+# A motion counts as single-directional if the path traveled backward is less than this share of the whole path.
 _BACKWARD_SHARE = 0.1
 # A fit without friction is tried as a rival if the squared ratio of the friction to its standard error is below this
 # limit.
@@ -172,11 +172,11 @@ class FittedModel:
 
         The value is the mean square of sums of successive residuals, divided by that expected from the noise model.
         """
-        # Form sums of 2 N^(1/3) successive residuals, with N the number of all residuals. This is a usual bandwidth for
-        # errors with unknown autocorrelation (Newey, West 1987).
         from scipy.special import chdtri
 
         weights, total = self.model.noise or self.noise, self.residuals.size
+        # Form sums of 2 N^(1/3) successive residuals, with N the number of all residuals. This is a usual bandwidth for
+        # errors with unknown autocorrelation (Newey, West 1987).
         size = int(2 * np.ceil(total ** (1 / 3)))
         starts = np.arange(0, total - size + 1, size)
         sums = np.add.reduceat(weights.weigh(self.residuals)[: starts[-1] + size], starts)

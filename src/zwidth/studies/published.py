@@ -136,13 +136,13 @@ def _maximize_alpha(delta: float, d: float) -> tuple[float, float]:
 
 def line_appears() -> float:
     """Compute the delta above which, for d = 0, walls with a real pole at z = -1 bound the stable set."""
-    # In the plane of alpha and beta, the walls with a real pole at z = -1 form a straight line. It starts at the
-    # corner, where the boundary curve ends with two poles at z = -1. The line therefore bounds the stable set (alpha >
-    # 0) above the delta at which the alpha of the corner becomes positive.
     # Import scipy.optimize here, because it loads slowly and no other study needs it.
     from scipy.optimize import root_scalar
 
-    # Set the tolerances to a few rounding errors, because the page of results prints 15 digits.
+    # In the plane of alpha and beta, the walls with a real pole at z = -1 form a straight line. It starts at the
+    # corner, where the boundary curve ends with two poles at z = -1. The line therefore bounds the stable set (alpha >
+    # 0) above the delta at which the alpha of the corner becomes positive. Set the tolerances of the search for this
+    # delta to a few rounding errors, because the page of results prints 15 digits.
     exact: dict[str, Any] = {"bracket": (1.0, 6.0), "method": "brentq", "xtol": 1e-15, "rtol": 1e-15}
     return float(root_scalar(lambda delta: float(boundary(np.pi, delta, 0).alpha), **exact).root)
 
