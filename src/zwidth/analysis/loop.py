@@ -169,7 +169,7 @@ class LinearLoop:
         return 1.0 + compute_poles_minus_one(self.roots, alpha, beta)
 
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """Return the spectral radius of each wall, below 1 if and only if the wall is stable; NaN if out of range."""
+        """Return the spectral radius of each wall, below 1 if and only if the wall is stable; NaN for invalid walls."""
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         stable = label_walls(self.boundary, alpha, beta).reshape(-1)
         radius = linear_radius(self.roots, alpha.reshape(-1), beta.reshape(-1), stable)

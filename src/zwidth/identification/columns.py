@@ -244,7 +244,8 @@ def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[s
         size = _read_unit("time", unit)[0]
         first = float(values[np.isfinite(values)][0])
         if not unit:
-            # Derive the unit of a time since 1970 from its magnitude, because a smaller unit yields a date before 2001.
+            # Derive the unit of a time since 1970 from its magnitude, because every smaller unit yields a date before
+            # 2001.
             name, size = next(((name, size) for name, size in _EPOCH_UNITS if first * size >= _EPOCH), ("s", 1.0))
             if name != "s":
                 notes.append(f"the time has no unit and is read in {name} since 1970, according to its magnitude")

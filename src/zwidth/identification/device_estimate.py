@@ -130,7 +130,7 @@ class DeviceEstimate:
     damping_tried: float | None = None  # largest B of the measured walls, N s/m; None for a log
     stiffness_tried: float | None = None  # K measured at the largest B, N/m; None for a log
 
-    # Attributes of the fitted scene (``nominal``) as attributes of the estimate.
+    # Make attributes of the fitted scene available as attributes of the estimate, because they are used often.
     mass = property(attrgetter("nominal.device.mass"))
     damping = property(attrgetter("nominal.device.damping"))
     delay = property(attrgetter("nominal.timing.delay"))

@@ -29,8 +29,8 @@ _SAME = 1e-5  # relative to the period
 _SURE = 5.0  # number of standard errors
 # A warning is issued if position or force is constant at its maximum or minimum for this number of samples.
 _STUCK = 25
-# For a force the warning also requires that the force varies elsewhere: the number of its other distinct values must
-# exceed this share of the number of samples.
+# A warning about a constant extreme value of the force also requires that the force varies elsewhere: the number of its
+# other distinct values must exceed this share of the number of samples.
 _MANY = 0.1
 _MISSING = 1.5  # ratio of a time step to the median time step above which samples are missing
 

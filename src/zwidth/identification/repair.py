@@ -18,7 +18,7 @@ from zwidth.identification.quantization_noise import find_resolution, find_steps
 from zwidth.units.formatting import plain, with_unit
 from zwidth.units.unit_system import UnitSystem
 
-# Times in s after which common clocks and counters roll over, by description.
+# Times in s after which common clocks and counters roll over, keyed by the descriptions that notes contain.
 _ROLLOVERS = {
     "a 32-bit counter of microseconds": 2.0**32 * 1e-6,
     "a 32-bit counter of milliseconds": 2.0**32 * 1e-3,
@@ -53,8 +53,8 @@ _SMOOTH = 8.0  # first limit, in typical second differences (their 99 % quantile
 _NEAR_WRAP = 0.05  # second limit, relative to the modulus; also the relative tolerance of jumps of equal size
 _SPAN = 0.5  # least jump that counts as a wrap if the modulus is unknown, relative to the range of the positions
 
-# Detection of times that a coarse clock has rounded to its ticks. They are recognized by time steps that differ from
-# the median time step.
+# Constants of the detection of times that a coarse clock has rounded to its ticks. Rounding causes time steps that
+# differ from the median time step.
 _FEW_ODD = 5  # least number of these time steps; missing samples may cause fewer
 # Number of time steps different from the median from which on rounding is certain. The errors of the times may then
 # have a range of 1.1 instead of 1.02 ticks, because timestamp jitter can add to the rounding errors.

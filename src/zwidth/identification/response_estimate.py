@@ -218,7 +218,7 @@ def _find_period(force: np.ndarray) -> int | None:
 
 
 def _find_repeats(force: np.ndarray, count: int) -> list[tuple[int, int]]:
-    """Find the stretches of the force in which a period of ``count`` samples repeats at least twice in succession.
+    """Find the stretches of the force in which a period of ``count`` samples occurs at least twice in succession.
 
     Returns:
         For each stretch the index of its first sample, and that of its last sample plus 1.

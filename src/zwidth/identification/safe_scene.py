@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 EXACT_DIGITS = 12  # digits of parameters without a standard error
 PERIOD_DIGITS = 7  # digits of sampling periods derived from timestamps, because no clock is more accurate
 LIMIT_DIGITS = 4  # digits of the safe limit, as many as are printed for a wall
-# Texts that describe the status of a fit. Its warnings contain the details.
+# Texts that describe the status of a fit in short. The warnings of the fit contain the details.
 _STATUS_TEXTS = {
     Status.NOT_CONVERGED: "the search did not converge",
     Status.NO_BOUNDARY: "no device has all of these walls on its stability boundary",

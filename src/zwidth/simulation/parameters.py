@@ -65,7 +65,7 @@ class Settings(NamedTuple):
 
 
 class ExternalInputs(NamedTuple):
-    """Initial state, external forces and random numbers in normalized units, and the values of these units in SI."""
+    """Initial state, external forces and random numbers in normalized units, and the units of time and mass in SI."""
 
     positions: np.ndarray  # initial positions, (bodies, batch)
     velocities: np.ndarray  # initial velocities, (bodies, batch)

@@ -52,7 +52,8 @@ class Outcome:
 
     table: dict[str, np.ndarray] = field(default_factory=dict)  # columns of the study's CSV file, all of one length
     arrays: dict[str, np.ndarray] = field(default_factory=dict)  # arrays of the study's npz file
-    # Functions that draw a figure and return its Axes, by the suffix of the file name after the name of the study.
+    # Functions that draw a figure and return its Axes. The keys are the suffixes that the names of the figures' files
+    # have after the name of the study.
     figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
     documents: dict[str, str] = field(default_factory=dict)  # contents of text files, by the name of the file
     answer: tuple[str, ...] = ()  # main results, in one or two lines for a terminal
