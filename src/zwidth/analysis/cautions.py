@@ -84,7 +84,7 @@ def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
 
 
 def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[Any], bool], otherwise: str) -> str:
-    """Return a text with the first option that avoids a problem of the wall, its wall and the loss of stiffness.
+    """Return a text with the first option that avoids a problem of the wall, the new wall, and the loss of stiffness.
 
     Args:
         recommendation: the recommendation whose wall has the problem.

@@ -233,7 +233,7 @@ class DeviceEstimate:
         return None
 
     def bound_measured_stiffness(self, confidence: float) -> float:
-        """Return a lower confidence limit in N/m of the K at the onset of instability, at the largest B; 0 for a log.
+        """Return a lower confidence limit in N/m of the onset stiffness measured at the largest B; 0 after a log fit.
 
         Args:
             confidence: probability that the true onset K is above the limit.

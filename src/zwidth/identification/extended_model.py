@@ -27,7 +27,8 @@ from zwidth.identification.friction_model import ModelResponse, Recording, recur
 from zwidth.identification.quantization_noise import MeasurementNoise
 from zwidth.numerics.held_mass import phi_functions
 
-# Step of central differences: absolute for delta and for the pole of a filter, relative for all other parameters.
+# Step of central differences: absolute for the pole of a filter, relative for the parameters; for delta at least this
+# value, because delta may be 0.
 _STEP = 1e-6
 # Lower and upper bounds of the parameters.
 LAG_RANGE = (0.02, 5.0)  # time constant tau of the actuator lag, in sampling periods

@@ -208,7 +208,7 @@ def bound_response(fit: FittedModel, scene: Scene, bank: PoleBank) -> MeasuredDe
 
 
 def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenResonances | None:
-    """Compute the posterior odds of one undetected resonance, and K_max of the device with each of its samples.
+    """Compute the posterior odds of one undetected resonance, and K_max for random samples of this resonance.
 
     Args:
         fit: The fitted model.

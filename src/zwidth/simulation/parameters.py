@@ -209,7 +209,7 @@ def find_longest_steps(machine: Mechanics) -> np.ndarray:
 
 
 def build_flows(machine: Mechanics, durations: np.ndarray, which: np.ndarray, options: Options) -> dict[str, Any]:
-    """Return the matrices of the mechanisms and their flows by name, as fields of `Parameters`.
+    """Return the matrices of the mechanisms and of their motion over given times, keyed by the fields of `Parameters`.
 
     Args:
         machine: matrices of the mechanisms of all scenes.
