@@ -3,9 +3,9 @@
 A *stretch* is a part of a log that contains at least two equal successive periods of the force. A *record* is the mean
 over the periods of one stretch; if there is only one stretch, each of its periods is a record. Let U be the spectrum of
 the force of a record, and Y that of its position without drift. At each frequency of the force (a *line*), the response
-is ``G = sum Y conj(U)/sum |U|^2``, with sums over the records. Its standard error is estimated from the residuals Y - G
-U; it therefore contains the errors of encoder, friction and noise (Pintelon, Schoukens 2012). The *deviation* of the
-response is a multiple of the standard error. A force that does not repeat is analyzed by spectra averaged over
+is ``G = sum Y conj(U)/sum |U|^2``, with sums over the records. Its standard error is estimated from the residuals
+Y - G U; it therefore contains the errors of encoder, friction and noise (Pintelon, Schoukens 2012). The *deviation* of
+the response is a multiple of the standard error. A force that does not repeat is analyzed by spectra averaged over
 overlapping segments (Welch 1967). w is the frequency in rad per sample.
 """
 
