@@ -1,4 +1,6 @@
-"""Logs and walls that commands, studies and pages fit again and again, fitted once a process: a fit takes seconds."""
+"""A cache for fits of logs and walls that commands, studies and reports repeat in one process, because a fit
+takes seconds.
+"""
 
 from __future__ import annotations
 
@@ -9,34 +11,33 @@ from functools import wraps
 from typing import Any
 from unittest.mock import patch
 
-from zwidth.identification import columns
-from zwidth.identification import onset_fit as buzz
+from zwidth.identification import columns, onset_fit
 from zwidth.identification.device_fit import DeviceFit
 
 _fitted: dict[tuple[str, bytes], DeviceFit] = {}
 
 
 def _once(fit: Callable[..., DeviceFit]) -> Callable[..., DeviceFit]:
-    """A fit whose answers are kept: it gives the same one to the same numbers, and nobody can change it."""
+    """Cache a fit by its arguments; the results are immutable."""
 
     @wraps(fit)
-    def fit_once(*given: Any, **options: Any) -> DeviceFit:
-        key = fit.__name__, pickle.dumps((given, sorted(options.items())))
+    def fit_once(*arguments: Any, **options: Any) -> DeviceFit:
+        key = fit.__name__, pickle.dumps((arguments, sorted(options.items())))
         if key not in _fitted:
-            _fitted[key] = fit(*given, **options)
+            _fitted[key] = fit(*arguments, **options)
         return _fitted[key]
 
     return fit_once
 
 
-_fit_log, _fit_buzz = _once(columns.fit_log), _once(buzz.fit_buzz)
+_fit_log, _fit_buzz = _once(columns.fit_log), _once(onset_fit.fit_buzz)
 
 
 @contextmanager
 def fitting_once() -> Iterator[None]:
-    """Meanwhile, commands and studies fit equal logs and walls once.
+    """Make commands and studies fit equal logs and walls only once.
 
-    `zwidth.fit_log` fits whenever it is asked, and so does a `fit_buzz` that was imported before.
+    `zwidth.fit_log` and any `fit_buzz` imported before are not cached.
     """
-    with patch.object(columns, "fit_log", _fit_log), patch.object(buzz, "fit_buzz", _fit_buzz):
+    with patch.object(columns, "fit_log", _fit_log), patch.object(onset_fit, "fit_buzz", _fit_buzz):
         yield

@@ -252,7 +252,7 @@ class Limit(NamedTuple):
     """An improvement of a scene, the stiffness of the improved scene, and its ratio to the current stiffness."""
 
     name: str  # name of the part or parameter
-    words: str  # the improvement in words, such as "half the delay"
+    label: str  # the improvement in words, such as "half the delay"
     stiffness: float  # in N/m: K_max, or K recommended under the same requirements, of the improved scene
     gain: float  # ratio of that stiffness to the current one
     note: str = ""  # quantity that stays constant, such as "the delay stays 1 ms"
@@ -261,14 +261,14 @@ class Limit(NamedTuple):
         """Return a text with the improvement, the stiffness that results from it, and the gain."""
         K = with_unit(round_conservatively(self.stiffness, "below"), find_unit(self, "N/m"))
         note = f"; {self.note}" if self.note else ""
-        return f"{self.words}: {K} (x {plain(self.gain, 3)}{note})"
+        return f"{self.label}: {K} (x {plain(self.gain, 3)}{note})"
 
 
 class Improvement(NamedTuple):
     """An improved copy of a scene, with the part or parameter that was improved and a description."""
 
     name: str  # name of the part or parameter
-    words: str  # the improvement in words
+    label: str  # the improvement in words
     scene: SceneOptima  # the improved scene
     note: str = ""  # quantity that stays constant
 
@@ -298,7 +298,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
         >>> import zwidth
         >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=30))
-        >>> [limit.words for limit in zwidth.limits_of(scene)][:2]
+        >>> [limit.label for limit in zwidth.limits_of(scene)][:2]
         ['twice the rate', 'half the delay']
     """
     return compute_gains(scene, _compute_max_stiffness(scene), _compute_max_stiffness)
@@ -355,7 +355,7 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
         slower["period_and_delay"] = scene.replace(delay=Span(float(scene.d), "periods"))
     for name, present in slower.items():
         if _can_sample_faster(present):
-            note = f"the delay stays {present.timing.kept_delay}" if timing.delay else ""
+            note = f"the delay stays {present.timing.delay_text}" if timing.delay else ""
             yield Improvement(name, "twice the rate", _double_rate(present), note)
     values = scene.parameters()
     for path, (factor, words) in IMPROVEMENTS.items():

@@ -101,7 +101,7 @@ class SceneParts(Part):
             object.__setattr__(self, name, part)
 
     @cached_property
-    def parts_beyond(self) -> tuple[str, ...]:
+    def nonrigid_parts(self) -> tuple[str, ...]:
         """Names of the parts that the closed forms for a rigid mass with the backward difference do not support."""
         hand = self.operator
         grasp = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
@@ -114,7 +114,7 @@ class SceneParts(Part):
         """Normalized loop of the scene, in the fastest implementation that supports its parts."""
         if isinstance(self.device, MeasuredDevice):
             return MeasuredLoop(self)
-        return LinearLoop(make_plain(self)) if self.parts_beyond else RigidLoop(self)
+        return LinearLoop(make_plain(self)) if self.nonrigid_parts else RigidLoop(self)
 
     def check_parts(self) -> None:
         """Raise `InputError` for an invalid combination of parts, such as a cutoff above the Nyquist frequency."""

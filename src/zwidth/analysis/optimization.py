@@ -98,7 +98,7 @@ class Crossing(NamedTuple):
     """A parameter value at which K_max equals the required stiffness, and the side on which K_max is sufficient."""
 
     value: float
-    enough: Side
+    sufficient_side: Side
 
 
 @compact_repr()
@@ -106,7 +106,7 @@ class RequiredValue(NamedTuple):
     """Required value of a parameter, the side on which K_max is sufficient, and all crossings found, ascending."""
 
     value: float
-    enough: Side
+    sufficient_side: Side
     crossings: tuple[Crossing, ...]
     range: tuple[float, float]
     status: Status
@@ -301,7 +301,7 @@ class SceneOptima(SceneAnalysis):
             negative_damping: as for `max_stiffness`.
 
         Returns:
-            ``value``, the sufficient value closest to the current one; ``enough``, the side of it on which K_max is
+            ``value``, the sufficient value closest to the current one; ``sufficient_side``, its side on which K_max is
             sufficient ("above" or "below"), "everywhere" if it is in the whole range (``value`` is then the current
             value, or the closest end of the range), or "nowhere"; ``crossings``, all crossings found, each confirmed by
             K_max on both sides; ``range``, the range searched; ``status``, UNREACHABLE with NaN if K_max is below the
@@ -316,7 +316,7 @@ class SceneOptima(SceneAnalysis):
             >>> import zwidth
             >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
             >>> needed = scene.required("damping", 25e3)
-            >>> print(f"{needed.value:.2f} N s/m or {needed.enough}")
+            >>> print(f"{needed.value:.2f} N s/m or {needed.sufficient_side}")
             18.62 N s/m or above
         """
         stiffness = _read_stiffness(stiffness, self.unit_system["N/m"])
@@ -367,7 +367,7 @@ class SceneOptima(SceneAnalysis):
             # Report no value if K_max could not be computed between the current value and the crossing, because a
             # closer crossing may exist there.
             return RequiredValue(math.nan, "nowhere", confirmed, (low, high), Status.NOT_CONVERGED)
-        return RequiredValue(best.value, best.enough, confirmed, (low, high), Status.OK)
+        return RequiredValue(best.value, best.sufficient_side, confirmed, (low, high), Status.OK)
 
     def best_damping(
         self, stiffness: float | str | None = None, *, goal: Goal = "fast", negative_damping: bool | None = None

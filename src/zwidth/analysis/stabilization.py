@@ -154,7 +154,7 @@ def _search(scene: SceneOptima, path: str, present: float, direction: int, facto
     near = _bisect(holds, values[first], values[first - 1]) if first else present
     after = stable.index(False, first) if False in stable[first:] else None
     far = _bisect(holds, values[after - 1], values[after]) if after else None
-    note = f"the delay stays {scene.timing.kept_delay}" if path == "rate" and scene.timing.delay else ""
+    note = f"the delay stays {scene.timing.delay_text}" if path == "rate" and scene.timing.delay else ""
     if direction > 0:
         return [Remedy(path, near, math.inf if far is None else far, note)]
     return [Remedy(path, -math.inf if far is None else far, near, note)]

@@ -63,7 +63,7 @@ class Starts(NamedTuple):
 
     position: np.ndarray
     velocity: np.ndarray
-    push: np.ndarray  # constant external force
+    external_force: np.ndarray  # constant external force
     half_steps: np.ndarray  # additional constant external force, in units of K Q/2
     scaled: np.ndarray  # bool; the displacement is proportional to the encoder step
 
@@ -108,13 +108,13 @@ class Experiment(NamedTuple):
         columns: dict[str, Any] = {name: value[:, None] for name, value in table.items()}
         present = self.hardware.resolution
         ratio = columns["resolution"] / present if present > 0 else 1.0
-        push = starts.push + 0.5 * starts.half_steps * columns["stiffness"] * columns["resolution"]
+        external_force = starts.external_force + 0.5 * starts.half_steps * columns["stiffness"] * columns["resolution"]
         motion = simulate(
             self.scene,
             **columns,
             start_position=starts.position * np.where(starts.scaled, ratio, 1.0),
             start_velocity=starts.velocity,
-            push=push,
+            external_force=external_force,
             periods=self.periods,
             record=False,
         )
@@ -151,8 +151,8 @@ def list_starts(scene: Any, hardware: Hardware) -> Starts:
     if isinstance(scene.device, LinearDevice):
         # Displace the equilibrium of a linear system by a constant external force, because its simulation always starts
         # at rest at 0.
-        push = np.minimum(K * starts[0], LARGEST_PUSH * hardware.max_force)
-        return Starts(np.zeros(len(push)), np.zeros(len(push)), push, *starts[3:])
+        external_force = np.minimum(K * starts[0], LARGEST_PUSH * hardware.max_force)
+        return Starts(np.zeros(len(external_force)), np.zeros(len(external_force)), external_force, *starts[3:])
     return Starts(*starts)
 
 

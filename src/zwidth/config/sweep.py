@@ -188,12 +188,12 @@ OutputName = Annotated[str, GetPydanticSchema(lambda _, handler: handler.generat
 
 
 _SCENE = "that of the scene"
-_Parts: Any = make_parts_base(_SCENE, _SCENE, " Its keys may be axes, with its name and a dot.")
+_Parts: Any = make_parts_base(_SCENE, _SCENE, " Its keys can be axes of the sweep (see the table of axes).")
 
 
 @register
 class SweepStudy(_Parts, Study):
-    """Outputs on a grid of parameters, written to a store that can be resumed, verified and opened with xarray."""
+    """The outputs at all points of a grid of parameters, written to a store that xarray can open."""
 
     method = "Closed forms in float64; bit for bit independent of chunks and workers."
     from_scene = ()
@@ -253,7 +253,7 @@ class SweepStudy(_Parts, Study):
     @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         axes = raw.get("axes")
-        if not isinstance(axes, dict) or not scene.parts_beyond:
+        if not isinstance(axes, dict) or not scene.nonrigid_parts:
             return
         given = _list_given(axes)
         if not given & set(PHYSICAL) and not {"delta", "d"} <= given:

@@ -20,7 +20,7 @@ from zwidth.core.errors import InputError
 from zwidth.core.status import Status
 from zwidth.core.types import ArrayLike
 from zwidth.identification.causes import Cause, explain_motion, explain_residuals
-from zwidth.identification.device_estimate import compute_reach, differentiate
+from zwidth.identification.device_estimate import compute_coverage_factor, differentiate
 from zwidth.identification.device_fit import (
     BEYOND,
     MASS_OPEN,
@@ -98,7 +98,7 @@ def fit_log(
 
     Returns:
         DeviceFit: ``friction`` and ``offset`` have errors NaN if the log does not distinguish the two forces, as for
-        motion in one direction only. ``doubts`` are warnings, for example about a unit; with a warning there is no safe
+        motion in one direction only. ``warnings`` may concern a unit, for example; with a warning there is no safe
         wall. ``status`` is UNREACHABLE if the delay is at the end of the search range; NOT_CONVERGED if the search did
         not converge; UNDECIDED, with K_max NaN, if the residuals are not white noise. ``response`` limits the safe wall
         for a device with undetected resonances.
@@ -129,9 +129,9 @@ def fit_log(
         >>> import numpy as np
         >>> import zwidth
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 2), zwidth.Timing(period=1e-3))
-        >>> push = np.where(np.arange(400) % 60 < 30, 1.0, -1.0)
-        >>> motion = zwidth.simulate(scene, 0.0, 0.0, push_history=push, periods=400)
-        >>> fit = zwidth.fit_log(1e-3, motion.position[:400], push)
+        >>> force = np.where(np.arange(400) % 60 < 30, 1.0, -1.0)
+        >>> motion = zwidth.simulate(scene, 0.0, 0.0, external_force_history=force, periods=400)
+        >>> fit = zwidth.fit_log(1e-3, motion.position[:400], force)
         >>> print(f"{fit.mass * 1e3:.1f} g, {fit.damping:.2f} N s/m")
         100.0 g, 2.00 N s/m
     """
@@ -190,7 +190,7 @@ def _fit(
     ).T
     from_period = period_error * period * by_period
     covariance = by_theta @ best.covariance[of_device, of_device] @ by_theta.T + np.outer(from_period, from_period)
-    freedom = max(1, best.count - theta.size)
+    degrees_of_freedom = max(1, best.count - theta.size)
     unexplained = _find_unexplained(best, pole, period, system) if bank else []
     warnings = step_warnings + warnings + _list_warnings(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
     status = Status.OK if best.converged else Status.NOT_CONVERGED
@@ -207,20 +207,20 @@ def _fit(
     analyses: dict[str, Any] = {}
     if bank and not unexplained:
         analyses = {"response": bound_response(best, scene, bank), "hidden": sample_resonances(best, scene, bank)}
-        analyses |= {"lag": bound_lag(best, lags, scene, compute_reach(freedom))}
+        analyses |= {"lag": bound_lag(best, lags, scene, compute_coverage_factor(degrees_of_freedom))}
     return DeviceFit(
         nominal=scene,
         covariance=covariance,
-        errors_of_log={"offset": offset[1], "friction": friction[1]},
+        force_errors={"offset": offset[1], "friction": friction[1]},
         offset=offset[0],
         friction=friction[0],
         resolution=step,
         motions=motions,
         noise=float(np.sqrt(best.variance)),
-        residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
-        doubts=(*warnings, *check_period_unit(period)),
+        residuals=np.concatenate([motion.position - motion.modeled for motion in motions]),
+        warnings=(*warnings, *check_period_unit(period)),
         status=int(status),
-        freedom=freedom,
+        degrees_of_freedom=degrees_of_freedom,
         notes=notes,
         **analyses,
     )
@@ -431,9 +431,9 @@ def _build_motions(
     """
     motions, parts = [], iter(best.model.split(best.response.position))
     for log, place, slices in zip(logs, places, stretches, strict=True):
-        modelled = np.full(log.force.size, np.nan)
+        modeled = np.full(log.force.size, np.nan)
         for each in slices:
             part = next(parts)
-            modelled[each.start + skip : each.start + skip + part.size] = part
-        motions.append(FittedMotion(period * place, log.force, log.position, modelled))
+            modeled[each.start + skip : each.start + skip + part.size] = part
+        motions.append(FittedMotion(period * place, log.force, log.position, modeled))
     return tuple(motions)

@@ -55,22 +55,22 @@ def choose_structure(best: FittedModel) -> Choice:
     if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * span**2:
         return best, None, None, None
     rigid = best, pole, bank, lags = _test_residuals(best)
-    rival = None
+    alternative = None
     for _ in range(_MAX_PARTS):
         # Use the test for lags as well, because it is more sensitive to lags than the scores of the poles: the
         # amplitude of the effect of a lag is known, so this test does not estimate it.
         has_lag = lags is not None and lags.projection.max() ** 2 > 2.0 * np.log(best.count)
-        if bank is None or rival or (pole is None and not has_lag):
+        if bank is None or alternative or (pole is None and not has_lag):
             break
-        larger, rival = _add_part(best, bank)
+        larger, alternative = _add_part(best, bank)
         if larger is None:
             break
         best, pole, bank, lags = _test_residuals(larger)
-    if best is rigid[0] or not (rival or (pole is None and best.excess <= ALIKE)):
+    if best is rigid[0] or not (alternative or (pole is None and best.excess <= ALIKE)):
         return rigid
     best = fit_nonnegative(best.model, best.theta)
     is_determined = best.converged and not best.inverse.undetermined[: best.model.parts.stop].any()
-    return (best, rival or pole, bank, lags) if is_determined else rigid
+    return (best, alternative or pole, bank, lags) if is_determined else rigid
 
 
 def _test_residuals(best: FittedModel) -> Choice:

@@ -152,10 +152,10 @@ class RigidFit(NamedTuple):
     @property
     def scale(self) -> float:
         """Noise variance of the weighted residuals: 1 if the noise is given; otherwise their estimated variance."""
-        return 1.0 if self.known_noise else max(self.best.squares / self.freedom, EXACT**2)
+        return 1.0 if self.known_noise else max(self.best.squares / self.degrees_of_freedom, EXACT**2)
 
     @property
-    def freedom(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """Degrees of freedom of the fit: two residuals per wall minus three unknowns."""
         return 2 * self.onsets.w.size - 3
 

@@ -11,8 +11,8 @@ The constant force and the friction are always fitted. A fit without them has sm
 valid only if both forces are 0. In a test in which a selection criterion omitted the forces, the damping was wrong by
 up to 179 of its standard errors.
 
-A *rival* is a second minimum of the sum of squares, with about the same value. The *misfit* is -2 log(likelihood); for
-N positions with white noise of unknown variance, it is N log(sum of squares), up to a constant.
+An *alternative* is a second minimum of the sum of squares, with about the same value. The *misfit* is -2
+log(likelihood); for N positions with white noise of unknown variance, it is N log(sum of squares), up to a constant.
 """
 
 from __future__ import annotations
@@ -59,10 +59,9 @@ _MAX_DAMPING = 1e12  # damping above which the search ends
 # Limits that decide whether the log can distinguish friction from a constant force.
 # A motion counts as single-directional if the path traveled backward is less than this share of the whole path.
 _BACKWARD_SHARE = 0.1
-# A fit without friction is tried as a rival if the squared ratio of the friction to its standard error is below this
-# limit.
+# A fit without friction is tried as an alternative if (friction/standard error)^2 is below this limit.
 _NEARLY_FRICTIONLESS = 900.0
-_EXCLUDED = 25.0  # a rival whose misfit exceeds that of the best fit by this much does not enlarge the covariance
+_EXCLUDED = 25.0  # an alternative whose misfit exceeds the best one by this much does not enlarge the covariance
 # An initial motion counts as invisible if its length is below this number of standard deviations of the noise.
 _INVISIBLE_DISTANCE = 3.0
 # Numerical limits and a significance level.
@@ -93,7 +92,7 @@ class FittedModel:
     theta: np.ndarray
     squares: float  # sum of the squared weighted residuals
     converged: bool
-    rivals: tuple[FittedModel, ...] = ()
+    alternatives: tuple[FittedModel, ...] = ()
 
     @property
     def count(self) -> int:
@@ -190,7 +189,7 @@ class FittedModel:
     def covariance(self) -> np.ndarray:
         """The covariance of theta, NaN for parameters that are not determined.
 
-        It accounts for the autocorrelated errors of the encoder, for the excess of the residuals, and for rivals.
+        It accounts for the autocorrelated errors of the encoder, for the excess of the residuals, and for alternatives.
         """
         (columns, sizes), weigh = self.columns, self.model.weigh
         # Use the pseudo-inverse of the derivatives, because the inverse of the normal matrix loses half of the digits.
@@ -199,23 +198,24 @@ class FittedModel:
         covariance = self.excess * (gram_inverse @ self.noise.spread(weigh(columns)) @ gram_inverse)
         covariance = covariance / np.outer(sizes, sizes)
         covariance[undetermined], covariance[:, undetermined] = np.nan, np.nan
-        for rival in self.rivals:
+        for alternative in self.alternatives:
             determined = ~undetermined & np.diag(covariance > 0)
             scales, block = np.sqrt(np.diag(covariance)[determined]), np.ix_(determined, determined)
-            away = (rival.theta - self.theta)[determined]
+            away = (alternative.theta - self.theta)[determined]
             steps = away / scales
             correlation = covariance[block] / np.outer(scales, scales)
             predicted = float(steps @ np.linalg.lstsq(correlation, steps, rcond=None)[0])
-            actual = max(rival.compare_misfit(self) / self.excess, 1.0)
-            # The misfit may increase less between the minimum and the rival than the derivatives predict, because the
-            # sum of squares has a kink between them. If so, enlarge the covariance in this direction until both agree.
+            actual = max(alternative.compare_misfit(self) / self.excess, 1.0)
+            # The misfit may increase less between the minimum and the alternative than the derivatives predict, because
+            # the sum of squares has a kink between them. If so, enlarge the covariance in this direction until both
+            # agree.
             if actual < min(predicted, _EXCLUDED):
                 covariance[block] += (1.0 / actual - 1.0 / predicted) * np.outer(away, away)
         return covariance
 
 
 def fit_model(model: Recordings) -> FittedModel:
-    """Fit a model without lag and modes by least squares, and find its rivals."""
+    """Fit a model without lag and modes by least squares, and find its alternatives."""
     start = _select_start(model, _list_starts(model))
     best = _fit(model, start, (), NEARLY if model.resolution else _CONVERGED)
     if model.resolution:
@@ -236,9 +236,9 @@ def fit_model(model: Recordings) -> FittedModel:
         else:
             parts, omitted = (0.0, -direction * total), -2
         start = np.append(best.theta[:-2], parts)
-        rival = _fit(model, start, (omitted,))
-        if rival.inverse.undetermined[-2:].all() and rival.fits_as_well_as(best):
-            return rival
+        alternative = _fit(model, start, (omitted,))
+        if alternative.inverse.undetermined[-2:].all() and alternative.fits_as_well_as(best):
+            return alternative
     # Compare with a fit without friction, because the standard error of a small friction may be wrong: at friction 0
     # the mass no longer sticks, so the sum of squares has a kink there, and may increase less toward it than the
     # derivatives predict.
@@ -247,8 +247,8 @@ def fit_model(model: Recordings) -> FittedModel:
         start[-1] = MIN_FRICTION * abs(start[0]) * model.largest_force
         frictionless = fit_nonnegative(model, start, (-1,))
         if best.fits_as_well_as(frictionless):
-            return replace(best, rivals=(frictionless,))
-        return replace(frictionless, rivals=(best,))
+            return replace(best, alternatives=(frictionless,))
+        return replace(frictionless, alternatives=(best,))
     return best
 
 

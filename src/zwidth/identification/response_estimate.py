@@ -65,7 +65,7 @@ class ResponseEstimate:
         cycle: period of the force in s; None for a force that is not periodic.
         records: number of stretches of periodic force, or number of segments of a force that is not periodic.
         noise: standard deviation of a sampled position in m, for a periodic force.
-        doubts: warnings, one sentence each.
+        warnings: sentences about questionable measurements.
         notes: interpretations of the columns of the logs and repairs of their rows, one clause each.
     """
 
@@ -75,7 +75,7 @@ class ResponseEstimate:
     cycle: float | None
     records: int
     noise: float
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
 
@@ -102,7 +102,7 @@ def respond(
 
     Returns:
         ResponseEstimate: ``device``, with a deviation of 4.5 standard errors; ``period``, ``coherence``, ``cycle``,
-        ``records``, ``noise``, ``doubts``.
+        ``records``, ``noise``, ``warnings``.
 
     Raises:
         InputError: times are uneven, force or position never changes, or the motion does not follow the force.
@@ -121,7 +121,7 @@ def respond(
         >>> import zwidth
         >>> record = zwidth.excite(period=1e-3, force=2.0, resolution=1e-5, duration=15)
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 5), zwidth.Timing(period=1e-3))
-        >>> motion = zwidth.simulate(scene, 0.0, 0.0, push_history=record.force, periods=record.force.size)
+        >>> motion = zwidth.simulate(scene, 0.0, 0.0, external_force_history=record.force, periods=record.force.size)
         >>> estimate = zwidth.respond(1e-3, motion.position[: record.force.size], record.force)
         >>> f"{estimate.device.frequency.size} lines from {estimate.records} stretches"
         '409 lines from 5 stretches'

@@ -91,9 +91,11 @@ def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> Safe
         return _find_structured_wall(fit, reliability, rigid, drawn)
     filtered = scene.velocity != BackwardDifference()
     devices = (
-        _SearchedDevices(drawn, fit) if filtered else _RigidDevices(scene, dict(zip(fit.numbers, drawn.T, strict=True)))
+        _SearchedDevices(drawn, fit)
+        if filtered
+        else _RigidDevices(scene, dict(zip(fit.parameter_names, drawn.T, strict=True)))
     )
-    most = np.inf if rigid or fit.damping_tried is None else fit.damping_tried
+    most = np.inf if rigid or fit.measured_damping is None else fit.measured_damping
     (stiffness, virtual_damping), resonance = devices.find(reliability, most), np.nan
     if virtual_damping == most:
         # Limit K to a lower confidence limit of the K measured at this B, because an undetected resonance may lower the
@@ -141,7 +143,7 @@ def _find_structured_wall(fit: DeviceEstimate, reliability: float, rigid: bool, 
 
 def is_stable_with_resonances(fit: DeviceEstimate, stiffness: float, virtual_damping: float) -> bool:
     """Return whether a wall and all softer walls with the same B are stable with every undetected resonance."""
-    if fit.damping_tried is not None and virtual_damping > fit.damping_tried:
+    if fit.measured_damping is not None and virtual_damping > fit.measured_damping:
         return False
     scene = fit.response_scene
     if scene is None or stiffness == 0:

@@ -334,7 +334,7 @@ def truncate_logs(fit: FittedModel) -> FittedModel:
     """Return a copy of the fit with the same theta and only the first `MAX_SAMPLES` positions of each log."""
     if max(log.position.size for log in fit.model.logs) <= MAX_SAMPLES:
         return fit
-    part = replace(fit, model=fit.model.truncate(MAX_SAMPLES), rivals=())
+    part = replace(fit, model=fit.model.truncate(MAX_SAMPLES), alternatives=())
     part = replace(part, squares=float(part.residuals @ part.residuals))
     return replace(part, model=replace(part.model, noise=part.noise)) if fit.model.noise is not None else part
 

@@ -86,7 +86,7 @@ class PeriodInputs(NamedTuple):
 
     k: Array  # index of the period and of the sample at its start
     noise: Array  # error of the measured position
-    push: Array  # external force on the device
+    external_force: Array  # external force on the device
     durations: Array  # durations of constant force, (substeps, pieces, batch); used with jitter only
 
 
@@ -192,7 +192,7 @@ def propagate(
     body: BodyState,
     work: Array,
     force: Array,
-    push: Array,
+    external_force: Array,
     indices: tuple[Array | int, Array | int],
     time: Array,
 ) -> tuple[BodyState, Array]:
@@ -204,7 +204,7 @@ def propagate(
         body: state of the bodies at the start of the piece.
         work: the four energies of `State` at the start of the piece.
         force: force of the wall (with an actuator, its command).
-        push: external force on the device.
+        external_force: external force on the device.
         indices: indices of the substep and of the piece.
         time: duration of the piece, in periods.
 
@@ -212,7 +212,7 @@ def propagate(
         The state of the bodies and the energies at the end of the piece.
     """
     zero, direct = 0.0 * body.x[0], params.rate.shape[1] == params.rate.shape[0] + 1
-    forces = jnp.stack([force + push + zero] if direct else [force + zero, push + zero])
+    forces = jnp.stack([force + external_force + zero] if direct else [force + zero, external_force + zero])
     step = None if options.jitter else Flow(*(read(read(part, indices[0], 1), indices[1], 1) for part in params.pieces))
     rubbed = zero
     if options.friction:
@@ -224,7 +224,7 @@ def propagate(
         z = jnp.concatenate([body.x, forces])
         after = BodyState(body.x + times(step.change[0], z), body.slip)
         lost = dot(z, times(step.loss[0], z))
-    pushed = push * dot(params.place[0], after.x - body.x)
+    pushed = external_force * dot(params.place[0], after.x - body.x)
     if direct:
         given = force * dot(params.place[0], after.x - body.x)
     else:
@@ -307,7 +307,9 @@ def _simulate_period(
         def one(carry: Any, piece: Any) -> Any:
             number, force = piece
             body, work = carry
-            return propagate(params, options, body, work, force, inputs.push, (j, number), read(lasting, number)), None
+            return propagate(
+                params, options, body, work, force, inputs.external_force, (j, number), read(lasting, number)
+            ), None
 
         # With friction or jitter, loop over the pieces by `scan`, because the program of one piece is then long and
         # should be compiled only once.
@@ -404,7 +406,7 @@ def run_batch(
         block = PeriodInputs(
             np.arange(first, first + BLOCK),
             _select_block(inputs.noise, first, (1,)),
-            params.push[None] + _select_block(inputs.history, first, (1,)),
+            params.external_force[None] + _select_block(inputs.history, first, (1,)),
             _select_block(inputs.durations, first, (0, 0, 1)),
         )
         # Allow rank promotion even if the caller's settings of JAX forbid it, because arrays without a batch axis must

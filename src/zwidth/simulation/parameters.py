@@ -105,7 +105,7 @@ class Parameters(NamedTuple):
     period: Array  # sampling period, in s
     force: Array  # unit of force, in N
     resolution: Array  # step of the encoder, in m
-    push: Array  # constant external force
+    external_force: Array  # constant external force
     bilateral: Array  # True if the wall acts on both sides of its surface
     pulling: Array  # True if the wall may pull the device
     late: Array  # integer delay, in periods

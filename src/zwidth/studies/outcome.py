@@ -171,7 +171,7 @@ def find_device_share(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) 
 
 def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Scene | None:
     """Return the scene of a rigid device in SI units if the axes contain only its delta and d, otherwise None."""
-    if not isinstance(owner, PhysicalScene | PhysicalDevice) or owner.parts_beyond:
+    if not isinstance(owner, PhysicalScene | PhysicalDevice) or owner.nonrigid_parts:
         return None
     alone = [axis.values().tolist() for axis in (delta, d)] == [[owner.delta], [owner.d]]
     return owner.to_scene() if alone else None

@@ -248,9 +248,9 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         f"{SOURCE}.",
         "",
         f"{len(printed)} printed numbers, {len(computed)} of them results: {agreeing} of {len(computed)} agree.",
-        f"Agreement: the computed value lies within half a unit of the last printed digit.{cited}",
+        f"A value agrees if it differs from the printed one by at most half a unit of the last printed digit.{cited}",
         "",
-        "| quantity | where | printed | computed | agrees |",
+        "| quantity | location | printed | computed | agrees |",
         "|---|---|---|---|---|",
         *(
             f"| {row.quantity} | {row.where} | {row.printed} | {_spell(row)} | {_AGREEMENT[row.agrees]} |"
@@ -272,7 +272,7 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
 
 @register
 class PublishedStudy(ComputedStudy):
-    """Comparison of all numbers printed in the paper with computed ones."""
+    """The numbers that are printed in the paper, for comparison with the printed values."""
 
     method = "The paper's numbers, from closed forms."
     from_scene = ()

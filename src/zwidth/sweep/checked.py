@@ -52,7 +52,7 @@ class CheckedStore(LocalStore):
         """
         assert byte_range is None, "chunks are read as a whole"
         file, is_chunk = self._checked_store.path / key, "c" in key.split("/")
-        # For "zarr.json", return the description whose checksum was verified, because this copy of it may be damaged.
+        # For "zarr.json", return the description whose checksum was verified, because the file itself may be damaged.
         data = json.dumps(self._checked_store.description).encode() if key == "zarr.json" else read_or_empty(file)
         if file in self._absent or not (data or is_chunk):
             return None

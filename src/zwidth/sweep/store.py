@@ -117,8 +117,8 @@ class Store:
         with silence_zarr():
             group = zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=True)
             arrays: dict[str, Any] = {name: group[name] for family in self.plan.families for name in family.variables}
-        # Let Zarr also write chunks that contain only the fill value, because detecting them takes longer than writing
-        # them.
+        # Let Zarr write chunks that contain only the fill value as well, because detecting them takes longer than
+        # writing them.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
 
     def label(self, task: Task) -> str:

@@ -227,7 +227,7 @@ def _write_comparison(content: dict[str, Any]) -> str:
         f'<td class="number">{_format_computed(row)}</td><td>{_AGREEMENT[row["agrees"]]}</td>'
         for row in content["published"]
     ]
-    head = "".join(f'<th scope="col">{word}</th>' for word in ("quantity", "where", "printed", "computed", ""))
+    head = "".join(f'<th scope="col">{word}</th>' for word in ("quantity", "location", "printed", "computed", ""))
     title = "Printed and computed numbers"
     return f"<h3>{title}</h3>{_write_table(title, rows, f'<thead><tr>{head}</tr></thead>')}"
 

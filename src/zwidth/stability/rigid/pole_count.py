@@ -292,8 +292,8 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
         device_larger = device_larger != valid
         certain = certain & (~valid | (0.5 - xp.abs(turns - nearest) > tolerance + 4.0 * eps * shift))
         crossovers.append(w)
-    # Mark the count as uncertain if the parity of the number of crossovers contradicts the larger of |T| and |B| at z =
-    # -r.
+    # At each crossover the larger of |T| and |B| changes. Mark the count as uncertain if this contradicts the larger
+    # one at z = -r.
     certain = certain & (device_larger == device_larger_at_end)
     return PoleCount(loop.n_plus_1 + 2.0 - (stop - start + 2.0 * full_turns), certain, crossovers)
 

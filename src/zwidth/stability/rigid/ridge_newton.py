@@ -26,7 +26,7 @@ from zwidth.numerics.held_mass import ANY, DelayClasses, DiscretePlant, Plant
 
 
 class Curve(NamedTuple):
-    """The coefficients of E, H and V of one device; they do not depend on D."""
+    """The coefficients of E, H and V of one device, which do not depend on the integer delay."""
 
     E: tuple[Array, Array, Array]  # in powers of y
     H: tuple[Array, Array]  # in powers of y
@@ -47,7 +47,7 @@ def expand_curve(plant: Plant | DiscretePlant) -> Curve:
 
 
 class Wave(NamedTuple):
-    """The terms of the boundary curve that depend only on the frequency and on D."""
+    """The terms of the boundary curve that depend only on the frequency omega and on D."""
 
     y: Array
     q: Array
