@@ -220,7 +220,7 @@ def find_stiffest(
         lowest, beta = min(dips, default=(1.0, math.nan))
         if lowest <= 0:
             dampings[log_stiffness] = beta * unit
-        # Limit the magnitude of the slack from below to 1e-12 and keep its sign, because `false_position` stops at
+        # Keep the magnitude of the slack above 1e-12 without changing its sign, because `false_position` stops at
         # values close to 0.
         return min(max(-lowest, 1e-12), 1.0) if lowest <= 0 else max(min(-lowest, -1e-12), -1.0)
 

@@ -347,8 +347,8 @@ class SweepStudy(_Parts, Study):
             message = f"got the axis {name!r}, but no {part} with the key {key!r}"
             remedy = f"add {_EXAMPLES.get(name, _EXAMPLES.get(part, part))!r}"
             yield ("axes", self.axes.find_key(name)), problem(message, "an axis needs the part that it changes", remedy)
-        # Check the parts at a few points of the grid only, because it may have too many points: with all parameters at
-        # their smallest values, and with each parameter of a part in turn at its largest value.
+        # Check the parts at a few points of the grid only, because the grid may have too many points to check them all:
+        # with all parameters at their smallest values, and with each parameter of a part in turn at its largest value.
         smallest = {name: self.axes.find_range(name)[0] for name in self.axes.given if name not in WALL}
         faults = {}
         for changed in (

@@ -34,8 +34,8 @@ _STEP = 1e-6
 LAG_RANGE = (0.02, 5.0)  # time constant tau of the actuator lag, in sampling periods
 FREQUENCY_RANGE = (0.0125, 3.11)  # frequency of a mode, in rad per sample
 RATIO_RANGE = (1e-6, 4.0)  # damping ratio zeta of a mode or of a second-order lag
-# Bounds of the low-frequency delay 2 zeta tau of a second-order lag, in sampling periods. The upper bound is that for
-# zeta = 1.
+# Bounds of the low-frequency delay 2 zeta tau of a second-order lag, in sampling periods. The upper bound is the
+# largest delay with zeta = 1.
 _DELAY_RANGE = 2.0 * RATIO_RANGE[0] * LAG_RANGE[0], 2.0 * LAG_RANGE[1]
 
 

@@ -202,7 +202,7 @@ def _integrate_with_friction(
         before = -v / a
         before = min(log1p(delta * before) / delta if delta else before, h)
         rest, s = h - before, -s if abs(forced) > friction else 0.0
-        # Compute the velocity at the end of the part of a mass that starts from rest at the stop.
+        # Compute the velocity that a mass starting from rest at the stop has at the end of the part.
         v = (-expm1(-delta * rest) / delta if delta else rest) * (forced - s * friction) if s else 0.0
         stops.append((k, before, s, v))
         changes.append((k + 1, s))

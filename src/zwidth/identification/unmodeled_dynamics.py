@@ -89,7 +89,7 @@ N_SAMPLES = 200  # number of resonances that are sampled from the posterior dist
 
 
 class HiddenResonances(NamedTuple):
-    """The posterior odds of one undetected resonance, and the maximum stiffness with each of its samples."""
+    """The posterior odds of one undetected resonance, and the maximum stiffness for each sample of this resonance."""
 
     odds: float  # posterior odds of one more resonance against none
     stiffness_max: np.ndarray  # K_max with each sampled resonance, relative to K_max without it; equally likely values

@@ -178,7 +178,7 @@ def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Sce
 
 
 def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
-    """Return K, B, frequency and kind of a stiffest wall as a dict by the names of the columns of a table."""
+    """Return K, B, frequency and kind of a stiffest wall as a dict, keyed by the column names of a table."""
     columns = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
     return {**columns, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 
