@@ -179,8 +179,8 @@ def round_margin(
         decibel: True to return a gain margin in dB.
     """
     value = float(getattr(margins, name))
-    # The safe direction is down, with two exceptions: a gain margin above 1 of an unstable wall (the gain must be
-    # increased to stabilize it), and one below 1 of a stable wall (a reduction of the gain destabilizes it).
+    # Round down, with two exceptions: a gain margin above 1 of an unstable wall, because the gain must be increased to
+    # stabilize the wall; and a gain margin below 1 of a stable wall, because a reduction of the gain destabilizes it.
     outward = name == "gain_margin" and (value > 1.0) != bool(stable)
     return round_conservatively(20.0 * math.log10(value) if decibel else value, "above" if outward else "below", digits)
 
@@ -321,7 +321,10 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
 
 
 def describe_islands(scene: SceneOptima) -> list[str]:
-    """Return a list of texts: one per island of stable walls, and one if the device is unstable without a wall."""
+    """Return a list of texts: one per island of stable walls not connected to K = 0, and one on an unstable device.
+
+    A device is unstable if it is unstable without a wall.
+    """
     lines, system = [], scene.unit_system
     least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
     if least is not None:
@@ -339,7 +342,8 @@ def _compute_max_stiffness(scene: SceneOptima) -> float:
     try:
         return float(scene.max_stiffness().stiffness)
     except InputError:
-        # An improved scene may be invalid: at twice the rate a long delay may exceed the largest number of periods.
+        # Return NaN for an invalid improved scene: at twice the sampling rate, a long delay may exceed the largest
+        # allowed number of periods.
         return math.nan
 
 
@@ -365,7 +369,8 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
             try:
                 improved.check_parts()
             except InputError:
-                # Remove the filter, because a cutoff above the Nyquist frequency is not possible.
+                # Remove the filter instead of doubling its cutoff, because the cutoff must not exceed the Nyquist
+                # frequency.
                 improved, words = scene.replace(velocity=BackwardDifference()), "no velocity filter"
         yield Improvement(path.partition(".")[0], words, improved)
     if scene.device.modes:
@@ -404,8 +409,9 @@ def trace_passivity_boundary(scene: SceneOptima, directions: int = 721) -> tuple
 
     The arrays have ``directions`` elements; they are empty for a device without damping.
     """
-    # The damping required for passivity is proportional to the distance of (K, B) from the origin. Therefore compute it
-    # for one wall in each direction, and scale the wall until the required damping equals that of the device.
+    # The device damping that passivity requires is proportional to the distance of the wall (K, B) from the origin.
+    # Therefore compute it for one wall in each direction, and scale the wall until the required damping equals that of
+    # the device.
     device_damping, units = float(scene.device.damping), scene.units
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, directions)
     # Clip the cosines at 0, because rounding errors may make them negative at angles of -90 and 90 degrees.

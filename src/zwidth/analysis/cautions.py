@@ -26,7 +26,7 @@ LONGEST_TIME_CONSTANT = 1.0  # largest time constant of the decay, in s
 
 
 def find_thin(verdict: Assessment, period: float) -> list[str]:
-    """Return texts that state the margins of a stable wall that are too small, and its time constant if too long.
+    """Return a list of texts, one for each margin of a stable wall that is too small and one for a slow decay.
 
     Args:
         verdict: assessment of the wall.
@@ -91,7 +91,7 @@ def _list_margins(requirements: Requirements) -> dict[str, Requirements]:
 def _advise(
     recommendation: Any, options: dict[str, Requirements], accepts: Callable[[Any], bool], otherwise: str
 ) -> str:
-    """Return a text that states the first option that solves a problem of the wall, with the new wall and its cost.
+    """Return a text with the first option that avoids a problem of the wall, the new wall, and the loss of stiffness.
 
     Args:
         recommendation: the recommendation whose wall has the problem.
@@ -111,7 +111,7 @@ def _advise(
 
 
 def judge_grasps(scene: Any) -> dict[str, bool]:
-    """Return a dictionary that maps each reference grasp to True if the wall of the scene is stable in it.
+    """Return a dictionary that maps each reference grasp to True if the wall of the scene is stable in this grasp.
 
     If the scene has an operator, the entry "released" is the stability without the operator.
     """

@@ -3,8 +3,8 @@
 A wall is stable or unstable only if all frequency responses within the error bounds agree (`measured_curve`,
 docs/theory/measured.md); otherwise it is undecided. *Lines* are the measured frequencies; alpha and beta are the
 normalized stiffness and damping of a wall, L is the open loop, and angles are w = omega T with the period T. A wall
-counts as connected to K = 0 if it is stable and no softer wall of the same damping is unstable. The stiffest wall is
-searched on lines of constant beta, and refined by golden-section search.
+counts as connected to K = 0 if it is stable and no softer wall of the same damping is unstable. The search for the
+stiffest wall evaluates a grid of beta, and refines the best beta by golden-section search.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class MeasuredLoop(LinearLoop):
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod = "auto", exact: Any = ()
     ) -> Stability:
-        """Return for each wall whether it is stable for every admitted response, with a status.
+        """Return for each wall whether it is stable for every response within the error bounds, with a status.
 
         The status is UNDECIDED if the lines are too far apart, if their errors are too large, or if the range of
         measured frequencies is too narrow. ``exact`` is an argument of the base class and ignored.
@@ -113,7 +113,7 @@ class MeasuredLoop(LinearLoop):
         return DominantPole(False, np.nan, np.nan, np.nan)
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
-        """Return the intervals of stable alpha for each beta, shape (n, intervals, 2); NaN if fewer."""
+        """Return the intervals of stable alpha for each beta, shape (n, intervals, 2), padded with NaN."""
         return _select_stable(self.walls.decide_alpha(beta), True)
 
     def find_stable_beta(self, alpha: float) -> np.ndarray:
@@ -195,7 +195,7 @@ class MeasuredLoop(LinearLoop):
         return RidgePoint(np.float64(value), np.float64(middle), np.float64(omega), kind, np.int32(Status.OK))
 
     def explain(self, alpha: float, beta: float) -> list[str]:
-        """Return texts with the reasons why a wall is undecided and the frequencies to measure; empty if decided."""
+        """Return texts on why a wall is undecided and which frequencies to measure; an empty list if it is decided."""
         wall = np.array([alpha]), np.array([beta])
         if self.decide(*wall, "auto", wall).status[0] == Status.OK:
             return []
@@ -225,7 +225,7 @@ class MeasuredLoop(LinearLoop):
         return reasons
 
     def explain_limit(self) -> str:
-        """Return a text with the reasons why no wall is decided, for the wall undecided at the fewest frequencies."""
+        """Return a text with the reasons why no wall is decided: those of the wall undecided at fewest frequencies."""
         rows = [(*self.walls.bound_alpha(beta), beta) for beta in self._tops[0].tolist()]
         walls = [(0.5 * (low + high), beta) for low, high, beta in rows if low < high]
         count = f"the {self.scene.device.frequency.size} frequencies of the response decide the stability of no wall"

@@ -32,7 +32,7 @@ from zwidth.units.display import compact_repr
 from zwidth.units.parsing import to_float
 from zwidth.units.quantities import FIELDS, WALL
 
-# At the damping of the stiffest wall, the stable interval of K may end below K_max by this relative tolerance, because
+# Relative tolerance by which the stable interval of K may end below K_max at the damping of the stiffest wall, because
 # K_max has a numerical error.
 STIFFNESS_TOLERANCE = 1e-6
 
@@ -158,7 +158,7 @@ def _choose_range(
 
 
 def _find_extrema(surplus: Callable[[float], float], grid: list[float], values: list[float]) -> list[float]:
-    """Return the parameter values of local extrema of the surplus at which its sign may differ from that on the grid.
+    """Return the parameter values at local extrema of the surplus that may differ in sign from nearby grid points.
 
     These are maxima close to grid points with negative surplus, and minima close to those with nonnegative surplus.
     ``values`` holds the surplus at the parameter values ``grid``.
@@ -187,8 +187,7 @@ def _find_crossing(surplus: Callable[[float], float], low: float, high: float) -
     try:
         root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
     except ValueError:
-        # Brent's method fails if it reaches a parameter value at which K_max cannot be computed. No crossing is then
-        # found.
+        # Return no crossing, because Brent's method has reached a parameter value at which K_max cannot be computed.
         return None
     value = math.exp(cast("float", root))
     for distance in CONFIRMATION_DISTANCES:

@@ -121,7 +121,8 @@ class Recommendation:
             wall = rounded(digits)
             if not (self.scene.is_stable(*wall) and all(spare >= 0 for spare in slack(*wall).values())):
                 return False
-            # Require that the printed B lies in the printed range of stable B, whose ends are rounded inwards.
+            # Require that the rounded B lies in the printed range of stable B, because the ends of this range are
+            # rounded inwards.
             low, high = ends
             inside = (
                 round_conservatively(low, "above", digits) <= wall[1] <= round_conservatively(high, "below", digits)
@@ -156,7 +157,8 @@ class Recommendation:
             near = self.stiffness * float(top.stiffness) / float(self.stiffest.stiffness)
             return choose_wall(improved, self.requirements, top, near, COARSE).stiffness
         except InputError:
-            # An improved scene may be invalid: at twice the rate a long delay may exceed the largest number of periods.
+            # Return NaN for an invalid improved scene: at twice the sampling rate, a long delay may exceed the largest
+            # allowed number of periods.
             return math.nan
 
     @cached_property
@@ -256,7 +258,7 @@ class Recommendation:
         return f"stable in {count} reference grasps{radii}"
 
     def spell_passive(self) -> str:
-        """Return "yes" for a passive wall, "no" for another one, and the reason as text if passivity is not known."""
+        """Return "yes" for a passive wall, "no" for another one, or the reason as text if passivity is not known."""
         passive = None if self.verdict is None else self.verdict.passive
         if passive and self.verdict is not None and self.verdict.passivity_margin < reserve_damping(self.scene):
             return "uncertain, because the fitted damping is"
@@ -316,7 +318,8 @@ def _describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -
         units: unit system of the texts.
     """
     if limit is None or (limit.forbids_all and not ignored):
-        # Return no note if the safe limit excludes all walls, because the reason for recommending no wall states this.
+        # Return no text if the safe limit excludes all walls, because the reason for the missing recommendation states
+        # this.
         return []
     return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]
 

@@ -82,7 +82,7 @@ class Remedy(NamedTuple):
 
 
 def count_steps(resolution: float) -> int:
-    """Return the number of counts per revolution of an encoder whose steps are at most ``resolution``, in rad."""
+    """Return the least number of counts per revolution of an encoder whose steps are at most ``resolution``, in rad."""
     return math.ceil(2.0 * math.pi / resolution - 1e-6)
 
 
@@ -161,7 +161,7 @@ def _search(scene: SceneOptima, path: str, present: float, direction: int, facto
 
 
 def _bisect(holds: Callable[[float], bool | None], inside: float, outside: float) -> float:
-    """Find by bisection the end of a stable range between a stable and another value; return its last stable value."""
+    """Find the end of a stable range by bisection between a stable and another value; return the last stable value."""
     for _ in range(HALVINGS):
         middle = 0.5 * (inside + outside)
         inside, outside = (middle, outside) if holds(middle) else (inside, middle)

@@ -120,8 +120,9 @@ class Experiment(NamedTuple):
         )
         if np.any(motion.outcome == MotionKind.INVALID):
             raise InputError("coulomb: friction stops and restarts the device too often within one period; lower it")
-        # A response that decays like the linear loop has the trend exp(-decay/8), because each half of the tail lasts
-        # an eighth of the simulation. Require at least the square root of this trend for a sustained oscillation.
+        # A response that decays like the linear loop, by exp(-decay) during the simulation, has the trend
+        # exp(-decay/8), because each half of the tail lasts an eighth of the simulation. Require at least the square
+        # root of this trend for a sustained oscillation.
         least_trend = max(SUSTAINED, math.exp(-self.decay / 16.0) if self.decay > 0 else 0.0)
         # Treat a growing response as unbounded only if the linear loop is unstable and the motor has no limits, because
         # all other growing responses approach a limit cycle.
@@ -134,8 +135,8 @@ def list_starts(scene: Any, hardware: Hardware) -> Starts:
     K, Q, period = float(scene.wall.stiffness), hardware.resolution, scene.timing.period
     position = [Q * factor for factor in DISPLACEMENTS if Q > 0]
     half_steps = [0.0] * len(position) + [1.0] * len(position)
-    # Let the displacements that are multiples of the encoder step change with the encoder step of a trial. Add the
-    # largest one a second time, as a displacement that does not change.
+    # If a trial changes the encoder step, scale the displacements, which are multiples of the encoder step, by the same
+    # factor. Add the largest one a second time, as a displacement that is not scaled.
     scaled = 2 * len(position)
     position, half_steps = position * 2 + position[-1:] * 2, half_steps + [0.0, 1.0][: 2 * len(position)]
     loads = [hardware.max_force, hardware.max_rate * period]

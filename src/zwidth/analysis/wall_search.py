@@ -76,7 +76,7 @@ class Requirements(NamedTuple):
         beyond_safe: bool = False,
         grasps: Grasps | None = None,
     ) -> Requirements:
-        """Return the requirements after a check of the arguments of `recommend`, with defaults if none is given."""
+        """Check the arguments of `recommend`, and return them as requirements; the defaults apply if none is given."""
         ranges = {"stiffness_fraction": FRACTION, **RANGES}
         limits = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
         for name, value in limits.items():
@@ -166,7 +166,8 @@ def measure_slack(scene: SceneOptima, requirements: Requirements, grasped: Seque
                 slacks["phase_margin"] = np.asarray(margins.phase_margin) / requirements.phase_margin - 1.0
         if requirements.passive:
             margin = (np.asarray(scene.passivity_margin(stiffness, damping)) - reserve) / (device_damping or 1.0)
-            # Use a negative slack if the passivity margin is exactly 0, because such a wall is not passive.
+            # Replace a passivity margin of exactly 0 by a negative slack, because a wall with this margin is not
+            # passive.
             slacks["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
         if grasped:
             stable_in_grasps = np.all([_is_stable_in_grasp(each, stiffness, damping) for each in grasped], axis=0)
@@ -219,8 +220,8 @@ def find_stiffest(
         lowest, beta = min(dips, default=(1.0, math.nan))
         if lowest <= 0:
             dampings[log_stiffness] = beta * unit
-        # Keep the sign of the slack, but keep its magnitude above 1e-12, because `false_position` stops at values close
-        # to 0.
+        # Keep the magnitude of the slack above 1e-12 without changing its sign, because `false_position` stops at
+        # values close to 0.
         return min(max(-lowest, 1e-12), 1.0) if lowest <= 0 else max(min(-lowest, -1e-12), -1.0)
 
     top, softest = math.log(most), scene.loop.least_stiffness(-math.inf)

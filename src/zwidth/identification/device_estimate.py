@@ -132,7 +132,7 @@ class DeviceEstimate:
     measured_damping: float | None = None  # largest B of the measured walls, N s/m; None for a log
     measured_stiffness: float | None = None  # K measured at the largest B, N/m; None for a log
 
-    # Shortcuts to attributes of the scene with the fitted parameters.
+    # Make attributes of the fitted scene available as attributes of the estimate, because they are used often.
     mass = property(attrgetter("nominal.device.mass"))
     damping = property(attrgetter("nominal.device.damping"))
     delay = property(attrgetter("nominal.timing.delay"))
@@ -149,12 +149,12 @@ class DeviceEstimate:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """The paths of the fitted parameters, in the order of the covariance."""
+        """The dotted paths of the fitted parameters, such as "modes.0.frequency", in the order of the covariance."""
         return name_parameters(self.nominal)
 
     @cached_property
     def estimates(self) -> np.ndarray:
-        """The values of the fitted parameters in SI units, in the order of ``parameter_names``."""
+        """The values of the fitted parameters in SI units, in the order of the covariance."""
         parameters = self.nominal.parameters()
         return np.array([parameters[name] for name in self.parameter_names])
 
@@ -164,7 +164,10 @@ class DeviceEstimate:
         return compute_coverage_factor(self.degrees_of_freedom)
 
     def normalize(self, drawn: np.ndarray) -> DimensionlessDevice:
-        """Convert parameters, one row per device and one column per entry of the covariance, to a batch of devices."""
+        """Convert parameters in SI units to a batch of dimensionless devices.
+
+        ``drawn`` has one row per device and one column per fitted parameter, in the order of the covariance.
+        """
         lag = 0 if self.actuator is None else self.actuator.order
         return DimensionlessDevice.from_parameters(np.moveaxis(drawn, 1, 0), self.period, lag)
 
@@ -234,7 +237,7 @@ class DeviceEstimate:
         return None
 
     def bound_measured_stiffness(self, confidence: float) -> float:
-        """Return a lower confidence limit in N/m of the stiffness that was measured at the largest B; 0 for a log.
+        """Return a lower confidence limit in N/m of the onset stiffness measured at the largest B; 0 after a log fit.
 
         Args:
             confidence: probability that the true onset K is above the limit.
@@ -250,7 +253,7 @@ class DeviceEstimate:
     def response_scene(self) -> Scene | None:
         """The scene of the fitted response with a radius that covers one undetected resonance; None without a response.
 
-        It is that of `build_response_scene` with the default of 99 % of the devices.
+        The radius covers the responses of 99 % of the devices that agree with the fitted parameters.
         """
         return self.build_response_scene(RELIABILITY, True)
 

@@ -35,7 +35,8 @@ BEYOND = 3.0
 # Usual range of sampling periods in s. A period outside this range causes a warning, because its unit may be wrong.
 _SHORTEST_PERIOD = 5e-6
 _LONGEST_PERIOD = 0.02
-# Remedy for warnings that the log does not distinguish two structures of the device, such as a lag and a resonance.
+# Remedy printed with a warning that the log cannot distinguish two structures of the device, such as a lag and a
+# resonance.
 SEE_MORE = "record a force of zwidth.excite, use a larger force, or a finer encoder"
 MASS_OPEN = "the mass is hardly determined: its standard error is more than half of its value"
 
@@ -62,8 +63,8 @@ class FittedMotion(NamedTuple):
     time: np.ndarray  # time of each sample, s
     force: np.ndarray  # commanded force, N
     position: np.ndarray  # measured position, m
-    # Modeled position in m. It is NaN at the start and after gaps, because the forces that act there were not
-    # logged, and after the first 200,000 samples, because these are not fitted.
+    # Modeled position in m. It is NaN at the start and after gaps, because the forces that act there were not logged,
+    # and beyond the first 200,000 samples, because later samples are not fitted.
     modeled: np.ndarray
 
 
@@ -206,7 +207,7 @@ class DeviceFit(DeviceEstimate):
         return float(np.sqrt(np.sum(self.propagate_errors(lambda scene: scene.max_stiffness().virtual_damping) ** 2)))
 
     def value_of(self, name: str) -> float:
-        """Return the value to which the entry ``name`` of ``errors`` belongs: an attribute, or a device parameter."""
+        """Return the fitted value whose standard error is ``errors[name]``: an attribute or a device parameter."""
         return float(self.nominal.parameters()[name] if "." in name else getattr(self, name))
 
     @cached_property
@@ -217,7 +218,8 @@ class DeviceFit(DeviceEstimate):
         the interval also includes the K measured at the largest B.
         """
         widths = {name: (self.value_of(name), self.coverage_factor * error) for name, error in self.errors.items()}
-        # Cut the intervals off at 0, except those of constant forces and modal masses, because these may be negative.
+        # Cut off the intervals at 0, except those of constant forces and modal masses, because only these may be
+        # negative.
         signed = [name for name in widths if name == "offset" or (name.startswith("modes") and name.endswith("mass"))]
         # Use np.maximum instead of max, because it returns NaN if the width is NaN.
         bars = {

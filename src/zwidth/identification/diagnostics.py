@@ -23,13 +23,13 @@ from zwidth.units.formatting import header
 _DRAWS = 1000  # largest number of random devices from which the confidence band is computed
 _ROWS = 121  # number of values of B from 0 to the largest stable one; a tenth more values lie above it
 _BEYOND = 1.1  # largest tabulated B, relative to the largest stable one
-# Largest lag of the autocorrelation. The smaller of the two limits applies.
-_LAGS = 60  # largest lag in samples
-_SHARE = 0.25  # largest lag relative to the number of samples of the log
+# Largest lag at which the autocorrelation of the residuals is tabulated: the smaller of two limits.
+_LAGS = 60  # first limit, in samples
+_SHARE = 0.25  # second limit, relative to the number of samples of the log
 
 
 def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = ()) -> dict[str, dict[str, Any]]:
-    """Return a dictionary of all tables of a fit by name, as required for its plots and files.
+    """Return all tables of a fit as a dictionary by name; its plots and data files contain these tables.
 
     Args:
         fit: the fit.
@@ -100,7 +100,7 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return the K up to which all walls are stable, 0 if none is, as an array over random devices and values of B.
+    """Return the largest stable stiffness at given values of B for each of several devices; 0 if no wall is stable.
 
     Args:
         fit: the fit.

@@ -25,7 +25,7 @@ from zwidth.units.formatting import plain, with_unit
 from zwidth.units.quantities import FIELDS
 from zwidth.units.unit_system import UnitSystem
 
-# Range of the RMS residuals that agree with the encoder step, relative to the quantization noise of the encoder.
+# Range of RMS residuals that quantization by the encoder explains, relative to its quantization noise.
 NEAR_ROUNDING = (0.5, 1.1)
 
 STIFFER = 1.005  # ratio of the stiffnesses of two walls above which the second wall is printed in addition
@@ -99,7 +99,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
 
 
 def _assume_rigid(fit: DeviceFit) -> Recommendation | None:
-    """Return the wall recommended for a device without undetected resonances; None if this wall is not stiffer."""
+    """Return the wall recommended without undetected resonances; None if it is not stiffer than the recommended one."""
     recommended = replace(fit.scene, safe_limit=limit_walls(fit, rigid=True)).recommend()
     return recommended if recommended.stiffness > STIFFER * fit.recommended.stiffness else None
 
@@ -152,7 +152,7 @@ def _describe_residuals(fit: DeviceFit) -> str:
 
 
 def _describe_next(fit: DeviceFit) -> str:
-    """Return a text that describes the wall to measure next, and the expected standard error of K_max after that."""
+    """Return a text with the wall to measure next, and the standard error of K_max expected after its measurement."""
     step, units = fit.next, fit.unit_system
     assert step is not None, "only fits to walls at the onset of instability propose a next experiment"
     B, K = format_value("damping", step.virtual_damping, units, 3), format_value("stiffness", step.stiffness, units, 3)

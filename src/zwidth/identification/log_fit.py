@@ -50,7 +50,8 @@ _LONGEST = 20  # largest delay of the search by default, in sampling periods
 _USUAL = {False: (2e-3, 10.0, 3.0, 1e3), True: (1e-8, 10.0, 100.0, 300.0)}
 _FEWEST = 20  # least number of fitted positions per stretch; shorter stretches are omitted
 _FEW = 60  # number of fitted positions below which a warning is issued, because very different devices may fit them
-# Largest number of fitted positions of all logs. More would need gigabytes of memory and only reduce the errors.
+# Largest number of fitted positions of all logs together. More positions would need gigabytes of memory, and would only
+# reduce standard errors that are already small.
 _MOST = 200_000
 _FINER = 0.3  # an encoder step is excluded if the residuals are at most this share of its quantization noise (RMS)
 _SEEN = 5.0  # least effect of the force on the positions, in standard errors; smaller effects are refused
@@ -266,13 +267,13 @@ def _convert_force(best: FittedModel, k: int) -> tuple[float, float]:
     value, indices = best.theta[k] / g, [0, k]
     slope = np.array([-value / g, 1.0 / g])
     error = float(np.sqrt(slope @ best.covariance[np.ix_(indices, indices)] @ slope))
-    # Report a friction at the lower bound of the search as 0, because the search does not reach 0 itself.
+    # Report a friction at the lower bound of the search as 0, because this bound is slightly above 0.
     is_zero = k == -1 and value <= 2.0 * MIN_FRICTION * best.model.largest_force
     return 0.0 if is_zero else float(value), error
 
 
 def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[list[float], list[str]]:
-    """List the candidates for the encoder step, coarsest first, and warnings about a step that the user specified.
+    """List the candidates for the encoder step, largest first, and warnings about a step that the user specified.
 
     Positions near integer multiples of a step need not be those of an encoder: under a constant force, the positions of
     a sensor without steps may have this property, too. Only the residuals distinguish the two cases. 0 is the candidate
@@ -297,7 +298,7 @@ def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[li
 
 
 def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[float]) -> tuple[float, Choice]:
-    """Fit the device with one candidate of the encoder step after another, until the residuals do not exclude it.
+    """Fit the device with each candidate for the encoder step in turn, until the residuals agree with a candidate.
 
     Args:
         recordings: the logs.
@@ -316,8 +317,8 @@ def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[
 def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:
     """Raise `InputError` if the commanded force explains too little of the motion, or the fitted mass is negative."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
-    # Fit the positions by the free motion from the initial states, without any force. The amount by which the fitted
-    # model reduces the residuals of the free motion is the effect of the forces.
+    # Fit the positions by the motion without forces, with free initial states. The effect of the forces is the amount
+    # by which the fitted model reduces the residuals of this motion.
     alone = model.simulate(np.append(theta[:-2], [0.0, 0.0])).derivatives[:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
@@ -388,7 +389,7 @@ def _list_warnings(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tu
         )
     size = float(residuals @ residuals)
     if size <= EXACT**2 * residuals.size * span**2:
-        # Residuals that are only rounding errors require no further warnings.
+        # Return without further warnings, because the residuals are only rounding errors.
         return warnings
     if damping == 0:
         warnings.append(

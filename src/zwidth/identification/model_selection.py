@@ -28,7 +28,7 @@ _FIRST_STEPS = 20  # largest number of Levenberg-Marquardt steps from each initi
 _FURTHER_STEPS = 40  # largest number of further steps, from the best result for each structure
 ALIKE = 1.5  # largest autocorrelation measure `FittedModel.excess` of residuals that count as white noise
 EXACT = 1e-9  # RMS residual, relative to the range of positions, below which residuals are rounding errors
-# Reduction of the misfit that two superfluous parameters exceed with a probability of 5 % (chi-square).
+# Reduction of the misfit that two unnecessary parameters exceed by chance with a probability of 5 % (chi-square).
 _BY_CHANCE = 5.99
 # Initial values of the parameters of an actuator lag.
 _TIME_CONSTANTS = (0.3, 1.5)  # time constants, in sampling periods
@@ -57,8 +57,8 @@ def choose_structure(best: FittedModel) -> Choice:
     rigid = best, pole, bank, lags = _test_residuals(best)
     alternative = None
     for _ in range(_MAX_PARTS):
-        # Use the test for lags as well, because it detects lags that the scores of the poles do not reveal: it does not
-        # estimate the amplitude of their effect, which is known.
+        # Use the test for lags as well, because it is more sensitive to lags than the scores of the poles: the
+        # amplitude of the effect of a lag is known, so this test does not estimate it.
         has_lag = lags is not None and lags.projection.max() ** 2 > 2.0 * np.log(best.count)
         if bank is None or alternative or (pole is None and not has_lag):
             break

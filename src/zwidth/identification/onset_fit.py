@@ -251,7 +251,7 @@ def _read_points(
         )
         rows = kept
     table = np.array(rows)
-    # Compare differences of B with K/w, the typical size of B, because all measured B may be 0 or close to 0.
+    # Compare differences of B with K/(2 pi f), a typical size of B, because all measured B may be 0 or close to 0.
     unit = table[0, 0] / (2 * np.pi * table[0, 2])
     if np.ptp(table[:, 1]) <= SAME * max(unit, np.abs(table[:, 1]).max()):
         count = "one wall does" if len(table) == 1 else f"{len(table)} walls of one damping do"
@@ -285,7 +285,7 @@ def _estimate_delay_step(derivatives: np.ndarray, best: Candidate) -> float:
     """Return the delay that least squares would choose if it were not fixed at 0, in standard errors.
 
     Args:
-        derivatives: weighted derivatives of the residuals in theta, one row per residual.
+        derivatives: weighted derivatives of the residuals with respect to theta, one row per residual.
         best: fit with the delay fixed at 0; its residuals are assumed to have variance 1.
     """
     inverse = np.linalg.pinv(derivatives)[2]
@@ -298,7 +298,7 @@ def _require_identifiability(
     """Raise `InputError` if the walls do not determine mass, damping and delay.
 
     Args:
-        derivatives: weighted derivatives of the residuals in theta, one row per residual.
+        derivatives: weighted derivatives of the residuals with respect to theta, one row per residual.
         theta: parameters of the best device.
         table: walls, shape (walls, 3), with the columns K, B and f.
         on_boundary: True if the walls are on the stability boundary of the best device.
@@ -329,13 +329,13 @@ def _propose_measurement(
         rigid_fit: the fit to the measured walls.
         stiffness_max: K_max of the fitted device in N/m.
         information: information matrix of theta from the measured walls.
-        wanted: derivatives of K_max in theta.
+        wanted: derivatives of K_max with respect to theta.
         precision: inverse variances of ln K and ln f.
     """
     onsets, theta = rigid_fit.onsets, rigid_fit.best.theta
     scene, period = rigid_fit.scene(theta), onsets.period
     w = np.linspace(0.0, np.pi, ANGLES + 2)[1:-1]
-    # Add low frequencies, because the stability boundary of a slow loop extends to them.
+    # Extend the uniform grid to low frequencies, because loops with long delay or weak damping become unstable there.
     w = np.concatenate([np.geomspace(1e-4, w[0], 60)[:-1], w])
     stiffness, damping = scene.boundary(w / period)
     # Exclude walls softer than a tenth of K_max, because their onset of instability is hard to measure.

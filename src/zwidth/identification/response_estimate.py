@@ -1,11 +1,11 @@
 """Estimate a frequency response with its deviation from records of commanded force and sampled position.
 
-A *stretch* is a part of a log in which the same period of the force repeats at least twice. A *record* is the mean over
-the periods of one stretch; if there is only one stretch, each of its periods is a record. Let U be the spectrum of the
-force of a record, and Y that of its position without drift. At each frequency of the force (a *line*), the response is
-``G = sum Y conj(U)/sum |U|^2``, with sums over the records. Its standard error is estimated from the residuals Y - G U;
-it therefore contains the errors of encoder, friction and noise (Pintelon, Schoukens 2012). The *deviation* of the
-response is a multiple of the standard error. A force that does not repeat is analyzed by spectra averaged over
+A *stretch* is a part of a log that contains at least two equal successive periods of the force. A *record* is the mean
+over the periods of one stretch; if there is only one stretch, each of its periods is a record. Let U be the spectrum of
+the force of a record, and Y that of its position without drift. At each frequency of the force (a *line*), the response
+is ``G = sum Y conj(U)/sum |U|^2``, with sums over the records. Its standard error is estimated from the residuals
+Y - G U; it therefore contains the errors of encoder, friction and noise (Pintelon, Schoukens 2012). The *deviation* of
+the response is a multiple of the standard error. A force that does not repeat is analyzed by spectra averaged over
 overlapping segments (Welch 1967). w is the frequency in rad per sample.
 """
 
@@ -218,7 +218,7 @@ def _find_period(force: np.ndarray) -> int | None:
 
 
 def _find_repeats(force: np.ndarray, count: int) -> list[tuple[int, int]]:
-    """Find the stretches of the force in which a period of ``count`` samples occurs at least twice.
+    """Find the stretches of the force in which a period of ``count`` samples occurs at least twice in succession.
 
     Returns:
         For each stretch the index of its first sample, and that of its last sample plus 1.
@@ -349,8 +349,8 @@ def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list
     w = 2.0 * np.pi * np.arange(2, size // 2) / size
     G = both / forces / (1.0 - np.exp(-1j * w))
     error = np.abs(G) * np.sqrt((1.0 - np.minimum(coherence, 1.0)) / np.maximum(coherence, 1e-300) * _OVERLAP / pieces)
-    # Add the error of the averaging over neighboring lines by the window. It is proportional to the second difference
-    # of the response of the acceleration, u G, with u = |1 - e^(-jw)|^2.
+    # Add the bias that the window causes, because it averages the response over neighboring lines. This bias is
+    # proportional to the second difference of u G, the response of the acceleration, with u = |1 - e^(-jw)|^2.
     u = 4.0 * np.sin(0.5 * w) ** 2
     bend = np.abs(np.diff(u * G, 2))
     deviation = SURE * error + np.pad(bend, 1, mode="edge") / u

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 # Numbers of significant digits to which values are rounded.
 EXACT_DIGITS = 12  # digits of parameters without a standard error
-PERIOD_DIGITS = 7  # digits of sampling periods derived from timestamps, which no clock exceeds in accuracy
+PERIOD_DIGITS = 7  # digits of sampling periods derived from timestamps, because no clock is more accurate
 LIMIT_DIGITS = 4  # digits of the safe limit, as many as are printed for a wall
-# Texts that describe the status of a fit. Its warnings contain the details.
+# Texts that describe the status of a fit in short. The warnings of the fit contain the details.
 _STATUS_TEXTS = {
     Status.NOT_CONVERGED: "the search did not converge",
     Status.NO_BOUNDARY: "no device has all of these walls on its stability boundary",
@@ -113,7 +113,7 @@ def _explain_limit(fit: DeviceFit, wall: SafeWall) -> str:
 
 
 def advise_record(fit: DeviceFit) -> str:
-    """Return a text that advises to record another log, with the command that designs the force for it."""
+    """Return a text that advises recording another log, with the command that designs the force for this log."""
     force = max(float(np.abs(motion.force).max()) for motion in fit.motions)
     options = {
         "rate": with_unit(1.0 / round_period(fit), "Hz"),

@@ -35,9 +35,10 @@ from zwidth.units.display import compact_repr
 from zwidth.units.quantities import SI_RANGE
 
 _SAMPLES = 8000  # largest number of random devices
-# Number of random devices, in multiples of ``LinearLoop.draws``, which is smaller for loops that are slow to compute.
-_SEARCHED = 5  # if the devices are used to search for the wall
-_CONFIRMED = 2  # if the devices are only used to confirm a wall
+# Numbers of random devices, in multiples of ``LinearLoop.draws``, a number that is smaller for loops that are slow to
+# compute.
+_SEARCHED = 5  # devices used to search for the wall
+_CONFIRMED = 2  # devices used only to confirm a wall
 _ACCURACY = 1e-3  # relative accuracy of K at which the bisection ends
 _NEGLIGIBLE = 1e-4  # K relative to the K_max of the devices below which no wall is reported
 _BELOW = 1e-9  # relative reduction of K, so that the device that limits the wall is not exactly on its boundary

@@ -85,7 +85,7 @@ def bound_lag(fit: FittedModel, test: LagTest | None, scene: Scene, coverage_fac
     """
     if test is None:
         return None
-    # Exclude a lag also if the damping or delay refitted with this lag is negative.
+    # Exclude a lag also if the damping or delay refitted with this lag is negative, because no such device exists.
     possible = (test.signature_size - test.projection <= coverage_factor) & (test.theta[1:3] >= 0).all(0)
     count = int(np.argmin(np.append(possible, False)))  # number of time constants below the first excluded one
     if not count:

@@ -88,7 +88,7 @@ def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
 
 
 def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, external_force: Any, periods: int) -> Any:
-    """Return the external force on the device in N, averaged over each period, plus the force of the moving hand.
+    """Return the external force on the device in N, averaged over each period, plus the force of a moving hand.
 
     Args:
         scenes: distinct scenes, each with a rigid operator.

@@ -30,8 +30,9 @@ SEGMENTS = 6  # number of equal segments of the tail; even, because the trend co
 # Factor on the noise bound of FOAW, slightly above 1, so that deviations of exactly one encoder count are admissible in
 # spite of rounding errors.
 SLACK = 1.0 + 1e-9
-# Use XLA's older loop emitters without splitting, because they halve the compile time at the same speed. Require full
-# optimization even if XLA_FLAGS sets a lower level, because a simulation runs for thousands of periods.
+# Use XLA's older loop emitters, and generate the code of a program in one part, because this halves the compile time
+# and does not change the run time. Require full optimization even if XLA_FLAGS sets a lower level, because a simulation
+# runs for thousands of periods.
 COMPILER_OPTIONS = (
     ("xla_cpu_use_fusion_emitters", False),
     ("xla_cpu_parallel_codegen_split_count", 1),
@@ -90,7 +91,7 @@ class PeriodInputs(NamedTuple):
 
 
 def _write(rows: Array, row: Array, index: Array) -> Array:
-    """Return a copy of an array in which the row with an index along the first axis is replaced."""
+    """Return a copy of the array ``rows`` in which ``row`` replaces the entry at ``index`` along the first axis."""
     return jax.lax.dynamic_update_index_in_dim(rows, row, index, 0, allow_negative_indices=False)
 
 
@@ -146,7 +147,7 @@ def control(
         force = -(params.alpha * measured + params.beta * velocity)
     else:
         force = options.law(measured, velocity / params.period, k * params.period) / params.force
-        # With a force law, count a nonzero force as contact, because a law has no surface.
+        # With a force law, count a nonzero force as contact, because a force law defines no surface of the wall.
         touching &= force != 0
     force = jnp.where(touching, force, 0.0)
     force = jnp.where(params.pulling, force, jnp.minimum(force, 0.0))
@@ -227,14 +228,14 @@ def propagate(
     if direct:
         given = force * dot(params.place[0], after.x - body.x)
     else:
-        # Compute the work of the wall from the energy balance, because with an actuator or modes its force on the
-        # bodies varies within the piece.
+        # Compute the work of the wall from the energy balance, because with an actuator or modes the force of the wall
+        # on the bodies varies within the piece.
         given = stored_energy(params, after.x) - stored_energy(params, body.x) + lost + rubbed - pushed
     return after, work + jnp.stack([given, pushed, lost, rubbed])
 
 
 def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, int]) -> State:
-    """Return the state before the first sample: uniform motion so far, no commands, and modes at rest (T2).
+    """Return the state before the first sample, after uniform motion without commands and with modes at rest (T2).
 
     ``rings`` contains the lengths of the rings of positions and of commands.
     """

@@ -204,7 +204,7 @@ class Motion:
 
 
 def _measure_width(summary: Any, start: int, stop: int) -> np.ndarray:
-    """Return the width of the motion of each body over segments ``start`` to ``stop - 1``; NaN if these are empty."""
+    """Return the width of the motion of each body over segments ``start`` to ``stop - 1``; NaN without samples."""
     width = summary.far[start:stop].max(0).sum(0)
     return np.where(width >= 0, width, np.nan)
 

@@ -171,7 +171,7 @@ def simulate(
 
 
 def _build_time(distinct: list[Any], which: np.ndarray, steps: np.ndarray, drawn: np.ndarray | None) -> np.ndarray:
-    """Return the recorded instants in s: one axis if all simulations have the same sampling period, else one row each.
+    """Return the recorded instants in s: one array for equal sampling periods, otherwise one row per simulation.
 
     Args:
         distinct: distinct scenes.

@@ -247,7 +247,7 @@ def _complete(device: Any, scene: PhysicalScene) -> Any:
     supplied = {"mass": scene.mass, "damping": scene.damping, "delay": scene.delay, **list_parts(scene)}
     supplied |= {} if {"period", "rate"} & set(device) else {"period": scene.period}
     # Supply no mass, damping or mechanical parts to a linear system or measured response, because it contains them,
-    # and no system or response to a device with a mass, because only one of them is allowed.
+    # and no system or response to a device with a mass, because a device has only one of both.
     if "device" in device:
         supplied = {name: value for name, value in supplied.items() if name in ("period", "delay", "velocity")}
     elif "mass" in device:

@@ -87,7 +87,7 @@ def _read_logs(raw: Any, handler: Any) -> Any:
 
 
 class _OneOrSeveral:
-    """Annotation that adds the form of a single entry to the JSON Schema of a list."""
+    """Annotation by which the JSON Schema of a list also accepts a single entry without a list."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -175,7 +175,8 @@ class FitStudy(ComputedStudy):
                 text = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in str(error))
                 path, message = parse_input_error(InputError(text))
                 is_key = len(path) == 1 and path[0] in LogSection.model_fields
-                # Omit the index from the path if there is one log, because it may be written without a list.
+                # Omit the index from the path if the study has only one log, because a single log may be written
+                # without a list.
                 place = ("log", *((k,) if len(self.log or ()) > 1 else ()))
                 yield (*place, *(path if is_key else ("csv",))), (message if is_key else parse_message(text))
         self._motions = tuple(motions)

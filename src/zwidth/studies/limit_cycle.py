@@ -39,7 +39,7 @@ _MAX_CURVES = 6  # largest number of values of a list that are drawn as curves; 
 # Default of the largest amplitude that counts as a limit cycle: in m for linear devices (key False), in rad for rotary
 # devices (key True).
 WIDEST = {False: 1e-3, True: math.radians(20.0)}
-WIDEST_STEPS = 10.0  # encoder steps; lower bound of the default amplitude above
+WIDEST_STEPS = 10.0  # lower bound of this default, in encoder steps
 
 
 # Make every field of `SimulationConditions` optional, because a condition contains only the values that it overrides.
@@ -143,8 +143,8 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
         for index, (condition, faults) in enumerate(zip(self.conditions, problems, strict=True)):
             for path, message in faults:
                 is_overridden = getattr(condition, str(path[0])) is not None
-                # Report a fault in a value of the study itself only for the first condition, because it is the same in
-                # all of them.
+                # Report a fault in a value of the study itself only once, for the first condition, because all
+                # conditions share this value.
                 if is_overridden or index == 0:
                     yield (("conditions", index, *path) if is_overridden else path), message
 

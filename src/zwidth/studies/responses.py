@@ -69,7 +69,7 @@ class ResponseStudy(ComputedStudy):
     def respond(
         self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
     ) -> tuple[dict[str, Any], str]:
-        """Compute the step response of a device with a wall; return its columns, and a note on settling (may be "").
+        """Compute the step response of a device with a wall; return its columns, and a note on the settling or "".
 
         Args:
             device: device without parts.
@@ -272,8 +272,8 @@ def draw(recommendation: Recommendation, response: Table | None = None) -> Any:
 
     The figure is not registered with pyplot, so that the caller need not close it.
     """
-    # Omit the panel of the step response for a measured device, because no model exists that could be simulated. Its
-    # verdict has no frequency.
+    # Omit the panel of the step response for a measured device, because a simulation needs a model. The assessment of a
+    # measured device contains no frequency of the dominant pole.
     columns = 1 if recommendation.verdict is None or math.isnan(recommendation.verdict.frequency) else 2
     _, axes = new_figure(WIDTH if columns == 2 else 5.6, 3.5, 1, columns)
     return plotting.plot.recommendation(recommendation, axes, response=response)
