@@ -69,7 +69,7 @@ _WALL = Parsed("WALL", _read_wall)
 _SOFTER = 50  # largest number of reductions of K to make the rounded wall stable
 
 
-# Options with the walls of the example in the help.
+# Options of the example that the help shows: two walls at the onset of instability.
 _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 
 
