@@ -25,19 +25,16 @@ tested against this module. Source: Hulin, Preusche, Hirzinger 2006, eqs. (15), 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import lazy_loader
 import numpy as np
 
 from zwidth.core.types import Array, Coefficients, Reals, Roots
+from zwidth.core.xp import lazy_jax as jax
 from zwidth.core.xp import namespace
 from zwidth.numerics.held_mass import Plant, discretize_mass, split_delay
 from zwidth.numerics.polynomials import Affine, companion
 from zwidth.numerics.root_finding import bracket_root, polish_root
-
-# Import JAX on first use, because NumPy computes the coefficients of few walls without it.
-jax: Any = lazy_loader.load("jax")
 
 NEAR_PI = np.pi * (1.0 - 1e-4)  # largest omega of the curve; rounding errors grow as 1/(pi - omega)
 
@@ -74,9 +71,11 @@ def expand_loop(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degre
 
 def compute_poles(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
     """Return the poles of walls, given by one-dimensional arrays, along a new last axis."""
-    return jax.vmap(lambda *wall: jax.numpy.linalg.eigvals(companion(expand_loop(*wall, degree))))(
-        alpha, beta, delta, d
-    )
+
+    def solve(alpha: Array, beta: Array, delta: Array, d: Array) -> Roots:
+        return jax.numpy.linalg.eigvals(companion(expand_loop(alpha, beta, delta, d, degree)))
+
+    return jax.vmap(solve)(alpha, beta, delta, d)
 
 
 def compute_radii(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Reals:
