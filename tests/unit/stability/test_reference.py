@@ -107,4 +107,4 @@ def test_boundary_points_separate_stable_from_unstable_walls(line, x64):
         # Scale beta + delta, which is positive on the boundary; beta itself may be 0.
         beta = (point.beta + delta) * factor - delta
         walls = (point.alpha * factor, point.beta) if line == "row" else (point.alpha, beta)
-        assert (zwidth.is_stable(*map(np.asarray, walls), delta, d) == expected).all()
+        assert (zwidth.is_stable(np.asarray(walls[0]), np.asarray(walls[1]), delta, d) == expected).all()
