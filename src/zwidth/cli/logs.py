@@ -287,7 +287,7 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
         share = float(made.expected.stiffness / made.limit.stiffness)
         result |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
         expected = format_wall(made.expected.stiffness, made.expected.virtual_damping, units)
-        lines += [format_row("expected safe wall", f"{expected}, {100 * share:.0f} % of the present K_max")]
+        lines += [format_row("expected safe wall", f"{expected}, {100 * share:.0f} % of the current K_max")]
     print_result(result, [*lines, format_row("wrote", str(out))], as_json)
 
 

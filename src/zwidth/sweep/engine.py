@@ -257,7 +257,7 @@ def refuse_changes(where: Path, name: str, noun: str, old: Any, new: Any) -> Non
         name: Name of the study.
         noun: Noun for the results, "store" or "run".
         old: Recorded study, as JSON.
-        new: Study of the present configuration, as JSON.
+        new: Study of the current configuration, as JSON.
     """
     # Ignore the keys delay_model and delay_models of earlier releases if they have the value that is now the only one.
     changed = [each for each in list_differences(old, new) if each[1:] not in (("held", None), (["held"], None))]
