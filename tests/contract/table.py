@@ -17,7 +17,8 @@ Written by `scripts/refresh_contract.py` from `tests/contract/cases.py`. Each ca
 - **Types of arguments.** At most one argument is traced. The others are Python numbers, NumPy scalars, NumPy
   arrays of ints or floats, 0-d arrays, lists or JAX arrays. `tests/contract/test_matrix.py` tests
   {combinations:,} combinations of these types in direct calls and inside `jit`, `vmap`, `grad`, `jit(grad)` and
-  the second derivative, in float64 and float32. It includes methods of a rigid `Scene`.
+  the second derivative, in float64 and float32: every combination for one function per way of evaluation, and
+  the common ones for all other functions. It includes methods of a rigid `Scene`.
 - **Bad points.** For an entry that is NaN, infinite, or negative where negative values are not allowed, the
   result is that of the column "bad points", and the status, if there is one, is INVALID_INPUT. An entry outside
   the domain has the same result with the status OUT_OF_RANGE. Bad entries do not change the other entries. A
