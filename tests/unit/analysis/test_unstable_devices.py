@@ -40,6 +40,8 @@ def test_the_stiffest_wall_is_that_of_the_stable_region(seed):
         assert scene.loop.least_stiffness(0.0) * scene.units.stiffness == pytest.approx(pull, rel=1e-9)
         assert min(radius(coefficients, delay, 0.99 * pull, B * share) for share in np.linspace(0.0, 2.0, 41)) > 1.0
         assert scene.islands() == []
+        if delay != (0, 1, 3)[seed % 3]:
+            continue  # a recommendation takes most of the time: one delay per seed
         found = scene.recommend()
         assert found.status == Status.OK
         assert radius(coefficients, delay, found.stiffness, found.virtual_damping) < 1.0
