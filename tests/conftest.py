@@ -92,7 +92,7 @@ def _nothing_is_left_open():
 
 @pytest.fixture
 def fitted_once():
-    """What commands, studies and pages say of a log, or of walls, is asked of one fit."""
+    """Compute fits, wall searches and diagnoses that commands, studies and pages repeat only once."""
     from fitted_once import fitting_once
 
     with fitting_once():

@@ -1,4 +1,4 @@
-"""Logs and walls that commands, studies and pages fit again and again, fitted once a process: a fit takes seconds."""
+"""Fits, wall searches and diagnoses that commands and pages repeat, computed once per process: each takes seconds."""
 
 from __future__ import annotations
 
@@ -9,34 +9,41 @@ from functools import wraps
 from typing import Any
 from unittest.mock import patch
 
+from zwidth.analysis import cautions, diagnosis, recommendation
 from zwidth.identification import columns
 from zwidth.identification import onset_fit as buzz
-from zwidth.identification.device_fit import DeviceFit
 
-_fitted: dict[tuple[str, bytes], DeviceFit] = {}
-
-
-def _once(fit: Callable[..., DeviceFit]) -> Callable[..., DeviceFit]:
-    """A fit whose answers are kept: it gives the same one to the same numbers, and nobody can change it."""
-
-    @wraps(fit)
-    def fit_once(*given: Any, **options: Any) -> DeviceFit:
-        key = fit.__name__, pickle.dumps((given, sorted(options.items())))
-        if key not in _fitted:
-            _fitted[key] = fit(*given, **options)
-        return _fitted[key]
-
-    return fit_once
+_results: dict[tuple[str, bytes], Any] = {}
 
 
-_fit_log, _fit_buzz = _once(columns.fit_log), _once(buzz.fit_buzz)
+def _once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that keeps its results: equal arguments have equal, immutable results."""
+
+    @wraps(function)
+    def compute_once(*given: Any, **options: Any) -> Any:
+        key = function.__name__, pickle.dumps((given, sorted(options.items())))
+        if key not in _results:
+            _results[key] = function(*given, **options)
+        return _results[key]
+
+    return compute_once
+
+
+_fit_log, _fit_buzz, _diagnose = _once(columns.fit_log), _once(buzz.fit_buzz), _once(diagnosis.diagnose)
+_choose_wall = _once(recommendation.choose_wall)
 
 
 @contextmanager
 def fitting_once() -> Iterator[None]:
-    """Meanwhile, commands and studies fit equal logs and walls once.
+    """Make commands and studies fit equal logs and walls, choose equal walls and diagnose them only once.
 
-    `zwidth.fit_log` fits whenever it is asked, and so does a `fit_buzz` that was imported before.
+    `zwidth.fit_log` still fits in each call, and functions that were imported before still compute.
     """
-    with patch.object(columns, "fit_log", _fit_log), patch.object(buzz, "fit_buzz", _fit_buzz):
+    with (
+        patch.object(columns, "fit_log", _fit_log),
+        patch.object(buzz, "fit_buzz", _fit_buzz),
+        patch.object(diagnosis, "diagnose", _diagnose),
+        patch.object(recommendation, "choose_wall", _choose_wall),
+        patch.object(cautions, "choose_wall", _choose_wall),
+    ):
         yield
