@@ -21,7 +21,10 @@ def _once(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(function)
     def compute_once(*given: Any, **options: Any) -> Any:
-        key = function.__name__, pickle.dumps((given, sorted(options.items())))
+        try:
+            key = function.__name__, pickle.dumps((given, sorted(options.items())))
+        except (pickle.PicklingError, TypeError, AttributeError):
+            return function(*given, **options)
         if key not in _results:
             _results[key] = function(*given, **options)
         return _results[key]
