@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Measure functions inside `jit` on every kind of device that JAX has here, a graphics processor beside the CPU.
+"""Measure functions inside `jit` on every type of device available to JAX, such as a CPU and a GPU.
 
     python benchmarks/bench_device.py [--points 1000000] [--runs 5] [--write benchmarks/results/device.md]
 
-Float64, scattered walls, each of a device of its own with a delay of its own. The time to compile stands apart; beside
-each speed stands the largest difference from what the same function says when it is called directly.
+In float64 at random walls, each with its own device and delay. Compile time is listed separately, and each speed is
+listed with the largest difference from direct calls of the same function.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SEED, SAMPLE = 20060901, 20_000
 
 
 def draw_walls(points: int) -> tuple[np.ndarray, ...]:
-    """alpha, beta, delta and d of as many walls, about half of them stable."""
+    """Return alpha, beta, delta and d of random walls, about half of which are stable."""
     generator = np.random.default_rng(SEED)
     delta, d = generator.uniform(0.01, 1.0, points), generator.uniform(0.0, 8.0, points)
     top = zwidth.alpha_max(delta, d)
@@ -35,7 +35,7 @@ def draw_walls(points: int) -> tuple[np.ndarray, ...]:
 
 
 def list_questions() -> Iterator[tuple[str, Callable[..., Any]]]:
-    """Functions of (alpha, beta, delta, d), each with a name."""
+    """Yield names and functions of (alpha, beta, delta, d)."""
     yield "`is_stable`", zwidth.is_stable
     yield "`spectral_radius`", zwidth.spectral_radius
     yield "`margins`, modulus", lambda *wall: zwidth.margins(*wall).modulus_margin
@@ -49,14 +49,14 @@ def list_questions() -> Iterator[tuple[str, Callable[..., Any]]]:
 
 
 def measure(function: Callable[..., Any], walls: tuple[np.ndarray, ...], device: Any, runs: int) -> tuple[float, ...]:
-    """Seconds to compile, walls a second, and the largest difference from a direct call, of 1 or the value."""
+    """Return compile time in s, walls per second, and the largest difference (of 1 or the value) from direct calls."""
     with jax.default_device(device):
         program, there = jax.jit(function), [jax.device_put(column, device) for column in walls]
         first = time_calls(lambda: jax.block_until_ready(program(*there)), 1)[0].min()
         best = time_calls(lambda: jax.block_until_ready(program(*there)), runs)[0].min()
         got = np.asarray(program(*there))[:SAMPLE].astype(float)
     with jax.default_device(jax.devices("cpu")[0]):
-        # A derivative is compiled here, too.
+        # Derivatives are also compiled here.
         direct = np.asarray(function(*(column[:SAMPLE] for column in walls))).astype(float)
     same = np.isnan(got) == np.isnan(direct)
     apart = np.abs(got - direct) / np.maximum(1.0, np.abs(direct))
@@ -64,21 +64,26 @@ def measure(function: Callable[..., Any], walls: tuple[np.ndarray, ...], device:
 
 
 def name_of(device: Any) -> str:
-    """What a device is called, with the processors of a CPU."""
+    """Return the name of a device, with the number of processors of a CPU."""
     return f"{os.cpu_count()} CPU cores" if device.platform == "cpu" else device.device_kind
 
 
 def measure_all(points: int, runs: int) -> str:
-    """The table as a page."""
+    """Return the page with the table."""
     devices = {device.platform: device for kind in ("cpu", jax.default_backend()) for device in jax.devices(kind)[:1]}
     walls = draw_walls(points)
-    head = [part for device in devices.values() for part in (f"{name_of(device)}: M walls/s", "s to compile", "apart")]
+    head = [
+        part for device in devices.values() for part in (f"{name_of(device)}: M walls/s", "s to compile", "difference")
+    ]
     lines = [
         "# Inside `jit`, by device",
         "",
-        f"Written by `benchmarks/bench_device.py --write`: {points:,} scattered walls, each of a device and a delay",
-        f"(0 to 8 periods) of its own, float64, JAX {jax.__version__}, Python {platform.python_version()}; the best of",
-        f"{runs} runs. Apart: the largest difference of {SAMPLE:,} values from a direct call's, over 1 or the value.",
+        "The command `benchmarks/bench_device.py --write` writes this table. Each function is called inside `jit` in",
+        f"float64 with a batch of {points:,} random walls. Each wall has a different device and a different delay of",
+        f"0 to 8 periods. The speed is the largest of {runs} runs, with JAX {jax.__version__} and Python",
+        f'{platform.python_version()}. The column "difference" contains the largest difference of {SAMPLE:,} values',
+        "from the values of a direct call. The difference is relative for values above 1 in magnitude, and absolute",
+        "for smaller values.",
         "",
         f"| function | {' | '.join(head)} |",
         f"|---|{'--:|' * len(head)}",

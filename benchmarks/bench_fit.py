@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""Measure fits of logs: how far off, how often the intervals and the safe walls hold on the true device.
+"""Measure fits of logs: errors, coverage of the intervals, and stability of the safe walls on the true device.
 
     python benchmarks/bench_fit.py [--logs 1000] [--devices 1000] [--processes 2] [--write docs/fitting.md]
 
-Devices, delays, forces, encoders, noises and clocks are random, with friction in two thirds of them. Errors stand over
-the bound of Cramer and Rao, for noise and the encoder's q^2/12 as white. The logs are made by the closed forms that the
-fit uses, which tests/unit/identification/test_friction_model.py compares with `zwidth.simulate`; those closed by a
-wall step by step. Those of devices with lags and resonances are of `tests/oracles/measured_devices.py`, by matrices.
+Devices, delays, forces, encoders, noise and clocks are random; two thirds of the devices have friction. Errors are
+relative to the Cramer-Rao bound for white noise plus the encoder's quantization variance q^2/12. The logs use the
+closed forms of the fit, which tests/unit/identification/test_friction_model.py compares with `zwidth.simulate`; logs in
+contact with a wall are computed step by step. Logs of devices with lags and resonances come from the matrices of
+`tests/oracles/measured_devices.py`.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ from methods.page import write_page
 PERIOD, SKIP = 1e-3, 22
 NAMES = ("mass", "damping", "delay", "friction")
 KINDS = ("to and fro", "single push", "closed by a wall", "jittered stamps")
-# Noise as a share of the encoder's step: those of the main table, and none.
+# Bounds of the noise relative to the encoder step: for the main table, and without noise.
 NOISY, SILENT = (0.15, 3.0), (0.0, 0.0)
 
 
 class Made(NamedTuple):
-    """A log and its truth: mass, damping, delay, friction, offset; the noise's deviation and the encoder's step."""
+    """A log and its true parameters: device, delay, friction, offset, noise standard deviation and encoder step."""
 
     kind: str
     time: Any
@@ -52,7 +53,7 @@ class Made(NamedTuple):
 
 
 class Mover(NamedTuple):
-    """A device in units of the period, as `Recording.move` takes it."""
+    """A device in units of the period, in the form required by `Recording.move`."""
 
     g: float
     delta: float
@@ -62,7 +63,7 @@ class Mover(NamedTuple):
 
 
 def make_log(seed: int, share: tuple[float, float]) -> Made:
-    """One random log; ``share`` bounds the noise over the encoder's step."""
+    """Return a random log; ``share`` bounds the noise relative to the encoder step."""
     random = np.random.default_rng([7, seed])
     kind = KINDS[seed % len(KINDS)]
     count = int(random.choice([1000, 2000, 5000]))
@@ -93,7 +94,7 @@ def make_log(seed: int, share: tuple[float, float]) -> Made:
 
 
 def make_force(random: np.random.Generator, count: int, kind: str) -> np.ndarray:
-    """Steps to and fro, a chirp, random steps, or a single push, in N."""
+    """Return alternating steps, a chirp, random steps or a single push, in N."""
     if kind == "single push":
         first, lasts = random.integers(5, 60), random.integers(20, 200)
         return np.where((np.arange(count) >= first) & (np.arange(count) < first + lasts), 1.0, 0.0)
@@ -108,7 +109,7 @@ def make_force(random: np.random.Generator, count: int, kind: str) -> np.ndarray
 def respond(
     device: Mover, force: np.ndarray, wall: tuple[float, float], step: float, errors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Forces, positions and readings; a wall adds its force, from readings, to the given one."""
+    """Return forces, positions and encoder readings; a wall adds a force computed from the readings."""
     count = force.size - SKIP
 
     def read(place: Any, error: Any) -> Any:
@@ -130,7 +131,7 @@ def respond(
 
 
 def glide(place: float, speed: float, push: float, lasts: float, delta: float, friction: float) -> tuple[float, float]:
-    """Place and speed after a constant push, turns and sticking included."""
+    """Return position and speed after a constant push, including reversals and sticking."""
     while lasts > 0:
         way = np.sign(speed) or (np.sign(push) if abs(push) > friction else 0.0)
         if not way:
@@ -146,11 +147,11 @@ def glide(place: float, speed: float, push: float, lasts: float, delta: float, f
 
 
 def bound_errors(made: Made) -> dict[str, float]:
-    """Least standard errors by Cramer and Rao, of the model that is fitted; nothing where it cannot be told."""
+    """Return the Cramer-Rao bounds of the fitted model as standard errors; empty if they cannot be computed."""
     mass, damping, delay, friction, offset = made.truth
     model = Recordings((Recording(made.force, made.position[SKIP:], SKIP),))
     g = PERIOD**2 / mass
-    # At 0 the slope of friction is not seen.
+    # At zero friction its derivative would vanish.
     theta = np.array([g, damping * PERIOD / mass, delay / PERIOD, 0, 0, g * offset, g * max(friction, 1e-12)])
     by_truth = np.eye(theta.size)
     by_truth[[0, 1], 0] = -theta[:2] / mass
@@ -169,7 +170,7 @@ def bound_errors(made: Made) -> dict[str, float]:
 
 
 def judge(seed: int, span: tuple[float, float]) -> dict[str, Any]:
-    """One log's fit beside its truth."""
+    """Return the results of the fit of one log, compared with the true parameters."""
     made = make_log(seed, span)
     bounds = bound_errors(made)
     start = time.process_time()
@@ -185,8 +186,8 @@ def judge(seed: int, span: tuple[float, float]) -> dict[str, Any]:
     truth["stiffness_max"] = float(scene.max_stiffness().stiffness)
     known = {name: bar for name, bar in fit.intervals.items() if np.isfinite(bar.low) and name in truth}
     safe = fit.safe_wall()
-    # In standard errors.
-    away = {name: abs(getattr(fit, name) - truth[name]) * fit.reach / (bar.high - getattr(fit, name))
+    # Errors in units of standard errors.
+    away = {name: abs(getattr(fit, name) - truth[name]) * fit.coverage_factor / (bar.high - getattr(fit, name))
             for name, bar in known.items()}  # fmt: skip
     return {
         "seed": seed,
@@ -197,7 +198,7 @@ def judge(seed: int, span: tuple[float, float]) -> dict[str, Any]:
         "open": "friction" not in known,
         "away": away,
         "status": fit.status,
-        "doubts": fit.doubts,
+        "warnings": fit.warnings,
         "safe": bool(scene.is_stable(safe.stiffness, safe.virtual_damping)) if safe.stiffness > 0 else None,
         "share": safe.stiffness / truth["stiffness_max"],
         "width": measure_width(fit),
@@ -205,13 +206,13 @@ def judge(seed: int, span: tuple[float, float]) -> dict[str, Any]:
 
 
 def measure_width(fit: zwidth.DeviceFit) -> float:
-    """Of the interval of K_max, over K_max; NaN where none is given."""
+    """Return the width of the interval of K_max relative to K_max; NaN without an interval."""
     low, high = fit.intervals["stiffness_max"]
     return (high - low) / fit.stiffness_max
 
 
 def judge_device(seed: int) -> dict[str, Any]:
-    """One log of a device that may have a lag or resonances, its K_max and safe walls judged on the device itself."""
+    """Return the results of one device that may have a lag or resonances, with walls checked on the true device."""
     random = np.random.default_rng([8, seed])
     true = measured_devices.TrueDevice.draw(random)
     count = int(random.choice([1000, 2000, 5000]))
@@ -225,7 +226,7 @@ def judge_device(seed: int) -> dict[str, Any]:
         fit = zwidth.fit_log(true.period, read, force)
     except zwidth.ZwidthError:
         return row | {"given": False}
-    if fit.is_doubted:
+    if fit.is_unreliable:
         return row | {"given": False}
     limit, bar, safe, rigid = (
         true.limit_of_walls(),
@@ -239,13 +240,13 @@ def judge_device(seed: int) -> dict[str, Any]:
         "width": measure_width(fit),
         "safe": true.is_stable(*safe[:2]) if safe.stiffness > 0 else None,
         "share": safe.stiffness / limit,
-        # Without a wall that drawn devices bear there is none to judge.
+        # Without a wall that is stable on all sampled devices, there is nothing to check.
         "rigid": bool(np.isfinite(rigid.stiffness)) and true.is_stable(*rigid[:2]),
     }
 
 
 def judge_all(judge: Callable[[int], dict[str, Any]], count: int, processes: int) -> list[dict[str, Any]]:
-    """As many logs, in processes of their own."""
+    """Return the results of ``count`` logs, computed in parallel processes."""
     if processes == 1:
         return [judge(seed) for seed in range(count)]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
@@ -253,7 +254,7 @@ def judge_all(judge: Callable[[int], dict[str, Any]], count: int, processes: int
 
 
 def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Coverage and errors, in Markdown."""
+    """Yield the lines of the table of coverage and errors, in Markdown."""
     yield "| | 95 % interval contains the true value | RMS error / bound | median error / bound |"
     yield "|---|--:|--:|--:|"
     for name in (*NAMES, "offset", "stiffness_max"):
@@ -266,7 +267,7 @@ def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def tabulate_kinds(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """How each kind of log fared, in Markdown."""
+    """Yield the lines of the table by kind of log, in Markdown."""
     columns = (
         "mass | damping | delay | friction | offset | K_max | friction not determined | with a warning | safe walls"
     )
@@ -277,13 +278,13 @@ def tabulate_kinds(rows: list[dict[str, Any]]) -> Iterator[str]:
         held = [share([row["held"][name] for row in those if name in row["held"]])
                 for name in (*NAMES, "offset", "stiffness_max")]  # fmt: skip
         safe = [row["safe"] for row in those if row["safe"] is not None]
-        doubted = sum(bool(row["doubts"]) for row in those)
-        cells = [*held, str(sum(row["open"] for row in those)), str(doubted), f"{sum(safe)} of {len(safe)}"]
+        warned = sum(bool(row["warnings"]) for row in those)
+        cells = [*held, str(sum(row["open"] for row in those)), str(warned), f"{sum(safe)} of {len(safe)}"]
         yield f"| {kind} | {' | '.join(cells)} |"
 
 
 def tabulate_devices(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """How logs of devices with lags and resonances fared, in Markdown."""
+    """Yield the lines of the table for devices with lags and resonances, in Markdown."""
     columns = "with K_max | interval contains K_max | interval width | stable safe walls | stiffness | rigid safe walls"
     yield f"| device | logs | {columns} |"
     yield "|---|--:|--:|--:|--:|--:|--:|--:|"
@@ -300,12 +301,12 @@ def tabulate_devices(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def rms(values: np.ndarray) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 def share(found: list[bool]) -> str:
-    """In percent of how many."""
+    """Return a percentage and the number of cases."""
     return f"{100 * np.mean(found):.1f} % of {len(found):,}" if found else "none of 0"
 
 
@@ -314,30 +315,31 @@ def spell_widths(rows: list[dict[str, Any]]) -> str:
     widths = [row["width"] for row in rows if np.isfinite(row["width"])]
     middle, high = 100 * np.quantile(widths, [0.5, 0.9])
     median = f"The median width of the intervals of K_max is {middle:.1f} % of K_max"
-    return f"{median}; one in ten is wider than {high:.0f} %."
+    return f"{median}; a tenth of the intervals are wider than {high:.0f} %."
 
 
 def tell_rest(rows: list[dict[str, Any]], fitted: list[dict[str, Any]]) -> str:
-    """What is refused and doubted, and what is wrong without a word."""
-    sure = [row for row in fitted if row["status"] == 0 and not row["doubts"]]
+    """Return a text on rejected fits, fits with warnings, and wrong fits without warnings."""
+    sure = [row for row in fitted if row["status"] == 0 and not row["warnings"]]
     wrong = [row for row in sure if max(row["away"].values()) > 5]
     safe = [row["safe"] for row in fitted if row["safe"] is not None]
     low, middle, high = np.quantile([row["share"] for row in fitted if row["safe"] is not None], [0.1, 0.5, 0.9])
-    spread = f"{middle:.2f}; it is less than {low:.2f} for one wall in ten and more than {high:.2f} for one in ten"
-    doubted, troubled = sum(bool(row["doubts"]) for row in fitted), sum(row["status"] != 0 for row in fitted)
+    spread = f"{middle:.2f}; the 10 % quantile is {low:.2f}, and the 90 % quantile is {high:.2f}"
+    warned, troubled = sum(bool(row["warnings"]) for row in fitted), sum(row["status"] != 0 for row in fitted)
     return "\n".join([
-        f"Logs that the fit refuses: {len(rows) - len(fitted)}. Fits with a warning: {doubted}.",
+        f"Logs for which the fit ends with an error: {len(rows) - len(fitted)}. Fits with a warning: {warned}.",
         f"Fits with a status other than OK: {troubled}. {spell_widths(fitted)}",
-        "Fits without a warning and with the status OK in which an estimate differs from the true value by more",
-        f"than 5 standard errors: {len(wrong)} of {len(sure)}.",
-        f"Safe walls that are stable on the true device: {sum(safe)} of {len(safe)}.",
+        f"In {len(wrong)} of {len(sure)} fits without a warning and with the status OK, an estimate differs from the",
+        "true value by more than 5 standard errors.",
+        f"On the true device, {sum(safe)} of {len(safe)} safe walls are stable.",
         f"The median stiffness of a safe wall, divided by K_max of the true device, is {spread}.",
-        "Safe walls are softer than K_max, because a log does not exclude all resonances. These devices have none.",
+        "Safe walls are softer than K_max, because a log cannot exclude all resonances. The devices of this test have",
+        "no resonances.",
     ])  # fmt: skip
 
 
 def report(count: int, parts: int, processes: int) -> str:
-    """All tables."""
+    """Return the page with all tables."""
     noisy, silent = (
         judge_all(partial(judge, span=span), size, processes)
         for size, span in ((count, NOISY), (max(count // 3, 1), SILENT))
@@ -345,20 +347,20 @@ def report(count: int, parts: int, processes: int) -> str:
     devices = judge_all(judge_device, parts, processes)
     fitted, quiet = ([row for row in rows if "refused" not in row] for rows in (noisy, silent))
     for row in (*noisy, *silent):
-        if "refused" in row or row["safe"] is False or (not row["doubts"] and max(row["away"].values()) > 5):
+        if "refused" in row or row["safe"] is False or (not row["warnings"] and max(row["away"].values()) > 5):
             print(row)
-    # Of this machine and this day: not for the page.
+    # Depends on the machine, so not part of the page.
     print(f"a fit took {np.median([row['took'] for row in fitted]):.2f} s of the processor (median)")
     lines = [
         "# Accuracy of fits to logs",
         "",
-        "Written by `benchmarks/bench_fit.py --write docs/fitting.md`.",
+        "The command `benchmarks/bench_fit.py --write docs/fitting.md` writes this page.",
         "",
         f"{count:,} random logs of 1,000 to 5,000 samples are fitted. The rigid devices have masses of 30 g to 1 kg",
         "and integer or fractional delays of 0 to 5 periods. The range of motion is 300 to 100,000 encoder steps,",
-        "and the noise is 0.15 to 3 steps. Two thirds of the devices have friction of 0.2 to 30 % of the effective",
-        "force, and a fifth of them have a constant force. There are four kinds of logs, with a quarter of the logs",
-        "each:",
+        "and the noise is 0.15 to 3 steps. Two thirds of the devices have friction of 0.2 to 30 % of the RMS",
+        "force, and a fifth of them have a constant force. There are four kinds of logs, and each kind makes up a",
+        "quarter of the logs:",
         "",
         "- to and fro: the force consists of steps, a chirp or random values;",
         "- single push: the device is pushed once;",
@@ -379,20 +381,20 @@ def report(count: int, parts: int, processes: int) -> str:
         "",
         tell_rest(noisy, fitted),
         "",
-        f"{len(silent):,} further logs have only the quantization error of the encoder,",
+        f"In {len(silent):,} further logs, the positions have no noise except the quantization error of the encoder,",
         "which is autocorrelated.",
         "",
         *tabulate(quiet),
         "",
         tell_rest(silent, quiet),
         "",
-        f"{parts:,} further logs are from devices that can have an actuator lag of 0.1 to 1 ms, and one or two",
+        f"{parts:,} further logs are those of devices that can have an actuator lag of 0.1 to 1 ms, and one or two",
         "resonances with frequencies of 30 to 400 Hz and damping ratios of 0.5 to 10 %. The devices are moved to",
         "and fro. The encoder steps are 1 to 40 µm, and the noise is as above. The table reports K_max for fits",
-        "without a warning. Each fit includes the actuator lag and the resonances that the log shows. The interval",
-        "of K_max also includes devices with one more resonance; before the log is considered, one more resonance",
-        "and none are equally likely. The interval width is a median, relative to the fitted K_max. The stiffness",
-        "is the median stiffness of the safe walls, relative to K_max of the true device.",
+        "without a warning. Each fit includes the actuator lag and the resonances that are detected in the log. The",
+        "interval of K_max also includes devices with one additional resonance; the prior probability of this",
+        "resonance is 50 %. The interval width is a median, relative to the fitted K_max. The stiffness is the median",
+        "stiffness of the safe walls, relative to K_max of the true device.",
         '"Stable safe walls" are the walls of `safe_wall()` that are stable on the true device. These walls',
         'are computed for devices that may have a resonance hidden in the log. "Rigid safe walls" are the walls of',
         "`safe_wall(rigid=True)` that are stable on the true device. These walls are computed without hidden",

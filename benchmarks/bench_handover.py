@@ -48,7 +48,7 @@ def read_code(text: str) -> tuple[float, float]:
 
 
 def hand_over(seed: int, folder: Path, with_run: bool) -> Counter[str]:
-    """Fit one device and count what holds of its wall."""
+    """Fit one device and count the checks that its wall passes."""
     true, force, position = draw_hidden(seed)
     counts: Counter[str] = Counter(devices=1)
     try:
@@ -64,7 +64,7 @@ def hand_over(seed: int, folder: Path, with_run: bool) -> Counter[str]:
     documents = outcome.documents
     if found.status != zwidth.Status.OK:
         none = scene.recommend().status != zwidth.Status.OK and "no wall" in documents["recommendation.md"]
-        return counts + Counter(without_a_wall=1, also_without_in_the_run=none, doubted=fit.is_doubted)
+        return counts + Counter(without_a_wall=1, also_without_in_the_run=none, unreliable=fit.is_unreliable)
     wall = found.stiffness, found.virtual_damping
     other = scene.recommend()
     document = json.loads(documents["recommendation.json"])["recommended"]

@@ -34,7 +34,7 @@ SOFTER = np.array([0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0])
 INTRODUCTION = """\
 # Accuracy of fits to walls at the onset of instability
 
-Written by `benchmarks/bench_onsets.py --write docs/onsets.md`.
+The command `benchmarks/bench_onsets.py --write docs/onsets.md` writes this page.
 
 `zwidth.fit_buzz` fits a rigid device to walls at the onset of instability. This benchmark simulates random devices.
 For each rigid device, four walls are measured. All other devices have an actuator lag of 0.1 to 1 ms, one or two
@@ -112,13 +112,13 @@ def judge(seed: int, rigid: bool) -> dict[str, Any] | None:
     if measured is None:
         return None
     true, walls, limit = measured
-    row: dict[str, Any] = {"seed": seed, "kind": name_kind(true), "doubted": True, "refused": False}
+    row: dict[str, Any] = {"seed": seed, "kind": name_kind(true), "unreliable": True, "refused": False}
     try:
         fit = zwidth.fit_buzz(walls, period=true.period, noise=NOISE)
     except zwidth.InputError as error:
         return {**row, "refused": True, "why": str(error)}
-    row |= {"doubted": fit.is_doubted, "why": "; ".join(fit.doubts), "structured": fit.is_structured}
-    if fit.is_doubted:
+    row |= {"unreliable": fit.is_unreliable, "why": "; ".join(fit.warnings), "structured": fit.is_structured}
+    if fit.is_unreliable:
         return row
     bar, safe, advice = fit.intervals["stiffness_max"], fit.safe_wall(), fit.recommended
 
@@ -154,7 +154,7 @@ def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
     kinds = sorted({row["kind"] for row in rows} - {"rigid"})
     for kind in ("rigid", *kinds, "all but rigid"):
         those = [row for row in rows if kind == row["kind"] or (kind == "all but rigid" and row["kind"] in kinds)]
-        known = [row for row in those if not row["doubted"]]
+        known = [row for row in those if not row["unreliable"]]
         walls = [row for row in known if row["safe"] is not None]
         held = sum(row["held"] for row in known)
         cells = [
@@ -173,7 +173,7 @@ def report(rigid: int, others: int, processes: int) -> str:
         if row.get("safe") is False or row.get("advised") is False or row.get("held") is False:
             print(row)
     advised = [row["advised"] for row in rows if row.get("advised") is not None]
-    stable = f"Recommended walls that are stable on the true device: {sum(advised)} of {len(advised)}."
+    stable = f"On the true device, {sum(advised)} of {len(advised)} recommended walls are stable."
     return "\n".join([INTRODUCTION, *tabulate(rows), "", stable, ""])
 
 

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Measure what only a program of its own can show: the memory of large maps, and XLA's flags.
+"""Measure in separate processes: memory for large maps, and the effect of XLA flags.
 
     PYTHONPATH=src python benchmarks/bench_process.py [--quick] [--out benchmarks/results/process.md]
 
-zwidth sets no flag: who wants one sets ``XLA_FLAGS`` before Python starts. Every setting is measured in programs of
-its own, the settings by turns, several times; ratios are those of the medians.
+zwidth sets no flags; users can set ``XLA_FLAGS`` before Python starts. Each setting is measured several times in new
+processes, alternating between settings; ratios are ratios of medians.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SETTINGS = {
     "one thread": "--xla_cpu_multi_thread_eigen=false",
     "none, again": "",
 }
-# What is timed under every setting: quantity, method, layout, delay, points.
+# Cases timed with every setting: quantity, method, layout, delay, points.
 CASES = [
     ("stable", "crossover", "map", 4.0, 4_000_000),
     ("stable", "crossover", "scattered", 4.0, 4_000_000),
@@ -38,7 +38,7 @@ CASES = [
     ("passive", "worst frequency", "scattered", 4.0, 1_000_000),
     ("spectral_radius", "newton", "scattered", 4.0, 250_000),
 ]
-# What is held against its memory: quantity, method, layout, delay, points, bytes of the result a point.
+# Cases of the memory table: quantity, method, layout, delay, points, bytes of the result per point.
 LARGE = [
     ("stable", "crossover", "map", 4.0, 100_000_000, 1),
     ("stable", "crossover", "map", 500.0, 100_000_000, 1),
@@ -50,7 +50,7 @@ LARGE = [
 
 
 def call(quantity: str, method: str, layout: str, d: float, points: int):
-    """The function to measure, and how many points it computes."""
+    """Return the function to measure and its number of points."""
     import zwidth
     from methods import problems
 
@@ -61,7 +61,7 @@ def call(quantity: str, method: str, layout: str, d: float, points: int):
 
 
 def time_cases(quick: bool) -> list[float]:
-    """Points a second of every case, by the median of some calls."""
+    """Return points per second of every case, by the median of several calls."""
     rates = []
     for quantity, method, layout, d, points in CASES:
         function, count = call(quantity, method, layout, d, points // (16 if quick else 1))
@@ -71,13 +71,13 @@ def time_cases(quick: bool) -> list[float]:
 
 
 def peak() -> int:
-    """The largest memory of this program so far, in bytes."""
+    """Return the peak memory of this process in bytes."""
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def memory_of(quantity: str, method: str, layout: str, d: float, points: int) -> list[int]:
-    """Points, and the growth of the peak by a large map after a small one has compiled and loaded everything."""
+    """Return the number of points and the increase of peak memory by a large map after a small warm-up map."""
     small, _ = call(quantity, method, layout, d, 100_000)
     small()
     before = peak()
@@ -87,7 +87,7 @@ def memory_of(quantity: str, method: str, layout: str, d: float, points: int) ->
 
 
 def in_program(arguments: list[str], flags: str = "") -> list:
-    """The JSON that this file prints when it is started with these arguments."""
+    """Run this file in a new process and return its JSON output."""
     environment = os.environ | ({"XLA_FLAGS": flags} if flags else {})
     command = [sys.executable, __file__, *arguments]
     done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
@@ -95,7 +95,7 @@ def in_program(arguments: list[str], flags: str = "") -> list:
 
 
 def report(quick: bool) -> str:
-    """Both tables as Markdown."""
+    """Return both tables in Markdown."""
     from methods.report import environment
 
     rates = {name: [] for name in SETTINGS}
@@ -143,7 +143,7 @@ def _size(count: float) -> str:
 
 
 def main() -> None:
-    """Measure, print, and write where a path is given."""
+    """Measure, print, and write to a file if a path is given."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small maps, one round")
     parser.add_argument("--out", type=Path, help="write the tables there")

@@ -142,26 +142,26 @@ def judge_grasps(scene: zwidth.Scene, stiffness: float, damping: float) -> dict[
 
 
 def improve(scene: zwidth.Scene, step: Any) -> zwidth.Scene:
-    """Return a new scene with an improvement from `Recommendation.steps`."""
+    """Return a new scene with an improvement from `Recommendation.improvements`."""
     device, timing = scene.device, scene.timing
     velocity: Any = scene.velocity
     period, delay = timing.period, timing.delay
-    if "rate" in step.words:
+    if "rate" in step.label:
         kept_periods = step.name == "period_and_delay" or timing.in_periods
         if isinstance(velocity, zwidth.WindowedDifference):
             velocity = zwidth.WindowedDifference(2 * velocity.samples)
         later = f"{float(scene.d)!r} periods" if kept_periods else delay
         return zwidth.Scene(device, zwidth.Timing(period=period / 2, delay=later), velocity=velocity)
-    if step.words == "half the delay":
+    if step.label == "half the delay":
         return zwidth.Scene(device, zwidth.Timing(period=period, delay=0.5 * scene.d * period), velocity=velocity)
-    if "damping" in step.words:
+    if "damping" in step.label:
         device = zwidth.Device(device.mass, 1.1 * device.damping, rotary=device.rotary)
-    elif step.words == "no velocity filter":
+    elif step.label == "no velocity filter":
         velocity = zwidth.BackwardDifference()
-    elif "filter" in step.words:
+    elif "filter" in step.label:
         velocity = replace(velocity, cutoff=2 * velocity.cutoff)
     else:
-        assert "window" in step.words, step.words
+        assert "window" in step.label, step.label
         velocity = zwidth.WindowedDifference(max(1, round(velocity.samples / 2)))
     return zwidth.Scene(device, timing, velocity=velocity)
 
@@ -182,7 +182,7 @@ def check_device(seed: int) -> tuple[Counter[str], list[str]]:
     counts["default wishes"] += not wishes
     if found.status != zwidth.Status.OK:
         return counts + Counter(without_a_wall=1), failures
-    K, B, _ = found.read
+    K, B, _ = found.rounded_wall
     for wall in ((K, B), (found.stiffness, found.virtual_damping)):
         count("walls stable", find_radius(scene, *wall) < 1, f"{wall}")
     grasps = judge_grasps(scene, found.stiffness, found.virtual_damping)
@@ -205,10 +205,10 @@ def check_device(seed: int) -> tuple[Counter[str], list[str]]:
     inside = ends[0] - spare <= B <= ends[1] + spare
     stable = all(find_radius(scene, K, end) < 1 for end in ends)
     count("printed ranges", stable and inside, f"{found.lines()[:2]}")
-    for step in found.steps:
+    for step in found.improvements:
         true = improve(scene, step).recommend(**wishes).stiffness
         right = bool(abs(step.stiffness / true - 1) < TRUE_STEP)
-        count("improvements", right, f"{step.words}: {step.stiffness / true:.4f} of the true one")
+        count("improvements", right, f"{step.label}: {step.stiffness / true:.4f} of the true one")
     return counts, failures
 
 

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Measure alpha_max: how many queries a second with value and gradient, beside optimistix' Newton method.
+"""Measure alpha_max: values with gradients per second, compared with the Newton method of optimistix.
 
     python benchmarks/bench_ridge.py [--count 200000] [--json FILE]
 
-Every row is compiled before it is timed, and waited for; the time is the best of several runs. The error beside it is
-the largest relative one over the smooth held points of tests/reference/ridge_extended.json with delta from 1e-3 to
-1e4, for alpha, and for its slopes relative to |slope| + alpha/(1 + delta) and |slope| + alpha.
+Every row is compiled before it is timed, and results are awaited; the time is the minimum of several runs. The error is
+the largest relative error at the smooth points of tests/reference/ridge_extended.json with delta from 1e-3 to 1e4: of
+alpha, and of its derivatives relative to |slope| + alpha/(1 + delta) and |slope| + alpha.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from zwidth.stability.reference import build_loop, solve_wall
 from zwidth.stability.rigid.ridge import ridge_kernel
 
 REFERENCE = Path(__file__).resolve().parents[1] / "tests" / "reference" / "ridge_extended.json"
-# On a busy machine the best of many short runs is closest to what the processor can do.
+# On a busy machine, the minimum of many short runs is least affected by other processes.
 LEAST_RUNS, LEAST_SECONDS, QUERIES = 7, 3.0, 5000
 
 
 class Row(NamedTuple):
-    """One measurement: time to trace and compile, points a second of wall and of processor time, relative errors."""
+    """One measurement: time to trace and compile, points per second of wall and CPU time, relative errors."""
 
     name: str
     compile_seconds: float
@@ -57,7 +57,7 @@ def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
         loop = build_loop(*point)
         return jax.grad(lambda w: solve_wall(w, loop)[0])(omega)
 
-    # As good a start as the fast route has, which fits s = sin(omega/2): within 4 %.
+    # Initial value as in zwidth, a fit of s = sin(omega/2) with an error below 4 %.
     u, t = 1.0 / (d + 1.0), delta * (d + 1.0) / (delta * (d + 1.0) + 3.0)
     start = 2.0 * jnp.arcsin(jnp.minimum((0.551 + 0.493 * t + (t * u) ** 2 * (1.204 * u - 0.701)) * u, 0.999))
     solver = optimistix.Newton(rtol=1e-13, atol=1e-13)
@@ -68,13 +68,13 @@ def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, float]:
-    """The best time of one call, and the least processor time of one, in seconds."""
+    """Return the minimum wall time and the minimum CPU time of one call, in s."""
     best, least = time_calls(lambda: jax.block_until_ready(call()), LEAST_RUNS, seconds=LEAST_SECONDS).min(axis=1)
     return best, least
 
 
 def errors(alpha: Any, by_delta: Any, by_d: Any, rows: list[dict[str, str]]) -> tuple[float, float]:
-    """The largest relative error of alpha and of its slopes at the reference points."""
+    """Return the largest relative errors of alpha and of its derivatives at the reference points."""
     exact = {
         name: np.array([float(row[name]) for row in rows]) for name in ("alpha", "delta", "alpha_delta", "alpha_d")
     }
@@ -87,7 +87,7 @@ def errors(alpha: Any, by_delta: Any, by_d: Any, rows: list[dict[str, str]]) -> 
 
 
 def traced_row(name: str, kernel: Callable[..., Any], points: tuple[np.ndarray, ...], rows: list) -> Row:
-    """Value and gradient of one kernel as one program of its own."""
+    """Measure value and gradient of one kernel, compiled as one program."""
     function = jax.jit(jax.vmap(jax.value_and_grad(kernel, (0, 1))))
     programs: list[Any] = []
     seconds = time_calls(lambda: programs.append(function.lower(*points).compile()), 1)[:, 0]
@@ -102,7 +102,7 @@ def reference_points(rows: list[dict[str, str]]) -> tuple[np.ndarray, ...]:
 
 
 def public_row(points: tuple[np.ndarray, ...], rows: list) -> Row:
-    """`zwidth.sensitivities` of NumPy arrays: K_max and all four slopes, on every processor."""
+    """Measure `zwidth.sensitivities` of NumPy arrays: K_max and its four derivatives, on all processors."""
 
     def call(delta: np.ndarray, d: np.ndarray) -> zwidth.Sensitivities:
         return zwidth.sensitivities(mass=1.0, damping=delta, period=1.0, delay=d)
@@ -121,13 +121,13 @@ def public_row(points: tuple[np.ndarray, ...], rows: list) -> Row:
 
 
 def one_query() -> dict[str, float]:
-    """Microseconds of one call for one number, and of a call that computes nothing, through the same door."""
+    """Return the time in us of a call for a single number, and of a call with the same overhead but no computation."""
     zwidth.alpha_max(0.1, 1.0)
     packed = jax.jit(lambda point: jnp.stack([point[0], point[1], point[0], point[1], point[0]]))
     point = np.array([0.1, 1.0])
 
     def many(call: Callable[[], Any]) -> float:
-        """The tenth percentile of single calls: on a busy machine the rest wait for a processor."""
+        """Return the tenth percentile of single calls, since slower calls wait for a processor on a busy machine."""
         return float(np.quantile(time_calls(call, QUERIES)[0], 0.1)) * 1e6
 
     return {
@@ -137,9 +137,9 @@ def one_query() -> dict[str, float]:
 
 
 def measure(count: int) -> dict[str, Any]:
-    """All rows, in float64."""
+    """Return all rows, in float64."""
     rng = np.random.default_rng(0)
-    # No corners, which the comparison does not know.
+    # Smooth maxima only, because the comparison cannot handle corners.
     points = 10 ** rng.uniform(-3, 2, count), rng.uniform(0.3, 8, count)
     rows = [
         row
@@ -166,7 +166,7 @@ def measure(count: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print the table; write it where asked."""
+    """Print the table, and write JSON if requested."""
     parser = argparse.ArgumentParser(description="Value and gradient of alpha_max, beside optimistix' Newton method.")
     parser.add_argument("--count", type=int, default=200_000, help="points in the batch")
     parser.add_argument("--json", type=Path, help="write the results to this file")

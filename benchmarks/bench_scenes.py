@@ -1,17 +1,17 @@
 #!/usr/bin/env python3
-"""Measure what each part of a scene adds: to the number of poles, to a verdict, to a map, to the stiffest wall.
+"""Measure the cost of each scene component: number of poles, time of a verdict, of a map and of the stiffest wall.
 
     python benchmarks/bench_scenes.py [--write docs/scenes.md]
 
-All in one process, side by side, with one thread: the best of some runs. Beside each map stands the time that
-`numpy.linalg.eigvals` takes for companion matrices of the same walls, and how many labels of a sample differ from it.
+All measurements run in one process with one thread; times are minima of several runs. Each map is compared with
+`numpy.linalg.eigvals` of companion matrices of the same walls: time, and number of different labels in a sample.
 """
 
 from __future__ import annotations
 
 import os
 
-# Before NumPy is loaded: one thread serves both sides of every comparison.
+# Before NumPy is loaded: both sides of every comparison use one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from zwidth.numerics.polynomials import companion
 from zwidth.stability.linear.roots import affine_polynomial
 
 MAP, SAMPLE, SCATTERED = 2000, 20_000, 100_000
-# Nearer to the circle than this eigenvalues cannot tell the side.
+# Closer to the unit circle, the error of eigenvalues exceeds their distance from it.
 BLUR = 1e-7
 
 TIMING = zwidth.Timing(period=1e-3, delay=1e-3)
@@ -53,24 +53,24 @@ SCENES = {
 
 
 def seconds(call: Callable[[], Any], runs: int = 5) -> float:
-    """Of the fastest run."""
+    """Return the time of the fastest run in s."""
     return time_calls(call, runs)[0].min()
 
 
 def fresh(scene: zwidth.Scene) -> zwidth.Scene:
-    """The same scene with nothing laid out yet."""
+    """Return a copy of a scene without cached results."""
     return scene.replace(mass=float(scene.device.mass))
 
 
 def eigenvalue_labels(scene: zwidth.Scene, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Spectral radii of walls by companion eigenvalues."""
+    """Return the spectral radii of walls from companion matrices."""
     parts = affine_polynomial(scene.loop.roots)
     polynomials = parts.D + alpha[:, None] * parts.N1 + beta[:, None] * parts.N2
     return np.abs(np.linalg.eigvals(companion(polynomials / polynomials[:, :1]))).max(-1)
 
 
 def measure(scene: zwidth.Scene) -> tuple[int, float, float, float, float, int, float]:
-    """Poles, seconds of a first verdict, a wall, a wall of a map, its eigenvalues; wrong labels; the stiffest wall."""
+    """Return poles, times of a first verdict, a wall, a map wall and its eigenvalues, wrong labels, maximum time."""
     top = float(scene.max_stiffness().stiffness)
     damping = 2.0 * max(abs(float(scene.max_stiffness().virtual_damping)), 10.0)
     stiffness, rows = np.linspace(0.0, 1.5 * top, MAP), np.linspace(-0.2 * damping, damping, MAP)[:, None]
@@ -92,7 +92,7 @@ def measure(scene: zwidth.Scene) -> tuple[int, float, float, float, float, int, 
 
 
 def report() -> str:
-    """The table in Markdown."""
+    """Return the table in Markdown."""
     lines = [
         "# Run times of scenes",
         "",
@@ -133,12 +133,12 @@ def report() -> str:
 
 
 def _spell(value: float) -> str:
-    """Two digits, without an exponent."""
+    """Format a number with two digits, without an exponent."""
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def _rigid_ratio(scene: zwidth.Scene) -> float:
-    """What a rigid scene adds to the closed form: runs in turns."""
+    """Return the time of a rigid scene relative to the closed form, measured in alternating runs."""
     stiffness, rows = np.linspace(0.0, 30e3, MAP), np.linspace(-10.0, 90.0, MAP)[:, None]
     alpha, beta = scene.normalize_walls(stiffness, rows)
     own, plain = [], []

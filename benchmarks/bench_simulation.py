@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Measure simulations in time: samples a second of a batch, beside a loop in NumPy and scipy.signal.dlsim.
+"""Measure time simulations: samples per second of a batch, compared with a NumPy loop and scipy.signal.dlsim.
 
     python benchmarks/bench_simulation.py [--write docs/simulation.md]
 
-All in one process, side by side: the best of some runs, after one that compiles. The error beside the time is the
-largest difference of the positions from those of the loop and of dlsim, relative to the largest position.
+All measurements run in one process; times are minima of several runs after a first run that compiles. The error is the
+largest difference from the positions of the loop and of dlsim, relative to the largest position.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PUSH = 0.5
 
 
 def random_scenes() -> tuple[list[zwidth.Scene], np.ndarray, np.ndarray]:
-    """Devices of many masses, dampings and delays, each with a wall at half of its largest stiffness."""
+    """Return random devices and delays, each with a wall of half its maximum stiffness."""
     random = np.random.default_rng(1)
     scenes = [
         zwidth.Scene(
@@ -42,7 +42,7 @@ def random_scenes() -> tuple[list[zwidth.Scene], np.ndarray, np.ndarray]:
 
 
 def loop_in_numpy(scene: zwidth.Scene, stiffness: float, virtual_damping: float) -> np.ndarray:
-    """What one writes first: the device's matrices once, then a sample at a time."""
+    """Simulate by a plain loop over samples with precomputed device matrices."""
     period, mass = scene.timing.period, scene.device.mass
     rate = np.array([[0.0, 1.0, 0.0], [0.0, -scene.device.damping / mass, 1.0 / mass], [0.0, 0.0, 0.0]])
     fraction = scene.d - scene.integer_delay
@@ -59,30 +59,30 @@ def loop_in_numpy(scene: zwidth.Scene, stiffness: float, virtual_damping: float)
 
 
 def dlsim(scene: zwidth.Scene, stiffness: float, virtual_damping: float) -> np.ndarray:
-    """The closed loop of scipy.signal, from its matrices."""
+    """Simulate the closed loop by scipy.signal.dlsim."""
     system = scene.state_space(stiffness, virtual_damping)
     return scipy.signal.dlsim((system.A, system.B, system.C, system.D, system.dt), np.full(PERIODS, PUSH))[1][:, 0]
 
 
 def seconds(call: Callable[[], Any], runs: int = 3) -> float:
-    """Of the fastest run."""
+    """Return the time of the fastest run in s."""
     return time_calls(call, runs)[0].min()
 
 
 def report() -> str:
-    """The tables in Markdown."""
+    """Return the tables in Markdown."""
     scenes, stiffness, damping = random_scenes()
     walls = list(zip(scenes[:BESIDE], stiffness[:BESIDE].tolist(), damping[:BESIDE].tolist(), strict=True))
-    options: dict[str, Any] = {"periods": PERIODS, "push": PUSH, "record": False}
+    options: dict[str, Any] = {"periods": PERIODS, "external_force": PUSH, "record": False}
     cold = seconds(lambda: zwidth.simulate(scenes, stiffness, damping, **options), 1)
     each = SCENES * PERIODS
     own = seconds(lambda: zwidth.simulate(scenes, stiffness, damping, **options)) / each
-    few = zwidth.simulate(scenes[:BESIDE], stiffness[:BESIDE], damping[:BESIDE], periods=PERIODS, push=PUSH)
+    few = zwidth.simulate(scenes[:BESIDE], stiffness[:BESIDE], damping[:BESIDE], periods=PERIODS, external_force=PUSH)
     assert few.position is not None, "a recorded motion"
     lines = [
         "# Run times of simulations",
         "",
-        "This page is written by `benchmarks/bench_simulation.py --write docs/simulation.md`.",
+        "The command `benchmarks/bench_simulation.py --write docs/simulation.md` writes this page.",
         "",
         "## Linear loops",
         "",
@@ -106,7 +106,7 @@ def report() -> str:
 
 
 def report_parts() -> list[str]:
-    """What nonlinear parts add: one device, many walls."""
+    """Return the table of the cost of nonlinear components, for one device and many walls."""
     timing = zwidth.Timing(period=1e-3, delay=1e-3)
     device = zwidth.Device(mass=0.1, damping=1.0)
     bare, coupled = zwidth.Scene(device, timing), zwidth.Device(0.1, 1.0, zwidth.Coupling(0.05, 20e3, 1.0))
@@ -129,7 +129,7 @@ def report_parts() -> list[str]:
         "",
         "One device is simulated with 1,000 walls for 1,000 periods, without recording the trajectories. The last",
         "column is the time of one simulation with one wall and a recorded trajectory. The first call includes",
-        "the compilation, unless a scene above uses the same compiled program.",
+        "the compilation, unless a scene in a row above uses the same compiled program.",
         "",
         "| scene | first call | time per sample, 1,000 walls | one recorded simulation |",
         "|---|--:|--:|--:|",

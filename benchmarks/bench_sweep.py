@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
-"""Measure sweeps end to end: what they compute a second with one and two workers, what they take of memory and disk.
+"""Measure sweeps end to end: points per second with one and two workers, memory and disk space.
 
     PYTHONPATH=src python benchmarks/bench_sweep.py [--quick] [--json]
 
-Every run is the command line in a program of its own, results and checksums on the disk. Three figures are told apart:
+Every run is a new process of the command line that writes results and checksums to disk. Three rates are measured:
 
-- cold: from the start of the program to its end, imports and compilation included;
-- warm: between the first and the last finished chunk, which is what long sweeps run at;
-- in process: a second sweep in a program that has compiled everything, creation of the store included.
+- cold: from the start of the program to its end, including imports and compilation;
+- warm: between the first and the last finished chunk, which is the rate of long sweeps;
+- in process: a second sweep in a process that has compiled everything, including the creation of the store.
 
-Rates depend on what else the machine does: one and two workers take turns, the ratio is that of their medians, and the
-load before and after stands beside them. The points a second of processor time hardly depend on it.
+Rates depend on the load of the machine: runs with one and two workers alternate, ratios are ratios of medians, and the
+load before and after is listed. The points per second of CPU time hardly depend on the load.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-# Large enough for some hundred chunks a worker; 25 times configs/dense.yaml.
+# About a hundred chunks per worker; 25 times configs/dense.yaml.
 STABLE = """\
 version: 1
 name: stable
@@ -57,7 +57,7 @@ studies:
     outputs: [spectral_radius]
 """
 
-# Runs a configuration twice in one program; prints the seconds of both.
+# Runs a configuration twice in one process and prints the time of both runs in s.
 TWICE = """
 import shutil, sys, time
 import zwidth
@@ -72,9 +72,9 @@ for number in range(int(sys.argv[3])):
 
 
 def run(config: Path, out: Path, workers: int) -> dict[str, float]:
-    """One run of the command line: rates, processor time, and the largest resident memory of any of its processes.
+    """Return rates, CPU time and the largest resident memory of any process for one run of the command line.
 
-    A worker gets one processor: alone it would otherwise use the others as well, and two could not be faster.
+    Each worker is limited to one processor, since a single worker would otherwise use all of them.
     """
     words = [sys.executable, "-m", "zwidth", "run", str(config), "--out", str(out), "--workers", str(workers)]
     available = sorted(os.sched_getaffinity(0))[:workers]
@@ -104,7 +104,7 @@ def run(config: Path, out: Path, workers: int) -> dict[str, float]:
     tasks = list(store.plan.tasks())
     ends = sorted((store.status_file(task).stat().st_mtime_ns, task.points) for task in tasks)
     points = sum(number for _, number in ends)
-    # Each worker's first chunk pays for its start.
+    # The first chunk of each worker includes its start-up.
     first, last = ends[workers - 1][0], ends[-1][0]
     warm = sum(number for _, number in ends[workers:])
     times, seconds_used = zip(*spent, strict=True)
@@ -123,7 +123,7 @@ def run(config: Path, out: Path, workers: int) -> dict[str, float]:
 
 
 def family(pid: int) -> list[int]:
-    """A process and its children."""
+    """Return the IDs of a process and its children."""
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()
     except OSError:
@@ -132,7 +132,7 @@ def family(pid: int) -> list[int]:
 
 
 def processor_seconds(pid: int) -> float:
-    """Processor time that a process has used."""
+    """Return the CPU time of a process in s."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
     except OSError:
@@ -141,7 +141,7 @@ def processor_seconds(pid: int) -> float:
 
 
 def resident(pid: int) -> int:
-    """Bytes of memory that a process has had at most."""
+    """Return the peak resident memory of a process in bytes."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace").splitlines()
     except OSError:
@@ -150,7 +150,7 @@ def resident(pid: int) -> int:
 
 
 def by_turns(text: str, folder: Path, rounds: int) -> dict[str, Any]:
-    """One and two workers by turns."""
+    """Return medians of alternating runs with one and two workers."""
     config = folder / "config.yaml"
     config.write_text(text, encoding="utf-8")
     found: dict[int, list[dict[str, float]]] = {1: [], 2: []}
@@ -166,12 +166,12 @@ def by_turns(text: str, folder: Path, rounds: int) -> dict[str, Any]:
     one, two = (medians[f"workers_{workers}"] for workers in (1, 2))
     ratio = two["warm_points_per_second"] / one["warm_points_per_second"]
     kept = two["warm_points_per_processor_second"] / one["warm_points_per_processor_second"]
-    # The second is what a machine allows that does nothing else.
+    # The second ratio is the speedup expected on an otherwise idle machine.
     return {**medians, "two_over_one": ratio, "two_over_one_by_processor_time": 2.0 * kept}
 
 
 def in_process(text: str, folder: Path, points: int) -> dict[str, float]:
-    """The same sweep a few times in one program."""
+    """Return rates of repeated sweeps in one process."""
     config = folder / "config.yaml"
     config.write_text(text, encoding="utf-8")
     result = subprocess.run(

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Measure what each trick of `core.xp` gains: the same work with it and without, in turns, in one process.
+"""Measure the speedup by each optimization of `core.xp`: alternating runs with and without it, in one process.
 
     python benchmarks/bench_xla.py [--points 65536] [--runs 15] [--only TEXT]
 
-A line gives the time without over the time with, to compile and to run (the best of all runs): above 1 the trick gains.
+Each line is the time without divided by the time with the optimization, to compile and to run (minimum of all runs).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Make = Callable[[], Callable[..., Any]]
 
 
 def compile_and_run(makes: list[Make], columns: tuple[Any, ...], runs: int) -> list[tuple[float, float]]:
-    """Seconds to the first result and of the fastest run, for each of several ways."""
+    """Return the times to the first result and of the fastest run in s, for each variant."""
     functions: list[Callable[..., Any]] = []
 
     def begin(make: Make) -> None:
@@ -47,7 +47,7 @@ def compile_and_run(makes: list[Make], columns: tuple[Any, ...], runs: int) -> l
 
 
 def compiled(kernel: Callable[..., Any], options: dict[str, Any] | None = None, **instead: Any) -> Make:
-    """A kernel compiled anew, with other text for some names of its modules (``module__name``)."""
+    """Return a maker of a compiled kernel in which some names of modules (``module__name``) are replaced."""
 
     def make() -> Callable[..., Any]:
         function = jax.jit(lambda *columns: kernel(*columns), compiler_options=options)
@@ -63,7 +63,7 @@ def compiled(kernel: Callable[..., Any], options: dict[str, Any] | None = None, 
 
 @contextmanager
 def replaced(names: dict[str, Any]) -> Iterator[None]:
-    """Other functions in place of those of a module, while something is traced."""
+    """Replace functions of modules temporarily, while a kernel is traced."""
     modules = {"crossover": crossover, "newton": ridge_newton}
     modules |= {"circle": circle, "radius": radius, "step": pole_step}
     patches = [patch.object(modules[name.split("__")[0]], name.split("__")[1], value) for name, value in names.items()]
@@ -93,7 +93,7 @@ def their_half_turn(x: Any, xp: Any) -> Any:
 
 
 def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple[Any, ...]]]:
-    """What is measured: a name, the way with the trick, the way without, and the arguments."""
+    """Yield the measurements: name, variant with the optimization, variant without, and arguments."""
     alpha, beta, delta, d = columns
 
     def stable(*walls: Any) -> Any:
@@ -126,12 +126,12 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
 
 
 def in_blocks(function: Callable[..., Any], size: int) -> Make:
-    """A compiled function applied to blocks of one size, on one processor."""
+    """Return a maker of a compiled function that is applied to blocks of one size, on one processor."""
     return lambda: lambda *columns: blocks.map_blocks(function, list(columns), size, 1)
 
 
 def slopes() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The first gradient outside `jit`, by the rule of `numerics.evaluate` and by JAX alone."""
+    """Return the gradient outside `jit` by the rule of `numerics.evaluate`, and by JAX alone."""
     by_rule = evaluate.compile_traced.__wrapped__(ridge.ridge_kernel, (ANY,))
     alone = jax.jit(lambda *columns: ridge.ridge_kernel(*columns, ANY))  # pyright: ignore
     return tuple(jax.grad(lambda *c, f=f: f(*c).alpha.sum(), argnums=(0, 1)) for f in (by_rule, alone))  # type: ignore

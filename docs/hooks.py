@@ -1,4 +1,4 @@
-"""What the site does beyond mkdocs: names become links, formulas MathML, and examples in docstrings code."""
+"""Extend mkdocs: turn names into links, formulas into MathML, and examples in docstrings into code."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 
 import griffe
 
-# Names that are links already, or of modules, are left alone.
+# Names outside of links; names of modules have no entry in the reference.
 _NAME = re.compile(r'(?<!">)<code>(zwidth\.[\w.]+)</code>')
 
 
-# Formulas in the theory's pages stand as indented lines, as they are typed; columns are aligned by runs of spaces.
-# Code in such a block would be colored, by elements of its own.
+# Formulas on the theory pages are indented lines of plain text; runs of spaces align columns. Blocks of code differ,
+# because highlighting adds elements to them.
 _BLOCK = re.compile(r'<div class="highlight"><pre><span></span><code>([^<]*)</code></pre></div>')
 _COLUMN = re.compile(r"\S+(?: {1,2}\S+)*")
 _TOKEN = re.compile(
@@ -23,9 +23,9 @@ _TOKEN = re.compile(
 # Lines of output that start with #, which Pygments highlights as a root prompt.
 _COMMENT = re.compile(r'^<span class="gp"># ?</span>(.*)$', re.MULTILINE)
 _TAG = re.compile(r"<[^>]*>")
-# Brackets of one size: taller ones would part the lines.
+# Brackets keep their size, because taller brackets would increase the line spacing.
 _FLAT = ' stretchy="false"'
-# Signs that stand as near to their neighbors as they are typed.
+# Signs without additional space around them.
 _CLOSE = f'{_FLAT} lspace="0" rspace="0"'
 _GREEK = {
     **{"alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "zeta": "ζ", "eta": "η", "theta": "θ", "kappa": "κ"},
@@ -70,14 +70,14 @@ _UPRIGHT = frozenset(
 
 
 def typeset(line: str) -> str:
-    """A typed formula as MathML: powers, indices, roots and Greek letters; words stay words."""
+    """Return a formula as MathML, with powers, indices, roots and Greek letters; words remain text."""
     tokens = [(match.lastgroup or "", match.group()) for match in _TOKEN.finditer(line)]
     shown, rest = _row(tokens, 0, "")
     return f"<math>{shown}</math>" if rest == len(tokens) else f"<code>{html.escape(line)}</code>"
 
 
 def _row(tokens: list[tuple[str, str]], at: int, until: str) -> tuple[str, int]:
-    """What stands up to a closing sign, and the place behind it."""
+    """Return the MathML of the tokens up to the sign ``until``, and the index of the token after it."""
     parts: list[str] = []
     while at < len(tokens) and tokens[at][1] != until:
         shown, at = _atom(tokens, at)
@@ -92,10 +92,13 @@ def _row(tokens: list[tuple[str, str]], at: int, until: str) -> tuple[str, int]:
 
 
 def _atom(tokens: list[tuple[str, str]], at: int, bare: bool = False) -> tuple[str, int]:
-    """One name, number, sign or group from here, and the place behind it; a ``bare`` group is without parentheses."""
+    """Return the MathML of one name, number, sign or group, and the index of the next token.
+
+    A ``bare`` group has no parentheses.
+    """
     kind, text = tokens[at]
     if kind == "space":
-        # Wide gaps part formulas on one line; others keep signs one below the other as they are typed.
+        # Wide gaps separate formulas on one line; narrow gaps keep the alignment of signs in columns.
         parts = len(text) > 1 and tokens[at - 1][1] == ","
         return f'<mspace width="{"2em" if parts else "0.2em"}"/>', at + 1
     if kind == "number":
@@ -118,7 +121,7 @@ def _atom(tokens: list[tuple[str, str]], at: int, bare: bool = False) -> tuple[s
 
 
 def _name(text: str) -> str:
-    """A quantity with its index and primes, an operator, or a word."""
+    """Return the MathML of a quantity with its index and primes, of an operator, or of a word."""
     base, _, index = text.rstrip("'").partition("_")
     primes = text[len(text.rstrip("'")) :]
     stem = base.rstrip("0123456789")
@@ -139,7 +142,7 @@ def _name(text: str) -> str:
 
 
 def _lay(block: re.Match[str]) -> str:
-    """Typed lines as a grid of formulas, their columns where they were."""
+    """Return lines of formulas as a grid that keeps their columns."""
     lines = [html.unescape(line) for line in block[1].rstrip("\n").split("\n")]
     pieces = [[(piece.start(), piece.group()) for piece in _COLUMN.finditer(line)] for line in lines]
     starts = sorted({start for line in pieces for start, _ in line})
@@ -158,7 +161,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Link `zwidth.name` to its place in the reference, if it has one, and typeset the formulas of the theory."""
+    """Link `zwidth.name` to its entry in the reference, if it has one, and typeset the formulas of the theory."""
     if page.file.src_uri.startswith("theory/"):
         html = _BLOCK.sub(_lay, html)
     html = _COMMENT.sub(lambda line: f'<span class="go"># {_TAG.sub("", line[1])}</span>', html)
@@ -166,12 +169,12 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
 
 
 class Docstrings(griffe.Extension):
-    """Says in Markdown what the docstrings say in plain text."""
+    """Convert docstrings from plain text to Markdown."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Name sections as mkdocstrings does and types once, and keep "> 0" at the start of a line from quoting it."""
+        """Rename sections to the names of mkdocstrings, omit repeated types, and escape ">" at the start of a line."""
         if obj.docstring:
             text = re.sub(r"^( *)Example:$", r"\1Examples:", obj.docstring.value, flags=re.MULTILINE)
-            # The signature says which type is returned.
+            # The signature contains the type of the result.
             text = re.sub(r"^( *Returns:\n +)[A-Z]\w+: ", r"\1", text, flags=re.MULTILINE)
             obj.docstring.value = re.sub(r"^( *)>(?!>)", r"\1\\>", text, flags=re.MULTILINE)

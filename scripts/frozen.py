@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Hold answers still while code moves: what every function, command and configuration says, kept and compared.
+"""Regression check: save the results of all functions, commands and configurations, and compare two such files.
 
     .venv/bin/python scripts/frozen.py keep FILE.npz [PART...]     PARTS: functions scenes commands configurations
-    .venv/bin/python scripts/frozen.py compare OLD.npz NEW.npz     lists what differs, and by how much; exit 1 where any
+    .venv/bin/python scripts/frozen.py compare OLD.npz NEW.npz     lists the differences; exit code 1 if there are any
 
-Inputs are random and fixed. Keep before a change and after it, on one machine: bits differ between processors. Of a
-configuration every data file counts by its SHA-256 (pictures, times and machine names do not).
+Inputs are random with fixed seeds. Run "keep" before and after a change on the same machine, since rounding differs
+between processors. For configurations, the SHA-256 of every data file is saved, except for figures and files with
+times and machine names.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ sys.path[:0] = [str(ROOT / "tests" / folder) for folder in ("support", "oracles"
 Answers = Iterator[tuple[str, np.ndarray]]
 
 _WALLS, _SCENES = 4000, 10
-# Written anew by each run.
+# These files differ between runs.
 _TIMES = ("run.json", "versions.json", "zarr.json", "zwidth.json")
 _PICTURES = (".png", ".svg", ".pdf", ".html")
 
 
 def flatten(name: str, value: Any) -> Answers:
-    """Every number and text of an answer under a name of its own."""
+    """Yield every number and text of a result with a unique name."""
     if hasattr(value, "_asdict"):
         value = value._asdict()
     elif hasattr(value, "as_dict"):
@@ -59,7 +60,7 @@ def flatten(name: str, value: Any) -> Answers:
 
 
 def ask(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Answers:
-    """What a function answers, or the words with which it refuses."""
+    """Yield the results of a function, or the error that it raises."""
     try:
         yield from flatten(name, function(*arguments, **options))
     except (zwidth.ZwidthError, ArithmeticError) as error:
@@ -67,7 +68,7 @@ def ask(name: str, function: Callable[..., Any], *arguments: Any, **options: Any
 
 
 def functions() -> Answers:
-    """Every function of normalized and of SI arrays, for few walls (NumPy), many (compiled), one and traced."""
+    """Yield results of all array functions for single walls, few walls (NumPy), many walls (compiled) and traced."""
     random = np.random.default_rng(1)
     delta = np.where(random.random(_WALLS) < 0.1, 0.0, 10.0 ** random.uniform(-6, 4, _WALLS))
     d = random.choice([0.0, 0.3, 1.0, 1.6, 2.0, 4.0, 8.0, 50.0, 137.5], _WALLS)
@@ -110,7 +111,7 @@ def functions() -> Answers:
 
 
 def scenes() -> Answers:
-    """Every question of scenes of every kind."""
+    """Yield results of all methods of scenes of every kind."""
     import any_loop
 
     random = np.random.default_rng(2)
@@ -146,8 +147,10 @@ def scenes() -> Answers:
 
 
 def simulate(scene: zwidth.Scene, stiffness: np.ndarray, damping: np.ndarray) -> dict[str, Any]:
-    """The figures of a motion, and where it ends."""
-    motion = scene.simulate(stiffness, damping, start_velocity=0.1, push=1.0, contact="unilateral", periods=300)
+    """Return the amplitude, outcome and final position of a simulation."""
+    motion = scene.simulate(
+        stiffness, damping, start_velocity=0.1, external_force=1.0, contact="unilateral", periods=300
+    )
     return {"end": motion.position[..., -1], "amplitude": motion.amplitude, "outcome": motion.outcome}
 
 
@@ -163,7 +166,7 @@ _PARTS = {
 
 
 def commands() -> Answers:
-    """Every command that prints JSON, and what it prints for a person."""
+    """Yield the JSON and text output of every command that prints JSON."""
     for name, parts in _PARTS.items():
         yield from run_command(f"check, {name}", "check", *_DEVICE, *_WALL, *parts)
         yield from run_command(f"ridge, {name}", "ridge", *_DEVICE, *parts)
@@ -173,7 +176,7 @@ def commands() -> Answers:
 
 
 def run_command(name: str, *arguments: str) -> Answers:
-    """A command's output, with --json and without."""
+    """Yield the output of a command with and without --json."""
     told = CliRunner().invoke(cli, [*arguments, "--json"])
     yield f"{name}.exit", np.array(told.exit_code)
     if told.exit_code == 0:
@@ -182,7 +185,7 @@ def run_command(name: str, *arguments: str) -> Answers:
 
 
 def configurations() -> Answers:
-    """Every shipped configuration: the SHA-256 of each of its data files."""
+    """Yield the SHA-256 of every data file that the shipped configurations write."""
     for path in sorted((ROOT / "configs").glob("*.yaml")):
         folder = Path(tempfile.mkdtemp())
         try:
@@ -205,16 +208,16 @@ PARTS = {part.__name__: part for part in (functions, scenes, commands, configura
 
 
 def keep(target: Path, parts: list[str]) -> None:
-    """Ask everything once and write it."""
+    """Compute all results once and save them."""
     answers = {f"{part}/{name}": value for part in parts or PARTS for name, value in PARTS[part]()}
-    # A slash would make folders of the archive.
+    # Names contain slashes, which would become folders in the archive.
     values = {str(k): v for k, v in enumerate(answers.values())}
     np.savez_compressed(target, allow_pickle=False, names=np.array(list(answers)), **values)
     print(f"{len(answers)} answers in {target}")
 
 
 def compare(old: Path, new: Path) -> bool:
-    """Print what differs between two files; whether nothing does."""
+    """Print the differences between two files; return True if there are none."""
     first, second = (read(path) for path in (old, new))
     same = True
     for name in sorted(first.keys() | second.keys()):

@@ -1,16 +1,15 @@
 #!/usr/bin/env python3
-"""Kill runs at random moments, resume them, and compare what they leave with an undisturbed run, value for value.
+"""Kill runs at random moments, resume them, and compare their results with those of an undisturbed run, bit for bit.
 
     PYTHONPATH=src .venv/bin/python scripts/kill_and_resume.py --kills 50 --json
 
-Two victims, each killed with SIGKILL ``--kills`` times, each time in a run of its own:
+Two kinds of processes are killed with SIGKILL, ``--kills`` times each, every time in a new run:
 
-- the parent, in one process and with two workers by turns: the run is then resumed, and must complete;
-- a worker of two, while it computes: the run itself must replace it and complete.
+- the parent, alternately without workers and with two workers: the run is then resumed and must complete;
+- one of two workers while it computes: the run itself must replace it and complete.
 
-After each of them every value, coordinate and status must be that of the undisturbed run, every checksum right, and no
-file of a chunk that was marked as done before the kill may have been written again. Exit code 1
-where one of this fails.
+Afterwards all values, coordinates and status arrays must equal those of the undisturbed run, all checksums must be
+correct, and no file of a chunk that was marked as done before the kill may have been rewritten. Exit code 1 on failure.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ import numpy as np
 from zwidth.sweep.dataset import open_dataset, verify
 from zwidth.sweep.store import Store
 
-# Two families, numbers and truth values; a second or two of work in some thirty chunks.
+# Two families of functions, real and boolean outputs; about 2 s of work in some thirty chunks.
 CONFIG = """\
 version: 1
 name: killed
@@ -70,7 +69,7 @@ class Trial:
     """Runs of one configuration.
 
     Args:
-        folder: where their folders go.
+        folder: parent of the run folders.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -88,7 +87,7 @@ class Trial:
         self.chunks = len(marked_files(folder / "undisturbed"))
 
     def start(self, out: Path, *options: str) -> subprocess.Popen[str]:
-        """Start a run in a process group of its own."""
+        """Start a run in a new process group."""
         return subprocess.Popen(
             [sys.executable, "-m", "zwidth", "run", str(self.config), "--out", str(out), *options],
             stdout=subprocess.DEVNULL,
@@ -98,13 +97,13 @@ class Trial:
         )
 
     def finish(self, process: subprocess.Popen[str]) -> None:
-        """Wait for a run that must go well."""
+        """Wait for the end of a run that must succeed."""
         errors = process.communicate(timeout=LONGEST)[1]
         if process.returncode:
             raise SystemExit(f"a run that was to complete ended with exit code {process.returncode}:\n{errors}")
 
     def wait_for_the_moment(self, process: subprocess.Popen[str], out: Path, moments: random.Random) -> None:
-        """Some moment of a run; two thirds of them lie between its first chunk and its end."""
+        """Wait until a random moment; two thirds of the moments lie between the first chunk and the end."""
         if moments.random() < 1 / 3:
             time.sleep(moments.uniform(0.0, self.beginning))
             return
@@ -113,7 +112,7 @@ class Trial:
         time.sleep(moments.uniform(0.0, 2.0 * (self.seconds - self.beginning) / self.chunks))
 
     def check(self, out: Path, before: dict[Path, tuple[int, int]]) -> None:
-        """Compare a completed run with the undisturbed one, and its finished chunks with those before the kill."""
+        """Check a completed run against the undisturbed run, and its finished chunks against those before the kill."""
         if contents(out) != self.reference:
             raise SystemExit(f"{out}: not the values of the undisturbed run")
         if not all(store.ok for store in verify(out)):
@@ -125,7 +124,7 @@ class Trial:
 
 
 def wait_for(condition: Callable[[], object]) -> None:
-    """Wait until something holds."""
+    """Wait until a condition holds."""
     deadline = time.monotonic() + LONGEST
     while not condition():
         if time.monotonic() > deadline:
@@ -134,13 +133,13 @@ def wait_for(condition: Callable[[], object]) -> None:
 
 
 def chunks_done(out: Path) -> int:
-    """How many chunks are marked as done."""
+    """Return the number of chunks that are marked as done."""
     files = [f"{top}/{file}" for top, _, files in os.walk(out) for file in files]
     return sum(bool(re.search(r"status/c(/\d+)*$", file)) for file in files)
 
 
 def marked_files(out: Path, *, flat: bool = False) -> dict:
-    """The files of all chunks that are marked as done, each with what would change if it were written again."""
+    """Return the files of all chunks marked as done, with inode and modification time, which rewriting would change."""
     found = {}
     for path in sorted(out.glob("*.zarr")):
         store = Store(path)
@@ -152,7 +151,7 @@ def marked_files(out: Path, *, flat: bool = False) -> dict:
 
 
 def contents(out: Path) -> dict[tuple[str, str], tuple[str, bytes]]:
-    """Every variable and coordinate of all stores, as bytes."""
+    """Return every variable and coordinate of all stores as bytes."""
     found = {}
     for path in sorted(out.glob("*.zarr")):
         with open_dataset(path) as data:
@@ -163,14 +162,14 @@ def contents(out: Path) -> dict[tuple[str, str], tuple[str, bytes]]:
 
 
 def children_of(pid: int) -> list[int]:
-    """The workers of a run: its child processes that multiprocessing spawned to compute."""
+    """Return the workers of a run: the child processes spawned by multiprocessing."""
     found = []
     for status in Path("/proc").glob("[0-9]*/status"):
         try:
             lines = dict(line.split(":\t", 1) for line in status.read_text().splitlines() if ":\t" in line)
             command = (status.parent / "cmdline").read_bytes()
         except (OSError, ValueError):
-            # It has ended in the meantime.
+            # The process has ended meanwhile.
             continue
         if int(lines["PPid"]) == pid and b"spawn_main" in command:
             found.append(int(lines["Pid"]))
@@ -178,7 +177,7 @@ def children_of(pid: int) -> list[int]:
 
 
 def kill_parent(trial: Trial, number: int, moments: random.Random) -> bool:
-    """Kill a run and resume it; False where it had ended before."""
+    """Kill a run and resume it; return False if it had already ended."""
     out = trial.folder / f"parent_{number}"
     options = ["--workers", "2"] if number % 2 else []
     process = trial.start(out, *options)
@@ -188,7 +187,7 @@ def kill_parent(trial: Trial, number: int, moments: random.Random) -> bool:
         return False
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
-    # Its workers notice by themselves; what they have finished until then counts.
+    # The workers end by themselves; chunks that they have finished until then count as done.
     wait_for(lambda: not group_lives(process.pid))
     before = marked_files(out, flat=True)
     trial.outcomes[stage(trial, out)] += 1
@@ -198,7 +197,7 @@ def kill_parent(trial: Trial, number: int, moments: random.Random) -> bool:
 
 
 def kill_worker(trial: Trial, number: int, moments: random.Random) -> bool:
-    """Kill a worker of a run, which then completes by itself; False where there was none to kill."""
+    """Kill a worker of a run, which must still complete; return False if there was no worker to kill."""
     out = trial.folder / f"worker_{number}"
     process = trial.start(out, "--workers", "2")
     trial.wait_for_the_moment(process, out, moments)
@@ -220,7 +219,7 @@ def kill_worker(trial: Trial, number: int, moments: random.Random) -> bool:
 
 
 def group_lives(group: int) -> bool:
-    """Whether a process group has a member left."""
+    """Return True if a process group still has members."""
     try:
         os.killpg(group, 0)
     except ProcessLookupError:
@@ -229,7 +228,7 @@ def group_lives(group: int) -> bool:
 
 
 def stage(trial: Trial, out: Path) -> str:
-    """How far a run was."""
+    """Return the stage that a run has reached."""
     done = chunks_done(out)
     if not any(out.glob("*.zarr")):
         return "before its first store"
@@ -237,7 +236,7 @@ def stage(trial: Trial, out: Path) -> str:
 
 
 def main() -> None:
-    """Kill, resume, compare, and tell."""
+    """Kill, resume, compare and report."""
     parser = argparse.ArgumentParser(description="Kill runs at random moments, resume and compare them.")
     parser.add_argument("--kills", type=int, default=50, help="of the parent, and as many of a worker [50]")
     parser.add_argument("--victim", choices=("parent", "worker"), help="one of the two only")

@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Write configs/arm.csv, the poses of configs/arm.yaml: mass and damping at the handle of a two-link arm.
+"""Write configs/arm.csv for configs/arm.yaml: effective mass and damping at the handle of a two-link arm per pose.
 
-Two links of equal length with a motor and a viscous bearing at each joint; the handle is at the end of the second, and
-the wall stands across x. With the joint inertia M(q) and the Jacobian J(q), a force at the handle along u meets the
-mass 1/(u^T J M^-1 J^T u) (Khatib 1987), and a damper of that mass squared times u^T J M^-1 C M^-1 J^T u.
+The arm has two links of equal length with a motor and a viscous bearing at each joint; the handle is at the end of the
+second link, and the wall is normal to x. With the joint inertia M(q), the joint damping C and the Jacobian J(q), the
+effective mass at the handle along u is 1/(u^T J M^-1 J^T u) (Khatib 1987), and the effective damping is the square of
+this mass times u^T J M^-1 C M^-1 J^T u.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ SHOULDERS, ELBOWS = np.linspace(0.0, 120.0, 25), np.linspace(30.0, 150.0, 25)  #
 
 
 def find_handle(shoulder: float, elbow: float) -> tuple[float, float]:
-    """Mass in kg and damping in N s/m at the handle across x, of one pose in rad."""
+    """Return effective mass in kg and damping in N s/m at the handle along x for a pose in rad."""
     both = shoulder + elbow
     across = -LENGTH * np.array([np.sin(shoulder) + np.sin(both), np.sin(both)])
     own, cross = LINK * LENGTH**2 / 3, LINK * LENGTH**2 / 2 * np.cos(elbow)
@@ -29,8 +30,8 @@ def find_handle(shoulder: float, elbow: float) -> tuple[float, float]:
 
 
 def make_table() -> str:
-    """The text of the file."""
-    lines = ["# Written by scripts/make_arm.py: a two-link arm, what a wall across x meets at its handle.",
+    """Return the text of the file."""
+    lines = ["# Written by scripts/make_arm.py: mass and damping at the handle, for a wall perpendicular to x.",
              "shoulder [deg],elbow [deg],mass [g],damping [N s/m]"]  # fmt: skip
     for elbow in ELBOWS:
         for shoulder in SHOULDERS:

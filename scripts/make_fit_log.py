@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Simulate the records that configs/fit.yaml is fitted to: writes configs/fit_log.csv, prints walls that buzz.
+"""Simulate the data fitted by configs/fit.yaml: write configs/fit_log.csv and print walls at the onset of instability.
 
-A light device with dry friction is pushed to and fro by steps of random length, at 1 kHz. The force acts 2.3 ms after
-it was commanded, no whole number of periods: the motion is simulated at a rate 10 times higher, and every 10th position
-is read by the encoder. The walls are on the device's boundary, without its friction, each stiffness and frequency off
-by some 2 %.
+A light device with dry friction is pushed back and forth by force steps of random length, at 1 kHz. The force is
+delayed by 2.3 ms, which is not an integer number of periods: the motion is simulated at a 10 times higher rate, and the
+encoder reads every 10th position. The walls lie on the stability boundary of the device without friction, with errors
+of about 2 % in stiffness and frequency.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ HOLDS = (30, 90)  # shortest and longest step, in samples
 
 
 def command() -> np.ndarray:
-    """Forces to and fro, each held for a random time, so that the device is back where it was after two of them."""
+    """Return double steps of force with random duration and amplitude, each of which leaves the device at rest."""
     rng = np.random.default_rng(2006)
     parts: list[np.ndarray] = []
     while sum(part.size for part in parts) < SAMPLES:
         hold = int(rng.integers(*HOLDS))
-        # A double step: the second half takes the velocity of the first one back.
+        # A double step: the second half cancels the velocity of the first half.
         parts.append(FORCE * rng.uniform(0.5, 1.0) * np.repeat([1.0, -1.0, -1.0, 1.0], hold // 2))
     return np.concatenate(parts)[:SAMPLES].round(2)
 
 
 def move(force: np.ndarray) -> np.ndarray:
-    """Counts of the encoder."""
+    """Return the encoder counts for a commanded force."""
     late = np.repeat(force, FINER)
     late = np.concatenate([np.zeros(round(DELAY / PERIOD * FINER)), late])[: late.size]
     scene = zwidth.Scene(zwidth.Device(MASS, DAMPING), zwidth.Timing(period=PERIOD / FINER))
-    options = {"coulomb": FRICTION, "resolution": RESOLUTION, "push_history": late, "periods": late.size}
+    options = {"coulomb": FRICTION, "resolution": RESOLUTION, "external_force_history": late, "periods": late.size}
     measured = zwidth.simulate(scene, 0.0, 0.0, **options).measured
     assert measured is not None, "it is recorded"
     return np.round(measured[::FINER][:SAMPLES] / RESOLUTION).astype(int)
 
 
 def make_log() -> str:
-    """The text of the file."""
+    """Return the text of the file."""
     force = command()
     lines = ["# Simulated by scripts/make_fit_log.py: free motion of a device under forces of a program.",
              f"# One count of the encoder is {1e3 * RESOLUTION:g} mm.",
@@ -56,7 +56,7 @@ def make_log() -> str:
 
 
 def list_walls() -> list[tuple[float, float, float]]:
-    """Stiffness in N/m, virtual damping in N s/m and frequency in Hz of walls at the onset of buzzing."""
+    """Return stiffness in N/m, virtual damping in N s/m and frequency in Hz of walls at the onset of instability."""
     rate = MASS / PERIOD
     edge = zwidth.boundary_point(DAMPING / rate, DELAY / PERIOD, beta=np.array(DAMPINGS) / rate)
     off = 1.0 + NOISE * np.random.default_rng(2006).standard_normal((2, len(DAMPINGS)))

@@ -80,7 +80,8 @@ def list_configuration() -> str:
         parts += _describe_model(name, models)
     for kind, name in studies.items():
         model = models[name]
-        parts += [f"## kind: {kind}", _join_lines(model["description"]), _describe_keys(model, models)]
+        description = re.sub("^The ", "the ", _join_lines(model["description"]))
+        parts += [f"## kind: {kind}", f"This study computes {description}", _describe_keys(model, models)]
         if kind in examples:
             file, study = examples[kind]
             text = yaml.safe_dump([study], sort_keys=False, allow_unicode=True, width=100).strip()
@@ -171,7 +172,8 @@ def list_units() -> str:
             units = ", ".join(f"`{unit}`" for unit in dimension.units)
             lines.append(f"| {dimension.base} | {units} | `{dimension.example}` |")
     words = ", ".join(f"`{word}`" for word in PERIOD_WORDS), ", ".join(f"`{word}`" for word in COUNTS)
-    return "\n".join(lines) + f"\n\nDelays can also be given in {words[0]}, encoder positions in {words[1]}."
+    text = f"Delays can also be given in {words[0]}. Encoder positions can also be given in {words[1]}."
+    return "\n".join([*lines, "", text])
 
 
 def list_statuses() -> str:

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Write into the pages of docs/ what their examples print, draw and include, so that nothing there is typed by hand.
+"""Update the output, figures and included files in the pages of docs/ by running the examples of each page.
 
-A page is run from top to bottom in a folder of its own, which has the project's configs/ and scripts/ and the files of
-docs/guides/files. Each command of a ``console`` block and each ``>>>`` of a ``python`` block is followed by what it
-prints. A figure that the page shows from docs/figures/guides is the file of that name that the page has written.
-Between ``<!-- include: WHAT -->`` and ``<!-- end -->`` stands a file of the project, a section of one (FILE#HEADING),
-the gallery or the table of the paper's numbers. ``--check`` changes nothing and fails where a page is out of date.
+A page runs from top to bottom in a temporary folder that contains the project's configs/ and scripts/ and the files of
+docs/guides/files. The output of each command in a ``console`` block and of each ``>>>`` in a ``python`` block is
+written below it. Figures in docs/figures/guides are the files of the same name written by the page. The text between
+``<!-- include: WHAT -->`` and ``<!-- end -->`` is a file of the project, a section of a file (FILE#HEADING), the
+gallery or the table of the paper's values. ``--check`` changes nothing and fails if a page is out of date.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _LANGUAGES = {".py": "python", ".txt": "text", ".yaml": "yaml"}
 
 
 def pages() -> list[Path]:
-    """Every page of the site."""
+    """Return all pages of the site."""
     return sorted(DOCS.rglob("*.md"))
 
 
 def refreshed(text: str, figures: Path | None = None) -> str:
-    """The text of a page with what its blocks print; what it draws goes to the folder ``figures``."""
+    """Return the text of a page with current output; copy its figures to the folder ``figures``."""
     names: dict[str, Any] = {"__name__": "__main__"}
 
     def fill(part: re.Match[str]) -> str:
@@ -70,7 +70,7 @@ def refreshed(text: str, figures: Path | None = None) -> str:
 
 
 def run_python(block: str, names: dict[str, Any]) -> str:
-    """The block with the output of each of its examples; without prompts it must be Python, and is not run."""
+    """Return a block with the output of its examples; a block without prompts is compiled but not run."""
     parts = doctest.DocTestParser().parse(block)
     if len(parts) == 1:
         compile(block, "<page>", "exec")
@@ -87,7 +87,7 @@ def _show(example: doctest.Example, names: dict[str, Any]) -> str:
 
 
 def include(what: str) -> str:
-    """What stands between the two marks."""
+    """Return the text between the two include comments."""
     if what in MADE:
         return MADE[what]()
     name, _, heading = what.partition("#")
@@ -102,7 +102,7 @@ def include(what: str) -> str:
 
 
 def list_gallery() -> str:
-    """Every configuration with its figures, which scripts/refresh_figures.py draws, and its text."""
+    """Return the gallery: all configurations with their text and the figures drawn by scripts/refresh_figures.py."""
     return "\n\n".join(_show_configuration(path) for path in sorted((ROOT / "configs").glob("*.yaml")))
 
 
@@ -115,11 +115,11 @@ def _show_configuration(path: Path) -> str:
         raise SystemExit(f"{path.name}: has no figures; run scripts/refresh_figures.py {path.stem}")
     shown = []
     for picture in pictures:
-        # The longest name that a figure's begins with is that of its study.
+        # The study of a figure has the longest name with which the file name begins.
         study = max((name for name in kinds if picture.stem.startswith(name)), key=len)
         shown += [
             f"![{path.stem}: {picture.stem}](figures/{path.stem}/{picture.name})",
-            f"*`{picture.stem}`, of the study `{study}` (`kind: {kinds[study]}`)*",
+            f"*Figure `{picture.stem}` of the study `{study}` (`kind: {kinds[study]}`)*",
         ]
     head = f"## {path.stem.replace('_', ' ')}" + (f"\n\n{config['description']}" if "description" in config else "")
     code = f"```yaml\n{text.strip()}\n```"
@@ -130,7 +130,7 @@ def _show_configuration(path: Path) -> str:
 
 
 def compare_paper() -> str:
-    """The tables that a run of configs/paper.yaml writes into published.md."""
+    """Return the tables that a run of configs/paper.yaml writes to published.md."""
     text = report.as_markdown(report.published_numbers(), report.sharpened_numbers())
     return text.partition("\n")[2].strip().replace("\n## ", "\n### ")
 
@@ -139,9 +139,9 @@ MADE = {"gallery": list_gallery, "published": compare_paper, **TABLES}
 
 
 def main() -> None:
-    """Refresh the pages, or check them."""
+    """Update or check the pages."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("pages", nargs="*", type=Path, help="all of them where left out")
+    parser.add_argument("pages", nargs="*", type=Path, help="default: all pages")
     parser.add_argument("--check", action="store_true", help="change nothing; fail where a page is out of date")
     options = parser.parse_args()
     stale = []

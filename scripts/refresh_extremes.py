@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write docs/extremes.md: which method holds where, measured against certified stability results."""
+"""Write docs/extremes.md: errors of each method in extreme cases, compared with certified stability results."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the comparison and write the page."""
     from methods import extremes
 
     (ROOT / "docs" / "extremes.md").write_text(extremes.report(), encoding="utf-8")

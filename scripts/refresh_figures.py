@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
-"""Draw the pictures of README.md and of the gallery anew: run every configuration, or those named.
+"""Redraw the figures of README.md and of the gallery: run all configurations, or those given by name.
 
-Every figure of a configuration goes to docs/figures/CONFIGURATION as PNG, with few colors so that it is small; those of
-README.md go to docs/figures as SVG. Afterwards scripts/refresh_docs.py puts new ones into docs/gallery.md.
+Figures of a configuration are written to docs/figures/CONFIGURATION as PNG files with a reduced palette to limit their
+size; figures of README.md are written to docs/figures as SVG. Run scripts/refresh_docs.py afterwards to update
+docs/gallery.md.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from zwidth.runs.draw import draw_stores
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "docs" / "figures"
 
-# configuration -> the figures that README.md shows
+# Figures shown in README.md, by configuration.
 SHOWN = {
     "paper": ("fig10", "passivity_cost"),
 }
-# Lines and shades of one figure, with their antialiasing; a color map takes most.
+# Palette size: enough for antialiased lines and for color maps, which need the most colors.
 COLORS = 192
 
 
 def draw(config: Path, out: Path) -> list[Path]:
-    """Run a configuration, or go on with it; returns its figures as PNG, each with an SVG beside it."""
+    """Run or resume a configuration and return its PNG figures; an SVG file lies next to each."""
     result = zwidth.run(config, out=out, resume=True)
     if not result.ok:
         raise SystemExit("\n".join(f"{study.name}: {study.error}" for study in result.failed))
@@ -40,9 +41,9 @@ def draw(config: Path, out: Path) -> list[Path]:
 
 
 def main() -> None:
-    """Run the configurations and copy what is shown of them."""
+    """Run the configurations and copy their figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("names", nargs="*", help="configurations without folder and ending; all where left out")
+    parser.add_argument("names", nargs="*", help="configurations without folder and suffix; default: all")
     parser.add_argument("--runs", type=Path, help="folder that keeps the runs, which go on where they are there")
     options = parser.parse_args()
     names = options.names or sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))

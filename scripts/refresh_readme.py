@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Write into README.md what its commands print, so that no output there is typed by hand.
+"""Update the command output in README.md by running its commands.
 
-In every block fenced as ``console``, each line that starts with ``$ zwidth`` or ``$ cat`` is run from the project's
-root and followed by its output. ``--check`` changes nothing and fails where README.md is out of date.
+In every ``console`` block, each line that starts with ``$ zwidth`` or ``$ cat`` is run in the project root and followed
+by its output. ``--check`` changes nothing and fails if README.md is out of date.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ _BLOCK = re.compile(r"^```console\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
 def output_of(command: str) -> str:
-    """What one command prints, without colors."""
+    """Return the output of a command without colors."""
     words = shlex.split(command)
     if words[0] == "cat":
         return "".join(Path(name).read_text(encoding="utf-8") for name in words[1:])
     if words[0] != "zwidth":
         raise SystemExit(f"{command!r} is neither zwidth nor cat")
-    # In this process, which has loaded what commands need.
+    # Run in this process, which avoids importing everything again.
     done = CliRunner(env={"NO_COLOR": "1", "COLUMNS": "100"}).invoke(cli, words[1:], prog_name="zwidth")
     if done.exit_code:
         raise subprocess.CalledProcessError(done.exit_code, command, done.output) from done.exception
@@ -38,19 +38,19 @@ def output_of(command: str) -> str:
 
 
 def show_commands(block: str) -> str:
-    """The commands of a console block, run in the current folder, each with its output."""
+    """Run the commands of a console block in the current folder and return them with their output."""
     commands = [line[2:] for line in block.splitlines() if line.startswith("$ ")]
     return "\n".join(f"$ {command}\n{output_of(command).rstrip()}\n" for command in commands)
 
 
 def refreshed(text: str) -> str:
-    """The text with the output of every command in its console blocks."""
+    """Return the text with current output of all commands in its console blocks."""
     with contextlib.chdir(ROOT):
         return _BLOCK.sub(lambda block: f"```console\n{show_commands(block.group(1))}```", text)
 
 
 def main() -> None:
-    """Refresh README.md, or check it."""
+    """Update or check README.md."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--check", action="store_true", help="change nothing; fail where README.md is out of date")
     check = parser.parse_args().check

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draw docs/figures/one_lobe.svg anew, the figure of docs/theory/one-lobe.md, from the formulas of that page."""
+"""Redraw docs/figures/one_lobe.svg, the figure of docs/theory/one-lobe.md, from the formulas on that page."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from zwidth.plotting import style
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "figures" / "one_lobe.svg"
 
-# (a): strong damping and no delay, where the line of z = -1 closes the stable set. (b): the device and its delays.
+# Panel (a): strong damping without delay, where the line of z = -1 bounds the stable set. Panel (b): device and delays.
 STRONG = 5.0
 DELTA, DELAYS = 1.0, (0.0, 0.5, 1.0, 2.0)
 TURNS = {0.25: r"$\theta = \pi/4$", 0.5: r"$\pi/2$", 0.75: r"$3\pi/4$"}
@@ -22,7 +22,7 @@ POINTS = 1201
 
 
 class Lobe:
-    """The boundary curve of L1 up to theta = pi, and the coordinates (w, m) of S16 inside."""
+    """Boundary curve of L1 up to theta = pi, and the coordinates (w, m) of S16 in its interior."""
 
     def __init__(self, delta: float, d: float) -> None:
         self.delta, self.n = delta, int(d)
@@ -34,14 +34,14 @@ class Lobe:
         self.alpha, self.beta = self.wall(self.w)
 
     def theta(self, w):
-        """The angle of L1, with the argument of M from its zeros, continuous in w."""
+        """Return the angle of L1, continuous in w, with the argument of M computed from its zeros."""
         a2, a1, a0 = self.m
         z, root = np.exp(1j * w), np.sqrt(a1**2 - 4 * a2 * a0)
         arg_m = -w + np.angle(z + (a1 + root) / (2 * a2)) + np.angle(z + 2 * a0 / (a1 + root))
         return (self.n + 1) * w + np.angle(z - self.c) - arg_m
 
     def wall(self, w, margin=0.0):
-        """(alpha, beta) with the crossover w and the phase margin m."""
+        """Return (alpha, beta) for the crossover w and the phase margin m."""
         a2, a1, a0 = self.m
         z = np.exp(1j * w)
         ratio = np.abs(z - self.c) / np.abs(a2 * z + a1 + a0 / z)
@@ -49,23 +49,23 @@ class Lobe:
         return 2 * np.tan(w / 2) * ratio * np.sin(phase), -ratio * np.cos(phase - w / 2) / np.cos(w / 2)
 
     def at(self, turn: float):
-        """The point of the lobe where theta is that share of pi."""
+        """Return the point of the lobe where theta is the given fraction of pi."""
         return self.wall(np.interp(turn * np.pi, self.theta(self.w), self.w))
 
     def outline(self):
-        """The border of the stable set from (0, -delta) to alpha = 0, along the lobe and the line of z = -1."""
+        """Return the boundary of the stable set from (0, -delta) to alpha = 0, along lobe and line of z = -1."""
         alpha, beta = np.append(0.0, self.alpha), np.append(-self.delta, self.beta)
         top = self.line() / 2 if self.w_end == np.pi else float(self.wall(self.w_end)[1])
         return np.append(alpha, 0.0), np.append(beta, top)
 
     def line(self) -> float:
-        """alpha + 2 beta on the line of z = -1 (n = 0)."""
+        """Return alpha + 2 beta on the line of z = -1 (n = 0)."""
         a2, a1, a0 = self.m
         return -2 * (1 + self.c) / (a1 - a2 - a0)
 
 
 def _numerator(delta: float, f: float) -> tuple[float, float, float]:
-    """a2, a1, a0 by S1: the means over the density e^(-delta t), by Gauss's rule on both sides of the kink."""
+    """Return a2, a1, a0 of S1: integrals with density e^(-delta t), by Gauss quadrature on both sides of the kink."""
     nodes, weights = np.polynomial.legendre.leggauss(40)
     late = 1.0 - f
     total = np.zeros(3)
@@ -97,7 +97,7 @@ def main() -> None:
 
 
 def _draw_coordinates(ax: Axes, lobe: Lobe) -> None:
-    """The stable set with its border, and lines of one crossover and of one margin inside."""
+    """Draw the stable set with its boundary, and lines of constant crossover and of constant phase margin."""
     ax.fill(*lobe.outline(), facecolor=style.BLUE, alpha=0.09, linewidth=0.0, zorder=1)
     for share in np.arange(0.1, 0.95, 0.1):
         w = share * np.pi
@@ -109,7 +109,7 @@ def _draw_coordinates(ax: Axes, lobe: Lobe) -> None:
     corner = (float(lobe.alpha[-1]), float(lobe.beta[-1]))
     top = lobe.line() / 2
     ax.plot([corner[0], 0.0], [corner[1], top], color=style.VERMILION, zorder=4)
-    # The line beyond the corner, where it bounds nothing.
+    # Extension of the line beyond the corner, where it is not part of the boundary.
     reach = corner[0] + 1.6
     ax.plot([reach, corner[0]], [(lobe.line() - reach) / 2, corner[1]], color=style.VERMILION, linestyle=style.DOTTED)
     ax.plot(*corner, "o", color=style.BLACK, markersize=4.0, zorder=6)
@@ -139,7 +139,7 @@ def _draw_coordinates(ax: Axes, lobe: Lobe) -> None:
 
 
 def _draw_delays(ax: Axes, lobes: list[Lobe]) -> None:
-    """The stable sets of one device for several delays, with theta along each lobe."""
+    """Draw the stable sets of one device for several delays, with values of theta along each lobe."""
     colors = style.ordered_colors(len(lobes))
     for lobe, d, color in zip(lobes, DELAYS, colors, strict=True):
         alpha, beta = lobe.outline()
@@ -159,7 +159,7 @@ def _draw_delays(ax: Axes, lobes: list[Lobe]) -> None:
 
 
 def _mark_turns(ax: Axes, lobe: Lobe, color, turns: dict[float, str]) -> None:
-    """Dots where theta is a share of pi."""
+    """Mark the points where theta is a given fraction of pi."""
     for turn, name in turns.items():
         place = lobe.at(turn)
         ax.plot(*place, "o", color=color, markersize=3.2, zorder=5)

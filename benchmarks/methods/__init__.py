@@ -1,1 +1,1 @@
-"""Measuring what each method costs and how wrong it can be, beside the tools people would use otherwise."""
+"""Measurement of speed and errors of each method, compared with common alternative tools."""

@@ -1,4 +1,4 @@
-"""The tools people would use otherwise, called as they would call them: spectral radii of walls."""
+"""Spectral radii of walls by common alternative tools, called as their users would call them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from zwidth.stability.rigid.poles import char_poly
 
 
 class Baseline(NamedTuple):
-    """A tool's function, and the largest batch that is worth its time at degree 4."""
+    """Function of a tool, and the largest batch that it computes in reasonable time at degree 4."""
 
     radius: Callable[[Walls], np.ndarray]
     points: int
@@ -29,7 +29,7 @@ def _coefficients(walls: Walls) -> np.ndarray:
 
 
 def companions(walls: Walls) -> np.ndarray:
-    """The companion matrices of every wall, of shape (points, degree, degree)."""
+    """Return the companion matrices of all walls, of shape (points, degree, degree)."""
     monic = _coefficients(walls)
     size = monic.shape[1] - 1
     matrices = np.zeros((monic.shape[0], size, size))
@@ -57,13 +57,13 @@ def _jax_eigvals(walls: Walls) -> np.ndarray:
 
 
 def _python_control(walls: Walls) -> np.ndarray:
-    """Discretize, close the loop, ask for the poles."""
+    """Return spectral radii by discretization and feedback in python-control."""
     control: Any = import_module("control")
     radii = []
     for alpha, beta, delta, d in zip(*walls.listed(), strict=True):
         device = control.ss([[0.0, 1.0], [0.0, -delta]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
         plant = control.c2d(device, 1.0, "zoh")
-        # (alpha z + beta (z - 1)) / z^(1 + d): the wall with its delay.
+        # Wall with delay: (alpha z + beta (z - 1)) / z^(1 + d).
         denominator = [1.0] + [0.0] * (1 + int(d))
         wall = control.tf2ss(control.tf([alpha + beta, -beta], denominator, 1.0))
         radii.append(np.abs(control.feedback(plant, wall).poles()).max())
@@ -71,7 +71,7 @@ def _python_control(walls: Walls) -> np.ndarray:
 
 
 def available() -> dict[str, Baseline]:
-    """Every baseline that is installed."""
+    """Return all installed baselines."""
     found = {
         "np.linalg.eigvals": Baseline(_numpy_eigvals, 20_000),
         "jnp.linalg.eigvals": Baseline(_jax_eigvals, 20_000),

@@ -1,4 +1,4 @@
-"""The one stopwatch of all benchmarks."""
+"""Timer of all benchmarks."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 
 def time_calls(call: Callable[[], Any], least: int, most: float = np.inf, seconds: float = 0.0) -> np.ndarray:
-    """Seconds of each call, by the clock and of the processor, in two rows.
+    """Return wall time and CPU time of each call in s, in two rows.
 
-    It is called ``least`` times at least, and then until it has taken as many ``seconds`` or ``most`` calls are made.
+    The function is called at least ``least`` times, then until ``seconds`` have passed or ``most`` calls are made.
     """
     spent: list[tuple[float, float]] = []
     total = 0.0

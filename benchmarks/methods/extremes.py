@@ -1,4 +1,4 @@
-"""The corners of the model: which method still tells stable from unstable there, judged by the certified one."""
+"""Errors of each stability method in extreme cases of the model, compared with certified results."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ DELTAS = (0.0, 5e-324, 1e-300, 1e-16, 1e-8, 1e-4, 1.0, 50.0, 700.0, 750.0, 1e4, 
 DELAYS = (0.0, 5e-324, 0.5, float(np.nextafter(1.0, 0.0)), 1.0, 8.0, 50.0, 500.0, 1e4, 1e5)
 DISTANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-15)
 METHODS: tuple[StabilityMethod, ...] = ("crossover", "companion")
-# Beyond, all poles take minutes.
+# Beyond this delay, computing all poles takes minutes.
 _LONGEST = {"companion": 50.0}
 
 
 class Group(NamedTuple):
-    """Walls that are extreme in one way, and for each how far it is from the boundary, or NaN where nobody says."""
+    """Walls that are extreme in one respect, with their distances from the boundary, NaN if unknown."""
 
     name: str
     walls: Walls
@@ -30,18 +30,18 @@ class Group(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """What one method makes of one group at one delay."""
+    """Results of one method for one group at one delay."""
 
     method: str
     group: str
     d: float
     points: int
     wrong: int
-    farthest: float  # the largest distance at which a label was wrong; 0 where none was, NaN where unknown
+    farthest: float  # largest distance of a wall with a wrong label; 0 if all are correct, NaN if unknown
 
 
 def groups(d: float) -> Iterator[Group]:
-    """Every group of walls at one delay."""
+    """Yield all groups of walls at one delay."""
     rng = np.random.default_rng(20061101)
     yield _group("walls near the stability boundary", [_near(delta, d, rng) for delta in DELTAS], d)
     yield _group("walls near the start of the boundary curve, beta = -delta", [_start(delta) for delta in DELTAS], d)
@@ -85,7 +85,7 @@ def _ridge(delta: float, d: float) -> tuple[np.ndarray, ...]:
 
 
 def judge(d: float) -> Iterator[Finding]:
-    """What every method makes of every group; points exactly on the boundary have no label and are left out."""
+    """Yield the results of every method for every group; points exactly on the boundary, without label, are omitted."""
     for group in groups(d):
         truth = decide_stability(*group.walls, method="certified")
         known = np.asarray(truth.status) == Status.OK
@@ -99,22 +99,22 @@ def judge(d: float) -> Iterator[Finding]:
 
 
 def report(delays: tuple[float, ...] = DELAYS) -> str:
-    """A Markdown table of every method and group over the delays: wrong labels, and the farthest of them."""
+    """Return a Markdown table of wrong labels and their largest distance, by method, group and delay."""
     found = [outcome for d in delays for outcome in judge(d)]
     lines = [
         "# Validity of the methods at extreme parameters",
         "",
-        "Each table lists the number of wrong labels (stable or unstable) of the methods of `zwidth.is_stable`. The",
+        "Each table contains the number of wrong labels (stable or unstable) of the methods of `zwidth.is_stable`. The",
         'reference is `method="certified"`, which returns a label only if the label is guaranteed to be correct.',
-        "The walls are those of devices with the normalized physical damping",
+        "The devices have the following values of the normalized physical damping:",
         f"delta = {', '.join(map(_shortest, DELTAS))}.",
         "",
         'A cell contains the number of wrong labels and the number of walls, for example "1 of 364". If the',
-        "distances of the walls from the stability boundary are known and some labels are wrong, the cell also",
+        "distances of the walls from the stability boundary are known and if labels are wrong, the cell also",
         "contains the largest distance of a wall with a wrong label, relative to alpha. A cell is empty if the",
         "method is not measured at this delay. The delay `1 - ulp` is the largest float64 number below 1.",
         "",
-        "This page is written by `scripts/refresh_extremes.py`.",
+        "The script `scripts/refresh_extremes.py` writes this page.",
         "",
     ]
     for name in dict.fromkeys(outcome.group for outcome in found):

@@ -1,4 +1,4 @@
-"""Speed against error: what each method costs and how wrong it can be, a panel for each delay."""
+"""Figure of speed against error of each method, with one panel per delay."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocat
 
 from zwidth.plotting import style
 
-# Points from one name to the next.
+# Distance of adjacent names in points.
 _LETTERS = 11.0
-# Where no error was seen; left of every measured one.
+# Position of marks without errors, left of all measured errors.
 _NONE_SEEN = 1e-17
 _LEAST = 3e-18
 _TICKS = [_NONE_SEEN, 1e-15, 1e-13, 1e-11, 1e-9, 1e-7, 1e-5, 1e-3, 1e-1]
@@ -40,13 +40,13 @@ class Mark(NamedTuple):
 
 @style.house_style()
 def draw_pareto(marks: Sequence[Mark], axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw points a second over the worst error seen, both logarithmic: up and to the left is better.
+    """Draw points per second over the largest error, both logarithmic: up and to the left is better.
 
-    Filled marks: maps (alpha and beta as axes); open ones: scattered points.
+    Filled marks are maps (with axes alpha and beta), open marks are scattered points.
 
     Args:
-        marks: the measurements; of several with one name the first is drawn.
-        axes: Axes of yours, one for each delay or fewer.
+        marks: measurements; the first of several with the same name is drawn.
+        axes: existing Axes, at most one per delay.
     """
     delays = sorted({mark.d for mark in marks})
     columns = min(3, len(delays))
@@ -90,11 +90,11 @@ def _draw_panel(ax: Axes, marks: Sequence[Mark], rates: tuple[float, float]) -> 
 
 
 def _name_methods(ax: Axes, tops: Sequence[Mark], rates: tuple[float, float]) -> None:
-    """One name for the two marks of a method, beside the panel, with a thin line from the faster one."""
+    """Write the name of each method next to the panel, with a thin line from its faster mark."""
     low, high = np.log10(rates)
     gap = _LETTERS / (72.0 * ax.get_window_extent().height / style.figure_of(ax).dpi)
     heights = [(np.log10(top.rate) - low) / (high - low) for top in tops]
-    # None below the panel, where the next one's title is.
+    # Not below the panel, where the title of the next panel is.
     ranks = np.argsort(np.argsort(heights, kind="stable"))
     for top, place in zip(tops, style.spread(np.maximum(heights, gap * ranks).tolist(), gap), strict=True):
         color = _COLORS[top.quantity]

@@ -1,4 +1,4 @@
-"""What is measured on: maps for the speed, walls close to the boundary for the error."""
+"""Problems of the benchmarks: maps for the speed, walls near the boundary for the error."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from zwidth.stability.rigid.dominant_poles import compute_dominant_poles
 from zwidth.stability.rigid.ridge import alpha_max
 from zwidth.stability.rigid.verdict import decide_stability
 
-# The device of the speed problems; the cost of no method depends on it.
+# Device of the speed problems; no method's cost depends on it.
 MAP_DELTA = 0.5
-# The devices of the error problems: undamped, nearly so, common, and strongly damped.
+# Devices of the error problems: undamped, nearly undamped, common and strongly damped.
 ERROR_DELTAS = (0.0, 1e-8, 0.1, 1.0, 4.0, 50.0)
 _SEED = 20060901
 _ROOT_BITS, _ROOT_WIDTH = 256, 1e-40
-# Of longer polynomials isolating all roots takes minutes.
+# For higher degrees, isolating all roots takes minutes.
 _MOST_ROOTS = 60
 _DIGITS = 40
-# Frequencies that are looked at in each period of the fastest oscillation, before the highest is refined.
+# Scanned frequencies per period of the fastest oscillation, before the maximum is refined.
 _PER_PERIOD = 64
 
 
 class Walls(NamedTuple):
-    """Arguments of one problem; they broadcast."""
+    """Arguments of one problem, which broadcast."""
 
     alpha: Any
     beta: Any
@@ -38,11 +38,11 @@ class Walls(NamedTuple):
 
     @property
     def points(self) -> int:
-        """How many points there are."""
+        """Number of points."""
         return int(np.prod(np.broadcast_shapes(*(np.shape(part) for part in self))))
 
     def listed(self) -> Walls:
-        """The same walls as columns of one length."""
+        """Return the same walls as arrays of equal length."""
         return Walls(*(np.ravel(part) for part in np.broadcast_arrays(*self)))
 
 
@@ -55,7 +55,7 @@ class Labelled(NamedTuple):
 
 
 def grid(d: float, points: int) -> Walls:
-    """A map of about ``points`` walls that covers the stable region of one device and some of what is beyond."""
+    """Return a map of about ``points`` walls that covers the stable region of one device and its surroundings."""
     side = max(2, round(points**0.5))
     _, _, beta = sample_lobe(MAP_DELTA, d)
     ridge = float(alpha_max(MAP_DELTA, d).alpha)
@@ -70,7 +70,7 @@ def grid(d: float, points: int) -> Walls:
 
 
 def scattered(d: float, points: int) -> Walls:
-    """As many random walls of the same region, each of a device of its own."""
+    """Return random walls of the same region, each with a different device."""
     box = grid(d, 4)
     generator = np.random.default_rng(_SEED)
     alpha = generator.uniform(box.alpha.min(), box.alpha.max(), points)
@@ -80,15 +80,15 @@ def scattered(d: float, points: int) -> Walls:
 
 
 def single(d: float, points: int = 1) -> Walls:
-    """One of these walls, as numbers."""
+    """Return one of these walls as numbers."""
     return Walls(*(column[0].item() for column in scattered(d, points)))
 
 
 @cache
 def near_boundary(d: float, points: int) -> Labelled:
-    """Walls 1e-3 to 1e-15 (relative, in alpha) off the boundary of many devices, with labels from ball arithmetic.
+    """Return walls at relative distances in alpha of 1e-3 to 1e-15 from boundaries, with labels from ball arithmetic.
 
-    A wall whose label cannot be proved, being exactly on the boundary, is left out.
+    Walls exactly on the boundary, whose labels cannot be proved, are omitted.
     """
     generator = np.random.default_rng([_SEED, round(1e6 * d)])
     each = max(1, points // len(ERROR_DELTAS))
@@ -112,7 +112,7 @@ def near_boundary(d: float, points: int) -> Labelled:
 
 @cache
 def with_radius(d: float, points: int) -> tuple[Walls, np.ndarray]:
-    """Walls near the boundary and all over the map, with spectral radii to far more digits than float64 has."""
+    """Return walls near the boundary and across the map, with spectral radii in extended precision."""
     near = near_boundary(d, 20 * len(ERROR_DELTAS)).walls
     some = np.random.default_rng(_SEED).permutation(near.points)[: points // 2]
     walls = [
@@ -124,7 +124,7 @@ def with_radius(d: float, points: int) -> tuple[Walls, np.ndarray]:
 
 
 def ball_polynomial(alpha: float, beta: float, delta: float, d: float, bits: int) -> list[Any]:
-    """The coefficients of P as balls, lowest power first."""
+    """Return the coefficients of P as balls, lowest power first."""
     import flint
 
     with flint.ctx.workprec(bits):
@@ -140,7 +140,7 @@ def ball_polynomial(alpha: float, beta: float, delta: float, d: float, bits: int
 
 
 def exact_radius(alpha: float, beta: float, delta: float, d: float) -> float:
-    """The largest of all isolated poles: an enclosure far narrower than a rounding error."""
+    """Return the spectral radius from isolated poles, with an enclosure far narrower than a rounding error."""
     import flint
 
     with flint.ctx.workprec(_ROOT_BITS):
@@ -150,16 +150,16 @@ def exact_radius(alpha: float, beta: float, delta: float, d: float) -> float:
 
 
 def refined_radius(alpha: float, beta: float, delta: float, d: float) -> float:
-    """The same for long delays: that one pole is the outermost rests on its proof in float64, its digits do not.
+    """Return the spectral radius for long delays by Newton's method, from the pole that float64 proves dominant.
 
     Raises:
-        ArithmeticError: there was no proof, or Newton's method left the pole.
+        ArithmeticError: there is no proof, or Newton's method diverges from the pole.
     """
     import flint
 
     pole = compute_dominant_poles([np.array([value]) for value in (alpha, beta, delta, d)], 1e-9)
     if not pole.error[0] <= 1e-9:
-        raise ArithmeticError(f"no proof of the outermost pole at {(alpha, beta, delta, d)}")
+        raise ArithmeticError(f"no proof of the dominant pole at {(alpha, beta, delta, d)}")
     with flint.ctx.workprec(_ROOT_BITS):
         coefficients = ball_polynomial(alpha, beta, delta, d, _ROOT_BITS)
         terms = [(k, value.mid()) for k, value in enumerate(coefficients) if value != 0]
@@ -171,22 +171,22 @@ def refined_radius(alpha: float, beta: float, delta: float, d: float) -> float:
             step = (value / slope).mid()
             z = (z - step).mid()
         if not (abs(step) < _ROOT_WIDTH and abs(z - start) < 1e-8):
-            raise ArithmeticError(f"Newton's method left the outermost pole at {(alpha, beta, delta, d)}")
+            raise ArithmeticError(f"Newton's method left the dominant pole at {(alpha, beta, delta, d)}")
         return float(abs(z).mid())
 
 
 @cache
 def with_needed_damping(d: float, points: int) -> tuple[Walls, np.ndarray]:
-    """Undamped walls, and the damping that makes each of them passive."""
+    """Return undamped walls and the damping that makes each of them passive."""
     walls = scattered(d, points)._replace(delta=np.zeros(points))
     needed = [exact_needed_damping(float(a), float(b), int(d)) for a, b in zip(walls.alpha, walls.beta, strict=True)]
     return walls, np.array(needed)
 
 
 def exact_needed_damping(alpha: float, beta: float, d: int) -> float:
-    """The supremum of ``alpha D/2 - beta cos((d + 1) w)``, ``D = sin((d + 1/2) w)/sin(w/2)``, for a whole delay.
+    """Return the supremum of ``alpha D/2 - beta cos((d + 1) w)``, ``D = sin((d + 1/2) w)/sin(w/2)``, for integer d.
 
-    Every local maximum of a dense scan that comes close to the highest is refined in many digits.
+    Every local maximum of a dense scan that is close to the largest is refined in extended precision.
     """
     from mpmath import mp
 
@@ -200,7 +200,7 @@ def exact_needed_damping(alpha: float, beta: float, d: int) -> float:
             return a * mp.sin((d + 0.5) * w) / (2 * mp.sin(w / 2)) - b * mp.cos((d + 1) * w)
 
         best = max(a * (d + mp.mpf("0.5")) - b, bound(mp.pi))
-        # Between two samples a maximum rises by less than 1 % of the bound's size.
+        # Between two samples, a maximum exceeds both by less than 1 % of the bound's magnitude.
         near = value > value.max() - 0.01 * (abs(alpha) * (d + 1) + abs(beta))
         tops = np.flatnonzero(near[1:-1] & (value[1:-1] >= value[:-2]) & (value[1:-1] >= value[2:])) + 1
         for top in tops:
@@ -209,7 +209,7 @@ def exact_needed_damping(alpha: float, beta: float, d: int) -> float:
 
 
 def _highest(bound: Any, low: Any, high: Any) -> Any:
-    """The maximum within a bracket, by golden sections: half of the digits of its place are all of its height."""
+    """Return the maximum in a bracket by golden-section search; half the digits of its location suffice."""
     from mpmath import mp
 
     ratio = (mp.sqrt(5) - 1) / 2

@@ -1,4 +1,4 @@
-"""`zwidth bench`, and its results as JSON, Markdown and a picture."""
+"""`zwidth bench` and its results as JSON, Markdown and a figure."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ REFERENCE = "np.linalg.eigvals"
 
 
 def environment() -> dict[str, Any]:
-    """What the numbers depend on beside the code."""
+    """Return the versions and the hardware that the results depend on."""
     return {
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)),
@@ -47,20 +47,28 @@ def _processor() -> str:
 
 
 def document(rows: Sequence[Row]) -> dict[str, Any]:
-    """Everything that was measured."""
+    """Return all measurements as a dictionary for JSON."""
     return {"environment": environment(), "rows": [asdict(row) for row in rows]}
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Tables for people: speeds as multiples of batched NumPy eigenvalues in the same run."""
+    """Return Markdown tables; speeds are relative to batched NumPy eigenvalues of the same run."""
     here = environment()
     lines = [
-        f"Measured in one run on {here['cores']} cores ({here['processor']}) with JAX {here['jax']} and NumPy",
-        f"{here['numpy']}. Times faster: points a second over those of batched `np.linalg.eigvals` at the same delay.",
-        "Layouts: a map has alpha and beta as axes, scattered points have a device each, and one is a single number.",
-        "First call: what it takes longer, compilation above all. Errors: of a label, against ball arithmetic on walls",
-        "1e-15 to 1e-3 from the boundary, the largest relative distance in alpha at which one was wrong; of a number,",
-        "the largest relative one, against 40 digits or more (of passivity, that of the damping that is needed).",
+        f"All results were measured in one run on {here['cores']} cores ({here['processor']}) with JAX {here['jax']}",
+        f"and NumPy {here['numpy']}.",
+        "",
+        "| column | content |",
+        "|---|---|",
+        "| layout | map: a grid of alpha and beta; scattered: each point has its own device; one: a single point |",
+        "| times faster | points per second, divided by those of batched `np.linalg.eigvals` at the same delay |",
+        "| first call | additional time of the first call, mainly for compilation |",
+        "| worst error | defined below; `none of N`: no error among N tested points |",
+        "",
+        "The error of a stability label is measured on walls at relative distances of 1e-15 to 1e-3 from the boundary.",
+        "The labels are compared with ball arithmetic, and the worst error is the largest relative distance in alpha",
+        "of a wall with a wrong label. The worst error of all other results is the largest relative error, compared",
+        "with results of at least 40 digits. For passivity, it is the error of the required damping.",
         "",
     ]
     lines += _questions(rows)
@@ -85,23 +93,23 @@ def markdown(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-# What may be asked of a map, from the least to the most, and what answers it.
+# Quantities of a map, from the cheapest to the most expensive, with the method of each.
 _QUESTIONS = {
     "stable or not": ("stable", "crossover", "map"),
-    "stable or not, each label proved": ("stable", "certified", "map"),
+    "stable or not, each label certified": ("stable", "certified", "map"),
     "passive or not": ("passive", "worst frequency", "map"),
-    "the largest pole, to 1e-9, proved": ("spectral_radius", "map to 1e-09", "map"),
-    "the largest pole, to 1e-2, proved": ("spectral_radius", "map to 0.01", "map"),
+    "spectral radius, certified to 1e-9": ("spectral_radius", "map to 1e-09", "map"),
+    "spectral radius, certified to 1e-2": ("spectral_radius", "map to 0.01", "map"),
     "all poles": ("spectral_radius", "aberth", "map"),
     "all poles, by eigenvalues": ("spectral_radius", "companion", "map"),
-    "the stiffest wall of as many devices": ("alpha_max", "newton", "scattered"),
+    "stiffest wall, one per device": ("alpha_max", "newton", "scattered"),
 }
 
 
 def _questions(rows: Sequence[Row]) -> list[str]:
-    """What is saved by asking for no more than is needed: time of a million points."""
+    """Return a table of the time per million points of each quantity."""
     delays = sorted({row.d for row in rows})
-    lines = ["### What each question costs", "", "Seconds for a million points, compilation apart.", ""]
+    lines = ["### What each question costs", "", "Run time in seconds per million points, without compilation.", ""]
     lines += [f"| question | {' | '.join(f'd = {d:,.10g}' for d in delays)} |", "|---|" + "--:|" * len(delays)]
     for question, key in _QUESTIONS.items():
         cells = []
@@ -113,7 +121,7 @@ def _questions(rows: Sequence[Row]) -> list[str]:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """The few lines that say most: each method at one delay, as plain text."""
+    """Return a short summary in plain text: each method at one delay."""
     references = {row.d: row.rate for row in rows if row.method == REFERENCE}
     d = 4.0 if 4.0 in references else min(references)
     lines = [f"{'at d = ' + format(d, 'g'):28}{'layout':>11}{'points/s':>12}{'times faster':>14}{'worst error':>14}"]
@@ -130,7 +138,7 @@ def summary(rows: Sequence[Row]) -> str:
 
 
 def _faster(row: Row, references: dict[float, float]) -> str:
-    """Against a batch of NumPy's, which one call for one number is no rival of."""
+    """Return the speed relative to batched NumPy, except for single calls, which are not comparable."""
     return f"{row.rate / references[row.d]:,.3g}" if row.d in references and row.layout != "one" else ""
 
 
@@ -146,7 +154,7 @@ def _error(row: Row) -> str:
 
 
 def write(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """Write ``bench.json``, ``bench.md``, ``summary.txt`` and ``pareto.png`` into a folder."""
+    """Write ``bench.json``, ``bench.md``, ``summary.txt`` and ``pareto.png`` to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     texts = {
         "bench.json": json.dumps(document(rows), indent=1, allow_nan=False) + "\n",
@@ -161,8 +169,8 @@ def write(rows: Sequence[Row], folder: Path) -> list[Path]:
 
 
 def run(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
-    """Measure, write and print what `zwidth bench` is asked for."""
-    # A file in the place of the folder would otherwise be found after minutes of work.
+    """Measure, write and print the results of `zwidth bench`."""
+    # Otherwise a file in place of the folder would raise only after minutes of measurements.
     if any(part.is_file() for part in (out, *out.parents)):
         raise InputError(f"--out: got {str(out)!r}, which is not a folder; choose another with --out DIR")
     if (out / "bench.json").exists() and not overwrite:

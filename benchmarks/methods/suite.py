@@ -1,4 +1,4 @@
-"""The measurements: every method on maps, scattered walls and single ones, for short delays and long ones."""
+"""Measurements: every method on maps, scattered walls and single walls, for short and long delays."""
 
 from __future__ import annotations
 
@@ -21,39 +21,38 @@ from zwidth.stability.rigid.ridge import RidgeMethod, alpha_max
 from zwidth.stability.rigid.spectral_radius import spectral_radius
 from zwidth.stability.rigid.verdict import StabilityMethod, decide_stability, is_stable
 
-# A measurement is repeated until it has taken this long, and at least this often.
+# Minimum total time in s and minimum number of repetitions of a measurement.
 _SECONDS = 0.4
 _LEAST, _MOST = 3, 40
-# Beyond these delays a method takes minutes to compile, or days to run.
+# Beyond these delays, a method takes minutes to compile or days to run.
 _LONGEST = {"companion": 50, "aberth": 21, "kkt": 50}
 _LONGEST_BASELINE = 50
 
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured of one method on one problem.
+    """Measurements of one method on one problem.
 
-    The error is 0 where none was seen; else, of "stable", the largest relative distance in alpha from the boundary at
-    which a label was wrong, and of every other quantity (of "passive", the damping that is needed) the largest relative
-    error.
+    The error of "stable" is the largest relative distance in alpha from the boundary at which a label was wrong, 0 if
+    none was. For other quantities it is the largest relative error, for "passive" that of the required damping.
     """
 
     quantity: str  # "stable", "spectral_radius", "passive" or "alpha_max"
-    method: str  # of a baseline the tool's name
-    layout: str  # "map" (axes of one device), "scattered" (a device for every point) or "one" (a single number)
+    method: str  # name of the tool for baselines
+    layout: str  # "map" (axes of one device), "scattered" (one device per point) or "one" (a single number)
     d: float
-    points: int  # computed at once
-    first_seconds: float  # what the first call takes longer than a later one: compilation, on a cold cache
-    rate: float  # points a second of later calls, by their median
+    points: int  # computed in one call
+    first_seconds: float  # additional time of the first call: compilation with a cold cache
+    rate: float  # points per second, median of later calls
     error: float
-    wrong: int  # labels among those checked; 0 of other quantities
-    checked: int  # points that the error was measured on, against more digits
-    baseline: bool = False  # whether it is a tool for comparison
+    wrong: int  # number of wrong labels; 0 for other quantities
+    checked: int  # number of points at which the error was measured, in extended precision
+    baseline: bool = False  # whether the method is an alternative tool
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured."""
+    """Sizes of the measurements."""
 
     delays: tuple[float, ...]
     map_points: int
@@ -62,25 +61,25 @@ class Sizes:
     roots: int
 
 
-# As many labels are checked as compiled code takes; of fewer points it is NumPy that is judged.
+# Enough labels to use compiled code; fewer points would be computed by NumPy.
 FULL = Sizes((0.0, 1.0, 4.0, 8.0, 50.0, 500.0, 10_000.0), 4_000_000, 100_000_000, 6_000, 60)
 QUICK = Sizes((0.0, 4.0, 500.0), 250_000, 1_000_000, 240, 20)
 
-# Errors of one method: the largest, how many labels were wrong, and of how many.
+# Errors of one method: largest error, number of wrong labels, number of checked points.
 Error = tuple[float, int, int]
 
 
 def clock(call: Callable[[], Any]) -> tuple[float, float]:
-    """Seconds that the first call took longer, and the median of the later ones."""
+    """Return the additional time of the first call and the median time of later calls, in s."""
     first = time_calls(call, 1)[0].item()
     warm = float(np.median(time_calls(call, _LEAST, _MOST, _SECONDS)[0]))
     return max(0.0, first - warm), warm
 
 
 def measure(sizes: Sizes, tell: Callable[[str], None] = lambda _: None) -> list[Row]:
-    """Run every measurement; ``tell`` hears what is measured next.
+    """Run all measurements; ``tell`` is called with the name of the next one.
 
-    Errors are measured against ball arithmetic, so python-flint (extra ``certified``) must be installed.
+    Errors are measured against ball arithmetic, which requires python-flint (extra ``certified``).
     """
     rows = []
     for d in sizes.delays:
@@ -98,7 +97,7 @@ def measure(sizes: Sizes, tell: Callable[[str], None] = lambda _: None) -> list[
 
 
 def _fewer(points: int, d: float) -> int:
-    """As many points as take about the same time where all poles are computed."""
+    """Return the number of points for about equal time if all poles are computed."""
     return max(16, int(points / (1.0 + d / 8.0) ** 2))
 
 
@@ -107,20 +106,20 @@ def _possible(method: str, d: float) -> bool:
 
 
 def label_error(classify: Callable[[Walls], Any], d: float, points: int) -> Error:
-    """The farthest wrong label, how many are wrong, and of how many."""
+    """Return the largest distance of a wrong label, the number of wrong labels, and of checked labels."""
     truth = problems.near_boundary(d, points)
     wrong = np.asarray(classify(truth.walls)) != truth.stable
     return float(np.max(truth.distance, initial=0.0, where=wrong)), int(wrong.sum()), int(wrong.size)
 
 
 def radius_error(radius: Callable[[Walls], Any], d: float, points: int) -> Error:
-    """The largest relative error."""
+    """Return the largest relative error of spectral radii."""
     walls, exact = problems.with_radius(d, points)
     return float(np.max(np.abs(np.asarray(radius(walls)) - exact) / exact)), 0, exact.size
 
 
 def map_error(radius: Any, walls: Walls, checked: int = 2_000) -> Error:
-    """The largest relative error of some of a map's radii, against these walls by themselves."""
+    """Return the largest relative error of some radii of a map, compared with computing these walls alone."""
     picked = np.random.default_rng(5).choice(radius.size, min(checked, radius.size), replace=False)
     place = np.unravel_index(picked, radius.shape)
     alone = spectral_radius(*(np.broadcast_to(part, radius.shape)[place] for part in walls))
@@ -129,12 +128,12 @@ def map_error(radius: Any, walls: Walls, checked: int = 2_000) -> Error:
 
 
 def largest(z: Any) -> np.ndarray:
-    """The largest modulus of each wall's poles."""
+    """Return the largest modulus of the poles of each wall."""
     return np.abs(z).max(axis=-1)
 
 
 def passive_error(d: float, points: int) -> Error:
-    """The largest relative error of the damping that a passive wall needs."""
+    """Return the largest relative error of the damping required for passivity."""
     walls, exact = problems.with_needed_damping(d, points)
     needed = -np.asarray(passivity_margin(*walls))
     return float(np.max(np.abs(needed - exact) / exact)), 0, exact.size
@@ -143,7 +142,7 @@ def passive_error(d: float, points: int) -> Error:
 def _time_layouts(
     quantity: str, method: str, d: float, error: Error, call: Callable[[Walls], Any], points: dict[str, int]
 ) -> Iterator[Row]:
-    """One row for each layout and its number of points."""
+    """Return one row per layout with its number of points."""
     make = {"map": problems.grid, "scattered": problems.scattered, "one": problems.single}
     for layout, count in points.items():
         walls = make[layout](d, count)
@@ -176,14 +175,14 @@ def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
     cases: tuple[tuple[str, Callable[[Walls], Any], dict[str, int]], ...] = (
         ("newton", lambda walls: spectral_radius(*walls, method="newton"), {"map": many, "scattered": many, "one": 1}),
         ("companion", lambda walls: spectral_radius(*walls, method="companion"), {"map": few, "scattered": few}),
-        # All poles, as by the companion matrix; their largest modulus is what has a reference.
+        # All poles, as from the companion matrix; the reference is for their largest modulus.
         ("aberth", lambda walls: largest(poles(*walls, method="aberth")), {"map": some, "scattered": some}),
     )
     for method, radius, points in cases:
         if not _possible(method, d):
             continue
         yield from _time_layouts("spectral_radius", method, d, radius_error(radius, d, sizes.roots), radius, points)
-    # The trade of a map: the same walls to each accuracy, against some of them one by one.
+    # Speed and accuracy of maps: the same walls at each accuracy, compared with single calls.
     plane = problems.grid(d, sizes.map_points)
     for accuracy in (1e-2, 1e-4, 1e-6, 1e-9):
         call = partial(spectral_radius, *plane, accuracy=accuracy)
@@ -202,18 +201,18 @@ def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
 
 def _passive(d: float, sizes: Sizes) -> Iterator[Row]:
     points = {"map": sizes.map_points // 4, "scattered": sizes.map_points // 16, "one": 1}
-    # The reference looks at every maximum of a bound that oscillates d times.
+    # The reference refines all maxima of a bound that oscillates d times.
     error = passive_error(d, min(sizes.roots, 20))
     yield from _time_layouts("passive", "worst frequency", d, error, lambda walls: is_passive(*walls), points)
 
 
 def ridge_error(d: float, method: RidgeMethod = "newton") -> Error:
-    """The least relative distance at which walls short of the ridge and beyond it are proved stable and unstable.
+    """Return the smallest relative distance at which walls before and beyond alpha_max are proved stable and unstable.
 
-    They lie on the line from the start of the boundary, (0, -delta), through the ridge: straight below a corner, walls
-    of the same beta may be unstable.
+    The walls lie on the line from the start of the boundary, (0, -delta), through the maximum, because walls of the
+    same beta just below a corner may be unstable.
     """
-    # For stronger damping the stable walls below the corner lie closer together than float64 numbers beta.
+    # For stronger damping, the stable range of beta below the corner is narrower than the float64 spacing.
     delta = np.concatenate([[0.0], 10.0 ** np.linspace(-8, 1, 37)])
     top = alpha_max(delta, d, method=method)
     alpha, beta = np.asarray(top.alpha), np.asarray(top.beta)
@@ -248,5 +247,5 @@ def _growing_maps(sizes: Sizes) -> Iterator[Row]:
 
 
 def can_measure() -> bool:
-    """Whether what errors are measured against is installed."""
+    """Return True if the reference implementation, python-flint, is installed."""
     return certified.available() and find_spec("mpmath") is not None

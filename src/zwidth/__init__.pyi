@@ -32,11 +32,11 @@ from .core.errors import TracedDelayError as TracedDelayError
 from .core.errors import ZwidthError as ZwidthError
 from .core.status import RidgeKind as RidgeKind
 from .core.status import Status as Status
+from .identification.device_fit import AlternativeDevice as AlternativeDevice
 from .identification.device_fit import DeviceFit as DeviceFit
 from .identification.device_fit import ErrorBar as ErrorBar
 from .identification.device_fit import FittedMotion as FittedMotion
-from .identification.device_fit import FurtherExperiment as FurtherExperiment
-from .identification.device_fit import RivalDevice as RivalDevice
+from .identification.device_fit import NextMeasurement as NextMeasurement
 from .identification.excite import Excitation as Excitation
 from .identification.excite import excite as excite
 from .identification.log_fit import fit_log as fit_log

@@ -1,9 +1,9 @@
-"""Every public function with every type of argument, inside transformations of JAX, in both precisions.
+"""Every public function with every argument type, in JAX transformations and in both precisions.
 
-One argument is traced, or none; all others have one type. Values are whole numbers, which every type holds exactly.
-Functions that convert their arguments by the same code share one representative (`REPRESENTATIVES`), which is traced
+At most one argument is traced, or all; the others share one type. Values are integers, which every type
+represents exactly. Functions that convert their arguments by the same code share one representative, which is traced
 with every type in every transformation. All other functions are called directly with every type, and traced with the
-common types, at shapes for which one compiled program serves all types.
+most common types, at shapes for which one compiled program serves all types.
 """
 
 from __future__ import annotations
@@ -37,11 +37,10 @@ ARRAYS = {
     "JAX float32 array": lambda value: jnp.full(2, value, jnp.float32),
 }
 TYPES = NUMBERS | ARRAYS
-# One of each way in which the other arguments are converted; each entry with derivatives compiles programs of its own.
-WAYS = ("int", "float", "int32", "JAX float32", "list of int", "float64 array")
-# One scalar and one array: in single precision the conversions are those of double precision, so fewer programs are
-# compiled.
-SINGLE_WAYS = ("int", "float64 array")
+# One type per conversion path of the untraced arguments, because each entry with derivatives compiles separately.
+CONVERSIONS = ("int", "float", "int32", "JAX float32", "list of int", "float64 array")
+# One scalar and one array: conversions in single precision follow the same paths, which saves compilations.
+SINGLE_CONVERSIONS = ("int", "float64 array")
 # One function per way of evaluation: quantities with units, a compiled kernel, a kernel with derivatives by NumPy, the
 # same in SI units, results with an axis of their own, conversion of complex numbers, methods of scenes.
 REPRESENTATIVES = (
@@ -56,7 +55,7 @@ REPRESENTATIVES = (
 # Types of the arguments that are not traced, for all other functions.
 COMMON = ("int", "float", "float32", "float64", "list of int", "int array", "float64 array", "JAX float32 array")
 DIFFERENTIATED = ("grad", "jit(grad)", "hessian")
-ALL = "all"  # in place of the name of an argument: every argument is traced
+ALL = "all"  # instead of an argument's name: all arguments are traced
 EVERY_CASE = [*CASES, *SCENE_CASES]
 
 
@@ -102,33 +101,33 @@ def all_combinations(case: Case) -> Iterator[Combination]:
             yield Combination(kind, "direct", "", x64)
             if case.refuses_tracing:
                 continue
-            # JAX turns a list into one traced value per item. Single numbers need a program of their own.
-            # A scene converts units in the precision of its traced parameters.
+            # JAX turns a list into one traced value per item. Single numbers need a separate compilation. A scene
+            # converts units in the precision of its traced parameters.
             coarse = case.one_number and kind in NUMBERS and kind.endswith(("float16", "float32"))
             if not kind.startswith("list") and not coarse and (x64 or kind in ARRAYS):
                 yield Combination(kind, "jit", ALL, x64)
-            ways = WAYS if x64 else SINGLE_WAYS
-            for traced in dict.fromkeys((case.free[0], case.free[-1])) if kind in ways else case.free[:1]:
-                if x64 or kind in WAYS:
+            conversions = CONVERSIONS if x64 else SINGLE_CONVERSIONS
+            for traced in dict.fromkeys((case.free[0], case.free[-1])) if kind in conversions else case.free[:1]:
+                if x64 or kind in CONVERSIONS:
                     yield Combination(kind, "jit", traced, x64)
-            if kind not in ways:
+            if kind not in conversions:
                 continue
-            # What is compiled depends on the argument, and the conversion of the others does not.
+            # The compiled program depends on the traced argument only, so the first argument suffices.
             first = case.free[0]
             yield Combination(kind, "vmap", first, x64)
             if first in case.one_number and kind in ARRAYS:
-                # The sum over several walls of one scene is no derivative of one wall.
+                # With several walls per scene, the gradient would sum over the walls.
                 continue
             if case.derivatives is not None:
                 yield Combination(kind, "grad", first, x64)
                 yield Combination(kind, "jit(grad)", first, x64)
-            # The contract promises no second derivatives in single precision.
+            # The contract covers no second derivatives in single precision.
             if case.derivatives == 2 and not case.gradient_in and x64:
                 yield Combination(kind, "hessian", first, x64)
 
 
 def compute(case: Case, entry: Combination) -> dict[str, Any]:
-    """Return the leaves of one entry: values, or derivatives of their sum by the name "slope"."""
+    """Return the leaves of one entry: values, or the derivative of their sum as "slope"."""
     fixed = {name: convert(case, name, entry.type) for name in case.good}
     if entry.transform == "direct":
         return case.leaves(case.call(**fixed))
@@ -137,30 +136,30 @@ def compute(case: Case, entry: Combination) -> dict[str, Any]:
         return run_traced(lambda arguments: case.leaves(case.call(**fixed, **arguments)), traced)
     del fixed[entry.traced]
 
-    def values(x: Any) -> dict[str, Any]:
+    def compute_leaves(x: Any) -> dict[str, Any]:
         return case.leaves(case.call(**fixed, **{entry.traced: x}))
 
-    def total(x: Any) -> Any:
-        return sum_leaves(values(x), jnp)
+    def compute_sum(x: Any) -> Any:
+        return sum_leaves(compute_leaves(x), jnp)
 
-    # Two points, with numbers as with arrays beside them: one program serves both. Scenes hold single numbers.
+    # Two points even if the other arguments are numbers, so that one program serves both. Scenes take single numbers.
     shape = () if entry.traced in case.one_number else (2,)
-    x = jnp.full(shape, moving(case, entry.traced), jnp.float64 if entry.x64 else jnp.float32)
+    x = jnp.full(shape, traced_value(case, entry.traced), jnp.float64 if entry.x64 else jnp.float32)
     if entry.transform == "vmap":
-        return {name: leaf[0] for name, leaf in jax.vmap(values)(x[None]).items()}
+        return {name: leaf[0] for name, leaf in jax.vmap(compute_leaves)(x[None]).items()}
     if entry.transform == "jit":
-        return run_traced(values, x)
-    slope = jax.grad(total)
+        return run_traced(compute_leaves, x)
+    slope = jax.grad(compute_sum)
     if entry.transform == "hessian":
-        # Each point depends on itself alone: the sum of its row is the second derivative of a point.
-        slope = jax.grad(lambda x: jnp.sum(jax.grad(total)(x)))
+        # Points are independent: the sum over a row of the Hessian is the second derivative at a point.
+        slope = jax.grad(lambda x: jnp.sum(jax.grad(compute_sum)(x)))
     return {"slope": run_traced(slope, x) if entry.transform == "jit(grad)" else slope(x)}
 
 
 def run_traced(function: Any, x: Any) -> Any:
-    """Trace a function as jit does, and run the operations of the trace one by one.
+    """Trace a function as jit does, and evaluate the operations of the trace one by one.
 
-    The kernels in the trace are compiled functions, which all entries share; jit itself would compile each entry.
+    The kernels in the trace are compiled functions shared by all entries, whereas jit would compile every entry.
     """
     trace = jax.jit(function).trace(x)
     leaves = jaxpr_as_fun(trace.jaxpr)(*jax.tree.leaves(x))
@@ -168,26 +167,28 @@ def run_traced(function: Any, x: Any) -> Any:
 
 
 def convert(case: Case, name: str, kind: str) -> Any:
-    """Return the whole number of an argument as one type; parameters of scenes are single numbers."""
-    value = case.whole[name]
+    """Return the integer value of an argument as one type; parameters of scenes stay single numbers."""
+    value = case.integer_point[name]
     return (NUMBERS["int"] if name in case.one_number and kind in ARRAYS else TYPES[kind])(value)
 
 
-def moving(case: Case, name: str) -> float:
-    """Return the value of a traced argument: no integer, because a derivative jumps at integer delays; a lag is one."""
-    return case.whole[name] + (0.0 if name == "lag" else 0.25)
+def traced_value(case: Case, name: str) -> float:
+    """Return the value of a traced argument: not an integer, since derivatives jump at integer delays, except
+    for a lag.
+    """
+    return case.integer_point[name] + (0.0 if name == "lag" else 0.25)
 
 
 def sum_leaves(leaves: dict[str, Any], xp: Any) -> Any:
-    """Return the sum of all real leaves and of the magnitudes of complex ones."""
+    """Return the sum of all real leaves and of the magnitudes of complex leaves."""
     kinds = {name: leaf.dtype.kind for name, leaf in leaves.items()}
     parts = [xp.abs(leaf) if kinds[name] == "c" else leaf for name, leaf in leaves.items() if kinds[name] in "fc"]
     return sum(xp.sum(part) for part in parts)
 
 
-def directly(case: Case, **moved: float) -> dict[str, np.ndarray]:
+def compute_direct(case: Case, **changes: float) -> dict[str, np.ndarray]:
     """Return the leaves of a direct call with Python floats."""
-    numbers = {name: float(value) for name, value in case.whole.items()} | moved
+    numbers = {name: float(value) for name, value in case.integer_point.items()} | changes
     return {name: np.asarray(leaf) for name, leaf in case.leaves(case.call(**numbers)).items()}
 
 
@@ -195,6 +196,6 @@ def expected_slope(case: Case, name: str, order: int) -> float:
     """Return a derivative of the sum of the leaves by central differences of direct calls."""
     step = (1e-5, 1e-3)[order - 1]
     low, middle, high = (
-        float(sum_leaves(directly(case, **{name: moving(case, name) + k * step}), np)) for k in (-1, 0, 1)
+        float(sum_leaves(compute_direct(case, **{name: traced_value(case, name) + k * step}), np)) for k in (-1, 0, 1)
     )
     return (high - low) / (2 * step) if order == 1 else (high - 2 * middle + low) / step**2

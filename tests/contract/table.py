@@ -1,41 +1,45 @@
-"""The contract as a page: what every public function promises, and which test holds it to that."""
+"""Generator of docs/contract.md: what every public function guarantees, and which tests check it."""
 
 from __future__ import annotations
 
 from contract.cases import CASES, DOMAINS, OTHERS, Case
 from contract.matrix import EVERY_CASE, combinations
 
-_HEAD = """# What every public function promises
+_HEAD = """# Contract of the public functions
 
-Written by `scripts/refresh_contract.py` from `tests/contract/cases.py`. Each case runs through all tests of
-`tests/contract/test_contract.py`:
+This page describes how each public function treats its arguments, how it behaves inside the transformations of JAX,
+and which derivatives it has. `scripts/refresh_contract.py` writes the page from `tests/contract/cases.py`, and
+`tests/contract/test_contract.py` tests every statement for each function of the first table:
 
-- **Types of results.** Arguments are numbers, lists, NumPy arrays or JAX arrays that broadcast. The results are
-  NumPy scalars for numbers, NumPy arrays for NumPy arrays, and JAX arrays for JAX arrays, all in float64
-  regardless of JAX's settings. Numbers are computed without loading JAX. Empty arrays return empty arrays. Values
-  that are not real numbers, and shapes that do not broadcast, raise `InputError` with the name of the argument.
-- **Types of arguments.** At most one argument is traced. The others are Python numbers, NumPy scalars, NumPy
-  arrays of ints or floats, 0-d arrays, lists or JAX arrays. `tests/contract/test_matrix.py` tests
-  {combinations:,} combinations of these types in direct calls and inside `jit`, `vmap`, `grad`, `jit(grad)` and
-  the second derivative, in float64 and float32: every combination for one function per way of evaluation, and
-  the common ones for all other functions. It includes methods of a rigid `Scene`.
-- **Bad points.** For an entry that is NaN, infinite, or negative where negative values are not allowed, the
-  result is that of the column "bad points", and the status, if there is one, is INVALID_INPUT. An entry outside
-  the domain has the same result with the status OUT_OF_RANGE. Bad entries do not change the other entries. A
-  number outside the domain raises `InputError` with field, value and range; "raises" in the column "bad number"
-  means that NaN and negative numbers raise the error as well.
-- **Inside `jit`, `vmap`, `grad` with x64.** Values and statuses agree with those of direct calls to 1e-11. Bad
-  points behave as above.
-- **Inside `jit` without x64.** float32 values agree to 2e-3 at moderate points, with the same statuses. Results
-  outside the domain are NaN.
-- **Derivatives** are finite at good points and NaN at bad ones. The contract tests cover the first order. The
-  tests of each function cover the second order, and the first order of {elsewhere}.
-- **On a graphics processor.** Inside `jit`, functions run on the device of JAX, with the same values and
-  statuses; these tests pass on a graphics processor as well. Direct calls compute few points with NumPy, and
-  divide many points into blocks that fit the caches of a CPU. On a graphics processor, call the functions inside
-  your own `jit` instead.
+- **Types of results.** Arguments can be numbers, lists, NumPy arrays or JAX arrays, and are broadcast against each
+  other. The results are NumPy scalars for numbers, NumPy arrays for lists and NumPy arrays, and JAX arrays for JAX
+  arrays. All results have the type float64, regardless of the settings of JAX. Calls with numbers do not load JAX.
+  Empty arrays return empty arrays. Values that are not real numbers, and shapes that cannot be broadcast, raise an
+  `InputError` with the name of the argument.
+- **Types of arguments.** `tests/contract/test_matrix.py` tests {combinations:,} combinations of types, in direct
+  calls and inside `jit`, `vmap`, `grad`, `jit(grad)` and the second derivative, in float64 and float32. In each
+  combination, at most one argument is traced. The other arguments are Python numbers, NumPy scalars, NumPy arrays of
+  integers or floats, 0-d arrays, lists or JAX arrays. Functions that convert their arguments by the same code share
+  one representative with all combinations; the other functions have the most common ones. The combinations also
+  cover methods of a rigid `Scene`.
+- **Bad points.** An entry of an array is bad if it is NaN or infinite, or if it is negative although negative values
+  are not allowed. The column "bad points" contains the result for a bad entry. If the function returns a status, the
+  status of this entry is INVALID_INPUT. An entry outside the domain has the same result, with the status
+  OUT_OF_RANGE. Bad entries do not affect the results of other entries. A single number outside the domain raises an
+  `InputError` with field, value and range. If the column "bad number" contains "raises", NaN and negative numbers
+  raise this error as well.
+- **Inside `jit`, `vmap` and `grad`, with x64 enabled.** Values and statuses agree with those of direct calls to 1e-11.
+  Bad points have the results described above.
+- **Inside `jit`, without x64.** Float32 values agree with those of direct calls to 2e-3 at moderate points, and the
+  statuses are the same. Results outside the domain are NaN.
+- **Derivatives** are finite at good points and NaN at bad points. The tests of the contract cover the first
+  derivatives. The tests of each function cover the second derivatives, and the first derivatives of {elsewhere}.
+- **On a graphics processor.** Inside `jit`, functions run on the device of JAX, with the same values and statuses. The
+  tests of the contract also pass on a graphics processor. Direct calls compute small arrays with NumPy, and divide
+  large arrays into blocks that fit into the caches of a CPU. On a graphics processor, therefore call the functions
+  inside your own `jit`.
 
-Domains of finite arguments:
+The domains of finite arguments are:
 
 | domain | arguments |
 |---|---|
@@ -45,16 +49,20 @@ Domains of finite arguments:
 """
 
 
-def page() -> str:
-    """The whole page."""
+def build_page() -> str:
+    """Text of the page."""
     rows = "".join(_row(case) for case in CASES)
     elsewhere = ", ".join(f"`{case.name}`" for case in CASES if case.gradient_in)
-    domains = "".join(f"| {name} | {said} |\n" for name, said in DOMAINS.items())
+    domains = "".join(f"| {name} | {description} |\n" for name, description in DOMAINS.items())
     number = sum(1 for case in EVERY_CASE for _ in combinations(case))
     head = _HEAD.format(elsewhere=elsewhere, domains=domains, combinations=number)
-    others = "".join(f"| `{name}` | {why} |\n" for name, why in sorted(OTHERS.items()))
-    rest = "Functions that do not compute arrays point by point, and functions that compile even for numbers:"
-    return f"{head}{rows}\n{rest}\n\n| function | arguments, and tests of the contract |\n|---|---|\n{others}"
+    others = "".join(f"| `{name}` | {tests} |\n" for name, tests in sorted(OTHERS.items()))
+    others_heading = (
+        "The following functions are not covered by the tests above, because they do not compute their results\n"
+        "elementwise, or because they compile JAX code even if all arguments are numbers. The second column contains\n"
+        "the argument of each function, and the file that tests the function."
+    )
+    return f"{head}{rows}\n{others_heading}\n\n| function | argument, and file with its tests |\n|---|---|\n{others}"
 
 
 def _row(case: Case) -> str:

@@ -1,4 +1,4 @@
-"""What every public function of arrays promises: types, shapes, bad points, messages, transformations."""
+"""Contract of every public function of arrays: types, shapes, bad points, error messages and transformations."""
 
 import inspect
 import subprocess
@@ -14,7 +14,17 @@ from mpmath import mpf
 import oracles
 import zwidth
 from contract.cases import CASES, OTHERS
-from contract.traced import ROWS, ask, batch, compiled, family_of, fixed_of, has_gradient, in_float32, in_float64
+from contract.traced import (
+    ROWS,
+    compile_case,
+    compute_float32,
+    compute_float64,
+    evaluate_case,
+    find_family,
+    has_gradient,
+    make_batch,
+    read_concrete,
+)
 from zwidth.core.errors import InputError, TracedDelayError
 from zwidth.core.status import Status
 
@@ -25,17 +35,17 @@ KINDS = {"b": np.bool_, "f": np.float64, "c": np.complex128}
 
 def assert_same(left, right, exact=True):
     for name, value in left.items():
-        # A single number is compiled apart from an array, to the last place.
+        # Numbers and arrays are computed by different code, which may differ by rounding.
         np.testing.assert_allclose(value, right[name], rtol=0 if exact else 1e-13, atol=0 if exact else 1e-15)
 
 
-def test_every_public_function_is_covered():
+def test_every_public_function_has_a_case():
     functions = {name for name in zwidth.__all__ if inspect.isfunction(getattr(zwidth, name))}
     assert functions == {case.function for case in CASES} | set(OTHERS)
 
 
 @ALL
-def test_numpy_in_numpy_out_in_float64(case):
+def test_numpy_arguments_return_float64_numpy_arrays(case):
     result = case.leaves(case.call(**case.arguments))
     for name, value in result.items():
         assert type(value) is np.ndarray, name
@@ -47,8 +57,8 @@ def test_numpy_in_numpy_out_in_float64(case):
 
 
 @ALL
-def test_jax_in_jax_out_with_all_digits(case):
-    # Powers of two, so that float32 holds them: nothing else may be rounded to it.
+def test_jax_arguments_return_jax_arrays_in_double_precision(case):
+    # The arguments are exact in float32; the results must not be rounded to it.
     arguments = {name: np.float32(values) for name, values in case.arguments.items()}
     expected = case.leaves(case.call(**{name: np.float64(values) for name, values in arguments.items()}))
     result = case.leaves(case.call(**{name: jnp.asarray(values) for name, values in arguments.items()}))
@@ -59,7 +69,7 @@ def test_jax_in_jax_out_with_all_digits(case):
 
 
 @ALL
-def test_numbers_in_numbers_out(case):
+def test_single_numbers_return_numpy_scalars(case):
     first = {name: values[0] for name, values in case.good.items()}
     for convert in (float, np.float64, np.asarray):
         result = case.leaves(case.call(**{name: convert(value) for name, value in first.items()}))
@@ -73,7 +83,7 @@ def test_numbers_in_numbers_out(case):
 def test_arguments_broadcast(case):
     names = list(case.good)
     arguments = {name: values[:2] for name, values in case.arguments.items()}
-    # The first argument runs down, the others run across.
+    # The first argument varies along the rows, the others along the columns.
     spread = {name: arguments[name][:, None] if name == names[0] else arguments[name] for name in names}
     if len(names) == 1:
         spread = {names[0]: np.broadcast_to(arguments[names[0]], (2, 2))}
@@ -86,13 +96,13 @@ def test_arguments_broadcast(case):
 
 @ALL
 @pytest.mark.parametrize("shape", [(0,), (2, 0)])
-def test_nothing_in_nothing_out(case, shape):
+def test_empty_arrays_return_empty_arrays(case, shape):
     for name, value in case.leaves(case.call(**{name: np.ones(shape) for name in case.good})).items():
         assert value.shape[: value.ndim - case.extra_axes] == shape, name
 
 
 @ALL
-def test_a_bad_point_is_marked_and_leaves_its_neighbors_alone(case):
+def test_bad_point_is_marked_and_does_not_change_other_points(case):
     clean = case.leaves(case.call(**case.arguments))
     for argument, bad in case.bad.items():
         arguments = case.arguments
@@ -110,18 +120,18 @@ def test_a_bad_point_is_marked_and_leaves_its_neighbors_alone(case):
 
 @ALL
 @pytest.mark.parametrize("value", ["1", 1j, None, ["1"], [1.0, [2.0]], {}], ids=repr)
-def test_what_is_no_real_number_is_named(case, value):
+def test_error_names_the_argument_that_is_not_real(case, value):
     for name in case.good:
-        # None says that the line, or the delay, is not given.
+        # None stands for an omitted line or delay.
         if value is None and (case.function, name) in OPTIONAL:
             continue
-        # Where a unit may be written, a text without one is told so.
+        # Arguments that accept units have a different message for a string without a unit.
         with pytest.raises(InputError, match=rf"^{name}\w*: got .*(real number|drop the quotes)"):
             case.call(**(case.arguments | {name: value}))
 
 
 @ALL
-def test_shapes_that_do_not_fit_are_named(case):
+def test_error_names_shapes_that_do_not_broadcast(case):
     names = list(case.good)
     if len(names) > 1:
         arguments = {name: np.ones(3) for name in names} | {names[-1]: np.ones(2)}
@@ -130,7 +140,7 @@ def test_shapes_that_do_not_fit_are_named(case):
 
 
 @ALL
-def test_negative_zero_is_zero(case):
+def test_negative_zero_equals_zero(case):
     for name in case.good:
         zero, negative = (case.arguments | {name: np.array([z, z, z])} for z in (0.0, -0.0))
         try:
@@ -141,11 +151,11 @@ def test_negative_zero_is_zero(case):
 
 
 @ALL
-def test_arguments_are_left_as_they_are(case):
+def test_arguments_are_not_modified(case):
     arguments = case.arguments
     result = case.leaves(case.call(**arguments))
     for value in result.values():
-        # What may not be written to cannot change anything.
+        # Read-only results cannot alias writable arguments.
         if value.flags.writeable:
             value[...] = 0
     for name, value in arguments.items():
@@ -153,7 +163,7 @@ def test_arguments_are_left_as_they_are(case):
 
 
 @ALL
-def test_beyond_the_range_an_entry_gets_a_status_and_a_number_an_error(case):
+def test_out_of_range_entry_sets_status_and_out_of_range_number_raises(case):
     clean = case.leaves(case.call(**case.arguments))
     for argument, beyond in case.beyond.items():
         arguments = case.arguments
@@ -170,14 +180,14 @@ def test_beyond_the_range_an_entry_gets_a_status_and_a_number_an_error(case):
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case.strict], ids=lambda case: case.name)
-def test_a_bad_quantity_by_itself_is_an_error(case):
+def test_single_bad_quantity_raises(case):
     for argument, bad in case.bad.items():
         numbers = {name: float(values[0]) for name, values in case.arguments.items()} | {argument: bad}
         with pytest.raises(InputError, match=rf"^{argument}: got .*(must be|needed)"):
             case.call(**numbers)
 
 
-def test_numbers_load_no_jax():
+def test_single_numbers_do_not_load_jax():
     program = f"""
 import sys
 
@@ -190,7 +200,7 @@ zwidth.count_poles([0.8], [1.0, 0.9], 0.01, 3.0)
 for name, line in (("beta", 0.3), ("alpha", 0.1)):
     zwidth.boundary_point(0.1, 1.0, **{{name: line}})
 zwidth.stable_region(0.5, 1)
-calls = {[(case.function, numbers_of(case)) for case in CASES if called_by_name(case)]!r}
+calls = {[(case.function, make_numbers(case)) for case in CASES if is_called_by_name(case)]!r}
 for name, numbers in calls:
     getattr(zwidth, name)(**numbers)
 del sys.modules["jax"]
@@ -202,22 +212,22 @@ print(len(calls))
     assert int(result.stdout) == len(CASES) - 3
 
 
-def numbers_of(case):
+def make_numbers(case):
     return {**getattr(case.call, "keywords", {}), **{name: values[1] for name, values in case.good.items()}}
 
 
-def called_by_name(case):
+def is_called_by_name(case):
     return case.function not in ("count_poles", "boundary_point")
 
 
 def is_marked(result, index):
-    """Whether a point shows that it is bad: NaN, False, or -1 of a count."""
+    """Return True if a point is marked as bad: NaN, False, or a count of -1."""
     values = [(name, np.asarray(value)[index]) for name, value in result.items()]
     floats = [np.isnan(value).any() for _, value in values if value.dtype.kind in "fc"]
     if floats:
         return any(floats)
-    kept = {value.dtype.kind: value for name, value in values if name not in ("status", "method")}
-    return not kept["b"] if "b" in kept else kept["i"] == -1
+    remaining = {value.dtype.kind: value for name, value in values if name not in ("status", "method")}
+    return not remaining["b"] if "b" in remaining else remaining["i"] == -1
 
 
 TRACED = [case for case in CASES if not case.refuses_tracing]
@@ -225,52 +235,52 @@ TRACEABLE = pytest.mark.parametrize("case", TRACED, ids=lambda case: case.name)
 SMOOTH = pytest.mark.parametrize("case", [case for case in TRACED if has_gradient(case)], ids=lambda case: case.name)
 
 
-def directly(case, columns):
+def compute_direct(case, columns):
     columns = dict(zip(case.free, columns, strict=True))
-    fixed = {name: np.full(ROWS, value) for name, value in fixed_of(case).items()}
+    fixed = {name: np.full(ROWS, value) for name, value in read_concrete(case).items()}
     return case.leaves(case.call(**columns, **fixed))
 
 
 @TRACEABLE
-def test_inside_a_transformation_values_and_statuses_are_those_of_the_direct_call(case):
-    traced, direct = in_float64(case.name)[0], directly(case, batch(case)[0])
+def test_traced_values_and_statuses_equal_those_of_direct_calls(case):
+    traced, direct = compute_float64(case.name)[0], compute_direct(case, make_batch(case)[0])
     for name, value in traced.items():
         assert value.shape == direct[name].shape, name
         assert value.dtype == direct[name].dtype or value.dtype.kind == "i", name
-        rtol = 1e-9 if name == "modulus_frequency" else 1e-11  # a minimum lies where half of the digits say
+        rtol = 1e-9 if name == "modulus_frequency" else 1e-11  # a minimum is accurate to half the digits only
         np.testing.assert_allclose(value, direct[name], rtol=rtol, atol=1e-12, err_msg=name)
 
 
 @TRACEABLE
-def test_inside_a_transformation_bad_points_leave_their_neighbors_alone(case):
-    columns, good = batch(case)
+def test_traced_bad_points_do_not_change_other_points(case):
+    columns, good = make_batch(case)
     clean = [np.where(good, column, column[0]) for column in columns]
     with jax.enable_x64(True):
-        result = compiled(case.name)([jnp.asarray(column) for column in clean])
+        result = compile_case(case.name)([jnp.asarray(column) for column in clean])
     leaves = result[1] if has_gradient(case) else result
-    traced = in_float64(case.name)[0]
+    traced = compute_float64(case.name)[0]
     for name, value in leaves.items():
         np.testing.assert_array_equal(np.asarray(value)[good], traced[name][good], err_msg=name)
     assert all(is_marked(traced, index) for index in np.flatnonzero(~good))
 
 
 @SMOOTH
-def test_derivatives_are_finite_at_good_points_and_nan_at_bad_ones(case):
-    slopes = in_float64(case.name)[1]
+def test_derivatives_are_finite_at_good_points_and_nan_at_bad_points(case):
+    slopes = compute_float64(case.name)[1]
     assert slopes
     gradient = np.stack([np.asarray(part) for parts in slopes.values() for part in parts], axis=-1)
-    good = batch(case)[1]
+    good = make_batch(case)[1]
     assert np.isfinite(gradient[good]).all()
     assert np.isnan(gradient[~good]).any(axis=-1).all()
 
 
 @TRACEABLE
-def test_without_x64_float32_is_computed_in_and_the_statuses_agree(case):
-    # What is beyond the range of float64 is infinite in float32: another status, NaN all the same.
-    columns, _ = batch(case, beyond=False)
+def test_without_x64_results_are_float32_with_equal_statuses(case):
+    # Values beyond the float64 domain overflow in float32, which changes the status but not the NaN.
+    columns, _ = make_batch(case, beyond=False)
     columns = [np.float32(column) for column in columns]
-    direct = directly(case, [np.float64(column) for column in columns])
-    for name, value in in_float32(family_of(case.name))[case.name].items():
+    direct = compute_direct(case, [np.float64(column) for column in columns])
+    for name, value in compute_float32(find_family(case.name))[case.name].items():
         assert value.dtype in (jnp.float32, jnp.complex64, jnp.bool_, jnp.int32), name
         if value.dtype.kind in "fc":
             np.testing.assert_allclose(value, direct[name], rtol=case.single, atol=case.single, err_msg=name)
@@ -279,76 +289,78 @@ def test_without_x64_float32_is_computed_in_and_the_statuses_agree(case):
 
 
 @pytest.mark.parametrize("name", ["is_stable", "normalize", "boundary"])
-def test_plain_numbers_inside_somebody_elses_transformation_are_computed_at_once(name):
+def test_untraced_arguments_in_a_transformation_are_computed_directly(name):
     case = next(case for case in CASES if case.name == name)
     expected = case.leaves(case.call(**case.arguments))
     first = {name: values[0] for name, values in case.good.items()}
-    of_one = case.leaves(case.call(**first))
-    seen = {}
+    single = case.leaves(case.call(**first))
+    results = {}
 
     def traced(factor):
-        # A direct call as any other: NumPy in, NumPy out, to the last place.
-        seen["array"] = case.leaves(case.call(**case.arguments))
-        seen["number"] = case.leaves(case.call(**first))
+        # Equal to a direct call to the last bit, as NumPy arrays.
+        results["array"] = case.leaves(case.call(**case.arguments))
+        results["number"] = case.leaves(case.call(**first))
         return factor * 2.0
 
     jax.jit(jax.vmap(jax.grad(traced)))(np.ones(2, np.float32))
-    assert all(type(value) is np.ndarray for value in seen["array"].values())
-    assert_same(seen["array"], expected)
-    assert_same(seen["number"], of_one)
+    assert all(type(value) is np.ndarray for value in results["array"].values())
+    assert_same(results["array"], expected)
+    assert_same(results["number"], single)
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case.concrete], ids=lambda case: case.name)
-def test_a_traced_delay_is_refused_where_it_decides_a_shape(case):
+def test_traced_delay_raises_where_it_determines_a_shape(case):
     with pytest.raises(TracedDelayError, match=r"d: got a traced value, .* pass .*a plain number"):
         jax.jit(lambda d: case.call(**{**case.arguments, "d": d}))(1.0)
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case.refuses_tracing], ids=lambda case: case.name)
-def test_a_transformation_is_refused_by_name(case):
+def test_error_names_the_function_that_cannot_be_traced(case):
     with pytest.raises(InputError, match=rf"^{case.function}: got traced values; .*use"):
         jax.jit(lambda values: case.call(**values))(case.arguments)
 
 
-# --- what single functions say there, asked of the programs that are compiled above -------------------------------
+# --- Derivatives of single functions, evaluated by the programs compiled above ---
 
 
-def test_the_outermost_pole_and_its_slope_at_traced_delays():
+def test_spectral_radius_and_its_derivative_at_traced_delays():
     delays, h = [0.0, 4.0, 1.5], mpf(10) ** -20
-    slopes = ask("spectral_radius", alpha=0.2, beta=0.4, delta=0.1, d=delays)[1]["value"]["alpha"]
+    slopes = evaluate_case("spectral_radius", alpha=0.2, beta=0.4, delta=0.1, d=delays)[1]["value"]["alpha"]
     for d, slope in zip(delays, slopes, strict=True):
         with mp.workdps(60):
             low, high = (oracles.exact_radius(mpf("0.2") + step, mpf("0.4"), mpf("0.1"), d) for step in (-h, h))
             assert slope == pytest.approx(float((high - low) / (2 * h)), rel=1e-9)
     np.testing.assert_allclose(slopes[:2], [0.92824, 0.53533], atol=1e-5)
-    found = ask("spectral_radius", alpha=0.5, beta=0.5, delta=0.1, d=[0.0, 1.5, 30.0])[0]["value"]
-    assert found[1] == pytest.approx(float(oracles.exact_radius(0.5, 0.5, 0.1, 1.5)), rel=1e-8)
-    np.testing.assert_allclose(found, zwidth.spectral_radius(0.5, 0.5, 0.1, [0.0, 1.5, 30.0]), rtol=1e-11)
+    values = evaluate_case("spectral_radius", alpha=0.5, beta=0.5, delta=0.1, d=[0.0, 1.5, 30.0])[0]["value"]
+    assert values[1] == pytest.approx(float(oracles.exact_radius(0.5, 0.5, 0.1, 1.5)), rel=1e-8)
+    np.testing.assert_allclose(values, zwidth.spectral_radius(0.5, 0.5, 0.1, [0.0, 1.5, 30.0]), rtol=1e-11)
 
 
-def test_at_a_double_pole_the_spectral_radius_has_no_derivative():
-    top = zwidth.alpha_max(5.0, 0.0)
-    slopes = ask("spectral_radius", alpha=top.alpha, beta=top.beta, delta=5.0, d=0.0)[1]["value"]
+def test_spectral_radius_has_no_derivative_at_a_double_pole():
+    maximum = zwidth.alpha_max(5.0, 0.0)
+    slopes = evaluate_case("spectral_radius", alpha=maximum.alpha, beta=maximum.beta, delta=5.0, d=0.0)[1]["value"]
     assert all(np.isnan(slope) for slope in slopes.values())
 
 
-def test_a_rate_of_decay_and_its_slope():
-    found, slopes = ask("decay_rate", alpha=0.1, beta=0.3, delta=0.2, d=1.0)
-    assert found["value"] == pytest.approx(zwidth.decay_rate(0.1, 0.3, 0.2, 1.0), rel=1e-12)
+def test_decay_rate_and_its_derivative():
+    values, slopes = evaluate_case("decay_rate", alpha=0.1, beta=0.3, delta=0.2, d=1.0)
+    assert values["value"] == pytest.approx(zwidth.decay_rate(0.1, 0.3, 0.2, 1.0), rel=1e-12)
     h = 1e-5
     difference = (zwidth.decay_rate(0.1 + h, 0.3, 0.2, 1.0) - zwidth.decay_rate(0.1 - h, 0.3, 0.2, 1.0)) / (2 * h)
     assert slopes["value"]["alpha"] == pytest.approx(difference, rel=1e-7)
 
 
 @pytest.mark.parametrize(("name", "line"), [("row", "beta"), ("column", "alpha")])
-def test_slopes_of_boundary_points_by_mpmath(name, line):
-    """Of the wall's other number in the given one, in delta and in d; at whole d those from the right."""
+def test_derivatives_of_boundary_points_match_mpmath(name, line):
+    """Derivatives with respect to the given coordinate, delta and d, at integer d from the right, against
+    secant roots in mpmath.
+    """
     other, axis, step = "alpha" if line == "beta" else "beta", ("alpha", "beta").index(line), mpf(10) ** -25
     points = [(0.1, 0.4, 0.4), (0.1, 0.4, 2.0), (0.05, 0.9, 2.3), (0.02, 0.1, 7.0)]
     if line == "beta":
         points += [(0.3, 0.1, 1.0), (0.1, 0.7, 2.4), (0.5, 0.0, 0.0), (50.0, 0.1, 1.0)]
     names = (line, "delta", "d")
-    found, slopes = ask(f"boundary_point of a {name}", **dict(zip(names, np.transpose(points), strict=True)))
+    leaves, slopes = evaluate_case(f"boundary_point of a {name}", **dict(zip(names, np.transpose(points), strict=True)))
 
     def exact(omega, number, delta, d):
         def offset(w):
@@ -360,23 +372,25 @@ def test_slopes_of_boundary_points_by_mpmath(name, line):
     with mp.workdps(160):
         for row, values in enumerate(points):
             if values[0] == 50.0:
-                # No wall of this row is stable.
-                assert np.isnan([found[other][row], *(slopes[other][name][row] for name in names)]).all()
+                # No wall in this row is stable.
+                assert np.isnan([leaves[other][row], *(slopes[other][name][row] for name in names)]).all()
                 continue
             for k, name in enumerate(names):
-                there = [mpf(value) + (step if j == k else 0) for j, value in enumerate(values)]
-                expected = (exact(found["omega"][row], *there) - exact(found["omega"][row], *map(mpf, values))) / step
+                shifted = [mpf(value) + (step if j == k else 0) for j, value in enumerate(values)]
+                expected = (
+                    exact(leaves["omega"][row], *shifted) - exact(leaves["omega"][row], *map(mpf, values))
+                ) / step
                 assert float(slopes[other][name][row]) == pytest.approx(float(expected), rel=1e-10)
 
 
-def test_slopes_of_areas():
+def test_derivatives_of_areas_match_central_differences():
     step, d = 1e-5, np.array([0.0, 0.3, 1.0, 2.5, 0.1, 1.3])
     low, high = zwidth.stable_area(np.array([1.0 - step, 1.0 + step]), 1.3)
-    slopes = ask("stable_area", delta=1.0, d=1.3)[1]["value"]
+    slopes = evaluate_case("stable_area", delta=1.0, d=1.3)[1]["value"]
     assert slopes["delta"] == pytest.approx((high - low) / (2 * step), rel=1e-8)
-    area, slopes = ask("passive_area", delta=0.7, d=d)
+    area, slopes = evaluate_case("passive_area", delta=0.7, d=d)
     np.testing.assert_allclose(area["value"], zwidth.passive_area(0.7, d), rtol=1e-14)
-    for at, by_d in zip(d[4:], slopes["value"]["d"][4:], strict=True):
-        # A maximum over frequency is found to the square root of a rounding error only.
-        low, high = zwidth.passive_area(0.7, np.array([at - step, at + step]))
+    for delay, by_d in zip(d[4:], slopes["value"]["d"][4:], strict=True):
+        # A maximum over frequency is accurate to the square root of a rounding error only.
+        low, high = zwidth.passive_area(0.7, np.array([delay - step, delay + step]))
         assert by_d == pytest.approx((high - low) / (2 * step), abs=1e-7)

@@ -1,45 +1,56 @@
-"""Every public function with every type of argument, in every transformation of JAX, in both precisions."""
+"""Every public function with every argument type, in every JAX transformation, against direct calls and central
+differences.
+"""
 
 import jax
 import numpy as np
 import pytest
 
 import zwidth
-from contract.matrix import ALL, DIFFERENTIATED, EVERY_CASE, combinations, compute, directly, expected_slope, moving
+from contract.matrix import (
+    ALL,
+    DIFFERENTIATED,
+    EVERY_CASE,
+    combinations,
+    compute,
+    compute_direct,
+    expected_slope,
+    traced_value,
+)
 from zwidth.core.errors import InputError
 
 
 @pytest.mark.parametrize("case", EVERY_CASE, ids=lambda case: case.name)
-def test_every_type_in_every_transformation(case):
+def test_every_argument_type_in_every_transformation(case):
     slopes = {}
     for entry in combinations(case):
         with jax.enable_x64(entry.x64):
-            found = {name: np.asarray(leaf) for name, leaf in compute(case, entry).items()}
+            leaves = {name: np.asarray(leaf) for name, leaf in compute(case, entry).items()}
         if entry.transform in DIFFERENTIATED:
             order = 2 if entry.transform == "hessian" else 1
             if order not in slopes:
                 slopes[order] = expected_slope(case, entry.traced, order)
-            # Central differences have 5 to 6 digits; derivatives in single precision lose some to cancellation.
+            # Central differences have 5 to 6 digits; single-precision derivatives lose some to cancellation.
             tolerance = 2e-4 if entry.x64 else 2e-2
             size = max(1.0, abs(slopes[1]))
             np.testing.assert_allclose(
-                found["slope"], slopes[order], rtol=tolerance, atol=tolerance * size, err_msg=str(entry)
+                leaves["slope"], slopes[order], rtol=tolerance, atol=tolerance * size, err_msg=str(entry)
             )
             continue
-        moved = {} if entry.traced in ("", ALL) else {entry.traced: moving(case, entry.traced)}
+        changes = {} if entry.traced in ("", ALL) else {entry.traced: traced_value(case, entry.traced)}
         exact = entry.x64 or entry.transform == "direct"
-        for name, expected in directly(case, **moved).items():
+        for name, expected in compute_direct(case, **changes).items():
             if expected.dtype.kind == "c":
-                # The order of poles is open.
-                found[name], expected = np.sort_complex(found[name]), np.sort_complex(expected)
+                # The order of the poles is unspecified.
+                leaves[name], expected = np.sort_complex(leaves[name]), np.sort_complex(expected)
             tolerance = 1e-11 if exact else case.single
             np.testing.assert_allclose(
-                *np.broadcast_arrays(found[name], expected), rtol=tolerance, atol=tolerance, err_msg=f"{name}: {entry}"
+                *np.broadcast_arrays(leaves[name], expected), rtol=tolerance, atol=tolerance, err_msg=f"{name}: {entry}"
             )
 
 
-def test_the_line_of_the_optimizer():
-    """Typed as a user types it: Python whole numbers, a compiled function."""
+def test_python_integers_in_jit_equal_direct_calls():
+    """Calls as an optimizer makes them: Python integers next to one traced argument."""
     with jax.enable_x64(True):
         assert jax.jit(lambda delta: zwidth.alpha_max(delta, 1).alpha)(0.1) == pytest.approx(
             zwidth.alpha_max(0.1, 1).alpha, rel=1e-14
@@ -53,17 +64,17 @@ def test_the_line_of_the_optimizer():
 
 
 @pytest.mark.parametrize("value", ["1", 1j, None, ["1"], {}], ids=repr)
-def test_inside_a_transformation_what_is_no_real_number_is_named(value):
+def test_traced_call_names_the_argument_that_is_not_real(value):
     with jax.enable_x64(True), pytest.raises(InputError, match=r"^d: got .*real number"):
         jax.jit(lambda delta: zwidth.alpha_max(delta, value).alpha)(0.1)
 
 
-def test_inside_a_transformation_shapes_that_do_not_fit_are_named():
+def test_traced_call_names_shapes_that_do_not_broadcast():
     with pytest.raises(InputError, match=r"shapes do not broadcast: delta \(2,\), d \(3,\)"):
         jax.jit(lambda delta: zwidth.alpha_max(delta, [1, 2, 3]).alpha)(np.ones(2))
 
 
-def test_traced_complex_numbers_and_lists_of_traced_numbers_are_named():
+def test_error_names_traced_complex_numbers_and_lists_of_tracers():
     with pytest.raises(InputError, match="delta: got complex numbers"):
         jax.jit(lambda delta: zwidth.alpha_max(delta, 1).alpha)(1j)
     with pytest.raises(InputError, match="delta: got a list of values that JAX traces"):

@@ -1,4 +1,4 @@
-"""The browser of a file's tests."""
+"""A browser shared by the tests of each module."""
 
 import pytest
 from browser import open_browser
@@ -6,5 +6,5 @@ from browser import open_browser
 
 @pytest.fixture(scope="module")
 def browser():
-    with open_browser() as opened:
-        yield opened
+    with open_browser() as instance:
+        yield instance

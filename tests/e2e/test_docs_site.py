@@ -1,4 +1,4 @@
-"""The documentation site: built strictly, then read in a browser that reaches nothing else."""
+"""The documentation site: built with `--strict`, then read in a browser that may request nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from waiting import LONGEST
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 WIDE, NARROW = 1280, 390
-# Contrast of WCAG 2, level AA, of normal and of large text.
+# Minimum contrast by WCAG 2, level AA, of normal and of large text.
 NORMAL, LARGE = 4.5, 3.0
-# Every text that is shown, with its color and that of the ground behind it, mixed where they are transparent.
+# Each visible text with its color and its background color, both blended over what lies behind them.
 TEXTS = """() => {
     const parse = (css) => { const n = css.match(/[\\d.]+/g).map(Number); return n.length < 4 ? [...n, 1] : n };
     const over = (top, under) => under.map((c, k) => top[3] * top[k] + (1 - top[3]) * c);
@@ -44,7 +44,7 @@ TEXTS = """() => {
     return found;
 }"""
 
-# Asked when what moves to its place in a window of another width has arrived there.
+# Evaluated after the layout of the new window width has settled.
 TOO_WIDE = """async () => {
     for (let k = 0; k < 2; k++) await new Promise(requestAnimationFrame);
     await Promise.allSettled(document.getAnimations().map(each => each.finished));
@@ -75,16 +75,16 @@ def build(folder, site):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The folder of the built site."""
+    """Folder of the built site."""
     folder = tmp_path_factory.mktemp("site")
-    done = build(ROOT, folder)
-    assert done.returncode == 0, done.stderr
+    result = build(ROOT, folder)
+    assert result.returncode == 0, result.stderr
     return folder
 
 
 @pytest.fixture(scope="module")
 def address(site):
-    """Where the site is served, on this machine only."""
+    """URL at which the site is served, on the loopback interface only."""
 
     class Silent(http.server.SimpleHTTPRequestHandler):
         def log_message(self, format, *args):
@@ -99,20 +99,20 @@ def address(site):
 
 @pytest.fixture
 def read(browser):
-    """Opens a page of one width and color scheme; in the end nothing may have gone wrong in it."""
+    """Open a page of a given width and color scheme; on exit assert that it logged no errors and requested nothing."""
 
     @contextmanager
-    def opened(width, scheme="light"):
+    def open_reader(width, scheme="light"):
         with open_page(browser, viewport={"width": width, "height": 900}, color_scheme=scheme) as page:
             yield page
             assert page.asked == []
             assert page.complaints == []
 
-    return opened
+    return open_reader
 
 
 def contrast(color, ground):
-    """The ratio of WCAG 2."""
+    """Contrast ratio defined by WCAG 2."""
 
     def luminance(rgb):
         linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in rgb)]
@@ -122,52 +122,52 @@ def contrast(color, ground):
     return (bright + 0.05) / (dark + 0.05)
 
 
-def test_contrast_is_that_of_wcag():
+def test_contrast_ratio_matches_wcag_examples():
     assert contrast((0, 0, 0), (255, 255, 255)) == 21.0
     assert round(contrast((0x76, 0x76, 0x76), (255, 255, 255)), 2) == 4.54
 
 
-def test_a_broken_link_fails_the_build(tmp_path):
-    # One page, checked as all of them are: the reference, which takes long, has no part in it.
+def test_broken_link_fails_the_build(tmp_path):
+    # A site of one page with the settings of the real one, without the slow reference pages.
     text = (DOCS / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[0]
     folder = tmp_path / "docs"
     shutil.copytree(DOCS / "stylesheets", folder / "stylesheets")
     shutil.copy(DOCS / "hooks.py", folder)
     (folder / "mkdocs.yml").write_text(re.sub(r"(?ms)^plugins:.*?(?=^\w)", "plugins: []\n", text), encoding="utf-8")
     (folder / "index.md").write_text("# Here\n\n[to itself](index.md), [to none](nowhere.md)\n", encoding="utf-8")
-    done = build(tmp_path, tmp_path / "site")
-    assert done.returncode == 1, done.stderr
-    # Nothing but that link fails it.
-    assert "nowhere.md" in done.stderr
-    assert done.stderr.count("WARNING") == 1
+    result = build(tmp_path, tmp_path / "site")
+    assert result.returncode == 1, result.stderr
+    # The broken link is the only warning.
+    assert "nowhere.md" in result.stderr
+    assert result.stderr.count("WARNING") == 1
 
 
-def test_only_pages_and_pictures_are_published(site):
+def test_sources_are_not_published(site):
     endings = {path.suffix for path in site.rglob("*") if path.is_file()}
     assert not endings & {".py", ".yml", ".yaml", ".md"}
 
 
-def test_names_are_links_and_examples_are_code(site):
-    choose = (site / "how-to-choose.html").read_text(encoding="utf-8")
-    assert 'href="reference/stability.html#zwidth.is_stable"' in choose
+def test_names_become_links_and_doctests_become_code(site):
+    guide = (site / "how-to-choose.html").read_text(encoding="utf-8")
+    assert 'href="reference/stability.html#zwidth.is_stable"' in guide
     pages = {page.name: page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html")}
     scene = set(re.findall(r'id="zwidth\.Scene\.(\w+)"', pages["scene.html"]))
     assert scene >= {"is_stable", "max_stiffness"}
     assert not scene & {"check_parts", "loop", "integer_delay"}
     for path in sorted((DOCS / "theory").glob("*.md")):
-        shown = (site / "theory" / f"{path.stem}.html").read_text(encoding="utf-8")
+        html = (site / "theory" / f"{path.stem}.html").read_text(encoding="utf-8")
         prompts = re.findall("^>>>", path.read_text(encoding="utf-8"), re.MULTILINE)
-        assert (path.stem, len(re.findall(">&gt;&gt;&gt; ?<", shown))) == (path.stem, len(prompts))
-    # What Markdown makes of ">>>" that nobody has told it is an example.
+        assert (path.stem, len(re.findall(">&gt;&gt;&gt; ?<", html))) == (path.stem, len(prompts))
+    # Markdown turns ">>>" outside a code block into nested quotations.
     assert [name for name, text in pages.items() if "<blockquote" in text] == []
     assert pages["stability.html"].count('class="gp"') > 10
-    # What a call returns is one thing, however many lines say what.
+    # Each Returns section describes a single value, even if its description spans several lines.
     returned = [part for text in pages.values() for part in re.findall(r"(?s)Returns:.*?<ul>(.*?)</ul>", text)]
     assert len(returned) > 50
     assert {part.count("<li") for part in returned} == {1}
 
 
-def test_every_page_is_readable_and_asks_nobody_else(site, address, read):
+def test_pages_fit_the_window_and_load_nothing_external(site, address, read):
     pages = sorted(path.relative_to(site).as_posix() for path in site.rglob("*.html"))
     assert len(pages) > 30
     too_wide, cut_off = [], []
@@ -175,12 +175,12 @@ def test_every_page_is_readable_and_asks_nobody_else(site, address, read):
         for name in pages:
             page.set_viewport_size({"width": WIDE, "height": 900})
             page.goto(address + name)
-            # Of each page once, since loading takes longest.
+            # Load each page once and resize it, because loading dominates the time.
             for width in (WIDE, NARROW):
                 page.set_viewport_size({"width": width, "height": 900})
                 if page.evaluate(TOO_WIDE):
                     too_wide.append((name, width))
-                # On a telephone long formulas are moved to and fro.
+                # On narrow screens long formulas scroll.
                 if width == WIDE:
                     cut_off += page.evaluate(CUT_OFF)
     assert too_wide == []
@@ -201,7 +201,7 @@ def test_text_has_enough_contrast(address, read, scheme):
     assert faint == set()
 
 
-def test_the_search_finds_a_function(address, read):
+def test_search_finds_a_function(address, read):
     with read(WIDE) as page:
         page.goto(address + "index.html")
         page.locator(".md-search__input").click()
@@ -209,13 +209,13 @@ def test_the_search_finds_a_function(address, read):
         first = page.locator(
             '.md-search-result__link[href*="reference/boundary.html"][href$="#zwidth.alpha_max"]'
         ).first
-        # The index is built in the page, which takes long on a busy machine.
+        # The search index is built in the page, which is slow on a busy machine.
         first.wait_for()
         first.click()
         page.wait_for_url("**/reference/boundary.html**")
 
 
-def test_the_palette_follows_the_reader(address, read):
+def test_palette_follows_the_preferred_color_scheme(address, read):
     with read(WIDE, "dark") as page:
         page.goto(address + "index.html")
         scheme = page.locator("body")

@@ -1,4 +1,4 @@
-"""`zwidth explore` and strangers who knock: without its token, from elsewhere, with no messages, in crowds."""
+"""Security of the `zwidth explore` server: missing tokens, foreign origins, malformed messages, many connections."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def server(tmp_path_factory):
         yield running
 
 
-def test_the_page_forbids_what_it_does_not_need(server):
+def test_content_security_policy_forbids_external_sources(server):
     status, headers, text = server.get()
     assert status == 200
     policy = headers["Content-Security-Policy"]
@@ -34,7 +34,7 @@ def test_the_page_forbids_what_it_does_not_need(server):
 @pytest.mark.parametrize(
     "address", ["/", "/wrong/", "/%ff%fe/", "/ws", "/wrong/ws", "/static/js/bokeh.min.js", "/../../etc/passwd"]
 )
-def test_who_does_not_know_the_token_is_refused(server, address):
+def test_requests_without_the_token_are_refused(server, address):
     with pytest.raises(urllib.error.HTTPError) as refusal:
         urllib.request.urlopen(f"http://{server.host}{address}", timeout=LONGEST)
     with refusal.value:
@@ -42,30 +42,30 @@ def test_who_does_not_know_the_token_is_refused(server, address):
 
 
 @pytest.mark.parametrize("headers", [{"Origin": "http://example.invalid"}, {"Host": "example.invalid"}])
-def test_another_origin_is_refused(server, headers):
+def test_requests_from_another_origin_are_refused(server, headers):
     assert server.get(**headers)[0] == 403
 
 
 @pytest.mark.parametrize(
     "path", ["assets/../server.py", "assets/%2e%2e/server.py", "assets//etc/passwd", "metadata", "autoload.js"]
 )
-def test_nothing_else_is_served(server, path):
+def test_other_paths_are_not_served(server, path):
     assert server.get(path)[0] in (403, 404)
 
 
-async def converse(server, messages, origin=None):
-    """Open the page's socket with its own ticket, say something, and wait until it is closed."""
+async def send_until_closed(server, messages, origin=None):
+    """Open the page's WebSocket with its session token, send the messages and wait until the server closes it."""
     from tornado.httpclient import HTTPRequest
     from tornado.websocket import WebSocketClosedError, websocket_connect
 
     text = server.get()[2]
-    ticket = json.loads(re.findall(r'id="start">(.*?)</script>', text)[0])["items"][0]["token"]
+    token = json.loads(re.findall(r'id="start">(.*?)</script>', text)[0])["items"][0]["token"]
     headers = {"Origin": origin or f"http://{server.host}"}
     request = HTTPRequest(server.address.replace("http:", "ws:") + "ws", headers=headers)
-    socket = await websocket_connect(request, subprotocols=["bokeh", ticket])
+    socket = await websocket_connect(request, subprotocols=["bokeh", token])
     try:
         assert await asyncio.wait_for(socket.read_message(), LONGEST) is not None
-        # It may be closed before the last of them is sent.
+        # The server may close the socket before the last message is sent.
         with contextlib.suppress(WebSocketClosedError):
             for message in messages:
                 await socket.write_message(message, binary=isinstance(message, bytes))
@@ -75,11 +75,11 @@ async def converse(server, messages, origin=None):
         socket.close()
 
 
-def test_a_socket_of_another_origin_is_refused(server):
+def test_websocket_from_another_origin_is_refused(server):
     from tornado.httpclient import HTTPClientError
 
     with pytest.raises(HTTPClientError) as refusal:
-        asyncio.run(converse(server, [], origin="http://example.invalid"))
+        asyncio.run(send_until_closed(server, [], origin="http://example.invalid"))
     assert refusal.value.code == 403
 
 
@@ -94,18 +94,18 @@ def test_a_socket_of_another_origin_is_refused(server):
     ],
     ids=["text", "bytes", "empty", "oversized", "deep"],
 )
-def test_a_malformed_message_ends_its_own_connection_alone(server, messages):
-    # One that stays open is waited for in vain, which is an error. One that is dropped in the middle of a message has
-    # no closing code.
-    asyncio.run(converse(server, messages))
+def test_malformed_message_closes_only_its_own_connection(server, messages):
+    # If the server kept the socket open, the wait would time out. A connection dropped within a message has no close
+    # code.
+    asyncio.run(send_until_closed(server, messages))
     assert server.get("assets/page.js")[0] == 200
 
 
-def test_two_hundred_at_a_time_are_survived(server):
-    async def knock(k, all_there):
+def test_two_hundred_simultaneous_requests_are_survived(server):
+    async def request_page(k, all_connected):
         reader, writer = await asyncio.open_connection(*server.host.split(":"))
         try:
-            await all_there.wait()
+            await all_connected.wait()
             path = server.address.partition(server.host)[2] if k % 2 else "/nobody/"
             writer.write(f"GET {path} HTTP/1.1\r\nHost: {server.host}\r\nConnection: close\r\n\r\n".encode())
             answer = await reader.read()
@@ -114,14 +114,14 @@ def test_two_hundred_at_a_time_are_survived(server):
             writer.close()
             await writer.wait_closed()
 
-    async def crowd():
-        all_there = asyncio.Barrier(200)
+    async def request_pages():
+        all_connected = asyncio.Barrier(200)
         async with asyncio.timeout(LONGEST), asyncio.TaskGroup() as group:
-            knocks = [group.create_task(knock(k, all_there)) for k in range(200)]
-        return [task.result() for task in knocks]
+            requests = [group.create_task(request_page(k, all_connected)) for k in range(200)]
+        return [task.result() for task in requests]
 
-    codes = asyncio.run(crowd())
+    codes = asyncio.run(request_pages())
     assert set(codes[::2]) == {403}
-    # Some get a page, the others are told that too many are open; later there is room again.
+    # Some get a page, the others 503 for too many open sessions; later there is room again.
     assert set(codes[1::2]) <= {200, 503}
     wait_for(lambda: server.get()[0] == 200, pause=0.2)

@@ -1,4 +1,4 @@
-"""`zwidth explore` as somebody uses it: a browser, a keyboard, a mouse."""
+"""`zwidth explore` in a real browser, operated by keyboard and mouse; results are compared with the library."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ def server(tmp_path_factory):
 @pytest.fixture(scope="module")
 def shared(server, browser):
     permissions = ["clipboard-read", "clipboard-write"]
-    with open_page(browser, viewport={"width": 1280, "height": 1000}, permissions=permissions) as opened:
-        opened.sockets = []
-        opened.on("websocket", lambda socket: opened.sockets.append(socket.url))
-        opened.goto(server.address)
-        settle(opened)
-        yield opened
+    with open_page(browser, viewport={"width": 1280, "height": 1000}, permissions=permissions) as session:
+        session.sockets = []
+        session.on("websocket", lambda socket: session.sockets.append(socket.url))
+        session.goto(server.address)
+        settle(session)
+        yield session
 
 
 @pytest.fixture
 def page(shared):
-    """A rigid scene, wherever the tests before have moved it."""
+    """Page showing a rigid scene in whatever state the previous tests left it."""
     yield shared
     settle(shared)
     assert shared.asked == []
     assert shared.complaints == []
 
 
-def wait(page, condition):
-    # Asked from here: the page's own policy lets nobody evaluate texts in it.
+def wait_until(page, condition):
+    # Polled from Python because the page's content security policy forbids evaluating strings in it.
     wait_for(
         lambda: page.evaluate(condition),
         lambda: f"not {condition}; {page.complaints}; {page.inner_text('header')}",
@@ -52,13 +52,16 @@ def wait(page, condition):
 
 
 def settle(page):
-    """Until everything that is shown belongs to what is set."""
-    wait(page, "inputs !== null && !scheduled && !rests && Object.keys(waiting).length === 0 && answered === serial"
-               " && !document.body.classList.contains('busy')"
-               " && document.getElementById('verdict').dataset.text !== undefined")  # fmt: skip
+    """Wait until everything shown belongs to the current inputs."""
+    wait_until(
+        page,
+        "inputs !== null && !scheduled && !rests && Object.keys(waiting).length === 0 && answered === serial"
+        " && !document.body.classList.contains('busy')"
+        " && document.getElementById('verdict').dataset.text !== undefined",
+    )
 
 
-def data_of(page, name):
+def read_data(page, name):
     columns = page.evaluate(
         "name => Object.fromEntries(Object.entries(Bokeh.documents[0].get_model_by_name(`${name} data`).data)"
         ".map(([column, values]) => [column, Array.from(values)]))",
@@ -67,185 +70,189 @@ def data_of(page, name):
     return {column: np.array([np.nan if v is None else v for v in values]) for column, values in columns.items()}
 
 
-def value_of(page, name):
+def read_value(page, name):
     return float(page.input_value(f"[id='{name}']"))
 
 
-def shown_scene(page):
-    """The scene of the fields, in SI units."""
-    numbers = {name: value_of(page, name) for name in ("mass", "damping", "period", "delay")}
+def read_scene(page):
+    """Scene described by the input fields, in SI units."""
+    numbers = {name: read_value(page, name) for name in ("mass", "damping", "period", "delay")}
     device = zwidth.Device(numbers["mass"] / 1e3, numbers["damping"])
-    wall = zwidth.VirtualWall(value_of(page, "stiffness"), value_of(page, "virtual_damping"))
+    wall = zwidth.VirtualWall(read_value(page, "stiffness"), read_value(page, "virtual_damping"))
     return zwidth.Scene(device, zwidth.Timing(numbers["period"] / 1e3, numbers["delay"] / 1e3), wall)
 
 
-def words_of_check(scene):
+def run_check(scene):
     options = {"mass": scene.mass, "damping": scene.damping, "period": scene.timing.period, "delay": scene.timing.delay}
     options |= {"stiffness": scene.wall.stiffness, "virtual-damping": scene.wall.virtual_damping}
-    words = [f"--{name}={value!r}" for name, value in options.items()]
-    done = CliRunner().invoke(cli, ["check", *words])
-    assert done.exit_code == 0, done.output
-    return done.stdout.rstrip("\n")
+    arguments = [f"--{name}={value!r}" for name, value in options.items()]
+    result = CliRunner().invoke(cli, ["check", *arguments])
+    assert result.exit_code == 0, result.output
+    return result.stdout.rstrip("\n")
 
 
-def assert_edge_is_of(page, scene):
+def assert_edge_matches(page, scene):
     region, units = zwidth.stable_region(scene.delta, scene.d), scene.units
-    edge = data_of(page, "edge")
-    # Closed, and with a gap behind it.
+    edge = read_data(page, "edge")
+    # The curve is closed and followed by a gap.
     np.testing.assert_array_equal(edge["x"][:-2], region.alpha * units.stiffness)
     np.testing.assert_array_equal(edge["y"][:-2], region.beta * units.virtual_damping)
 
 
-def test_the_page_asks_nobody_else_and_complains_of_nothing(page, server):
-    # What it asked for and complained of is looked at when every one of these tests ends.
+def test_page_opens_only_its_own_websocket(page, server):
+    # The `page` fixture checks requests and console messages after each test.
     assert page.sockets == [f"ws://{server.host}{server.address.partition(server.host)[2]}ws"]
-    assert_edge_is_of(page, shown_scene(page))
+    assert_edge_matches(page, read_scene(page))
 
 
-def test_a_slider_moved_by_the_keyboard_changes_the_boundary(page):
-    before = value_of(page, "damping")
+def test_moving_a_slider_by_keyboard_updates_the_boundary(page):
+    before = read_value(page, "damping")
     page.focus("#damping-slider")
     for _ in range(5):
         page.keyboard.press("ArrowRight")
     settle(page)
-    assert value_of(page, "damping") > before
-    assert_edge_is_of(page, shown_scene(page))
+    assert read_value(page, "damping") > before
+    assert_edge_matches(page, read_scene(page))
 
 
-def test_every_control_is_reached_by_the_keyboard(page):
-    wanted = page.evaluate(
+def test_every_control_is_labeled_and_reachable_by_keyboard(page):
+    expected = page.evaluate(
         "[...document.querySelectorAll('#controls input, #controls select, button, #plane, input[type=checkbox]')]"
         ".filter(e => e.offsetParent !== null).map(e => e.id || e.dataset.copy)"
     )
     reached = set()
     page.focus("#mode")
-    for _ in range(3 * len(wanted)):
+    for _ in range(3 * len(expected)):
         reached.add(page.evaluate("document.activeElement.id || document.activeElement.dataset.copy"))
         page.keyboard.press("Tab")
-    assert set(wanted) - reached == set()
-    unlabelled = page.evaluate(
+    assert set(expected) - reached == set()
+    unlabeled = page.evaluate(
         "[...document.querySelectorAll('input, select, textarea')]"
         ".filter(e => !e.labels.length && !e.getAttribute('aria-label')).map(e => e.id)"
     )
-    assert unlabelled == []
+    assert unlabeled == []
 
 
-@pytest.mark.parametrize("place", [(0.4, 0.5), (0.85, 0.25)])
-def test_a_click_gives_the_verdict_of_check(page, place):
+@pytest.mark.parametrize("position", [(0.4, 0.5), (0.85, 0.25)])
+def test_click_shows_the_verdict_of_the_check_command(page, position):
     plane = page.locator("#plane").bounding_box()
-    before = value_of(page, "stiffness")
-    page.mouse.click(plane["x"] + place[0] * plane["width"], plane["y"] + place[1] * plane["height"])
-    wait(page, f"document.getElementById('stiffness').valueAsNumber !== {before!r}")
+    before = read_value(page, "stiffness")
+    page.mouse.click(plane["x"] + position[0] * plane["width"], plane["y"] + position[1] * plane["height"])
+    wait_until(page, f"document.getElementById('stiffness').valueAsNumber !== {before!r}")
     settle(page)
-    assert page.get_attribute("#verdict", "data-text") == words_of_check(shown_scene(page))
+    assert page.get_attribute("#verdict", "data-text") == run_check(read_scene(page))
     labels = page.evaluate("[...document.querySelectorAll('#verdict div > :first-child')].map(e => e.textContent)")
     assert {"device", "passive", "K_max"} <= set(labels)
-    assert page.inner_text("#word") == ("stable" if zwidth.assess(shown_scene(page)).stable else "UNSTABLE")
+    assert page.inner_text("#word") == ("stable" if zwidth.assess(read_scene(page)).stable else "UNSTABLE")
 
 
-@pytest.mark.parametrize("slow", [False, True], ids=["at once after another", "held"])
+@pytest.mark.parametrize("slow", [False, True], ids=["immediate", "long-press"])
 def test_no_click_is_lost(page, slow):
     plane = page.locator("#plane").bounding_box()
     first, last = ((plane["x"] + x * plane["width"], plane["y"] + 0.5 * plane["height"]) for x in (0.3, 0.6))
     page.mouse.click(*first)
-    # From 0.3 s on the plot takes it for a press.
+    # The plot interprets clicks longer than 0.3 s as presses.
     page.mouse.click(*last, delay=600 if slow else 0)
-    frame = page.evaluate(
+    x_range = page.evaluate(
         "(() => { const r = Bokeh.documents[0].get_model_by_name('plane').x_range; return [r.start, r.end] })()"
     )
-    wait(page, f"document.getElementById('stiffness').valueAsNumber > {frame[0] + 0.4 * (frame[1] - frame[0])!r}")
+    wait_until(
+        page, f"document.getElementById('stiffness').valueAsNumber > {x_range[0] + 0.4 * (x_range[1] - x_range[0])!r}"
+    )
 
 
 def test_arrow_keys_move_the_wall(page):
-    before = shown_scene(page).wall
+    before = read_scene(page).wall
     page.focus("#plane")
     page.keyboard.press("Shift+ArrowRight")
     page.keyboard.press("ArrowUp")
     settle(page)
-    after = shown_scene(page).wall
+    after = read_scene(page).wall
     assert after.stiffness > before.stiffness
     assert after.virtual_damping > before.virtual_damping
-    wall = data_of(page, "wall")
+    wall = read_data(page, "wall")
     assert (wall["x"][0], wall["y"][0]) == (after.stiffness, after.virtual_damping)
 
 
-def test_what_is_copied_runs(page, tmp_path, unpainted):
+def test_copied_configuration_runs(page, tmp_path, unpainted):
     page.fill("#damping", "7.5")
     page.press("#damping", "Enter")
     page.select_option("#velocity", "LowPass")
     settle(page)
     page.click("[data-copy=yaml]")
-    wait(page, "document.getElementById('copied').textContent === 'copied'")
-    text, cutoff = page.evaluate("navigator.clipboard.readText()"), value_of(page, "velocity.cutoff")
+    wait_until(page, "document.getElementById('copied').textContent === 'copied'")
+    text, cutoff = page.evaluate("navigator.clipboard.readText()"), read_value(page, "velocity.cutoff")
     page.select_option("#velocity", "BackwardDifference")
     file = tmp_path / "copied.yaml"
     file.write_text(text, encoding="utf-8")
     assert zwidth.run(file, out=tmp_path / "run").ok
-    given: Any = zwidth.load_config(file).scene
-    scene = given.to_scene()
+    section: Any = zwidth.load_config(file).scene
+    scene = section.to_scene()
     assert scene.device.damping == 7.5
     assert scene.velocity == zwidth.LowPass(cutoff=cutoff, order=1)
 
 
-def test_a_contact_is_simulated_on_demand(page):
-    assert data_of(page, "contact")["x"].size == 0
+def test_contact_is_simulated_on_demand(page):
+    assert read_data(page, "contact")["x"].size == 0
     page.check("#contact-wanted")
-    wait(page, "document.getElementById('contact_words').textContent !== ''")
+    wait_until(page, "document.getElementById('contact_words').textContent !== ''")
     settle(page)
-    scene, shown = shown_scene(page), data_of(page, "contact")
+    scene, data = read_scene(page), read_data(page, "contact")
     page.uncheck("#contact-wanted")
     start = -0.5 * scene.timing.period / max(1.0, 10.0 * scene.delta)
-    hit = scene.simulate(start_position=start, start_velocity=0.1, contact="unilateral", periods=shown["x"].size)
-    np.testing.assert_array_equal(shown["force"], hit.wall_force)
+    contact = scene.simulate(start_position=start, start_velocity=0.1, contact="unilateral", periods=data["x"].size)
+    np.testing.assert_array_equal(data["force"], contact.wall_force)
 
 
-def test_a_refused_value_is_said_and_the_page_goes_on(page):
+def test_invalid_value_is_reported_and_page_stays_usable(page):
     page.fill("#mass", "-5")
     page.press("#mass", "Enter")
-    wait(page, "document.getElementById('error').textContent.startsWith('mass m: got -5 g')")
+    wait_until(page, "document.getElementById('error').textContent.startsWith('mass m: got -5 g')")
     page.fill("#mass", "200")
     page.press("#mass", "Enter")
     settle(page)
     assert page.inner_text("#error") == ""
-    assert_edge_is_of(page, shown_scene(page))
+    assert_edge_matches(page, read_scene(page))
 
 
-def test_a_rate_is_a_period_and_one_that_is_none_is_refused(page):
-    before = value_of(page, "period")
+def test_sampling_rate_sets_period_and_invalid_rate_is_refused(page):
+    before = read_value(page, "period")
     for text in ("0", "-3", ""):
         page.fill("#rate", text)
         page.press("#rate", "Enter")
-        wait(page, "document.getElementById('error').textContent.startsWith('rate 1/T in Hz: not a number above 0')")
+        wait_until(
+            page, "document.getElementById('error').textContent.startsWith('rate 1/T in Hz: not a number above 0')"
+        )
         page.press("#rate", "Escape")
         settle(page)
         assert page.inner_text("#error") == ""
-        assert value_of(page, "rate") == pytest.approx(1e3 / before, rel=1e-5)
+        assert read_value(page, "rate") == pytest.approx(1e3 / before, rel=1e-5)
     page.fill("#rate", "800")
     assert "before this input" in page.inner_text("#verdict-line")
     page.press("#rate", "Enter")
     settle(page)
-    assert value_of(page, "period") == 1.25
+    assert read_value(page, "period") == 1.25
 
 
-def test_it_fits_and_can_be_read(page):
+def test_page_fits_the_window_with_enough_contrast(page):
     for width, scheme in ((390, "dark"), (390, "light"), (900, "light"), (1280, "light"), (1280, "dark")):
         page.set_viewport_size({"width": width, "height": 900})
         page.emulate_media(color_scheme=scheme)
         settle(page)
         assert page.evaluate("document.documentElement.scrollWidth") <= width
-        # No control reaches over the edge of its card.
-        assert page.evaluate(OVER_THE_EDGE) == []
-        # WCAG's contrast of the text on what it stands on: 4.5 for AA.
+        # No control extends beyond the edge of its card.
+        assert page.evaluate(OVERFLOWING) == []
+        # WCAG 2, level AA, requires a contrast of 4.5.
         assert page.evaluate(CONTRAST) >= 4.5
 
 
-def test_when_the_server_ends_the_page_says_so(shared, server):
-    """The last one of this file."""
+def test_page_reports_when_the_server_ends(shared, server):
+    """Must be the last test of this module, because it stops the shared server."""
     assert server.end() == ("stopped\n", "", 0)
-    wait(shared, "document.getElementById('error').textContent.includes('has ended')")
+    wait_until(shared, "document.getElementById('error').textContent.includes('has ended')")
 
 
-OVER_THE_EDGE = """(() => {
+OVERFLOWING = """(() => {
   const edge = document.getElementById("controls").getBoundingClientRect().right;
   const parts = [...document.querySelectorAll("#controls .row > *")];
   return parts.filter(e => e.getBoundingClientRect().right > edge).map(e => e.id);

@@ -1,4 +1,4 @@
-"""The page of a run in a browser: it opens from the disk, asks for nothing, and its slices answer to keys."""
+"""The HTML report of a run in a real browser: opens from disk, requests nothing, and its slices respond to keys."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STUDY = study("plane", PLANES, ("spectral_radius",))
 
 
 @pytest.mark.parametrize("width, scheme", [(1280, "light"), (390, "dark")])
-def test_the_page_opens_from_the_disk(browser, tmp_path, width, scheme):
+def test_report_opens_from_disk_and_responds_to_keys(browser, tmp_path, width, scheme):
     zwidth.run({"version": 1, "name": "example", "studies": [STUDY]}, out=tmp_path / "run")
     file = zwidth.write_report(tmp_path / "run")
     with open_page(browser, viewport={"width": width, "height": 900}, color_scheme=scheme) as page:
@@ -30,7 +30,7 @@ def test_the_page_opens_from_the_disk(browser, tmp_path, width, scheme):
             page.keyboard.press("ArrowDown")
         expected = zwidth.spectral_radius(0.01, -0.2, 0.5, 1.0)
         assert float(readout.inner_text().split(":")[1]) == pytest.approx(float(expected), rel=1e-4)
-        # The map's corner lies within its axes: the highest row of the first column.
+        # The corner of the map lies inside the axes: first column, top row.
         page.locator("canvas").hover(position={"x": 72, "y": 14})
         assert readout.inner_text().startswith("normalized stiffness = 0.01, normalized virtual damping = 1: ")
         page.locator("canvas").hover(position={"x": 4, "y": 4})
@@ -39,7 +39,7 @@ def test_the_page_opens_from_the_disk(browser, tmp_path, width, scheme):
         assert page.complaints == []
 
 
-WRITTEN = """window.written = [];
+RECORD_TEXTS = """window.written = [];
 const fillText = CanvasRenderingContext2D.prototype.fillText;
 CanvasRenderingContext2D.prototype.fillText = function (text, ...more) {
   written.push(text);
@@ -47,7 +47,7 @@ CanvasRenderingContext2D.prototype.fillText = function (text, ...more) {
 };"""
 
 
-def test_round_values_stand_beside_a_map_of_chosen_rows_and_columns(browser, tmp_path):
+def test_decimated_map_has_round_tick_labels(browser, tmp_path):
     axes = {
         "alpha": {"log": {"start": 0.002, "stop": 8, "num": 301}},
         "beta": {"linear": {"start": -2, "stop": 2, "num": 170}},
@@ -58,8 +58,8 @@ def test_round_values_stand_beside_a_map_of_chosen_rows_and_columns(browser, tmp
     zwidth.run({"version": 1, "name": "example", "studies": [fine]}, out=tmp_path / "run")
     file = zwidth.write_report(tmp_path / "run")
     with open_page(browser, viewport={"width": 1280, "height": 900}) as page:
-        page.add_init_script(WRITTEN)
+        page.add_init_script(RECORD_TEXTS)
         page.goto(file.as_uri())
-        written = set(page.evaluate("written"))
-    assert {"0.01", "0.1", "1", "-1.5", "0", "0.5", "2", "yes", "no"} <= written
-    assert max(len(text) for text in written if not text.startswith("normalized")) <= 4
+        texts = set(page.evaluate("written"))
+    assert {"0.01", "0.1", "1", "-1.5", "0", "0.5", "2", "yes", "no"} <= texts
+    assert max(len(text) for text in texts if not text.startswith("normalized")) <= 4

@@ -26,8 +26,8 @@ def _masses_and_links(scene: Any) -> tuple[list[list[float]], list[tuple[float, 
         bodies.append([tip.mass, 0.0, 0.0])
         links.append((tip.stiffness, tip.damping))
     if hand is not None and hand.coupling_stiffness is None:
-        held = bodies[-1]
-        bodies[-1] = [a + b for a, b in zip(held, (hand.mass, hand.damping, hand.stiffness), strict=True)]
+        body = bodies[-1]
+        bodies[-1] = [a + b for a, b in zip(body, (hand.mass, hand.damping, hand.stiffness), strict=True)]
     elif hand is not None:
         bodies.append([hand.mass, hand.damping, hand.stiffness])
         links.append((hand.coupling_stiffness, hand.coupling_damping))
@@ -55,39 +55,39 @@ def rate_table(scene: Any, number: Any = float) -> tuple[list[list[Any]], int, n
         table[n + k][k] -= number(stiffness) / number(mass)
         table[n + k][n + k] -= number(damping) / number(mass)
     for k, pair in enumerate(links):
-        for place, value in zip((0, n), pair, strict=True):
-            for at, other in ((k, k + 1), (k + 1, k)):
-                share = number(value) / number(bodies[at][0])
-                table[n + at][place + at] -= share
-                table[n + at][place + other] += share
+        for offset, value in zip((0, n), pair, strict=True):
+            for index, other in ((k, k + 1), (k + 1, k)):
+                ratio = number(value) / number(bodies[index][0])
+                table[n + index][offset + index] -= ratio
+                table[n + index][offset + other] += ratio
     tip = scene.device.coupling
-    seen = np.zeros(size)
-    seen[int(tip is not None and tip.sensor == "tip")] = 1.0
+    output_row = np.zeros(size)
+    output_row[int(tip is not None and tip.sensor == "tip")] = 1.0
     acts = size if lag is None else size - lag.order
     table[n][acts] = 1 / number(bodies[0][0])
-    turn = 2 * (flint.arb.pi() if number is flint.arb else np.pi)
+    two_pi = 2 * (flint.arb.pi() if number is flint.arb else np.pi)
     for k, mode in enumerate(modes):
-        at, w = 2 * (n + k), turn * number(mode.frequency)
-        table[at][at + 1] = number(1)
-        table[at + 1][at], table[at + 1][at + 1] = -w * w, -2 * number(mode.damping_ratio) * w
-        table[at + 1][acts] = 1 / number(mode.mass)
-        seen[at] = 1.0
+        index, w = 2 * (n + k), two_pi * number(mode.frequency)
+        table[index][index + 1] = number(1)
+        table[index + 1][index], table[index + 1][index + 1] = -w * w, -2 * number(mode.damping_ratio) * w
+        table[index + 1][acts] = 1 / number(mode.mass)
+        output_row[index] = 1.0
     if lag is not None:
-        w = 1 / number(lag.time_constant) if lag.cutoff is None else turn * number(lag.cutoff)
+        w = 1 / number(lag.time_constant) if lag.cutoff is None else two_pi * number(lag.cutoff)
         if lag.order == 1:
             table[acts][acts], table[acts][size] = -w, w
         else:
             table[acts][acts + 1] = number(1)
             table[acts + 1][acts], table[acts + 1][acts + 1] = -w * w, -2 * number(lag.damping_ratio) * w
             table[acts + 1][size] = w * w
-    return table, size, seen
+    return table, size, output_row
 
 
 def continuous(scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return A, B and the sensor row of the device in continuous time, in SI units."""
-    table, size, seen = rate_table(scene)
+    table, size, output_row = rate_table(scene)
     rate = np.array(table)
-    return rate[:size, :size], rate[:size, size], seen
+    return rate[:size, :size], rate[:size, size], output_row
 
 
 def flow(a: np.ndarray, b: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
@@ -114,8 +114,8 @@ def _companion(device: Any, number: Any) -> tuple[list[list[Any]], int, np.ndarr
     for k in range(size - 1):
         table[k][k + 1] = number(1)
     table[size - 1] = [*(-exact(value) for value in bottom[:0:-1]), number(1)]
-    seen = np.array([exact(value) for value in top[::-1]] + [number(0)] * (size - len(top)), object)
-    return table, size, seen if number is flint.arb else seen.astype(float)
+    output_row = np.array([exact(value) for value in top[::-1]] + [number(0)] * (size - len(top)), object)
+    return table, size, output_row if number is flint.arb else output_row.astype(float)
 
 
 def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -142,15 +142,15 @@ def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def _sample(scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the transition over a period, the effects of the newer and the older force, and the sensor row."""
-    a, b, seen = continuous(scene)
+    a, b, output_row = continuous(scene)
     period, fraction = scene.timing.period, scene.d - scene.integer_delay
     rest, newer = flow(a, b, (1.0 - fraction) * period)
-    return flow(a, b, period)[0], newer, rest @ flow(a, b, fraction * period)[1], seen
+    return flow(a, b, period)[0], newer, rest @ flow(a, b, fraction * period)[1], output_row
 
 
 def closed_loop_matrix(scene: Any, stiffness: float, virtual_damping: float) -> np.ndarray:
     """Return the state matrix of the closed loop: positions, velocities, filter, then the delayed commands."""
-    step, newer, older, seen = _sample(scene)
+    step, newer, older, output_row = _sample(scene)
     size, late = len(step), scene.integer_delay
     fraction = scene.d - late
     top, bottom = velocity_polynomials(scene)
@@ -159,7 +159,7 @@ def closed_loop_matrix(scene: Any, stiffness: float, virtual_damping: float) -> 
     queue = late + (1 if fraction else 0)
     total = size + order + queue
     force = np.zeros(total)
-    force[:size] = -(stiffness + virtual_damping * top[0]) * seen
+    force[:size] = -(stiffness + virtual_damping * top[0]) * output_row
     force[size : size + order] = -virtual_damping * (top[1:] - top[0] * bottom[1:])
 
     def sample(age: int) -> np.ndarray:
@@ -174,7 +174,7 @@ def closed_loop_matrix(scene: Any, stiffness: float, virtual_damping: float) -> 
     if order:
         matrix[size, size : size + order] = -bottom[1:]
         matrix[size + 1 : size + order, size : size + order - 1] = np.eye(order - 1)
-        matrix[size, :size] += seen
+        matrix[size, :size] += output_row
     for age in range(queue):
         matrix[size + order + age] = sample(age)
     return matrix
@@ -210,8 +210,8 @@ def random_scene(kind: str, generator: np.random.Generator) -> zwidth.Scene:
     if kind in ("hand", "soft hand", "all"):
         hand_mass, damping, stiffness = mass * 10 ** draw(-1, 1), 10 ** draw(-1, 1), 10 ** draw(1, 3)
         soft = kind == "soft hand" or (kind == "all" and draw() < 0.5)
-        behind = {"coupling_stiffness": 10 ** draw(2, 4), "coupling_damping": 10 ** draw(-1, 1)} if soft else {}
-        hand = zwidth.Operator(hand_mass, damping, stiffness, **behind)
+        link = {"coupling_stiffness": 10 ** draw(2, 4), "coupling_damping": 10 ** draw(-1, 1)} if soft else {}
+        hand = zwidth.Operator(hand_mass, damping, stiffness, **link)
     if kind in ("filter", "all"):
         cutoff = 10 ** draw(-2.5, -0.4) / period
         velocity = (
@@ -231,8 +231,8 @@ def random_scene(kind: str, generator: np.random.Generator) -> zwidth.Scene:
             for sign in generator.choice([1.0, 1.0, -1.0], generator.integers(0, 3))
         ]
         device = replace(device, modes=modes, actuator=lag if draw() < 0.6 or not modes else None)
-    whole, odd = int(generator.integers(0, 12)), float(draw(0, 8))
-    periods = float(generator.choice([0, 1, whole, odd, 0.3, np.nextafter(3, 0)]))
+    n, fractional = int(generator.integers(0, 12)), float(draw(0, 8))
+    periods = float(generator.choice([0, 1, n, fractional, 0.3, np.nextafter(3, 0)]))
     return zwidth.Scene(device, zwidth.Timing(period, periods * period), velocity=velocity, operator=hand)
 
 
@@ -244,26 +244,31 @@ def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np
 
     The response of the device is computed from its state matrix at each frequency.
     """
-    own, newer, older, seen = _sample(scene)
-    size, late = len(own), scene.integer_delay
+    transition, newer, older, output_row = _sample(scene)
+    size, late = len(transition), scene.integer_delay
     fraction = scene.d - late
     top, bottom = velocity_polynomials(scene)
 
-    def needed(w: np.ndarray) -> Any:
+    def critical_controller(w: np.ndarray) -> Any:
         """Return ``-1/G - B F``, which is the stiffness where it is real."""
         z = np.exp(1j * w)
-        push = newer[None, :] + older[None, :] / z[:, None] if fraction else np.broadcast_to(newer, (w.size, size))
-        moved = np.linalg.solve(z[:, None, None] * np.eye(size) - own, push[..., None])[..., 0] @ seen
-        return -(z**late) / moved - virtual_damping * np.polyval(top, z) / np.polyval(bottom, z)
+        input_response = (
+            newer[None, :] + older[None, :] / z[:, None] if fraction else np.broadcast_to(newer, (w.size, size))
+        )
+        position = (
+            np.linalg.solve(z[:, None, None] * np.eye(size) - transition, input_response[..., None])[..., 0]
+            @ output_row
+        )
+        return -(z**late) / position - virtual_damping * np.polyval(top, z) / np.polyval(bottom, z)
 
     grid = np.unique(np.concatenate([np.geomspace(1e-6, 0.3, angles // 2), np.linspace(1e-3, np.pi - 1e-9, angles)]))
-    value = needed(grid)
+    value = critical_controller(grid)
     k = np.flatnonzero(np.sign(value.imag[:-1]) * np.sign(value.imag[1:]) < 0)
     low, high, sign = grid[k], grid[k + 1], np.sign(value.imag[k])
     for _ in range(60 if k.size else 0):
         middle = 0.5 * (low + high)
-        same = np.sign(needed(middle).imag) == sign
+        same = np.sign(critical_controller(middle).imag) == sign
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     at_ends = np.array([1e-9, np.pi])
-    found: Any = np.concatenate([needed(0.5 * (low + high)), needed(at_ends)])
-    return found.real, float(np.median(np.abs(value)))
+    values: Any = np.concatenate([critical_controller(0.5 * (low + high)), critical_controller(at_ends)])
+    return values.real, float(np.median(np.abs(value)))

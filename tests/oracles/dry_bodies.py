@@ -1,4 +1,4 @@
-"""Bodies in a row under constant forces, the first on dry friction: by Runge-Kutta, or one body in closed form."""
+"""Bodies in series under constant forces, dry friction on the first: by Runge-Kutta, or one body in closed form."""
 
 from __future__ import annotations
 
@@ -10,25 +10,24 @@ import numpy as np
 from any_loop import continuous
 from scipy.integrate import solve_ivp
 
-# A share of a period: an event is not looked for right behind another one, and so short a way is a parabola.
-BLIND = 1e-9
+BLIND = 1e-9  # in periods: no event is searched this soon after another; so short a motion is a parabola
 
 
 class Friction(NamedTuple):
-    """Of the first body, in N: slipping, and the most at rest."""
+    """Friction on the first body in N: while sliding, and at most at rest."""
 
     coulomb: float
     static: float
 
 
 def _event(value: Any, direction: float, terminal: bool) -> Any:
-    """A function that solve_ivp watches, which asks it for attributes."""
+    """Set the attributes of an event function that solve_ivp reads."""
     value.direction, value.terminal = direction, terminal
     return value
 
 
 class Bodies:
-    """Bodies in a row by solve_ivp."""
+    """Bodies in series, integrated by solve_ivp."""
 
     def __init__(self, scene: Any, friction: Friction | None, rtol: float, step: float) -> None:
         self.matrix, self.push, _ = continuous(scene)
@@ -37,14 +36,14 @@ class Bodies:
         self.mass = 1.0 / self.push[self.count]
         self.held = self.matrix.copy()
         self.held[[0, self.count]] = 0.0
-        # The force of springs and dampers on the first body, with that body at rest.
+        # The force of springs and dampers on the first body while it sticks.
         self.pull = self.matrix[self.count] * self.mass
         self.pull[self.count] = 0.0
         self.longest = step / max(np.abs(np.linalg.eigvals(self.matrix)).max(), 1e-300)
         self.size = 0.0
 
     def other_forces(self, state: np.ndarray, force: float) -> float:
-        """Their sum on the first body, held."""
+        """Return the sum of the other forces on the first body while it sticks."""
         return float(self.pull @ state) + force
 
     def _flow(self, force: float, slip: float | None) -> tuple[np.ndarray, np.ndarray]:
@@ -53,9 +52,9 @@ class Bodies:
         return self.matrix, self.push * (force - (slip * self.friction.coulomb if slip and self.friction else 0.0))
 
     def _grow(self, state: np.ndarray, push: np.ndarray) -> None:
-        """The largest position, velocity and acceleration so far, times the period as often as makes a length."""
-        reached = np.concatenate([state[: self.count], state[self.count :] * self.period, push * self.period**2])
-        self.size = max(self.size, float(np.abs(reached).max()))
+        """Update the largest position, velocity and acceleration, converted to lengths by powers of the period."""
+        lengths = np.concatenate([state[: self.count], state[self.count :] * self.period, push * self.period**2])
+        self.size = max(self.size, float(np.abs(lengths).max()))
 
     def _solve(self, state: np.ndarray, span: float, matrix: np.ndarray, push: np.ndarray, events: Any = None) -> Any:
         n = self.count
@@ -74,15 +73,15 @@ class Bodies:
         )
 
     def move(self, state: np.ndarray, span: float, force: float, slip: float | None) -> np.ndarray:
-        """The state after a span, whatever happens on the way."""
+        """Return the state after a time span, ignoring events."""
         matrix, push = self._flow(force, slip)
         if abs(span) <= BLIND * self.period:
             rate = matrix @ state + push
             return state + span * rate + 0.5 * span**2 * (matrix @ rate)
         return self._solve(state, span, matrix, push).y[:, -1]
 
-    def _watched(self, force: float, slip: float) -> list[tuple[np.ndarray, float, float]]:
-        """Rows and constants whose sum rises through 0 at the next event, and the size of it."""
+    def _list_events(self, force: float, slip: float) -> list[tuple[np.ndarray, float, float]]:
+        """Return rows and constants whose sum increases through 0 at the next event, and the scale of each."""
         assert self.friction is not None
         if slip:
             row = np.zeros_like(self.push)
@@ -94,53 +93,53 @@ class Bodies:
     def until(
         self, state: np.ndarray, span: float, force: float, slip: float, note: Callable[[str, float], None]
     ) -> tuple[float, np.ndarray, bool]:
-        """Time, state and whether it is one: the next event, or the end of the span."""
+        """Return time and state of the next event or of the end of the span, and whether it is an event."""
         matrix, push = self._flow(force, slip)
         if slip == 0 and self.count == 1:
             return span, state.copy(), False
         if span <= BLIND * self.period:
             return span, self.move(state, span, force, slip), False
         self._grow(state, push)
-        watched = self._watched(force, slip)
+        monitored = self._list_events(force, slip)
 
         def rise(k: int) -> Any:
             def value(_: float, y: np.ndarray) -> float:
-                return float(watched[k][0] @ y) + watched[k][1]
+                return float(monitored[k][0] @ y) + monitored[k][1]
 
             return _event(value, 1.0, terminal=True)
 
         def top(k: int) -> Any:
             def value(_: float, y: np.ndarray) -> float:
-                return float(watched[k][0] @ (matrix @ y + push))
+                return float(monitored[k][0] @ (matrix @ y + push))
 
             return _event(value, -1.0, terminal=False)
 
-        rises = [rise(k) for k in range(len(watched))]
-        result = self._solve(state, span, matrix, push, [*rises, *(top(k) for k in range(len(watched)))])
+        rises = [rise(k) for k in range(len(monitored))]
+        result = self._solve(state, span, matrix, push, [*rises, *(top(k) for k in range(len(monitored)))])
         end, high = float(result.t[-1]), []
-        for k, (row, constant, size) in enumerate(watched):
-            tops = result.t_events[len(watched) + k], result.y_events[len(watched) + k]
-            for at, y in zip(*tops, strict=True):
+        for k, (row, constant, size) in enumerate(monitored):
+            tops = result.t_events[len(monitored) + k], result.y_events[len(monitored) + k]
+            for instant, y in zip(*tops, strict=True):
                 height = float(row @ y) + constant
                 note("graze" if slip else "static", height / size)
-                if height > 0.0 and at < end:
-                    high.append(at)
+                if height > 0.0 and instant < end:
+                    high.append(instant)
         if high:
-            # Up and down again within one step: there it is up.
+            # The value rises above 0 and returns within one step: integrate to the maximum, where it is positive.
             result = self._solve(state, min(high), matrix, push, rises)
             end = float(result.t[-1])
-        hit = next((k for k in range(len(watched)) if result.t_events[k].size), None)
+        hit = next((k for k in range(len(monitored)) if result.t_events[k].size), None)
         if hit is None:
             return span, result.y[:, -1], False
-        # The interpolant found the event; the integration itself places it.
-        row, constant, _ = watched[hit]
+        # The interpolant locates the event approximately; refine it by integration.
+        row, constant, _ = monitored[hit]
         y = self.move(state, end, force, slip)
         for _ in range(3):
             rate = float(row @ (matrix @ y + push))
-            more = -(float(row @ y) + constant) / rate if rate else 0.0
-            if not abs(more) < 1e-3 * self.period:
+            correction = -(float(row @ y) + constant) / rate if rate else 0.0
+            if not abs(correction) < 1e-3 * self.period:
                 break
-            y, end = self.move(y, more, force, slip), end + more
+            y, end = self.move(y, correction, force, slip), end + correction
         return min(max(end, 0.0), span), y, True
 
 
@@ -162,7 +161,7 @@ class RigidBody(Bodies):
         if c == 0:
             return np.array([x + v * span + 0.5 * a * span**2, v + a * span])
         gained = -math.expm1(-c * span) / c
-        # (span - gained)/c without the cancellation where c is small.
+        # (span - gained)/c without cancellation at small c.
         bend = _second(c * span) * span**2
         return np.array([x + v * gained + a * bend, v * math.exp(-c * span) + a * gained])
 
@@ -172,13 +171,13 @@ class RigidBody(Bodies):
         if slip == 0:
             return span, state.copy(), False
         a, c, v = self._flow(force, slip)[1][1], self.loss, state[1]
-        speed, answer = slip * v, slip * (a - c * v)
-        if answer >= 0 or speed <= 0:
+        speed, acceleration = slip * v, slip * (a - c * v)
+        if acceleration >= 0 or speed <= 0:
             stop = math.inf
         elif c == 0:
-            stop = speed / -answer
+            stop = speed / -acceleration
         else:
-            # v reaches 0 at exp(c t) = 1 - c v/a; a driving force in the slip's direction never lets it.
+            # v reaches 0 at exp(c t) = 1 - c v/a, or never if the force acts in the direction of motion.
             stop = math.log1p(-c * v / a) / c if slip * a < 0 else math.inf
         if stop >= span:
             return span, self.move(state, span, force, slip), False
@@ -186,7 +185,7 @@ class RigidBody(Bodies):
 
 
 def _second(c: float) -> float:
-    """``(c - 1 + e^-c)/c^2``."""
+    """Return ``(c - 1 + e^-c)/c^2``."""
     if abs(c) > 0.5:
         return (c + math.expm1(-c)) / c**2
     return sum((-c) ** k / math.factorial(k + 2) for k in range(20))

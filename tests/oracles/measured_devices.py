@@ -1,7 +1,9 @@
-"""Random devices as matrices, played a force and read by an encoder: exact between samples, without zwidth.
+"""Random devices as matrices, excited by a force and measured by an encoder: exact between samples, without
+zwidth.
 
-Bodies, modes and the amplifier are one continuous system ``x' = A x + B u``, ``y = C x``; the force is held, limited
-and late; the encoder reads whole steps. A wall closes the loop by eigenvalues of one matrix.
+Bodies, modes and the amplifier are one continuous system ``x' = A x + B u``, ``y = C x``; the force is held,
+limited and delayed; the encoder rounds to its steps. Stability of a wall follows from eigenvalues of one
+matrix.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ class TrueDevice:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> TrueDevice:
-        """One of the four kinds."""
+        """Draw a device of one of the four kinds."""
         kind = KINDS[rng.integers(4)]
         mass = float(10 ** rng.uniform(-1.5, 0.0))
         count = {"one resonance": 1, "two resonances": 2}.get(kind, 0)
@@ -43,7 +45,7 @@ class TrueDevice:
             (float(top), float(10 ** rng.uniform(np.log10(0.005), -1.0)), float(mass * 10 ** rng.uniform(0.0, 1.5)))
             for top in tops
         )
-        # Beyond a node now and then.
+        # Some modes have a negative mass ratio.
         modes = tuple((f, z, m * (-1.0 if rng.random() < 0.3 else 1.0)) for f, z, m in modes)
         return cls(
             kind, mass, float(mass * 10 ** rng.uniform(0.5, 2.0)),
@@ -53,7 +55,7 @@ class TrueDevice:
         )  # fmt: skip
 
     def matrices(self) -> tuple[Any, Any, Any]:
-        """A, B and C of the continuous system."""
+        """Return A, B and C of the continuous system."""
         blocks = [np.array([[0.0, 1.0], [0.0, -self.damping / self.mass]])]
         push, read = [0.0, 1.0 / self.mass], [1.0, 0.0]
         for hertz, ratio, mass in self.modes:
@@ -67,19 +69,19 @@ class TrueDevice:
         return A, B, C
 
     def sampled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same with the forces on their way as states: one step a period."""
+        """Return A, B and C of the sampled system; delayed forces are states."""
         A, B, C = self.matrices()
         size, periods = B.size, self.delay / self.period
         n = int(periods)
         f = periods - n
 
         def step(t: float) -> tuple[np.ndarray, np.ndarray]:
-            whole = expm(np.block([[A, B[:, None]], [np.zeros((1, size + 1))]]) * t)
-            return whole[:size, :size], whole[:size, size]
+            transition = expm(np.block([[A, B[:, None]], [np.zeros((1, size + 1))]]) * t)
+            return transition[:size, :size], transition[:size, size]
 
-        late, new = step(self.period * (1 - f)), step(self.period * f)
-        Ad = late[0] @ new[0]
-        older, newer = late[0] @ new[1], late[1]
+        second_part, first_part = step(self.period * (1 - f)), step(self.period * f)
+        Ad = second_part[0] @ first_part[0]
+        older, newer = second_part[0] @ first_part[1], second_part[1]
         # States: the device, then the commands of 1, 2, ..., n + 1 samples ago.
         total = np.zeros((size + n + 1, size + n + 1))
         total[:size, :size], total[:size, size + n] = Ad, older
@@ -94,16 +96,16 @@ class TrueDevice:
         return total, force, np.append(C, np.zeros(n + 1))
 
     def play(self, force: np.ndarray, read: bool = True) -> np.ndarray:
-        """The positions while the force is played, as the encoder reads them or as they are."""
+        """Return the positions during an excitation, as read by the encoder or exact."""
         A, B, C = self.sampled()
-        given, x, out = np.clip(force, -self.limit, self.limit), np.zeros(B.size), np.empty(force.size)
+        limited_force, x, out = np.clip(force, -self.limit, self.limit), np.zeros(B.size), np.empty(force.size)
         for k in range(force.size):
             out[k] = C @ x
-            x = A @ x + B * given[k]
+            x = A @ x + B * limited_force[k]
         return self.encoder * np.round(out / self.encoder) if read else out
 
     def is_stable(self, stiffness: float, virtual_damping: float) -> bool:
-        """Whether a wall with the difference of two samples is stable: all eigenvalues inside the unit circle."""
+        """Return whether a wall with backward difference is stable: all eigenvalues inside the unit circle."""
         A, B, C = self.sampled()
         size, rate = B.size, virtual_damping / self.period
         closed = np.zeros((size + 1, size + 1))
@@ -113,16 +115,16 @@ class TrueDevice:
         return bool(np.abs(np.linalg.eigvals(closed)).max() < 1.0)
 
     def limit_of_walls(self) -> float:
-        """K_max of the true device, by zwidth of its parts."""
+        """Return K_max of the true device, computed by zwidth."""
         modes = [zwidth.Mode(*mode) for mode in self.modes]
         actuator = zwidth.Actuator(time_constant=self.lag) if self.lag else None
         device = zwidth.Device(self.mass, self.damping, actuator=actuator, modes=modes)
-        found = zwidth.Scene(device, zwidth.Timing(self.period, self.delay)).max_stiffness()
-        return float(found.stiffness) if found.status == 0 else 0.0
+        maximum = zwidth.Scene(device, zwidth.Timing(self.period, self.delay)).max_stiffness()
+        return float(maximum.stiffness) if maximum.status == 0 else 0.0
 
 
 def draw_hidden(seed: int) -> tuple[TrueDevice, np.ndarray, np.ndarray]:
-    """Return a device with an actuator lag, resonances or both, a force on it, and what a coarse encoder reads."""
+    """Return a device with actuator lag, resonances or both, a force on it, and the readings of a coarse encoder."""
     rng = np.random.default_rng([52, seed])
     mass = float(10 ** rng.uniform(-1.5, 0.0))
     kind = ("amplifier", "one resonance", "amplifier and resonance", "two resonances")[rng.integers(4)]
@@ -145,12 +147,16 @@ def draw_hidden(seed: int) -> tuple[TrueDevice, np.ndarray, np.ndarray]:
     return true, force, encoder * np.round(exact / encoder + 0.2 * rng.standard_normal(size))
 
 
-MASS, DAMPING, DELAY, PERIOD, STRONGEST = 0.1, 1.0, 1.5e-3, 1e-3, 3.0
+MASS = 0.1  # kg
+DAMPING = 1.0  # N s/m
+DELAY = 1.5e-3  # s
+PERIOD = 1e-3  # s
+STRONGEST = 3.0  # N, largest force
 
 
 @dataclass(frozen=True)
 class OtherDevice(TrueDevice):
-    """One of other matrices, of 100 g and 1 N s/m."""
+    """A device of 100 g and 1 N s/m given by other matrices."""
 
     plant: Any = None
 
@@ -166,37 +172,39 @@ class OtherDevice(TrueDevice):
         return float(scene.max_stiffness().stiffness)
 
     def record(self, rng: np.random.Generator, count: int = 2000, hold: int = 25) -> tuple[np.ndarray, np.ndarray]:
-        """Steps to and fro, and what an encoder with noise reads of them."""
+        """Return a random square-wave force and the readings of an encoder with noise."""
         force = self.limit * np.repeat(rng.choice([-1.0, 1.0], -(-count // hold)), hold)[:count]
         exact = self.play(force, read=False)
         return force, self.encoder * np.round(exact / self.encoder + 0.3 * rng.standard_normal(count))
 
 
 def couple(stiffness: float, tip: float, damping: float, sensor: int) -> Any:
-    """Two bodies of 100 g together, the force and damping to ground on the first, the sensor on either."""
+    """Return two coupled bodies of 100 g in total; force and damping to ground on the first, the sensor on either."""
     masses = np.array([MASS - tip, tip])
-    pull = np.array([[-1.0, 1.0], [1.0, -1.0]]) / masses[:, None]
-    rub = damping * pull - np.diag([DAMPING / masses[0], 0.0])
-    A = np.block([[np.zeros((2, 2)), np.eye(2)], [stiffness * pull, rub]])
+    coupling_matrix = np.array([[-1.0, 1.0], [1.0, -1.0]]) / masses[:, None]
+    damping_matrix = damping * coupling_matrix - np.diag([DAMPING / masses[0], 0.0])
+    A = np.block([[np.zeros((2, 2)), np.eye(2)], [stiffness * coupling_matrix, damping_matrix]])
     return A, np.array([0.0, 0.0, 1.0 / masses[0], 0.0]), np.eye(4)[sensor]
 
 
-def add_mode(plant: Any, frequency: float, ratio: float, share: float) -> Any:
-    """A resonance beside the mass that moves so much as it; negative beyond a node."""
+def add_mode(plant: Any, frequency: float, ratio: float, mass_ratio: float) -> Any:
+    """Return the plant with a parallel mode of the given mass ratio, which is negative with opposite phase at
+    the sensor.
+    """
     A, B, C = plant
     w = 2 * np.pi * frequency
-    more = np.array([[0, 1], [-w * w, -2 * ratio * w]])
-    return block_diag(A, more), np.array([*B, 0.0, 1 / MASS]), np.array([*C, share, 0.0])
+    mode_matrix = np.array([[0, 1], [-w * w, -2 * ratio * w]])
+    return block_diag(A, mode_matrix), np.array([*B, 0.0, 1 / MASS]), np.array([*C, mass_ratio, 0.0])
 
 
 def add_lag(plant: Any, den: tuple[float, ...]) -> Any:
-    """An amplifier of ``1 / (den[0] s^n + ... + 1)`` before it."""
+    """Return the plant with an amplifier ``1 / (den[0] s^n + ... + 1)`` in series."""
     A, B, C = plant
     size, order = len(A), len(den) - 1
     lag = np.eye(order, k=1)
     lag[-1] = -np.array(den[:0:-1]) / den[0]
-    whole = np.block([[A, np.outer(B, np.eye(order)[0])], [np.zeros((order, size)), lag]])
-    return whole, np.eye(size + order)[-1] / den[0], np.array([*C, *np.zeros(order)])
+    combined = np.block([[A, np.outer(B, np.eye(order)[0])], [np.zeros((order, size)), lag]])
+    return combined, np.eye(size + order)[-1] / den[0], np.array([*C, *np.zeros(order)])
 
 
 def _loop(hertz: float) -> tuple[float, float, float]:
@@ -205,11 +213,11 @@ def _loop(hertz: float) -> tuple[float, float, float]:
 
 
 def _couple(hertz: float, sensor: int) -> Any:
-    """Compliance with two thirds of the mass at the tip."""
+    """Return a compliance with two thirds of the mass at the tip."""
     tip = 2 / 3 * MASS
-    less = tip * (MASS - tip) / MASS
+    reduced_mass = tip * (MASS - tip) / MASS
     w = 2 * np.pi * hertz
-    return couple(less * w**2, tip, 2 * 0.03 * w * less, sensor)
+    return couple(reduced_mass * w**2, tip, 2 * 0.03 * w * reduced_mass, sensor)
 
 
 RIGID = np.array([[0.0, 1.0], [0.0, -DAMPING / MASS]]), np.array([0.0, 1 / MASS]), np.array([1.0, 0.0])
@@ -224,38 +232,38 @@ OTHERS = {
 
 
 class Trial(NamedTuple):
-    """What two records of one device told of its walls: the first one blind, the second one made from it."""
+    """Results of two measurements of one device: the first without prior knowledge, the second designed from it."""
 
     device: TrueDevice
     limit: float  # K_max of the true device, N/m
-    stable: tuple[bool | None, ...]  # of each safe wall, on the true device; None where none was given
-    share: tuple[float, ...]  # of the limit that each safe wall has
-    promised: float  # share that the second record was said to tell
-    outside: float  # share of all lines whose true response is outside of the band
+    stable: tuple[bool | None, ...]  # of each safe wall, on the true device; None without a wall
+    share: tuple[float, ...]  # safe stiffness relative to the limit
+    promised: float  # stiffness expected for the second measurement, relative to the limit
+    outside: float  # fraction of frequencies whose true response is outside of the band
 
 
 def measure(seed: int) -> Trial:
-    """Draw a device, play what `zwidth.excite` designs, twice, and judge the safe walls on the device itself."""
+    """Draw a device, measure it twice as designed by `zwidth.excite`, and check the safe walls on the true device."""
     true, period = TrueDevice.draw(np.random.default_rng(seed)), 1e-3
     limit, response, promised = true.limit_of_walls(), None, 0.0
     stable, share, outside = [], [], []
     A, B, C = true.sampled()
-    for turn in range(2):
+    for repetition in range(2):
         record = zwidth.excite(
             period=period,
             force=true.limit,
             resolution=true.encoder,
             duration=DURATION,
             response=response,
-            seed=seed + turn,
+            seed=seed + repetition,
         )
         response = zwidth.respond(period, true.play(record.force), record.force).device
         safe = zwidth.Scene(response, zwidth.Timing(period)).max_stiffness()
-        given = safe.status == zwidth.Status.OK
-        stable.append(true.is_stable(safe.stiffness, safe.virtual_damping) if given else None)
-        share.append(float(safe.stiffness) / limit if given else 0.0)
+        has_wall = safe.status == zwidth.Status.OK
+        stable.append(true.is_stable(safe.stiffness, safe.virtual_damping) if has_wall else None)
+        share.append(float(safe.stiffness) / limit if has_wall else 0.0)
         promised = float(record.expected.stiffness) / limit if record.expected is not None else 0.0
         z = np.exp(2j * np.pi * response.frequency * period)
-        exact = np.array([C @ np.linalg.solve(each * np.eye(B.size) - A, B) for each in z])
+        exact = np.array([C @ np.linalg.solve(root * np.eye(B.size) - A, B) for root in z])
         outside.append(np.abs(response.response - exact) > response.deviation)
     return Trial(true, limit, tuple(stable), tuple(share), promised, float(np.concatenate(outside).mean()))

@@ -1,7 +1,7 @@
-"""Independent formulas in mpmath: what the library computes in float64, here with 60 digits and more.
+"""Independent formulas in mpmath with at least 60 digits, as references for the library's float64 results.
 
-Each is written from the model's definitions as printed (quotients, powers, sums), never from the rearranged
-forms that the library uses. Where a printed formula cancels, more digits are carried instead.
+Each follows the printed definitions of the model (quotients, powers, sums), not the rearranged forms of the
+library. Where a printed formula has cancellation, more digits are used instead.
 """
 
 from __future__ import annotations
@@ -13,12 +13,11 @@ import numpy as np
 from mpmath import mp, mpc, mpf
 
 DIGITS = 60
-# The smallest float64 squared has 647 zeros: digits enough to see it beside 1.
-WIDE = 1400
+WIDE = 1400  # digits that resolve the square of the smallest float64 (647 zeros) next to 1
 
 
 def digits_for(delta: float) -> int:
-    """Decimal digits that survive the cancellation of order delta^2 in the printed formulas."""
+    """Return the decimal digits necessary with the cancellation of order delta^2 in the printed formulas."""
     if delta == 0:
         return DIGITS
     return DIGITS + max(0, math.ceil(-4 * math.log10(delta)))
@@ -34,7 +33,7 @@ class Phi(NamedTuple):
 
 
 def phi(x) -> Phi:
-    """The quotients as printed; their limits at 0. Call it with the digits of `digits_for` at work."""
+    """Return the printed quotients, or their limits at 0. Requires the working precision of `digits_for`."""
     x = mpf(x)
     if x == 0:
         return Phi(mpf(1), mpf(1), mpf(1) / 2, mpf(1) / 2)
@@ -45,19 +44,19 @@ def phi(x) -> Phi:
 
 
 def numerator(delta, fraction) -> tuple[mpf, mpf, mpf]:
-    """z n0(z) + n1(z) of the held plant, highest power first, from the g's of the exact discretization."""
+    """Return z n0(z) + n1(z) of the zero-order-hold plant, highest power first, from the exact discretization."""
     delta, f = mpf(delta), mpf(fraction)
-    whole, late, early = phi(delta), phi(delta * (1 - f)), phi(delta * f)
+    full, late, early = phi(delta), phi(delta * (1 - f)), phi(delta * f)
     t = 1 - f
     g0x, g0v = t**2 * late.phi2, t * late.phi1
     g1x = f**2 * early.phi2 + t * late.phi1 * f * early.phi1
     g1v = mp.exp(-delta * t) * f * early.phi1
-    c, phi1 = whole.c, whole.phi1
+    c, phi1 = full.c, full.phi1
     return g0x, (phi1 * g0v - c * g0x) + g1x, phi1 * g1v - c * g1x
 
 
 def polynomial(alpha, beta, delta, d) -> list[mpf]:
-    """P of a held delay, highest power first: degree 3 + d for whole d, 4 + n otherwise."""
+    """Return P with an exact delay, highest power first: degree 3 + d at integer d, otherwise 4 + n."""
     alpha, beta, delta, d = mpf(alpha), mpf(beta), mpf(delta), mpf(d)
     n = int(mp.floor(d).real)
     f = d - n
@@ -75,7 +74,7 @@ def polynomial(alpha, beta, delta, d) -> list[mpf]:
 
 
 def paper_polynomial(alpha, beta, delta, d: int) -> list[mpf]:
-    """Eq. (17) as printed, for whole d and delta > 0: degree 3 + d, not monic."""
+    """Return eq. (17) as printed, for integer d and delta > 0: degree 3 + d, not monic."""
     alpha, beta, delta = mpf(alpha), mpf(beta), mpf(delta)
     c = mp.exp(-delta)
     total = [-(delta**2), delta**2 * (1 + c), -(delta**2) * c] + [mpf(0)] * (d + 1)
@@ -86,7 +85,7 @@ def paper_polynomial(alpha, beta, delta, d: int) -> list[mpf]:
 
 
 def paper_polynomial_si(mass, damping, period, stiffness, virtual_damping, d: int) -> list[mpf]:
-    """Eq. (11) as printed, for whole d and b > 0."""
+    """Return eq. (11) as printed, for integer d and b > 0."""
     m, b, T, K, B = (mpf(value) for value in (mass, damping, period, stiffness, virtual_damping))
     c = mp.exp(-T * b / m)
     lead = -T * b**2
@@ -98,14 +97,14 @@ def paper_polynomial_si(mass, damping, period, stiffness, virtual_damping, d: in
 
 
 def boundary(omega, delta, d, delay: str = "held") -> tuple[mpf, mpf]:
-    """(alpha, beta) from the 2x2 system Re P = Im P = 0 at z = e^(j omega), 0 < omega < pi."""
+    """Return (alpha, beta) from the 2x2 system Re P = Im P = 0 at z = e^(j omega), 0 < omega < pi."""
     omega, delta, d = mpf(omega), mpf(delta), mpf(d)
     z = mp.expj(omega)
     c = mp.exp(-delta)
     if delay == "held":
         n = mp.floor(d)
         a2, a1, a0 = numerator(delta, d - n)
-        # z^-(1+n) P: a power of z does not move the zeros, and keeps d = 500 as cheap as d = 0
+        # Use z^-(1+n) P: a power of z does not change the zeros, and makes d = 500 as fast as d = 0.
         gain = ((a2 * z + a1) * z + a0) / z ** (2 + n)
     else:
         values = phi(delta)
@@ -119,12 +118,12 @@ def boundary(omega, delta, d, delay: str = "held") -> tuple[mpf, mpf]:
 
 
 def complex_number(real: Any, imag: Any = 0) -> mpc:
-    """A complex number of any two parts; type checkers infer of mpmath's own class that they are whole."""
+    """Return a complex number; type checkers infer integer parts from mpmath's own class."""
     return mpc(real, imag)
 
 
 def evaluate(coefficients, z) -> mpc:
-    """Horner's rule, highest power first."""
+    """Evaluate a polynomial by Horner's rule, highest power first."""
     total = mpc(0)
     for coefficient in coefficients:
         total = total * z + coefficient
@@ -132,30 +131,32 @@ def evaluate(coefficients, z) -> mpc:
 
 
 def roots(coefficients) -> list[mpc]:
-    """All roots of a polynomial with simple roots, highest power first: NumPy's, finished by Newton's method."""
+    """Return all roots of a polynomial with simple roots: NumPy's roots refined by Newton's method."""
     degree = len(coefficients) - 1
     derivative = [(degree - k) * coefficient for k, coefficient in enumerate(coefficients[:-1])]
-    found: list[Any] = [mpc(root) for root in np.roots(np.array([float(coefficient) for coefficient in coefficients]))]
+    refined: list[Any] = [
+        mpc(root) for root in np.roots(np.array([float(coefficient) for coefficient in coefficients]))
+    ]
     for _ in range(8):
-        found = [root - evaluate(coefficients, root) / evaluate(derivative, root) for root in found]
-    distances = [abs(a - b) for k, a in enumerate(found) for b in found[:k]]
+        refined = [root - evaluate(coefficients, root) / evaluate(derivative, root) for root in refined]
+    distances = [abs(a - b) for k, a in enumerate(refined) for b in refined[:k]]
     assert min(distances) > mpf(10) ** -20, "two starting points met at one root"
-    return found
+    return refined
 
 
 def exact_radius(alpha, beta, delta, d) -> mpf:
-    """The size of the outermost pole, of simple ones."""
+    """Return the modulus of the dominant pole, if all poles are simple."""
     with mp.workdps(max(mp.dps, digits_for(delta))):
         return max(abs(root) for root in roots(polynomial(alpha, beta, delta, d)))
 
 
 def relative_error(got, exact, floor: float = 0) -> float:
-    """|got - exact| over |exact| (or over ``floor``, where that is larger)."""
+    """Return |got - exact| divided by |exact|, or by ``floor`` if larger."""
     scale = max(abs(exact), mpf(floor))
     difference = abs(mpf(float(got)) - exact)
     return float(difference / scale) if scale else float(difference)
 
 
 def worst(got, exact, floor: float = 0) -> float:
-    """The largest `relative_error` of two sequences."""
+    """Return the largest `relative_error` of two sequences."""
     return max(relative_error(g, e, floor) for g, e in zip(np.ravel(got), exact, strict=True))

@@ -50,20 +50,20 @@ def ball_parts(scene: Any) -> tuple[flint.acb_poly, flint.acb_poly, flint.acb_po
     fraction = flint.arb(scene.d) - late
     rate = flint.arb_mat(table) * flint.arb(scene.timing.period)
     step, rest, first = (_top((rate * part).exp(), size) for part in (flint.arb(1), 1 - fraction, fraction))
-    own = step[0].charpoly()
+    unforced = step[0].charpoly()
 
     def answer(push: flint.arb_mat) -> flint.arb_poly:
         """Return ``C adj(z - step) push`` by the matrix determinant lemma."""
-        seen = flint.arb_mat(size, size, [push[i, 0] * sees[j] for i in range(size) for j in range(size)])
-        return (step[0] - seen).charpoly() - own
+        closed_update = flint.arb_mat(size, size, [push[i, 0] * sees[j] for i in range(size) for j in range(size)])
+        return (step[0] - closed_update).charpoly() - unforced
 
     z = flint.acb_poly([0, 1])
     top, bottom = _ball_filter(scene)
     if scene.d == late:
-        device, moved = z**late * flint.acb_poly(own), flint.acb_poly(answer(rest[1]))
+        device, moved = z**late * flint.acb_poly(unforced), flint.acb_poly(answer(rest[1]))
     else:
         older = flint.acb_poly(answer(rest[0] * first[1]))
-        device, moved = z ** (late + 1) * flint.acb_poly(own), z * flint.acb_poly(answer(rest[1])) + older
+        device, moved = z ** (late + 1) * flint.acb_poly(unforced), z * flint.acb_poly(answer(rest[1])) + older
     return device * bottom, moved * bottom, moved * top
 
 
@@ -95,7 +95,7 @@ def count_outside(scene: Any, stiffness: float, virtual_damping: float, digits: 
 
 
 def proved_poles(
-    scene: Any, stiffness: float, virtual_damping: float, found: np.ndarray, digits: int = 90
+    scene: Any, stiffness: float, virtual_damping: float, computed: np.ndarray, digits: int = 90
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return pole - 1 for all poles, and the backward error of each computed pole.
 
@@ -109,7 +109,7 @@ def proved_poles(
         terms = device, spring * flint.arb(stiffness), damper * flint.arb(virtual_damping)
         roots = nonzero(terms[0] + terms[1] + terms[2]).roots(tol=10.0 ** (-digits // 2))
         missed = []
-        for zeta in found.tolist():
+        for zeta in computed.tolist():
             z = 1 + flint.acb(zeta.real, zeta.imag)
             values = [term(z) for term in terms]
             size = abs(values[0]) + abs(values[1]) + abs(values[2])
@@ -168,24 +168,30 @@ def proved_column(scene: Any, stiffness: float, digits: int = 60) -> np.ndarray 
             total += sum((a[j + k] * b[j] - a[j] * b[j + k] for j in range(count - k)), flint.arb(0)) * sines[k - 1]
         # The first and last coefficients may be rounding errors of 0.
         parts = total.coeffs()
-        least = max(abs(part).abs_upper() for part in parts) * flint.arb(10) ** (12 - digits)
-        kept = [k for k, part in enumerate(parts) if not abs(part) < least]
-        roots = flint.acb_poly(parts[kept[0] : kept[-1] + 1]).roots(tol=10.0 ** (-digits // 2)) if len(kept) > 1 else []
+        threshold = max(abs(part).abs_upper() for part in parts) * flint.arb(10) ** (12 - digits)
+        significant = [k for k, part in enumerate(parts) if not abs(part) < threshold]
+        roots = (
+            flint.acb_poly(parts[significant[0] : significant[-1] + 1]).roots(tol=10.0 ** (-digits // 2))
+            if len(significant) > 1
+            else []
+        )
         real = [r.real for r in roots if abs(r.imag) < flint.arb(10) ** (-digits // 3) * abs(r)]
         angles = [flint.acb(1 - y, (y * (2 - y)).sqrt()) for y in real if y > 0 and y < 2] + [
             flint.acb(1),
             flint.acb(-1),
         ]
         size = sum((abs(moved[k]) for k in range(count)), flint.arb(0))
-        known = [z for z in angles if not abs(moved(z)) < size * flint.arb(10) ** (-digits // 4)]
-        met = np.array(sorted(float(-(fixed(z) / moved(z)).real.mid()) for z in known))
+        regular = [z for z in angles if not abs(moved(z)) < size * flint.arb(10) ** (-digits // 4)]
+        crossings = np.array(sorted(float(-(fixed(z) / moved(z)).real.mid()) for z in regular))
     except ValueError:
         return None
     finally:
         flint.ctx.dps = before
-    reach = np.ptp(met) + np.abs(met).max() + 1e-300
-    ends = np.concatenate([[-np.inf], met, [np.inf]])
-    between = 0.5 * (np.concatenate([[met[0] - reach], met]) + np.concatenate([met, [met[-1] + reach]]))
+    reach = np.ptp(crossings) + np.abs(crossings).max() + 1e-300
+    ends = np.concatenate([[-np.inf], crossings, [np.inf]])
+    between = 0.5 * (
+        np.concatenate([[crossings[0] - reach], crossings]) + np.concatenate([crossings, [crossings[-1] + reach]])
+    )
     outside = [count_outside(scene, stiffness, damping, digits) for damping in between.tolist()]
     if None in outside:
         return None

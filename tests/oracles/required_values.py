@@ -1,4 +1,4 @@
-"""What a wanted stiffness needs of a rigid device: the root that SciPy finds of K_max in closed form."""
+"""Parameter values of a rigid device required for a stiffness, by SciPy's root finding on the closed form of K_max."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from scipy.optimize import root_scalar
 import zwidth
 
 
-def find_required(name: str, stiffness: float, low: float, high: float, **known: float) -> float:
-    """The value of one quantity in SI units between two at which K_max is the wanted one."""
+def find_required(name: str, stiffness: float, low: float, high: float, **fixed: float) -> float:
+    """Return the value of one parameter in SI units, between two bounds, at which K_max equals ``stiffness``."""
 
     def surplus(value: float) -> float:
-        return math.log(float(zwidth.max_stiffness(**known, **{name: value})) / stiffness)
+        return math.log(float(zwidth.max_stiffness(**fixed, **{name: value})) / stiffness)
 
     return root_scalar(surplus, bracket=(low, high), method="brentq", xtol=1e-300, rtol=1e-14).root

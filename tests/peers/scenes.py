@@ -1,4 +1,4 @@
-"""Two hundred random devices and walls in SI units, and models of them by tools that are not ours."""
+"""Two hundred random devices and walls in SI units, and their models by independent tools."""
 
 from __future__ import annotations
 
@@ -23,18 +23,20 @@ class Loop:
     virtual_damping: float
 
     @property
-    def whole(self) -> int:
-        """Whole periods of the delay."""
+    def n_delay(self) -> int:
+        """Integer part of the delay in periods."""
         return int(np.floor(self.delay / self.period + 1e-9))
 
     @property
     def fraction(self) -> float:
-        """The part of a period that remains of the delay."""
-        return max(self.delay / self.period - self.whole, 0.0)
+        """Fractional part of the delay in periods."""
+        return max(self.delay / self.period - self.n_delay, 0.0)
 
 
 def random_loops() -> list[Loop]:
-    """Masses of 5 g to 5 kg, rates of 100 Hz to 10 kHz, delays of 0 to 6 periods, every other one whole."""
+    """Return loops with masses of 5 g to 5 kg, rates of 100 Hz to 10 kHz, delays of 0 to 6 periods, half of
+    them integer.
+    """
     generator = np.random.default_rng(2006)
     loops = []
     for index in range(COUNT):
@@ -42,7 +44,7 @@ def random_loops() -> list[Loop]:
         periods = generator.integers(0, 7) if index % 2 == 0 else generator.uniform(0, 6)
         delta = 0.0 if index % 10 == 0 else 10 ** generator.uniform(-3, 0.7)
         alpha, beta = generator.uniform(0.001, 1.0), generator.uniform(-delta, 1.2)
-        # Walls of every kind: most of those drawn near the stable region are a little in or out of it.
+        # Most walls near the stable region, inside and outside.
         scale = (1.0 + delta) / (1.0 + periods)
         loops.append(
             Loop(mass, delta * mass / period, period, float(periods) * period, alpha * scale * mass / period**2,
@@ -52,22 +54,22 @@ def random_loops() -> list[Loop]:
 
 
 def continuous(loop: Loop) -> tuple[np.ndarray, np.ndarray]:
-    """The damped mass in continuous time, force to (position, velocity)."""
+    """Return the damped mass in continuous time, from force to (position, velocity)."""
     return np.array([[0.0, 1.0], [0.0, -loop.damping / loop.mass]]), np.array([[0.0], [1.0 / loop.mass]])
 
 
-def held(loop: Loop, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """The state after ``duration`` from the state and from a force held for that long."""
+def hold_force(loop: Loop, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the transition over ``duration``, and the effect of a force held for that time."""
     transition, by_force = advance(loop.mass, loop.damping, duration)
     return transition, by_force[:, None]
 
 
 def closed_loop_matrix(loop: Loop) -> np.ndarray:
-    """One period of the closed loop; state: position, velocity, last position, then the forces on their way."""
-    f, n, t = loop.fraction, loop.whole, loop.period
-    step, _ = held(loop, t)
-    rest, newer = held(loop, (1.0 - f) * t)
-    _, first = held(loop, f * t)
+    """Return the state matrix of the closed loop: position, velocity, last position, then the delayed forces."""
+    f, n, t = loop.fraction, loop.n_delay, loop.period
+    step, _ = hold_force(loop, t)
+    rest, newer = hold_force(loop, (1.0 - f) * t)
+    _, first = hold_force(loop, f * t)
     size = 4 + n
     matrix = np.zeros((size, size))
     force = np.zeros(size)
@@ -75,7 +77,7 @@ def closed_loop_matrix(loop: Loop) -> np.ndarray:
     force[2] = loop.virtual_damping / t
     matrix[:2, :2] = step
     matrix[2, 0] = 1.0
-    # The queue holds the forces of samples k - 1, ..., k - n - 1.
+    # The queue contains the forces of samples k - 1, ..., k - n - 1.
     matrix[:2, 3 + n] += (rest @ first).ravel()
     if n == 0:
         matrix[:2] += newer @ force[None, :]

@@ -1,4 +1,4 @@
-"""Devices given as linear systems against python-control's own sampling, feedback, margins and steps."""
+"""Linear devices, against discretization, feedback, margins and step responses of python-control."""
 
 from __future__ import annotations
 
@@ -14,42 +14,42 @@ T = 1e-3
 
 
 def random_model(generator: np.random.Generator, pairs: int) -> Any:
-    """A damped mass with an amplifier and so many resonances, as python-control's matrices."""
+    """Return a damped mass with an amplifier and ``pairs`` resonances, as a python-control system."""
     model: Any = control.ss([[0.0, 1.0], [0.0, -generator.uniform(5, 50)]], [[0.0], [10.0]], [[1.0, 0.0]], [[0.0]])
     for _ in range(pairs):
         w, ratio = 2 * np.pi * generator.uniform(40, 350), generator.uniform(0.02, 0.2)
-        share = generator.choice([-1.0, 1.0]) * generator.uniform(0.2, 2.0)
-        model = model + control.ss([[0.0, 1.0], [-w * w, -2 * ratio * w]], [[0.0], [share]], [[1.0, 0.0]], [[0.0]])
+        gain = generator.choice([-1.0, 1.0]) * generator.uniform(0.2, 2.0)
+        model = model + control.ss([[0.0, 1.0], [-w * w, -2 * ratio * w]], [[0.0], [gain]], [[1.0, 0.0]], [[0.0]])
     rate = 2 * np.pi * generator.uniform(200, 800)
     return model * control.ss([[-rate]], [[rate]], [[1.0]], [[0.0]])
 
 
 @pytest.fixture(scope="module", params=range(8))
 def pair(request):
-    """A scene, its wall, and the same loop by python-control: device with delay, and wall."""
+    """Return a scene with a wall, and the same device (with delay) and wall as python-control systems."""
     generator = np.random.default_rng(request.param)
-    model, whole = random_model(generator, request.param % 4), int(generator.integers(0, 3))
-    scene = zwidth.Scene(zwidth.LinearDevice(model), zwidth.Timing(T, whole * T))
+    model, n_delay = random_model(generator, request.param % 4), int(generator.integers(0, 3))
+    scene = zwidth.Scene(zwidth.LinearDevice(model), zwidth.Timing(T, n_delay * T))
     top = scene.max_stiffness()
     scene = scene.replace(stiffness=0.4 * top.stiffness, virtual_damping=0.8 * top.virtual_damping)
     z: Any = control.tf([1.0, 0.0], [1.0], T)
-    device = control.c2d(model, T, "zoh") * control.ss(1 / z**whole if whole else control.tf([1.0], [1.0], T))
+    device = control.c2d(model, T, "zoh") * control.ss(1 / z**n_delay if n_delay else control.tf([1.0], [1.0], T))
     spring, damper = scene.wall.stiffness, scene.wall.virtual_damping / T
     wall = control.ss(control.tf([spring + damper, -damper], [1.0, 0.0], T))
     return scene, device, wall
 
 
-def test_poles_are_those_of_its_feedback(pair):
+def test_poles_agree_with_python_control(pair):
     scene, device, wall = pair
     loop: Any = control.feedback(device, wall)
     poles = loop.poles()
     assert scene.spectral_radius() == pytest.approx(np.abs(poles).max(), rel=1e-7)
-    found = np.sort(np.abs(scene.poles()))[::-1]
-    np.testing.assert_allclose(found[:4], np.sort(np.abs(poles))[::-1][:4], rtol=1e-6)
+    moduli = np.sort(np.abs(scene.poles()))[::-1]
+    np.testing.assert_allclose(moduli[:4], np.sort(np.abs(poles))[::-1][:4], rtol=1e-6)
     assert scene.is_stable()
 
 
-def test_margins_are_those_of_its_loop(pair):
+def test_margins_agree_with_python_control(pair):
     scene, device, wall = pair
     gains, _, _, crossings, *_ = control.stability_margins(device * wall, returnall=True)
     margins = scene.margins()
@@ -58,9 +58,9 @@ def test_margins_are_those_of_its_loop(pair):
     assert np.min(np.abs(crossings - 2 * np.pi * margins.phase_crossover)) < 1e-5 * crossings.max()
 
 
-def test_steps_are_those_of_its_feedback(pair):
+def test_step_responses_agree_with_python_control(pair):
     scene, device, wall = pair
-    # A force on the device acts as the command does, but is not late.
-    late = round(scene.d)
-    response = control.step_response(control.feedback(device, wall), np.arange(60 + late) * T).outputs
-    np.testing.assert_allclose(scene.state_space().step(60), response[late:], rtol=1e-6, atol=1e-12)
+    # An external force acts like the command, but without delay.
+    n_delay = round(scene.d)
+    response = control.step_response(control.feedback(device, wall), np.arange(60 + n_delay) * T).outputs
+    np.testing.assert_allclose(scene.state_space().step(60), response[n_delay:], rtol=1e-6, atol=1e-12)

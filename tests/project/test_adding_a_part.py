@@ -1,4 +1,4 @@
-"""A part of a scene is added as CONTRIBUTING.md says: in the files that it names, and everything else knows it."""
+"""A scene component added as CONTRIBUTING.md describes is known to API, command line, configurations and explorer."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Mount(Part):
     damping: Any = 0.0
 '''
 IMPORT = "from zwidth.model.mount import Mount\n"
-# By file: texts, and what stands there in the copy.
+# Per file: text to replace, and its replacement in the copy.
 EDITS = {
     "units/quantities.py": {
         '    Parameter("stiffness", "stiffness K': (
@@ -63,7 +63,7 @@ EDITS = {
         )
     },
     "__init__.pyi": {
-        "from .parts.operator": "from .parts.mount import Mount as Mount\nfrom .parts.operator",
+        "from .model.operator": "from .model.mount import Mount as Mount\nfrom .model.operator",
     },
 }
 
@@ -111,7 +111,7 @@ print(json.dumps({
     "slopes": sorted(scene.sensitivities().per),
     "help": say("check", "--help"),
     "checked": say(*CHECK, "--mount-stiffness", "135", "--mount-damping", "6"),
-    "doubted": say(*CHECK, "--mount-stiffness", "1e12"),
+    "warned": say(*CHECK, "--mount-stiffness", "1e12"),
     "needed": say(*CHECK, "--mount-damping", "1"),
     "refused": [refuse(lambda: zwidth.Mount(stiffness=0)), refuse(lambda: scene.replace(mount=None).replace(mount=5))],
     "faults": refuse(lambda: zwidth.load_config("wrong.yaml")),
@@ -123,12 +123,12 @@ print(json.dumps({
 
 
 @pytest.fixture(scope="module")
-def copied(tmp_path_factory):
-    """What a program says that runs with a copy of the package, to which the part was added."""
+def results(tmp_path_factory):
+    """Output of PROGRAM, run with a copy of the package to which the component was added."""
     folder = tmp_path_factory.mktemp("copy")
     package = folder / "zwidth"
     shutil.copytree(ROOT / "src" / "zwidth", package, ignore=shutil.ignore_patterns("__pycache__"))
-    (package / "parts" / "mount.py").write_text(MOUNT, encoding="utf-8")
+    (package / "model" / "mount.py").write_text(MOUNT, encoding="utf-8")
     for file, edits in EDITS.items():
         text = (package / file).read_text(encoding="utf-8")
         for old, new in edits.items():
@@ -136,65 +136,68 @@ def copied(tmp_path_factory):
             text = text.replace(old, new)
         (package / file).write_text(text, encoding="utf-8")
     (folder / "mounted.yaml").write_text(CONFIGURATION, encoding="utf-8")
-    wrong = CONFIGURATION.replace("stiffness: 0.135 N/mm, damping: 6", "stiffness: 0, dampin: 6")
-    (folder / "wrong.yaml").write_text(wrong, encoding="utf-8")
+    invalid_config = CONFIGURATION.replace(
+        "stiffness: 0.135 N/mm, damping: 6",
+        "stiffness: 0, dampin: 6",  # codespell:ignore
+    )
+    (folder / "wrong.yaml").write_text(invalid_config, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(folder)}
-    found = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", PROGRAM], cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
-    assert found.returncode == 0, found.stderr[-3000:]
-    return json.loads(found.stdout)
+    assert result.returncode == 0, result.stderr[-3000:]
+    return json.loads(result.stdout)
 
 
-def test_the_files_are_those_that_the_guide_names():
+def test_edited_files_are_those_named_in_the_guide():
     guide = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     section = guide[guide.index("**A part of a scene**") : guide.index("## Style")]
     named = set(re.findall(r"`([\w/]+\.pyi?)`", section))
     assert named == set(EDITS)
-    # With its own file they are six.
+    # Six files together with the module of the component.
     assert len(EDITS) == 5
 
 
-def test_a_scene_knows_its_numbers(copied):
-    assert {name: value for name, value in copied["parameters"].items() if "." in name} == {
+def test_scene_knows_and_checks_the_parameters(results):
+    assert {name: value for name, value in results["parameters"].items() if "." in name} == {
         "mount.stiffness": 135.0,
         "mount.damping": 6.0,
     }
-    assert {"mount.stiffness", "mount.damping"} <= set(copied["slopes"])
+    assert {"mount.stiffness", "mount.damping"} <= set(results["slopes"])
     assert (
-        copied["refused"][0]
+        results["refused"][0]
         == "mount.stiffness: got 0 N/m; it must be greater than 0 N/m; write a number in this range"
     )
-    assert copied["refused"][1].startswith("mount: got 5")
+    assert results["refused"][1].startswith("mount: got 5")
 
 
-def test_every_answer_is_that_of_a_massless_hand_with_the_same_numbers(copied):
-    mounted, held = copied["answers"]
-    assert mounted == pytest.approx(held, rel=1e-9)
-    assert mounted[2:4] == [True, False]
+def test_results_equal_those_of_a_massless_operator(results):
+    with_mount, with_operator = results["answers"]
+    assert with_mount == pytest.approx(with_operator, rel=1e-9)
+    assert with_mount[2:4] == [True, False]
 
 
-def test_the_command_line_takes_judges_and_doubts_it(copied):
-    assert "Stiffness of the mount, in N/m." in copied["help"]
-    assert re.search(r"^mount +stiffness 135\.0 N/m, damping 6\.000 N s/m", copied["checked"], re.MULTILINE)
-    assert "--mount-stiffness is 1e+12 N/m, an implausible value" in copied["doubted"]
-    assert "a mount requires a stiffness; give --mount-stiffness" in copied["needed"]
+def test_the_command_line_accepts_judges_and_warns_about_it(results):
+    assert "Stiffness of the mount, in N/m." in results["help"]
+    assert re.search(r"^mount +stiffness 135\.0 N/m, damping 6\.000 N s/m", results["checked"], re.MULTILINE)
+    assert "--mount-stiffness is 1e+12 N/m, an implausible value" in results["warned"]
+    assert "a mount requires a stiffness; give --mount-stiffness" in results["needed"]
 
 
-def test_configurations_have_its_section_and_stores_its_axis(copied):
-    assert "scene.mount.stiffness: got 0 N/m; it must be greater than 0 N/m" in copied["faults"]
-    assert "a mount has the keys 'stiffness', 'damping'; did you mean 'damping'?" in copied["faults"]
-    dims, attributes = copied["store"]
+def test_configuration_section_and_store_axis_exist(results):
+    assert "scene.mount.stiffness: got 0 N/m; it must be greater than 0 N/m" in results["faults"]
+    assert "a mount has the keys 'stiffness', 'damping'; did you mean 'damping'?" in results["faults"]
+    dims, attributes = results["store"]
     assert "mount_stiffness" in dims
     assert attributes == {"long_name": "stiffness of the mount", "units": "N/m"}
-    section, known = copied["schema"]
-    assert known
+    section, is_listed = results["schema"]
+    assert is_listed
     assert section["required"] == ["stiffness"]
     assert section["properties"]["damping"]["description"].startswith("Damping of the mount, in N s/m or with a unit")
 
 
-def test_the_explorer_has_its_sliders_and_writes_it_down(copied):
-    slider, choices, shown, yaml, python = copied["page"]
+def test_explorer_has_its_sliders_and_exports_it(results):
+    slider, choices, shown, yaml, python = results["page"]
     assert slider == ["stiffness of the mount k_0", "N/m", 1.0, 1.0, 1000.0, False]
     assert choices == {"none": "none", "soft": "soft"}
     assert (shown["mount"], shown["mount.stiffness"]) == ("soft", 50.0)

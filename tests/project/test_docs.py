@@ -1,4 +1,4 @@
-"""The pages of docs/ show what the program really prints, draws and computes, and name everything that is public."""
+"""The pages of docs/ show actual output, figures and values, and the reference lists every public name."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from waiting import LONGEST
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
-# For the project's README.
-PORTRAITS = {"docs-site.png"}
-# What all pictures together may take in a clone.
-MOST_BYTES = 6_000_000
+# Shown in the project's README only.
+README_PICTURES = {"docs-site.png"}
+# Limit for the total size of the pictures in a clone.
+MAX_PICTURE_BYTES = 6_000_000
 
 
 @pytest.fixture(autouse=True)
 def jax_settings():
-    """Pages set JAX's precision as a user does; other tests keep their own."""
+    """Restore JAX's precision, which the examples set as a user does."""
     config: Any = jax.config
     before = config.jax_enable_x64
     yield
@@ -46,7 +46,7 @@ def test_every_page_is_up_to_date(page, refresh_docs, fitted_once, unpainted):
     assert refresh_docs.refreshed(text) == text
 
 
-def test_outputs_are_written_where_they_are_missing_or_old(refresh_docs):
+def test_missing_and_outdated_outputs_are_written(refresh_docs):
     old = "```python\n>>> x = 2\n>>> x + 1\n4\n>>> for k in range(2):\n...     print(k)\n```\n"
     new = "```python\n>>> x = 2\n>>> x + 1\n3\n>>> for k in range(2):\n...     print(k)\n0\n1\n```\n"
     assert refresh_docs.refreshed(old) == new
@@ -67,21 +67,21 @@ def test_outputs_are_written_where_they_are_missing_or_old(refresh_docs):
         ("<!-- include: docs/no_such_file.md -->\n<!-- end -->", FileNotFoundError),
     ],
 )
-def test_what_cannot_be_run_is_an_error(refresh_docs, text, error):
+def test_examples_that_fail_raise(refresh_docs, text, error):
     with pytest.raises(error):
         refresh_docs.refreshed(text)
 
 
 @pytest.fixture
 def hooks(monkeypatch):
-    """What the site does beyond mkdocs, as a module."""
+    """Hooks of the documentation site as a module."""
     pytest.importorskip("griffe")
     monkeypatch.syspath_prepend(DOCS)
     return importlib.import_module("hooks")
 
 
-def test_formulas_are_typeset(hooks):
-    shown = hooks.typeset("T^ <= sqrt(a2) e^(-delta t) phi1, of x''")
+def test_formulas_are_typeset_as_mathml(hooks):
+    html = hooks.typeset("T^ <= sqrt(a2) e^(-delta t) phi1, of x''")
     for part in (
         "<mover><mi>T</mi><mo>^</mo></mover>",
         "<mo>≤</mo>",
@@ -91,12 +91,12 @@ def test_formulas_are_typeset(hooks):
         "<mtext>of</mtext>",
         "<msup><mi>x</mi><mo>′′</mo></msup>",
     ):
-        assert part in shown
+        assert part in html
     assert hooks.typeset("a (b < c") == "<code>a (b &lt; c</code>"
 
 
-def test_prompts_and_output_have_classes_of_their_own(hooks):
-    """The copy button leaves both out."""
+def test_prompts_and_output_are_marked_for_the_copy_button(hooks):
+    """The copy button omits elements of these classes."""
     assert hooks.on_page_markdown("```python\n>>> 1\n1\n```") == "```pycon\n>>> 1\n1\n```"
     assert hooks.on_page_markdown("```python\nx = 1\n```") == "```python\nx = 1\n```"
     page = SimpleNamespace(file=SimpleNamespace(src_uri="index.md"))
@@ -106,7 +106,7 @@ def test_prompts_and_output_have_classes_of_their_own(hooks):
 
 
 def test_every_formula_of_the_theory_can_be_typeset(hooks):
-    """None is shown as it is typed, for want of a bracket."""
+    """A formula that cannot be parsed would be shown as code."""
     lines = [
         line
         for page in sorted((DOCS / "theory").glob("*.md"))
@@ -117,35 +117,35 @@ def test_every_formula_of_the_theory_can_be_typeset(hooks):
     assert not [line for line in lines if "<code>" in hooks.typeset(line.strip())]
 
 
-def test_a_section_ends_where_the_next_one_begins(refresh_docs):
-    found = refresh_docs.include("benchmarks/results/bench.md#What each question costs")
-    assert "| question |" in found
-    assert "###" not in found
+def test_included_section_ends_at_the_next_heading(refresh_docs):
+    section = refresh_docs.include("benchmarks/results/bench.md#What each question costs")
+    assert "| question |" in section
+    assert "###" not in section
 
 
-@pytest.mark.parametrize("module", ["", "figures"])
-def test_every_public_name_stands_once_in_the_reference(module):
+@pytest.mark.parametrize("module", ["", "plotting"])
+def test_every_public_name_is_listed_once_in_the_reference(module):
     stub = (ROOT / "src" / "zwidth" / module / "__init__.pyi").read_text(encoding="utf-8")
     public = re.findall(r"^from .* as (\w+)$", stub, re.MULTILINE)
     text = "\n".join(page.read_text(encoding="utf-8") for page in (DOCS / "reference").glob("*.md"))
     prefix = f"zwidth.{module}." if module else "zwidth."
     named = re.findall(rf"^::: {re.escape(prefix)}(\w+)$", text, re.MULTILINE)
     if not module:
-        # Modules stand there by their place.
+        # Modules are listed by their full path.
         named += re.findall(r"^::: zwidth\.\w+\.(devices|plot)$", text, re.MULTILINE)
     assert len(public) > 10
     assert sorted(named) == sorted(public)
 
 
-def test_pictures_are_few_and_all_are_shown():
+def test_pictures_are_small_and_all_are_shown():
     pictures = [path for path in (DOCS / "figures").rglob("*") if path.is_file()]
     texts = "\n".join(page.read_text(encoding="utf-8") for page in [ROOT / "README.md", *PAGES])
-    shown = {Path(name).as_posix() for name in re.findall(r"figures/([\w./-]+)\)", texts)} | PORTRAITS
+    shown = {Path(name).as_posix() for name in re.findall(r"figures/([\w./-]+)\)", texts)} | README_PICTURES
     assert [path for path in pictures if path.relative_to(DOCS / "figures").as_posix() not in shown] == []
-    assert sum(path.stat().st_size for path in pictures) < MOST_BYTES
+    assert sum(path.stat().st_size for path in pictures) < MAX_PICTURE_BYTES
 
 
-def test_the_script_sets_up_and_builds_strictly(tmp_path):
+def test_docs_script_runs_setup_and_a_strict_build(tmp_path):
     (tmp_path / "scripts").mkdir()
     (tmp_path / "docs").mkdir()
     (tmp_path / ".venv" / "bin").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""What Jupyter shows: every result as a table, pictures under their cells, and no warning."""
+"""Jupyter shows results as tables and figures below their cells, without warnings."""
 
 from __future__ import annotations
 
@@ -26,51 +26,53 @@ scene""",
     "region": "zwidth.plot.region(scene)",
     "bode": "zwidth.plot.bode(scene);",
 }
-# Of a result, a table beside its text; of a picture, an image.
+# Results are shown as a table besides the text, figures as images.
 TABLES = ("stiffest", "verdict", "recommendation", "margins", "sensitivities", "motion", "bad")
 PICTURES = ("region", "bode")
 
 
 @pytest.fixture(scope="module")
 def shown() -> dict[str, list[Any]]:
-    """The outputs of every cell."""
+    """Outputs of every cell."""
     import nbformat
     from nbclient import NotebookClient
 
-    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(text.strip()) for text in CELLS.values()])
-    # In a loop that is closed afterwards.
-    asyncio.run(NotebookClient(book, timeout=LONGEST, kernel_name="python3").async_execute())
-    return dict(zip(CELLS, (cell.outputs for cell in book.cells), strict=True))
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(text.strip()) for text in CELLS.values()])
+    # asyncio.run closes the event loop afterwards.
+    asyncio.run(NotebookClient(notebook, timeout=LONGEST, kernel_name="python3").async_execute())
+    return dict(zip(CELLS, (cell.outputs for cell in notebook.cells), strict=True))
 
 
-def _data(outputs: list[Any]) -> dict[str, str]:
-    """What stands below a cell, by its kind."""
+def read_data(outputs: list[Any]) -> dict[str, str]:
+    """Output data of a cell by MIME type."""
     return {kind: text for output in outputs for kind, text in output.get("data", {}).items()}
 
 
-def test_nothing_is_warned_of(shown):
-    said = {name: [each.text for each in outputs if each.output_type == "stream"] for name, outputs in shown.items()}
-    assert not any(said.values()), said
+def test_no_cell_prints_warnings(shown):
+    printed = {
+        name: [output.text for output in outputs if output.output_type == "stream"] for name, outputs in shown.items()
+    }
+    assert not any(printed.values()), printed
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_results_are_tables_beside_their_texts(shown, name):
-    data = _data(shown[name])
+def test_results_have_a_table_and_a_short_text(shown, name):
+    data = read_data(shown[name])
     assert data["text/html"].startswith("<table")
     assert len(data["text/plain"]) < 1500
     assert "array([" not in data["text/plain"]
 
 
-def test_a_motion_has_its_picture(shown):
-    assert "<svg" in _data(shown["motion"])["text/html"]
+def test_simulation_has_a_figure(shown):
+    assert "<svg" in read_data(shown["motion"])["text/html"]
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_pictures_stand_below_their_cells(shown, name):
-    assert len(_data(shown[name])["image/png"]) > 5000
+def test_figures_are_shown_as_images(shown, name):
+    assert len(read_data(shown[name])["image/png"]) > 5000
 
 
-def test_units_and_names_of_codes_are_said(shown):
-    assert "kN/m" in _data(shown["stiffest"])["text/plain"]
-    assert "degrees" in _data(shown["margins"])["text/plain"]
-    assert "INVALID_INPUT" in _data(shown["bad"])["text/plain"]
+def test_texts_contain_units_and_status_names(shown):
+    assert "kN/m" in read_data(shown["stiffest"])["text/plain"]
+    assert "degrees" in read_data(shown["margins"])["text/plain"]
+    assert "INVALID_INPUT" in read_data(shown["bad"])["text/plain"]

@@ -1,4 +1,4 @@
-"""The promises that no single module can keep: files that exist, pins, scripts, and a silent import."""
+"""Project-wide checks: documented paths, pinned dependencies, script permissions and side effects of imports."""
 
 import ast
 import itertools
@@ -18,7 +18,7 @@ import zwidth
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# A folder of the project followed by a path, or one of the files beside the README.
+# A path that begins with a folder of the project, or one of the files next to the README.
 NAMED_PATH = re.compile(
     r"(?<![\w./:-])(?:\./)?("
     r"(?:src|tests|benchmarks|configs|scripts|docs|\.ci)/[\w./*-]*[\w*/]"
@@ -26,20 +26,20 @@ NAMED_PATH = re.compile(
     r")"
 )
 LINK = re.compile(r"\]\((?![a-z]+:|#)([^)#\s]+)")
-# The groups keep these patterns from matching their own text.
+# The groups prevent these patterns from matching their own source.
 FOREIGN_TEXT = {
     "a registry's host": re.compile(r"(?:pypi|pythonhosted|npmjs|debian)\.(?:org|com|net)"),
     "a machine's path": re.compile(r"(?<![\w.~)/-])/(?:home|root|Users|mnt|opt|srv|tmp|work)/"),
 }
 
 
-def documents():
+def list_documents():
     names = ["README.md", "CONTRIBUTING.md", "configs/*.yaml"]
     return [path for name in names for path in sorted(ROOT.glob(name))]
 
 
-def project_files():
-    """Every file that is tracked or about to be; all of them where this is no checkout."""
+def list_project_files():
+    """All tracked and untracked files that Git does not ignore; without a checkout, all files."""
     listing = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -56,7 +56,7 @@ def project_files():
 
 
 def run_python(code):
-    """Run code in a fresh interpreter, since this one has long since imported everything."""
+    """Run code in a new interpreter, because this one has imported everything already."""
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False, timeout=LONGEST
     )
@@ -64,8 +64,8 @@ def run_python(code):
     return result.stdout
 
 
-@pytest.mark.parametrize("document", documents(), ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_every_named_path_exists(document):
+@pytest.mark.parametrize("document", list_documents(), ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_path_in_documents_exists(document):
     text = document.read_text(encoding="utf-8")
     if document.suffix == ".yaml":
         text = "\n".join(re.findall(r"(?:^|\s)#(.*)", text))
@@ -75,7 +75,7 @@ def test_every_named_path_exists(document):
     assert not missing
 
 
-def test_constraints_hold_pins_and_nothing_else():
+def test_constraints_contain_only_sorted_pins():
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pin = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*==[0-9][0-9a-z.]*")
     assert [line for line in lines if not pin.fullmatch(line)] == []
@@ -97,13 +97,13 @@ def test_every_dependency_is_pinned_within_its_bounds():
     assert outside == []
 
 
-def test_the_citation_is_of_this_version():
+def test_citation_matches_the_project_metadata():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == project["version"] == zwidth.__version__
     assert citation["license"] == project["license"]
     assert citation["keywords"] == project["keywords"]
-    # What the format, 1.2.0, asks for.
+    # Keys required by CFF 1.2.0.
     assert {"cff-version", "message", "title", "authors"} <= citation.keys()
     for work in (citation, *citation["references"]):
         assert work["title"]
@@ -113,21 +113,21 @@ def test_the_citation_is_of_this_version():
     assert [author["family-names"] for author in paper["authors"]] == ["Hulin", "Preusche", "Hirzinger"]
 
 
-@pytest.mark.parametrize("what", FOREIGN_TEXT)
-def test_no_file_names(what):
-    found = []
-    for path in project_files():
+@pytest.mark.parametrize("kind", FOREIGN_TEXT)
+def test_no_file_contains(kind):
+    matches = []
+    for path in list_project_files():
         data = path.read_bytes()
         if b"\0" in data:
             continue
-        match = FOREIGN_TEXT[what].search(data.decode("utf-8", errors="replace"))
+        match = FOREIGN_TEXT[kind].search(data.decode("utf-8", errors="replace"))
         if match:
-            found.append(f"{path.relative_to(ROOT)}: {match.group()}")
-    assert found == []
+            matches.append(f"{path.relative_to(ROOT)}: {match.group()}")
+    assert matches == []
 
 
-def test_scripts_can_be_executed():
-    scripts = [*(ROOT / "scripts").iterdir(), ROOT / ".ci" / "run"]
+def test_scripts_are_executable():
+    scripts = [*(path for path in (ROOT / "scripts").iterdir() if path.suffix != ".txt"), ROOT / ".ci" / "run"]
     assert [path.name for path in scripts if path.is_file() and not os.access(path, os.X_OK)] == []
 
 
@@ -179,7 +179,7 @@ print([name for name in before if before[name] != after[name]])
     assert output.strip() == "[]"
 
 
-def test_help_answers_without_jax():
+def test_help_loads_no_heavy_modules():
     output = run_python("""
 import sys
 
@@ -196,7 +196,7 @@ print("heavy:", sorted({"bokeh", "jax", "jaxlib", "matplotlib", "scipy", "tornad
     assert output.splitlines()[-1] == "heavy: []"
 
 
-def test_figures_and_configurations_need_no_jax():
+def test_plotting_and_configuration_schema_load_no_jax():
     output = run_python("""
 import sys
 
@@ -208,10 +208,10 @@ print("jax" in sys.modules)
     assert output.strip() == "False"
 
 
-def test_no_two_types_share_a_name():
-    homes = {}
+def test_class_names_are_unique():
+    files_by_name = {}
     for path in sorted((ROOT / "src").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ClassDef):
-                homes.setdefault(node.name.strip("_"), []).append(path.name)
-    assert {name: files for name, files in homes.items() if len(files) > 1} == {}
+                files_by_name.setdefault(node.name.strip("_"), []).append(path.name)
+    assert {name: files for name, files in files_by_name.items() if len(files) > 1} == {}

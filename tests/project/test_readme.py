@@ -1,4 +1,4 @@
-"""README.md shows what the program really prints and computes."""
+"""README.md shows actual output of the commands and examples."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_every_console_block_shows_the_output_of_its_commands():
+def test_console_blocks_show_the_output_of_their_commands():
     spec = importlib.util.spec_from_file_location("refresh_readme", ROOT / "scripts" / "refresh_readme.py")
     assert spec is not None
     assert spec.loader is not None
@@ -20,7 +20,7 @@ def test_every_console_block_shows_the_output_of_its_commands():
     assert module.refreshed(text) == text
 
 
-def test_every_python_example_runs_as_shown():
+def test_python_examples_run_as_shown():
     result = doctest.testfile(str(ROOT / "README.md"), module_relative=False)
     assert result.attempted >= 5
     assert result.failed == 0

@@ -1,4 +1,6 @@
-"""Arrays have the axes that their annotations name: checked by jaxtyping, which the program itself never loads."""
+"""Arrays have the shapes and types of their annotations, as checked by jaxtyping, which the package never loads
+itself.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ from zwidth.stability.rigid.step_response import step_response
 with patch.object(typing, "TYPE_CHECKING", True):
     ALIASES = {name: value for name, value in runpy.run_path(_types.__file__).items() if name[0] != "_"}
 
-# Arguments that broadcast to the shape (2, 3), and arrays of it.
+# Arguments that broadcast to shape (2, 3), and arrays of that shape.
 WALL = {"alpha": np.array([0.1, 0.2, 0.4]), "beta": np.array([[0.1], [0.3]]), "delta": np.float64(0.2)}
 GRID = dict(zip(WALL, np.broadcast_arrays(*WALL.values()), strict=True))
 DEVICE = {"delta": GRID["delta"], "d": np.full((2, 3), 1.5)}
@@ -61,39 +63,41 @@ CALLS = [
 ]
 
 
-def hints_of(annotated):
+def read_hints(annotated):
     return typing.get_type_hints(annotated, {**vars(sys.modules[annotated.__module__]), **ALIASES})
 
 
-def named(value, hint, place):
-    """The arrays in a value whose annotation names their axes: place, array, annotation."""
+def list_annotated(value, hint, path):
+    """Yield path, array and annotation of each array in a value whose annotation names its axes."""
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
-        yield place, value, hint
+        yield path, value, hint
     elif hasattr(hint, "_fields"):
-        for name, inner in hints_of(hint).items():
-            yield from named(getattr(value, name), inner, f"{place}.{name}")
+        for name, inner in read_hints(hint).items():
+            yield from list_annotated(getattr(value, name), inner, f"{path}.{name}")
     elif typing.get_origin(hint) is tuple and Ellipsis not in typing.get_args(hint):
         for index, (part, inner) in enumerate(zip(value, typing.get_args(hint), strict=True)):
-            yield from named(part, inner, f"{place}[{index}]")
+            yield from list_annotated(part, inner, f"{path}[{index}]")
 
 
-def misfits(function, arguments):
-    """Which arguments and results have other axes or another type than the annotations say."""
-    hints = hints_of(function)
-    given = [found for name, value in arguments.items() for found in named(value, hints[name], name)]
-    returned = list(named(function(**arguments), hints["return"], "result"))
-    assert returned
+def find_mismatches(function, arguments):
+    """Paths of the arguments and results whose axes or type differ from the annotation."""
+    hints = read_hints(function)
+    annotated_arguments = [
+        item for name, value in arguments.items() for item in list_annotated(value, hints[name], name)
+    ]
+    annotated_results = list(list_annotated(function(**arguments), hints["return"], "result"))
+    assert annotated_results
     with jaxtyped("context"):
-        return [place for place, value, hint in given + returned if not isinstance(value, hint)]
+        return [path for path, value, hint in annotated_arguments + annotated_results if not isinstance(value, hint)]
 
 
 @pytest.mark.parametrize("function, arguments", CALLS, ids=[function.__name__ for function, _ in CALLS])
-def test_arrays_have_the_axes_that_annotations_name(function, arguments):
-    assert misfits(function, arguments) == []
+def test_arrays_match_their_annotations(function, arguments):
+    assert find_mismatches(function, arguments) == []
 
 
-def test_other_axes_are_noticed():
-    def turned(alpha: Reals, beta: Reals) -> Roots:
+def test_mismatched_axes_are_detected():
+    def transposed(alpha: Reals, beta: Reals) -> Roots:
         return ROOTS_FIRST
 
-    assert misfits(turned, {"alpha": GRID["alpha"], "beta": GRID["beta"].T}) == ["beta", "result"]
+    assert find_mismatches(transposed, {"alpha": GRID["alpha"], "beta": GRID["beta"].T}) == ["beta", "result"]

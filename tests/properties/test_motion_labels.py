@@ -1,4 +1,4 @@
-"""Observed behavior of random motions, compared with the recorded positions and with the linear verdict."""
+"""Final states of random responses, against the recorded positions and the linear verdict."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from zwidth.simulation.result import MotionKind
 
 SEED, COUNT, PERIODS = 7, 60, 800
 SEGMENTS = 6
-PARTS = {"resolution": 0.0, "coulomb": 0.0, "static": 0.0, "max_force": np.inf, "max_rate": np.inf}
-"""Nonlinear parts, and their values in a linear loop."""
+LINEAR_VALUES = {"resolution": 0.0, "coulomb": 0.0, "static": 0.0, "max_force": np.inf, "max_rate": np.inf}
+"""Parameters of nonlinear components, with their values in a linear loop."""
 
 
 def draw_motions(linear: bool) -> list[tuple[Any, dict[str, Any]]]:
@@ -24,7 +24,7 @@ def draw_motions(linear: bool) -> list[tuple[Any, dict[str, Any]]]:
     drawn = [random_motions.random_motion("rigid", rng) for _ in range(COUNT)]
     motions = []
     for motion in drawn:
-        arguments = dict(motion.arguments) | (PARTS if linear else {})
+        arguments = dict(motion.arguments) | (LINEAR_VALUES if linear else {})
         arguments.pop("jitter_samples")
         arguments |= {"start_position": arguments.pop("position"), "start_velocity": arguments.pop("velocity")}
         motions.append((motion.scene, arguments | ({"contact": "bilateral"} if linear else {})))
@@ -32,7 +32,7 @@ def draw_motions(linear: bool) -> list[tuple[Any, dict[str, Any]]]:
 
 
 def label(position: np.ndarray, velocity: np.ndarray, delay: int) -> MotionKind:
-    """Return the observed behavior of one body from its recorded motion, by the rules of T7."""
+    """Return the final state of one body from its recorded response, by the rules of T7."""
     size = np.abs(position).max()
     if not size < 1e100:
         return MotionKind.DIVERGED
@@ -65,27 +65,27 @@ def count_turns(velocity: np.ndarray, edges: np.ndarray) -> int:
 
 
 @pytest.mark.parametrize("contact", ["bilateral", "unilateral", "push_only"])
-def test_labels_describe_the_recorded_positions(contact: Any) -> None:
+def test_labels_agree_with_recorded_positions(contact: Any) -> None:
     motions = [each for each in draw_motions(linear=False) if each[1]["contact"] == contact]
     columns: dict[str, Any] = {
         name: [arguments[name] for _, arguments in motions] for name in motions[0][1] if name != "contact"
     }
-    found: Any = zwidth.simulate([scene for scene, _ in motions], **columns, contact=contact, periods=PERIODS)
+    result: Any = zwidth.simulate([scene for scene, _ in motions], **columns, contact=contact, periods=PERIODS)
     expected = [
         label(position, velocity, int(scene.integer_delay))
-        for position, velocity, (scene, _) in zip(found.position, found.velocity, motions, strict=True)
+        for position, velocity, (scene, _) in zip(result.position, result.velocity, motions, strict=True)
     ]
-    assert [MotionKind(code).name for code in found.outcome] == [kind.name for kind in expected]
+    assert [MotionKind(code).name for code in result.outcome] == [kind.name for kind in expected]
 
 
-def test_observed_trends_of_linear_motions_agree_with_the_linear_verdict():
+def test_labels_of_linear_responses_agree_with_the_verdict():
     motions = draw_motions(linear=True)
     columns: dict[str, Any] = {
         name: [arguments[name] for _, arguments in motions] for name in motions[0][1] if name != "contact"
     }
-    found = zwidth.simulate([scene for scene, _ in motions], **columns, periods=4 * PERIODS, record=False)
+    result = zwidth.simulate([scene for scene, _ in motions], **columns, periods=4 * PERIODS, record=False)
     stable = np.array([scene.is_stable(each["stiffness"], each["virtual_damping"]) for scene, each in motions])
     assert 0.2 < np.mean(stable) < 0.8
-    assert np.isin(found.outcome[stable], [MotionKind.REST, MotionKind.DECAYING, MotionKind.UNCLEAR]).all()
-    assert np.isin(found.outcome[~stable], [MotionKind.GROWING, MotionKind.DIVERGED, MotionKind.UNCLEAR]).all()
-    assert np.mean(found.outcome == MotionKind.UNCLEAR) <= 0.1
+    assert np.isin(result.outcome[stable], [MotionKind.REST, MotionKind.DECAYING, MotionKind.UNCLEAR]).all()
+    assert np.isin(result.outcome[~stable], [MotionKind.GROWING, MotionKind.DIVERGED, MotionKind.UNCLEAR]).all()
+    assert np.mean(result.outcome == MotionKind.UNCLEAR) <= 0.1

@@ -1,4 +1,4 @@
-"""Passive implies stable, boundary points carry a pole on the circle, and more damping never costs stiffness."""
+"""Passive walls are stable, boundary points have a pole on the unit circle, and damping increases K_max."""
 
 import math
 
@@ -10,7 +10,7 @@ from mpmath import mp
 
 import oracles
 import zwidth
-from properties.strategies import delays, deltas, magnitudes, whole_delays
+from properties.strategies import delays, deltas, integer_delays, magnitudes
 
 
 @given(magnitudes(-6, 4), magnitudes(-6, 0.5), st.floats(-1.2, 1.2).map(lambda x: x if abs(x) > 1e-50 else 0.0), delays)
@@ -22,7 +22,7 @@ def test_passive_implies_stable(delta, stiffness, damping, d):
 
 
 @given(delays, st.integers(0, 2**32 - 1))
-def test_passive_implies_stable_for_many(d, seed):
+def test_passive_implies_stable_in_batches(d, seed):
     rng = np.random.default_rng(seed)
     delta = 10 ** rng.uniform(-2, 2, 64)
     alpha, beta = rng.uniform(0, 2, 64) * delta / (d + 0.5), rng.uniform(-1, 1, 64) * delta
@@ -31,32 +31,32 @@ def test_passive_implies_stable_for_many(d, seed):
 
 
 @given(st.floats(0.0, 1.0), deltas, delays)
-def test_the_curve_puts_a_pole_on_the_circle(part, delta, d):
-    omega = 1e-3 + part * (math.pi - 2e-3)
+def test_boundary_has_a_pole_on_the_unit_circle(ratio, delta, d):
+    omega = 1e-3 + ratio * (math.pi - 2e-3)
     wall = zwidth.boundary(omega, delta, d)
     with mp.workdps(40 + (0 if delta == 0 else 60)):
         terms = oracles.polynomial(wall.alpha, wall.beta, delta, d)
         value = oracles.evaluate(terms, mp.expj(omega))
-        # Rounding errors of the phase (d + 1) omega reach the wall as well.
+        # The phase (d + 1) omega also contributes rounding errors.
         assert abs(value) <= tol.BOUNDARY.float64 * (d + 2) * 4 * sum(abs(term) for term in terms)
 
 
 @given(deltas, st.floats(0.0, 1.0), delays)
-def test_more_damping_of_the_device_never_costs_stiffness(delta, more, d):
-    low, high = zwidth.alpha_max(np.array([delta, delta * (1 + more) + more * 1e-3]), d).alpha
+def test_maximum_stiffness_increases_with_damping(delta, increment, d):
+    low, high = zwidth.alpha_max(np.array([delta, delta * (1 + increment) + increment * 1e-3]), d).alpha
     assert high >= low * (1 - tol.EPS64 * 8)
 
 
-@given(deltas, whole_delays)
-def test_a_longer_delay_never_gives_stiffness(delta, d):
+@given(deltas, integer_delays)
+def test_maximum_stiffness_decreases_with_delay(delta, d):
     stiffest = zwidth.alpha_max(delta, np.array([d, d + 1.0])).alpha
     assert stiffest[1] < stiffest[0]
 
 
 @given(magnitudes(-3, 3), delays, st.floats(0.05, 0.95))
-def test_the_middle_between_the_ridge_and_the_start_is_stable(delta, d, share):
-    # The stable set is not convex, but its boundary turns its hollow side nowhere along this segment.
+def test_walls_between_ridge_and_start_are_stable(delta, d, ratio):
+    # The stable region is not convex, but it contains this segment.
     top = zwidth.alpha_max(delta, d)
-    alpha, beta = share * top.alpha, -delta + share * (top.beta + delta)
+    alpha, beta = ratio * top.alpha, -delta + ratio * (top.beta + delta)
     assert zwidth.alpha_max(delta, d).status == 0
     assert zwidth.spectral_radius(alpha, beta, delta, d) < 1

@@ -1,4 +1,4 @@
-"""A browser for tests: Debian's Chromium, driven by Playwright; what a page asks for and complains of is kept."""
+"""Chromium, driven by Playwright, with a record of each page's requests and errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FLAGS = ("--no-sandbox", "--disable-gpu", "--disable-background-networking", "--
 
 @contextmanager
 def open_browser() -> Iterator[Any]:
-    """A browser, which takes a second to start; while it runs, this thread has an event loop."""
+    """Yield a browser, whose start takes about a second; while it runs, this thread has an event loop."""
     path = shutil.which("chromium")
     if path is None:
         if os.environ.get("CI"):
@@ -34,16 +34,20 @@ def open_browser() -> Iterator[Any]:
 
 @contextmanager
 def open_page(browser: Any, **context: Any) -> Iterator[Any]:
-    """A page, apart from all others, with ``asked``, its addresses outside of this machine, and ``complaints``."""
-    own = browser.new_context(**context)
-    page: Any = own.new_page()
+    """Yield a page in a separate context; ``page.asked`` lists requests to other machines, ``page.complaints``
+    errors.
+    """
+    separate = browser.new_context(**context)
+    page: Any = separate.new_page()
     page.set_default_timeout(1e3 * LONGEST)
     page.asked, page.complaints = [], []
-    here = ("http://127.0.0.1", "ws://127.0.0.1", "file:", "data:", "blob:")
-    page.on("request", lambda request: page.asked.append(request.url) if not request.url.startswith(here) else None)
-    page.on("console", lambda told: page.complaints.append(told.text) if told.type == "error" else None)
+    local_schemes = ("http://127.0.0.1", "ws://127.0.0.1", "file:", "data:", "blob:")
+    page.on(
+        "request", lambda request: page.asked.append(request.url) if not request.url.startswith(local_schemes) else None
+    )
+    page.on("console", lambda message: page.complaints.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: page.complaints.append(str(error)))
     try:
         yield page
     finally:
-        own.close()
+        separate.close()

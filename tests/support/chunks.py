@@ -1,4 +1,4 @@
-"""Chunks that go wrong, in a file that a run's processes load in no time: they find them by their names."""
+"""Functions that replace `zwidth.sweep.jobs.perform` and fail in chunk 2; worker processes import them by name."""
 
 import os
 import shutil
@@ -12,12 +12,12 @@ from zwidth.sweep.store import Store
 
 
 def replay_from(finished, out):
-    """Let chunks that kill others be taken from a finished run: a process that soon dies need not load JAX before."""
+    """Let chunks be copied from a finished run, so that processes which are soon killed need not load JAX."""
     out.with_name(f"{out.name}.finished").write_text(str(finished), encoding="utf-8")
 
 
 def replay(path, family, index):
-    """A chunk of a finished run, its mark at last; computed where none was named."""
+    """Copy a chunk of the finished run, its status file last; compute it if no finished run was named."""
     store = Store(Path(path))
     task = Task(store.plan.family(family), index)
     named = store.path.parent.with_name(f"{store.path.parent.name}.finished")
@@ -25,27 +25,27 @@ def replay(path, family, index):
         perform(path, family, index)
     elif not store.is_done(task):
         source = Store(Path(named.read_text(encoding="utf-8")) / store.path.name)
-        for theirs, ours in zip(source.files(task), store.files(task), strict=True):
-            ours.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(theirs, ours)
+        for source_file, target_file in zip(source.files(task), store.files(task), strict=True):
+            target_file.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source_file, target_file)
 
 
-def failing_on_2(path, family, index):
-    """Chunk 2 always fails."""
+def fail_on_2(path, family, index):
+    """Raise an error in chunk 2."""
     if index == 2:
         raise ArithmeticError("no number is good enough")
     perform(path, family, index)
 
 
-def killed_on_2(path, family, index):
-    """Chunk 2 always kills the process that computes it."""
+def kill_worker_on_2(path, family, index):
+    """Kill the process that computes chunk 2, always."""
     if index == 2:
         os.kill(os.getpid(), signal.SIGKILL)
     replay(path, family, index)
 
 
-def killed_once_on_2(path, family, index):
-    """Chunk 2 kills its first process only."""
+def kill_worker_once_on_2(path, family, index):
+    """Kill the first process that computes chunk 2."""
     mark = Path(path).with_suffix(".killed")
     if index == 2 and not mark.exists():
         mark.touch()
@@ -53,39 +53,39 @@ def killed_once_on_2(path, family, index):
     replay(path, family, index)
 
 
-def disturb(path, number):
-    """Send the scheduler a signal, once it has heard of the chunks before."""
+def signal_scheduler(path, number):
+    """Send the scheduler a signal, after it has received the results of earlier chunks."""
     time.sleep(0.5)
     os.kill(int((Path(path).parents[1] / "pid").read_text(encoding="utf-8")), number)
 
 
-def killing_the_scheduler_on_2(path, family, index):
-    """The scheduler dies while chunk 2 is computed."""
+def kill_scheduler_on_2(path, family, index):
+    """Kill the scheduler while chunk 2 is computed."""
     if index == 2:
-        disturb(path, signal.SIGKILL)
+        signal_scheduler(path, signal.SIGKILL)
     replay(path, family, index)
 
 
-def stopping_the_scheduler_on_2(path, family, index):
-    """The scheduler falls silent while chunk 2 is computed."""
+def stop_scheduler_on_2(path, family, index):
+    """Stop the scheduler's process while chunk 2 is computed."""
     if index == 2:
-        disturb(path, signal.SIGSTOP)
+        signal_scheduler(path, signal.SIGSTOP)
     replay(path, family, index)
 
 
-def doing_nothing(path, family, index):
-    """A chunk that is called done, and of which nothing is kept."""
+def store_nothing(path, family, index):
+    """Return without storing the chunk."""
 
 
-def interrupted_on_2(path, family, index):
-    """Somebody presses Ctrl-C while chunk 2 is computed."""
+def interrupt_on_2(path, family, index):
+    """Raise KeyboardInterrupt while chunk 2 is computed."""
     if index == 2:
         raise KeyboardInterrupt
     perform(path, family, index)
 
 
-def disk_full_on_2(path, family, index):
-    """The disk is full when chunk 2 is written."""
+def fill_disk_on_2(path, family, index):
+    """Raise the error of a full disk when chunk 2 is written."""
     if index == 2:
         raise OSError(28, "No space left on device")
     perform(path, family, index)

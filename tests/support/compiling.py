@@ -1,4 +1,4 @@
-"""How tests compile what they run once."""
+"""Compiler options and helpers for functions that tests run only a few times."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,9 +8,9 @@ import numpy as np
 
 from zwidth.core.xp import filter_options
 
-# In a third of the time, for what runs once or a few times: XLA simplifies and fuses, but does little work on machine
-# code, in one piece and by its older emitters. Where both were compared the numbers were the same to the last places.
-# That the library's own compiled functions are right at full optimization is seen wherever they are called.
+# These options reduce compilation to a third of the time: XLA simplifies and fuses, but hardly optimizes machine code.
+# Results were equal up to the last digits wherever compared. The library's own compiled functions are tested with full
+# optimization.
 QUICKLY = filter_options(
     ("xla_backend_optimization_level", 0),
     ("xla_cpu_use_fusion_emitters", False),
@@ -19,17 +19,18 @@ QUICKLY = filter_options(
 
 
 def compile_bends(slopes: Callable[[Any], Any]) -> Callable[[Any], tuple[np.ndarray, np.ndarray]]:
-    """From slopes at a point: slopes at many points, and how they change in each number of the point, last axis.
+    """Return a function that evaluates ``slopes`` and its Jacobian (last axis) at many points.
 
-    One number after the other, by one program: for all at once it compiles twice as long, and slopes need no other.
+    The derivatives are computed one variable at a time by one program, because a program for all variables
+    compiles twice as long.
     """
-    along = jax.jit(
+    differentiate_along = jax.jit(
         jax.vmap(lambda point, side: jax.jvp(slopes, (point,), (side,)), (0, None)), compiler_options=QUICKLY
     )
 
     def differentiate(points: Any) -> tuple[np.ndarray, np.ndarray]:
         points = np.asarray(points)
-        found = [along(points, side) for side in np.eye(points.shape[-1])]
-        return np.asarray(found[0][0]), np.stack([np.asarray(change) for _, change in found], axis=-1)
+        columns = [differentiate_along(points, side) for side in np.eye(points.shape[-1])]
+        return np.asarray(columns[0][0]), np.stack([np.asarray(change) for _, change in columns], axis=-1)
 
     return differentiate

@@ -1,4 +1,4 @@
-"""`zwidth explore` as a program of its own."""
+"""`zwidth explore` as a separate process, and helpers for its page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from waiting import LONGEST, wait_for
 
 
 class Server:
-    """A running command."""
+    """A running `zwidth explore`."""
 
     def __init__(self, folder, *arguments):
         command = [sys.executable, "-m", "zwidth", "explore", "--no-browser", *arguments]
@@ -30,7 +30,7 @@ class Server:
         self.host = self.address.split("/")[2]
 
     def end(self):
-        """What it has said, and its exit code."""
+        """End the process; return its stdout, stderr and exit code."""
         if self.said:
             return self.said
         self.process.send_signal(signal.SIGINT)
@@ -45,8 +45,8 @@ class Server:
     def get(self, path="", **headers):
         request = urllib.request.Request(f"{self.address}{path}", headers=headers)
         try:
-            with urllib.request.urlopen(request, timeout=LONGEST) as answer:
-                return answer.status, answer.headers, answer.read().decode()
+            with urllib.request.urlopen(request, timeout=LONGEST) as response:
+                return response.status, response.headers, response.read().decode()
         except urllib.error.HTTPError as error:
             with error:
                 return error.code, error.headers, error.read().decode()
@@ -54,10 +54,10 @@ class Server:
 
 @contextlib.contextmanager
 def serve(folder):
-    """A server that stops when it is told, says so, and leaves nothing behind."""
-    running = Server(folder)
-    yield running
-    assert running.end() == ("stopped\n", "", 0)
+    """Yield a server and check that it stops cleanly without leaving files."""
+    server = Server(folder)
+    yield server
+    assert server.end() == ("stopped\n", "", 0)
     assert list(folder.iterdir()) == []
 
 

@@ -1,4 +1,4 @@
-"""Tables of studies with made-up columns, and what each function of `zwidth.plotting` draws of them."""
+"""Tables of studies with synthetic columns, and the arguments of each function of `zwidth.plotting`."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ from zwidth.plotting.table import stack
 
 
 def outline(delta, d=0.0, line=False):
-    """Half an ellipse from (0, -delta) to (0, 2 + delta); with ``line``, its end runs straight at omega = pi."""
+    """Return half an ellipse from (0, -delta) to (0, 2 + delta); with ``line``, its end is straight at omega = pi."""
     omega = np.linspace(0.0, np.pi if line else 2.0, 21)
-    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 21)
-    alpha, beta = (1.0 + delta) * np.cos(turn), 1.0 + (1.0 + delta) * np.sin(turn)
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 21)
+    alpha, beta = (1.0 + delta) * np.cos(angle), 1.0 + (1.0 + delta) * np.sin(angle)
     if line:
         alpha, beta, omega = np.append(alpha, 0.0), np.append(beta, 3.0), np.append(omega, np.pi)
         alpha[-2] = 0.5
@@ -18,7 +18,7 @@ def outline(delta, d=0.0, line=False):
 
 
 def of_model(model):
-    """Return the column of a delay model; none in the tables of exact delays only."""
+    """Return the column of a delay model; none in tables of exact delays only."""
     return {"delay_model": model} if model else {}
 
 
@@ -29,8 +29,8 @@ def ridge(d=0.0, model="held"):
 
 
 def path(d=0.0):
-    given = ridge(d, "")
-    return {"curve": "ridge_path", **given, "alpha": given.pop("alpha_max")}
+    columns_of_ridge = ridge(d, "")
+    return {"curve": "ridge_path", **columns_of_ridge, "alpha": columns_of_ridge.pop("alpha_max")}
 
 
 def interval(d=0.0, model="held", curve="stable"):
@@ -45,7 +45,7 @@ def passive_outline(delta, d=0.0):
 
 
 def in_si(columns):
-    """The same walls in N/m and N s/m as well."""
+    """Return the columns with the walls in N/m and N s/m added."""
     walls = {"stiffness_N_per_m": 1e5 * columns["alpha"], "virtual_damping_N_s_per_m": 100.0 * columns["beta"]}
     return {**columns, **walls}
 
@@ -75,9 +75,13 @@ def grid_map(deltas=(0.1,)):
 
 def measured_response():
     frequency = np.geomspace(1.0, 400.0, 60)
-    answer = 1.0 / (-0.1 * (2 * np.pi * frequency) ** 2 + 40j * np.pi * frequency)
-    loop = 5e3 * answer
-    columns = {"real_m_per_N": answer.real, "imag_m_per_N": answer.imag, "deviation_m_per_N": np.full(60, 2e-6)}
+    response_values = 1.0 / (-0.1 * (2 * np.pi * frequency) ** 2 + 40j * np.pi * frequency)
+    loop = 5e3 * response_values
+    columns = {
+        "real_m_per_N": response_values.real,
+        "imag_m_per_N": response_values.imag,
+        "deviation_m_per_N": np.full(60, 2e-6),
+    }
     return {"frequency_Hz": frequency, **columns, "open_loop_real": loop.real, "open_loop_imag": loop.imag}
 
 
@@ -88,7 +92,7 @@ LIMITS = {0.0: 4.0, 0.5: 2.5}
 SLOPES = {"d": np.linspace(0.0, 1.0, 9), "slope": 4.0 - 3.0 * np.linspace(0.0, 1.0, 9)}
 COSTS = stack([cost(0.0), cost(1.0)])
 
-# What each function draws; the name is the function's, and what is special about the case.
+# Arguments per figure; the key is the function's name and the special feature of the case.
 _POSE = np.meshgrid(np.linspace(0.0, 120.0, 5), np.linspace(30.0, 150.0, 4))
 POSES: dict[str, np.ndarray] = {"shoulder_deg": _POSE[0].ravel(), "elbow_deg": _POSE[1].ravel()}
 POSES["stiffness_N_per_m"] = 1e4 + 50.0 * POSES["shoulder_deg"] + POSES["elbow_deg"] ** 2

@@ -1,4 +1,4 @@
-"""The explorer's page without a browser and without a server."""
+"""The explorer's page without browser and server."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from zwidth.app.explorer.page import Page
 
 
 class Queue:
-    """Takes the place of the worker: what is submitted runs when the test says so."""
+    """Replaces the worker: submitted tasks run when the test calls `work`."""
 
     def __init__(self):
         self.tasks = []
@@ -28,17 +28,17 @@ class Queue:
 
 
 def open_page(controls: Controls) -> Any:
-    """A page whose ``texts`` hold what it has told, and whose ``queue`` what it wants computed."""
+    """Return a page with ``texts`` (its messages to the browser) and ``queue`` (its submitted computations)."""
     queue: Any = Queue()
     texts: dict[str, Any] = {}
-    opened: Any = Page(Document(), controls, queue)
-    opened.answer.on_change("data", lambda _, __, data: texts.update(json.loads(data["json"][0])))
-    # There is no loop: what is handed over is taken at once.
-    opened._schedule_update = opened._apply_update
-    opened.texts, opened.queue = texts, queue
-    return opened
+    page: Any = Page(Document(), controls, queue)
+    page.answer.on_change("data", lambda _, __, data: texts.update(json.loads(data["json"][0])))
+    # Without an event loop, scheduled updates are applied immediately.
+    page._schedule_update = page._apply_update
+    page.texts, page.queue = texts, queue
+    return page
 
 
-def say(page: Any, **message: Any) -> None:
-    """What a browser would send."""
+def send_message(page: Any, **message: Any) -> None:
+    """Send a message as a browser would."""
     page.receive({"json": [json.dumps(message)]})

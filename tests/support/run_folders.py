@@ -1,4 +1,4 @@
-"""Configurations of small runs, and what the folder of a run holds."""
+"""Configurations of small runs, and readers of a run's folder."""
 
 import json
 
@@ -10,8 +10,8 @@ studies:
   - {kind: map, name: two, alpha: 0.1, beta: [0.1, 0.4], delta: 0.1, d: 0}
 """
 
-# A sweep as well: what holds for one kind of study holds for every other.
-BOTH = (
+# With a sweep, because every kind of study must behave equally.
+SMALL_WITH_SWEEP = (
     SMALL
     + """
   - {kind: sweep, name: swept, axes: {alpha: [0.1, 0.9], beta: [0.1, 0.4], delta: 0.1, d: [0, 1]}}
@@ -19,15 +19,15 @@ BOTH = (
 )
 
 
-def record_of(folder):
+def read_record(folder):
     return json.loads((folder / "run.json").read_text(encoding="utf-8"))
 
 
-def states(folder):
-    return {entry["name"]: entry["state"] for entry in record_of(folder)["studies"]}
+def read_states(folder):
+    return {entry["name"]: entry["state"] for entry in read_record(folder)["studies"]}
 
 
-def contents(folder):
-    """Every file of a run, with what would change if it were written again."""
+def list_contents(folder):
+    """Return every file of a run with its inode and modification time, which change if it is rewritten."""
     files = [path for path in folder.rglob("*") if path.is_file() and ".locks" not in path.parts]
     return {path.relative_to(folder).as_posix(): (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}

@@ -1,4 +1,4 @@
-"""What the tests of sweeps share: small configurations, the command line, and stores to compare."""
+"""Helpers for tests of sweeps: small configurations, the command line, and comparison of stores."""
 
 import os
 import re
@@ -27,7 +27,7 @@ AXES = {
     "d": [0, 0.5, 1, 2],
 }
 
-# Two planes of walls, as a report slices them.
+# Two planes of walls, shown as slices in a report.
 PLANES = {
     "alpha": {"linear": {"start": 0.01, "stop": 0.3, "num": 30}},
     "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 20}},
@@ -52,89 +52,89 @@ IN_SI = {
 }
 
 
-def config_of_everything():
-    """Every output, in both kinds of units, and radii to an accuracy."""
-    return config_of(
+def make_full_config():
+    """Return a configuration with every output, in normalized and SI units, and with an accuracy for radii."""
+    return make_config(
         study("map", FEW, (*WALLS, *DEVICES)),
         study("proved", FEW, ("spectral_radius", "settling_time"), accuracy=1e-11),
         study("si", IN_SI, (*WALLS, "stiffness_max", "virtual_damping_at_max")),
     )
 
 
-def cut(monkeypatch, walls, devices):
-    """From now on, plan chunks of at most this many points; a run's other processes follow the plan in its store."""
-    whole = plan.chunk_shape
+def limit_chunk_sizes(monkeypatch, walls, devices):
+    """Limit chunks to this many points; other processes read the plan from the store."""
+    original = plan.chunk_shape
 
     def chunk_shape(shape, target):
-        # Walls have two dimensions more than their devices.
-        return whole(shape, walls if len(shape) > 3 else devices)
+        # Grids of walls have two dimensions more than those of devices.
+        return original(shape, walls if len(shape) > 3 else devices)
 
     monkeypatch.setattr(plan, "chunk_shape", chunk_shape)
 
 
-def config_of(*studies, name="test"):
+def make_config(*studies, name="test"):
     return Config.model_validate({"version": 1, "name": name, "studies": list(studies) or [study()]})
 
 
-def sweep_of(described) -> SweepStudy:
-    """A sweep as described, checked and complete."""
-    (sweep,) = config_of(described).studies
+def make_sweep(fields) -> SweepStudy:
+    """Return a validated sweep."""
+    (sweep,) = make_config(fields).studies
     assert isinstance(sweep, SweepStudy)
     return sweep
 
 
 def run_sweeps(config, out, *, perform=None, **options):
-    """Run a configuration, its chunks computed by ``perform``; returns what became of those of all its sweeps."""
+    """Run a configuration with its chunks computed by ``perform``; return the counts and failures of all sweeps."""
     with patch("zwidth.sweep.jobs.perform", perform) if perform else nullcontext():
         result = run(config, out=out, **options)
     sweeps = result.sweeps.values()
     counts = {name: sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")}
     failed = {chunk: error for sweep in sweeps for chunk, error in sweep.failed.items()}
-    more = {name: getattr(result, name) for name in ("ok", "repaired", "hopeless", "interrupted")}
-    return SimpleNamespace(**counts, **more, failed=failed)
+    flags_of_run = {name: getattr(result, name) for name in ("ok", "repaired", "fatal_error", "interrupted")}
+    return SimpleNamespace(**counts, **flags_of_run, failed=failed)
 
 
-def values_of(path):
-    """Every variable of a store, in memory."""
+def read_values(path):
+    """Return every variable of a store, in memory."""
     with open_dataset(path) as dataset:
         return {name: variable.values for name, variable in dataset.data_vars.items()}
 
 
-def assert_same(first, second):
-    """Two stores, or all stores of two folders, hold the same values, bit by bit."""
+def assert_equal_stores(first, second):
+    """Check that two stores, or all stores of two folders, are equal bit by bit."""
     stores = list_stores(first)
     assert [store.name for store in stores] == [store.name for store in list_stores(second)]
-    for store, with_it in zip(stores, list_stores(second), strict=True):
-        one, other = values_of(store), values_of(with_it)
-        assert one.keys() == other.keys()
-        for name in one:
-            assert one[name].dtype == other[name].dtype
-            assert one[name].tobytes() == other[name].tobytes(), (store.name, name)
+    for store, other_store in zip(stores, list_stores(second), strict=True):
+        first_values, second_values = read_values(store), read_values(other_store)
+        assert first_values.keys() == second_values.keys()
+        for name in first_values:
+            assert first_values[name].dtype == second_values[name].dtype
+            assert first_values[name].tobytes() == second_values[name].tobytes(), (store.name, name)
 
 
-def flags(path):
-    """The marks of finished chunks, each with what would change if it were written again."""
-    # Unlike `rglob` it goes on where a folder gets its name meanwhile.
+def list_status_files(path):
+    """Return the status files of finished chunks with inode and modification time, which change if rewritten."""
+    # Unlike `rglob`, `os.walk` tolerates folders that are renamed meanwhile.
     files = [f"{top}/{file}" for top, _, files in os.walk(path) for file in files]
     marks = [Path(file) for file in files if re.search(r"status/c(/\d+)*$", file)]
     return {mark: (mark.stat().st_ino, mark.stat().st_mtime_ns) for mark in marks}
 
 
 def chunk_file(path, variable="stable", number=0):
-    """One file of a variable."""
+    """Return one chunk file of a variable."""
     return sorted(file for file in (Path(path) / variable / "c").rglob("*") if file.is_file())[number]
 
 
 def command(*arguments):
-    """The words that start the command line."""
+    """Return the arguments that start the command line."""
     return [sys.executable, "-m", "zwidth", *map(str, arguments)]
 
 
-def main_of(*arguments):
-    """The exit code of the command line, run in this process, which its settings do not reach."""
+def run_main(*arguments):
+    """Run the command line in this process and return its exit code, without changing this process's settings."""
     handler = signal.getsignal(signal.SIGTERM)
     try:
-        # With a folder given, it makes none of the user's.
+        # With an empty setting, the command does not create the user's cache folder.
         with patch.dict(os.environ, JAX_COMPILATION_CACHE_DIR=""):
             main([str(argument) for argument in arguments])
     except SystemExit as end:
@@ -144,13 +144,13 @@ def main_of(*arguments):
     return 0
 
 
-def zwidth(*arguments, **options):
-    """Run the command line to its end."""
+def run_command(*arguments, **options):
+    """Run the command line in a subprocess to its end."""
     return subprocess.run(command(*arguments), capture_output=True, text=True, check=False, timeout=LONGEST, **options)
 
 
-def start(*arguments, **options):
-    """Start the command line in a process group of its own."""
+def start_command(*arguments, **options):
+    """Start the command line in its own process group."""
     return subprocess.Popen(
         command(*arguments),
         stdout=subprocess.PIPE,
@@ -161,7 +161,7 @@ def start(*arguments, **options):
     )
 
 
-def flip(file, position=-1):
+def flip_byte(file, position=-1):
     """Flip the bits of one byte of a file."""
     data = bytearray(file.read_bytes())
     data[position] ^= 0xFF

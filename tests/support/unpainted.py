@@ -1,4 +1,4 @@
-"""Runs without their pictures, for tests that look at something else: painting takes most of the time of such runs."""
+"""Runs without rendering figures, for tests of other things: rendering takes most of the time of such runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from zwidth import plotting
 def _write_name(
     drawn: Any, stem: Path, formats: Sequence[str] = ("png", "svg"), dpi: float | None = None
 ) -> tuple[Path, ...]:
-    """In place of `zwidth.plotting.save`."""
+    """Write files that contain their own names, in place of `zwidth.plotting.save`."""
     files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)
     for file in files:
         file.write_text(file.name, encoding="utf-8")
@@ -23,6 +23,6 @@ def _write_name(
 
 @contextmanager
 def painting_nothing() -> Iterator[None]:
-    """Meanwhile figures are drawn as ever, and their files hold their names alone."""
+    """Draw figures without rendering them; their files contain only their names."""
     with patch.object(plotting, "save", _write_name):
         yield

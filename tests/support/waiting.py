@@ -1,4 +1,4 @@
-"""Tests wait for a thing, never for a time: what they wait for has a bound only so that a hang ends."""
+"""Waiting for conditions instead of fixed times; the timeout only ends tests that hang."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-# Seconds. On a machine that has ten other things to do, nothing that the tests wait for takes a tenth of it.
-LONGEST = 300.0
+LONGEST = 300.0  # seconds; ten times more than any wait needs on a machine with ten other jobs
 
 
 def wait_for(
     condition: Callable[[], Any], complaint: Callable[[], object] | str = "nothing happened", pause: float = 0.01
 ) -> Any:
-    """The first true answer of a condition, which is asked again after a pause: longer where asking costs much."""
+    """Return the first true value of a condition, evaluated repeatedly with a pause."""
     end = time.monotonic() + LONGEST
-    while not (answer := condition()):
+    while not (value := condition()):
         if time.monotonic() > end:
             raise AssertionError(f"{complaint if isinstance(complaint, str) else complaint()} in {LONGEST:g} s")
         time.sleep(pause)
-    return answer
+    return value

@@ -179,8 +179,8 @@ def round_margin(
         decibel: True to return a gain margin in dB.
     """
     value = float(getattr(margins, name))
-    # The safe direction is down, with two exceptions: a gain margin above 1 of an unstable wall (the gain must be
-    # increased to stabilize it), and one below 1 of a stable wall (a reduction of the gain destabilizes it).
+    # Round down, with two exceptions: a gain margin above 1 of an unstable wall, because the gain must be increased to
+    # stabilize the wall; and a gain margin below 1 of a stable wall, because a reduction of the gain destabilizes it.
     outward = name == "gain_margin" and (value > 1.0) != bool(stable)
     return round_conservatively(20.0 * math.log10(value) if decibel else value, "above" if outward else "below", digits)
 
@@ -252,7 +252,7 @@ class Limit(NamedTuple):
     """An improvement of a scene, the stiffness of the improved scene, and its ratio to the current stiffness."""
 
     name: str  # name of the part or parameter
-    words: str  # the improvement in words, such as "half the delay"
+    label: str  # the improvement in words, such as "half the delay"
     stiffness: float  # in N/m: K_max, or K recommended under the same requirements, of the improved scene
     gain: float  # ratio of that stiffness to the current one
     note: str = ""  # quantity that stays constant, such as "the delay stays 1 ms"
@@ -261,14 +261,14 @@ class Limit(NamedTuple):
         """Return a text with the improvement, the stiffness that results from it, and the gain."""
         K = with_unit(round_conservatively(self.stiffness, "below"), find_unit(self, "N/m"))
         note = f"; {self.note}" if self.note else ""
-        return f"{self.words}: {K} (x {plain(self.gain, 3)}{note})"
+        return f"{self.label}: {K} (x {plain(self.gain, 3)}{note})"
 
 
 class Improvement(NamedTuple):
     """An improved copy of a scene, with the part or parameter that was improved and a description."""
 
     name: str  # name of the part or parameter
-    words: str  # the improvement in words
+    label: str  # the improvement in words
     scene: SceneOptima  # the improved scene
     note: str = ""  # quantity that stays constant
 
@@ -298,7 +298,7 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
         >>> import zwidth
         >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=30))
-        >>> [limit.words for limit in zwidth.limits_of(scene)][:2]
+        >>> [limit.label for limit in zwidth.limits_of(scene)][:2]
         ['twice the rate', 'half the delay']
     """
     return compute_gains(scene, _compute_max_stiffness(scene), _compute_max_stiffness)
@@ -321,7 +321,10 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
 
 
 def describe_islands(scene: SceneOptima) -> list[str]:
-    """Return a list of texts: one per island of stable walls, and one if the device is unstable without a wall."""
+    """Return a list of texts: one per island of stable walls not connected to K = 0, and one on an unstable device.
+
+    A device is unstable if it is unstable without a wall.
+    """
     lines, system = [], scene.unit_system
     least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
     if least is not None:
@@ -339,7 +342,8 @@ def _compute_max_stiffness(scene: SceneOptima) -> float:
     try:
         return float(scene.max_stiffness().stiffness)
     except InputError:
-        # An improved scene may be invalid: at twice the rate a long delay may exceed the largest number of periods.
+        # Return NaN for an invalid improved scene: at twice the sampling rate, a long delay may exceed the largest
+        # allowed number of periods.
         return math.nan
 
 
@@ -351,7 +355,7 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
         slower["period_and_delay"] = scene.replace(delay=Span(float(scene.d), "periods"))
     for name, present in slower.items():
         if _can_sample_faster(present):
-            note = f"the delay stays {present.timing.kept_delay}" if timing.delay else ""
+            note = f"the delay stays {present.timing.delay_text}" if timing.delay else ""
             yield Improvement(name, "twice the rate", _double_rate(present), note)
     values = scene.parameters()
     for path, (factor, words) in IMPROVEMENTS.items():
@@ -365,7 +369,8 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
             try:
                 improved.check_parts()
             except InputError:
-                # Remove the filter, because a cutoff above the Nyquist frequency is not possible.
+                # Remove the filter instead of doubling its cutoff, because the cutoff must not exceed the Nyquist
+                # frequency.
                 improved, words = scene.replace(velocity=BackwardDifference()), "no velocity filter"
         yield Improvement(path.partition(".")[0], words, improved)
     if scene.device.modes:
@@ -404,8 +409,9 @@ def trace_passivity_boundary(scene: SceneOptima, directions: int = 721) -> tuple
 
     The arrays have ``directions`` elements; they are empty for a device without damping.
     """
-    # The damping required for passivity is proportional to the distance of (K, B) from the origin. Therefore compute it
-    # for one wall in each direction, and scale the wall until the required damping equals that of the device.
+    # The device damping that passivity requires is proportional to the distance of the wall (K, B) from the origin.
+    # Therefore compute it for one wall in each direction, and scale the wall until the required damping equals that of
+    # the device.
     device_damping, units = float(scene.device.damping), scene.units
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, directions)
     # Clip the cosines at 0, because rounding errors may make them negative at angles of -90 and 90 degrees.

@@ -90,7 +90,7 @@ class SceneParts(Part):
             )
 
     def _shift_parts(self) -> None:
-        """Move the parts to their own fields if the positional arguments omit the wall."""
+        """Move velocity estimate and operator to their fields if the positional arguments omit the wall before them."""
         estimate, fourth, hand = self.wall, self.velocity, self.operator
         if isinstance(fourth, Operator) and hand is None:
             hand = fourth
@@ -101,8 +101,8 @@ class SceneParts(Part):
             object.__setattr__(self, name, part)
 
     @cached_property
-    def parts_beyond(self) -> tuple[str, ...]:
-        """Names of the parts that `RigidLoop` does not support; none for a rigid mass with backward difference."""
+    def nonrigid_parts(self) -> tuple[str, ...]:
+        """Names of the parts that the closed forms for a rigid mass with the backward difference do not support."""
         hand = self.operator
         grasp = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
         basic = {"velocity": is_plain(self.velocity, self.timing.period), "operator": grasp}
@@ -114,7 +114,7 @@ class SceneParts(Part):
         """Normalized loop of the scene, in the fastest implementation that supports its parts."""
         if isinstance(self.device, MeasuredDevice):
             return MeasuredLoop(self)
-        return LinearLoop(make_plain(self)) if self.parts_beyond else RigidLoop(self)
+        return LinearLoop(make_plain(self)) if self.nonrigid_parts else RigidLoop(self)
 
     def check_parts(self) -> None:
         """Raise `InputError` for an invalid combination of parts, such as a cutoff above the Nyquist frequency."""
@@ -269,7 +269,7 @@ def wrap_function(
 
 
 def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Collection[str]) -> None:
-    """Wrap the public methods of a scene class, except those named in ``but``, to check arguments and set units.
+    """Wrap the public methods of a scene class, except those named in ``but``, so that their results print with units.
 
     The results of a wrapped method print in the units of the device. A wrapped method that is not named in
     ``traceable`` raises `InputError` for values traced by JAX.
@@ -281,7 +281,7 @@ def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Col
 
 
 def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], traceable: bool) -> Callable[..., Result]:
-    """Wrap a method: its result prints in the device's units, and values traced by JAX are refused unless traceable."""
+    """Wrap a method so that its result prints in the device's units; refuse traced values unless ``traceable``."""
 
     @wraps(method)
     def wrapped(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from zwidth.analysis.assessment import Assessment, assess, round_margin
-from zwidth.analysis.wall_search import COARSE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN, Wanted, choose_wall
+from zwidth.analysis.wall_search import COARSE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN, Requirements, choose_wall
 from zwidth.core.status import Status
 from zwidth.model.device import Device
 from zwidth.model.grasps import list_grasps
@@ -26,7 +26,7 @@ LONGEST_TIME_CONSTANT = 1.0  # largest time constant of the decay, in s
 
 
 def find_thin(verdict: Assessment, period: float) -> list[str]:
-    """Return texts that state the margins of a stable wall that are too small, and its time constant if too long.
+    """Return a list of texts, one for each margin of a stable wall that is too small and one for a slow decay.
 
     Args:
         verdict: assessment of the wall.
@@ -45,21 +45,26 @@ def find_thin(verdict: Assessment, period: float) -> list[str]:
 
 def list_cautions(recommendation: Any) -> tuple[str, ...]:
     """Return the cautions about the wall of a `Recommendation`, one sentence each; empty if there are none."""
-    scene, verdict, wanted, cautions = recommendation.scene, recommendation.verdict, recommendation.wanted, []
+    scene, verdict, requirements, cautions = (
+        recommendation.scene,
+        recommendation.verdict,
+        recommendation.requirements,
+        [],
+    )
     if thin := find_thin(verdict, scene.timing.period):
         rings = thin[0].startswith("phase") and verdict.frequency > 0 and math.isfinite(verdict.time_constant)
         after = f": rings for {with_unit(verdict.time_constant, 's', 2)}" if rings else ""
         advice = _advise(
             recommendation,
-            _list_margins(wanted),
+            _list_margins(requirements),
             lambda improved: not find_thin(assess(improved), scene.timing.period),
             "no other requirement avoids this; more damping of the device or less delay may",
         )
         cautions.append(f"{', '.join(thin)}{after}; {advice}")
     if unstable := [name for name, stable in recommendation.grasps.items() if not stable]:
-        options = {"--grasps all": wanted._replace(grasps="all")}
+        options = {"--grasps all": requirements._replace(grasps="all")}
         if float(scene.device.damping) > 0 and not find_unsupported_reason(**vars(scene.device)):
-            options["--passive"] = Wanted(passive=True, beyond_safe=wanted.beyond_safe)
+            options["--passive"] = Requirements(passive=True, beyond_safe=requirements.beyond_safe)
         advice = _advise(
             recommendation,
             options,
@@ -70,21 +75,23 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
     return tuple(cautions)
 
 
-def _list_margins(wanted: Wanted) -> dict[str, Wanted]:
+def _list_margins(requirements: Requirements) -> dict[str, Requirements]:
     """Return a dictionary of other requirements that may yield larger margins, keyed by their command-line options."""
-    phase = max(DEFAULT_PHASE_MARGIN, wanted.phase_margin or 0.0)
-    gain = max(DEFAULT_GAIN_MARGIN, wanted.gain_margin or 0.0)
+    phase = max(DEFAULT_PHASE_MARGIN, requirements.phase_margin or 0.0)
+    gain = max(DEFAULT_GAIN_MARGIN, requirements.gain_margin or 0.0)
     by_phase, by_gain = f"--phase-margin {phase:g}", f"--gain-margin {gain:g}"
-    tried = {by_phase: wanted._replace(phase_margin=phase)}
-    tried[f"{by_phase} {by_gain}"] = wanted._replace(phase_margin=phase, gain_margin=gain)
-    if wanted.passive:
-        tried[f"{by_phase} without --passive"] = wanted._replace(phase_margin=phase, passive=False)
-    defaults = Wanted.check(None, None, None, False, wanted.beyond_safe, wanted.grasps)
+    tried = {by_phase: requirements._replace(phase_margin=phase)}
+    tried[f"{by_phase} {by_gain}"] = requirements._replace(phase_margin=phase, gain_margin=gain)
+    if requirements.passive:
+        tried[f"{by_phase} without --passive"] = requirements._replace(phase_margin=phase, passive=False)
+    defaults = Requirements.check(None, None, None, False, requirements.beyond_safe, requirements.grasps)
     return tried | {"without options for margins": defaults}
 
 
-def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[Any], bool], otherwise: str) -> str:
-    """Return a text that states the first option that solves a problem of the wall, with the new wall and its cost.
+def _advise(
+    recommendation: Any, options: dict[str, Requirements], accepts: Callable[[Any], bool], otherwise: str
+) -> str:
+    """Return a text with the first option that avoids a problem of the wall, the new wall, and the loss of stiffness.
 
     Args:
         recommendation: the recommendation whose wall has the problem.
@@ -92,9 +99,9 @@ def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[
         accepts: function that returns True if the wall of a scene does not have the problem.
         otherwise: text to return if no option solves the problem.
     """
-    for words, wanted in options.items():
+    for words, requirements in options.items():
         scene = recommendation.scene
-        wall = choose_wall(scene, wanted, recommendation.stiffest, recommendation.stiffness, COARSE)
+        wall = choose_wall(scene, requirements, recommendation.stiffest, recommendation.stiffness, COARSE)
         if wall.status == Status.OK and accepts(scene.replace(stiffness=wall.stiffness, virtual_damping=wall.damping)):
             ratio = wall.stiffness / recommendation.stiffness
             cost = f"costs {max(100.0 * (1.0 - ratio), 0.1):.2g} % of the stiffness"
@@ -104,7 +111,7 @@ def _advise(recommendation: Any, options: dict[str, Wanted], accepts: Callable[[
 
 
 def judge_grasps(scene: Any) -> dict[str, bool]:
-    """Return a dictionary that maps each reference grasp to True if the wall of the scene is stable in it.
+    """Return a dictionary that maps each reference grasp to True if the wall of the scene is stable in this grasp.
 
     If the scene has an operator, the entry "released" is the stability without the operator.
     """

@@ -240,7 +240,8 @@ def _find_cause(experiment: Experiment, worst: SustainedMotion, dominant: Any) -
         return "instability"
     limited = min(hardware.max_force, hardware.max_rate) < math.inf
     if not limited and hardware.resolution == 0:
-        # With an ideal encoder and motor, decide by the linear loop alone, because friction only dissipates energy.
+        # With an ideal encoder and motor, report no sustained oscillation unless the linear loop is unstable, because
+        # friction only dissipates energy.
         return "none"
     if not worst.at_rest[0] and experiment.decay < SETTLED:
         return "undecided"

@@ -43,11 +43,11 @@ class Variants:
             yield self.scene.replace(**{name: float(values[k]) for name, values in self.drawn.items()})
 
     def labels(self, stiffness: float, damping: float) -> np.ndarray:
-        """Return a boolean array that states for each variant whether a wall is stable."""
+        """Return a boolean array with one entry per variant: True if the wall is stable on this variant."""
         return np.array([bool(scene.is_stable(stiffness, damping)) for scene in self.scenes()])
 
     def find_stiffness_limits(self, damping: np.ndarray) -> np.ndarray:
-        """Return the upper end of the stable interval of K for each variant and each B; 0 if no wall is stable.
+        """Return the upper end of the lowest stable interval of K for each variant and each B; 0 if no wall is stable.
 
         The interval is the one that starts at K = 0. If the device is unstable without a wall, it is the interval with
         the softest walls of K > 0.
@@ -83,7 +83,8 @@ class RigidVariants(Variants):
         with np.errstate(all="ignore"):
             self.rate = mass / self.period
             self.delta = damping / self.rate
-            # Vary d with the period only if the delay was given in seconds.
+            # Vary d with the period only if the delay was given in seconds, because a delay given in periods stays
+            # constant.
             relevant = {"delay"} if scene.timing.in_periods else {"delay", "period"}
             self.d = delay / self.period if relevant & set(drawn) else np.full(self.count, float(scene.d))
 
@@ -113,7 +114,7 @@ class RigidVariants(Variants):
 
     @staticmethod
     def evaluate(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
-        """Evaluate a function of arrays; divide them into pieces if NumPy is then faster than code compiled by JAX.
+        """Evaluate a function of arrays, in small pieces if NumPy then takes less time than compilation by JAX.
 
         A function called with at most ``FEW`` elements runs in NumPy; with more elements JAX compiles it.
         """

@@ -61,7 +61,7 @@ from zwidth.stability.rigid.verdict import StabilityMethod, decide_stability, is
 from zwidth.units.quantities import WALL_RANGE
 
 # Largest log|z| of poles of a lossless loop that are treated as poles on the unit circle. It exceeds 1e-8, because a
-# rounding error of 1e-16 moves a double pole by its square root.
+# rounding error of 1e-16 moves a double pole by the square root of this error.
 ON_CIRCLE = 1e-7
 
 
@@ -76,17 +76,19 @@ class DominantPole(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LinearLoop:
-    """Analyses of a scene whose device has a model; alpha and beta are arrays of equal shape unless stated."""
+    """Analyses of a scene whose device has a model; by default, alpha and beta are arrays of equal shape."""
 
     scene: Any
     # Cache of computed ridges; the key is True if negative damping is allowed.
     _ridges: dict[bool, RidgeSolution | None] = field(default_factory=dict, init=False, repr=False)
 
-    # Default number of random devices in tolerance estimates; small, because K_max of one device takes 10 to 50 ms.
+    # Default number of random devices in tolerance estimates. It is small, because K_max of one device takes 10 to 50
+    # ms.
     draws: ClassVar[int] = 200
     # True if the methods with arguments alpha and beta work inside jit, vmap and grad.
     traceable: ClassVar[bool] = False
-    # Largest velocity window and delay, in periods, that other modules try; the run time increases with their square.
+    # Largest velocity window and delay, in periods, that searches in other modules try. It is limited, because the run
+    # time increases with the square of window and delay.
     most_periods: ClassVar[float] = 128
 
     @cached_property
@@ -124,7 +126,7 @@ class LinearLoop:
 
     @cached_property
     def poles_sought(self) -> int:
-        """Number of poles to compute for one spectral radius."""
+        """Number of closed-loop poles that have to be computed to determine the spectral radius of one wall."""
         return self.roots.order
 
     def labels(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
@@ -167,7 +169,7 @@ class LinearLoop:
         return 1.0 + compute_poles_minus_one(self.roots, alpha, beta)
 
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
-        """Return the spectral radius of each wall, below 1 if and only if the wall is stable; NaN if out of range."""
+        """Return the spectral radius of each wall, below 1 if and only if the wall is stable; NaN for invalid walls."""
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         stable = label_walls(self.boundary, alpha, beta).reshape(-1)
         radius = linear_radius(self.roots, alpha.reshape(-1), beta.reshape(-1), stable)
@@ -186,7 +188,7 @@ class LinearLoop:
         return DominantPole(False, float(self.radius(*wall)[0]), -float(log_modulus(dominant)), float(angle))
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
-        """Return the stable intervals of alpha for each beta, shape (n, intervals, 2); NaN if a beta has fewer."""
+        """Return the stable intervals of alpha for each beta, shape (n, intervals, 2), padded with NaN."""
         return np.stack(find_stable_intervals(self.boundary, *nan_beyond(WALL_RANGE, beta))[:2], -1)
 
     def find_stable_beta(self, alpha: float) -> np.ndarray:
@@ -213,7 +215,7 @@ class LinearLoop:
         return ""
 
     def find_connected_beta(self, alpha: float, least: float) -> list[tuple[float, float]]:
-        """Return for one alpha the intervals of beta >= ``least`` of stable walls that are connected to K = 0."""
+        """Return for one alpha the intervals of beta >= ``least`` in which walls are stable and connected to K = 0."""
         intervals = np.maximum(self.find_stable_beta(alpha), least).tolist()
         return [(low, high) for low, high in intervals if low < high and self.is_connected(alpha, 0.5 * (low + high))]
 
@@ -256,7 +258,7 @@ class LinearLoop:
         return RidgePoint(alpha, beta, omega, np.int32(ridge.kind), np.int32(status))
 
     def ridge(self, negative: bool) -> tuple[RidgeSolution | None, Status]:
-        """Return the stiffest wall with its active constraints, or None, and a status; JAX cannot trace this method."""
+        """Return the stiffest stable wall with its active constraints, None if no wall is stable; and a status code."""
         stable_set = self.stable_set
         if negative not in self._ridges:
             try:
@@ -409,13 +411,13 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
         stiffness, *derivatives = stiffness_slopes(slopes, scene.mass, scene.timing.period, *values)
     per = dict(zip(("mass", "damping", "period", "delay"), derivatives, strict=True))
     if scene.timing.in_periods and scene.timing.d:
-        # If the delay is given in periods, t_d = d T increases with T. By the chain rule, the derivative of K_max in T
-        # at constant d is that at constant t_d, plus d times the derivative in t_d.
+        # If the delay is given in periods, t_d = d T increases with T. By the chain rule, the derivative of K_max with
+        # respect to T at constant d is the derivative at constant t_d, plus d times the derivative with respect to t_d.
         per["period"] = per["period"] + scene.timing.d * per["delay"]
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
-        # Differentiate the active constraints of the stiffest wall implicitly, because the derivative of K_max in the
-        # stiffness of the operator has no closed form.
+        # Differentiate the active constraints of the stiffest wall implicitly, because the derivative of K_max with
+        # respect to the stiffness of the operator has no closed form.
         ridge = scene.loop.ridge(negative)[0]
         per["operator.stiffness"] = (
             math.nan if ridge is None else differentiate_stiffness(scene, ridge, "operator.stiffness")

@@ -40,8 +40,8 @@ LEAST_DAMPING_RATIO = 0.005  # smallest damping ratio zeta of a resonance betwee
 # Factor in the bound of a resonance between two lines: if its frequency f is in the middle of the interval of length d,
 # and it changes the second difference of S by D, the height of its peak in S is D d/(16/3 zeta f).
 RESONANCE_FACTOR = 16.0 / 3.0
-SMOOTH_FACTOR = 0.25  # error of a chord of a smooth curve over its second difference: 1/8, doubled for safety
-MAX_TURN = 0.5  # rad; if the phase changes by more between two lines, S may be anywhere between both
+SMOOTH_FACTOR = 0.25  # ratio of the error of a chord of a smooth curve to its second difference: 1/8, doubled
+MAX_TURN = 0.5  # rad; change of phase between two lines above which the bound covers all values of S between them
 MAX_STEP = 0.005  # largest relative change of S, or of w^2, between two interpolated points
 MAX_POINTS = 32  # largest number of interpolated points between two lines
 
@@ -101,8 +101,8 @@ class ResponseCurve:
         w = 2.0 * np.pi * device.frequency * period
         if w[-1] >= np.pi:
             raise InputError(
-                f"frequency: got {device.frequency[-1]:g} Hz at a period of {period:g} s; it must be less than half "
-                f"the rate, {0.5 / period:g} Hz: remove the lines above, or correct the period"
+                f"frequency: got {device.frequency[-1]:g} Hz at a period of {period:g} s; it must be below the "
+                f"Nyquist frequency, {0.5 / period:g} Hz: remove the higher frequencies, or correct the period"
             )
         G = device.response * stiffness
         r = np.zeros(w.size) if device.deviation is None else device.deviation * stiffness
@@ -120,7 +120,8 @@ class ResponseCurve:
         step = np.diff(w)[line]
         angles = np.append(w[line] + share * step, w[-1])
         slope = np.gradient(S, w)
-        # Interpolate S between two lines by a cubic Hermite polynomial, with finite differences as its derivatives.
+        # Interpolate S between two lines by a cubic Hermite polynomial, whose derivatives at the lines are finite
+        # differences.
         t = share
         inner = (1 + 2 * t) * (1 - t) ** 2 * S[line] + t * (1 - t) ** 2 * step * slope[line]
         inner += t * t * (3 - 2 * t) * S[line + 1] + t * t * (t - 1) * step * slope[line + 1]
@@ -193,8 +194,8 @@ def _bound_above(w: np.ndarray, size: np.ndarray, r: np.ndarray) -> float:
 def _bound_gaps(w: np.ndarray, S: np.ndarray) -> np.ndarray:
     """Return bounds of the interpolation error of S, one per interval between adjacent lines; shape (lines - 1,)."""
     step, chord = np.diff(w), np.diff(S)
-    # Compute the second derivative of S at the inner lines, and assign to each interval the larger second difference
-    # of those at its two ends.
+    # Compute the second difference of S for each interval: the larger one of the second derivatives at its two ends,
+    # times the squared length of the interval.
     curvature = np.abs(2.0 * np.diff(chord / step) / (step[1:] + step[:-1]))
     difference = np.maximum(np.append(curvature[:1], curvature), np.append(curvature, curvature[-1:])) * step**2
     relative_step = 2.0 * step / (w[1:] + w[:-1])
@@ -287,8 +288,8 @@ class DecidedWalls:
         half = M[0, free] + across * M[free, other]
         c = M[0, 0] + 2.0 * across * M[0, other] + across * across * M[other, other]
         discriminant = half * half - a * c
-        # If a > 0, the walls between the two roots of the form are undecided; if a <= 0, those outside the roots are
-        # undecided.
+        # If a > 0, the walls between the two roots of the quadratic form are undecided; if a <= 0, the walls outside of
+        # them.
         has_roots, outer = discriminant >= 0, a <= 0
         # A fixed value is unusable if one point of the curve, or the bounds outside the measured range, leave all its
         # walls undecided.
@@ -314,7 +315,8 @@ class DecidedWalls:
         gap_high = np.column_stack([low, most])
         line, gap = np.nonzero((gap_high > gap_low + MIN_WIDTH * np.abs(gap_high)) & usable[:, None])
         low, high = gap_low[line, gap], gap_high[line, gap]
-        # Take the middle wall of each interval, because all its walls have the same winding number.
+        # Compute the winding number of each interval for its middle wall, because all walls of the interval have the
+        # same one.
         walls = (0.5 * (low + high), fixed[line])[:: 1 if free == 1 else -1]
         return line, low, high, self._count_windings(*walls) == 0
 

@@ -1,11 +1,10 @@
 """Loop of a measured device: the analyses of `zwidth.analysis.loop.LinearLoop` that need no model of the device.
 
-A wall is *certainly* stable or unstable if it is so for every frequency response within the error bounds
-(`measured_curve`, docs/theory/measured.md); otherwise it is undecided. *Lines* are the measured frequencies; alpha and
-beta are the normalized stiffness K and damping of a wall, L is the open loop with the plant G and the velocity estimate
-F, and angles are w = omega T with the period T. A wall counts as connected to K = 0 if it is certainly stable and no
-softer wall with the same damping is certainly unstable. The stiffest wall is searched on a grid of beta, and refined by
-golden-section search.
+A wall is stable or unstable only if all frequency responses within the error bounds agree (`measured_curve`,
+docs/theory/measured.md); otherwise it is undecided. *Lines* are the measured frequencies; alpha and beta are the
+normalized stiffness and damping of a wall, L is the open loop, and angles are w = omega T with the period T. A wall
+counts as connected to K = 0 if it is stable and no softer wall of the same damping is unstable. The search for the
+stiffest wall evaluates a grid of beta, and refines the best beta by golden-section search.
 """
 
 from __future__ import annotations
@@ -79,7 +78,7 @@ class MeasuredLoop(LinearLoop):
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod = "auto", exact: Any = ()
     ) -> Stability:
-        """Return for each wall whether it is certainly stable, and a status that states whether it is decided.
+        """Return for each wall whether it is stable for every response within the error bounds, with a status.
 
         The status is UNDECIDED if the lines are too far apart, if their errors are too large, or if the range of
         measured frequencies is too narrow. ``exact`` is an argument of the base class and ignored.
@@ -114,15 +113,15 @@ class MeasuredLoop(LinearLoop):
         return DominantPole(False, np.nan, np.nan, np.nan)
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
-        """Return the certainly stable intervals of alpha for each beta, shape (n, intervals, 2), padded with NaN."""
+        """Return the intervals of stable alpha for each beta, shape (n, intervals, 2), padded with NaN."""
         return _select_stable(self.walls.decide_alpha(beta), True)
 
     def find_stable_beta(self, alpha: float) -> np.ndarray:
-        """Return the certainly stable intervals of beta for one alpha, shape (intervals, 2)."""
+        """Return the intervals of stable beta for one alpha, shape (intervals, 2)."""
         return _select_stable(self.walls.decide_beta(np.array([alpha])), True)[0]
 
     def _find_connected_alpha(self, beta: np.ndarray) -> np.ndarray:
-        """Return the certainly stable intervals of alpha that lie below all certainly unstable alpha at the same beta.
+        """Return the intervals of stable alpha that lie below all unstable alpha of the same beta.
 
         The result has the shape (n, intervals, 2), with NaN if a beta has fewer intervals.
         """
@@ -131,7 +130,7 @@ class MeasuredLoop(LinearLoop):
         return _select_stable(intervals, intervals.low < unstable[:, None])
 
     def is_connected(self, alpha: float, beta: float) -> bool:
-        """Return whether a wall is certainly stable, and no softer wall with the same beta is certainly unstable."""
+        """Return whether a wall is stable, and no softer wall with the same beta is unstable."""
         ends = self._find_connected_alpha(np.array([beta]))[0]
         return bool(np.any((ends[:, 0] < alpha) & (alpha < ends[:, 1])))
 
@@ -177,7 +176,7 @@ class MeasuredLoop(LinearLoop):
         return [Outline(*walls, False, False)] if beta.size else []
 
     def stiffest(self, negative: bool) -> RidgePoint:
-        """Return the stiffest certainly stable wall connected to K = 0; ``negative`` allows beta < 0."""
+        """Return the stiffest stable wall connected to K = 0; ``negative`` allows beta < 0."""
         beta, top = self._tops
         top = np.where((beta < 0) & (not negative), 0.0, top)
         best = int(np.argmax(top))
@@ -196,7 +195,7 @@ class MeasuredLoop(LinearLoop):
         return RidgePoint(np.float64(value), np.float64(middle), np.float64(omega), kind, np.int32(Status.OK))
 
     def explain(self, alpha: float, beta: float) -> list[str]:
-        """Return texts with the reasons why a wall is undecided and the frequencies to measure; empty if decided."""
+        """Return texts on why a wall is undecided and which frequencies to measure; an empty list if it is decided."""
         wall = np.array([alpha]), np.array([beta])
         if self.decide(*wall, "auto", wall).status[0] == Status.OK:
             return []
@@ -226,7 +225,7 @@ class MeasuredLoop(LinearLoop):
         return reasons
 
     def explain_limit(self) -> str:
-        """Return a text with the reasons why no wall is decided, for the wall undecided at the fewest frequencies."""
+        """Return a text with the reasons why no wall is decided: those of the wall undecided at fewest frequencies."""
         rows = [(*self.walls.bound_alpha(beta), beta) for beta in self._tops[0].tolist()]
         walls = [(0.5 * (low + high), beta) for low, high, beta in rows if low < high]
         count = f"the {self.scene.device.frequency.size} frequencies of the response decide the stability of no wall"

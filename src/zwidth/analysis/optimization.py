@@ -32,7 +32,7 @@ from zwidth.units.display import compact_repr
 from zwidth.units.parsing import to_float
 from zwidth.units.quantities import FIELDS, WALL
 
-# At the damping of the stiffest wall, the stable interval of K may end below K_max by this relative tolerance, because
+# Relative tolerance by which the stable interval of K may end below K_max at the damping of the stiffest wall, because
 # K_max has a numerical error.
 STIFFNESS_TOLERANCE = 1e-6
 
@@ -98,7 +98,7 @@ class Crossing(NamedTuple):
     """A parameter value at which K_max equals the required stiffness, and the side on which K_max is sufficient."""
 
     value: float
-    enough: Side
+    sufficient_side: Side
 
 
 @compact_repr()
@@ -106,7 +106,7 @@ class RequiredValue(NamedTuple):
     """Required value of a parameter, the side on which K_max is sufficient, and all crossings found, ascending."""
 
     value: float
-    enough: Side
+    sufficient_side: Side
     crossings: tuple[Crossing, ...]
     range: tuple[float, float]
     status: Status
@@ -158,7 +158,7 @@ def _choose_range(
 
 
 def _find_extrema(surplus: Callable[[float], float], grid: list[float], values: list[float]) -> list[float]:
-    """Return the parameter values of local extrema of the surplus at which its sign may differ from that on the grid.
+    """Return the parameter values at local extrema of the surplus that may differ in sign from nearby grid points.
 
     These are maxima close to grid points with negative surplus, and minima close to those with nonnegative surplus.
     ``values`` holds the surplus at the parameter values ``grid``.
@@ -187,8 +187,7 @@ def _find_crossing(surplus: Callable[[float], float], low: float, high: float) -
     try:
         root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
     except ValueError:
-        # Brent's method fails if it reaches a parameter value at which K_max cannot be computed. No crossing is then
-        # found.
+        # Return no crossing, because Brent's method has reached a parameter value at which K_max cannot be computed.
         return None
     value = math.exp(cast("float", root))
     for distance in CONFIRMATION_DISTANCES:
@@ -302,7 +301,7 @@ class SceneOptima(SceneAnalysis):
             negative_damping: as for `max_stiffness`.
 
         Returns:
-            ``value``, the sufficient value closest to the current one; ``enough``, the side of it on which K_max is
+            ``value``, the sufficient value closest to the current one; ``sufficient_side``, its side on which K_max is
             sufficient ("above" or "below"), "everywhere" if it is in the whole range (``value`` is then the current
             value, or the closest end of the range), or "nowhere"; ``crossings``, all crossings found, each confirmed by
             K_max on both sides; ``range``, the range searched; ``status``, UNREACHABLE with NaN if K_max is below the
@@ -317,7 +316,7 @@ class SceneOptima(SceneAnalysis):
             >>> import zwidth
             >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
             >>> needed = scene.required("damping", 25e3)
-            >>> print(f"{needed.value:.2f} N s/m or {needed.enough}")
+            >>> print(f"{needed.value:.2f} N s/m or {needed.sufficient_side}")
             18.62 N s/m or above
         """
         stiffness = _read_stiffness(stiffness, self.unit_system["N/m"])
@@ -368,7 +367,7 @@ class SceneOptima(SceneAnalysis):
             # Report no value if K_max could not be computed between the current value and the crossing, because a
             # closer crossing may exist there.
             return RequiredValue(math.nan, "nowhere", confirmed, (low, high), Status.NOT_CONVERGED)
-        return RequiredValue(best.value, best.enough, confirmed, (low, high), Status.OK)
+        return RequiredValue(best.value, best.sufficient_side, confirmed, (low, high), Status.OK)
 
     def best_damping(
         self, stiffness: float | str | None = None, *, goal: Goal = "fast", negative_damping: bool | None = None

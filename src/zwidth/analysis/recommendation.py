@@ -1,9 +1,9 @@
 """Recommended wall of a device: the stiffest that satisfies requirements, with cautions and useful improvements.
 
-The requirements (`wall_search.Wanted`) limit the stiffness K relative to the maximum stiffness K_max of the device, the
-margins, the passivity, and the stability in reference grasps, which are models of a hand. The *safe limit* of a scene
-bounds K and the damping B to walls that measurements of the device support. The *active* requirement is the one that
-excludes every stiffer wall.
+The requirements (`wall_search.Requirements`) limit the stiffness K relative to the maximum stiffness K_max of the
+device, the margins, the passivity, and the stability in reference grasps, which are models of a hand. The *safe limit*
+of a scene bounds K and the damping B to walls that measurements of the device support. The *active* requirement is the
+one that excludes every stiffer wall.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from zwidth.analysis.assessment import (
 from zwidth.analysis.cautions import judge_grasps, list_cautions
 from zwidth.analysis.optimization import SceneOptima, StiffestWall
 from zwidth.analysis.wall_code import write_wall
-from zwidth.analysis.wall_search import COARSE, Grasps, Wanted, choose_wall, list_grasped_scenes, measure_slack
+from zwidth.analysis.wall_search import COARSE, Grasps, Requirements, choose_wall, list_grasped_scenes, measure_slack
 from zwidth.core.errors import InputError
 from zwidth.core.status import Status
 from zwidth.model.checks import check_limit
@@ -68,7 +68,7 @@ class Recommendation:
     Attributes:
         scene: the device with the recommended wall, for `zwidth.assess`, `zwidth.simulate` and figures.
         stiffest: the stiffest stable wall of the device.
-        wanted: the requirements on the wall.
+        requirements: the requirements on the wall.
         limited_by: the active requirement, which excludes every stiffer wall: "stiffness_fraction", "gain_margin",
             "phase_margin", "passive", "grasps" or "safe_limit"; "" if no wall is recommended.
         status: code of `zwidth.Status`; no wall is recommended unless it is OK.
@@ -78,7 +78,7 @@ class Recommendation:
 
     scene: Any
     stiffest: StiffestWall
-    wanted: Wanted
+    requirements: Requirements
     limited_by: str
     status: Status
     reason: str = ""
@@ -100,14 +100,14 @@ class Recommendation:
         return float(self.scene.wall.virtual_damping) if self.status == Status.OK else math.nan
 
     @cached_property
-    def read(self) -> tuple[float, float, int]:
+    def rounded_wall(self) -> tuple[float, float, int]:
         """K and B of the wall, rounded for printing, and their number of significant digits.
 
         The number of digits is the smallest, at least 4, with which the rounded wall satisfies the requirements. K is
         rounded down. If only a narrow range of B satisfies the requirements, more than 4 digits are needed.
         """
-        grasped = list_grasped_scenes(self.scene, self.wanted)
-        slack, verdict = measure_slack(self.scene, self.wanted, grasped), self.verdict
+        grasped = list_grasped_scenes(self.scene, self.requirements)
+        slack, verdict = measure_slack(self.scene, self.requirements, grasped), self.verdict
         ends = (math.nan, math.nan)
         if verdict is not None:
             ends = verdict.virtual_damping_lower, verdict.virtual_damping_upper
@@ -121,7 +121,8 @@ class Recommendation:
             wall = rounded(digits)
             if not (self.scene.is_stable(*wall) and all(spare >= 0 for spare in slack(*wall).values())):
                 return False
-            # Require that the printed B lies in the printed range of stable B, whose ends are rounded inwards.
+            # Require that the rounded B lies in the printed range of stable B, because the ends of this range are
+            # rounded inwards.
             low, high = ends
             inside = (
                 round_conservatively(low, "above", digits) <= wall[1] <= round_conservatively(high, "below", digits)
@@ -137,7 +138,7 @@ class Recommendation:
         return assess(self.scene) if self.status == Status.OK else None
 
     @cached_property
-    def steps(self) -> list[Limit]:
+    def improvements(self) -> list[Limit]:
         """Improvements of the device that allow a stiffer wall under the same requirements, the largest gain first.
 
         The improvements are those of `zwidth.limits_of`. The stiffness of each entry is that of the wall recommended
@@ -154,9 +155,10 @@ class Recommendation:
         try:
             top = improved.max_stiffness()
             near = self.stiffness * float(top.stiffness) / float(self.stiffest.stiffness)
-            return choose_wall(improved, self.wanted, top, near, COARSE).stiffness
+            return choose_wall(improved, self.requirements, top, near, COARSE).stiffness
         except InputError:
-            # An improved scene may be invalid: at twice the rate a long delay may exceed the largest number of periods.
+            # Return NaN for an invalid improved scene: at twice the sampling rate, a long delay may exceed the largest
+            # allowed number of periods.
             return math.nan
 
     @cached_property
@@ -200,19 +202,19 @@ class Recommendation:
         if verdict is None:
             return (f"no wall: {self.reason}",)
         # Compute the stable range of B at the printed K, because a negative lower end depends strongly on K.
-        intervals = tuple(map(tuple, self.scene.stable_damping(self.read[0]).tolist()))
+        intervals = tuple(map(tuple, self.scene.stable_damping(self.rounded_wall[0]).tolist()))
         lower, upper = format_interval(
-            *find_nearest_interval(intervals, self.virtual_damping), self.unit_system["N s/m"], self.read[2]
+            *find_nearest_interval(intervals, self.virtual_damping), self.unit_system["N s/m"], self.rounded_wall[2]
         )
         room = f"B from {lower} to {upper} is stable at this K"
         margins = f"margins: {self.spell_margins()}; passive: {self.spell_passive()}; {room}"
-        hands = [f"in a hand: {hands}"] if (hands := self.spell_hands()) else []
+        hands = [f"grasps: {hands}"] if (hands := self.spell_hands()) else []
         cautions = (f"caution: {caution}" for caution in self.cautions)
         return f"{self.spell_wall()}: {self.spell_limit()}", margins, *hands, *cautions
 
     def spell_wall(self) -> str:
         """Return a text with K and B of the recommended wall, such as "K = 8 kN/m, B = 33 N s/m"."""
-        (K, B, digits), units = self.read, self.unit_system
+        (K, B, digits), units = self.rounded_wall, self.unit_system
         return f"K = {format_stiffness(K, units, digits)}, B = {with_unit(B, units['N s/m'], digits)}"
 
     def spell_limit(self) -> str:
@@ -226,12 +228,12 @@ class Recommendation:
         bounded = (
             ", with B limited by the safe limit" if self.limited_by != "safe_limit" and self.is_at_safe_limit else ""
         )
-        return f"limited by {self.wanted.spell(self.limited_by)}{bounded}"
+        return f"limited by {self.requirements.spell(self.limited_by)}{bounded}"
 
     @property
     def is_at_safe_limit(self) -> bool:
         """True if the safe limit is active, i.e. K or B of the wall equals its bound."""
-        limit = None if self.wanted.beyond_safe else self.scene.safe_limit
+        limit = None if self.requirements.beyond_safe else self.scene.safe_limit
         ends = None if limit is None else limit.dampings(self.stiffness)
         at_end = ends is not None and any(math.isclose(self.virtual_damping, end, rel_tol=1e-3) for end in ends)
         return at_end or self.limited_by == "safe_limit"
@@ -256,7 +258,7 @@ class Recommendation:
         return f"stable in {count} reference grasps{radii}"
 
     def spell_passive(self) -> str:
-        """Return "yes" for a passive wall, "no" for another one, and the reason as text if passivity is not known."""
+        """Return "yes" for a passive wall, "no" for another one, or the reason as text if passivity is not known."""
         passive = None if self.verdict is None else self.verdict.passive
         if passive and self.verdict is not None and self.verdict.passivity_margin < reserve_damping(self.scene):
             return "uncertain, because the fitted damping is"
@@ -281,21 +283,21 @@ class Recommendation:
                 "frequency": float(top.frequency),
                 "kind": name_kind(top),
             },
-            "wanted": self.wanted._asdict(),
+            "requirements": self.requirements._asdict(),
             "recommended": {
                 "stiffness_fraction": self.stiffness / float(top.stiffness),
                 "limited_by": self.limited_by,
                 "stiffness": self.stiffness,
                 "virtual_damping": self.virtual_damping,
                 # Number of significant digits with which K and B are printed.
-                "digits": None if verdict is None else self.read[2],
+                "digits": None if verdict is None else self.rounded_wall[2],
                 **{name: judged.get(name) for name in _JUDGED},
                 "stable": verdict is not None and verdict.stable,
                 "decay_time": float(decay_time(1.0 / np.float64(constant))),
                 # The recommend study sets this value if it computes a step response.
                 "settling_time": None,
             },
-            "steps": [step._asdict() for step in self.steps],
+            "improvements": [each._asdict() for each in self.improvements],
             "grasps": self.grasps,
             "cautions": list(self.cautions),
             "reason": self.reason,
@@ -303,7 +305,7 @@ class Recommendation:
         }
         if self.limited_by == "stiffness_fraction":
             # Replace the computed fraction by the value that the user gave, because both may differ in the last digit.
-            result["recommended"]["stiffness_fraction"] = self.wanted.stiffness_fraction
+            result["recommended"]["stiffness_fraction"] = self.requirements.stiffness_fraction
         return to_json(result)
 
 
@@ -316,7 +318,8 @@ def _describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -
         units: unit system of the texts.
     """
     if limit is None or (limit.forbids_all and not ignored):
-        # Return no note if the safe limit excludes all walls, because the reason for recommending no wall states this.
+        # Return no text if the safe limit excludes all walls, because the reason for the missing recommendation states
+        # this.
         return []
     return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]
 
@@ -351,9 +354,10 @@ class SceneAdvice(SceneOptima):
 
         Returns:
             Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, the active requirement; ``cautions``,
-            small margins and grasps that destabilize the wall; ``verdict``, the `zwidth.assess` of the wall; ``steps``,
-            improvements of the device that allow a stiffer wall under the same requirements; ``code("c")``, the wall as
-            a program for a control loop. ``status`` is UNREACHABLE if no wall satisfies the requirements.
+            small margins and grasps that destabilize the wall; ``verdict``, the `zwidth.assess` of the wall;
+            ``improvements``, changes of the device that allow a stiffer wall under the same requirements;
+            ``code("c")``, the wall as a program for a control loop. ``status`` is UNREACHABLE if no wall satisfies the
+            requirements.
 
         Numerics:
             A stiffness fraction without other requirements needs no search: B is that of the stiffest wall if the wall
@@ -370,18 +374,18 @@ class SceneAdvice(SceneOptima):
             >>> scene.recommend().limited_by
             'phase_margin'
         """
-        wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe, grasps)
-        if wanted.passive and (obstacle := find_unsupported_reason(**vars(self.device))):
+        requirements = Requirements.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe, grasps)
+        if requirements.passive and (obstacle := find_unsupported_reason(**vars(self.device))):
             raise InputError(f"passive: got True {obstacle}")
-        if not isinstance(self.device, Device) and wanted.grasps != "none" and grasps is not None:
+        if not isinstance(self.device, Device) and requirements.grasps != "none" and grasps is not None:
             raise InputError(f"grasps: got {grasps!r}, but the device is no Device with a mass; only 'none' is allowed")
         if grasps is None and (self.operator is not None or not isinstance(self.device, Device)):
-            wanted = wanted._replace(grasps="none")
+            requirements = requirements._replace(grasps="none")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)
-        choice = choose_wall(bare, wanted, top)
+        choice = choose_wall(bare, requirements, top)
         notes += [choice.note] if choice.note else []
         notes += _describe_limit(self.safe_limit, beyond_safe, self.unit_system)
         if choice.status == Status.OK:
             bare = bare.replace(wall=VirtualWall(choice.stiffness, choice.damping))
-        return Recommendation(bare, top, wanted, choice.limit, choice.status, choice.reason, tuple(notes))
+        return Recommendation(bare, top, requirements, choice.limit, choice.status, choice.reason, tuple(notes))

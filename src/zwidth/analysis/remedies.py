@@ -34,7 +34,7 @@ class _Candidates(NamedTuple):
     increasing: bool
 
     def select(self, at_rest: np.ndarray) -> int:
-        """Return the smallest index from which all trials come to rest; ``len(at_rest)`` if the last does not."""
+        """Return the smallest index from which on all trials come to rest; ``len(at_rest)`` if no such index exists."""
         return len(at_rest) - int(np.argmin(np.append(at_rest[::-1], False)))
 
     def refine(self, index: int, present: float) -> _Candidates:
@@ -62,7 +62,7 @@ class _Candidates(NamedTuple):
 
 
 def search_remedies(experiment: Experiment, cause: Literal["quantization", "saturation"]) -> list[Remedy]:
-    """Return one `Remedy` per parameter whose change stops the oscillation: a range from the smallest change on."""
+    """Return one `Remedy` per parameter whose change stops the oscillation: its values from the smallest change on."""
     hardware = experiment.hardware
     periods = min(experiment.periods, LONGEST_TRIAL)
     experiment = experiment._replace(periods=periods, decay=experiment.decay * periods / experiment.periods)

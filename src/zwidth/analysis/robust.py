@@ -46,12 +46,12 @@ class Interval(NamedTuple):
 Uncertain: TypeAlias = Interval | ArrayLike
 
 
-@compact_repr(attained="N/m", mass="kg", damping="N s/m", period="s", delay="s")
+@compact_repr(stiffness_max="N/m", mass="kg", damping="N s/m", period="s", delay="s")
 class RobustStiffness(NamedTuple):
     """Largest stiffness that every device of a box can render, and the weakest device found, which limits it."""
 
     stiffness: Array
-    attained: Array
+    stiffness_max: Array
     mass: Array
     damping: Array
     period: Array
@@ -87,9 +87,9 @@ def robust_max_stiffness(
             one box.
 
     Returns:
-        RobustStiffness of the broadcast shape: ``stiffness`` in N/m, 1e-6 below ``attained``; ``attained``, K_max of
-        the weakest device found, with its ``mass``, ``damping``, ``period`` and ``delay``; ``is_vertex``, True if this
-        device is a vertex of the box; ``status``: OK, or INVALID_INPUT or OUT_OF_RANGE with NaN for a box among
+        RobustStiffness of the broadcast shape: ``stiffness`` in N/m, 1e-6 below ``stiffness_max``; ``stiffness_max``,
+        K_max of the weakest device found, with its ``mass``, ``damping``, ``period`` and ``delay``; ``is_vertex``, True
+        if this device is a vertex of the box; ``status``: OK, or INVALID_INPUT or OUT_OF_RANGE with NaN for a box among
         arrays.
 
     Raises:
@@ -258,9 +258,9 @@ def _build_grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
 def _find_weakest_device(low: np.ndarray, high: np.ndarray) -> tuple:
     """Find the weakest device of a box from ``low`` to ``high``, and return the fields of `RobustStiffness`."""
     device = _find_lowest(_compute_max_stiffness, low, high)
-    attained = float(_compute_max_stiffness(device)[0])
+    stiffness_max = float(_compute_max_stiffness(device)[0])
     is_vertex = bool(np.all((device == low) | (device == high)))
-    return attained * (1.0 - BELOW), attained, *device[0], is_vertex, Status.OK
+    return stiffness_max * (1.0 - BELOW), stiffness_max, *device[0], is_vertex, Status.OK
 
 
 def _find_common_limit(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:

@@ -82,7 +82,7 @@ class Remedy(NamedTuple):
 
 
 def count_steps(resolution: float) -> int:
-    """Return the number of counts per revolution of an encoder whose steps are at most ``resolution``, in rad."""
+    """Return the least number of counts per revolution of an encoder whose steps are at most ``resolution``, in rad."""
     return math.ceil(2.0 * math.pi / resolution - 1e-6)
 
 
@@ -154,14 +154,14 @@ def _search(scene: SceneOptima, path: str, present: float, direction: int, facto
     near = _bisect(holds, values[first], values[first - 1]) if first else present
     after = stable.index(False, first) if False in stable[first:] else None
     far = _bisect(holds, values[after - 1], values[after]) if after else None
-    note = f"the delay stays {scene.timing.kept_delay}" if path == "rate" and scene.timing.delay else ""
+    note = f"the delay stays {scene.timing.delay_text}" if path == "rate" and scene.timing.delay else ""
     if direction > 0:
         return [Remedy(path, near, math.inf if far is None else far, note)]
     return [Remedy(path, -math.inf if far is None else far, near, note)]
 
 
 def _bisect(holds: Callable[[float], bool | None], inside: float, outside: float) -> float:
-    """Find by bisection the end of a stable range between a stable and another value; return its last stable value."""
+    """Find the end of a stable range by bisection between a stable and another value; return the last stable value."""
     for _ in range(HALVINGS):
         middle = 0.5 * (inside + outside)
         inside, outside = (middle, outside) if holds(middle) else (inside, middle)

@@ -67,7 +67,7 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
 
 
 def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
-    """Compute K_max in N/m; ``kind`` states whether d has delays below 1, delays from 1 on, or fractional delays."""
+    """Compute K_max in N/m; ``kind`` states which delays d contains: below 1, from 1 on, or fractional ones."""
     return ridge_kernel(delta, d, kind).alpha * (mass / period) / period
 
 
@@ -138,10 +138,10 @@ def sensitivities(
 
 
 def _sensitivities_kernel(mass, damping, period, delay, delta, d, kind) -> Sensitivities:
-    """Compute K_max and its derivatives; ``kind`` states whether d has delays below 1, from 1 on, or fractional."""
+    """Compute K_max and its derivatives in SI units; ``kind`` is that of `max_stiffness_kernel`."""
     xp = namespace(mass, delta, d)
-    # If JAX traces the quantities, compile this part separately, so that the derivatives in delta and d are computed
-    # once and not again for each quantity.
+    # If JAX traces the quantities, compile the derivatives with respect to delta and d as a separate function, so that
+    # JAX computes them once instead of once per quantity.
     slopes = slopes_kernel(delta, d, kind) if xp is np else compile_traced(slopes_kernel, (kind,))(delta, d)
     # Compute the status of entries out of range from the quantities in SI units, because delta or d is NaN there.
     input_status = quantity_status(mass=mass, damping=damping, period=period, delay=delay)

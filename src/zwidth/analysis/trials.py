@@ -63,7 +63,7 @@ class Starts(NamedTuple):
 
     position: np.ndarray
     velocity: np.ndarray
-    push: np.ndarray  # constant external force
+    external_force: np.ndarray  # constant external force
     half_steps: np.ndarray  # additional constant external force, in units of K Q/2
     scaled: np.ndarray  # bool; the displacement is proportional to the encoder step
 
@@ -108,20 +108,21 @@ class Experiment(NamedTuple):
         columns: dict[str, Any] = {name: value[:, None] for name, value in table.items()}
         present = self.hardware.resolution
         ratio = columns["resolution"] / present if present > 0 else 1.0
-        push = starts.push + 0.5 * starts.half_steps * columns["stiffness"] * columns["resolution"]
+        external_force = starts.external_force + 0.5 * starts.half_steps * columns["stiffness"] * columns["resolution"]
         motion = simulate(
             self.scene,
             **columns,
             start_position=starts.position * np.where(starts.scaled, ratio, 1.0),
             start_velocity=starts.velocity,
-            push=push,
+            external_force=external_force,
             periods=self.periods,
             record=False,
         )
         if np.any(motion.outcome == MotionKind.INVALID):
             raise InputError("coulomb: friction stops and restarts the device too often within one period; lower it")
-        # A response that decays like the linear loop has the trend exp(-decay/8), because each half of the tail lasts
-        # an eighth of the simulation. Require at least the square root of this trend for a sustained oscillation.
+        # A response that decays like the linear loop, by exp(-decay) during the simulation, has the trend
+        # exp(-decay/8), because each half of the tail lasts an eighth of the simulation. Require at least the square
+        # root of this trend for a sustained oscillation.
         least_trend = max(SUSTAINED, math.exp(-self.decay / 16.0) if self.decay > 0 else 0.0)
         # Treat a growing response as unbounded only if the linear loop is unstable and the motor has no limits, because
         # all other growing responses approach a limit cycle.
@@ -134,8 +135,8 @@ def list_starts(scene: Any, hardware: Hardware) -> Starts:
     K, Q, period = float(scene.wall.stiffness), hardware.resolution, scene.timing.period
     position = [Q * factor for factor in DISPLACEMENTS if Q > 0]
     half_steps = [0.0] * len(position) + [1.0] * len(position)
-    # Let the displacements that are multiples of the encoder step change with the encoder step of a trial. Add the
-    # largest one a second time, as a displacement that does not change.
+    # If a trial changes the encoder step, scale the displacements, which are multiples of the encoder step, by the same
+    # factor. Add the largest one a second time, as a displacement that is not scaled.
     scaled = 2 * len(position)
     position, half_steps = position * 2 + position[-1:] * 2, half_steps + [0.0, 1.0][: 2 * len(position)]
     loads = [hardware.max_force, hardware.max_rate * period]
@@ -150,8 +151,8 @@ def list_starts(scene: Any, hardware: Hardware) -> Starts:
     if isinstance(scene.device, LinearDevice):
         # Displace the equilibrium of a linear system by a constant external force, because its simulation always starts
         # at rest at 0.
-        push = np.minimum(K * starts[0], LARGEST_PUSH * hardware.max_force)
-        return Starts(np.zeros(len(push)), np.zeros(len(push)), push, *starts[3:])
+        external_force = np.minimum(K * starts[0], LARGEST_PUSH * hardware.max_force)
+        return Starts(np.zeros(len(external_force)), np.zeros(len(external_force)), external_force, *starts[3:])
     return Starts(*starts)
 
 

@@ -146,7 +146,7 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
         start += [f"{name} = 0.0" for name in inner] + [f"{last} = " + ("0.0" if count else f"u / {denominator[-1]!r}")]
         start += [] if count or number == len(sections) - 1 else [f"u = {numerator[-1]!r} * {last}"]
         if numerator == (1.0, 1.0) and denominator[-1] != 0:
-            # If the section has a zero at z = 0, write it as q += a0 (u - q), the usual form of a first-order low-pass.
+            # Write a section with a zero at z = 0 as q += a0 (u - q), the usual form of a first-order low-pass filter.
             force += [f"{last} += {denominator[-1]!r} * (u - {last})", f"u = {last}"]
             start = [line if line != f"{last} = u / {denominator[-1]!r}" else f"{last} = u" for line in start]
             gain /= denominator[-1]

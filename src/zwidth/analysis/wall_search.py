@@ -56,7 +56,7 @@ Slack = Callable[[float, Any], dict[str, np.ndarray]]
 Grasps: TypeAlias = Literal["all", "soft", "none"]
 
 
-class Wanted(NamedTuple):
+class Requirements(NamedTuple):
     """Requirements on a wall; None for no requirement."""
 
     stiffness_fraction: float | None = None  # upper limit of K/K_max
@@ -75,8 +75,8 @@ class Wanted(NamedTuple):
         passive: bool,
         beyond_safe: bool = False,
         grasps: Grasps | None = None,
-    ) -> Wanted:
-        """Return the requirements after a check of the arguments of `recommend`, with defaults if none is given."""
+    ) -> Requirements:
+        """Check the arguments of `recommend`, and return them as requirements; the defaults apply if none is given."""
         ranges = {"stiffness_fraction": FRACTION, **RANGES}
         limits = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
         for name, value in limits.items():
@@ -100,7 +100,7 @@ class Wanted(NamedTuple):
         )
 
     def spell(self, name: str) -> str:
-        """Return a text that describes the requirement ``name``, a field of `Wanted` or "safe_limit"."""
+        """Return a text that describes the requirement ``name``, a field of `Requirements` or "safe_limit"."""
         return {
             "stiffness_fraction": f"{100.0 * (self.stiffness_fraction or 1.0):.4g} % of K_max",
             "gain_margin": f"gain margin {self.gain_margin:g}" if self.gain_margin else "",
@@ -121,31 +121,33 @@ class WallChoice(NamedTuple):
 
     stiffness: float  # in N/m; NaN if no wall exists
     damping: float  # virtual damping in N s/m; NaN if no wall exists
-    limit: str  # active requirement: a field of `Wanted`, or "safe_limit"
+    limit: str  # active requirement: a field of `Requirements`, or "safe_limit"
     status: Status
     reason: str = ""  # reason why no wall exists
     note: str = ""  # remark on the choice
 
 
-def list_grasped_scenes(scene: SceneOptima, wanted: Wanted) -> list[SceneOptima]:
+def list_grasped_scenes(scene: SceneOptima, requirements: Requirements) -> list[SceneOptima]:
     """Return copies of the scene in each required grasp; if the scene has an operator, also one without operator."""
-    if not isinstance(scene.device, Device) or wanted.grasps == "none":
+    if not isinstance(scene.device, Device) or requirements.grasps == "none":
         return []
     pairs = list_grasps(scene.unit_system.rotary)
-    hands: list[Any] = [hand for name, hand in pairs if wanted.grasps == "all" or name.startswith(wanted.grasps)]
+    hands: list[Any] = [
+        hand for name, hand in pairs if requirements.grasps == "all" or name.startswith(requirements.grasps)
+    ]
     return [scene.replace(operator=hand) for hand in (*hands, *([None] if scene.operator is not None else []))]
 
 
-def measure_slack(scene: SceneOptima, wanted: Wanted, grasped: Sequence[SceneOptima] = ()) -> Slack:
+def measure_slack(scene: SceneOptima, requirements: Requirements, grasped: Sequence[SceneOptima] = ()) -> Slack:
     """Return a function that computes the slack of each requirement for walls with K in N/m and B in N s/m.
 
-    The requirements are those on margins and passivity in ``wanted``, and stability in every scene of ``grasped``. The
-    slack of the latter is the modulus margin of the wall, so that a search for the largest slack prefers well-damped
-    walls.
+    The requirements are those on margins and passivity in ``requirements``, and stability in every scene of
+    ``grasped``. The slack of the latter is the modulus margin of the wall, so that a search for the largest slack
+    prefers well-damped walls.
     """
     device_damping = float(scene.device.damping)
-    reserve = 0.0 if wanted.beyond_safe else reserve_damping(scene)
-    needed_margins = [name for name in ("gain_margin", "phase_margin") if getattr(wanted, name)]
+    reserve = 0.0 if requirements.beyond_safe else reserve_damping(scene)
+    needed_margins = [name for name in ("gain_margin", "phase_margin") if getattr(requirements, name)]
     needed_margins += ["modulus_margin"] if grasped else []
 
     def slack(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
@@ -155,14 +157,17 @@ def measure_slack(scene: SceneOptima, wanted: Wanted, grasped: Sequence[SceneOpt
         margins: Any = None
         if needed_margins:
             margins = scene.loop.margins(alpha, beta, needed_margins)
-            if wanted.gain_margin:
+            if requirements.gain_margin:
                 with np.errstate(all="ignore"):
-                    slacks["gain_margin"] = np.abs(np.log(margins.gain_margin)) / math.log(wanted.gain_margin) - 1.0
-            if wanted.phase_margin:
-                slacks["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
-        if wanted.passive:
+                    slacks["gain_margin"] = (
+                        np.abs(np.log(margins.gain_margin)) / math.log(requirements.gain_margin) - 1.0
+                    )
+            if requirements.phase_margin:
+                slacks["phase_margin"] = np.asarray(margins.phase_margin) / requirements.phase_margin - 1.0
+        if requirements.passive:
             margin = (np.asarray(scene.passivity_margin(stiffness, damping)) - reserve) / (device_damping or 1.0)
-            # Use a negative slack if the passivity margin is exactly 0, because such a wall is not passive.
+            # Replace a passivity margin of exactly 0 by a negative slack, because a wall with this margin is not
+            # passive.
             slacks["passive"] = np.where(margin == 0, -np.finfo(float).eps, margin)
         if grasped:
             stable_in_grasps = np.all([_is_stable_in_grasp(each, stiffness, damping) for each in grasped], axis=0)
@@ -215,8 +220,8 @@ def find_stiffest(
         lowest, beta = min(dips, default=(1.0, math.nan))
         if lowest <= 0:
             dampings[log_stiffness] = beta * unit
-        # Keep the sign of the slack, but keep its magnitude above 1e-12, because `false_position` stops at values close
-        # to 0.
+        # Keep the magnitude of the slack above 1e-12 without changing its sign, because `false_position` stops at
+        # values close to 0.
         return min(max(-lowest, 1e-12), 1.0) if lowest <= 0 else max(min(-lowest, -1e-12), -1.0)
 
     top, softest = math.log(most), scene.loop.least_stiffness(-math.inf)
@@ -255,19 +260,19 @@ def _clip(intervals: list[tuple[float, float]], low: float, high: float) -> list
 
 
 def choose_wall(
-    scene: SceneOptima, wanted: Wanted, top: StiffestWall, near: float | None = None, width: float = WIDTH
+    scene: SceneOptima, requirements: Requirements, top: StiffestWall, near: float | None = None, width: float = WIDTH
 ) -> WallChoice:
     """Choose the stiffest wall of a scene that satisfies the requirements.
 
     Args:
         scene: the scene.
-        wanted: the requirements.
+        requirements: the requirements.
         top: the stiffest stable wall of the scene.
         near: initial guess of K in N/m.
         width: relative tolerance of K.
     """
-    grasps, active = list_grasped_scenes(scene, wanted), list[SceneOptima]()
-    free = choice = _choose_free(scene, wanted, top, near, width, active)
+    grasps, active = list_grasped_scenes(scene, requirements), list[SceneOptima]()
+    free = choice = _choose_free(scene, requirements, top, near, width, active)
     # Add a grasp to the requirements only if the chosen wall is unstable in it, because each grasp slows the search.
     while choice.status == Status.OK and (
         unstable := [
@@ -275,7 +280,7 @@ def choose_wall(
         ]
     ):
         active += unstable
-        choice = _choose_free(scene, wanted, top, GRASP_GUESS * choice.stiffness, width, active)
+        choice = _choose_free(scene, requirements, top, GRASP_GUESS * choice.stiffness, width, active)
     if choice.status != Status.OK:
         return choice
     return choice._replace(limit="grasps" if choice.stiffness < (1.0 - 2.0 * width) * free.stiffness else free.limit)
@@ -283,7 +288,7 @@ def choose_wall(
 
 def _choose_free(
     scene: SceneOptima,
-    wanted: Wanted,
+    requirements: Requirements,
     top: StiffestWall,
     near: float | None,
     width: float,
@@ -296,27 +301,27 @@ def _choose_free(
     nan = math.nan
     if top.status != Status.OK:
         return WallChoice(nan, nan, "", Status(int(top.status)), explain_missing(scene, top.status))
-    most, active = (wanted.stiffness_fraction or 1.0) * float(top.stiffness), "stiffness_fraction"
-    safe = None if wanted.beyond_safe else scene.safe_limit
+    most, active = (requirements.stiffness_fraction or 1.0) * float(top.stiffness), "stiffness_fraction"
+    safe = None if requirements.beyond_safe else scene.safe_limit
     if safe is not None:
         if safe.forbids_all:
             why = "; ".join(safe.warnings) or safe.reason or "the safe limit is 0"
             return WallChoice(nan, nan, "", Status.UNREACHABLE, f"no wall is safe: {why}")
         # Limit K to the same fraction of the safe limit as of K_max, because both limits need the same reserve.
-        share = wanted.safe_share * safe.stiffness
+        share = requirements.safe_share * safe.stiffness
         most, active = (share, "safe_limit") if share < most else (most, active)
-    usual, slack = choose_damping(scene, top, most), measure_slack(scene, wanted, grasped)
+    usual, slack = choose_damping(scene, top, most), measure_slack(scene, requirements, grasped)
     if safe is not None:
         low, high = safe.dampings(most) or (usual, usual)
         usual = min(max(usual, low), high)
     spare = slack(most, usual)
-    if spare and not (wanted.stiffness_fraction and min(spare.values()) >= 0):
+    if spare and not (requirements.stiffness_fraction and min(spare.values()) >= 0):
         stiffness, damping = find_stiffest(scene, slack, most, near, width, safe)
         if math.isnan(stiffness):
-            reason = f"no wall satisfies {' and '.join(map(wanted.spell, spare))}; relax a requirement"
-            if wanted.passive and scene.device.damping == 0:
+            reason = f"no wall satisfies {' and '.join(map(requirements.spell, spare))}; relax a requirement"
+            if requirements.passive and scene.device.damping == 0:
                 reason = "no passive wall exists, because the device has no physical damping"
-            elif wanted.passive and safe is not None and scene.device.damping <= safe.damping_reserve:
+            elif requirements.passive and safe is not None and scene.device.damping <= safe.damping_reserve:
                 reason = (
                     "no wall is passive for certain, because the device may have no physical damping; record longer"
                 )

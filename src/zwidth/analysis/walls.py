@@ -150,7 +150,8 @@ class SceneAnalysis(SceneParts):
         join_shapes([("frequency", hertz.shape), ("stiffness", alpha.shape), ("virtual_damping", beta.shape)])
         hertz, alpha, beta = np.broadcast_arrays(hertz, alpha, beta)
         w = 2.0 * np.pi * hertz * self.timing.period
-        # Map the Nyquist frequency to exactly pi, because the rounded product may exceed pi.
+        # Map the Nyquist frequency to exactly pi, because the product of frequency and period may be rounded to a
+        # larger value.
         w = np.where(np.abs(w - np.pi) < 1e-14, np.pi, w)
         inside = (w > 0) & (w <= np.pi)
         value = self.loop.open_loop(alpha, beta, np.where(inside, w, 1.0))

@@ -37,8 +37,8 @@ COLORS = {"STABLE": "green", "SET": "green", "UNSTABLE": "red", "NO WALL": "red"
 COLORS |= dict.fromkeys(("MARGINAL", "UNDECIDED", "CAUTION"), "yellow")
 _NARROW = 60  # smallest width with a separate column for labels
 _COLUMN = re.compile(r" {2,}")
-# Pattern of spaces at which lines must not break, because they are part of a quantity such as "B = 3 N s/m". Matches of
-# some other spaces are harmless.
+# Pattern of spaces within a quantity such as "B = 3 N s/m", at which lines must not break. It also matches some other
+# spaces, which is harmless.
 _NO_BREAK = re.compile(r"(?<=[\dNgm=]) (?=\S)| (?==)")
 
 
@@ -72,7 +72,7 @@ def wrap_lines(lines: Iterable[str], indent: int = LABEL, width: int = WIDTH) ->
 
 
 def print_lines(lines: Iterable[str], indent: int = 24) -> None:
-    """Print lines, wrapped to ``COLUMNS`` or the width of the terminal, at most 100 columns, with colored labels."""
+    """Print lines with colored labels, wrapped to the width of the terminal (or $COLUMNS), at most 100 columns."""
     width = shutil.get_terminal_size((WIDTH, 24)).columns
     for each in wrap_lines(lines, indent, min(width, WIDTH)):
         word = each[: LABEL - 1].rstrip()
@@ -185,7 +185,7 @@ def spell_diagnosis(diagnosis: Diagnosis | None) -> list[tuple[str, str]]:
 
 
 def spell_alarm(diagnosis: Diagnosis | None, *alarms: str) -> str:
-    """Return "; CAUTION: ..." for a headline, from a diagnosed oscillation and ``alarms``; "" if there are none."""
+    """Return the end of a headline, "; CAUTION: ..." with a diagnosed oscillation and ``alarms``; "" without any."""
     oscillation = [] if diagnosis is None or diagnosis.cause == "none" else [diagnosis.word.lower()]
     words = [*oscillation, *filter(None, alarms)]
     return f"; CAUTION: {', '.join(words)}" if words else ""
@@ -202,7 +202,7 @@ def format_hardware(hardware: str) -> list[str]:
 
 
 def list_omission_cautions(scene: Scene, omitted: Collection[str]) -> list[str]:
-    """Return a list of cautions about a delay or a friction that is 0 only because the user has not given it.
+    """Return a list of cautions about a delay or a friction that is 0 only because the user has given no value.
 
     ``omitted`` contains the names of options that were not given.
     """
@@ -256,10 +256,10 @@ def list_slopes(scene: Scene) -> list[Slope]:
         # Choose the step of the parameter whose effect is stated: the power of ten nearest to one percent of the scale;
         # 1 N s/m for a linear damping; 1 or, for rotary devices, 1e-3 if the scale is 0.
         step = 10.0 ** (math.floor(math.log10(size) + 0.5) - 2) if not by_one else 1e-3 if system.rotary else 1.0
-        effect = "changes nothing" if isfinite(value) else "has an effect that could not be computed"
+        effect = "no change" if isfinite(value) else "not computed"
         if isfinite(value) and (change := value * step):
-            effect = f"{'buys' if change > 0 else 'costs'} {with_unit(abs(change), system['N/m'], 3)}"
-        note = f" (the delay stays {scene.timing.kept_delay})" if path == "period" and scene.timing.delay else ""
-        words = f"{with_unit(step, unit, 1)} more {effect}{note}"
+            effect = f"{'+' if change > 0 else '-'}{with_unit(abs(change), system['N/m'], 3)}"
+        note = f" (the delay stays {scene.timing.delay_text})" if path == "period" and scene.timing.delay else ""
+        words = f"{effect} for {with_unit(step, unit, 1)} more{note}"
         slopes.append(Slope(path, value, f"{system['N/m']} per {unit}" if unit else system["N/m"], words))
     return slopes

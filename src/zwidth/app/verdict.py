@@ -54,7 +54,7 @@ MARGINAL_DAMPER = (
 )
 MARGINAL_PLANT = "poles on the unit circle: the response neither decays nor grows"
 
-# Phrases for the reference grasps (hands that hold the device) in which a wall is required to be stable.
+# Phrases for the reference grasps (models of a hand on the device) in which a wall is required to be stable.
 GRASP_WORDS = {
     "all": "stable in all six reference grasps",
     "soft": "stable in the soft reference grasps",
@@ -139,7 +139,7 @@ def write_check(scene: Scene, verdict: Assessment, limits: Iterable[Limit] | Non
 
 
 def _spell_room(verdict: Assessment, dampings: Intervals) -> str:
-    """Return a phrase with the stable intervals of K at the B of the wall, and of B at its K."""
+    """Return a phrase with the stable interval of K at the wall's B, and that of B at the wall's K."""
     units = verdict.unit_system
     rooms = (("K", verdict.stable_stiffness, units["N/m"], "B"), ("B", dampings, units["N s/m"], "K"))
     return "; ".join(_spell_intervals(*room) for room in rooms)
@@ -226,15 +226,15 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
 
 
 def format_gains(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:
-    """Return the lines of a table of improvements of a device and their gains; ``verbose`` includes small gains."""
+    """Return the lines of a table of improvements of a device and the factors by which they raise K_max."""
     shown = [limit for limit in limits if isfinite(limit.gain) and (verbose or limit.gain > NOTEWORTHY)]
     if not shown:
         return []
-    width, rows = max(len(limit.words) for limit in shown), []
+    width, rows = max(len(limit.label) for limit in shown), []
     for limit in shown:
         stiffness = with_unit(round_conservatively(limit.stiffness, "below"), find_unit(limit, "N/m"))
         kept = f"; {limit.note}" if limit.note else ""
-        rows.append(f"{limit.words:<{width}}  {stiffness}  (x {plain(limit.gain, 3)}{kept})")
+        rows.append(f"{limit.label:<{width}}  {stiffness}  (x {plain(limit.gain, 3)}{kept})")
     if len(heading) > LONG:
         return ["", heading, *(format_line("", row) for row in rows)]
     return ["", *(f"{heading if not k else '':<{len(heading)}}  {row}" for k, row in enumerate(rows))]
@@ -258,7 +258,7 @@ def format_recommendation(
     if verdict is None:
         return [format_line("NO WALL", recommendation.reason), *device, *omission_lines]
     thin = "small margins" if find_thin(verdict, scene.timing.period) else ""
-    alarm = spell_alarm(diagnosis, thin, "" if all(recommendation.grasps.values()) else "unstable in a hand")
+    alarm = spell_alarm(diagnosis, thin, "" if all(recommendation.grasps.values()) else "unstable in a grasp")
     margins = [format_line("margins", recommendation.spell_margins())]
     if verbose:
         margins = [
@@ -270,11 +270,11 @@ def format_recommendation(
         format_line("SET", f"{recommendation.spell_wall()}; {recommendation.spell_limit()}{alarm}"),
         *device,
         *margins,
-        *([format_line("in a hand", hands)] if (hands := recommendation.spell_hands()) else []),
+        *([format_line("grasps", hands)] if (hands := recommendation.spell_hands()) else []),
         *format_diagnosis(diagnosis),
         format_line("passive", spell_passivity(scene, verdict) if verbose else recommendation.spell_passive()),
         *omission_lines,
         *(format_line("CAUTION", caution) for caution in recommendation.cautions),
     ]
-    heading = f"To gain stiffness under the same requirements ({GRASP_WORDS[recommendation.wanted.grasps]}):"
-    return lines + format_gains(heading, recommendation.steps, verbose)
+    heading = f"To gain stiffness under the same requirements ({GRASP_WORDS[recommendation.requirements.grasps]}):"
+    return lines + format_gains(heading, recommendation.improvements, verbose)

@@ -73,10 +73,10 @@ def cli() -> None:
 def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) -> None:
     """Assess one wall: stability, margins and passivity; for an unstable wall, the changes that stabilize it.
 
-    With --resolution, --friction or --max-force the wall is also simulated, to find limit cycles and saturation.
-    Required: --stiffness, --mass (or --device) and --rate (or --period); damping and delay default to 0. SCENE.yaml (or
-    the folder of a run) supplies parameters not given as options; options override it. The exit code is 0 for every
-    verdict.
+    The options --stiffness, --mass (or --device) and --rate (or --period) are required; the defaults of damping and
+    delay are 0. Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). With
+    --resolution, --friction or --max-force, the command also simulates the wall to find limit cycles and saturation.
+    The exit code is 0 for stable and for unstable walls.
     """
     from zwidth.analysis.assessment import assess, limits_of
     from zwidth.analysis.stabilization import stabilize
@@ -111,13 +111,13 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
 def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> None:
     """Compute the stiffest stable wall of a device.
 
-    With a velocity filter, a linear system or a measured response only walls with B >= 0 count, because a negative B
-    may cancel damping that exists only in the model. In Python, Scene.max_stiffness(negative_damping=True) includes
-    B < 0.
+    With a velocity filter, a linear system or a measured response, only walls with B >= 0 are considered, because a
+    negative B may cancel damping that exists only in the model. In Python, Scene.max_stiffness(negative_damping=True)
+    includes walls with B < 0.
 
-    The device is given by --delta and --d, or by its physical parameters and parts; with the latter the sensitivity of
-    K_max to each parameter is also printed. `zwidth recommend` recommends a softer wall to set. SCENE.yaml (or the
-    folder of a run) supplies parameters not given as options; options override it.
+    Describe the device by --delta and --d, or by its physical parameters and parts. In the second case, the command
+    also prints the sensitivity of K_max to each parameter. Parameters that are not given as options are taken from
+    SCENE.yaml (or from the folder of a run). To choose a wall with stability margins, use `zwidth recommend`.
     """
     from zwidth.analysis.assessment import name_kind
     from zwidth.analysis.optimization import explain_missing
@@ -179,7 +179,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
 
 
 def _list_obstacles(scene: Any) -> list[str]:
-    """Return notes on the measurements required before a stiffer wall can be certified on a measured response."""
+    """Return notes on the measurements that are required to certify a stiffer wall on a measured response."""
     if not isinstance(scene.device, MeasuredDevice):
         return []
     from zwidth.identification.response_estimate import find_nominal_limit
@@ -209,14 +209,16 @@ def devices(name: str | None, as_json: bool) -> None:
     if name is None:
         lines = []
         for device in chosen:
-            numbers = (f"{key.replace('_', ' ')} {each.spell()}" for key, each in device.numbers.items())
+            numbers = (f"{key.replace('_', ' ')} {each.spell()}" for key, each in device.parameters.items())
             # Omit the name of the parameter "counts", because its unit has the same name.
             lines.append(format_row(device.name, ", ".join(number.removeprefix("counts ") for number in numbers)))
     else:
-        notes = {quantity: f" ({number.note})" if number.note else "" for quantity, number in chosen[0].numbers.items()}
+        notes = {
+            quantity: f" ({number.note})" if number.note else "" for quantity, number in chosen[0].parameters.items()
+        }
         lines = [f"{chosen[0].title} ({chosen[0].motion})"]
         lines += [
-            format_row(key, f"{each.spell()}{notes[key]}; {each.source}") for key, each in chosen[0].numbers.items()
+            format_row(key, f"{each.spell()}{notes[key]}; {each.source}") for key, each in chosen[0].parameters.items()
         ]
     printing.print_result([device.as_dict() for device in chosen], lines, as_json)
 
@@ -238,7 +240,7 @@ def _complete(context: click.Context, parameter: click.Parameter, begun: str) ->
 def init(name: str | None, example: str | None, listing: bool) -> None:
     """Write an example configuration NAME.yaml to run and edit.
 
-    Existing files are never replaced. Without NAME, the file has the name of the example.
+    The command never replaces an existing file. If NAME is omitted, the file has the name of the example.
     """
     examples = find_examples()
     if listing:
@@ -255,8 +257,8 @@ def init(name: str | None, example: str | None, listing: bool) -> None:
     if not re.fullmatch("[a-z0-9_-]{1,64}", name):
         raise InputError(f"NAME: got {name!r}; write 1 to 64 of a-z, 0-9, _ and -, such as my_device")
     text = examples[example].read_text(encoding="utf-8")
-    # Remove the line with the path of the schema, which exists only in a checkout. Set the name in the configuration to
-    # that of the new file, because the results of a run have this name.
+    # Remove the line with the path of the schema, because the schema exists only in a checkout. Set the name in the
+    # configuration to that of the new file, because the results of a run have this name.
     text = re.sub(r"\A# yaml-language-server:.*\n(?:#\n)?", "", text)
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", text, count=1)
     contents = {Path(f"{name}.yaml"): text}
@@ -292,8 +294,8 @@ def find_examples() -> dict[str, Path]:
 def explore(path: Path | None, port: int, no_browser: bool) -> None:
     """Open a page in the browser with sliders for device and wall, and a chart of the stable walls.
 
-    The page starts with the scene of a CONFIG file, or of the run in DIR. The server accepts connections from this
-    machine only, with the token in its address. Ctrl-C ends it.
+    The page starts with the scene of the file CONFIG, or of the run in DIR. The server accepts connections only from
+    this machine, and only with the token that the address of the page contains. To stop the server, press Ctrl-C.
     """
     import threading
     import webbrowser
@@ -325,7 +327,8 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
 def report(folder: Path, out: Path | None, as_json: bool) -> None:
     """Write the results of the run in DIR as one HTML file, with slices of its sweeps.
 
-    The file contains figures, methods, versions and configuration, and requires no server and no network.
+    The file contains figures, methods, versions and configuration. It can be opened without a server and without a
+    network connection.
     """
     from zwidth.app.report.page import write_report
 
@@ -372,12 +375,13 @@ def recommend(
 ) -> None:
     """Recommend the wall to set: the stiffest wall with the required margins.
 
-    --stiffness-fraction, --gain-margin, --phase-margin and --passive replace all defaults; --grasps does not. With
-    --resolution, --friction or --max-force the wall is also simulated, to find limit cycles and saturation; --max-force
-    also limits the force in the code of --code. A hand (--operator-...) counts as part of the device; the wall is then
-    also checked without it. Required: --mass (or --device) and --rate (or --period); damping and delay default to 0.
-    SCENE.yaml (or the folder of a run) supplies parameters not given as options; options override it. Exit code 1: no
-    wall exists.
+    The options --mass (or --device) and --rate (or --period) are required; the defaults of damping and delay are 0.
+    Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). If you use
+    --stiffness-fraction, --gain-margin, --phase-margin or --passive, your requirement replaces all default
+    requirements; --grasps does not replace them. With --resolution, --friction or --max-force, the command also
+    simulates the wall to find limit cycles and saturation; --max-force also limits the force in the code of --code. A
+    hand (--operator-...) is a part of the device, and the command also checks the wall without this hand. The exit code
+    is 1 if no wall exists.
     """
     from zwidth.app.verdict import format_recommendation
 

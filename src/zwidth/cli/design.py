@@ -39,7 +39,7 @@ from zwidth.units.formatting import (
 from zwidth.units.parsing import read_share
 from zwidth.units.quantities import PARAMETERS
 
-# By value of the option --find: path in a scene of the parameter that it selects.
+# Path of a parameter in a scene, by the value of the option --find that selects the parameter.
 _FINDS = {name: name for name in ("damping", "mass", "period", "rate", "delay")}
 _FINDS |= {"cutoff": "velocity.cutoff", "virtual_damping": "virtual_damping"}
 _TRIED = 41  # number of values of a parameter at which K_max is computed, to find its largest value in a range
@@ -80,16 +80,17 @@ _TOLERANCE = Parsed("NAME=SHARE", _read_tolerance, "write NAME=SHARE, such as ma
 def design(scene: Any, find: str | None, tolerances: dict[str, float], as_json: bool, **drawn: Any) -> None:
     """Compute the parameter that a given stiffness requires, or the effect of tolerances.
 
-    With --find: the value of one parameter at which K_max reaches --stiffness; with --find virtual_damping, the damping
-    with which a wall of --stiffness settles fastest. With --tolerance: the share of random devices on which the wall
-    (--stiffness, --virtual-damping) is stable, the stiffness up to which 99 % of them are stable, and, for uniform
-    tolerances of a rigid device, the stiffest wall, found by search, that is stable on all devices.
-    SCENE.yaml (or the folder of a run) supplies parameters not given as options; options override it.
+    With --find, the command computes the value of one parameter at which K_max reaches --stiffness. With --find
+    virtual_damping, it computes the virtual damping with which a wall of --stiffness settles fastest. With --tolerance,
+    the command computes the percentage of random devices on which the wall (--stiffness, --virtual-damping) is stable,
+    and the stiffness up to which 99 % of the devices are stable. For uniform tolerances of a rigid device, it also
+    searches for the stiffest wall that is stable on all devices. Parameters that are not given as options are taken
+    from SCENE.yaml (or from the folder of a run).
     """
     if find is None and not tolerances:
         raise click.UsageError("give --find or --tolerance, or both")
     shares, uniform = tolerances, drawn["distribution"] == "uniform"
-    searchable = shares and uniform and not scene.parts_beyond and all(name in _BOX for name in shares)
+    searchable = shares and uniform and not scene.nonrigid_parts and all(name in _BOX for name in shares)
     # Exclude a tolerance of the period if the delay is given in periods, because the delay then varies with the period,
     # but the search assumes independent intervals of both.
     searchable = searchable and not ("period" in shares and scene.timing.in_periods)
@@ -119,8 +120,8 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
             f"--find {find}: not a parameter of this scene; give {name_option(path)} as a starting value"
         )
     present = values[path]
-    # If the current value is 0, search a range that suits every device, because the default range is relative to this
-    # value.
+    # If the current value is 0, search a range that suits every device, because the default range is proportional to
+    # the current value.
     period = scene.timing.period
     within = None if present else {"damping": (1e-6, 1e4), "delay": (1e-3 * period, 500 * period)}[path]
     wanted = float(scene.wall.stiffness)
@@ -128,14 +129,14 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     if path == "delay" and needed.status == Status.UNREACHABLE and within is None:
         # Extend the default range to shorter delays, because a large stiffness may require a very short delay.
         needed = scene.required(path, wanted, within=(1e-4 * present, needed.range[1]))
-    result = {"parameter": path, "value": needed.value, "unit": unit, "enough": needed.enough}
+    result = {"parameter": path, "value": needed.value, "unit": unit, "sufficient_side": needed.sufficient_side}
     result["status"] = Status(needed.status).name
-    result |= {"crossings": [[c.value, c.enough] for c in needed.crossings], "range": list(needed.range)}
+    result |= {"crossings": [[c.value, c.sufficient_side] for c in needed.crossings], "range": list(needed.range)}
     if path in ("period", "rate"):
         result["rate"] = needed.value if path == "rate" else 1.0 / needed.value
     low, high = (with_unit(end, unit) for end in needed.range)
     goal = f"for K_max = {format_stiffness(wanted, units)}"
-    kept = f" (the delay stays {scene.timing.kept_delay})" if path in ("period", "rate") and scene.timing.delay else ""
+    kept = f" (the delay stays {scene.timing.delay_text})" if path in ("period", "rate") and scene.timing.delay else ""
     if needed.status == Status.UNREACHABLE:
         best = _find_best(scene, path, needed.range)
         result["best"] = best
@@ -143,13 +144,13 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         text = f"none {goal} from {low} to {high}{kept}; {reached}" if best["stiffness"] else f"none {goal}"
     elif needed.status != Status.OK:
         text = f"not found from {low} to {high}{kept}: {Status(needed.status).message}"
-    elif needed.enough == "everywhere":
+    elif needed.sufficient_side == "everywhere":
         text = f"any from {low} to {high} {goal}{kept}"
     else:
         values = [crossing.value for crossing in needed.crossings]
-        text = f"{format_sufficient(needed.value, needed.enough, values, unit)}"
-        # Count the crossings of K_max with the goal that the text does not contain yet: all except one or, for an
-        # interval, two.
+        text = f"{format_sufficient(needed.value, needed.sufficient_side, values, unit)}"
+        # Count the values at which K_max equals the goal and that the text does not contain yet. It contains one or, if
+        # it states an interval, two of them.
         others = len(values) - 1 - (" to " in text)
         text += f" {goal}{kept}; now {with_unit(present, unit)}"
         text += f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
@@ -219,7 +220,7 @@ def _tolerate(
     lines = [
         format_line("wall", format_wall(scene.wall.stiffness, scene.wall.virtual_damping, scene.unit_system)),
         format_line("stable", f"{share} ({interval})"),
-        format_line(percent, f"of them are stable for K up to {stiffness} at this B"),
+        format_line("stiffness", f"{percent} of them are stable for K up to {stiffness} at this B"),
     ]
     if simulation.stiffness_max == simulation.stiffness_max:
         lines.append(format_line("", f"or up to {stiffness_best}, each device with its best B"))
@@ -249,6 +250,6 @@ def _search_box(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], l
     units, names = scene.unit_system, ("stiffness", "stiffness_max")
     stiffness, stiffness_best = (with_unit(round_conservatively(result[name], "below"), units["N/m"]) for name in names)
     damping = with_unit(result["virtual_damping"], units["N s/m"], DIGITS)
-    text = f"of all devices within the tolerances are stable for K up to {stiffness} at B = {damping} (by search), "
+    text = f"all devices within the tolerances are stable for K up to {stiffness} at B = {damping} (by search), "
     text += f"or up to {stiffness_best}, each device with its best B"
-    return result, [format_line("100 %", text)]
+    return result, [format_line("stiffness", text)]

@@ -22,7 +22,7 @@ GROUPS = {
     "Further parts of the device": ("--coupling-", "--actuator-", "--modes-"),
     "Output": ("--figure", "--code", "--verbose", "--json", "--help"),
 }
-EXACT = ("--stiffness", "--delay")  # matched as whole names, because other groups have options with these prefixes
+EXACT = ("--stiffness", "--delay")  # matched as whole names; other groups have options with these prefixes
 
 
 class GroupedCommand(click.Command):

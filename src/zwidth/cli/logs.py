@@ -66,10 +66,10 @@ def _read_wall(text: str) -> tuple[tuple[float, float, float], bool | None]:
 
 
 _WALL = Parsed("WALL", _read_wall)
-_SOFTER = 50  # largest number of reductions of K until the rounded wall is stable
+_SOFTER = 50  # largest number of reductions of K to make the rounded wall stable
 
 
-# Options with the walls of the example in the help.
+# Options of the example that the help shows: two walls at the onset of instability.
 _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 
 
@@ -116,13 +116,16 @@ def fit(
 ) -> None:
     """Identify mass, damping and delay of a device, and recommend a wall.
 
-    With LOG.csv: from its free motion under the force commanded by a computer; also identifies friction. If several
-    logs are given, they must come from the same device and have the same columns. Units are in the headers, as 'encoder
-    [counts]', or follow a colon. With --buzz: from walls, at two or more values of B, at which the device began to
-    oscillate while K was raised, and their frequencies.
-    SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, the motor's largest force, and
-    the period of walls and of logs without a column of times; options override it. --max-force limits the force in the
-    program of --code and in the simulation. Exit code 1: no wall is recommended (0 with --yaml).
+    With LOG.csv, the command identifies a device, including its friction, from a log of its motion under a commanded
+    force. If you pass several logs, they must come from the same device and have the same columns. Write the unit of a
+    column into its header, as in 'encoder [counts]', or after a colon in the option. With --buzz, the command
+    identifies a device from walls at the onset of oscillation: for two or more values of B, increase K until the device
+    begins to oscillate, and pass K, B and the frequency of the oscillation.
+
+    The velocity estimate, the encoder step and the largest force of the motor are taken from SCENE.yaml (or from the
+    folder of a run) if they are not given as options. The sampling period is also taken from this file for walls, and
+    for logs without a time column. --max-force limits the force in the code of --code and in the simulation. The exit
+    code is 1 if no wall is recommended, but 0 with --yaml.
     """
     from zwidth.identification.fit_report import list_units, write_scene
 
@@ -146,7 +149,7 @@ def fit(
         points, rotary = tuple(BuzzPoint(*point) for point, _ in walls), kinds.pop() if kinds else rotary_scene
         loop.check_kind(rotary)
         device_fit = fit_buzz(points, period=period, velocity=velocity, noise=noise, rotary=rotary)
-        source = f"{len(walls)} buzzing walls"
+        source = f"{len(walls)} onsets of instability"
     else:
         if noise is not None:
             raise click.UsageError("--noise applies only to --buzz; omit it, because the noise of a log is estimated")
@@ -198,12 +201,12 @@ def _diagnose(device_fit: Any, motor: dict[str, float]) -> Any:
 
 
 def _list_lines(device_fit: Any, source: str, diagnosis: Any, verbose: bool) -> list[str]:
-    """Return the printed lines of a fit, with the checks of the recommended wall in a hand and by simulation."""
+    """Return the printed lines of a fit, with the checks of the recommended wall in grasps and by simulation."""
     from zwidth.identification.fit_report import detail_fit, summarize_fit
 
     checks, more = [], "details: --verbose; scene for the other commands: --yaml"
     if device_fit.recommended.status == Status.OK:
-        checks = [("in a hand", device_fit.recommended.spell_hands())]
+        checks = [("grasps", device_fit.recommended.spell_hands())]
         more += "; program for the loop: --code c"
     checks += spell_diagnosis(diagnosis)
     details = [("", ""), *detail_fit(device_fit, source)] if verbose else []
@@ -237,9 +240,9 @@ def excite(
 ) -> None:
     """Design the force to play before `zwidth respond`, or the torque if the units are those of a rotary device.
 
-    Required: --rate (or --period), --force and --resolution. SCENE.yaml (or the folder of a run) supplies those not
-    given as options: its period, max_force and resolution; also its velocity estimate, and a measured device as
-    --response.
+    The sampling period, the largest force and the encoder step are required. Values that are not given as options
+    (--rate or --period, --force, --resolution) are taken from the scene of SCENE.yaml (or of the folder of a run). The
+    velocity estimate and a measured device (instead of --response) are also taken from this scene.
     """
     hardware = get_hardware()
     options: dict[str, Any] = {"period": loop.known_period, "force": force or hardware.get("max_force")}
@@ -274,7 +277,9 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
     units = SYSTEMS[made.rotary]
     lines = [
         format_row("record", f"{made.force.size} samples, up to {with_unit(abs(made.force).max(), units['N'])}"),
-        format_row("lines", f"{made.frequency.size} from {low} to {high}, repeated after {with_unit(made.cycle, 's')}"),
+        format_row(
+            "frequencies", f"{made.frequency.size} from {low} to {high}, repeated after {with_unit(made.cycle, 's')}"
+        ),
         format_row("deviation", f"{_compliance(made.deviation, units)} expected (median)"),
     ]
     result: dict[str, Any] = {"file": str(out), "samples": made.force.size, "cycle": made.cycle}
@@ -282,7 +287,7 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
         share = float(made.expected.stiffness / made.limit.stiffness)
         result |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
         expected = format_wall(made.expected.stiffness, made.expected.virtual_damping, units)
-        lines += [format_row("expected", f"safe wall {expected}, {100 * share:.0f} % of the present K_max")]
+        lines += [format_row("expected safe wall", f"{expected}, {100 * share:.0f} % of the present K_max")]
     print_result(result, [*lines, format_row("wrote", str(out))], as_json)
 
 
@@ -304,10 +309,11 @@ def respond(
 ) -> None:
     """Measure the frequency response of a device, and compute a safe wall from it.
 
-    No model is required; the response has an error band. The logs contain a force designed by `zwidth excite`, or any
-    other force. The other commands accept the file of --save, or the table of an analyzer, as a device: `zwidth ridge
-    --device FILE.csv`. SCENE.yaml (or the folder of a run) supplies the velocity estimate, the encoder step, and
-    the period of logs without a column of times; options override it.
+    The command requires no model of the device, and computes the response with an error band. The logs can contain a
+    force that `zwidth excite` has designed, or any other force. Other commands accept the file of --save, or a table
+    from a network analyzer, as a device: `zwidth ridge --device FILE.csv`. The velocity estimate, the encoder step and,
+    for logs without a time column, the sampling period are taken from SCENE.yaml (or from the folder of a run) if they
+    are not given as options.
     """
     if not logs:
         raise click.UsageError("give one LOG.csv or several")
@@ -324,13 +330,13 @@ def _print_response(
     from zwidth.analysis.scene import Scene
     from zwidth.identification.response_estimate import find_nominal_limit
 
-    device, period, doubts = response.device, response.period, response.doubts
+    device, period, warnings = response.device, response.period, response.warnings
     kind = "parts of a repeating force" if response.cycle else "parts"
     source = f"{' and '.join(log.name for log in logs)}, {response.records} {kind}"
     scene = Scene(device, Timing(period), velocity=velocity or BackwardDifference())
     top, safe = find_nominal_limit(scene), scene.max_stiffness()
     low, high = (with_unit(float(end), "Hz") for end in device.frequency[[0, -1]])
-    lines = [format_row("response of", source), format_row("lines", f"{device.frequency.size} from {low} to {high}")]
+    lines = [format_row("data", source), format_row("frequencies", f"{device.frequency.size} from {low} to {high}")]
     if device.deviation is not None:
         lines.append(format_row("deviation", f"{_compliance(device.deviation, device.unit_system)} (median)"))
     undecided = (
@@ -342,19 +348,19 @@ def _print_response(
         else "undecided"
     )
     lines.append(format_row("K_max", words))
-    given = safe.status == Status.OK and device.deviation is not None and not doubts
+    given = safe.status == Status.OK and device.deviation is not None and not warnings
     words = f"{spell_safe_wall(scene, safe)}: stable for every response in the band" if given else "none"
     lines.append(format_row("safe wall", words))
     lines += [format_row("stiffer wall" if k == 0 else "", text) for k, text in enumerate(undecided)]
-    lines += [format_row("warning", text) for text in doubts]
+    lines += [format_row("WARNING", text) for text in warnings]
     lines += [format_row("note", text) for text in response.notes]
     if save is not None:
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
         lines.append(format_row("wrote", str(save)))
     if figure is not None:
         lines.append(save_figure(_draw(scene, safe if safe.status == Status.OK else None), figure))
-    result = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
-    result |= {"safe_wall": _plain(safe) if given else None, "undecided": undecided, "doubts": list(doubts)}
+    result = {"frequencies": device.frequency.size, "period": period, "maximum": _plain(top)}
+    result |= {"safe_wall": _plain(safe) if given else None, "undecided": undecided, "warnings": list(warnings)}
     result |= {"notes": list(response.notes), "rotary": device.rotary}
     print_result(result, lines, as_json)
 

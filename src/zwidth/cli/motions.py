@@ -47,8 +47,9 @@ _LIMITS = "--resolution '20 um' --friction '50 mN'"
 def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
     """Find the cause of a device's oscillation on a wall, and the changes that stop it.
 
-    Possible causes: linear instability, steps of the encoder, limits of the motor. Required: --stiffness, --mass (or
-    --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies parameters not given as options.
+    Possible causes are instability of the linear loop, the steps of the encoder, and the limits of the motor. The
+    options --stiffness, --mass (or --device) and --rate (or --period) are required. Parameters that are not given as
+    options are taken from SCENE.yaml (or from the folder of a run).
     """
     from zwidth.analysis.diagnosis import diagnose as find_cause
 
@@ -64,7 +65,9 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
 @cli.command(**show_example("simulate --hit '0.1 m/s'", _WALL, OF_SCENE))
 @scene_options(wall=True)
 @click.option("--hit", type=quantity_type("m/s", POSITIVE), help="Speed of a hit on the wall from outside, in m/s.")
-@click.option("--push", type=quantity_type("N", ANY), help="Constant external force, in N, positive into the wall.")
+@click.option(
+    "--external-force", type=quantity_type("N", ANY), help="Constant external force, in N, positive into the wall."
+)
 @click.option(
     "--hold", type=quantity_type("m", ANY), help="Depth in the wall at which the device is released at rest, in m."
 )
@@ -79,41 +82,43 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
 def simulate(
     scene: Any,
     hit: float | None,
-    push: float | None,
+    external_force: float | None,
     hold: float | None,
     hardware: dict[str, Any],
     duration: Any,
     figure: Path | None,
     as_json: bool,
 ) -> None:
-    """Simulate a hit on a wall, a constant push, or the release of the device from inside the wall.
+    """Simulate a hit on a wall, a constant external force, or the release of the device from inside the wall.
 
-    In a hit the wall is unilateral; otherwise it is bilateral. Without --hit, --push and --hold the device is released
-    at a depth of 1 mm (1 mrad if rotary), or of 50 encoder steps if --resolution is given. Required: --stiffness,
-    --mass (or --device) and --rate (or --period). SCENE.yaml (or the folder of a run) supplies parameters not given as
-    options.
+    In a hit the wall is unilateral; otherwise it is bilateral. Without --hit, --external-force and --hold the device is
+    released at a depth of 1 mm (1 mrad if rotary), or of 50 encoder steps if --resolution is given. The options
+    --stiffness, --mass (or --device) and --rate (or --period) are required. Parameters that are not given as options
+    are taken from SCENE.yaml (or from the folder of a run).
     """
     from zwidth.analysis.diagnosis import diagnose as find_cause
     from zwidth.simulation.behavior import describe_ending
     from zwidth.simulation.result import OF_WHOLE, MotionKind
 
-    options = _choose_start(scene, hit, push, hold, hardware)
+    options = _choose_start(scene, hit, external_force, hold, hardware)
     periods = _choose_length(scene) if duration is None else max(1, round(duration.periods(scene.timing.period)))
     motion = scene.simulate(**options, **hardware, periods=periods)
     cause, ending = find_cause(scene, **hardware, remedies=False), describe_ending(motion)
     units = scene.unit_system
+    load = "torque" if units.rotary else "force"
     start = [
         f"hit at {with_unit(hit, units['m/s'], 3)}" if hit is not None else "",
-        f"pushed with {with_unit(options['push'], units['N'], 3)}" if options.get("push") else "",
+        f"external {load} {with_unit(options['external_force'], units['N'], 3)}"
+        if options.get("external_force")
+        else "",
         f"released at a depth of {with_unit(options['start_position'], units['m'], 3)}"
         if hit is None and options.get("start_position")
         else "",
     ]
     force = max(abs(float(motion.command.min())), abs(float(motion.command.max())))
-    load = "torque" if units.rotary else "force"
     depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}, "
     depth += f"{load} up to {with_unit(force, units['N'], 3)}; "
-    # Omit the largest depth and force of a growing motion, because they depend only on the simulated time.
+    # Omit the largest depth and force of a growing motion, because they grow with the simulated time.
     depth = "" if int(motion.outcome) == MotionKind.GROWING else depth
     lines = [
         format_row("start", ", ".join(filter(None, start)) or "at rest"),
@@ -135,7 +140,7 @@ def simulate(
 
 
 def _choose_start(
-    scene: Any, hit: float | None, push: float | None, hold: float | None, hardware: dict[str, Any]
+    scene: Any, hit: float | None, external_force: float | None, hold: float | None, hardware: dict[str, Any]
 ) -> dict[str, Any]:
     """Return the initial conditions and the external force of a simulation, as arguments of `zwidth.simulate`."""
     if hit is not None and hold is not None:
@@ -144,14 +149,19 @@ def _choose_start(
         )
     if hit is not None:
         before = -APPROACH * hit * scene.timing.period
-        return {"start_position": before, "start_velocity": hit, "push": push or 0.0, "contact": "unilateral"}
-    if hold is None and push is None:
+        return {
+            "start_position": before,
+            "start_velocity": hit,
+            "external_force": external_force or 0.0,
+            "contact": "unilateral",
+        }
+    if hold is None and external_force is None:
         depth = DEFAULT_STEPS * hardware["resolution"] if "resolution" in hardware else DEFAULT_DEPTH
         if isinstance(scene.device, LinearDevice):
             # Displace a linear system by a constant external force, because its simulation always starts at rest at 0.
-            return {"push": depth * float(scene.wall.stiffness)}
+            return {"external_force": depth * float(scene.wall.stiffness)}
         hold = depth
-    return {"start_position": hold or 0.0, "push": push or 0.0}
+    return {"start_position": hold or 0.0, "external_force": external_force or 0.0}
 
 
 def _choose_length(scene: Any) -> int:

@@ -35,7 +35,7 @@ from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 if TYPE_CHECKING:
     from zwidth.analysis.scene import Scene
-    from zwidth.model.devices import KnownDevice
+    from zwidth.model.devices import PublishedDevice
 
 # Keys under which data are stored in the click context of a command.
 _WITH_KIND = "zwidth.with_kind"  # options whose units determine the kind of device, linear or rotary
@@ -43,10 +43,10 @@ _HARDWARE = "zwidth.hardware"  # encoder, friction and motor of the scene file
 BOTH_PERIODS = "--period and --rate are both given; give only one of them"
 Command: TypeAlias = Callable[..., Any]
 
-# Names of the parts of a scene, and the paths of the parameters of all parts, sorted by part.
+# Names of the parts of a scene; and the paths of the parameters of all parts, sorted by part.
 _PART_NAMES = tuple(dict.fromkeys(path.rpartition(".")[0] for path in OF_PARTS))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
-# Parts that cannot be added to a linear system or a measured response, because these devices contain them.
+# Parts that cannot be added to a linear system or a measured response, because such a device includes them.
 _CONTAINED = ("operator", "coupling", "actuator", "modes")
 # Names of the structural modes among the parts: "modes.0", "modes.1" and so on.
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
@@ -56,7 +56,7 @@ _ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
 class Parsed(click.ParamType):
-    """Type of a click option whose text ``read`` converts; ``remedy`` completes the message of its `ValueError`."""
+    """Type of a click option: ``read`` converts its text; ``remedy`` completes the message for an invalid text."""
 
     def __init__(self, name: str, read: Callable[[str], Any], remedy: str = "") -> None:
         self.name, self.read, self.remedy = name, read, remedy
@@ -223,7 +223,7 @@ def read_scene_file(path: Path) -> Scene:
 
     file = find_config(path) if path.is_dir() else path
     given = load_config(file).scene
-    for line in getattr(given, "doubts", ()):
+    for line in getattr(given, "warnings", ()):
         click.echo(f"zwidth: {line}", err=True)
     click.get_current_context().meta[_HARDWARE] = getattr(given, "hardware", {})
     return load_scene(file)
@@ -252,19 +252,19 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
     """Return the scene of a file with the parameters replaced that are given as options."""
-    from zwidth.model.devices import KnownDevice
+    from zwidth.model.devices import PublishedDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}
     device = changes.get("device")
-    if isinstance(device, KnownDevice):
+    if isinstance(device, PublishedDevice):
         _check_published(device, given)
         changes["device"] = device.to_device(**{name: changes.pop(name) for name in _BARE & changes.keys()})
     if part_values := _select_part(given, "velocity"):
         same = "kind" not in part_values and part_values.keys() <= {item.name for item in fields(scene.velocity)}
         kept = {"kind": name_estimate(scene.velocity), **spell_part(scene.velocity)} if same else {}
         if part_values.keys() & _ONE_OF_TWO:
-            # If an option gives one of them, drop cutoff and time constant of the file, because a low-pass takes only
-            # one of them.
+            # A low-pass has either a cutoff or a time constant. If an option gives one of the two, drop both values of
+            # the file.
             kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
         changes["velocity"] = make_velocity({**kept, **part_values})
     parts = {} if device else find_parts(scene)
@@ -294,10 +294,10 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
 def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scene:
     """Return the scene built from options, without a scene file."""
     from zwidth.analysis.scene import Scene
-    from zwidth.model.devices import KnownDevice
+    from zwidth.model.devices import PublishedDevice
 
     device = given.pop("device", None)
-    published = device if isinstance(device, KnownDevice) else None
+    published = device if isinstance(device, PublishedDevice) else None
     timed = {"period", "rate"} & given.keys() or (published and published.period)
     requirements = {"--mass or --device": device or "mass" in given, "--rate or --period": timed}
     missing = [flags for flags, given_any in requirements.items() if not given_any]
@@ -320,7 +320,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
     timing = Timing
     if device is None:
         device = Device(**select("mass", "damping"), rotary=system.rotary)
-    elif isinstance(device, KnownDevice):
+    elif isinstance(device, PublishedDevice):
         timing, device = device.to_timing, device.to_device(**select("mass", "damping"))
     else:
         for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _CONTAINED):
@@ -332,7 +332,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
     return Scene(device, timing(**select("period", "rate", "delay")), wall, velocity).replace(**parts)
 
 
-def _check_published(device: KnownDevice, given: dict[str, Any], more: Sequence[str] = ()) -> None:
+def _check_published(device: PublishedDevice, given: dict[str, Any], more: Sequence[str] = ()) -> None:
     """Raise an error if parameters of a device are unpublished and not given as options; list these options."""
     remedies = {"mass": "--mass", "damping": "--damping (0 if unknown)"}
     flags = [*(remedies[name] for name in device.list_missing(given)), *more]

@@ -1,7 +1,7 @@
 """Commands on runs: ``zwidth run`` with its progress on stderr, ``verify``, ``export``, ``figures`` and ``bench``.
 
 A run computes the studies of a configuration file and writes their results into one folder. A sweep is a study of up to
-10^11 points; it is computed in chunks, each of which is saved in the store DIR/STUDY.zarr, so that a stopped run can be
+10^12 points; it is computed in chunks, each of which is saved in the store DIR/STUDY.zarr, so that a stopped run can be
 resumed.
 """
 
@@ -44,7 +44,7 @@ def _read_size(text: str) -> int:
 
 
 def _read_slice(text: str) -> tuple[str, str]:
-    """Return NAME and VALUE of a text "NAME=VALUE", both as texts."""
+    """Split a text "NAME=VALUE" into NAME and VALUE, both as texts."""
     name, _, value = (part.strip() for part in text.partition("="))
     if not name or not value:
         raise ValueError
@@ -84,15 +84,15 @@ _FIGURE_SIZE = Parsed(
 def run(path: Path, dry_run: bool, size: tuple[float, float | None] | None, dpi: int | None, **options: Any) -> None:
     """Run the studies of a CONFIG file.
 
-    Write data, figures and a record of the run into one folder, and the results of each sweep into DIR/STUDY.zarr.
-    After Ctrl-C the results so far are kept; continue with --resume.
+    The command writes data, figures and a record of the run into one folder, and the results of each sweep into
+    DIR/STUDY.zarr. If you stop the run with Ctrl-C, the results so far are kept, and --resume continues the run.
     """
     from zwidth.plotting.style import style_sheet
     from zwidth.runs.run import run as run_studies
     from zwidth.studies.document import load_config
 
     config = load_config(path)
-    for line in getattr(config.scene, "doubts", ()):
+    for line in getattr(config.scene, "warnings", ()):
         click.echo(f"zwidth: {path}: {line}", err=True)
     if dry_run:
         _print_plan(config, **options)
@@ -162,15 +162,15 @@ def _report_end(result: RunResult, command: str) -> None:
     sweeps = result.sweeps.values()
     chunks = [sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")]
     done = sum(study.state in ("done", "kept") for study in result.studies if study.sweep is None)
-    parts = [f"{done} of {result.whole} done"] if result.whole else []
+    parts = [f"{done} of {result.computed_count} done"] if result.computed_count else []
     parts += [f"{chunks[0] + chunks[1]} of {chunks[2]} chunks done ({chunks[0]} now)"] if sweeps else []
     click.echo(f"{', '.join(parts) or 'nothing done'}, results in {result.folder}")
     for study in result.studies:
         print_lines(format_row("" if number else study.name, line) for number, line in enumerate(study.answer))
     if any(study.sweep and study.state in ("done", "kept") for study in result.studies):
         click.echo(f"figures of the sweeps: {shlex.join(['zwidth', 'figures', str(result.folder)])}")
-    if result.hopeless:
-        click.echo(f"Error: out: {result.folder}: {result.hopeless}", err=True)
+    if result.fatal_error:
+        click.echo(f"Error: out: {result.folder}: {result.fatal_error}", err=True)
         click.echo(f"zwidth: the disk is full or read-only; make room and resume with: {command}", err=True)
         return
     for study in result.failed:
@@ -178,8 +178,8 @@ def _report_end(result: RunResult, command: str) -> None:
             click.echo(f"Error: chunk {chunk} failed: {error}", err=True)
         if not study.sweep:
             click.echo(f"Error: study {study.name!r} failed: {study.error}", err=True)
-    if result.lost:
-        click.echo(f"Error: {result.lost}; results so far are kept. Resume with: {command}", err=True)
+    if result.cluster_error:
+        click.echo(f"Error: {result.cluster_error}; results so far are kept. Resume with: {command}", err=True)
     elif result.failed and not result.interrupted:
         click.echo(f"zwidth: retry the failed parts with: {command}", err=True)
 
@@ -190,7 +190,7 @@ def _report_end(result: RunResult, command: str) -> None:
 def verify(folder: Path, as_json: bool) -> None:
     """Verify the checksums of all files of the sweeps in DIR.
 
-    Exit code 1 if a file is damaged or missing; `zwidth run --resume` repairs it.
+    The exit code is 1 if a file is damaged or missing; `zwidth run --resume` then repairs the file.
     """
     from zwidth.sweep.dataset import verify as verify_stores
 
@@ -231,6 +231,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option(
     "--at",
+    "selection",
     multiple=True,
     type=_SLICE,
     callback=read_pairs,
@@ -245,18 +246,19 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
 @json_option
-def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, **drawing: Any) -> None:
+def figures(folder: Path, selection: dict[str, str], out: Path | None, as_json: bool, **drawing: Any) -> None:
     """Draw the sweeps in DIR, as PNG and SVG.
 
     The figures show stable and passive walls with their boundaries, contours of margins and decay times, and the
-    stiffest wall as a surface. --at selects the nearest value in the sweep; values without a unit have the unit of the
-    store. Without --at, each of up to three values of a parameter has a panel.
+    stiffest wall as a surface. --at selects the value of the sweep that is nearest to the given value; values without a
+    unit have the unit of the store. Without --at, the figure has one panel for each of up to three values of a
+    parameter.
     """
     from zwidth.runs.draw import draw_stores
 
     callbacks: dict[str, Any] = {"note": lambda text: click.echo(f"zwidth: {text}", err=True)}
     callbacks |= {} if as_json else {"progress": lambda file: click.echo(f"wrote {file}")}
-    files = draw_stores(folder, out, at=at, **drawing, **callbacks)
+    files = draw_stores(folder, out, selection=selection, **drawing, **callbacks)
     if as_json:
         print_json({"files": [str(file) for file in files]})
     if not files:
@@ -277,9 +279,10 @@ def figures(folder: Path, at: dict[str, str], out: Path | None, as_json: bool, *
 def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
     """Measure speed and error of every method, and of comparable tools.
 
-    Required: a checkout of the project, whose benchmarks/methods it runs, and the extra "test" for the errors.
+    The command requires a checkout of the project, because it runs the programs in benchmarks/methods. To measure the
+    errors, it also requires the extra "test".
     """
-    # Look for the benchmarks in the checkout, because an installed package does not contain them.
+    # Search the checkout for the benchmarks, because an installed package does not contain them.
     folder = Path(__file__).parents[3] / "benchmarks"
     if not (folder / "methods").is_dir():
         raise ResourceError(

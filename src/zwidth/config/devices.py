@@ -61,7 +61,7 @@ _Numbers = Annotated[Any, BeforeValidator(_check_numbers), WithJsonSchema({"type
 
 
 class SystemSection(PartSection, noun="a linear system"):
-    """A device as a linear system, from commanded force in N to sensed position in m."""
+    """A device as a linear system, from the commanded force in N to the measured position in m."""
 
     numerator: _Numbers | None = None
     """Numerator coefficients in powers of s, or of z for a sampled system; highest power first."""

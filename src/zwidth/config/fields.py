@@ -46,7 +46,7 @@ LocatedProblem: TypeAlias = tuple[FieldPath, PydanticCustomError]
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault of a configuration; line and column are None if it has no position, e.g. for a missing file."""
+    """One fault of a configuration; line and column are None for a fault without a position, such as a missing file."""
 
     file: str  # path as given by the user; empty for a configuration passed as a mapping
     line: int | None  # line number, counted from 1
@@ -105,7 +105,7 @@ _REMOVED_KEYS = ("delay_model", "delay_models")  # keys that studies had in earl
 
 
 def list_problems(error: ValidationError | PydanticCustomError, *above: str) -> list[LocatedProblem]:
-    """Convert an error to a list of pairs (path, problem), one pair for each invalid field.
+    """Convert a validation error to a list of pairs (path, problem), one pair for each invalid field.
 
     Errors that pydantic itself detected, such as a wrong type, are converted to a `problem` with allowed values and a
     remedy.
@@ -204,22 +204,22 @@ class Strict(BaseModel):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Return the mapping to validate, e.g. with derived keys added. Hook; by default it is ``raw`` itself."""
+        """Return the mapping to validate: by default ``raw``. A hook, with which subclasses add derived keys."""
         return raw
 
     @classmethod
     def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        """Return the problems of keys that exclude or require each other. Hook, called before values are validated."""
+        """Return the problems of keys that exclude or require each other. A hook, called before the validation."""
         return ()
 
     @classmethod
     def explain_missing(cls, name: str) -> tuple[str, str]:
-        """Return the allowed values and the remedy to report if the required key ``name`` is missing. Hook."""
+        """Return the allowed values and the remedy to report if the required key ``name`` is missing. A hook."""
         return f"{cls.noun} needs it", f"add {name!r}"
 
     @classmethod
     def explain_unknown(cls, name: str) -> tuple[str, str, str]:
-        """Return the message, the allowed keys and the remedy to report for the unknown key ``name``. Hook."""
+        """Return the message, the allowed keys and the remedy to report for the unknown key ``name``. A hook."""
         if name == "<<":
             return "unknown key", "YAML 1.2 has no merge keys", "write the keys out"
         if name in _REMOVED_KEYS:
@@ -232,12 +232,12 @@ class Strict(BaseModel):
         return "unknown key", allowed, suggestion(name, cls.model_fields, "remove it")
 
     def find_faults(self) -> Iterable[LocatedProblem]:
-        """Return the problems of combinations of fields. Hook, called only if every single field is valid."""
+        """Return the problems of combinations of fields. A hook, called only if every single field is valid."""
         return ()
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """Add the description of each field to the schema: its docstring, otherwise the description of its quantity."""
+        """Add a description of each field to the JSON Schema: its docstring or else the description of its quantity."""
         reference = handler(schema)
         properties = handler.resolve_ref_schema(reference)["properties"]
         for name in FIELDS.keys() & properties.keys():
@@ -284,7 +284,7 @@ class Strict(BaseModel):
 
     @classmethod
     def _add_remedies(cls, error: ValidationError, skipped: set[Any]) -> Iterable[LocatedProblem]:
-        """Yield the problems of ``error``; those of absent required keys get the texts of `explain_missing`.
+        """Yield the problems of ``error``; those of missing required keys get the texts of the hook `explain_missing`.
 
         ``skipped`` contains the unusable keys of the mapping, whose problems are already reported.
         """

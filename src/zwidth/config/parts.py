@@ -201,7 +201,7 @@ def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Stri
     """
     parts: dict[str, Any] = {"velocity": ("Velocity estimate", VelocityField, no_estimate)}
     parts |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
-    parts["modes"] = "Resonances that the sensor sees", list[ModeSection], no_part
+    parts["modes"] = "Resonances in the measured position", list[ModeSection], no_part
     keys: Any = {
         name: (form | None, Field(default=None, description=f"{description}. Default: {absent}.{more}"))
         for name, (description, form, absent) in parts.items()

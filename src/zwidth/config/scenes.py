@@ -75,9 +75,9 @@ class _PhysicalPlant(_Parts, SampledMass):
                 yield (field,), problem(message, f"{name} must be {bounds}", "check the units and the mass")
 
     @property
-    def parts_beyond(self) -> tuple[str, ...]:
+    def nonrigid_parts(self) -> tuple[str, ...]:
         """Names of the parts that a rigid mass with backward difference lacks; only some kinds of study accept them."""
-        return self.to_scene().parts_beyond
+        return self.to_scene().nonrigid_parts
 
     @property
     def delta(self) -> float:
@@ -108,7 +108,7 @@ class _NormalizedPlant(OneKind):
     """A plant in normalized parameters, as a mass of 1 kg at a period of 1 s."""
 
     period: ClassVar[float] = 1.0
-    parts_beyond: ClassVar[tuple[str, ...]] = ()
+    nonrigid_parts: ClassVar[tuple[str, ...]] = ()
 
     delta: NonNegative
     d: Annotated[float, quantity_of("d")] = 0.0
@@ -214,7 +214,7 @@ class PhysicalScene(_PhysicalPlant, noun="a scene"):
         return kind(**{name: value for name, value in values.items() if value is not None}, **list_parts(self))
 
     @property
-    def doubts(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """Warnings about implausible values of parameters, one line each."""
         parameters = {
             path: value for path, value in self.to_scene().parameters().items() if path not in ("period", "rate")
@@ -262,7 +262,7 @@ def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
 
 
 def is_normalized(raw: dict[str, Any]) -> bool:
-    """Return whether the first key of a mapping that belongs to only one kind is a normalized key."""
+    """Return whether a mapping is normalized, by the first of its keys that belongs to only one of the two kinds."""
     decisive = [key for key in raw if key in PHYSICAL_KEYS | NORMALIZED_KEYS]
     return bool(decisive) and decisive[0] in NORMALIZED_KEYS
 

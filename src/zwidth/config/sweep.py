@@ -188,12 +188,12 @@ OutputName = Annotated[str, GetPydanticSchema(lambda _, handler: handler.generat
 
 
 _SCENE = "that of the scene"
-_Parts: Any = make_parts_base(_SCENE, _SCENE, " Its keys may be axes, with its name and a dot.")
+_Parts: Any = make_parts_base(_SCENE, _SCENE, " Its keys can be axes of the sweep (see the table of axes).")
 
 
 @register
 class SweepStudy(_Parts, Study):
-    """Outputs on a grid of parameters, written to a store that can be resumed, verified and opened with xarray."""
+    """The outputs at all points of a grid of parameters, written to a store that xarray can open."""
 
     method = "Closed forms in float64; bit for bit independent of chunks and workers."
     from_scene = ()
@@ -253,7 +253,7 @@ class SweepStudy(_Parts, Study):
     @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         axes = raw.get("axes")
-        if not isinstance(axes, dict) or not scene.parts_beyond:
+        if not isinstance(axes, dict) or not scene.nonrigid_parts:
             return
         given = _list_given(axes)
         if not given & set(PHYSICAL) and not {"delta", "d"} <= given:
@@ -320,8 +320,8 @@ class SweepStudy(_Parts, Study):
                 yield (name,), problem(f"got {name!r} with normalized axes", "parts are in SI units", "remove it")
             return
         parts = build_parts(self)
-        # For a linear system or a measured response, check its own attributes instead of parts, because it replaces
-        # them.
+        # Find the reason, if any, why the output "passive" is not available. It depends on the parts of the device; for
+        # a linear system or a measured response, which has no parts, it depends on the attributes of this object.
         obstacle = find_unsupported_reason(**(vars(parts["device"]) if "device" in parts else parts))
         for index, name in enumerate(self.outputs):
             if name not in OUTPUTS_WITH_PARTS:
@@ -347,8 +347,8 @@ class SweepStudy(_Parts, Study):
             message = f"got the axis {name!r}, but no {part} with the key {key!r}"
             remedy = f"add {_EXAMPLES.get(name, _EXAMPLES.get(part, part))!r}"
             yield ("axes", self.axes.find_key(name)), problem(message, "an axis needs the part that it changes", remedy)
-        # Check the parts only with every parameter at its smallest value, and with one parameter of a part at its
-        # largest, because the grid may have too many points to check all of them.
+        # Check the parts at a few points of the grid only, because the grid may have too many points to check them all:
+        # with all parameters at their smallest values, and with each parameter of a part in turn at its largest value.
         smallest = {name: self.axes.find_range(name)[0] for name in self.axes.given if name not in WALL}
         faults = {}
         for changed in (
@@ -369,7 +369,7 @@ class SweepStudy(_Parts, Study):
         if part == "modes":
             return int(key.partition(".")[0]) < len(section or ())
         kind = section.part if section is not None else PARTS.get(part, BackwardDifference)
-        # A part without a section is present if all its parameters have defaults.
+        # Treat a part without a section as present if all its parameters have defaults.
         needed = section is None and any(item.default is MISSING for item in fields(kind))
         return not needed and key in kind.__dataclass_fields__
 

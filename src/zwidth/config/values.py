@@ -263,7 +263,7 @@ class AxisOf:
 
     @property
     def _forms(self) -> dict[str, Quantity]:
-        """Quantity of the first and last value of each mapping form; the values of ``log`` must be positive."""
+        """Quantities that validate the ends of the forms ``linear`` and ``log``; those of ``log`` must be positive."""
         low, high, low_open, high_open = self.quantity.allowed
         positive = Range(max(low, 0.0), high, low_open or low <= 0.0, high_open)
         return {"linear": self.quantity, "log": replace(self.quantity, allowed=positive)}

@@ -12,7 +12,7 @@ Value = TypeVar("Value")
 
 @contextmanager
 def set_temporarily(variable: ContextVar[Value], value: Value) -> Iterator[None]:
-    """Set a context variable, and restore its previous value at the end of the ``with`` block, also after an error."""
+    """Set a context variable, and restore its previous value when the ``with`` block ends, normally or by an error."""
     token = variable.set(value)
     try:
         yield

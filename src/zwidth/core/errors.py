@@ -67,7 +67,8 @@ class TracedDelayError(ZwidthError, TypeError):
     """
 
 
-# Names that users may write for a quantity, with the name of its field, which messages suggest.
+# Common names of quantities that are not names of fields, each with the name of the field that messages suggest
+# instead.
 SYNONYMS = {"weight": "mass", "inertia": "mass", "frequency": "rate", "latency": "delay", "dead_time": "delay"}
 
 

@@ -30,7 +30,7 @@ def is_jax(value: Any) -> bool:
     if isinstance(value, _HOST_TYPES):
         return False
     kind = getattr(sys.modules.get("jax"), "Array", None)
-    # ``Array`` does not exist yet while another thread imports JAX.
+    # While another thread imports JAX, the module may have no attribute ``Array`` yet, and no value is a JAX array.
     return kind is not None and isinstance(value, kind)
 
 
@@ -139,7 +139,7 @@ def differentiate_along(
 
 
 def expand_along(values: np.ndarray, like: Any) -> Any:
-    """Return a vector in the type of ``like``, reshaped to broadcast with ``like[..., None]`` along the last axis."""
+    """Convert a vector to the array type and dtype of ``like``, in a shape that broadcasts with ``like[..., None]``."""
     return namespace(like).asarray(values, like.dtype).reshape((1,) * like.ndim + (-1,))
 
 
@@ -176,7 +176,7 @@ def _polynomial(coefficients: tuple[float, ...]) -> Callable[[Any], Any]:
 
 
 def square_roots(*values: Any) -> tuple[Any, ...]:
-    """Return the square roots of arrays, or of objects with a method ``sqrt`` such as balls."""
+    """Return the square roots of arrays, or of numbers with a method ``sqrt``, such as the balls of python-flint."""
     if hasattr(values[0], "sqrt"):
         return tuple([value.sqrt() for value in values])
     return tuple(map(namespace(*values).sqrt, values))
@@ -230,7 +230,7 @@ WIDE = ("xla_cpu_prefer_vector_width", 512)
 
 @cache
 def filter_options(*options: tuple[str, int]) -> dict[str, int]:
-    """Return those compiler options that the installed XLA accepts, because an unknown option raises an error."""
+    """Return the compiler options that the installed XLA accepts; any other option would raise an error."""
     import jax
 
     def are_accepted(values: dict[str, int]) -> bool:

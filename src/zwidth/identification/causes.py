@@ -24,8 +24,8 @@ from zwidth.units.unit_system import UnitSystem
 # Lengths of the test functions, in samples. The effect of position errors decreases as 1/length^2.
 _WINDOWS = (32, 128)
 _MIN_WINDOWS = 12  # least number of half-overlapping test functions that fit into a log
-# A wrong sign of the force or position is reported if the fitted mass is negative and the residual sum of squares is
-# less than this share of the sum of squared accelerations.
+# A wrong sign of the force or position is reported if the fitted mass is negative and the regression explains most of
+# the acceleration: its residual sum of squares is less than this share of the total sum of squares.
 _SIGN = 0.3
 # A spring or gravity is reported if adding it to the model reduces the residual sum of squares to less than this share.
 _EXPLAINED = 0.25
@@ -36,7 +36,7 @@ _SHARE = 0.5  # a force is reported as the cause if it explains more than this s
 # than `_SHARE`, because the size of rounding errors is computed and not fitted.
 _ROUNDING_SHARE = 0.2
 _TRIALS = 4  # number of random draws of the rounding errors, over which their effect is averaged
-_MIN_LEVELS = 8  # least number of distinct forces; fewer may be set points and are not attributed to rounding
+_MIN_LEVELS = 8  # least number of distinct forces; a force with fewer values is not tested for rounding
 _MIN_STEP = 2e-4  # least rounding step that is tested, relative to the largest force
 
 
@@ -113,7 +113,7 @@ def _integrate(log: Recording, window: int) -> np.ndarray | None:
 
 
 def _fit_columns(wanted: np.ndarray, columns: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Fit a vector by a linear combination of columns; return the coefficients and the residual sum of squares."""
+    """Fit a vector by a linear combination of columns; return its coefficients and the residual sum of squares."""
     matrix = np.array(columns).T
     sizes = np.linalg.norm(matrix, axis=0)
     sizes = np.where(sizes > 0, sizes, 1.0)
@@ -144,8 +144,8 @@ def explain_residuals(best: FittedModel, system: UnitSystem) -> str:
         gravity = explain(*([function(log.position) for log in best.model.logs] for function in (np.sin, np.cos)))
         if gravity > _SHARE and gravity > spring + 0.1:
             return "they depend on the angle, as gravity would cause"
-    # The message contains no stiffness, because its estimate would be biased: the fitted friction has already absorbed
-    # a part of the spring force.
+    # Do not report the stiffness of the spring, because its estimate would be biased: the fitted friction has already
+    # absorbed a part of the spring force.
     if spring > _SHARE:
         return "they depend on the position, as a weak spring, a cable or gravity would cause"
     return ""
@@ -170,7 +170,7 @@ def _simulate_accelerations(best: FittedModel, accelerations: list[np.ndarray]) 
 
 
 def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float, system: UnitSystem) -> str:
-    """Return a clause for a message if the rounding of the force column explains the residuals, "" otherwise.
+    """Return a clause that names the rounding of the force column as the cause of the residuals; "" if it is not.
 
     The expected effect of the rounding is the mean over random rounding errors, simulated with the fitted mass.
 
@@ -192,7 +192,8 @@ def _explain_rounding(best: FittedModel, basis: np.ndarray, squares: float, syst
         accelerations = []
         for log in best.model.logs:
             force = log.force[log.skip :][: log.position.size]
-            # Draw one rounding error for each run of equal forces, because equal forces are rounded equally.
+            # Draw one rounding error for each run of successive equal forces, because equal forces have equal rounding
+            # errors.
             run = np.append(0, np.cumsum(np.diff(force) != 0))
             accelerations.append(best.theta[0] * rng.uniform(-0.5 * step, 0.5 * step, run[-1] + 1)[run])
         moved = _simulate_accelerations(best, accelerations)

@@ -49,7 +49,9 @@ _COARSEST = 1.1  # rad or m; largest accepted encoder step (6 steps per turn), b
 
 @dataclass(frozen=True, eq=False)
 class LoggedMotion:
-    """Time, position and force of one log in SI units, one array entry per row; NaN for a cell without a number.
+    """Time, position and force of one log in SI units, as arrays with one entry per row of the file.
+
+    NaN marks a cell without a number.
 
     Attributes:
         time: times in s; None if the period replaces them.
@@ -204,7 +206,7 @@ def _name_units(
 
 
 def _is_rotary(units: Mapping[str, str], sources: Mapping[str, Column], resolution: Any) -> bool:
-    """Return whether the axis is rotary: by the units, or without units by the resolution, or else by the headers."""
+    """Return whether the axis is rotary, by the units; without units by the resolution; else by the headers."""
     for name in ("force", "position"):
         linear, angular = DIMENSIONS[name]
         base = _integrate_unit(units[name]) or units[name]
@@ -242,7 +244,8 @@ def _join_times(column: Column, numbers: Mapping[int, np.ndarray], notes: list[s
         size = _read_unit("time", unit)[0]
         first = float(values[np.isfinite(values)][0])
         if not unit:
-            # Derive the unit of a time since 1970 from its magnitude, because no other unit results in a recent date.
+            # Derive the unit of a time since 1970 from its magnitude, because every smaller unit yields a date before
+            # 2001.
             name, size = next(((name, size) for name, size in _EPOCH_UNITS if first * size >= _EPOCH), ("s", 1.0))
             if name != "s":
                 notes.append(f"the time has no unit and is read in {name} since 1970, according to its magnitude")
@@ -261,7 +264,7 @@ def _integrate_unit(unit: str) -> str | None:
 
 
 def _read_constant(constant: str | None, unit: str) -> tuple[float, str]:
-    """Return the force or torque in SI units that one unit of current produces, and its unit, "N" or "N m".
+    """Return the force in N or the torque in N m per unit of current, and the unit of the result, "N" or "N m".
 
     Args:
         constant: motor constant as specified by the user, such as "5 N/A"; None if the user specified none.
@@ -375,7 +378,7 @@ def read_step(resolution: Any) -> tuple[float, bool | None]:
 
 
 def join_logs(motions: Sequence[LoggedMotion], period: float | None) -> dict[str, Any]:
-    """Combine logs of one axis into keyword arguments of `zwidth.fit_log`; the period replaces missing times."""
+    """Return the logs of one axis as keyword arguments of `zwidth.fit_log`; ``period`` replaces missing times."""
     if len({motion.rotary for motion in motions}) > 1:
         raise InputError("logs: some have angles, others lengths; fit them separately")
     steps = {motion.resolution for motion in motions}

@@ -33,7 +33,7 @@ from zwidth.stability.rigid.ridge import plant_slopes
 # Least |zeta^2 - 1| of a pole pair with damping ratio zeta. Pairs that are closer to a double pole are moved apart,
 # because partial fractions require distinct poles.
 _DOUBLE = 1e-5
-# Maximization over B on a grid that is repeatedly refined around its best point.
+# Constants of the maximization over B (`find_highest`), on a grid that is repeatedly refined around its best point.
 _DAMPINGS = 33  # number of points of the first grid
 _REFINED = 9  # number of points of each refined grid
 _TIMES = 3  # number of refinements
@@ -60,8 +60,9 @@ class CriticalController:
         if poles:
             both = np.array(np.broadcast_arrays(fraction + np.zeros(1), *poles, *residues)[1:], complex)
             poles, self.residues = np.where(both[: len(poles)] == 0, 1e-300, both[: len(poles)]), both[len(poles) :]
-            # ``growth`` is e^p - 1. ``gain`` is the gain (e^p - 1)/p of a force that acts for a whole period, and
-            # ``late_gain`` that of a force that acts only after the fractional delay.
+            # Precompute terms of h: ``growth`` is e^p - 1, ``gain`` is (e^p - 1)/p, the change of E by a unit force
+            # that acts for a whole period, and ``late_gain`` the change by a unit force that acts only after the
+            # fractional delay f.
             self.growth, self.gain = np.expm1(poles), np.expm1(poles) / poles
             self.late_gain = np.expm1((1.0 - fraction) * poles) / poles
 
@@ -76,7 +77,7 @@ class CriticalController:
         return rigid / (1.0 - rigid * self.evaluate_parts(points)) if self.has_parts else rigid
 
     def evaluate_rigid(self, points: CirclePoints) -> Jet:
-        """Return q of the rigid mass alone, and its derivative in the frequency w."""
+        """Return q of the rigid mass alone, and its derivative with respect to the frequency w."""
         plant, turn = self.plant, 1j * points.z
         numerator, z_minus_c = _evaluate_numerator(plant, points), points.z_minus_1 + plant.em
         q = -np.exp(1j * self.n_delay * points.w) * points.z_minus_1 * z_minus_c / numerator
@@ -98,7 +99,7 @@ class CriticalController:
             q: value of q of the rigid mass at these points.
 
         Returns:
-            The derivatives in delta and in d.
+            The derivatives with respect to delta and to d.
         """
         by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
         numerator = _evaluate_numerator(self.plant, points)
@@ -109,7 +110,7 @@ class CriticalController:
 
 
 def _evaluate_numerator(plant: Plant, points: CirclePoints) -> Any:
-    """Return ``a2 z + a1 + a0/z``, the numerator of the transfer function of the rigid plant divided by z."""
+    """Return ``a2 z + a1 + a0/z``: the numerator of the transfer function of the sampled rigid mass, divided by z."""
     return plant.a2 * points.z + plant.a1 + plant.a0 / points.z
 
 
@@ -176,11 +177,11 @@ class GridLimits:
 
     @cached_property
     def damping_limits(self) -> np.ndarray:
-        """The B of each device below which walls with K -> 0+ are stable; infinite if they are stable for all B."""
+        """Upper limit of B for each device, below which walls with K -> 0+ are stable; infinite if no limit exists."""
         return _cross_first(self.critical * self.velocity.conj(), self.critical / self.velocity)
 
     def limit_stiffness(self, virtual_damping: np.ndarray) -> np.ndarray:
-        """Return the stiffness of each device up to which all walls with a given B are stable; 0 if none is stable.
+        """Return the stability limit of each device at a given B: the K below which all walls are stable; 0 if none is.
 
         Args:
             virtual_damping: B, one value for all devices or one per device.
@@ -219,7 +220,7 @@ def find_highest(limit: Callable[[np.ndarray], np.ndarray], top: np.ndarray) -> 
 
 @np.errstate(all="ignore")
 def _cross_first(criterion: Array, value: Array) -> np.ndarray:
-    """Return the smallest positive Re(``value``) at the zero crossings of Im(``criterion``) over the frequency.
+    """Return the smallest positive Re(``value``) at the frequencies at which Im(``criterion``) crosses zero.
 
     Rows are devices and columns frequencies. Both arrays are interpolated linearly between neighboring frequencies. At
     the last frequency, ``criterion`` counts as real, because this frequency is at or near z = -1.

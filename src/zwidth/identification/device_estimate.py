@@ -106,16 +106,16 @@ def differentiate_stiffness_max(scene: Scene) -> tuple[float, np.ndarray]:
     return float(sensitivities.stiffness), np.array([sensitivities.per[path] for path in name_parameters(scene)])
 
 
-def compute_reach(freedom: int | None, upper: float = UPPER) -> float:
+def compute_coverage_factor(degrees_of_freedom: int | None, upper: float = UPPER) -> float:
     """Return the half-width of a confidence interval in standard errors: a quantile of the t or normal distribution.
 
     Args:
-        freedom: degrees of freedom with which the noise was estimated; None if the noise is known.
+        degrees_of_freedom: degrees of freedom with which the noise was estimated; None if the noise is known.
         upper: probability that the true value is below the upper end of the interval.
     """
     from scipy.special import ndtri, stdtrit
 
-    return float(ndtri(upper) if freedom is None else stdtrit(freedom, upper))
+    return float(ndtri(upper) if degrees_of_freedom is None else stdtrit(degrees_of_freedom, upper))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,12 +125,14 @@ class DeviceEstimate:
     nominal: Scene  # scene with the fitted parameters
     covariance: np.ndarray  # covariance of the parameters, in SI units
     noise: float | tuple[float, float]  # standard deviation of the position in m; for walls that of K and f, relative
-    freedom: int | None = None  # degrees of freedom with which the noise was estimated; None if the noise is given
+    degrees_of_freedom: int | None = (
+        None  # degrees of freedom with which the noise was estimated; None if the noise is given
+    )
     response: MeasuredDevice | None = None  # response; its radius covers the largest undetected resonance
-    damping_tried: float | None = None  # largest B of the measured walls, N s/m; None for a log
-    stiffness_tried: float | None = None  # K measured at the largest B, N/m; None for a log
+    measured_damping: float | None = None  # largest B of the measured walls, N s/m; None for a log
+    measured_stiffness: float | None = None  # K measured at the largest B, N/m; None for a log
 
-    # Shortcuts to attributes of the scene with the fitted parameters.
+    # Make attributes of the fitted scene available as attributes of the estimate, because they are used often.
     mass = property(attrgetter("nominal.device.mass"))
     damping = property(attrgetter("nominal.device.damping"))
     delay = property(attrgetter("nominal.timing.delay"))
@@ -146,23 +148,26 @@ class DeviceEstimate:
         return self.actuator is not None or bool(self.modes)
 
     @property
-    def numbers(self) -> tuple[str, ...]:
-        """The paths of the fitted parameters, in the order of the covariance."""
+    def parameter_names(self) -> tuple[str, ...]:
+        """The dotted paths of the fitted parameters, such as "modes.0.frequency", in the order of the covariance."""
         return name_parameters(self.nominal)
 
     @cached_property
     def estimates(self) -> np.ndarray:
-        """The values of the fitted parameters in SI units, in the order of ``numbers``."""
+        """The values of the fitted parameters in SI units, in the order of the covariance."""
         parameters = self.nominal.parameters()
-        return np.array([parameters[name] for name in self.numbers])
+        return np.array([parameters[name] for name in self.parameter_names])
 
     @property
-    def reach(self) -> float:
+    def coverage_factor(self) -> float:
         """The half-width of the 95 % confidence intervals, in standard errors."""
-        return compute_reach(self.freedom)
+        return compute_coverage_factor(self.degrees_of_freedom)
 
     def normalize(self, drawn: np.ndarray) -> DimensionlessDevice:
-        """Convert parameters, one row per device and one column per entry of ``numbers``, to a batch of devices."""
+        """Convert parameters in SI units to a batch of dimensionless devices.
+
+        ``drawn`` has one row per device and one column per fitted parameter, in the order of the covariance.
+        """
         lag = 0 if self.actuator is None else self.actuator.order
         return DimensionlessDevice.from_parameters(np.moveaxis(drawn, 1, 0), self.period, lag)
 
@@ -182,7 +187,7 @@ class DeviceEstimate:
             # Use a one-sided difference if a parameter would change its sign on one side, because most parameters must
             # not be negative.
             sides = [side for side in (-1.0, 1.0) if np.all((values + side * step) * np.where(values < 0, -1, 1) >= 0)]
-            moved = [dict(zip(self.numbers, (values + side * step).tolist(), strict=True)) for side in sides]
+            moved = [dict(zip(self.parameter_names, (values + side * step).tolist(), strict=True)) for side in sides]
             ends = [evaluate(self.nominal.replace(**each)) for each in moved]
             if len(sides) == 1:
                 sides, ends = [0.0, *sides], [middle, *ends]
@@ -201,14 +206,14 @@ class DeviceEstimate:
             count: number of devices.
 
         Returns:
-            The parameters, one row per device, in the order of ``numbers``. None if the covariance is not finite, or if
-            almost all drawn devices have negative parameters.
+            The parameters, one row per device, in the order of ``parameter_names``. None if the covariance is not
+            finite, or if almost all drawn devices have negative parameters.
         """
         values = self.estimates
         if not np.all(np.isfinite(self.covariance)):
             return None
         # Mark the modal masses, because their reciprocals are drawn, and because they may have either sign.
-        inverse = np.array([name.endswith(".mass") for name in self.numbers])
+        inverse = np.array([name.endswith(".mass") for name in self.parameter_names])
         center, slopes = values.copy(), np.ones(values.size)
         center[inverse], slopes[inverse] = 1.0 / values[inverse], -1.0 / values[inverse] ** 2
         center[0], slopes[0] = np.log(self.mass), 1.0 / self.mass
@@ -217,8 +222,10 @@ class DeviceEstimate:
         kept = np.zeros((0, values.size))
         for _ in range(_ROUNDS):
             spread = generator.standard_normal((count, values.size))
-            if self.freedom is not None:
-                spread /= np.sqrt(generator.chisquare(self.freedom, count) / self.freedom)[:, None]
+            if self.degrees_of_freedom is not None:
+                spread /= np.sqrt(generator.chisquare(self.degrees_of_freedom, count) / self.degrees_of_freedom)[
+                    :, None
+                ]
             devices = center + spread @ root.T
             devices = devices[np.all((devices >= 0) | inverse | (np.arange(values.size) == 0), 1)]
             with np.errstate(over="ignore", divide="ignore"):
@@ -230,19 +237,23 @@ class DeviceEstimate:
         return None
 
     def bound_measured_stiffness(self, confidence: float) -> float:
-        """Return a lower confidence limit in N/m of the stiffness that was measured at the largest B; 0 for a log.
+        """Return a lower confidence limit in N/m of the onset stiffness measured at the largest B; 0 after a log fit.
 
         Args:
             confidence: probability that the true onset K is above the limit.
         """
         noise = self.noise[0] if isinstance(self.noise, tuple) else 0.0
-        return max(0.0, (self.stiffness_tried or 0.0) * (1.0 - compute_reach(self.freedom, confidence) * noise))
+        return max(
+            0.0,
+            (self.measured_stiffness or 0.0)
+            * (1.0 - compute_coverage_factor(self.degrees_of_freedom, confidence) * noise),
+        )
 
     @cached_property
     def response_scene(self) -> Scene | None:
         """The scene of the fitted response with a radius that covers one undetected resonance; None without a response.
 
-        It is that of `build_response_scene` with the default of 99 % of the devices.
+        The radius covers the responses of 99 % of the devices that agree with the fitted parameters.
         """
         return self.build_response_scene(RELIABILITY, True)
 
@@ -270,8 +281,8 @@ class DeviceEstimate:
             # To first order, the confidence region of the response at one frequency is an ellipse in the complex plane.
             # Add the longer half-axis of the ellipse to the radius, so that the disk contains the ellipse.
             square, across = np.sum(np.abs(changes) ** 2, 0), np.abs(np.sum(changes**2, 0))
-            count = len(self.numbers)
-            reach = count * fdtri(count, self.freedom, reliability)
+            count = len(self.parameter_names)
+            reach = count * fdtri(count, self.degrees_of_freedom, reliability)
             radius = radius + np.sqrt(0.5 * (square + across) * reach)
         if not np.all(np.isfinite(radius)):
             return None

@@ -35,7 +35,8 @@ BEYOND = 3.0
 # Usual range of sampling periods in s. A period outside this range causes a warning, because its unit may be wrong.
 _SHORTEST_PERIOD = 5e-6
 _LONGEST_PERIOD = 0.02
-# Remedy for warnings that the log does not distinguish two structures of the device, such as a lag and a resonance.
+# Remedy printed with a warning that the log cannot distinguish two structures of the device, such as a lag and a
+# resonance.
 SEE_MORE = "record a force of zwidth.excite, use a larger force, or a finer encoder"
 MASS_OPEN = "the mass is hardly determined: its standard error is more than half of its value"
 
@@ -47,13 +48,13 @@ class ErrorBar(NamedTuple):
     high: float
 
 
-class FurtherExperiment(NamedTuple):
+class NextMeasurement(NamedTuple):
     """The proposed next measurement: raise K at the given B until the wall becomes unstable."""
 
     virtual_damping: float  # B at which to raise K, N s/m
     stiffness: float  # expected K at the onset of instability, N/m
     frequency: float  # expected frequency of the oscillation, Hz
-    error_afterwards: float  # expected standard error of K_max after this measurement, N/m; NaN if K_max is NaN
+    stiffness_error: float  # expected standard error of K_max after this measurement, N/m; NaN if K_max is NaN
 
 
 class FittedMotion(NamedTuple):
@@ -62,12 +63,12 @@ class FittedMotion(NamedTuple):
     time: np.ndarray  # time of each sample, s
     force: np.ndarray  # commanded force, N
     position: np.ndarray  # measured position, m
-    # Modeled position in m. It is NaN at the start and after gaps, because the forces that act there were not
-    # logged, and after the first 200,000 samples, because these are not fitted.
-    modelled: np.ndarray
+    # Modeled position in m. It is NaN at the start and after gaps, because the forces that act there were not logged,
+    # and beyond the first 200,000 samples, because later samples are not fitted.
+    modeled: np.ndarray
 
 
-class RivalDevice(NamedTuple):
+class AlternativeDevice(NamedTuple):
     """Another device that fits equally well: its mass in kg, damping in N s/m, delay in s, and K_max in N/m."""
 
     mass: float
@@ -77,8 +78,8 @@ class RivalDevice(NamedTuple):
 
 
 @compact_repr(
-    ("mass", "damping", "delay", "stiffness_max", "stiffness_error", "friction", "status", "doubts"),
-    missing=dict.fromkeys(("stiffness_max", "stiffness_error"), "see status and doubts"),
+    ("mass", "damping", "delay", "stiffness_max", "stiffness_error", "friction", "status", "warnings"),
+    missing=dict.fromkeys(("stiffness_max", "stiffness_error"), "see status and warnings"),
     mass="kg",
     damping="N s/m",
     delay="s",
@@ -98,24 +99,23 @@ class DeviceFit(DeviceEstimate):
             and `zwidth.Mode`. A negative modal mass means that actuator and sensor are on opposite sides of a node.
         errors: standard errors by name: of mass, damping and delay, and of the other parameters by their paths, such
             as "actuator.time_constant" and "modes.0.frequency".
-        numbers: paths of the fitted parameters.
-        covariance: covariance of the parameters in the order of ``numbers``, in SI units.
+        parameter_names: paths of the fitted parameters.
+        covariance: covariance of the parameters in the order of ``parameter_names``, in SI units.
         stiffness_max: K_max in N/m of the estimated device, `zwidth.Scene.max_stiffness`; NaN if the status is not OK,
-            except for UNDECIDED if the rivals have the same K_max within its error.
+            except for UNDECIDED if the alternatives have the same K_max within its error.
         stiffness_error: standard error of K_max, from its gradient in the parameters.
         noise: standard deviation of the noise, given or estimated from the residuals: for walls those of K and of the
             frequency f, relative; for a log that of the position in m.
         residuals: measured minus fitted values: for walls an array (n, 2) in units of the noise of K and f; for a log
             in m, NaN for samples that are not fitted.
-        doubts: warnings about the measurements or the estimate, one sentence each. With a warning there is no safe
-            wall.
+        warnings: sentences about questionable measurements or estimates. With a warning there is no safe wall.
         notes: interpretations of the columns of a log and repairs of its rows, one clause each.
         status: code of `zwidth.Status`; UNDECIDED if another device fits equally well, or if the residuals of a log are
             not white noise.
-        rivals: other devices that fit equally well, each a `zwidth.RivalDevice`.
+        alternatives: other devices that fit equally well, each a `zwidth.AlternativeDevice`.
         next: for walls, the further measurement that reduces the error of K_max most; otherwise None.
         offset, friction: for a log, constant force in addition to the commanded one, and Coulomb friction, in N. Their
-            errors, in ``errors_of_log`` and ``errors``, are NaN if the log does not distinguish the two forces.
+            errors, in ``force_errors`` and ``errors``, are NaN if the log does not distinguish the two forces.
         resolution: encoder step in m with which a log was fitted; 0 without an encoder step, and for walls.
         motions: for a log, the measured and fitted positions, `zwidth.FittedMotion`.
         scene: `zwidth.Scene` of the fitted device, with the safe limit of its walls. Its parameters are rounded to a
@@ -131,37 +131,37 @@ class DeviceFit(DeviceEstimate):
         hidden: for a log, ``(odds, stiffness_max)``: the posterior odds of one undetected resonance against none, and
             equally likely values of K_max with such a resonance, relative to K_max without. The interval of K_max
             averages over these values. None if ``response`` is None.
-        damping_tried, stiffness_tried: for walls, the largest measured B in N s/m, and the K in N/m measured there;
-            None for a log.
-        freedom: degrees of freedom with which the noise was estimated; None if the noise is given.
+        measured_damping, measured_stiffness: for walls, the largest measured B in N s/m, and the K in N/m measured
+            there; None for a log.
+        degrees_of_freedom: degrees of freedom with which the noise was estimated; None if the noise is given.
     """
 
     residuals: np.ndarray
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     status: int
-    next: FurtherExperiment | None = None
+    next: NextMeasurement | None = None
     offset: float = 0.0
     friction: float = 0.0
     resolution: float = 0.0
     motions: tuple[FittedMotion, ...] = ()
-    rivals: tuple[RivalDevice, ...] = ()
+    alternatives: tuple[AlternativeDevice, ...] = ()
     lag: HiddenLag | None = None
     hidden: HiddenResonances | None = None
-    errors_of_log: dict[str, float] = field(default_factory=dict)
+    force_errors: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     @cached_property
     def errors(self) -> dict[str, float]:
         """The standard errors of the fitted parameters and forces as a dictionary, by name or path."""
         errors = np.sqrt(np.diag(self.covariance)).tolist()
-        return dict(zip(self.numbers, errors, strict=True)) | self.errors_of_log
+        return dict(zip(self.parameter_names, errors, strict=True)) | self.force_errors
 
     @cached_property
     def _stiffest(self) -> tuple[float, float]:
         """K_max and its standard error; both NaN if an equally well fitting device has a clearly different K_max."""
         value, gradient = differentiate_stiffness_max(self.nominal)
         error = float(np.sqrt(gradient @ self.covariance @ gradient))
-        agreed = bool(self.rivals) and all(abs(rival.stiffness_max - value) <= error for rival in self.rivals)
+        agreed = bool(self.alternatives) and all(abs(each.stiffness_max - value) <= error for each in self.alternatives)
         is_determined = self.status == Status.OK or (self.status == Status.UNDECIDED and agreed)
         return (value, error) if is_determined else (np.nan, np.nan)
 
@@ -176,13 +176,13 @@ class DeviceFit(DeviceEstimate):
         return self._stiffest[1]
 
     @property
-    def is_doubted(self) -> bool:
+    def is_unreliable(self) -> bool:
         """True if the fit has a warning or its status is not OK; then no wall is recommended.
 
         In simulations, dynamics that the model lacks changed K_max by a factor of up to 2.8, mostly in fits with
         warnings.
         """
-        return self.status != Status.OK or bool(self.doubts)
+        return self.status != Status.OK or bool(self.warnings)
 
     @cached_property
     def scene(self) -> Scene:
@@ -207,7 +207,7 @@ class DeviceFit(DeviceEstimate):
         return float(np.sqrt(np.sum(self.propagate_errors(lambda scene: scene.max_stiffness().virtual_damping) ** 2)))
 
     def value_of(self, name: str) -> float:
-        """Return the value to which the entry ``name`` of ``errors`` belongs: an attribute, or a device parameter."""
+        """Return the fitted value whose standard error is ``errors[name]``: an attribute or a device parameter."""
         return float(self.nominal.parameters()[name] if "." in name else getattr(self, name))
 
     @cached_property
@@ -217,8 +217,9 @@ class DeviceFit(DeviceEstimate):
         The interval of K_max includes the effects of ``hidden`` and ``lag``. If the B at K_max exceeds all measured B,
         the interval also includes the K measured at the largest B.
         """
-        widths = {name: (self.value_of(name), self.reach * error) for name, error in self.errors.items()}
-        # Cut the intervals off at 0, except those of constant forces and modal masses, because these may be negative.
+        widths = {name: (self.value_of(name), self.coverage_factor * error) for name, error in self.errors.items()}
+        # Cut off the intervals at 0, except those of constant forces and modal masses, because only these may be
+        # negative.
         signed = [name for name in widths if name == "offset" or (name.startswith("modes") and name.endswith("mass"))]
         # Use np.maximum instead of max, because it returns NaN if the width is NaN.
         bars = {
@@ -229,13 +230,13 @@ class DeviceFit(DeviceEstimate):
         with np.errstate(all="ignore"):
             # Compute the interval of ln K_max, because K_max is a strongly nonlinear function of the delay near 0.
             error = np.divide(self.stiffness_error, stiffness)
-            ends = np.array([-self.reach, self.reach]) * error
+            ends = np.array([-self.coverage_factor, self.coverage_factor]) * error
             if self.hidden is not None and error > 0:
                 ends = self._average_models(error, *self.hidden)
             # Extend the interval to the estimate itself, which lies outside if most devices with an undetected
             # resonance have another K_max.
             low, high = (stiffness * np.exp([min(ends[0], 0.0), max(ends[1], 0.0)])).tolist()
-        if self.damping_tried is not None and self.virtual_damping > self.damping_tried:
+        if self.measured_damping is not None and self.virtual_damping > self.measured_damping:
             # K_max is extrapolated to a B beyond the measured ones. The only certain statement is that it is at least
             # the measured K, so extend the interval down to the lower confidence limit of this K.
             low = min(low, self.bound_measured_stiffness(UPPER))
@@ -261,7 +262,7 @@ class DeviceFit(DeviceEstimate):
         far = np.abs(middles).max() + _FAR * error
 
         def exceed(value: float, probability: float) -> float:
-            return float(weights @ stdtr(self.freedom, (value - middles) / error)) - probability
+            return float(weights @ stdtr(self.degrees_of_freedom, (value - middles) / error)) - probability
 
         return [
             float(brentq(exceed, -far, far, args=(0.5 + side * (UPPER - 0.5),)))  # pyright: ignore[reportArgumentType]  (a number by default)
@@ -318,7 +319,7 @@ class DeviceFit(DeviceEstimate):
         if options not in self._safe_walls:
             status = self.status if self.status != Status.OK else int(Status.UNDECIDED)
             none = SafeWall(np.nan, np.nan, np.nan, status)
-            self._safe_walls[options] = none if self.is_doubted else find_safe_wall(self, *options)
+            self._safe_walls[options] = none if self.is_unreliable else find_safe_wall(self, *options)
         return self._safe_walls[options]
 
     @cached_property
@@ -329,7 +330,7 @@ class DeviceFit(DeviceEstimate):
     def as_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary of plain numbers and texts for JSON, with None in place of NaN."""
         numbers = {
-            **dict(zip(self.numbers, self.estimates.tolist(), strict=True)),
+            **dict(zip(self.parameter_names, self.estimates.tolist(), strict=True)),
             "stiffness_max": self.stiffness_max,
             "virtual_damping": self.virtual_damping,
             "errors": self.errors
@@ -337,9 +338,12 @@ class DeviceFit(DeviceEstimate):
             "intervals": self.intervals,
             "covariance": self.covariance.tolist(),
             "noise": self.noise,
-            **{name: getattr(self, name) for name in ("offset", "friction", "resolution", "period", "doubts", "notes")},
+            **{
+                name: getattr(self, name)
+                for name in ("offset", "friction", "resolution", "period", "warnings", "notes")
+            },
             "status": int(self.status),
-            "rivals": [rival._asdict() for rival in self.rivals],
+            "alternatives": [each._asdict() for each in self.alternatives],
             "next": None if self.next is None else self.next._asdict(),
             "safe_wall": self.safe_wall()._asdict(),
             "safe_limit": asdict(self.scene.safe_limit) if self.scene.safe_limit else None,

@@ -14,7 +14,7 @@ import numpy as np
 
 from zwidth.core.errors import InputError
 from zwidth.core.status import Status
-from zwidth.identification.device_estimate import compute_reach
+from zwidth.identification.device_estimate import compute_coverage_factor
 from zwidth.identification.device_fit import DeviceFit
 from zwidth.identification.fit_report import unit_of
 from zwidth.identification.onset_fit import BuzzPoint
@@ -23,13 +23,13 @@ from zwidth.units.formatting import header
 _DRAWS = 1000  # largest number of random devices from which the confidence band is computed
 _ROWS = 121  # number of values of B from 0 to the largest stable one; a tenth more values lie above it
 _BEYOND = 1.1  # largest tabulated B, relative to the largest stable one
-# Largest lag of the autocorrelation. The smaller of the two limits applies.
-_LAGS = 60  # largest lag in samples
-_SHARE = 0.25  # largest lag relative to the number of samples of the log
+# Largest lag at which the autocorrelation of the residuals is tabulated: the smaller of two limits.
+_LAGS = 60  # first limit, in samples
+_SHARE = 0.25  # second limit, relative to the number of samples of the log
 
 
 def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = ()) -> dict[str, dict[str, Any]]:
-    """Return a dictionary of all tables of a fit by name, as required for its plots and files.
+    """Return all tables of a fit as a dictionary by name; its plots and data files contain these tables.
 
     Args:
         fit: the fit.
@@ -48,11 +48,11 @@ def gather_evidence(fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = (
 def tabulate_motions(fit: DeviceFit) -> dict[str, np.ndarray]:
     """Return a table of the measured position, the modeled position and the residual of every sample."""
     logs = [np.full(motion.time.size, k, int) for k, motion in enumerate(fit.motions, start=1)]
-    names = {"force": "force", "position": "position", "modelled": "position"}
+    names = {"force": "force", "position": "position", "modeled": "position"}
     units = {"time": "s"} | {name: unit_of(quantity, fit.unit_system) for name, quantity in names.items()}
     columns = {name: np.concatenate([getattr(motion, name) for motion in fit.motions]) for name in units}
     table = {header(name, unit): columns[name] for name, unit in units.items()}
-    residual = columns["position"] - columns["modelled"]
+    residual = columns["position"] - columns["modeled"]
     return {"log": np.concatenate(logs), **table, header("residual", units["position"]): residual}
 
 
@@ -61,7 +61,7 @@ def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
 
     At each lag, the autocorrelation of white noise is within the band with a probability of 95 %.
     """
-    residuals = [motion.position - motion.modelled for motion in fit.motions]
+    residuals = [motion.position - motion.modeled for motion in fit.motions]
     residuals = [each[np.isfinite(each)] for each in residuals]
     most = int(min(_LAGS, *(_SHARE * each.size for each in residuals)))
     lags = np.arange(1, most + 1)
@@ -70,7 +70,7 @@ def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
     return {
         header("lag", "s"): lags * fit.period,
         "autocorrelation": products / size if size > 0 else np.full(most, np.nan),
-        "band": np.full(most, compute_reach(None) / np.sqrt(count)),
+        "band": np.full(most, compute_coverage_factor(None) / np.sqrt(count)),
     }
 
 
@@ -100,7 +100,7 @@ def trace_boundary(fit: DeviceFit) -> dict[str, np.ndarray]:
 
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return the K up to which all walls are stable, 0 if none is, as an array over random devices and values of B.
+    """Return the largest stable stiffness at given values of B for each of several devices; 0 if no wall is stable.
 
     Args:
         fit: the fit.
@@ -110,7 +110,7 @@ def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.
     Returns:
         An array with one row per device and one column per value of B.
     """
-    return fit.nominal.loop.vary(dict(zip(fit.numbers, devices.T, strict=True))).find_stiffness_limits(damping)
+    return fit.nominal.loop.vary(dict(zip(fit.parameter_names, devices.T, strict=True))).find_stiffness_limits(damping)
 
 
 def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str, np.ndarray]:
@@ -127,9 +127,7 @@ def tabulate_walls(fit: DeviceFit, points: Sequence[BuzzPoint] = ()) -> dict[str
     )
     noise = fit.noise[0] if isinstance(fit.noise, tuple) else np.nan
     for each, residual in zip(points, fit.residuals if points else (), strict=True):
-        rows.append(
-            ("buzzing", each.stiffness, each.virtual_damping, noise * each.stiffness, each.frequency, *residual)
-        )
+        rows.append(("onset", each.stiffness, each.virtual_damping, noise * each.stiffness, each.frequency, *residual))
     kinds, *numbers = zip(*rows, strict=True)
     stiffness, damping = (unit_of(name, fit.unit_system) for name in ("stiffness", "damping"))
     heads = {"stiffness": stiffness, "virtual_damping": damping, "stiffness_error": stiffness, "frequency": "Hz"}

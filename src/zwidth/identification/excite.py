@@ -37,8 +37,9 @@ _HIGHEST = 0.98  # highest frequency of the force, relative to the Nyquist frequ
 _LOWEST = 1.0  # Hz; lowest frequency of the force
 _FIRST = 3  # least value of the lowest frequency, in cycles per period of the force
 _SOFT = 20.0  # Hz; below this frequency the amplitudes decrease in proportion to the frequency, to limit the motion
-# Constants of a second record, which is designed from the response that a first record measured.
-# Largest uncertainty of the response between two frequencies, relative to its distance from the onset of instability.
+# Constants of the design of a second record, which uses the response measured with a first record.
+# Largest accepted error of the response interpolated between two frequencies, relative to the distance of the response
+# from the value at which a wall becomes unstable.
 _GAP = 0.03
 _WEAKEST = 0.01  # smallest amplitude of a sine, relative to the largest
 # Stiffnesses of the walls whose stability the record is designed to decide, relative to the stiffest wall.
@@ -178,8 +179,9 @@ def _design(
     scale = most / max(float(np.abs(stretch).max()) for stretch in stretches)
     commanded = scale * np.concatenate([np.tile(stretch, _PERIODS) for stretch in stretches])
     amplitude = scale * shape
-    # White noise of standard deviation sigma in n samples has the amplitude 2 sigma/sqrt(n) at a line. Count the equal
-    # periods of a stretch only once in n, because their quantization errors are equal and are not averaged out.
+    # White noise of standard deviation sigma in n samples has the amplitude 2 sigma/sqrt(n) at a line. Let n count only
+    # one of the equal periods of each stretch, because their quantization errors are equal, so that averaging does not
+    # reduce them.
     deviation = SURE * step / np.sqrt(12.0) * 2.0 / np.sqrt(_STRETCHES * count) / amplitude
     hertz, expected = lines / (count * period), None
     if scene is not None and response is not None:
@@ -190,7 +192,7 @@ def _design(
 
 
 def _build_frequency_grid(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
-    """Return the lines of the force, whose spacing is prescribed, as integer numbers of cycles per period of the force.
+    """Return lines with the given relative spacing, as integer numbers of cycles per period of the force.
 
     Args:
         count: number of samples per period of the force.
@@ -217,7 +219,7 @@ def _interpolate_response(scene: Scene, w: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _design_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the frequencies and amplitudes of a second record that decides the stability of walls near the stiffest.
+    """Choose the lines and amplitudes of a second record, to decide the stability of walls close to the stiffest one.
 
     Args:
         scene: scene with the response measured with the first record.

@@ -7,7 +7,7 @@ The actuator lag A(s) and the resonances (*modes*) are linear. They therefore ad
 
     A(s)/(s (s + delta)) = 1/(s (s + delta)) + sum_j (r_j/p_j)/(p_j + delta) (1/(s - p_j) - 1/(s + delta)).
 
-The derivative of E_p in p is E_p filtered once more by the same pole; the derivative in the delay d is ``-E_p'``.
+The derivative of E_p with respect to p is E_p filtered once more by the same pole; that with respect to d is -E_p'.
 
 Friction is not linear. The times at which friction stops the mass are approximated by those of a rigid mass whose delay
 is increased by the delay of the lag at low frequencies, -A'(0). This approximation neglects that the lag also smooths
@@ -27,13 +27,15 @@ from zwidth.identification.friction_model import ModelResponse, Recording, recur
 from zwidth.identification.quantization_noise import MeasurementNoise
 from zwidth.numerics.held_mass import phi_functions
 
-# Step of central differences: absolute for delta and for the pole of a filter, relative for all other parameters.
+# Step of central differences: absolute for the pole of a filter, relative for the parameters; for delta at least this
+# value, because delta may be 0.
 _STEP = 1e-6
 # Lower and upper bounds of the parameters.
 LAG_RANGE = (0.02, 5.0)  # time constant tau of the actuator lag, in sampling periods
 FREQUENCY_RANGE = (0.0125, 3.11)  # frequency of a mode, in rad per sample
 RATIO_RANGE = (1e-6, 4.0)  # damping ratio zeta of a mode or of a second-order lag
-# Low-frequency delay 2 zeta tau of a second-order lag, in sampling periods.
+# Bounds of the low-frequency delay 2 zeta tau of a second-order lag, in sampling periods. The upper bound is the
+# largest delay with zeta = 1.
 _DELAY_RANGE = 2.0 * RATIO_RANGE[0] * LAG_RANGE[0], 2.0 * LAG_RANGE[1]
 
 
@@ -69,11 +71,11 @@ class Recordings:
     resolution: float = 0.0
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
-        """Weight columns with one row per sample according to the noise model; without one, return them unchanged."""
+        """Weight the rows of an array, one per sample, by the noise model; return it unchanged without noise model."""
         return columns if self.noise is None else self.noise.weigh(columns)
 
     def truncate(self, count: int) -> Recordings:
-        """Return a copy with equal weights and logs cut off ``count`` positions after the first change of the force."""
+        """Return a copy with equal weights, whose logs end ``count`` positions after their first change of force."""
         return replace(self, logs=tuple(log.truncate(count) for log in self.logs), noise=None)
 
     @property
@@ -82,7 +84,7 @@ class Recordings:
         return np.concatenate([log.position for log in self.logs])
 
     def split(self, column: np.ndarray) -> list[np.ndarray]:
-        """Split an array with one entry per sample of all logs into a list with one array per log."""
+        """Split an array that contains the samples of all logs in succession into a list with one array per log."""
         return np.split(column, np.cumsum([log.position.size for log in self.logs])[:-1])
 
     @property
@@ -138,8 +140,7 @@ class Recordings:
         """Simulate the device with parameters theta under the forces of log ``k``."""
         late, by_late = _limit_lag_delay(theta, self.lag, self.logs[k])
         v0 = self.velocity_indices[k]
-        # List the indices in theta of the parameters of the rigid mass, in the order of the arguments of
-        # `Recording.move`.
+        # Select the parameters of the rigid mass from theta, in the order of the arguments of `Recording.move`.
         rigid_indices = np.array([0, 1, 2, v0 - 1, v0, -2, -1])
         rigid = self.logs[k].move(*(theta[rigid_indices] + late * np.eye(7)[2]).tolist())
         parts = self.simulate_parts(theta, k) if self.lag or self.modes else None
@@ -176,9 +177,9 @@ class Recordings:
                 place += (decay * amplitude).real
                 free_responses.append((j, decay, by_theta, amplitude))
         if self.lag:
-            # `simulate_log` simulates the rigid mass with the delay d plus the low-frequency delay of the lag,
-            # ``late``, because of the friction. Replace its linear part by that with the delay d, which the partial
-            # fractions require.
+            # `simulate_log` delays the forces on the rigid mass by d plus the low-frequency delay of the lag, ``late``,
+            # so that friction stops the mass at about the right times. Replace the linear part of its response by that
+            # with the delay d alone, because the partial fractions require it.
             late, by_late = _limit_lag_delay(theta, self.lag, log)
             by_total = unit[2] + by_late @ unit[3 : 3 + self.lag]
             for gain, by_delay, delay in ((g, unit[2], d), (-g, by_total, d + late)):
@@ -188,8 +189,9 @@ class Recordings:
                 exchanged.append((gain, by_delay, velocity.position, displacement))
 
         def differentiate() -> np.ndarray:
-            # Each term of the derivatives is the real part of a product: an array over the samples times an array over
-            # theta. The derivative of E_p in the delay is -E_p' = -p E_p - F.
+            # Collect the derivatives of the positions with respect to theta as terms (a, b): each term is the real part
+            # of the product of an array a over the samples and an array b over theta. The derivative of E_p with
+            # respect to the delay is -E_p' = -p E_p - F.
             force = log.recent_forces[0, log.skip - int(np.floor(d)) + samples]
             terms: list[tuple[Any, Any]] = [(force, -unit[2] * weights.sum())]
             poles_by_theta, weights_by_theta = self._differentiate_poles(theta)
@@ -209,7 +211,7 @@ class Recordings:
         return ModelResponse(place, differentiate)
 
     def _find_poles(self, thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute those poles of the lag and the modes that have a nonnegative imaginary part, and their weights.
+        """Compute the poles of the lag and the modes with nonnegative imaginary part, and their weights r.
 
         Args:
             thetas: parameter vectors along the first axis, shape (size, count).
@@ -221,21 +223,21 @@ class Recordings:
         device = self.normalize(thetas, 1.0)
         poles, weights = (np.array(each) for each in expand_partial_fractions(device.delta, device.lag, device.modes))
         states, height = np.maximum(np.arange(-len(poles), 0) + 2 * self.modes, -1), np.imag(poles[:, 0])
-        # Omit the lower pole of each complex pair and double the weight of the upper one, because only the real parts
-        # of the responses are used, which are equal for both poles.
+        # Omit the pole with negative imaginary part of each complex pair and double the weight of the other one,
+        # because only the real parts of their responses are used, which are equal.
         weights = weights * thetas[0] * (1.0 + (height > 0))[:, None]
         return poles[height >= 0], weights[height >= 0], states[height >= 0]
 
     def _differentiate_poles(self, theta: np.ndarray) -> np.ndarray:
-        """Differentiate the poles and their weights in theta by central differences.
+        """Differentiate the poles and their weights with respect to theta by central differences.
 
         Returns:
             An array of shape (2, poles, size): the derivatives of the poles, and those of their weights.
         """
         moving = np.r_[0, 1, self.parts]
         steps, count = _STEP * np.abs(theta[moving]), moving.size
-        # Use an absolute step for delta, and the step of T^2/m for T^2/m_i with the modal masses m_i, because delta and
-        # T^2/m_i may be 0.
+        # Use steps that do not vanish for delta and for T^2/m_i, with the modal masses m_i, because these parameters
+        # may be 0: an absolute step for delta, and the step of T^2/m for T^2/m_i.
         steps[1], steps[4 + self.lag :: 3] = max(_STEP, steps[1]), steps[0]
         thetas = np.tile(theta[:, None], 1 + 2 * count)
         thetas[moving, 1 + np.arange(count)] += steps
@@ -247,7 +249,7 @@ class Recordings:
 
 
 def _limit_lag_delay(theta: np.ndarray, order: int, log: Recording) -> tuple[float, np.ndarray]:
-    """Return the low-frequency delay of the lag, limited so that its sum with d does not require forces before the log.
+    """Return the low-frequency delay of the lag, limited so that the total delay requires no forces before the log.
 
     Args:
         theta: parameter vector.
@@ -255,7 +257,7 @@ def _limit_lag_delay(theta: np.ndarray, order: int, log: Recording) -> tuple[flo
         log: the log.
 
     Returns:
-        The delay, and its derivatives in the parameters of the lag.
+        The delay, and its derivatives with respect to the parameters of the lag.
     """
     late, by = theta[3:4].sum() if order else 0.0, np.eye(2)[0, :order]
     most = log.skip - 1.5 - theta[2]
@@ -263,7 +265,7 @@ def _limit_lag_delay(theta: np.ndarray, order: int, log: Recording) -> tuple[flo
 
 
 def _filter_force(log: Recording, pole: complex, d: float) -> ModelResponse:
-    """Compute the filtered force E_p at the samples with positions; E_p is 0 at the first sample of the log.
+    """Compute the filtered force E_p at the samples that have positions; E_p is 0 at the first sample of the log.
 
     Args:
         log: the log.
@@ -271,13 +273,13 @@ def _filter_force(log: Recording, pole: complex, d: float) -> ModelResponse:
         d: delay.
 
     Returns:
-        E_p as positions, and its derivative in p as derivatives of the response.
+        E_p as positions, and its derivative with respect to p as derivatives of the response.
     """
     n_delay = int(np.floor(d))
     f, pole, first = d - n_delay, pole if pole.imag else pole.real, log.skip - n_delay
     with_positions = slice(first, first + log.position.size)
-    # Compute the gains with which the two forces of a period, before and after the delayed change, contribute to E_p at
-    # the next sample. Compute them at p and, for the derivative in p, at p plus and minus a step.
+    # Within a period the delayed force changes once. Compute the gains from the forces before and after this change to
+    # E_p at the next sample, at the pole p and, for the derivative with respect to p, at p plus and minus a step.
     near = pole + _STEP * np.array([[0.0], [1.0], [-1.0]])
     near = np.where(near == 0, 1e-300, near)
     gains = np.expm1(np.array([1.0 - f, f]) * near) / near * np.exp([0.0, 1.0 - f] * near)
@@ -302,7 +304,7 @@ def _integrate_velocity(log: Recording, delta: float, d: float, velocity: ModelR
         velocity: velocity of the mass, E_p for p = -delta.
 
     Returns:
-        The displacement, and its derivative in delta.
+        The displacement, and its derivative with respect to delta.
     """
     n_delay = int(np.floor(d))
     spans, now = np.array([d - n_delay, 1.0 - d + n_delay, 1.0]), log.skip - n_delay

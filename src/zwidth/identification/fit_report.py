@@ -18,14 +18,14 @@ import numpy as np
 
 from zwidth.analysis.recommendation import Recommendation
 from zwidth.core.status import Status
-from zwidth.identification.device_fit import DeviceFit, RivalDevice
+from zwidth.identification.device_fit import AlternativeDevice, DeviceFit
 from zwidth.identification.safe_scene import advise_record, describe_status, limit_walls, round_parameter, round_period
 from zwidth.model.parameter_paths import spell_estimate
 from zwidth.units.formatting import plain, with_unit
 from zwidth.units.quantities import FIELDS
 from zwidth.units.unit_system import UnitSystem
 
-# Range of the RMS residuals that agree with the encoder step, relative to the quantization noise of the encoder.
+# Range of RMS residuals that quantization by the encoder explains, relative to its quantization noise.
 NEAR_ROUNDING = (0.5, 1.1)
 
 STIFFER = 1.005  # ratio of the stiffnesses of two walls above which the second wall is printed in addition
@@ -71,7 +71,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
     """
     recommended = fit.recommended
     rows = [("NO WALL", recommended.reason)]
-    if fit.is_doubted:
+    if fit.is_unreliable:
         rows = [("NO WALL", "resolve the warnings first, then record again")]
     elif recommended.status == Status.OK:
         limit = recommended.scene.safe_limit
@@ -88,7 +88,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
     # Add a warning about the status only if it is NOT_CONVERGED, because the fit itself has warnings about every other
     # status.
     unconverged = [f"NOT_CONVERGED: {describe_status(fit)}"] if fit.status == Status.NOT_CONVERGED else []
-    rows += [("WARNING", text) for text in (*unconverged, *fit.doubts)] or [("warnings", "none")]
+    rows += [("WARNING", text) for text in (*unconverged, *fit.warnings)] or [("warnings", "none")]
     rows += [("note", note) for note in fit.notes]
     if fit.next is not None:
         rows.append(("next", _describe_next(fit)))
@@ -99,21 +99,21 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
 
 
 def _assume_rigid(fit: DeviceFit) -> Recommendation | None:
-    """Return the wall recommended for a device without undetected resonances; None if this wall is not stiffer."""
+    """Return the wall recommended without undetected resonances; None if it is not stiffer than the recommended one."""
     recommended = replace(fit.scene, safe_limit=limit_walls(fit, rigid=True)).recommend()
     return recommended if recommended.stiffness > STIFFER * fit.recommended.stiffness else None
 
 
 def _describe_device(fit: DeviceFit) -> list[tuple[str, str]]:
     """Return pairs (label, text) that list the fitted parameters of the device with their 95 % confidence intervals."""
-    texts = [f"{symbol_of(name, fit.unit_system)} = {_format_estimate(fit, name)}" for name in fit.numbers[:2]]
+    texts = [f"{symbol_of(name, fit.unit_system)} = {_format_estimate(fit, name)}" for name in fit.parameter_names[:2]]
     texts.append(f"delay {_format_estimate(fit, 'delay')}")
     if "friction" in fit.errors:
         certain = math.isfinite(fit.errors["friction"])
         friction = f"friction {_format_estimate(fit, 'friction')}" if fit.friction else "no friction"
         texts.append(friction if certain else "friction not determined")
     rows = [("device", ", ".join(texts))]
-    for name in fit.numbers[3:]:
+    for name in fit.parameter_names[3:]:
         *owner, last = name.split(".")
         label = "actuator" if owner[0] == "actuator" else "resonance"
         text = f"{last.replace('_', ' ')} {_format_estimate(fit, name)}"
@@ -152,13 +152,13 @@ def _describe_residuals(fit: DeviceFit) -> str:
 
 
 def _describe_next(fit: DeviceFit) -> str:
-    """Return a text that describes the wall to measure next, and the expected standard error of K_max after that."""
+    """Return a text with the wall to measure next, and the standard error of K_max expected after its measurement."""
     step, units = fit.next, fit.unit_system
     assert step is not None, "only fits to walls at the onset of instability propose a next experiment"
     B, K = format_value("damping", step.virtual_damping, units, 3), format_value("stiffness", step.stiffness, units, 3)
     text = f"raise K at B = {B}, to about {K} and {with_unit(step.frequency, 'Hz', 3)}"
-    if math.isfinite(fit.stiffness_error + step.error_afterwards):
-        errors = [format_value("stiffness", error, units, 2) for error in (fit.stiffness_error, step.error_afterwards)]
+    if math.isfinite(fit.stiffness_error + step.stiffness_error):
+        errors = [format_value("stiffness", error, units, 2) for error in (fit.stiffness_error, step.stiffness_error)]
         text += f": decreases the standard error of K_max from {' to '.join(errors)}"
     return text
 
@@ -170,22 +170,22 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
         fit: the fit.
         source: name of the log, or number of walls, for the first line.
     """
-    rows, units = [("fitted to", source)], fit.unit_system
+    rows, units = [("data", source)], fit.unit_system
     count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
     gaps = sum(int(np.count_nonzero(np.diff(motion.time) > 1.5 * fit.period)) for motion in fit.motions)
     if gaps:
         where = "a gap" if gaps == 1 else f"each of {gaps} gaps"
         rows.append(
             (
-                "used",
-                f"{count:,} of {total:,} samples: those after {where} depend on forces that were not logged",
+                "samples",
+                f"{count:,} of {total:,} used: those after {where} depend on forces that were not logged",
             )
         )
-    elif any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
-        rows.append(("used", f"{count:,} of {total:,} samples, from the start; more would only reduce the errors"))
+    elif any(np.isnan(motion.modeled[-1]) for motion in fit.motions):
+        rows.append(("samples", f"{count:,} of {total:,} used, from the start; more would only reduce the errors"))
     if math.isfinite(fit.virtual_damping):
         B, error = (format_value("damping", value, units) for value in (fit.virtual_damping, fit.virtual_damping_error))
-        rows.append(("at K_max", f"B = {B} (standard error {error})"))
+        rows.append(("B at K_max", f"{B} (standard error {error})"))
     for name in ("friction", "offset"):
         if name in fit.errors and not math.isfinite(fit.errors[name]):
             rows.append(
@@ -193,27 +193,27 @@ def detail_fit(fit: DeviceFit, source: str) -> list[tuple[str, str]]:
             )
         elif name == "offset" and name in fit.errors:
             rows.append((name, f"{_format_estimate(fit, name)}, a constant force"))
-    rows += [("alternative", format_rival(rival, units)) for rival in fit.rivals]
+    rows += [("alternative", format_alternative(each, units)) for each in fit.alternatives]
     if fit.lag is not None:
         names = ("time_constant", "delay", "stiffness_max")
         lag, delay, K = (format_value(name, value, units, 3) for name, value in zip(names, fit.lag, strict=True))
         rows.append(
             ("alternative", f"an actuator lag of up to {lag}; at this lag the fitted delay is {delay} and K_max is {K}")
         )
-    if fit.is_doubted or fit.scene.safe_limit is None:
+    if fit.is_unreliable or fit.scene.safe_limit is None:
         return rows
     rows.append(("safe limit", fit.scene.safe_limit.describe(units)))
     if (wall := _assume_rigid(fit)) is not None:
-        kind = "no further resonances" if fit.is_structured else "a rigid device"
-        rows.append(("assuming", f"{kind}: {wall.spell_wall()}; {wall.spell_requirement()}"))
+        condition = "has no further resonances" if fit.is_structured else "is rigid"
+        rows.append(("stiffer wall", f"{wall.spell_wall()} if the device {condition}; {wall.spell_requirement()}"))
     return rows
 
 
-def format_rival(rival: RivalDevice, system: UnitSystem) -> str:
+def format_alternative(alternative: AlternativeDevice, system: UnitSystem) -> str:
     """Format the parameters and K_max of another device that fits equally well, in one line."""
     names = ("mass", "damping", "delay")
-    parts = {symbol_of(name, system): format_value(name, getattr(rival, name), system) for name in names}
-    parts[symbol_of("stiffness_max", system)] = format_value("stiffness", rival.stiffness_max, system)
+    parts = {symbol_of(name, system): format_value(name, getattr(alternative, name), system) for name in names}
+    parts[symbol_of("stiffness_max", system)] = format_value("stiffness", alternative.stiffness_max, system)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 
 
@@ -284,15 +284,15 @@ def write_scene(
         f"# Fitted to {source}: {_format_interval(fit, 'stiffness_max')} for K_max.",
         *(f"# Note: {note}" for note in fit.notes),
         *("version: 1", f"name: {_name_file(source)}", "scene:"),
-        *(f"  {_write_part(fit, key)}" for key in fit.numbers[:3]),
+        *(f"  {_write_part(fit, key)}" for key in fit.parameter_names[:3]),
         f"  period: {round_period(fit)!r} s # {origin}",
     ]
     if fit.actuator is not None:
         lines += ["  actuator:", f"    order: {fit.actuator.order} # fitted"]
-        lines += [f"    {_write_part(fit, name)}" for name in fit.numbers if name.startswith("actuator")]
+        lines += [f"    {_write_part(fit, name)}" for name in fit.parameter_names if name.startswith("actuator")]
     lines += ["  modes:"] if fit.modes else []
     for k in range(len(fit.modes)):
-        parts = [_write_part(fit, name) for name in fit.numbers if name.startswith(f"modes.{k}.")]
+        parts = [_write_part(fit, name) for name in fit.parameter_names if name.startswith(f"modes.{k}.")]
         lines += [f"    {'-' if j == 0 else ' '} {part}" for j, part in enumerate(parts)]
     for key, section in spell_estimate(fit.velocity, every=True).items():
         inside = ", ".join(f"{name}: {json.dumps(value).strip(chr(34))}" for name, value in section.items())

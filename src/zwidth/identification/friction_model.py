@@ -8,10 +8,10 @@ with the mass m, the damping b, the delay d in sampling periods T, a constant fo
 and v0 are the position and velocity at the first sample. In each period the delayed force F(t - d) changes once, at the
 fractional part f of the delay. The period therefore has two *parts* of durations f and 1 - f in which a is constant.
 
-Within a part the velocity approaches a/delta exponentially, so it reaches 0 at most once. At such a *stop* the mass
+Within a part the velocity approaches a/delta exponentially, so it reaches 0 at most once. At this *stop* the mass
 sticks if ``|g F + o| <= c``; otherwise it reverses. The time of the stop follows from a logarithm. Before and after it
-the velocity and position have a closed form in the phi-functions of `zwidth.numerics.held_mass`. The derivatives in the
-parameters are exact, too: a change dv of the velocity near the stop shifts its time by -dv/a.
+the velocity and position have a closed form in the phi-functions of `zwidth.numerics.held_mass`. The derivatives with
+respect to the parameters are exact, too: a change dv of the velocity near the stop shifts its time by -dv/a.
 
 Stops are computed one after another in Python; all other steps are vectorized, and linear recursions are solved by
 LAPACK. JAX is not used, because it would compile for seconds for every new length of a log.
@@ -29,7 +29,7 @@ import numpy as np
 
 from zwidth.numerics.held_mass import PhiFunctions, phi_functions
 
-# Column indices of the parameters in the derivatives of `Recording.move`.
+# Columns of the derivatives that `Recording.move` computes: index of each parameter.
 G = 0  # reciprocal mass g = T^2/m
 DELTA = 1  # damping delta = b T/m
 DELAY = 2  # delay d, in sampling periods
@@ -54,7 +54,7 @@ class SlipParts(NamedTuple):
 
 @dataclass(frozen=True)
 class ModelResponse:
-    """Sampled positions of a model, and their derivatives in the parameters; the derivatives are computed on demand."""
+    """Sampled positions of a model, and their derivatives with respect to the parameters, computed on demand."""
 
     position: np.ndarray
     differentiate: Callable[[], np.ndarray]
@@ -78,7 +78,7 @@ class Recording:
 
     @cached_property
     def recent_forces(self) -> np.ndarray:
-        """The later and the earlier one of the two forces that act in the period before each sample k if 0 <= d < 1.
+        """The two forces that act in the period before each sample k if 0 <= d < 1, the later one in the first row.
 
         The first row contains the force commanded at sample k - 1, the second row that at sample k - 2; forces before
         the log are 0. Two further columns repeat the last force, because a search may evaluate negative delays.
@@ -104,7 +104,7 @@ class Recording:
         offset: float = 0.0,
         friction: float = 0.0,
     ) -> ModelResponse:
-        """Simulate the mass under the forces of the log, and return its positions at the samples with positions.
+        """Simulate the mass under the forces of the log, and return its positions from sample ``skip`` on.
 
         The derivatives of the result have the columns `G` to `FRICTION`. The arguments are the symbols of the module,
         with times in sampling periods; ``offset`` is the acceleration o and ``friction`` the deceleration c.
@@ -159,11 +159,11 @@ def _integrate_with_friction(
     )
     acceleration = acceleration.T.ravel()
     gained = {s: s * by_forces - by_friction for s in (1.0, -1.0)}
-    # List the parts in which the forces exceed the friction, because a sticking mass starts to move in the next of
-    # these.
+    # List the parts in which the forces exceed the friction, because a sticking mass starts to move in the next one.
     able = np.flatnonzero(np.abs(acceleration) > friction)
     decay = np.exp(-delta * np.arange(count // 2 + 1))
-    # Tabulate the decay e^(-delta t) over the time t since the start of a first part, and of a second part.
+    # Tabulate the decay e^(-delta t) at all later starts of parts, with the time t counted from the start of the first
+    # or of the second part of a period.
     decays = [np.outer(decay, [1.0, each]).ravel() for each in slow]
     # In the loop, part m starts with velocity v in the direction s. `changes` collects the parts at whose start the
     # direction changes, with the new direction.
@@ -178,8 +178,8 @@ def _integrate_with_friction(
             m, v = int(able[after]), 0.0
             s = 1.0 if acceleration[m] > 0 else -1.0
             changes.append((m, s))
-        # Search for the next part at whose end s v <= 0, in windows of increasing size, because the next stop is
-        # usually near.
+        # Search for the next part at whose end s v <= 0. Test parts in blocks of increasing size, because the next stop
+        # is usually near.
         gain, decay, first, size = gained[s], decays[m % 2], m + 1, 128
         ahead = s * v - gain.item(m)  # the term s v_m - G_m of the formula above
         while first <= count:
@@ -194,22 +194,23 @@ def _integrate_with_friction(
         v, forced, part = s * max(0.0, gain.item(k) + ahead * decay.item(k - m)), acceleration.item(k), k % 2
         m, h, a = k + 1, spans.item(part), forced - s * friction
         if not (a * s < 0.0 and h > 0.0):
-            # Continue without a stop if the mass does not decelerate, because the sign of s v at the end of the part is
-            # then a rounding error.
+            # Continue without a stop if the mass does not decelerate, because s v <= 0 at the end of the part is then a
+            # rounding error.
             v = slow[part] * v + rates[part] * a
             continue
         # Compute the time from the start of the part to the stop: first without damping, then corrected for damping.
         before = -v / a
         before = min(log1p(delta * before) / delta if delta else before, h)
         rest, s = h - before, -s if abs(forced) > friction else 0.0
-        # Compute the velocity at the end of the part, starting from rest at the stop.
+        # Compute the velocity that a mass starting from rest at the stop has at the end of the part.
         v = (-expm1(-delta * rest) / delta if delta else rest) * (forced - s * friction) if s else 0.0
         stops.append((k, before, s, v))
         changes.append((k + 1, s))
     starts, directions = np.array(changes).T
     direction = np.repeat(directions, np.diff(np.append(starts, count)).astype(int))
     sticks = direction == 0
-    # Recompute all velocities by a linear recursion, now that the directions and stops are known.
+    # Recompute all velocities by a linear recursion, because the loop has computed only those at starts of motion and
+    # at stops.
     factors = np.where(sticks, 0.0, np.tile(slow, count // 2))
     added = np.tile(rates, count // 2) * (acceleration - direction * friction)
     added[sticks] = 0.0
@@ -263,8 +264,8 @@ def _integrate_positions(
     def differentiate() -> np.ndarray:
         # The axes of ``by`` are: displacement or end velocity; parameter; part; period.
         by = _differentiate_segment(phi, delta, span, v, a, force, direction, sticks)
-        # Compute the derivatives of the end velocity and of the displacement in the start velocity, and the
-        # acceleration v' at the end. The end velocity of a sticking mass does not depend on its start velocity.
+        # Compute the derivatives of the end velocity and of the displacement with respect to the start velocity, and
+        # the acceleration v' at the end. The end velocity of a sticking mass does not depend on its start velocity.
         velocity_by_v, moved_by_v, rate = np.where(sticks, 0.0, phi.c), by[1, OFFSET].copy(), a - delta * end
         if t.size:
             rate[k] = a_after - delta * end[k]
@@ -278,8 +279,9 @@ def _integrate_positions(
                 phi_after, delta, r, 0.0 * r, a_after, force[k], direction_after, sticks_after
             )
             by[0][:, *k], by[1][:, *k] = before[0] + shift * before[1] + after[0], velocity_shift * before[1] + after[1]
-        # A longer delay extends the first part and shortens the second one. Therefore the derivatives in the delay are
-        # the velocity and the acceleration at the end of the part, negative for the second part.
+        # A longer delay extends the first part and shortens the second one. Therefore the derivatives of displacement
+        # and end velocity with respect to the delay are the velocity and the acceleration at the end of the part, with
+        # a negative sign for the second part.
         by[:, DELAY] = np.array([end, rate]) * [[1.0], [-1.0]]
         # Combine the derivatives of the two parts of each period, and compute those of the velocities at the start of
         # all periods by a recursion.
@@ -305,7 +307,7 @@ def _differentiate_segment(phi: PhiFunctions, delta: float, t: np.ndarray, *segm
 
     Returns:
         An array of shape (2, 7, ...). The first axis is displacement and end velocity, the second the parameters `G` to
-        `FRICTION`. The derivatives in the delay and in the initial state are 0.
+        `FRICTION`. The derivatives with respect to the delay and the initial state are 0.
     """
     v, a, force, direction, sticks = segment
     minus_phi2_slope = np.where(delta * t == 0, 1.0 / 6.0, phi.gap / np.where(delta * t == 0, 1.0, delta * t))

@@ -205,7 +205,7 @@ def _classify_axis(words: Sequence[str]) -> bool | None:
 
 
 def _find_parts(heads: Sequence[str]) -> Column | None:
-    """Find the two columns of a time split into seconds and nano- or microseconds; None if there is no such pair."""
+    """Find the two columns of a time split into seconds and nanoseconds or microseconds; None if none exist."""
     words = [_split_words(head) for head in heads]
     pairs = [
         (i, j)

@@ -1,7 +1,7 @@
 """Fit a device to a log of its free motion under a commanded force.
 
 The steps are: read and repair the logs (`identification.recordings`); fit the positions by least squares
-(`identification.output_error`) with the model structure that Schwarz's criterion selects
+(`identification.output_error`) with the model structure that the Bayesian information criterion (BIC) selects
 (`identification.model_selection`); refuse logs whose motion the force does not explain; test the residuals for white
 noise; and bound undetected resonances and actuator lags (`identification.unmodeled_dynamics`,
 `identification.unmodeled_lag`). ``theta`` is the parameter vector of `identification.extended_model`. A *stretch* is a
@@ -20,7 +20,7 @@ from zwidth.core.errors import InputError
 from zwidth.core.status import Status
 from zwidth.core.types import ArrayLike
 from zwidth.identification.causes import Cause, explain_motion, explain_residuals
-from zwidth.identification.device_estimate import compute_reach, differentiate
+from zwidth.identification.device_estimate import compute_coverage_factor, differentiate
 from zwidth.identification.device_fit import (
     BEYOND,
     MASS_OPEN,
@@ -50,7 +50,8 @@ _LONGEST = 20  # largest delay of the search by default, in sampling periods
 _USUAL = {False: (2e-3, 10.0, 3.0, 1e3), True: (1e-8, 10.0, 100.0, 300.0)}
 _FEWEST = 20  # least number of fitted positions per stretch; shorter stretches are omitted
 _FEW = 60  # number of fitted positions below which a warning is issued, because very different devices may fit them
-# Largest number of fitted positions of all logs. More would need gigabytes of memory and only reduce the errors.
+# Largest number of fitted positions of all logs together. More positions would need gigabytes of memory, and would only
+# reduce standard errors that are already small.
 _MOST = 200_000
 _FINER = 0.3  # an encoder step is excluded if the residuals are at most this share of its quantization noise (RMS)
 _SEEN = 5.0  # least effect of the force on the positions, in standard errors; smaller effects are refused
@@ -77,8 +78,8 @@ def fit_log(
     The model is ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, with zero-order hold of the force; the positions
     are fitted by least squares. The constant force f0 and the friction F_c are always fitted. This increases the errors
     of the other parameters, but omitting f0 or F_c when they are hardly visible could bias the other parameters by many
-    standard errors. An actuator lag of first or second order and resonances are added if Schwarz's criterion requires
-    them.
+    standard errors. An actuator lag of first or second order and resonances are added if the Bayesian information
+    criterion (BIC) requires them.
 
     Args:
         time: times of the samples in s, evenly spaced, or only the sampling period. The parts before and after missing
@@ -97,7 +98,7 @@ def fit_log(
 
     Returns:
         DeviceFit: ``friction`` and ``offset`` have errors NaN if the log does not distinguish the two forces, as for
-        motion in one direction only. ``doubts`` are warnings, for example about a unit; with a warning there is no safe
+        motion in one direction only. ``warnings`` may concern a unit, for example; with a warning there is no safe
         wall. ``status`` is UNREACHABLE if the delay is at the end of the search range; NOT_CONVERGED if the search did
         not converge; UNDECIDED, with K_max NaN, if the residuals are not white noise. ``response`` limits the safe wall
         for a device with undetected resonances.
@@ -128,9 +129,9 @@ def fit_log(
         >>> import numpy as np
         >>> import zwidth
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 2), zwidth.Timing(period=1e-3))
-        >>> push = np.where(np.arange(400) % 60 < 30, 1.0, -1.0)
-        >>> motion = zwidth.simulate(scene, 0.0, 0.0, push_history=push, periods=400)
-        >>> fit = zwidth.fit_log(1e-3, motion.position[:400], push)
+        >>> force = np.where(np.arange(400) % 60 < 30, 1.0, -1.0)
+        >>> motion = zwidth.simulate(scene, 0.0, 0.0, external_force_history=force, periods=400)
+        >>> fit = zwidth.fit_log(1e-3, motion.position[:400], force)
         >>> print(f"{fit.mass * 1e3:.1f} g, {fit.damping:.2f} N s/m")
         100.0 g, 2.00 N s/m
     """
@@ -163,8 +164,8 @@ def _fit(
         if not parts:
             most = max((each.stop - each.start for each in find_even(places[k], 1)), default=1)
             raise InputError(
-                f"time: log {k + 1} has {most} samples without a gap, of which the first {skip} only provide past "
-                f"forces; at least {skip + _FEWEST} are needed: record longer, or give a shorter max_delay"
+                f"time: log {k + 1} has {most} samples without a gap; at least {skip + _FEWEST} are needed, "
+                f"because the first {skip} only provide past forces: record longer, or give a shorter max_delay"
             )
     count = sum(map(len, stretches))
     recordings = tuple(
@@ -189,7 +190,7 @@ def _fit(
     ).T
     from_period = period_error * period * by_period
     covariance = by_theta @ best.covariance[of_device, of_device] @ by_theta.T + np.outer(from_period, from_period)
-    freedom = max(1, best.count - theta.size)
+    degrees_of_freedom = max(1, best.count - theta.size)
     unexplained = _find_unexplained(best, pole, period, system) if bank else []
     warnings = step_warnings + warnings + _list_warnings(scene, np.sqrt(np.diag(covariance)), best, logs) + unexplained
     status = Status.OK if best.converged else Status.NOT_CONVERGED
@@ -206,20 +207,20 @@ def _fit(
     analyses: dict[str, Any] = {}
     if bank and not unexplained:
         analyses = {"response": bound_response(best, scene, bank), "hidden": sample_resonances(best, scene, bank)}
-        analyses |= {"lag": bound_lag(best, lags, scene, compute_reach(freedom))}
+        analyses |= {"lag": bound_lag(best, lags, scene, compute_coverage_factor(degrees_of_freedom))}
     return DeviceFit(
         nominal=scene,
         covariance=covariance,
-        errors_of_log={"offset": offset[1], "friction": friction[1]},
+        force_errors={"offset": offset[1], "friction": friction[1]},
         offset=offset[0],
         friction=friction[0],
         resolution=step,
         motions=motions,
         noise=float(np.sqrt(best.variance)),
-        residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
-        doubts=(*warnings, *check_period_unit(period)),
+        residuals=np.concatenate([motion.position - motion.modeled for motion in motions]),
+        warnings=(*warnings, *check_period_unit(period)),
         status=int(status),
-        freedom=freedom,
+        degrees_of_freedom=degrees_of_freedom,
         notes=notes,
         **analyses,
     )
@@ -266,13 +267,13 @@ def _convert_force(best: FittedModel, k: int) -> tuple[float, float]:
     value, indices = best.theta[k] / g, [0, k]
     slope = np.array([-value / g, 1.0 / g])
     error = float(np.sqrt(slope @ best.covariance[np.ix_(indices, indices)] @ slope))
-    # Report a friction at the lower bound of the search as 0, because the search does not reach 0 itself.
+    # Report a friction at the lower bound of the search as 0, because this bound is slightly above 0.
     is_zero = k == -1 and value <= 2.0 * MIN_FRICTION * best.model.largest_force
     return 0.0 if is_zero else float(value), error
 
 
 def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[list[float], list[str]]:
-    """List the candidates for the encoder step, coarsest first, and warnings about a step that the user specified.
+    """List the candidates for the encoder step, largest first, and warnings about a step that the user specified.
 
     Positions near integer multiples of a step need not be those of an encoder: under a constant force, the positions of
     a sensor without steps may have this property, too. Only the residuals distinguish the two cases. 0 is the candidate
@@ -297,7 +298,7 @@ def _list_steps(resolution: Any, read: ReadLogs, system: UnitSystem) -> tuple[li
 
 
 def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[float]) -> tuple[float, Choice]:
-    """Fit the device with one candidate of the encoder step after another, until the residuals do not exclude it.
+    """Fit the device with each candidate for the encoder step in turn, until the residuals agree with a candidate.
 
     Args:
         recordings: the logs.
@@ -316,8 +317,8 @@ def _choose_step(recordings: tuple[Recording, ...], longest: float, steps: list[
 def _refuse_unmoved(best: FittedModel, period: float, system: UnitSystem) -> None:
     """Raise `InputError` if the commanded force explains too little of the motion, or the fitted mass is negative."""
     model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
-    # Fit the positions by the free motion from the initial states, without any force. The amount by which the fitted
-    # model reduces the residuals of the free motion is the effect of the forces.
+    # Fit the positions by the motion without forces, with free initial states. The effect of the forces is the amount
+    # by which the fitted model reduces the residuals of this motion.
     alone = model.simulate(np.append(theta[:-2], [0.0, 0.0])).derivatives[:, model.parts.stop : -2]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
@@ -388,7 +389,7 @@ def _list_warnings(scene: Scene, errors: np.ndarray, best: FittedModel, logs: tu
         )
     size = float(residuals @ residuals)
     if size <= EXACT**2 * residuals.size * span**2:
-        # Residuals that are only rounding errors require no further warnings.
+        # Return without further warnings, because the residuals are only rounding errors.
         return warnings
     if damping == 0:
         warnings.append(
@@ -430,9 +431,9 @@ def _build_motions(
     """
     motions, parts = [], iter(best.model.split(best.response.position))
     for log, place, slices in zip(logs, places, stretches, strict=True):
-        modelled = np.full(log.force.size, np.nan)
+        modeled = np.full(log.force.size, np.nan)
         for each in slices:
             part = next(parts)
-            modelled[each.start + skip : each.start + skip + part.size] = part
-        motions.append(FittedMotion(period * place, log.force, log.position, modelled))
+            modeled[each.start + skip : each.start + skip + part.size] = part
+        motions.append(FittedMotion(period * place, log.force, log.position, modeled))
     return tuple(motions)

@@ -1,11 +1,12 @@
-"""Select the structure of a device by Schwarz's criterion: a rigid mass, or one with an actuator lag and resonances.
+"""Select the structure of a device by the BIC: a rigid mass, or a mass with an actuator lag and resonances.
 
-Starting from the rigid mass, a score test of the residuals (`identification.unmodeled_dynamics`,
-`identification.unmodeled_lag`) decides whether the model lacks a pole or a lag. If so, all models with one *part* more
-are fitted: an actuator lag of the next order, or a resonance (*mode*) at one of the frequencies with the highest
-scores. Schwarz's criterion (BIC, Schwarz 1978) selects the model with the lowest sum of the *misfit*,
--2 log(likelihood), and log(N) per parameter, for N positions. Then the residuals are tested again. ``theta`` is the
-parameter vector of `identification.extended_model.Recordings`.
+Starting from the rigid mass, a score test of the residuals (`zwidth.identification.unmodeled_dynamics`,
+`identification.unmodeled_lag`)
+decides whether the model lacks a pole or a lag. If so, all models with one *part* more are fitted: an actuator lag of
+the next order, or a resonance (*mode*) at one of the frequencies with the highest scores. The Bayesian information
+criterion (BIC, Schwarz 1978) selects the model with the lowest sum of the *misfit*, -2 log(likelihood), and log(N) per
+parameter, for N positions. Then the residuals are tested again. ``theta`` is the parameter vector of
+`zwidth.identification.extended_model.Recordings`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _FIRST_STEPS = 20  # largest number of Levenberg-Marquardt steps from each initi
 _FURTHER_STEPS = 40  # largest number of further steps, from the best result for each structure
 ALIKE = 1.5  # largest autocorrelation measure `FittedModel.excess` of residuals that count as white noise
 EXACT = 1e-9  # RMS residual, relative to the range of positions, below which residuals are rounding errors
-# Reduction of the misfit that two superfluous parameters exceed with a probability of 5 % (chi-square).
+# Reduction of the misfit that two unnecessary parameters exceed by chance with a probability of 5 % (chi-square).
 _BY_CHANCE = 5.99
 # Initial values of the parameters of an actuator lag.
 _TIME_CONSTANTS = (0.3, 1.5)  # time constants, in sampling periods
@@ -54,22 +55,22 @@ def choose_structure(best: FittedModel) -> Choice:
     if float(best.residuals @ best.residuals) <= EXACT**2 * best.residuals.size * span**2:
         return best, None, None, None
     rigid = best, pole, bank, lags = _test_residuals(best)
-    rival = None
+    alternative = None
     for _ in range(_MAX_PARTS):
-        # Use the test for lags as well, because it detects lags that the scores of the poles do not reveal: it does not
-        # estimate the amplitude of their effect, which is known.
+        # Use the test for lags as well, because it is more sensitive to lags than the scores of the poles: the
+        # amplitude of the effect of a lag is known, so this test does not estimate it.
         has_lag = lags is not None and lags.projection.max() ** 2 > 2.0 * np.log(best.count)
-        if bank is None or rival or (pole is None and not has_lag):
+        if bank is None or alternative or (pole is None and not has_lag):
             break
-        larger, rival = _add_part(best, bank)
+        larger, alternative = _add_part(best, bank)
         if larger is None:
             break
         best, pole, bank, lags = _test_residuals(larger)
-    if best is rigid[0] or not (rival or (pole is None and best.excess <= ALIKE)):
+    if best is rigid[0] or not (alternative or (pole is None and best.excess <= ALIKE)):
         return rigid
     best = fit_nonnegative(best.model, best.theta)
     is_determined = best.converged and not best.inverse.undetermined[: best.model.parts.stop].any()
-    return (best, rival or pole, bank, lags) if is_determined else rigid
+    return (best, alternative or pole, bank, lags) if is_determined else rigid
 
 
 def _test_residuals(best: FittedModel) -> Choice:
@@ -83,7 +84,7 @@ def _test_residuals(best: FittedModel) -> Choice:
 
 
 def _add_part(best: FittedModel, bank: PoleBank) -> tuple[FittedModel | None, HiddenPole | None]:
-    """Fit all models with one part more than ``best``, and return the one that Schwarz's criterion selects.
+    """Fit all models with one part more than ``best``, and return the one that the BIC selects.
 
     A weak resonance has nearly the same effect on the positions as a lag, which has fewer parameters, but its K_max is
     very different. Therefore a resonance that fits significantly better than the selected lag is returned as well.

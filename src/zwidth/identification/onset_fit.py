@@ -22,12 +22,12 @@ from zwidth.identification.device_fit import (
     BEYOND,
     MASS_OPEN,
     VAGUE,
+    AlternativeDevice,
     DeviceFit,
-    FurtherExperiment,
-    RivalDevice,
+    NextMeasurement,
     check_period_unit,
 )
-from zwidth.identification.fit_report import format_rival
+from zwidth.identification.fit_report import format_alternative
 from zwidth.identification.onset_model import Onsets
 from zwidth.identification.onset_search import (
     AS_GOOD,
@@ -95,8 +95,8 @@ def fit_buzz(
 
     Returns:
         DeviceFit: if B at K_max exceeds the largest measured B, the interval of K_max includes the K measured there.
-        ``status``: UNDECIDED if other devices fit equally well (``rivals``); NO_BOUNDARY if no rigid device has the
-        walls on its boundary, K_max is then NaN.
+        ``status``: UNDECIDED if other devices fit equally well (``alternatives``); NO_BOUNDARY if no rigid device has
+        the walls on its boundary, K_max is then NaN.
 
     Raises:
         InputError: an invalid number, or a missing experiment, which the message names.
@@ -142,8 +142,8 @@ def fit_buzz(
     best, equals = rigid_fit.best, rigid_fit.equals
     scale = rigid_fit.scale
     refusal = None
-    if noise_pair and best.squares > chdtri(rigid_fit.freedom, CHANCE):
-        ratio = plain(np.sqrt(best.squares / rigid_fit.freedom), 2)
+    if noise_pair and best.squares > chdtri(rigid_fit.degrees_of_freedom, CHANCE):
+        ratio = plain(np.sqrt(best.squares / rigid_fit.degrees_of_freedom), 2)
         refusal = (
             f"no rigid device has these walls: residuals are {ratio} times the noise; check K, B and f, or fit a log "
             "for lags and resonances"
@@ -169,11 +169,12 @@ def fit_buzz(
         # theta, in standard errors, is then at most AS_GOOD.
         if all((step := other.theta - one) @ information @ step > AS_GOOD for one in distinct):
             distinct.append(other.theta)
-    rivals = tuple(_describe_rival(rigid_fit.scene(theta)) for theta in distinct[1:])
-    if rivals:
+    alternatives = tuple(_describe_alternative(rigid_fit.scene(theta)) for theta in distinct[1:])
+    if alternatives:
         status = Status.UNDECIDED
         warnings.append(
-            f"another device fits equally well: {format_rival(rivals[0], system)}; add the measurement proposed as next"
+            f"another device fits equally well: {format_alternative(alternatives[0], system)}; "
+            "add the measurement proposed as next"
         )
     if refusal:
         warnings.append(refusal)
@@ -193,17 +194,17 @@ def fit_buzz(
         covariance=covariance,
         noise=noise_pair or (float(np.sqrt(scale)), float(np.sqrt(scale))),
         residuals=best.residuals / np.sqrt(scale),
-        doubts=(*warnings, *check_period_unit(period)),
+        warnings=(*warnings, *check_period_unit(period)),
         status=int(status),
-        freedom=None if noise_pair else rigid_fit.freedom,
-        rivals=rivals,
-        damping_tried=damping,
-        stiffness_tried=stiffness,
+        degrees_of_freedom=None if noise_pair else rigid_fit.degrees_of_freedom,
+        alternatives=alternatives,
+        measured_damping=damping,
+        measured_stiffness=stiffness,
     )
     if further is None or status == Status.NO_BOUNDARY:
         return fit
-    after = further.error_afterwards if fit.stiffness_max > 0 else np.nan
-    return replace(fit, next=further._replace(error_afterwards=after))
+    after = further.stiffness_error if fit.stiffness_max > 0 else np.nan
+    return replace(fit, next=further._replace(stiffness_error=after))
 
 
 def _read_points(
@@ -250,7 +251,7 @@ def _read_points(
         )
         rows = kept
     table = np.array(rows)
-    # Compare differences of B with K/w, the typical size of B, because all measured B may be 0 or close to 0.
+    # Compare differences of B with K/(2 pi f), a typical size of B, because all measured B may be 0 or close to 0.
     unit = table[0, 0] / (2 * np.pi * table[0, 2])
     if np.ptp(table[:, 1]) <= SAME * max(unit, np.abs(table[:, 1]).max()):
         count = "one wall does" if len(table) == 1 else f"{len(table)} walls of one damping do"
@@ -275,16 +276,16 @@ def _read_noise(noise: Any) -> tuple[float, float] | None:
     return float(pair[0]), float(pair[1])
 
 
-def _describe_rival(scene: Scene) -> RivalDevice:
+def _describe_alternative(scene: Scene) -> AlternativeDevice:
     """Return mass, damping, delay and K_max of the device of a scene, as an alternative that fits equally well."""
-    return RivalDevice(scene.mass, scene.damping, scene.timing.delay, float(scene.max_stiffness().stiffness))
+    return AlternativeDevice(scene.mass, scene.damping, scene.timing.delay, float(scene.max_stiffness().stiffness))
 
 
 def _estimate_delay_step(derivatives: np.ndarray, best: Candidate) -> float:
     """Return the delay that least squares would choose if it were not fixed at 0, in standard errors.
 
     Args:
-        derivatives: weighted derivatives of the residuals in theta, one row per residual.
+        derivatives: weighted derivatives of the residuals with respect to theta, one row per residual.
         best: fit with the delay fixed at 0; its residuals are assumed to have variance 1.
     """
     inverse = np.linalg.pinv(derivatives)[2]
@@ -297,7 +298,7 @@ def _require_identifiability(
     """Raise `InputError` if the walls do not determine mass, damping and delay.
 
     Args:
-        derivatives: weighted derivatives of the residuals in theta, one row per residual.
+        derivatives: weighted derivatives of the residuals with respect to theta, one row per residual.
         theta: parameters of the best device.
         table: walls, shape (walls, 3), with the columns K, B and f.
         on_boundary: True if the walls are on the stability boundary of the best device.
@@ -319,7 +320,7 @@ def _require_identifiability(
 
 def _propose_measurement(
     rigid_fit: RigidFit, stiffness_max: float, information: np.ndarray, wanted: np.ndarray, precision: np.ndarray
-) -> FurtherExperiment | None:
+) -> NextMeasurement | None:
     """Return the further wall whose measurement would reduce the standard error of K_max most; None if none exists.
 
     The candidates are on the stability boundary of the fitted device, with B >= 0.
@@ -328,13 +329,13 @@ def _propose_measurement(
         rigid_fit: the fit to the measured walls.
         stiffness_max: K_max of the fitted device in N/m.
         information: information matrix of theta from the measured walls.
-        wanted: derivatives of K_max in theta.
+        wanted: derivatives of K_max with respect to theta.
         precision: inverse variances of ln K and ln f.
     """
     onsets, theta = rigid_fit.onsets, rigid_fit.best.theta
     scene, period = rigid_fit.scene(theta), onsets.period
     w = np.linspace(0.0, np.pi, ANGLES + 2)[1:-1]
-    # Add low frequencies, because the stability boundary of a slow loop extends to them.
+    # Extend the uniform grid to low frequencies, because loops with long delay or weak damping become unstable there.
     w = np.concatenate([np.geomspace(1e-4, w[0], 60)[:-1], w])
     stiffness, damping = scene.boundary(w / period)
     # Exclude walls softer than a tenth of K_max, because their onset of instability is hard to measure.
@@ -348,7 +349,7 @@ def _propose_measurement(
     added = np.einsum("nki,k,nkj->nij", rows, precision, rows)
     after = np.linalg.solve(information + added, wanted[:, None])[..., 0] @ wanted
     best = int(np.argmin(after))
-    return FurtherExperiment(
+    return NextMeasurement(
         float(damping[best]),
         float(stiffness[best]),
         float(w[best] / (2 * np.pi * period)),

@@ -40,7 +40,7 @@ class PredictedWalls(NamedTuple):
     converged: np.ndarray  # mask of the walls for which the iteration converged
     differentiate: Callable[
         [], np.ndarray
-    ]  # function that returns the derivatives of ln kappa and ln w in theta, shape (walls, 2, 3)
+    ]  # function that returns the derivatives of ln kappa and ln w with respect to theta, shape (walls, 2, 3)
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ class Onsets:
             )
             step = np.clip(-residual / slope, -LONGEST * w, LONGEST * w)
             w = np.minimum(w + step, 0.5 * (w + np.pi))
-            # This condition also ends the iteration for walls whose step is NaN, because it then stays NaN and the
-            # comparison is false.
+            # Walls with a NaN step do not prolong the iteration, because comparisons with NaN are false. Their step
+            # stays NaN.
             if not np.any(np.abs(step) > CONVERGED * w):
                 break
         points = circle_points(w)
@@ -107,13 +107,14 @@ class Onsets:
             longest: largest delay d in the grid.
             count: largest number of initial values.
         """
-        # At fixed delta and d, the cost is quadratic in ln m, so that the mean of the real parts is the optimal ln m.
         from scipy.ndimage import minimum_filter
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)
         points = circle_points(self.w)
         q = CriticalController(deltas[:, None, None], delays[:, None]).evaluate_rigid(points).value
         errors = np.log((self.kappa + self.scaled_damping * self._estimate.jet(points).value) / q)
+        # At fixed delta and d, the cost is quadratic in ln m, so that the optimal ln m is the mean of the real parts of
+        # the logarithms.
         log_mass = errors.real.mean(-1)
         cost = (errors.imag**2).sum(-1) + ((errors.real - log_mass[..., None]) ** 2).sum(-1)
         lowest = np.argwhere(cost == minimum_filter(cost, 3, mode="constant", cval=np.inf))

@@ -58,7 +58,7 @@ def is_rank_deficient(derivatives: np.ndarray) -> bool:
 
 def _list_dampings(onsets: Onsets) -> np.ndarray:
     """Return the grid of initial values of delta: `DELTAS`, extended downward if a measured frequency is low."""
-    # Extend the grid to values of delta at which the lowest measured frequency w can occur, because at B = 0 a device
+    # Extend the grid down to values of delta at which the lowest measured frequency w can occur: at B = 0 a device
     # becomes unstable near w^2 = delta/(d + 1/2).
     ratio = DELTAS[1] / DELTAS[0]
     more = np.ceil(np.log(DELTAS[0] / (0.1 * float(onsets.w.min()) ** 2)) / np.log(ratio))
@@ -152,10 +152,10 @@ class RigidFit(NamedTuple):
     @property
     def scale(self) -> float:
         """Noise variance of the weighted residuals: 1 if the noise is given; otherwise their estimated variance."""
-        return 1.0 if self.known_noise else max(self.best.squares / self.freedom, EXACT**2)
+        return 1.0 if self.known_noise else max(self.best.squares / self.degrees_of_freedom, EXACT**2)
 
     @property
-    def freedom(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """Degrees of freedom of the fit: two residuals per wall minus three unknowns."""
         return 2 * self.onsets.w.size - 3
 
@@ -197,7 +197,7 @@ def find_device(onsets: Onsets, weights: np.ndarray, known_noise: bool) -> Rigid
 
 @np.errstate(all="ignore")
 def _is_onset(fit: RigidFit, candidate: Candidate) -> bool:
-    """Return whether the fitted walls are at the onset of instability.
+    """Return whether all fitted walls of a candidate are at the onset of instability.
 
     The walls of a candidate have a pole on the unit circle. That is not sufficient, because another pole may already be
     unstable.

@@ -11,8 +11,8 @@ The constant force and the friction are always fitted. A fit without them has sm
 valid only if both forces are 0. In a test in which a selection criterion omitted the forces, the damping was wrong by
 up to 179 of its standard errors.
 
-A *rival* is a second minimum of the sum of squares, with about the same value. The *misfit* is -2 log(likelihood); for
-N positions with white noise of unknown variance, it is N log(sum of squares), up to a constant.
+An *alternative* is a second minimum of the sum of squares, with about the same value. The *misfit* is -2
+log(likelihood); for N positions with white noise of unknown variance, it is N log(sum of squares), up to a constant.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from zwidth.identification.quantization_noise import MeasurementNoise
 _DELTAS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0)  # damping delta = b T/m
 # Initial values of the friction, relative to the largest force.
 _FRICTIONS = np.array([0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.35])
-# Least friction of the search, relative to the largest force. It is not 0, because the derivative of the positions in
-# the friction is 0 at this value.
+# Least friction of the search, relative to the largest force. It is not exactly 0, because the model then omits
+# friction, so that the derivative of the positions with respect to the friction would be 0.
 MIN_FRICTION = 1e-12
 _N_LEADING = 600  # number of leading positions of each log from which the initial values are computed
 _BATCH_SIZE = 32  # number of delays per batch, to limit the memory
@@ -57,12 +57,11 @@ _NEGLIGIBLE_DAMPING = 1e-6  # value below which a decreasing damping is set to 0
 _MAX_DAMPING = 1e12  # damping above which the search ends
 
 # Limits that decide whether the log can distinguish friction from a constant force.
-# A motion counts as one in a single direction if the path traveled backward is less than this share of the whole path.
+# A motion counts as single-directional if the path traveled backward is less than this share of the whole path.
 _BACKWARD_SHARE = 0.1
-# A fit without friction is tried as a rival if the squared ratio of the friction to its standard error is below this
-# number.
+# A fit without friction is tried as an alternative if (friction/standard error)^2 is below this limit.
 _NEARLY_FRICTIONLESS = 900.0
-_EXCLUDED = 25.0  # a rival whose misfit exceeds that of the best fit by this much does not enlarge the covariance
+_EXCLUDED = 25.0  # an alternative whose misfit exceeds the best one by this much does not enlarge the covariance
 # An initial motion counts as invisible if its length is below this number of standard deviations of the noise.
 _INVISIBLE_DISTANCE = 3.0
 # Numerical limits and a significance level.
@@ -73,7 +72,7 @@ _Fixed = tuple[int, ...]  # indices of the parameters in theta that keep their i
 
 
 class ColumnsInverse(NamedTuple):
-    """Pseudo-inverse of the normalized derivatives of the positions in theta, with results of the decomposition."""
+    """Pseudo-inverse of the normalized derivatives of the positions with respect to theta, and their column space."""
 
     matrix: np.ndarray  # pseudo-inverse, one row per parameter
     undetermined: np.ndarray  # mask of the parameters that the positions do not determine
@@ -93,7 +92,7 @@ class FittedModel:
     theta: np.ndarray
     squares: float  # sum of the squared weighted residuals
     converged: bool
-    rivals: tuple[FittedModel, ...] = ()
+    alternatives: tuple[FittedModel, ...] = ()
 
     @property
     def count(self) -> int:
@@ -102,7 +101,7 @@ class FittedModel:
 
     @cached_property
     def response(self) -> ModelResponse:
-        """The modeled positions of all logs and their derivatives in theta."""
+        """The modeled positions of all logs and their derivatives with respect to theta."""
         return self.model.simulate(self.theta)
 
     @cached_property
@@ -127,9 +126,9 @@ class FittedModel:
 
     @cached_property
     def columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """The weighted derivatives of the positions in theta, each column divided by its norm, and these norms.
+        """The weighted derivatives of the positions with respect to theta, in normalized columns, and their norms.
 
-        A column that is zero, such as the derivative in v0 of a sticking mass, is divided by 1 instead.
+        A zero column, such as the derivative with respect to v0 for a sticking mass, stays zero; its norm is set to 1.
         """
         columns = self.model.weigh(self.response.derivatives)
         sizes = np.linalg.norm(columns, axis=0)
@@ -163,20 +162,20 @@ class FittedModel:
         return self.count * np.log(ratio)
 
     def fits_as_well_as(self, other: FittedModel) -> bool:
-        """Return whether Schwarz's criterion (BIC) prefers this model to ``other``, which has more parameters."""
+        """Return whether the BIC (Schwarz 1978) prefers this model to ``other``, which has more parameters."""
         return self.compare_misfit(other) < max(1, other.inverse.rank - self.inverse.rank) * np.log(self.count)
 
     @cached_property
     def excess(self) -> float:
-        """The factor by which autocorrelation increases the variance of sums of residuals; 1 if it is not significant.
+        """The factor by which autocorrelation increases the variance of sums of residuals; 1 if the test finds none.
 
         The value is the mean square of sums of successive residuals, divided by that expected from the noise model.
         """
-        # Form sums of 2 N^(1/3) successive residuals, with N their number. This is a usual bandwidth for errors with
-        # unknown autocorrelation (Newey, West 1987).
         from scipy.special import chdtri
 
         weights, total = self.model.noise or self.noise, self.residuals.size
+        # Form sums of 2 N^(1/3) successive residuals, with N the number of all residuals. This is a usual bandwidth for
+        # errors with unknown autocorrelation (Newey, West 1987).
         size = int(2 * np.ceil(total ** (1 / 3)))
         starts = np.arange(0, total - size + 1, size)
         sums = np.add.reduceat(weights.weigh(self.residuals)[: starts[-1] + size], starts)
@@ -190,32 +189,33 @@ class FittedModel:
     def covariance(self) -> np.ndarray:
         """The covariance of theta, NaN for parameters that are not determined.
 
-        It accounts for the autocorrelated errors of the encoder, for the excess of the residuals, and for rivals.
+        It accounts for the autocorrelated errors of the encoder, for the excess of the residuals, and for alternatives.
         """
         (columns, sizes), weigh = self.columns, self.model.weigh
-        # Use the pseudo-inverse instead of products of the derivatives, because these lose half of the digits.
+        # Use the pseudo-inverse of the derivatives, because the inverse of the normal matrix loses half of the digits.
         inverse, undetermined, _ = self.inverse
         gram_inverse = inverse @ inverse.T
         covariance = self.excess * (gram_inverse @ self.noise.spread(weigh(columns)) @ gram_inverse)
         covariance = covariance / np.outer(sizes, sizes)
         covariance[undetermined], covariance[:, undetermined] = np.nan, np.nan
-        for rival in self.rivals:
+        for alternative in self.alternatives:
             determined = ~undetermined & np.diag(covariance > 0)
             scales, block = np.sqrt(np.diag(covariance)[determined]), np.ix_(determined, determined)
-            away = (rival.theta - self.theta)[determined]
+            away = (alternative.theta - self.theta)[determined]
             steps = away / scales
             correlation = covariance[block] / np.outer(scales, scales)
             predicted = float(steps @ np.linalg.lstsq(correlation, steps, rcond=None)[0])
-            actual = max(rival.compare_misfit(self) / self.excess, 1.0)
-            # The misfit may increase less between the minimum and the rival than the derivatives predict, because the
-            # sum of squares has a kink between them. If so, enlarge the covariance in this direction until both agree.
+            actual = max(alternative.compare_misfit(self) / self.excess, 1.0)
+            # The misfit may increase less between the minimum and the alternative than the derivatives predict, because
+            # the sum of squares has a kink between them. If so, enlarge the covariance in this direction until both
+            # agree.
             if actual < min(predicted, _EXCLUDED):
                 covariance[block] += (1.0 / actual - 1.0 / predicted) * np.outer(away, away)
         return covariance
 
 
 def fit_model(model: Recordings) -> FittedModel:
-    """Fit a model without lag and modes by least squares, and find its rivals."""
+    """Fit a model without lag and modes by least squares, and find its alternatives."""
     start = _select_start(model, _list_starts(model))
     best = _fit(model, start, (), NEARLY if model.resolution else _CONVERGED)
     if model.resolution:
@@ -223,32 +223,32 @@ def fit_model(model: Recordings) -> FittedModel:
         model = replace(model, noise=best.noise)
         best = _fit(model, best.theta)
     # If the mass moves in one direction only, and rests before or after, the log determines only the sum of the
-    # constant force and the friction. Then set one of them to 0. Try such a fit also if the mass moves backward a
-    # little, because the noise may cause this motion.
+    # constant force and the friction. In this case set one of both to 0. Try such a fit also if the mass moves backward
+    # a little, because noise may cause this backward motion.
     steps = np.diff(best.response.position)
     direction = float(np.sign(steps.sum()))
     if -np.sum(steps, where=direction * steps < 0) * direction < _BACKWARD_SHARE * np.abs(steps).sum():
         g, total = best.theta[0], best.theta[-2] - direction * best.theta[-1]
-        # Attribute the sum of both forces to the constant force if it acts in the direction of motion, and to friction
-        # otherwise.
+        # Attribute the sum of both forces to the constant force if the sum acts in the direction of motion, and to
+        # friction otherwise.
         if direction * total > 0:
             parts, omitted = (total, MIN_FRICTION * abs(g) * model.largest_force), -1
         else:
             parts, omitted = (0.0, -direction * total), -2
         start = np.append(best.theta[:-2], parts)
-        rival = _fit(model, start, (omitted,))
-        if rival.inverse.undetermined[-2:].all() and rival.fits_as_well_as(best):
-            return rival
-    # Compare with a fit without friction, because the standard error of a small friction may be wrong: at friction 0,
-    # where the mass ceases to rest, the sum of squares has a kink, and it may increase less there than the derivatives
-    # predict.
+        alternative = _fit(model, start, (omitted,))
+        if alternative.inverse.undetermined[-2:].all() and alternative.fits_as_well_as(best):
+            return alternative
+    # Compare with a fit without friction, because the standard error of a small friction may be wrong: at friction 0
+    # the mass no longer sticks, so the sum of squares has a kink there, and may increase less toward it than the
+    # derivatives predict.
     if best.theta[-1] ** 2 < _NEARLY_FRICTIONLESS * best.covariance[-1, -1]:
         start = best.theta - np.nan_to_num(best.covariance[:, -1]) * best.theta[-1] / best.covariance[-1, -1]
         start[-1] = MIN_FRICTION * abs(start[0]) * model.largest_force
         frictionless = fit_nonnegative(model, start, (-1,))
         if best.fits_as_well_as(frictionless):
-            return replace(best, rivals=(frictionless,))
-        return replace(frictionless, rivals=(best,))
+            return replace(best, alternatives=(frictionless,))
+        return replace(frictionless, alternatives=(best,))
     return best
 
 
@@ -272,7 +272,7 @@ def _list_starts(model: Recordings) -> list[np.ndarray]:
     )
 
     def search(deltas: tuple[float, ...]) -> tuple[float, int]:
-        """Return the damping of ``deltas`` and the integer delay with the least sum of squares."""
+        """Return the damping in ``deltas`` and the integer delay that together yield the least sum of squares."""
         tried = []
         for delta, some in product(deltas, np.array_split(np.arange(most + 1), 1 + most // _BATCH_SIZE)):
             rows = np.swapaxes(_simulate_rows(early, delta, 0.0, base)[:, samples - some[:, None]], 0, 1)
@@ -287,19 +287,19 @@ def _list_starts(model: Recordings) -> list[np.ndarray]:
 
     delta, d = search(_DELTAS)
     starts = [minimize_squares(model, start(delta, d), (-1,), tolerance=_NEAR)[0]]
-    # Linearize the positions at the constant force of the first initial value, to compute the other initial values.
+    # Compute the other initial values from positions that are linearized at the constant force of the first one.
     base[-2] = starts[0][-2] / starts[0][0]
     for friction in _FRICTIONS * model.largest_force:
         base[-1] = friction
-        # Omit dampings above that found for the previous, smaller friction, because friction then explains more of the
-        # energy loss. Allow one grid step more as a margin.
+        # Omit dampings above the one selected for the previous, smaller friction, because a larger friction explains
+        # more of the energy loss. Keep the next larger damping of the grid as a margin.
         delta, d = search(_DELTAS[: _DELTAS.index(delta) + 2])
         starts.append(minimize_squares(model, start(delta, d), (-1,), tolerance=_NEAR)[0])
     return starts
 
 
 def _simulate_rows(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.ndarray:
-    """Simulate the positions for g = 1 and their derivatives in the linear parameters, as basis of a linear fit.
+    """Simulate the positions for g = 1, and their derivatives with respect to x0, v0 and o, as basis of a linear fit.
 
     Args:
         model: the logs, with a model without lag and modes.
@@ -308,8 +308,8 @@ def _simulate_rows(model: Recordings, delta: float, d: float, base: np.ndarray) 
         base: a theta that contains the initial states, o and c, divided by g.
 
     Returns:
-        An array with one sample per column. The rows are the positions, their derivatives in x0 and v0 of each log, and
-        that in o.
+        An array with one sample per column. The rows are the positions, and their derivatives with respect to x0 and v0
+        of each log and to o.
     """
     response = model.simulate(np.array([1.0, delta, d, *base[3:]]))
     return np.vstack([response.position, response.derivatives[:, 3:-1].T])
@@ -353,8 +353,8 @@ def _fit(model: Recordings, start: np.ndarray, fixed: _Fixed = (), tolerance: fl
         fixed: indices of the parameters that keep their initial values.
         tolerance: tolerance of the search, as in `minimize_squares`.
     """
-    # Treat initial motions that friction stops within the noise separately: the derivative of the positions in such an
-    # initial velocity is almost 0, so that the search converges slowly.
+    # Treat initial motions that end within the noise of the positions separately: the derivative of the positions with
+    # respect to such an initial velocity is almost 0, so that the search converges slowly.
     best = fit_nonnegative(model, start, fixed, tolerance)
     speed, (_, delta, *_, friction) = np.abs(best.theta[model.velocity_indices]), best.theta
     # Approximate the distance to the stop by a formula that is exact without damping, v^2/(2 c), and without friction,
@@ -411,7 +411,7 @@ def minimize_squares(
     for _ in range(most):
         derivatives = model.weigh(response.derivatives)
         sizes = np.linalg.norm(derivatives, axis=0)
-        # Change only parameters that have an effect on the positions and would not leave their bounds.
+        # Let the step change only parameters that have an effect on the positions and would not leave their bounds.
         descent = derivatives.T @ residuals
         free = (sizes > 0) & ((theta > low) | (descent > 0)) & ((theta < high) | (descent < 0))
         sizes = sizes[free]

@@ -11,6 +11,8 @@ variance of one sample is sigma^2 + q^2/12.
 At rest, all samples have the same error, and ordinary least squares would fit this error as if it were motion.
 Therefore the positions are divided into *stretches* whose motion is shorter than one encoder step, and the mean of
 each stretch is weighted according to its variance.
+
+The *rounding step* of a column is the resolution to which its numbers were rounded when the log was written.
 """
 
 from __future__ import annotations
@@ -26,8 +28,8 @@ _WAVES = 40  # number of terms h; the omitted ones, about 1.5 % of q^2/12, are t
 _MIN_WEIGHT = 1e-6  # smallest w_h that is included, relative to the variance of a sample
 # Constants of the detection of the encoder step. Positions are integer multiples of it, plus a common offset.
 _MAX_OFFSET = 0.02  # largest distance of a position from an integer multiple of the encoder step, in steps
-# The same distance for the rounding step of a column, in rounding steps. It is smaller, because only rounding errors of
-# float64 contribute to it.
+# Largest distance of a number from an integer multiple of the rounding step, in rounding steps. It is smaller than
+# `_MAX_OFFSET`, because only rounding errors of float64 contribute to it.
 _MAX_ROUNDING_OFFSET = 1e-4
 # Least encoder step that is detected, in rounding steps of the column. Smaller encoder steps are hidden by the
 # rounding.
@@ -44,14 +46,18 @@ def find_steps(position: np.ndarray) -> tuple[float, float]:
     column contains encoder counts, both steps are equal.
     """
     values = np.unique(position)
-    # Tolerate this rounding error, because the subtraction of the common offset from the positions causes it.
+    # Tolerate errors of this size, because the subtraction of the common offset from the positions causes rounding
+    # errors.
     error = 16.0 * float(np.spacing(np.abs(values).max()))
     column = _find_lattice(values, _MAX_ROUNDING_OFFSET, error)
     return _find_lattice(values, _MAX_OFFSET, max(column, error)) or column, column
 
 
 def find_resolution(position: np.ndarray) -> float:
-    """Detect the encoder step: the largest step of which all positions are multiples plus an offset; 0 if none."""
+    """Detect the encoder step: the largest step of which all positions are integer multiples, up to a common offset.
+
+    The result is 0 if no such step exists.
+    """
     return find_steps(position)[0]
 
 
@@ -74,8 +80,8 @@ def _find_lattice(values: np.ndarray, off: float, slack: float) -> float:
     picks = (values - values[0])[np.unique(np.geomspace(1, values.size - 1, _PICKS).astype(int))]
     while rest.size and span <= _MAX_STEPS * (least := float(rest.min())) and least >= (_ROUNDINGS - 1.0) * slack:
         step = smallest = float(np.mean(rest[rest <= least + 2.0 * slack]))
-        # Refine the step by distances of n steps: the error of distance/n decreases with n. Use the distances in
-        # ascending order, because n can only be determined if the step is already accurate enough.
+        # Refine the step by distances between values that are n steps apart: the error of distance/n decreases with n.
+        # Use the distances in ascending order, because a larger n requires a more accurate step.
         for distance in picks.tolist():
             step = distance / max(1.0, np.round(distance / step))
         chance = (2.0 * max(off, slack / step)) ** (values.size - 1)
@@ -133,11 +139,11 @@ class MeasurementNoise:
 
     @property
     def count(self) -> int:
-        """The effective number of samples: expected sum of squares of the weighted errors over ``variance``."""
+        """The effective number of samples: the expected sum of squared weighted errors, divided by ``variance``."""
         return int(self.position.size + np.sum(1.0 - self._rests[-1]))
 
     def weigh(self, columns: np.ndarray) -> np.ndarray:
-        """Weight columns with one row per sample: scale the mean of each stretch to the variance of white noise.
+        """Weight an array with one row per sample: scale the mean of each stretch to the variance of white noise.
 
         Deviations from the mean of a stretch do not change.
         """
@@ -149,7 +155,7 @@ class MeasurementNoise:
         return weighed
 
     def spread(self, columns: np.ndarray) -> np.ndarray:
-        """Return the covariance ``J^T C J`` of linear combinations of the errors; C is the covariance of the samples.
+        """Return the covariance ``J^T C J`` of linear combinations of the errors, with coefficients J and covariance C.
 
         Args:
             columns: the matrix J, one row per sample and one column per linear combination.

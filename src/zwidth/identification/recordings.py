@@ -23,13 +23,14 @@ from zwidth.units.unit_system import UnitSystem
 # Largest accepted deviation of a time from the fitted line, in sampling periods.
 _UNEVEN = 0.05  # deviation that is always accepted
 _JITTER = 0.25  # deviation accepted if the user allows timestamp jitter; smaller than a missing sample causes
-# Largest difference between the sampling periods of two logs: relative to the period, plus a number of standard errors.
+# Largest accepted difference between the sampling periods of two logs: a share of the period plus a number of standard
+# errors.
 _SAME = 1e-5  # relative to the period
 _SURE = 5.0  # number of standard errors
 # A warning is issued if position or force is constant at its maximum or minimum for this number of samples.
 _STUCK = 25
-# A force that stays at its maximum or minimum counts as varying elsewhere if the number of its other distinct values
-# exceeds this share of the number of samples.
+# A warning about a constant extreme value of the force also requires that the force varies elsewhere: the number of its
+# other distinct values must exceed this share of the number of samples.
 _MANY = 0.1
 _MISSING = 1.5  # ratio of a time step to the median time step above which samples are missing
 

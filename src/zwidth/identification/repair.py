@@ -18,7 +18,7 @@ from zwidth.identification.quantization_noise import find_resolution, find_steps
 from zwidth.units.formatting import plain, with_unit
 from zwidth.units.unit_system import UnitSystem
 
-# Times in s after which common clocks and counters roll over, by description.
+# Times in s after which common clocks and counters roll over, keyed by the descriptions that notes contain.
 _ROLLOVERS = {
     "a 32-bit counter of microseconds": 2.0**32 * 1e-6,
     "a 32-bit counter of milliseconds": 2.0**32 * 1e-3,
@@ -53,11 +53,11 @@ _SMOOTH = 8.0  # first limit, in typical second differences (their 99 % quantile
 _NEAR_WRAP = 0.05  # second limit, relative to the modulus; also the relative tolerance of jumps of equal size
 _SPAN = 0.5  # least jump that counts as a wrap if the modulus is unknown, relative to the range of the positions
 
-# Detection of times that a coarse clock has rounded to its ticks. They are recognized by time steps that differ from
-# the median time step.
-_FEW_ODD = 5  # least number of such steps; fewer may be caused by missing samples
-# Number of such steps that proves the rounding. The errors of the times may then have a range of 1.1 instead of 1.02
-# ticks, because timestamp jitter can add to the rounding errors.
+# Constants of the detection of times that a coarse clock has rounded to its ticks. Rounding causes time steps that
+# differ from the median time step.
+_FEW_ODD = 5  # least number of these time steps; missing samples may cause fewer
+# Number of time steps different from the median from which on rounding is certain. The errors of the times may then
+# have a range of 1.1 instead of 1.02 ticks, because timestamp jitter can add to the rounding errors.
 _MANY_ODD = 20
 _COARSEST = 10.0  # largest tick of a clock whose times are repaired, in sampling periods
 
@@ -170,7 +170,7 @@ def _unroll(clock: np.ndarray, notes: list[str]) -> np.ndarray:
             f"time: the time decreases by {with_unit(-float(jumps[0]), 's')} after sample {timed[k]}; sort the rows, "
             "or save each record to a separate file"
         )
-    # Choose the clock with which the time step across the rollover is closest to the median time step.
+    # Choose the clock for which the corrected time step across the rollover is closest to the median time step.
     name, span = min(fitting.items(), key=lambda item: abs(float(np.median(jumps)) + item[1] - usual))
     unrolled = clock.copy()
     # Correct only the rows with a time, so that missing times stay NaN.
@@ -262,7 +262,7 @@ def find_modulus(position: np.ndarray, step: float, system: UnitSystem) -> float
             continue
         bends = np.abs(np.diff(unwrap(places, modulus), 2))
         typical = float(np.quantile(bends, 0.99)) if bends.size else 0.0
-        # Compute the larger one of the two second differences that contain the step across each wrap.
+        # Compute for each wrap the larger one of the two second differences that contain the step across the wrap.
         around = np.maximum(*(np.append(bends, 0.0)[np.clip(events - k, 0, bends.size)] for k in (0, 1)))
         smooth = around <= np.maximum(_SMOOTH * typical, _NEAR_WRAP * modulus)
         if smooth.mean() > 0.5:
@@ -337,7 +337,7 @@ def find_glitches(position: np.ndarray, modulus: float = 0.0) -> np.ndarray:
     wild = np.zeros(position.size, bool)
     if position.size < 4 * _REACH or not moving.size:
         return wild
-    # Add some encoder steps to the limit, because single steps cause most of the second differences in slow motion.
+    # Add several encoder steps to the limit, because in slow motion most second differences are single encoder steps.
     limit = _FAR * float(np.quantile(moving, 0.9)) + _STEPS * float(moving.min())
     # Estimate the usual difference of successive positions by a running median, on which glitches have no effect.
     usual = _filter_median(moves, _REACH + 1)

@@ -1,11 +1,11 @@
 """Estimate a frequency response with its deviation from records of commanded force and sampled position.
 
-A *stretch* is a part of a log in which the same period of the force repeats at least twice. A *record* is the mean over
-the periods of one stretch; if there is only one stretch, each of its periods is a record. Let U be the spectrum of the
-force of a record, and Y that of its position without drift. At each frequency of the force (a *line*), the response is
-``G = sum Y conj(U)/sum |U|^2``, with sums over the records. Its standard error is estimated from the residuals Y - G U;
-it therefore contains the errors of encoder, friction and noise (Pintelon, Schoukens 2012). The *deviation* of the
-response is a multiple of the standard error. A force that does not repeat is analyzed by spectra averaged over
+A *stretch* is a part of a log that contains at least two equal successive periods of the force. A *record* is the mean
+over the periods of one stretch; if there is only one stretch, each of its periods is a record. Let U be the spectrum of
+the force of a record, and Y that of its position without drift. At each frequency of the force (a *line*), the response
+is ``G = sum Y conj(U)/sum |U|^2``, with sums over the records. Its standard error is estimated from the residuals
+Y - G U; it therefore contains the errors of encoder, friction and noise (Pintelon, Schoukens 2012). The *deviation* of
+the response is a multiple of the standard error. A force that does not repeat is analyzed by spectra averaged over
 overlapping segments (Welch 1967). w is the frequency in rad per sample.
 """
 
@@ -65,7 +65,7 @@ class ResponseEstimate:
         cycle: period of the force in s; None for a force that is not periodic.
         records: number of stretches of periodic force, or number of segments of a force that is not periodic.
         noise: standard deviation of a sampled position in m, for a periodic force.
-        doubts: warnings, one sentence each.
+        warnings: sentences about questionable measurements.
         notes: interpretations of the columns of the logs and repairs of their rows, one clause each.
     """
 
@@ -75,7 +75,7 @@ class ResponseEstimate:
     cycle: float | None
     records: int
     noise: float
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
 
@@ -102,7 +102,7 @@ def respond(
 
     Returns:
         ResponseEstimate: ``device``, with a deviation of 4.5 standard errors; ``period``, ``coherence``, ``cycle``,
-        ``records``, ``noise``, ``doubts``.
+        ``records``, ``noise``, ``warnings``.
 
     Raises:
         InputError: times are uneven, force or position never changes, or the motion does not follow the force.
@@ -121,7 +121,7 @@ def respond(
         >>> import zwidth
         >>> record = zwidth.excite(period=1e-3, force=2.0, resolution=1e-5, duration=15)
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 5), zwidth.Timing(period=1e-3))
-        >>> motion = zwidth.simulate(scene, 0.0, 0.0, push_history=record.force, periods=record.force.size)
+        >>> motion = zwidth.simulate(scene, 0.0, 0.0, external_force_history=record.force, periods=record.force.size)
         >>> estimate = zwidth.respond(1e-3, motion.position[: record.force.size], record.force)
         >>> f"{estimate.device.frequency.size} lines from {estimate.records} stretches"
         '409 lines from 5 stretches'
@@ -218,7 +218,7 @@ def _find_period(force: np.ndarray) -> int | None:
 
 
 def _find_repeats(force: np.ndarray, count: int) -> list[tuple[int, int]]:
-    """Find the stretches of the force in which a period of ``count`` samples occurs at least twice.
+    """Find the stretches of the force in which a period of ``count`` samples occurs at least twice in succession.
 
     Returns:
         For each stretch the index of its first sample, and that of its last sample plus 1.
@@ -349,8 +349,8 @@ def _average_segments(logs: tuple[Recording, ...], period: float, warnings: list
     w = 2.0 * np.pi * np.arange(2, size // 2) / size
     G = both / forces / (1.0 - np.exp(-1j * w))
     error = np.abs(G) * np.sqrt((1.0 - np.minimum(coherence, 1.0)) / np.maximum(coherence, 1e-300) * _OVERLAP / pieces)
-    # Add the error of the averaging over neighboring lines by the window. It is proportional to the second difference
-    # of the response of the acceleration, u G, with u = |1 - e^(-jw)|^2.
+    # Add the bias that the window causes, because it averages the response over neighboring lines. This bias is
+    # proportional to the second difference of u G, the response of the acceleration, with u = |1 - e^(-jw)|^2.
     u = 4.0 * np.sin(0.5 * w) ** 2
     bend = np.abs(np.diff(u * G, 2))
     deviation = SURE * error + np.pad(bend, 1, mode="edge") / u

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 # Numbers of significant digits to which values are rounded.
 EXACT_DIGITS = 12  # digits of parameters without a standard error
-PERIOD_DIGITS = 7  # digits of sampling periods derived from timestamps, which no clock exceeds in accuracy
+PERIOD_DIGITS = 7  # digits of sampling periods derived from timestamps, because no clock is more accurate
 LIMIT_DIGITS = 4  # digits of the safe limit, as many as are printed for a wall
-# Texts that describe the status of a fit. Its warnings contain the details.
+# Texts that describe the status of a fit in short. The warnings of the fit contain the details.
 _STATUS_TEXTS = {
     Status.NOT_CONVERGED: "the search did not converge",
     Status.NO_BOUNDARY: "no device has all of these walls on its stability boundary",
@@ -58,13 +58,13 @@ def round_scene(fit: DeviceFit) -> Scene:
     # Replace the sampling period before the delay, because a change of the period also changes a delay that is
     # specified in periods.
     nominal = replace(nominal, timing=replace(nominal.timing, period=round_period(fit)))
-    return nominal.replace(**{name: round_parameter(fit, name) for name in fit.numbers})
+    return nominal.replace(**{name: round_parameter(fit, name) for name in fit.parameter_names})
 
 
 def describe_status(fit: DeviceFit) -> str:
     """Return a text that describes the status of a fit; "" if the status is OK."""
     status = Status(fit.status)
-    if status == Status.UNDECIDED and not fit.rivals:
+    if status == Status.UNDECIDED and not fit.alternatives:
         return "the residuals are not white noise"
     return "" if status == Status.OK else _STATUS_TEXTS.get(status, status.message)
 
@@ -76,9 +76,9 @@ def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
         fit: the fit.
         rigid: assume that the device has no resonances other than the fitted ones, as in `DeviceFit.safe_wall`.
     """
-    if fit.is_doubted:
+    if fit.is_unreliable:
         text = describe_status(fit)
-        return SafeLimit(0.0, reason=text or "resolve the warnings first", warnings=fit.doubts)
+        return SafeLimit(0.0, reason=text or "resolve the warnings first", warnings=fit.warnings)
     wall = fit.safe_wall(rigid=rigid)
     if wall.status != Status.OK or not wall.stiffness > 0:
         return SafeLimit(0.0, reason="the fitted parameters are too uncertain for any wall; record longer")
@@ -101,9 +101,9 @@ def _explain_limit(fit: DeviceFit, wall: SafeWall) -> str:
         near = with_unit(wall.resonance, "Hz", 3)
         hidden = f"a resonance near {near}, undetectable in the log, may make stiffer walls unstable"
         return f"{hidden}; {advise_record(fit)}"
-    if fit.damping_tried is not None and wall.virtual_damping >= fit.damping_tried:
+    if fit.measured_damping is not None and wall.virtual_damping >= fit.measured_damping:
         unit = fit.unit_system["N s/m"]
-        measured = with_unit(fit.damping_tried, unit)
+        measured = with_unit(fit.measured_damping, unit)
         remedy = "" if fit.next is None else f", such as B = {with_unit(fit.next.virtual_damping, unit, 3)}"
         return (
             f"no wall with B > {measured} was measured, and an undetected resonance may make such walls unstable; "
@@ -113,7 +113,7 @@ def _explain_limit(fit: DeviceFit, wall: SafeWall) -> str:
 
 
 def advise_record(fit: DeviceFit) -> str:
-    """Return a text that advises to record another log, with the command that designs the force for it."""
+    """Return a text that advises recording another log, with the command that designs the force for this log."""
     force = max(float(np.abs(motion.force).max()) for motion in fit.motions)
     options = {
         "rate": with_unit(1.0 / round_period(fit), "Hz"),

@@ -35,9 +35,10 @@ from zwidth.units.display import compact_repr
 from zwidth.units.quantities import SI_RANGE
 
 _SAMPLES = 8000  # largest number of random devices
-# Number of random devices, in multiples of ``LinearLoop.draws``, which is smaller for loops that are slow to compute.
-_SEARCHED = 5  # if the devices are used to search for the wall
-_CONFIRMED = 2  # if the devices are only used to confirm a wall
+# Numbers of random devices, in multiples of ``LinearLoop.draws``, a number that is smaller for loops that are slow to
+# compute.
+_SEARCHED = 5  # devices used to search for the wall
+_CONFIRMED = 2  # devices used only to confirm a wall
 _ACCURACY = 1e-3  # relative accuracy of K at which the bisection ends
 _NEGLIGIBLE = 1e-4  # K relative to the K_max of the devices below which no wall is reported
 _BELOW = 1e-9  # relative reduction of K, so that the device that limits the wall is not exactly on its boundary
@@ -90,9 +91,11 @@ def find_safe_wall(fit: DeviceEstimate, reliability: float, rigid: bool) -> Safe
         return _find_structured_wall(fit, reliability, rigid, drawn)
     filtered = scene.velocity != BackwardDifference()
     devices = (
-        _SearchedDevices(drawn, fit) if filtered else _RigidDevices(scene, dict(zip(fit.numbers, drawn.T, strict=True)))
+        _SearchedDevices(drawn, fit)
+        if filtered
+        else _RigidDevices(scene, dict(zip(fit.parameter_names, drawn.T, strict=True)))
     )
-    most = np.inf if rigid or fit.damping_tried is None else fit.damping_tried
+    most = np.inf if rigid or fit.measured_damping is None else fit.measured_damping
     (stiffness, virtual_damping), resonance = devices.find(reliability, most), np.nan
     if virtual_damping == most:
         # Limit K to a lower confidence limit of the K measured at this B, because an undetected resonance may lower the
@@ -140,7 +143,7 @@ def _find_structured_wall(fit: DeviceEstimate, reliability: float, rigid: bool, 
 
 def is_stable_with_resonances(fit: DeviceEstimate, stiffness: float, virtual_damping: float) -> bool:
     """Return whether a wall and all softer walls with the same B are stable with every undetected resonance."""
-    if fit.damping_tried is not None and virtual_damping > fit.damping_tried:
+    if fit.measured_damping is not None and virtual_damping > fit.measured_damping:
         return False
     scene = fit.response_scene
     if scene is None or stiffness == 0:

@@ -5,7 +5,8 @@ noise of variance ``sigma^2``. The *signature* of a mode or lag is the part of i
 change of the fitted parameters ``theta`` (`identification.extended_model.Recordings`) reproduces. A mode of *mass
 ratio* r has the modal mass ``m/(r sqrt(1 - zeta^2))``, with the mass m of the device and the damping ratio zeta of the
 mode; r is negative if actuator and sensor are on opposite sides of a node. A *unit mode* has mass ratio 1. J are the
-derivatives of the positions in theta, W the weights of the samples. Unless stated otherwise, times are in sampling
+derivatives of the positions with respect to theta, W the weights of the samples. Unless stated otherwise, times are in
+sampling
 periods and frequencies are relative to the sampling rate.
 
 The candidates are a bank of poles: a grid of frequencies for each of a few damping ratios, and real poles for actuator
@@ -14,8 +15,8 @@ effect. K_max is the maximum stiffness of a wall. The steps are explained in doc
 
 1. Score: the reduction of the sum of squares, in sigma^2, if the real and imaginary part of the force filtered by the
    pole are added to the model (Rao 1948). It is a chi-square variable if no pole is missing.
-2. Detection: `detect_missing_pole` returns the pole of the highest score if it satisfies Schwarz's criterion (BIC,
-   Schwarz 1978) for white noise and for the autocorrelated errors of the encoder.
+2. Detection: `detect_missing_pole` returns the pole of the highest score if it satisfies the Bayesian information
+   criterion (BIC, Schwarz 1978) for white noise and for the autocorrelated errors of the encoder.
 3. Bound: if no pole is detected, |r| is at most ``(sqrt(score) + 4)/size``, with ``size = |s|/sigma`` of the unit mode.
    `bound_response` computes the largest change of the response by such a mode, a radius that limits the safe walls.
 4. Averaging: with ``t = s'e/(sigma^2 size)``, the likelihood ratio of a device with one more mode to one without it is
@@ -53,8 +54,8 @@ MAX_FREQUENCY = 0.49  # highest natural frequency in the bank, just below the Ny
 # (actuator lags).
 FREQUENCY_SPACING = {LEAST_DAMPING_RATIO: 1.01, 0.03: 1.06, 0.2: 1.06, 1.0: 1.06}
 BOUNDED_RATIOS = (LEAST_DAMPING_RATIO, 0.03)  # damping ratios of the undetected modes that `bound_response` considers
-# A pole counts as absorbed if the part of the filtered force that is orthogonal to the weighted derivatives of the
-# positions in theta is smaller than this share of its norm.
+# A pole counts as absorbed if the part of the filtered force that is orthogonal to the weighted derivatives J is
+# smaller than this share of the norm of the filtered force.
 ABSORBED_NORM = 1e-6
 
 # Constants of the detection of a missing pole.
@@ -73,8 +74,8 @@ N_NEIGHBORS = 15  # number of poles on each side whose scores determine the loca
 MIN_RESPONSE_FREQUENCY = 2e-4  # lowest frequency of the grid
 N_BELOW_BANK = 40  # number of grid frequencies below the lowest frequency of the bank
 BAND_PHASE_STEP = 0.3  # rad; largest phase change by the delay between neighboring frequencies in `bound_response`
-# Largest such phase change in `sample_resonances`, in rad. It is smaller, because the linear interpolation between the
-# frequencies requires a finer grid.
+# The same limit for `sample_resonances`, in rad: the largest phase change by the delay between neighboring frequencies.
+# It is smaller than `BAND_PHASE_STEP`, because the response is interpolated linearly between the frequencies.
 INTERPOLATION_PHASE_STEP = 0.06
 # Distances of the additional grid points from a resonance frequency, in half-widths of the resonance.
 RESONANCE_OFFSETS = np.sinh(np.linspace(-4.0, 4.0, 61))
@@ -88,7 +89,7 @@ N_SAMPLES = 200  # number of resonances that are sampled from the posterior dist
 
 
 class HiddenResonances(NamedTuple):
-    """The posterior odds of one undetected resonance, and the maximum stiffness with each of its samples."""
+    """The posterior odds of one undetected resonance, and the maximum stiffness for each sample of this resonance."""
 
     odds: float  # posterior odds of one more resonance against none
     stiffness_max: np.ndarray  # K_max with each sampled resonance, relative to K_max without it; equally likely values
@@ -141,7 +142,7 @@ def detect_missing_pole(fit: FittedModel) -> tuple[HiddenPole | None, PoleBank]:
         fit: The fitted model, at the minimum of its sum of squares.
 
     Returns:
-        The pole with the highest score that satisfies Schwarz's criterion (BIC), or None; and the scores of all poles.
+        The pole with the highest score that satisfies the BIC, or None; and the scores of all poles.
     """
     fit = truncate_logs(fit)
     basis, residuals = fit.inverse.basis, fit.model.weigh(fit.residuals)
@@ -149,7 +150,7 @@ def detect_missing_pole(fit: FittedModel) -> tuple[HiddenPole | None, PoleBank]:
     noise_variance = fit.variance * fit.excess
     bank = _score_poles(fit, basis, residuals, noise_variance)
     squares = float(residuals @ residuals)
-    # Schwarz's criterion (BIC) requires that each further parameter reduces -2 log(likelihood) by log(count). A complex
+    # The BIC requires that each further parameter reduces -2 log(likelihood) by log(count). A complex
     # pole adds two real parameters for the pole and two amplitudes, a real pole one of each. Both therefore add two
     # parameters per amplitude.
     threshold_per_amplitude = 2.0 * np.log(fit.count)
@@ -199,7 +200,7 @@ def bound_response(fit: FittedModel, scene: Scene, bank: PoleBank) -> MeasuredDe
     response, derivatives = _evaluate_response(fit, scene.timing.period, grid)
     deviation = np.zeros(grid.size)
     for poles in banks:
-        # Subtract the change of the response by the bias of theta, because an undetected mode has biased the fit.
+        # Subtract the change of the response that the bias of theta causes, because an undetected mode biases the fit.
         bias = poles.absorbed[:, : fit.model.parts.stop] @ derivatives.T
         change = _evaluate_unit_modes(fit, grid, poles.frequency[:, None], poles.ratio[:, None]) - bias
         deviation = np.maximum(deviation, np.max(np.abs(change) * poles.bound_mass_ratios()[:, None], 0))
@@ -207,7 +208,7 @@ def bound_response(fit: FittedModel, scene: Scene, bank: PoleBank) -> MeasuredDe
 
 
 def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenResonances | None:
-    """Compute the posterior odds of one undetected resonance, and K_max for samples of it.
+    """Compute the posterior odds of one undetected resonance, and K_max for random samples of this resonance.
 
     Args:
         fit: The fitted model.
@@ -219,7 +220,7 @@ def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenR
     """
     odds, modes, mass_ratio = _draw_modes(bank.select(bank.ratio < 1.0))
     # The first sample has mass ratio 0 and represents the device without a further mode. Its K_max is the reference for
-    # those of the other samples.
+    # the K_max of the other samples.
     frequency, damping_ratio = modes.frequency[:, None], modes.ratio[:, None]
     # Evaluate the response of each sample on a common grid joined with a fine grid around its resonance.
     common = _build_frequency_grid(scene, INTERPOLATION_PHASE_STEP)[None]
@@ -228,7 +229,7 @@ def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenR
     responses, period = [], scene.timing.period
     for grid in (common, local):
         response, derivatives = _evaluate_response(fit, period, grid)
-        # Subtract the change of the response by the bias of theta, because an undetected mode has biased the fit.
+        # Subtract the change of the response that the bias of theta causes, because an undetected mode biases the fit.
         bias = (derivatives @ modes.absorbed[:, : fit.model.parts.stop, None])[..., 0]
         change = _evaluate_unit_modes(fit, grid, frequency, damping_ratio) - bias
         responses.append(response + mass_ratio[:, None] * change)
@@ -304,7 +305,7 @@ def _evaluate_unit_modes(fit: FittedModel, grid: np.ndarray, frequency: np.ndarr
 
 
 def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frequency response of the fitted device, and its derivatives in the device parameters of theta.
+    """Return the frequency response of the fitted device, and its derivatives with respect to the device parameters.
 
     Args:
         fit: The fitted model.
@@ -333,7 +334,7 @@ def truncate_logs(fit: FittedModel) -> FittedModel:
     """Return a copy of the fit with the same theta and only the first `MAX_SAMPLES` positions of each log."""
     if max(log.position.size for log in fit.model.logs) <= MAX_SAMPLES:
         return fit
-    part = replace(fit, model=fit.model.truncate(MAX_SAMPLES), rivals=())
+    part = replace(fit, model=fit.model.truncate(MAX_SAMPLES), alternatives=())
     part = replace(part, squares=float(part.residuals @ part.residuals))
     return replace(part, model=replace(part.model, noise=part.noise)) if fit.model.noise is not None else part
 

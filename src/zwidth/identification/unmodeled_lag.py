@@ -70,14 +70,14 @@ def score_lags(fit: FittedModel) -> LagTest:
     return LagTest(lags, norms / error, signatures.T @ residuals / norms / error, theta)
 
 
-def bound_lag(fit: FittedModel, test: LagTest | None, scene: Scene, reach: float) -> HiddenLag | None:
+def bound_lag(fit: FittedModel, test: LagTest | None, scene: Scene, coverage_factor: float) -> HiddenLag | None:
     """Compute the longest first-order actuator lag that the residuals do not exclude, and K_max with this lag.
 
     Args:
         fit: The fitted model.
         test: The result of `score_lags`, None if lags were not tested.
         scene: The scene of the fitted device.
-        reach: Half-width of the confidence interval, in standard errors.
+        coverage_factor: Half-width of the confidence interval, in standard errors.
 
     Returns:
         The lag, the remaining delay and K_max with both; None if lags were not tested, or if the residuals exclude even
@@ -85,8 +85,8 @@ def bound_lag(fit: FittedModel, test: LagTest | None, scene: Scene, reach: float
     """
     if test is None:
         return None
-    # Exclude a lag also if the damping or delay refitted with this lag is negative.
-    possible = (test.signature_size - test.projection <= reach) & (test.theta[1:3] >= 0).all(0)
+    # Exclude a lag also if the damping or delay refitted with this lag is negative, because no such device exists.
+    possible = (test.signature_size - test.projection <= coverage_factor) & (test.theta[1:3] >= 0).all(0)
     count = int(np.argmin(np.append(possible, False)))  # number of time constants below the first excluded one
     if not count:
         return None

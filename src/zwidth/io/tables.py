@@ -249,7 +249,7 @@ def _read_text(file: Path, lines: list[str]) -> NamedColumns:
         heads = [str(k + 1) for k in range(len(heads))]
     elif layout.units is not None:
         units = [cell.strip("[]()") for cell in _split(lines[layout.units], separator)]
-        # Add no unit to a name that already contains one.
+        # Add the unit of the line of units, unless the name of the column already contains a unit.
         added = [
             f" [{unit}]" if is_unit(unit) and not split_head(head)[1] else ""
             for head, unit in zip(heads, units, strict=False)
@@ -367,7 +367,7 @@ def _read_with_numpy(lines: list[str], layout: _Layout, count: int, indices: Seq
     begin, separator = layout.begin, layout.separator
     time_columns = _find_time_columns(lines, layout, indices)
     if separator != "," and all(any(sign in line for line in islice(lines, begin, None)) for sign in ",."):
-        # Leave a table with commas and points to `_read_cells`, which checks that all decimal signs are the same.
+        # Leave a table with decimal commas and points to `_read_cells`, which requires equal decimal signs.
         return None
     if separator == " ":
         width = max(len(line.split()) for line in lines[begin:])

@@ -11,7 +11,7 @@ import numpy as np
 # 2024-05-01T12:00:00.001Z.
 CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?(\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?)(Z|[+-]\d\d:?\d\d)?")
 _DAY = "1970-01-01T"  # date assumed for times of day without a date
-_BATCH = 20_000  # largest number of texts that are converted at once, because all texts at once may need much memory
+_BATCH = 20_000  # largest number of texts that are converted at once, to limit the memory
 # Pattern of a duration as MATLAB writes it in timetables: a number and a unit, as in "0.001 sec".
 _DURATION = re.compile(r"([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s+(sec|min|hr)")
 _SECONDS = {"sec": 1.0, "min": 60.0, "hr": 3600.0}  # seconds per unit of a duration

@@ -18,7 +18,7 @@ from zwidth.model.checks import Part
 
 
 def to_angular(frequency: Any) -> Any:
-    """Return the angular frequency ``2 pi f`` in rad/s; if f is a ball (interval of python-flint), pi is one, too."""
+    """Return the angular frequency in rad/s of a frequency in Hz, a number or a ball (interval of python-flint)."""
     return 2.0 * (frequency.pi() if hasattr(frequency, "pi") else np.pi) * frequency
 
 
@@ -43,7 +43,7 @@ class Actuator(Part):
     """
 
     _owner = "actuator"
-    # Presets of this part in the explorer: arguments of the constructor by name of the preset.
+    # Presets of this part in the page of ``zwidth explore``: arguments of the constructor, by name of the preset.
     usual: ClassVar[dict[str, dict[str, float]]] = {
         "first order": {"cutoff": 300.0},
         "second order": {"cutoff": 300.0, "order": 2, "damping_ratio": 0.7},

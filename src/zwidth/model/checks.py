@@ -29,7 +29,8 @@ from zwidth.units.unit_system import LINEAR, SYSTEMS, UnitSystem
 
 def to_periods(delay: Array, period: Array) -> Array:
     """Return ``delay/period``; a quotient within 4 rounding errors of an integer becomes this integer."""
-    # Without this correction, 1.1 ms over 0.1 ms would be 11.000000000000002 periods in float64, a fractional delay.
+    # Without this correction, 1.1 ms divided by 0.1 ms would be 11.000000000000002 periods in float64, a fractional
+    # delay.
     xp = namespace(delay, period)
     quotient = delay / period
     nearest = xp.round(quotient)
@@ -76,7 +77,7 @@ Result = TypeVar("Result")
 
 
 def accept_units(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Wrap a function of SI quantities so that it also accepts texts with a unit, "70 g", and a delay in periods.
+    """Wrap a function of SI quantities so that it also accepts texts with a unit, such as "70 g" or "1.5 periods".
 
     The result is displayed in rotary units if an argument has a rotary unit.
     """
@@ -206,7 +207,7 @@ def _flatten(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _kind_of(value: Any) -> bool | None:
-    """Return the kind of device that a text with a unit, or a part, requires: True for rotary; None if it fits both."""
+    """Return the kind of device to which a text with a unit, or a part, belongs; None if it fits both kinds."""
     return detect_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
 
 
@@ -301,14 +302,15 @@ def _read(field: str, value: Any, read: Callable[[Any], Any]) -> Any:
     if isinstance(value, np.ndarray) or is_jax(value):
         value = np.asarray(value).item()
     if isinstance(value, Real) and not isinstance(value, bool):
-        # NumPy scalars are included, because they are registered as `numbers.Real`.
+        # Convert NumPy scalars as well, which are registered as `numbers.Real`.
         value = to_float(value)  # pyright: ignore[reportArgumentType]  (anything that float takes)
     try:
         return read(value)
     except UnusableValueError as error:
         message = str(error)
         if not isinstance(value, str):
-            # Show the value in the notation of Python instead of YAML, because it is not from a file.
+            # Show the value in the notation of Python instead of that of YAML, because the value does not come from a
+            # file.
             message = message.replace(f"got {describe(value)};", f"got {value!r};", 1)
         raise InputError(f"{field}: {message}") from None
 

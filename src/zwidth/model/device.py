@@ -36,7 +36,7 @@ class Coupling(Part):
     """
 
     _owner = "coupling"
-    # Presets of this part in the explorer: arguments of the constructor by name of the preset.
+    # Presets of this part in the page of ``zwidth explore``: arguments of the constructor, by name of the preset.
     usual: ClassVar[dict[str, dict[str, Any]]] = {
         "motor": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0},
         "tip": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0, "sensor": "tip"},

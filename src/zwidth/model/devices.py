@@ -20,7 +20,7 @@ from zwidth.model.operator import Operator
 from zwidth.model.timing import Timing
 from zwidth.units.formatting import with_unit
 
-__all__ = ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_device"]
+__all__ = ["DEVICES", "HAND", "PublishedDevice", "PublishedHand", "PublishedValue", "find_device"]
 
 
 def __dir__() -> list[str]:
@@ -28,7 +28,7 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-class Published(NamedTuple):
+class PublishedValue(NamedTuple):
     """A published parameter with its unit, its source, and a note on its use."""
 
     value: float
@@ -44,7 +44,7 @@ class Published(NamedTuple):
 
 
 @dataclass(frozen=True)
-class KnownDevice:
+class PublishedDevice:
     """Published parameters of one device; unpublished ones are None.
 
     Attributes:
@@ -66,21 +66,21 @@ class KnownDevice:
     name: str
     title: str
     motion: Literal["linear", "rotary"] = "linear"
-    mass: Published | None = None
-    damping: Published | None = None
-    friction: Published | None = None
-    resolution: Published | None = None
-    counts: Published | None = None
-    period: Published | None = None
-    delay: Published | None = None
-    force: Published | None = None
-    stiffness_limit: Published | None = None
-    damping_limit: Published | None = None
+    mass: PublishedValue | None = None
+    damping: PublishedValue | None = None
+    friction: PublishedValue | None = None
+    resolution: PublishedValue | None = None
+    counts: PublishedValue | None = None
+    period: PublishedValue | None = None
+    delay: PublishedValue | None = None
+    force: PublishedValue | None = None
+    stiffness_limit: PublishedValue | None = None
+    damping_limit: PublishedValue | None = None
 
     def __repr__(self) -> str:
         """Return the name and the parameters, without sources."""
-        parameters = [f"{name}={parameter.spell()}" for name, parameter in self.numbers.items()]
-        return f"KnownDevice({', '.join([self.name, *parameters])})"
+        parameters = [f"{name}={parameter.spell()}" for name, parameter in self.parameters.items()]
+        return f"PublishedDevice({', '.join([self.name, *parameters])})"
 
     @property
     def rotary(self) -> bool:
@@ -88,10 +88,12 @@ class KnownDevice:
         return self.motion == "rotary"
 
     @property
-    def numbers(self) -> dict[str, Published]:
+    def parameters(self) -> dict[str, PublishedValue]:
         """The published parameters by name."""
         return {
-            field.name: value for field in fields(self) if isinstance(value := getattr(self, field.name), Published)
+            field.name: value
+            for field in fields(self)
+            if isinstance(value := getattr(self, field.name), PublishedValue)
         }
 
     def to_device(self, *, mass: Any = None, damping: Any = None) -> Device:
@@ -144,30 +146,30 @@ class KnownDevice:
         return [name for name in ("mass", "damping") if name not in given and getattr(self, name) is None]
 
     def _choose(self, name: str, given: Any) -> Any:
-        """Return the passed value, or the published one if None is passed; raise `InputError` if none is published."""
+        """Return the passed value or, if it is None, the published one; raise `InputError` if both are missing."""
         if given is not None:
             return given
         published = getattr(self, name)
         if published is None:
-            names = ", ".join(self.numbers)
+            names = ", ".join(self.parameters)
             raise InputError(f"{name}: no value is published for {self.name!r}, only {names}; pass a value")
         return published.value
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields by name, with values that JSON can represent; unpublished parameters are None (null)."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value._asdict() if isinstance(value, Published) else value for name, value in values.items()}
+        return {name: value._asdict() if isinstance(value, PublishedValue) else value for name, value in values.items()}
 
 
 @dataclass(frozen=True)
-class KnownHand:
+class PublishedHand:
     """Published parameters of a hand: a mass in kg, connected to ground by a damper in N s/m and a spring in N/m."""
 
     name: str
     title: str
-    mass: Published
-    damping: Published
-    stiffness: Published
+    mass: PublishedValue
+    damping: PublishedValue
+    stiffness: PublishedValue
 
     def to_operator(self) -> Operator:
         """Return a `zwidth.Operator` with a rigid grasp.
@@ -182,27 +184,29 @@ class KnownHand:
         return Operator(self.mass.value, self.damping.value, self.stiffness.value)
 
 
-def _read_published() -> tuple[tuple[KnownDevice, ...], KnownHand]:
+def _read_published() -> tuple[tuple[PublishedDevice, ...], PublishedHand]:
     """Return a tuple of all devices of ``published.json``, and the hand."""
     catalog = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
 
     def convert(entry: dict[str, Any]) -> dict[str, Any]:
-        """Convert the parameters of an entry to `Published`, with the text of the source in place of its key."""
+        """Convert the parameters of an entry to `PublishedValue`, with the text of the source in place of its key."""
         return {
-            name: Published(value[0], value[1], catalog["sources"][value[2]], *value[3:])
+            name: PublishedValue(value[0], value[1], catalog["sources"][value[2]], *value[3:])
             if isinstance(value, list)
             else value
             for name, value in entry.items()
         }
 
-    return tuple(KnownDevice(**convert(entry)) for entry in catalog["devices"]), KnownHand(**convert(catalog["hand"]))
+    return tuple(PublishedDevice(**convert(entry)) for entry in catalog["devices"]), PublishedHand(
+        **convert(catalog["hand"])
+    )
 
 
 DEVICES, HAND = _read_published()
 """All devices of the catalog, those with measured parameters first; and a hand with published parameters."""
 
 
-def find_device(name: str) -> KnownDevice:
+def find_device(name: str) -> PublishedDevice:
     """Return a device of the catalog.
 
     Args:
@@ -226,8 +230,8 @@ def find_device(name: str) -> KnownDevice:
     raise InputError(f"device: {describe_choice(name, tuple(device.name for device in DEVICES))}")
 
 
-def read_device(text: str) -> KnownDevice | LinearDevice | MeasuredDevice:
-    """Return the device that an option ``--device`` selects.
+def read_device(text: str) -> PublishedDevice | LinearDevice | MeasuredDevice:
+    """Return the device that the text of an option ``--device`` describes by name, transfer function or file.
 
     Args:
         text: the name of a device for `find_device`; a transfer function ``"NUMERATOR / DENOMINATOR"`` with the

@@ -127,7 +127,7 @@ def characteristic_polynomial(matrix: np.ndarray) -> Polynomial:
 
 
 def find_roots(polynomial: Polynomial, offsets: bool = False) -> np.ndarray:
-    """Return all roots of a polynomial to full float64 accuracy, repeated according to their multiplicity.
+    """Return all roots of a polynomial (or their ``offsets`` from 1) to full float64 accuracy, with multiplicity.
 
     Args:
         polynomial: the polynomial.

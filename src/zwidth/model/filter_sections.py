@@ -38,7 +38,7 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
     try:
         rows = list(given) if np.ndim(given) or any(map(np.ndim, given)) else [given]
     except ValueError:
-        # `numpy.ndim` raises this error for sections of different lengths.
+        # `numpy.ndim` raises `ValueError` for a list of sections of different lengths.
         rows = list(given)
     except TypeError:
         rows = [given]

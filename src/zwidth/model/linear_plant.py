@@ -61,7 +61,7 @@ class System:
         return [1.0] * self.device.poles.size
 
     def realize(self) -> Realization:
-        """Return the state equation, in units of the period and the mass: of x' or, for a sampled device, of x[k+1]."""
+        """Return the normalized state equation; its left side is x' or, for a sampled device, the next state x[k+1]."""
         A, B = _realize_companion(self.device) if hasattr(self.mass, "mid") else _realize_sections(self.device)
         if self.sampled:
             B = B * (self.mass / self.period**2)
@@ -80,7 +80,7 @@ class System:
                 )
             if self.d != self.n_delay:
                 raise InputError(
-                    f"delay: got {float(self.d):g} periods; a sampled device allows only whole periods; include the "
+                    f"delay: got {float(self.d):g} periods; a sampled device allows only an integer delay; include the "
                     "fraction in the device"
                 )
             return
@@ -127,8 +127,9 @@ def _pair_roots(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, 
         return sorted([*pairs, *(real[k : k + 2] for k in range(0, real.size, 2))], key=lambda each: np.abs(each).min())
 
     sections = sorted(group(poles), key=lambda each: each.size, reverse=True)
-    # Assign each group of zeros to the free section whose poles have the most similar magnitude. A section with two
-    # poles is always free for a pair of zeros, because there are more poles than zeros.
+    # The zeros are divided into groups: a conjugate pair, two real zeros, or a single one. Assign each group to the
+    # free section whose poles have the most similar magnitude. A section with two poles is always free for a group of
+    # two zeros, because the device has more poles than zeros.
     left, chosen = list(range(len(sections))), {}
     for each in sorted(group(zeros), key=lambda each: each.size, reverse=True):
         far = [abs(np.log((1e-300 + np.abs(sections[k]).max()) / (1e-300 + np.abs(each).max()))) for k in left]
@@ -170,7 +171,7 @@ def _output_as_first_state(A: Any, B: Any, C: Any) -> tuple[Any, Any]:
     best = max(range(len(C)), key=lambda k: abs(float(C[k])))
     order = [best, *(k for k in range(len(C)) if k != best)]
     A, B, C = A[order][:, order], B[order], C[order]
-    # Substitute x1 = (y - c2 x2 - c3 x3 - ..)/c1.
+    # Replace the state x1 by y: substitute x1 = (y - c2 x2 - c3 x3 - ..)/c1.
     columns = A[:, :1] / C[0]
     A = np.concatenate([columns, A[:, 1:] - columns * C[None, 1:]], 1)
     first = C @ A

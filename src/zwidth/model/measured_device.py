@@ -23,7 +23,7 @@ from zwidth.model.linear_device import ResponseDevice
 from zwidth.units.formatting import suggestion
 from zwidth.units.parsing import ANGLE, FORCE, LENGTH, RATE, Dimension, split_head
 
-_MIN_LINES = 8  # smallest number of frequencies, because fewer do not define a curve
+_MIN_LINES = 8  # smallest number of frequencies that define a curve
 SUFFIXES = (".csv", ".txt", ".dat", ".npz", ".mat")  # suffixes of files that contain a measured response
 # Accepted names of each column, in lower case.
 _NAMES = {
@@ -36,7 +36,7 @@ _NAMES = {
     "deviation": ("deviation", "radius", "uncertainty"),
 }
 _TURN = 2.0 * math.pi  # rad per revolution
-# Dimensions of the columns, with the units that are accepted.
+# Physical dimensions of the columns, with their accepted units.
 _FREQUENCY = Dimension(RATE.names, RATE.example, {"rad/s": 1.0 / _TURN, "1/s": 1.0 / _TURN, "krad/s": 1e3 / _TURN})
 _COMPLIANCE = Dimension(", ".join(f"{length}/{force}" for length in LENGTH.units for force in FORCE.units), "1 mm/N")
 _ANGULAR_COMPLIANCE = Dimension("rad/(N m), rad/(mN m), mrad/(N m), mrad/(mN m), deg/(N m), deg/(mN m)", "1 rad/(N m)")

@@ -117,15 +117,15 @@ class Chain:
         count, actuator_states = bodies + modes, 0 if lag is None else 2 if isinstance(lag, Resonance) else 1
         size = 2 * count + actuator_states
         zero = xp.asarray(0.0 * (self.bodies[0].mass + self.bodies[-1].damping + sum(mode.rate for mode in self.modes)))
-        # Represent every quantity, a linear combination of states, command and external force, by its row of
-        # coefficients. The rows of the states and of both inputs are the unit vectors in ``axes``.
+        # Every quantity is a linear combination of the states, the command and the external force. Represent it by the
+        # vector of its coefficients. The vectors of the states and of both inputs are the unit vectors in ``axes``.
         axes = xp.asarray(np.eye(size + 2).astype(zero.dtype)).reshape(size + 2, size + 2, *[1] * zero.ndim)
         command, external = axes[size:]
         actuator_force = command if lag is None else axes[2 * count]
         forces = [
             link.stiffness * axes[k] + link.damping * axes[count + k] for k, link in enumerate(self.links, start=1)
         ]
-        # Add a zero force at both ends of the row, because no link precedes the first body or follows the last one.
+        # Add a zero force before the first and after the last body, because no link connects them to a further body.
         forces = [zero, *forces, zero]
         accelerations = []
         for k, body in enumerate(self.bodies):
@@ -264,7 +264,7 @@ def expand_compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
 
     Both are arrays of coefficients in s, highest power first. Modes are not included.
     """
-    # The loop adds the bodies from the last one to the first. numerator/denominator is the dynamic stiffness of the
+    # Add the bodies one by one, from the last one to the first. numerator/denominator is the dynamic stiffness of the
     # bodies added so far: a force on the body added last, divided by the position of this body. Once the sensor body is
     # added, its position divided by this force is sensor_numerator/numerator. All terms are positive, so that nothing
     # cancels and slow roots are accurate.
@@ -276,7 +276,7 @@ def expand_compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
             link = np.array([chain.links[k].damping, chain.links[k].stiffness], float)
             denominator = np.polyadd(np.convolve(link, denominator), numerator)
             # Connect the link in series with the bodies added so far: their joint dynamic stiffness is link * numerator
-            # / (link * denominator + numerator). This sum is the new denominator.
+            # / (link * denominator + numerator). The divisor is the new denominator.
             numerator = np.polyadd(np.convolve(dynamic_stiffness, denominator), np.convolve(link, numerator))
             sensor_numerator = denominator if k == chain.sensor else np.convolve(link, sensor_numerator)
         else:

@@ -39,7 +39,7 @@ class Operator(Part):
     """
 
     _owner = "operator"
-    # Presets of this part in the explorer: arguments of the constructor by name of the preset.
+    # Presets of this part in the page of ``zwidth explore``: arguments of the constructor, by name of the preset.
     usual: ClassVar[dict[str, dict[str, float]]] = {
         "rigid": _HAND,
         "grasp": {**_HAND, "coupling_stiffness": 1e3, "coupling_damping": 5.0},
@@ -54,7 +54,7 @@ class Operator(Part):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.rigid:
-            # Check the mass only now, because the base class has converted it to SI units.
+            # Check the range of the mass after the base class has converted the mass to SI units.
             check_number("operator.mass", self.mass, self.unit_system["kg"], POSITIVE)
         # Treat a damping that is a JAX array as nonzero, because the value of a traced array is unknown.
         if self.rigid and (is_jax(self.coupling_damping) or self.coupling_damping):

@@ -48,7 +48,7 @@ _WHOLE = ("safe_limit",)  # parts that can only be replaced as a whole, because 
 PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator}
 """Classes of the optional parts of a scene, by name, in the order in which descriptions list these parts."""
 _OF_DEVICE = ("coupling", "actuator")  # optional parts that are fields of the device
-# Fields of the scene whose name is the first part of the paths of their parameters.
+# Fields of the scene with whose names the paths of their parameters begin.
 _NAMED = ("velocity", *(name for name in PARTS if name not in _OF_DEVICE))
 
 

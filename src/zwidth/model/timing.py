@@ -65,7 +65,7 @@ class Timing(Part):
         return self.delay if self._periods is None else Span(self._periods, "periods")
 
     @property
-    def kept_delay(self) -> str:
+    def delay_text(self) -> str:
         """The delay as text in the unit in which it stays constant if the period changes: "1 period" or "1 ms"."""
         if self._periods is None:
             return with_unit(float(self.delay), "s")

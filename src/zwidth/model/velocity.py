@@ -337,7 +337,7 @@ def name_estimate(velocity: Velocity) -> str:
 
 
 def is_plain(velocity: Velocity, period: Any) -> bool:
-    """Return whether an estimate is the backward difference, divided by the loop's period, with no parameter set."""
+    """Return whether an estimate is the backward difference, divided by the loop's period, with all fields None."""
     if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
         return False
     estimate = velocity.estimate(period)

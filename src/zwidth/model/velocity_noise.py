@@ -34,8 +34,8 @@ def _sum_squared_response(estimate: Estimate) -> float:
     if estimate.window and not estimate.zeros.size and not estimate.poles.size:
         return 2.0 * (float(estimate.gain) / estimate.window) ** 2
     A, B, C, D, _ = realize_estimate(estimate)
-    # The sum is C G C' + D^2 with the controllability Gramian G, the sum of A^k B B' A'^k. Smith's method (1968)
-    # doubles the number of summed terms in each step.
+    # The sum of squares is C G C' + D^2 with the controllability Gramian G, the sum of A^k B B' A'^k. Smith's method
+    # (1968) doubles the number of summed terms in each step.
     gramian, power = B @ B.T, A
     for _ in range(DOUBLINGS):
         added = power @ gramian @ power.T

@@ -28,7 +28,7 @@ class VirtualWall(Part):
 
 @dataclass(frozen=True, repr=False)
 class NoWall(VirtualWall):
-    """Placeholder for the wall of a scene that has none: its force is 0, and it is not used as default wall."""
+    """Placeholder for the wall of a scene without wall: the force is 0, and functions do not take K and B from it."""
 
     stiffness: Any = field(default=0.0, init=False, repr=False)
     virtual_damping: Any = field(default=0.0, init=False, repr=False)

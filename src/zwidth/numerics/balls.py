@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-# Working precisions in bits; a computation tries them in this order until its error bound certifies the result.
+# Working precisions in bits. A computation tries them in this order until its error bound certifies the result.
 BITS = tuple(128 << k for k in range(7))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from zwidth.core.xp import compute_concretely, tree_map
 from zwidth.numerics.threads import run_in_threads
 
-LEAST = 1 << 4  # number of points of the smallest block, because XLA rounds differently in shorter arrays
+LEAST = 1 << 4  # number of points of the smallest block; XLA rounds differently in shorter arrays
 
 
 def map_blocks(
@@ -25,7 +25,7 @@ def map_blocks(
     within: Callable[[], Any] = compute_concretely,
     exact: bool = False,
 ) -> Any:
-    """Apply a function to columns of points in blocks of equal size, on all processors, and join the results.
+    """Apply a function to columns, in blocks of equally many points and on all processors, and join the results.
 
     The intermediate arrays of a block fit in the cache. In a single block of a million points, the ridge takes 2.5
     times as long (benchmarks/bench_xla.py).
@@ -42,7 +42,7 @@ def map_blocks(
         The results for all points, as writable NumPy arrays.
     """
     count = count_points(columns)
-    # Round up to a power of 2, so that batches of many sizes share a few compilations.
+    # Round the number of points up to a power of 2, so that batches of many sizes share a few compiled programs.
     size = block if exact else min(block, 1 << max(count - 1, LEAST - 1).bit_length())
     flagged = [(column, column.size == 1 < count) for column in columns]
 
@@ -67,12 +67,12 @@ def map_blocks(
 
 
 def count_points(columns: Sequence[np.ndarray]) -> int:
-    """Return the number of points of columns, each of which has this length or length 1."""
+    """Return the number of points that the columns describe; each column has this length or length 1."""
     return np.broadcast_shapes(*(column.shape for column in columns))[0]
 
 
 def _cut_block(column: np.ndarray, start: int, size: int) -> np.ndarray:
-    """Return the ``size`` elements of a column from index ``start`` on; repeat the last one if fewer remain."""
+    """Return ``size`` elements of a column from index ``start`` on; if fewer remain, repeat the last element."""
     part = column[start : start + size]
     missing = size - part.size
     if not missing:

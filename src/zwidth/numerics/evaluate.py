@@ -27,7 +27,7 @@ from zwidth.core.xp import WIDE, compute_concretely, filter_options, is_jax, is_
 from zwidth.numerics.blocks import count_points, map_blocks
 from zwidth.units.quantities import SIZES
 
-# Types of plain numbers, whose conversion to float64 needs no check; bool and 0-d arrays are checked.
+# Types of plain numbers, which are converted to float64 without a check; Booleans and 0-d arrays are checked first.
 _PLAIN = frozenset({float, int, np.float64})
 _NUMBERS = (int, float, np.floating, np.integer)
 
@@ -38,7 +38,7 @@ def are_numbers(*values: ArrayLike) -> bool:
 
 
 def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
-    """Raise `InputError` if the magnitude of a plain number is outside the range of its parameter in `SIZES`.
+    """Raise `InputError` if the magnitude of a plain number is outside the range of its parameter (`SIZES`).
 
     Other invalid numbers and arrays pass, because results report them by a status.
     """
@@ -104,14 +104,14 @@ def broadcast(arguments: Mapping[str, ArrayLike]) -> list[np.ndarray]:
     return list(np.broadcast_arrays(*arrays.values()))
 
 
-def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], what: str = "shapes") -> tuple[int, ...]:
+def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], noun: str = "shapes") -> tuple[int, ...]:
     """Return the common shape to which named shapes broadcast; raise `InputError` if they do not broadcast."""
     named = list(named)
     try:
         return np.broadcast_shapes(*(shape for _, shape in named))
     except ValueError:
         shapes = ", ".join(f"{name} {shape}" for name, shape in named)
-        raise InputError(f"{what} do not broadcast: {shapes}; make each axis equal or 1") from None
+        raise InputError(f"{noun} do not broadcast: {shapes}; make each axis equal or 1") from None
 
 
 def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:
@@ -183,8 +183,9 @@ Route: TypeAlias = Literal["auto", "numpy", "jax"]
 # Type of a function that computes, in NumPy, the values of a kernel and their derivatives in each argument.
 Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
 
-# Largest number of points that NumPy evaluates. It takes some tenths of a second for them, a compilation takes seconds.
-# With ten times as many points a compilation saves time, because compiled calls are two to five times as fast.
+# Largest number of points that NumPy evaluates. NumPy takes some tenths of a second for so many points, a compilation
+# takes seconds. With ten times as many points a compilation saves time, because compiled calls are two to five times as
+# fast.
 FEW = 1 << 18
 _AT_ONCE = 1 << 15  # points per NumPy call, so that arrays stay in caches
 BLOCK = 1 << 16  # points per compiled call: one compilation, bounded memory, work for every processor
@@ -217,11 +218,11 @@ def evaluate(
         try:
             numbers = list(map(np.float64, values))
         except OverflowError:
-            pass  # `broadcast` names the integer that overflows
+            pass  # ignore an integer that overflows; `broadcast` reports it by name
         else:
             with np.errstate(all="ignore"):
-                found = kernel(*numbers, *static)
-            return found if isinstance(found, np.generic) else tree_map(_plain, found)
+                result = kernel(*numbers, *static)
+            return result if isinstance(result, np.generic) else tree_map(_plain, result)
     if is_traced(*values):
         return compile_traced(kernel, static, slopes)(*broadcast_traced(arguments))
     arrays = broadcast(arguments)
@@ -285,8 +286,8 @@ def compile_traced(
         moving = [k for k, moves in enumerate(active) if moves]
 
         def of_moving(*values: Any) -> Any:
-            known = dict(zip(moving, values, strict=True))
-            return plain(*(known.get(k, array) for k, array in enumerate(arrays)))
+            varied = dict(zip(moving, values, strict=True))
+            return plain(*(varied.get(k, array) for k, array in enumerate(arrays)))
 
         points = tuple(arrays[k] for k in moving)
         ones = jax.numpy.ones_like(points[0])

@@ -32,9 +32,9 @@ from zwidth.units.quantities import LARGEST_DAMPING, LONGEST_DELAY
 
 SERIES_BELOW = 2.5  # x below which the series are used
 SERIES_TERMS = 11  # the first omitted term is below 1.25^22/23! = 6e-21 of the sum and of its first two derivatives
-# phi1 = e^(-x/2) sum_k (x/2)^(2k) / (2k + 1)!
+# Coefficients of the series phi1 = e^(-x/2) sum_k (x/2)^(2k) / (2k + 1)!
 PHI1 = [1.0 / factorial(2 * k + 1) for k in range(SERIES_TERMS)]
-# gap = -x phi2' = e^(-x/2) x sum_k (k + 1) (x/2)^(2k) / (2k + 3)!
+# Coefficients of the series gap = -x phi2' = e^(-x/2) x sum_k (k + 1) (x/2)^(2k) / (2k + 3)!
 GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(SERIES_TERMS)]
 
 
@@ -62,8 +62,8 @@ def phi_functions(x: Array) -> PhiFunctions:
     half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, SERIES_BELOW, x)
     half_squared = half * half
     low1, low_gap = factor * horner(half_squared, PHI1), factor * (2.0 * half) * horner(half_squared, GAP)
-    # Compute 1 - c as a difference and not by expm1. It does not cancel above `SERIES_BELOW`, and its derivative has a
-    # small relative error, unlike that of expm1.
+    # Compute 1 - c as a difference and not by expm1. The difference does not cancel above `SERIES_BELOW`, and its
+    # derivative has a small relative error, unlike that of expm1.
     inverse = 1.0 / high
     high1 = (1.0 - c) * inverse
     return PhiFunctions(

@@ -280,7 +280,7 @@ def _find_dominant(loop: _CircleParts, eps: float, xp: Any) -> tuple[Array, Arra
 
 
 def _evaluate_difference(loop: _CircleParts, t: Array, eps: float, xp: Any) -> tuple[Array, Array]:
-    """Return ``|T|^2 - |B|^2`` at points t, scaled to avoid overflow, and a bound of the rounding error.
+    """Return ``|T|^2 - |B|^2`` at points t, scaled to avoid overflow, and a bound on its rounding error.
 
     The scale is ``(1 + |t|)^(2 size)`` with the number ``size`` of factors of T or B.
     """

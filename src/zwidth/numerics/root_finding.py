@@ -20,7 +20,7 @@ from zwidth.core.xp import expand_along, iterate, namespace, stop_gradient
 Function = Callable[[Array], Array]
 Sloped = Callable[[Array], tuple[Array, Array]]
 
-HALVINGS = 60  # bisection to the last digit of float64, also of the logarithm of a range of 32 decades
+HALVINGS = 60  # halvings in a bisection to the last digit of float64, also of the logarithm of a range of 32 decades
 CONVERGED_STEP = 1e-11  # relative step after which the error of Newton's method is rounding, also near a double zero
 ZERO_VALUE = 1e-15  # largest |value| of a zero in `false_position`: rounding error of a phase in rad, its main use
 BISECTIONS = 52  # halvings of a bracket; they reduce it to one unit in the last place of a float64
@@ -28,7 +28,7 @@ MAX_NEWTON_STEPS = 16  # largest number of Newton steps in `polish_root`
 
 
 def bisect(holds: Function, low: Array, high: Array) -> Array:
-    """Find by bisection the point between ``low`` and ``high`` above which the condition ``holds`` is False."""
+    """Find by bisection the point in [low, high] below which ``holds`` is True and above which it is False."""
     xp = namespace(low, high)
 
     def halve(ends: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ class ColorScale(NamedTuple):
     low: float  # value of the first color
     high: float  # value of the last color
     logarithmic: bool
-    extend: Literal["neither", "min", "max", "both"]  # ends of the color bar with an arrow, because values lie outside
+    extend: Literal["neither", "min", "max", "both"]  # ends of the color bar with an arrow, beyond which values lie
 
 
 def choose_scale(output: Output, finite: np.ndarray) -> ColorScale:

@@ -75,7 +75,7 @@ def draw_curves(
             style.use_whole(ax)
         ax.margins(y=0.06)
         if output.logarithmic:
-            # Choose the ticks by the values of all panels, because the panels share the axis.
+            # Choose the ticks from the values of all panels, because the panels share the axis.
             style.use_logarithmic(ax, "y", whole)
         if output.color_scale == "diverging":
             ax.axhline(output.center, color=style.GRAY, linewidth=0.7, linestyle=style.DASHED, zorder=0.5)

@@ -2,7 +2,7 @@
 
 b is the physical damping of the device, K_max the stiffness of its stiffest stable wall. A *filters study* computes
 K_max and the velocity noise for velocity estimates of several *kinds*: low-pass filters, differences over windows, and
-the one-sample difference. A *design study* computes the value of one parameter of the device at which K_max reaches a
+the backward difference. A *design study* computes the value of one parameter of the device at which K_max reaches a
 *required* stiffness times a *reserve* (a safety factor).
 """
 
@@ -28,16 +28,16 @@ from zwidth.units.quantities import PARAMETERS
 
 _STIFFNESS = SI_COLUMNS[0]  # name of the column of K_max
 _NOISE = "velocity_noise_m_per_s"  # name of the column of the velocity noise
-# By kind of filter: column and axis label of the parameter over which K_max is drawn.
+# Column and axis label of the parameter over which K_max is drawn, for each kind of filter.
 _OVER = {
     "low_pass": ("cutoff_Hz", "cut-off of the low-pass  $f_c$  in Hz"),
     "windowed_difference": ("samples", "length of the window  $n$  in periods"),
 }
-# By kind of velocity estimate: line style, marker and legend entry.
+# Line style, marker and legend entry of each kind of velocity estimate.
 _KINDS: dict[str, tuple[Any, str, str]] = {
     "low_pass": (style.SOLID, "", "low-pass"),
     "windowed_difference": (style.DOTTED, "", "window"),
-    "backward_difference": ("", "s", "one-sample difference"),
+    "backward_difference": ("", "s", "backward difference"),
 }
 
 
@@ -59,7 +59,7 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
             look = {"color": color, "label": f"b = {damping:g}", **(style.POINTS if over == "samples" else _dots(rows))}
             ax.plot(rows[over], rows[_STIFFNESS] * factor, **look)
             (unfiltered,) = select(table, damping_N_s_per_m=damping, estimate="backward_difference")[_STIFFNESS]
-            look = {"linewidth": 0.9, "linestyle": style.DASHED, "label": f"difference, b = {damping:g}"}
+            look = {"linewidth": 0.9, "linestyle": style.DASHED, "label": f"backward difference, b = {damping:g}"}
             ax.axhline(unfiltered * factor, color=color, **look)
         ax.set_xlabel(label)
         values = select(table, estimate=kind)[over]
@@ -70,7 +70,7 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
             style.use_logarithmic(ax, "x", values, style.DECADES)
     panels[0].set_ylabel(words)
     handles = [style.line(_name_damping(damping), color=color) for damping, color in colors.items()]
-    handles.append(style.line("one-sample difference", style.DASHED, 0.9))
+    handles.append(style.line("backward difference", style.DASHED, 0.9))
     style.legend(panels, handles, outside=axes is None, ncols=len(handles))
     return panels
 
@@ -150,7 +150,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     Args:
         curve: Columns parameter, value with its unit (such as ``value_Hz``), stiffness_N_per_m.
         required: Columns of a design study: stiffness_N_per_m, reserve; present, value and other_crossings with the
-            unit of the parameter in their names; enough; and with tolerances stable_share.
+            unit of the parameter in their names; sufficient_side; and with tolerances stable_share.
         axes: An existing Axes.
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 3.8)
@@ -170,7 +170,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
         height = np.exp(np.interp(np.log(present), *np.log(curve_drawn)))
         look: dict[str, Any] = {"marker": "s", "markersize": 5, "markerfacecolor": "white", "color": style.BLACK}
         ax.plot([present], [height], linestyle="", label="present", zorder=5, **look)
-    columns = (required[name] for name in (value_in, "enough", header("other_crossings", parameter.unit)))
+    columns = (required[name] for name in (value_in, "sufficient_side", header("other_crossings", parameter.unit)))
     names = []
     for target, value, enough, others in zip(targets, *columns, strict=True):
         all_known = enough in ENOUGH
@@ -228,10 +228,10 @@ def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, col
         value: Required value of the parameter; NaN if there is none.
         color: Color of the marks.
     """
-    ax.axhline(target, color=color, linewidth=0.9, linestyle=style.DASHED, zorder=2, label=f"wanted {target:g}")
+    ax.axhline(target, color=color, linewidth=0.9, linestyle=style.DASHED, zorder=2, label=f"target {target:g}")
     x, y = (np.append(part, end) for part, end in zip(curve, (value, target), strict=True))
     order = np.argsort(x)
     band = np.where(y[order] >= target, target, np.nan)
-    ax.plot(x[order], band, color=color, linewidth=3.5, alpha=0.35, label="enough", zorder=2.5)
+    ax.plot(x[order], band, color=color, linewidth=3.5, alpha=0.35, label="sufficient", zorder=2.5)
     if np.isfinite(value):
         ax.plot([value], [target], linestyle="", marker="o", markersize=6, color=color, label="required", zorder=6)

@@ -102,7 +102,8 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
         if output.dtype == "bool":
             values = values.astype(float).where(data[status] == Status.OK)
         elif output.dtype == "float64":
-            # Choose the unit for the median of the first plane, because reading all values of a large store is slow.
+            # Choose a unit that suits the median of the first plane only, because reading all values of a large store
+            # is slow.
             part = values.isel({dim: slice(0, 1) for dim in values.dims[:-2]}).values
             part = np.abs(part[np.isfinite(part) & (part != 0)])
             middle = np.median(part) if part.size else 1.0
@@ -227,7 +228,7 @@ def find_edges(values: np.ndarray) -> np.ndarray:
 
 
 def scale_axis(ax: Axes, which: str, values: Any) -> None:
-    """Set the range of an axis ("x" or "y") to that of the values; make it logarithmic if `logarithmic` is True."""
+    """Set the range of an axis ("x" or "y") to that of its values; make it logarithmic if the values suggest it."""
     low, high = float(np.min(values)), float(np.max(values))
     if logarithmic(values):
         style.use_logarithmic(ax, which, values, _FEW_DECADES)

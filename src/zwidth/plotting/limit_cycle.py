@@ -162,7 +162,9 @@ def draw_limit_cycle_curves(
     return panels
 
 
-def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest: np.ndarray, widest: str) -> None:
+def _name_absent(
+    ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest: np.ndarray, largest_amplitude: str
+) -> None:
     """Write the labels of the curves without any limit cycle into a panel, with the reason.
 
     Args:
@@ -170,12 +172,12 @@ def _name_absent(ax: Axes, looks: list[dict[str, Any]], cycles: np.ndarray, rest
         looks: Line properties and label of each curve.
         cycles: Mask of the points that are limit cycles, of shape (curve, point).
         rest: Mask of the points at rest, of shape (curve, point).
-        widest: Upper bound of the amplitude, as text.
+        largest_amplitude: Upper bound of the amplitude, as text.
     """
     reasons: dict[str, list[str]] = {}
     for look, cycle, resting in zip(looks, cycles, rest, strict=True):
         if not cycle.any():
-            too_large = f"larger than {widest}"
+            too_large = f"larger than {largest_amplitude}"
             reason = (
                 f"{'at rest' if resting.all() else too_large} everywhere"
                 if resting.all() or not resting.any()

@@ -1,7 +1,7 @@
 """Draw results of identification: a fitted device with its stability boundary, and a measured frequency response.
 
 A device is fitted either to *logs*, recorded motions, or to *onsets of instability*, walls at which the operator
-observed the beginning of a limit cycle. Tables call such walls "buzzing", and the wall that is recommended for use
+observed the beginning of a limit cycle. Tables call such walls "onset", and the wall that is recommended for use
 "set". Columns of tables are named as in the CSV files of fit studies. K and B are the stiffness and the virtual damping
 of a wall, G the measured response from force to position, L the open loop with a wall.
 """
@@ -24,7 +24,7 @@ _TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder":
 _DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}  # dots of residuals
 _LOW = "stiffness_low_N_per_m"  # name of the column with the lower end of the 95 % band of the boundary
 _HIGH = "stiffness_high_N_per_m"  # name of the column with the upper end of the 95 % band of the boundary
-# For the first and for the second fit: color of the boundary, color of its band, and line style.
+# Color of the boundary, color of its band, and line style, for the first and for the second fit.
 _FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))
 _ROWS = ("position", "residuals", "autocorrelation", "walls")  # names of the panels on the left, from top to bottom
 
@@ -42,22 +42,22 @@ def draw_device_fit(
     """Draw a fitted device: measured motion, residuals, their autocorrelation, and the stable walls.
 
     The last panel shows the stability boundary with its 95 % band, the stiffest wall, the recommended wall, and the
-    onsets of instability. For a fit to a log, the panels before it show the measured and the modelled position, the
+    onsets of instability. For a fit to a log, the panels before it show the measured and the modeled position, the
     residuals, and their autocorrelation with the 95 % band of white noise. For a fit to onsets, one panel shows their
     deviations from the fit, in standard deviations of their noise.
 
     Args:
         boundary: Columns virtual_damping and stiffness with its lower and upper end, of one or several fits, given by
             the column ``fitted_to``.
-        walls: Columns fitted_to, kind ("stiffest", "set" for the recommended wall, or "buzzing" for an onset),
+        walls: Columns fitted_to, kind ("stiffest", "set" for the recommended wall, or "onset" of instability),
             stiffness, its error, virtual_damping, frequency; for onsets also stiffness_residual and frequency_residual.
         axes: Existing Axes, one per panel.
-        motion: Columns log, time, position, modelled and residual of the logs.
+        motion: Columns log, time, position, modeled and residual of the logs.
         correlation: Columns lag, autocorrelation and band of the logs.
         step: Encoder step, drawn with the residuals; 0 for none.
     """
     names = [*(_ROWS[:3] if motion is not None and correlation is not None else ())]
-    names += ["walls"] if "buzzing" in np.asarray(walls["kind"]) else []
+    names += ["walls"] if "onset" in np.asarray(walls["kind"]) else []
     panels = dict(zip([*names, "boundary"], _make_panels(axes, len(names)), strict=False))
     if motion is not None and correlation is not None:
         _draw_motion(panels, motion, step)
@@ -84,24 +84,24 @@ def _make_panels(axes: style.AnyAxes | None, rows: int) -> Any:
 
 
 def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
-    """Draw measured and modelled position, and the residuals, of the first log.
+    """Draw measured and modeled position, and the residuals, of the first log.
 
     Args:
         panels: Axes by name; "position" and "residuals" are optional.
-        motion: Columns log, time, position, modelled and residual.
+        motion: Columns log, time, position, modeled and residual.
         step: Encoder step, drawn with the residuals; 0 for none.
     """
     logs = np.asarray(motion["log"])
     first = select(motion, log=logs[0])
     thin = slice(None, None, max(1, -(-logs[logs == logs[0]].size // _MAX_SAMPLES)))
-    time, place, model, rest = (first[name] for name in ("time_s", "position_m", "modelled_m", "residual_m"))
+    time, place, model, rest = (first[name] for name in ("time_s", "position_m", "modeled_m", "residual_m"))
     clock, second = style.si_unit(time[-1] - time[0], "s")
     time = (time - time[0]) * clock
     if "position" in panels:
         ax = panels["position"]
         factor, length = style.si_unit(np.ptp(place), "m")
         ax.plot(time[thin], place[thin] * factor, color=style.GRAY, linewidth=2.4, alpha=0.55, label="measured")
-        ax.plot(time[thin], model[thin] * factor, color=style.VERMILION, linewidth=0.9, label="modelled")
+        ax.plot(time[thin], model[thin] * factor, color=style.VERMILION, linewidth=0.9, label="modeled")
         ax.set(ylabel=f"{'angle' if style.units().rotary else 'position'}  in {length}", xlim=(0.0, time[-1]))
         ax.tick_params(labelbottom="residuals" not in panels)
         _put_above(ax)
@@ -113,8 +113,10 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
         ax.plot(time[thin], rest[thin] * factor, color=style.BLUE, label="residual", **_DOT)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
         for end in (-0.5 * step, 0.5 * step) if step else ():
-            ax.axhline(end * factor, color=style.BLACK, linestyle=style.DASHED, linewidth=0.8, label="half a step")
-        ax.set(xlabel=f"time  in {second}", ylabel=f"measured minus\nmodelled  in {length}", xlim=(0.0, time[-1]))
+            ax.axhline(
+                end * factor, color=style.BLACK, linestyle=style.DASHED, linewidth=0.8, label="half an encoder step"
+            )
+        ax.set(xlabel=f"time  in {second}", ylabel=f"measured minus\nmodeled  in {length}", xlim=(0.0, time[-1]))
         if step:
             _put_above(ax, [style.line("half an encoder step", style.DASHED, 0.8, style.BLACK)])
             far = factor * max(0.62 * step, float(np.nanmax(np.abs(rest))))
@@ -127,7 +129,7 @@ def _draw_correlation(ax: Axes, correlation: Table) -> None:
     factor, second = style.si_unit(lag, "s")
     values = np.asarray(correlation["autocorrelation"])
     far = lag[-1] * factor * 1.02
-    ax.axhspan(-band[0], band[0], color=style.GRAY, alpha=0.22, linewidth=0.0, label="95 % of white noise")
+    ax.axhspan(-band[0], band[0], color=style.GRAY, alpha=0.22, linewidth=0.0, label="95 % band of white noise")
     ax.vlines(lag * factor, 0.0, values, color=style.BLUE, linewidth=1.1, label="autocorrelation")
     ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
     largest = max(0.2, 1.25 * float(np.nanmax(np.abs(values), initial=0.0)))
@@ -145,16 +147,14 @@ def _put_above(ax: Axes, handles: Any = None) -> None:
 
 def _draw_onsets(ax: Axes, walls: Table) -> None:
     """Draw the deviations of the onsets of instability from the fit, in standard deviations of their noise."""
-    buzzing = select(walls, kind="buzzing")
-    factor, unit = style.si_unit(buzzing[SI_COLUMNS[1]], "N s/m")
+    onsets = select(walls, kind="onset")
+    factor, unit = style.si_unit(onsets[SI_COLUMNS[1]], "N s/m")
     for name, marker, color in (("stiffness", "o", style.VERMILION), ("frequency", "s", style.BLUE)):
-        values = np.asarray(buzzing[f"{name}_residual"])
-        ax.plot(buzzing[SI_COLUMNS[1]] * factor, values, marker, color=color, markersize=4.5, label=name, zorder=3)
+        values = np.asarray(onsets[f"{name}_residual"])
+        ax.plot(onsets[SI_COLUMNS[1]] * factor, values, marker, color=color, markersize=4.5, label=name, zorder=3)
     ax.axhspan(-1.96, 1.96, color=style.GRAY, alpha=0.22, linewidth=0.0, label="95 %")
     ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
-    far = max(
-        3.0, *(1.2 * float(np.nanmax(np.abs(buzzing[f"{name}_residual"]))) for name in ("stiffness", "frequency"))
-    )
+    far = max(3.0, *(1.2 * float(np.nanmax(np.abs(onsets[f"{name}_residual"]))) for name in ("stiffness", "frequency")))
     ax.set(ylim=(-far, far), xlabel=f"virtual damping  $B$  in {unit}", ylabel="onset minus fit,\nstandardized")
     ax.margins(x=0.1)
     _put_above(ax)
@@ -183,7 +183,7 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     colors = colors if len(colors) > 1 else dict.fromkeys(colors, style.BLACK)
     handles += _mark_walls(ax, walls, colors, (to_spring, spring), (to_damper, damper))
     ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to_spring)
-    # Extend the axis of B upwards by the height of the legend.
+    # Extend the axis of B upwards by the height of the legend, so that the legend covers no wall.
     highest = float(np.max(dampings)) * to_damper
     ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
     name_axes(ax, spring, damper)
@@ -203,11 +203,14 @@ def _mark_walls(
         damping: Factor from N s/m to the unit of the damping axis, and this unit.
     """
     handles, kinds = [], {}
-    for kind in ("stiffest", "set", "buzzing"):
+    for kind in ("stiffest", "set", "onset"):
         selected = select(walls, kind=kind)
         K, B = selected[SI_COLUMNS[0]] * stiffness[0], selected[SI_COLUMNS[1]] * damping[0]
         kinds[kind] = selected, K, B
-    for kind, mark, words in (("stiffest", "stiffest", "stiffest wall"), ("set", "recommended", "recommended wall")):
+    for kind, mark, words in (
+        ("stiffest", "stiffest", "stiffest stable wall"),
+        ("set", "recommended", "recommended wall"),
+    ):
         selected, *values = kinds[kind]
         for fit, K, B in zip(selected["fitted_to"], *values, strict=True):
             color = colors.get(fit, style.BLACK)
@@ -216,12 +219,12 @@ def _mark_walls(
             numbers = f"$K = {round_conservatively(K, 'below'):.4g}$ {stiffness[1]}, $B = {B:.4g}$ {damping[1]}"
             handles.append(style.line(f"{words}: {numbers}", "", color=color, **MARKS[mark]))
     if not kinds["set"][1].size:
-        handles.append(style.line("no wall recommended: warnings, or no safe wall", ""))
-    selected, K, B = kinds["buzzing"]
+        handles.append(style.line("no wall recommended", ""))
+    selected, K, B = kinds["onset"]
     if K.size:
         look = {"color": style.VERMILION, "markersize": 5.0, "marker": "X"}
         reach = 1.96 * selected["stiffness_error_N_per_m"] * stiffness[0]
-        ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
+        ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="onset", **look)
         middle = float(np.max(kinds["stiffest"][2]))
         for x, y, frequency in zip(K, B, selected["frequency_Hz"], strict=True):
             # Write the frequency of an onset outside of the shaded region of stable walls: below the onset in the lower

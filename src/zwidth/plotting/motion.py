@@ -21,7 +21,7 @@ from zwidth.plotting.table import Table, curves, draws_tables
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}  # mark of the settling time
 _ZERO_ORDER_HOLD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}  # line of the sampled wall force
-# If a motion grows without bound, the axis ends at this multiple of the largest value of the smallest motion.
+# If a motion grows without bound, the axis ends at this multiple of the largest absolute value of the smallest motion.
 _CLIP = 8.0
 # A motion is taken to grow without bound if the ratio of the largest value in the last quarter of its time to the
 # largest value before exceeds this factor. The factor must be above 4/3, the ratio for a constant velocity.
@@ -33,7 +33,7 @@ _MAX_PANELS = 6  # largest number of motions in a figure of energies; if there a
 _ENERGIES = {
     "energy_J": ("energy of the bodies", style.BLACK, style.SOLID),
     "wall_work_J": ("work of the wall", style.VERMILION, style.DASHED),
-    "push_work_J": ("work of the hand", style.GREEN, style.DOTTED),
+    "external_work_J": ("work of the external force", style.GREEN, style.DOTTED),
     "damping_loss_J": ("dissipated by dampers", style.BLUE, style.DASH_DOTTED),
     "friction_loss_J": ("dissipated by friction", style.PURPLE, style.SOLID),
 }

@@ -260,7 +260,7 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     return panels
 
 
-_MAX_LEGEND_ENTRIES = 8  # largest number of deltas in a legend; more have a color bar, which is easier to read
+_MAX_LEGEND_ENTRIES = 8  # largest number of deltas in a legend; for more deltas a color bar is easier to read
 # Largest number of deltas, and of delays, in a grid of panels. If there are more, evenly spaced ones are drawn.
 _MAX_PANELS = 3
 

@@ -2,7 +2,9 @@
 
 A plane has two parameters of a sweep as axes; values of a third parameter have one panel each. Boundaries of regions
 are drawn from exact outlines if the cells agree with them, otherwise as contours or along the cells. The boundary of
-the stable walls is the contour 0 or 1 of a smooth output (margin, spectral radius), if the data contain one.
+the stable walls is the contour 0 or 1 of a smooth output (margin, spectral radius), if the data contain one. A *ridge
+surface* shows the stiffest stable wall over two parameters of the device; a *corner optimum* is such a wall at a corner
+of the stability boundary.
 """
 
 from __future__ import annotations
@@ -31,10 +33,10 @@ if TYPE_CHECKING:
 Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, stable_set.Outlines]]"
 """Returns the outlines of the "stable" and the "passive" walls of a panel in its units, stiffness first."""
 
-# Outputs that have a contour along the boundary of the stable walls. It is smoother than the contour of the Boolean
+# Outputs that have a contour along the boundary of the stable walls. This contour is smoother than that of the Boolean
 # output "stable".
 SMOOTH = ("margin", "spectral_radius")
-# By Boolean output: smooth outputs that have a contour along the boundary of its region.
+# Smooth outputs that have a contour along the boundary of the region of each Boolean output.
 _SMOOTH_OUTPUTS = {"stable": SMOOTH, "passive": ("passivity_margin",)}
 # Outputs that are finite for stable walls only.
 _FINITE_IF_STABLE = ("settling_time", "delay_margin")
@@ -43,7 +45,7 @@ _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", 
 _FEW_TICKS = 1000.0  # ratio of largest to smallest value below which a color bar also has ticks at 2 and 5
 _LABELLED = 0.1  # fraction of a panel that a region must fill for contour labels
 _SEEN = 0.003  # fraction of a panel that corner optima must fill for a legend entry
-# Styles of boundaries, and of the marker at the stiffest stable wall.
+# Line style of boundaries, and style of the marker at the stiffest stable wall.
 _EDGE: dict[str, Any] = {"color": style.BLACK, "linestyle": style.SOLID, "linewidth": 1.3, "zorder": 2.2}
 _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
 
@@ -111,7 +113,7 @@ def read_panel(part: xarray.Dataset, name: str, edges: Edges | None) -> Panel:
     variables = {str(each): np.ma.masked_invalid(values.values) for each, values in part.items() if values.ndim}
     peak = {str(each).removesuffix("_peak"): float(values) for each, values in part.items() if not values.ndim}
     inside = all(part[dim].min() <= value <= part[dim].max() for dim, value in peak.items())
-    # Outlines have the stiffness first, so swap their columns if it is not along x.
+    # The first column of an outline is the stiffness. Swap the columns if the stiffness is not along x.
     step, outlines_of_part = -1 if across in ("beta", "virtual_damping") else 1, edges(part) if edges else {}
     outlines = {kind: [(points[:, ::step], hole) for points, hole in each] for kind, each in outlines_of_part.items()}
     axes = part[across].values, part[up].values
@@ -130,7 +132,7 @@ def _select_drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
 
 
 def _add_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> xarray.Dataset:
-    """Return the dataset ``drawn`` with the stiffest stable walls added, if the axes are K and B and they are known."""
+    """Return the dataset ``drawn`` with the stiffest stable walls of ``data`` added, if the axes are K and B."""
     names = dict(zip((x, y), _PEAKS.get(x, ()), strict=False))
     if y not in ("beta", "virtual_damping") or not names or not all(name in data for name in names.values()):
         return drawn
@@ -180,7 +182,7 @@ def draw_panels(axes: np.ndarray, panels: Sequence[Panel], name: str, label: str
 
 
 def _draw_regions(ax: Axes, panel: Panel, name: str) -> Any:
-    """Draw the stable and the passive walls as areas with their boundaries; return the image of the last."""
+    """Draw the stable and the passive walls as areas with their boundaries; return the image of the area drawn last."""
     image = None
     x, y, variables = panel.x, panel.y, panel.variables
     for each, dash in (("stable", style.SOLID), ("passive", style.DASH_DOTTED)):
@@ -278,15 +280,15 @@ def _add_legend(axes: np.ndarray, panels: Sequence[Panel], name: str, image: Any
         if output.logarithmic:
             style.use_logarithmic(bar.ax, "y", (image.norm.vmin, image.norm.vmax), _FEW_TICKS)
         bar.ax.tick_params(labelsize=8)
-    exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
+    exact = any(line.get_label() == "exact boundary" for ax in axes for line in ax.lines)
     crossed = finite.size and finite.min() < output.center < finite.max()
     if crossed if output.color_scale == "diverging" else (exact and output.color_scale != "truth"):
         walls = "passive" if name == "passivity_margin" else "stable"
-        handles.append(style.line(f"edge of what is {walls}", width=1.3, color=style.BLACK))
+        handles.append(style.line(f"boundary of the {walls} walls", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):
         handles.append(Patch(facecolor=MISSING, label="unstable"))
     elif any(np.ma.is_masked(panel.variables[name]) for panel in panels):
-        handles.append(Patch(facecolor=MISSING, label="no answer"))
+        handles.append(Patch(facecolor=MISSING, label="no result"))
     if any(np.mean(panel.variables["kind"] == 1) > _SEEN for panel in panels if "kind" in panel.variables):
         handles.append(Patch(facecolor="white", hatch="////", edgecolor="#606060", linewidth=0, label="corner optimum"))
     if any(panel.peak for panel in panels):

@@ -49,8 +49,8 @@ from zwidth.units.formatting import format_wall
 from zwidth.units.quantities import PARAMETERS
 
 N_ANGLES = 181  # number of points on the outline of the passive walls
-# Number of frequencies of an open loop on each of two grids up to the Nyquist frequency, a logarithmic and a linear
-# one.
+# Number of frequencies of an open loop on each of two grids up to the Nyquist frequency, one logarithmic and one
+# linear.
 N_FREQUENCIES = 2000
 MIN_PERIODS = 100  # least number of sampling periods in the step response of a recommended wall
 MAX_PERIODS = 20_000  # largest number of sampling periods in the step response of a recommended wall
@@ -151,16 +151,16 @@ def _trace_passive(scene: Scene, label: str = "") -> dict[str, Any]:
 
 @_with_house_style
 def recommendation(
-    found: Recommendation, axes: style.AnyAxes | None = None, *, response: Table | None = None
+    recommendation: Recommendation, axes: style.AnyAxes | None = None, *, response: Table | None = None
 ) -> np.ndarray:
     """Draw a recommended wall among the stable ones, and its response to a step of 1 N.
 
     Args:
-        found: Result of `zwidth.Scene.recommend`; if it has no wall, only the stable walls are drawn.
+        recommendation: Result of `zwidth.Scene.recommend`; if it has no wall, only the stable walls are drawn.
         axes: An existing Axes for the walls only, or two. Default: a pyplot figure.
         response: Columns of a step study of this wall, in SI units. Default: computed at the samples.
     """
-    scene, verdict, recommended = found.scene, found.verdict, found.as_dict()["recommended"]
+    scene, verdict, recommended = recommendation.scene, recommendation.verdict, recommendation.as_dict()["recommended"]
     # Omit the step response of a measured device, because it can only be computed from a model.
     has_model = not isinstance(scene.device, MeasuredDevice)
     if axes is None:
@@ -175,7 +175,7 @@ def recommendation(
         outlines = stack([outlines, _trace_passive(scene)])
     if verdict is None:
         return draw_stable_set(outlines, walls, panels[:1])
-    K, B = found.stiffness, found.virtual_damping
+    K, B = recommendation.stiffness, recommendation.virtual_damping
     row = {
         "label": "",
         "wall": f"recommended ({100 * recommended['stiffness_fraction']:.3g} %)",
@@ -193,7 +193,7 @@ def recommendation(
             min(max(MIN_PERIODS, 1.5 * (recommended["decay_time"] or 0.0) / scene.timing.period), MAX_PERIODS)
         )
         columns = _tabulate_step(scene, K, B, periods)
-        if not scene.parts_beyond:
+        if not scene.nonrigid_parts:
             wall = verdict.alpha, verdict.beta, float(scene.delta), float(scene.d)
             columns["settling_time_s"] = settling_time(*wall) * scene.timing.period
         response = stack([columns])
@@ -242,7 +242,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
         ax.fill_between(grid, 0.0, top * factor, color=style.BLUE, alpha=0.08, linewidth=0.0)
     words = quantity.label_in(scene.unit_system) if quantity else style.literal(parameter)
     words += f"  in {value_unit}" if value_unit not in ("", "1") else ""
-    ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
+    ax.set(xlabel=words, ylabel=rf"maximum stable stiffness  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
     scale_axis(ax, "x", grid)
     if whole and ax.get_xscale() == "linear":
         ax.set_xlim(*style.span(float(grid.min()), float(grid.max())))
@@ -397,7 +397,10 @@ def poles(
     outside = np.abs(z) >= 1.0
     reach = 1.15 * max(1.0, float(np.abs(z).max()))
     ax = _make_complex_plane(ax, (-reach, reach), (-reach, reach))
-    looks = (~outside, style.BLUE, "x", "inside"), (outside, style.VERMILION, "D", "not inside")
+    looks = (
+        (~outside, style.BLUE, "x", "inside the unit circle"),
+        (outside, style.VERMILION, "D", "on or outside the unit circle"),
+    )
     for mask, color, mark, words in looks:
         if mask.any():
             ax.plot(z[mask].real, z[mask].imag, mark, color=color, markersize=6, label=f"poles {words}")
@@ -406,23 +409,23 @@ def poles(
 
 
 @_with_house_style
-def motion(found: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
+def motion(motion: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
     """Draw the position of one or several simulated motions over time.
 
     Args:
-        found: Result of `zwidth.simulate` with recorded positions.
+        motion: Result of `zwidth.simulate` with recorded positions.
         ax: An existing Axes. Default: pyplot's current one.
         labels: Names of several motions, in their order.
     """
-    if not hasattr(found, "wall_force"):
-        raise InputError(f"found: got {type(found).__name__}; pass the result of zwidth.simulate")
-    if found.position is None or found.time is None:
-        raise InputError("found: got a motion that was not recorded; simulate with record=True")
-    rows = found.position.reshape(-1, found.position.shape[-1])
+    if not hasattr(motion, "wall_force"):
+        raise InputError(f"motion: got {type(motion).__name__}; pass the result of zwidth.simulate")
+    if motion.position is None or motion.time is None:
+        raise InputError("motion: got a motion that was not recorded; simulate with record=True")
+    rows = motion.position.reshape(-1, motion.position.shape[-1])
     if labels and len(labels) != len(rows):
         raise InputError(f"labels: got {len(labels)} for {len(rows)} motions; pass one for each")
-    times = np.broadcast_to(found.time.reshape(-1, rows.shape[-1]), rows.shape)
-    contact = found.contact.reshape(len(rows), -1)
+    times = np.broadcast_to(motion.time.reshape(-1, rows.shape[-1]), rows.shape)
+    contact = motion.contact.reshape(len(rows), -1)
     touching = np.repeat(contact, rows.shape[-1] // contact.shape[-1], axis=1)
     columns = zip(list(labels) or [""] * len(rows), times, rows, touching, strict=True)
     names = ("label", "time_s", "position_m", "contact")

@@ -151,7 +151,7 @@ def agrees(outlines: Outlines, x: np.ndarray, y: np.ndarray, good: np.ndarray) -
 
 
 def _cells_inside(outlines: Outlines, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return a mask of the cells inside outlines, of shape (y, x): an odd number of outlines is crossed to their left.
+    """Return a mask of the cells inside outlines, of shape (y, x): a ray to the left crosses an odd number of lines.
 
     The coordinates x and y may be ascending or descending.
     """
@@ -193,7 +193,7 @@ def draw_exact(
     fitted = fit_axes(outlines, ax)
     shade_region(ax, fitted, face, zorder=1.5)
     for points, _ in fitted:
-        ax.plot(*_close(points).T, label="exact edge", **look)
+        ax.plot(*_close(points).T, label="exact boundary", **look)
     return fitted
 
 
@@ -221,7 +221,7 @@ def fit_axes(outlines: Outlines, ax: Axes) -> Outlines:
 
 
 def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
-    """Yield each outline of the stable set of a scene as columns of a table, together with further ``columns``."""
+    """Yield each outline of the stable set of a scene as columns of a table, with the additional ``columns``."""
     for number, outline in enumerate(scene.stable_region(), start=1):
         piece = "hole" if outline.hole else ("island" if outline.island else "outline")
         # Repeat the first point at the end, because tables contain closed lines.
@@ -272,8 +272,8 @@ def draw_stable_set(
         pieces |= _draw_pieces(ax, select(outlines, label=label), names, color, factors, 0.5 / (1 + len(labels)))
     rows, spec = select(walls), ax.get_subplotspec()
     width = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
-    # Extend the stiffness axis for the text to the right of the stiffest wall, by a larger part if the panel is narrow,
-    # because the width of the text does not shrink with the panel.
+    # Extend the stiffness axis for the text to the right of the stiffest wall, by a larger fraction if the panel is
+    # narrow, because the width of the text does not shrink with the panel.
     right_margin, most = 0.28 * max(1.0, 5.6 / width), max(rows[names[0]], default=np.nan) * factors[0]
     rows = {"digits": np.full(len(rows["wall"]), 4), **rows}
     for kind, label, digits, *wall in zip(*(rows[name] for name in ("wall", "label", "digits", *names)), strict=True):
@@ -303,7 +303,7 @@ def draw_stable_set(
         mark = {**MARKS["stiffest"], "marker": markers[label]}
         handles.append(style.line(style.literal(label), color=color, **mark))
     handles += [style.line(name, dash) for name, dash in _DASHES.items() if name in pieces and name != "outline"]
-    handles += [] if alone else [style.line("stiffest wall", "", **MARKS["stiffest"])]
+    handles += [] if alone else [style.line("stiffest stable wall", "", **MARKS["stiffest"])]
     style.legend(panels, handles, outside=axes is None, ncols=3, loc="upper right")
     return panels
 

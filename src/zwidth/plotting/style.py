@@ -50,7 +50,7 @@ STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED, (0, (11.0, 2.5)), (0, (6.0, 1.8, 1
 # Markers that distinguish curves if their line styles already have a meaning.
 MARKERS = ("o", "s", "^", "v", "P", "X", "*")
 
-# Spelling in labels of units for which it differs from the spelling in datasets (UDUNITS).
+# Spelling of units in labels, for those units whose spelling in datasets (UDUNITS) differs.
 _WRITTEN = {"1": "", "degree": "degrees", "g cm^2": "g cm$^2$"}
 
 # Line properties for curves over an integer parameter: points without lines between them.
@@ -65,12 +65,12 @@ LIGHTEST = 0.6  # position of the lightest curve color in the colormap viridis; 
 _DENSE_TICKS = 5.0  # ratio of the ends of a logarithmic axis, below which ticks at 1, 2 and 5 are too few
 _SINGLE_VALUE_RANGE = 2.0  # factor between a single value and each end of its logarithmic axis
 
-# Metadata to be omitted by file format, because the same figure must always have the same bytes.
+# Metadata to omit from files, by file format, so that the same figure always has the same bytes.
 _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 _RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_default_template=False))
 Size: TypeAlias = tuple[float, float | None]
-_ONE_COLUMN = 5.0  # least width of a figure with several columns of panels, in inches, because labels need room
+_ONE_COLUMN = 5.0  # least width of a figure with several columns of panels, in inches
 
 
 class _FigureSettings(NamedTuple):
@@ -149,7 +149,7 @@ def panels(given: AnyAxes | None, count: int, width: float, height: float, colum
     """Return a 1-D array of the Axes to draw into: the given ones, or those of a new figure.
 
     Args:
-        given: Existing Axes, of which the first ``count`` are returned; None for a new figure.
+        given: Existing Axes; the first ``count`` of them are returned. None for a new figure.
         count: Number of panels.
         width: Width of a new figure in inches.
         height: Height of a new figure in inches.
@@ -193,7 +193,7 @@ def literal(text: Any) -> str:
 
 
 def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
-    """Label the x and y axes of each panel; if ``once`` and there are several panels, those of the figure instead."""
+    """Label the x and y axes of each panel; with ``once``, label several panels together, by the figure's labels."""
     if once and len(axes) > 1:
         axes[0].figure.supxlabel(x, fontsize=9.0)
         axes[0].figure.supylabel(y, fontsize=9.0)
@@ -245,8 +245,8 @@ class _PlainLocator(LogLocator):
         low, high = sorted((vmin, vmax))
         if low <= 0 or np.count_nonzero((low <= ticks) & (ticks <= high)) > 1:
             return ticks
-        # Use powers of ten on axes longer than a decade, because with 2 and 5 times powers of ten, matplotlib places no
-        # ticks at all on axes of very many decades. Use linear ticks on shorter axes.
+        # Use powers of ten on axes longer than a decade: with 2 and 5 times powers of ten, matplotlib would place no
+        # ticks on axes of very many decades. Use linear ticks on shorter axes.
         wide = LogLocator() if high > 10.0 * low else AutoLocator()
         return wide.tick_values(low, high)
 
@@ -367,13 +367,13 @@ def save(
 
 
 def ordered_colors(count: int) -> list[Any]:
-    """Return ``count`` colors for values in ascending order; larger values are darker."""
+    """Return ``count`` colors for values in ascending order; colors of larger values are darker."""
     shades = np.linspace(LIGHTEST, 0.0, count) if count > 1 else np.array([0.25])
     return [matplotlib.colormaps["viridis"](shade) for shade in shades]
 
 
 def color_by_value(values: Sequence[float]) -> dict[float, Any]:
-    """Return a color for each distinct value; larger values are darker."""
+    """Return a color for each distinct value; colors of larger values are darker."""
     distinct = sorted(set(values))
     return dict(zip(distinct, ordered_colors(len(distinct)), strict=True))
 

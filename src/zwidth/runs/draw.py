@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 _PLANES = ({"alpha", "beta"}, {"stiffness", "virtual_damping"})  # dimensions of a plane of walls
 FOLDER = "figures"  # default name of the folder of the figures, next to the stores
-# Smallest number of values along both axes with which an output of devices is drawn as a plane. With fewer values, it
-# is drawn as curves.
+# Smallest number of values along both axes for which an output of devices is drawn as a plane. With fewer values, the
+# output is drawn as curves.
 _MIN_SURFACE = 6
 
 
@@ -86,7 +86,7 @@ def draw_stores(
     path: str | os.PathLike[str],
     out: str | os.PathLike[str] | None = None,
     *,
-    at: Mapping[str, float | str] | None = None,
+    selection: Mapping[str, float | str] | None = None,
     formats: Sequence[str] = ("png", "svg"),
     dpi: float | None = None,
     size: Size | None = None,
@@ -99,9 +99,9 @@ def draw_stores(
     Args:
         path: Store, or folder with stores.
         out: Folder of the figures; by default ``figures`` next to the stores.
-        at: Values by name of the parameter that select a slice: a number in the units of the store, a quantity with its
-            unit such as "1 ms", or the label of a device. The nearest value of the sweep is drawn. For every other
-            parameter that is not an axis, up to three values are drawn.
+        selection: Values by name of the parameter that select a slice: a number in the units of the store, a quantity
+            with its unit such as "1 ms", or the label of a device. The nearest value of the sweep is drawn. For every
+            other parameter that is not an axis, up to three values are drawn.
         formats: File formats.
         dpi: Resolution of pixel graphics, in dots per inch.
         size: Width of the figures, or width and height, in inches.
@@ -121,7 +121,7 @@ def draw_stores(
     beside = folder.parent if stores == [folder] else folder
     target = beside / FOLDER if out is None else Path(os.fsdecode(out))
     # Replace dots by underscores, because the names of dimensions in stores have underscores in place of dots.
-    wanted = {name.replace(".", "_"): value for name, value in (at or {}).items()}
+    wanted = {name.replace(".", "_"): value for name, value in (selection or {}).items()}
     datasets = {store: open_dataset(store).reset_coords(drop=True) for store in stores}
     for store in (store for store, data in datasets.items() if not data.attrs["complete"]):
         note(f"{store.name}: chunks are missing and left blank; 'zwidth run CONFIG --resume' computes them")

@@ -4,7 +4,7 @@ The record contains one *entry* per study. It is written again after every study
 time leaves a correct record. The files of a study are created in a hidden folder, then entered in the record, and only
 then moved to their names in the folder of the run. So no file of a run is ever incomplete under its name, and a file
 that is not in the record, a file *of the user*, is never replaced or removed. *Inputs* of a study are its configuration
-and the files that this configuration reads, of which the folder ``inputs`` contains copies.
+and the files that this configuration reads; the folder ``inputs`` contains copies of them.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Record:
             self.damaged = True
             if content.get("format") == RUN_FORMAT:
                 # Mark all studies as unfinished, so that they are computed again. Keep only entries with a list of
-                # files, because a run replaces no files that its record does not list.
+                # files, because a run may replace only the files that its record lists.
                 entries = [entry for entry in content["studies"] if isinstance(entry, dict)]
                 content["studies"] = [
                     {**entry, "state": "open"}
@@ -197,8 +197,8 @@ class Record:
         """Update the record and write its file.
 
         Args:
-            about: Entries of the record to be set, apart from those of the studies. entry: Entry of a study, which
-                replaces an earlier entry of the same study; None for no change.
+            about: Entries of the record to be set, apart from those of the studies.
+            entry: Entry of a study, which replaces an earlier entry of the same study; None for no change.
         """
         content = {**self.content, **about}
         studies = [old for old in content.get("studies", ()) if entry is None or old["name"] != entry["name"]]
@@ -283,7 +283,7 @@ class Record:
 
 
 def _find_fault(content: Any) -> str:
-    """Return a phrase with the reason why a JSON value is not a record of a run; "" if it is a record."""
+    """Return a phrase that states why a JSON value is not the record of a run; "" if it is a record."""
     kinds = {"studies": list, "versions": dict, "inputs": dict}
     if not all(isinstance(content.get(key, kind()), kind) for key, kind in kinds.items()):
         return "no record of a run"
@@ -344,7 +344,7 @@ def _choose_name(name: str, taken: dict[str, bytes]) -> str:
     plain = re.sub(r"[^A-Za-z0-9._-]", "_", PurePath(name).name)
     stem, suffix = PurePath(plain).stem, PurePath(plain).suffix
     number = 1
-    # Compare in lower case, because some file systems do not distinguish upper and lower case.
+    # Compare the names in lower case, because some file systems do not distinguish upper and lower case.
     while plain.lower() in {each.lower() for each in taken}:
         number += 1
         plain = f"{stem}-{number}{suffix}"
@@ -352,7 +352,7 @@ def _choose_name(name: str, taken: dict[str, bytes]) -> str:
 
 
 def rename_inputs(value: Any, names: dict[str, str]) -> Any:
-    """Return the JSON of a configuration in which the names of files are replaced, given the new names by old name."""
+    """Replace the names of files in the JSON value of a configuration; ``names`` contains the new names by old name."""
     if isinstance(value, list):
         return [rename_inputs(item, names) for item in value]
     if not isinstance(value, dict):

@@ -46,7 +46,7 @@ class StudyResult:
     kind: str
     state: Literal["done", "kept", "failed", "open"]
     seconds: float = 0.0  # computing time in s; for a sweep, its part of the time in which all sweeps were computed
-    files: tuple[str, ...] = ()  # names of the files written in the folder of the run; for a sweep, that of its store
+    files: tuple[str, ...] = ()  # names of the files written in the folder of the run; for a sweep, of its store
     notes: tuple[str, ...] = ()  # remarks that affect the use of the results, such as points without a result
     answer: tuple[str, ...] = ()  # main result in one or two lines; empty if it is longer
     error: str = ""  # type and message of the exception that ended the study; empty if there was none
@@ -63,10 +63,10 @@ class RunResult:
     studies: tuple[StudyResult, ...]  # outcome of each study, sweeps last
     seconds: float  # run time in s
     repaired: tuple[str, ...] = ()  # damaged or missing files and chunks that were created again
-    hopeless: str = ""  # error that ended the run, because it affects every study, such as a full disk
+    fatal_error: str = ""  # error that ended the run, because it affects every study, such as a full disk
     interrupted: bool = False  # True if the user stopped the run with Ctrl-C; earlier results are kept
-    lost: str = ""  # error of the cluster that ended the run; earlier results are kept
-    whole: int = 0  # number of studies in the configuration that are not sweeps
+    cluster_error: str = ""  # error of the cluster that ended the run; earlier results are kept
+    computed_count: int = 0  # number of studies in the configuration that are not sweeps
 
     @property
     def failed(self) -> tuple[StudyResult, ...]:
@@ -81,7 +81,7 @@ class RunResult:
     @property
     def ok(self) -> bool:
         """True if no study failed, and neither the user nor an error ended the run early."""
-        return not (self.failed or self.interrupted or self.hopeless or self.lost)
+        return not (self.failed or self.interrupted or self.fatal_error or self.cluster_error)
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def run(
         if plans and not active.over:
             active.run_sweeps(plans, about, workers=workers, scheduler=scheduler)
     seconds = time.perf_counter() - clock
-    ends = active.hopeless, active.interrupted, active.lost, len(computed)
+    ends = active.fatal_error, active.interrupted, active.cluster_error, len(computed)
     return RunResult(shown, tuple(active.results), seconds, tuple(active.repaired), *ends)
 
 
@@ -230,13 +230,13 @@ class _Run:
         self.config, self.record, self.inputs, self.report, self.total = config, record, inputs, report, total
         self.results: list[StudyResult] = []
         self.repaired = [f"{RUN_FILE} is damaged"] if record.damaged else []
-        self.hopeless = self.lost = ""
+        self.fatal_error = self.cluster_error = ""
         self.interrupted = False
 
     @property
     def over(self) -> bool:
         """True if no further study is to be computed."""
-        return bool(self.hopeless) or self.interrupted
+        return bool(self.fatal_error) or self.interrupted
 
     def compute_studies(self, computed: list[ComputedStudy]) -> None:
         """Compute the studies that are not done yet.
@@ -290,7 +290,7 @@ class _Run:
                 with suppress(OSError):
                     self.record.note({**make_entry(error), "files": before.get("files", {})})
         if error is not None and is_fatal(error):
-            self.hopeless = _describe_error(error)
+            self.fatal_error = _describe_error(error)
         kept = self.record.entry(study.name) or {"files": ()}
         ended = "failed" if error else "done", time.perf_counter() - clock, tuple(kept["files"])
         texts = outcome.notes, outcome.answer, _describe_error(error), error
@@ -306,8 +306,8 @@ class _Run:
         """
         clock = time.perf_counter()
         number = {plan.study.name: len(self.results) + k for k, plan in enumerate(plans, start=1)}
-        # Count the time between two completed chunks as computing time of the second chunk's sweep, because workers
-        # compute chunks of several sweeps in parallel.
+        # Count the time between two completed chunks as computing time of the second chunk's sweep. Workers compute
+        # chunks of several sweeps in parallel, so the times of sweeps cannot be measured separately.
         spent = dict.fromkeys(number, 0.0)
 
         def report_chunk(progress: Progress) -> None:
@@ -329,7 +329,11 @@ class _Run:
             # Record an interrupt before the first chunk; `compute_sweeps` handles later interrupts itself.
             self.interrupted = True
             return
-        self.hopeless, self.interrupted, self.lost = sweeps.fatal_error, sweeps.interrupted, sweeps.lost
+        self.fatal_error, self.interrupted, self.cluster_error = (
+            sweeps.fatal_error,
+            sweeps.interrupted,
+            sweeps.cluster_error,
+        )
         for study in (plan.study for plan in plans):
             sweep = sweeps.results[study.name]
             self.repaired += sweep.repaired
@@ -337,9 +341,9 @@ class _Run:
             state = "failed" if sweep.failed else "open" if store.missing() else "done"
             counts = store.count_statuses() if state == "done" else {}
             notes = tuple(note for family, each in counts.items() for note in note_failures(each, f"{family}s"))
-            error = next(iter(sweep.failed.values()), sweeps.lost)
+            error = next(iter(sweep.failed.values()), sweeps.cluster_error)
             seconds = spent[study.name]
-            if not self.hopeless:
+            if not self.fatal_error:
                 ended = {"seconds": round(seconds, 3), "notes": [*notes], "error": error}
                 self.record.note({**self._make_sweep_entry(study, state), **ended})
             files = (sweep.store.name,)

@@ -87,8 +87,8 @@ def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, push: Any, periods: int) -> Any:
-    """Return the external force on the device in N, averaged over each period, plus the force of the moving hand.
+def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, external_force: Any, periods: int) -> Any:
+    """Return the external force on the device in N, averaged over each period, plus the force of a moving hand.
 
     Args:
         scenes: distinct scenes, each with a rigid operator.
@@ -105,8 +105,8 @@ def convert_hand(scenes: list[Any], which: np.ndarray, hand: Any, push: Any, per
     units = [(each.operator.stiffness, each.operator.damping / each.timing.period) for each in scenes]
     spring, damper = np.moveaxis(np.array(units, float)[which], -1, 0)[..., None]
     with np.errstate(all="ignore"):
-        pushes = spring * 0.5 * (places[..., 1:] + places[..., :-1]) + damper * np.diff(places)
-    return pushes if push is None else pushes + as_float64("push_history", push)
+        forces = spring * 0.5 * (places[..., 1:] + places[..., :-1]) + damper * np.diff(places)
+    return forces if external_force is None else forces + as_float64("external_force_history", external_force)
 
 
 def _read_history(name: str, values: Any, length: int, unit: str) -> np.ndarray:
@@ -195,12 +195,12 @@ def read_arguments(
         name: as_float64(_spell(name), read_texts(_spell(name), value, system[_unit(name)]))
         for name, value in given.items()
     }
-    seeds, pushes = _read_seeds(seed), None
+    seeds, forces = _read_seeds(seed), None
     shapes = {"scenes": which.shape, **{_spell(name): array.shape for name, array in arrays.items()}}
     shapes["seed"] = seeds.shape
     if history is not None:
-        pushes = _read_history("push_history", history, periods, system["N"])
-        shapes["push_history without its last axis"] = pushes.shape[:-1]
+        forces = _read_history("external_force_history", history, periods, system["N"])
+        shapes["external_force_history without its last axis"] = forces.shape[:-1]
     shape = join_shapes((name, part) for name, part in shapes.items() if part or name == "scenes")
     if not math.prod(shape):
         raise InputError(f"scenes: got a batch of shape {shape}; use at least one simulation")
@@ -216,11 +216,11 @@ def read_arguments(
         name: np.where(good, np.broadcast_to(array, shape), 0.0).reshape(-1) for name, array in arrays.items()
     }
     numbers["seed"] = np.broadcast_to(seeds, shape).reshape(-1)
-    if pushes is not None:
-        finite = np.isfinite(pushes)
+    if forces is not None:
+        finite = np.isfinite(forces)
         good &= np.broadcast_to(finite.all(-1), shape)
-        filled = np.where(finite, pushes, 0.0)
-        numbers["push_history"] = np.broadcast_to(filled, (*shape, periods)).reshape(-1, periods)
+        filled = np.where(finite, forces, 0.0)
+        numbers["external_force_history"] = np.broadcast_to(filled, (*shape, periods)).reshape(-1, periods)
     return numbers, which, good.reshape(-1)
 
 
@@ -231,8 +231,8 @@ def refuse_bodies(scenes: list[Any], which: np.ndarray, numbers: dict[str, np.nd
         if np.any((numbers[name] != 0) & system):
             field = "coulomb, static" if name == "static" else _spell(name)
             raise InputError(
-                f"{field}: a linear system has no known bodies and starts at rest at 0; use push or push_history, or a "
-                "zwidth.Device"
+                f"{field}: a linear system has no known bodies and starts at rest at 0; use external_force or "
+                "external_force_history, or a zwidth.Device"
             )
 
 
@@ -243,7 +243,10 @@ def check_memory(numbers: dict[str, np.ndarray], settings: Settings) -> None:
     kept = count * instants * RECORDED_BYTES if settings.record else 0
     jitter = together * instants * JITTER_BYTES if np.any(numbers["jitter"] > 0) else 0
     drawn = (
-        together * settings.periods * DRAWN_BYTES * (bool(np.any(numbers["noise"] > 0)) + ("push_history" in numbers))
+        together
+        * settings.periods
+        * DRAWN_BYTES
+        * (bool(np.any(numbers["noise"] > 0)) + ("external_force_history" in numbers))
     )
     if kept + jitter + drawn > MOST_BYTES:
         remedy = f"use {'record=False' if kept else 'fewer periods'}, or fewer simulations per call"

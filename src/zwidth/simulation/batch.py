@@ -41,8 +41,8 @@ def find_structure(scene: Parts) -> tuple[Any, ...]:
     """Return the structure of a scene, a tuple that is equal for scenes that can share a compiled program."""
     sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
     orders = len(scene.device.modes), 0 if scene.device.actuator is None else scene.device.actuator.order
-    # Include the system and its period in the structure of a `LinearDevice`, because each of them needs a separate
-    # program.
+    # Include the linear system and its period in the structure of a scene with a `LinearDevice`, because each
+    # combination of both needs a separate program.
     system = None if isinstance(scene.device, Device) else (scene.device, scene.timing.period)
     longest = scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
     return *name_bodies(scene), sensor, *orders, longest, system
@@ -166,7 +166,7 @@ def build_batch(
         period=period,
         force=1.0 / force,
         resolution=numbers["resolution"],
-        push=numbers["push"] * force,
+        external_force=numbers["external_force"] * force,
         bilateral=np.array([settings.contact == "bilateral"]),
         pulling=np.array([settings.contact != "push_only"]),
         late=late,
@@ -186,7 +186,7 @@ def build_batch(
         positions=np.stack([numbers[f"start_position.{name}"] for name in names]),
         velocities=np.stack([numbers[f"start_velocity.{name}"] for name in names]) * period,
         noise=draw_noise(numbers["seed"], numbers["noise"], settings.periods),
-        history=(numbers["push_history"] * force[:, None]).T if "push_history" in numbers else None,
+        history=(numbers["external_force_history"] * force[:, None]).T if "external_force_history" in numbers else None,
         durations=durations,
         instants=instants,
         period=period,
@@ -217,7 +217,7 @@ def draw_noise(seeds: np.ndarray, sizes: np.ndarray, periods: int) -> np.ndarray
 def draw_instants(
     seeds: np.ndarray, most: np.ndarray, whole: np.ndarray, fractions: np.ndarray, settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw the jittered sampling instants, and compute the durations of the pieces with constant force (T3).
+    """Draw the jittered sampling instants, and compute the durations of the time intervals with constant force.
 
     Args:
         seeds: seed of each simulation; equal seeds yield equal jitter.
@@ -239,9 +239,9 @@ def draw_instants(
     k = np.arange(periods)[:, None]
     effective = []
     for age in (1, 0, -1):
-        # Compute the time within the period at which each command takes effect. The age of a command is the number of
-        # samples by which it precedes that of sample k - whole. Clip the index of its sample, because no command
-        # exists before the first sample.
+        # Compute the time within period k at which each command takes effect. The age of a command is the number of
+        # samples by which it precedes the command of sample k - whole, with the integer delay ``whole``. Clip the index
+        # of the sample, because no command exists before the first sample.
         sample = np.clip(k - whole - age, 0, periods)
         effective.append(fractions - age + np.take_along_axis(late, sample, 0) - late[:-1])
     durations = cut_period(1.0 + np.diff(late, axis=0), effective, settings.substeps)

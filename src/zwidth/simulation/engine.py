@@ -5,8 +5,9 @@ the index of a sample. One compiled *block* simulates a fixed number of periods,
 further compilation. A period is divided into *substeps*, at whose starts a *frame* is recorded, and a substep into
 *pieces* with constant force; a *reading* is the result of the control program at one sample. A *ring* is a circular
 buffer of positions or commands, indexed by k modulo its length. The *tail* is the last part of a simulation, in which
-its behavior is classified. ``x`` is the state of the bodies, of which the rows ``params.place`` and ``params.motion``
-compute their positions and velocities. FOAW is the adaptive velocity estimate of Janabi-Sharifi et al. 2000.
+its behavior is classified. ``x`` is the state of the bodies; its products with the rows of ``params.place`` and
+``params.motion`` are their positions and velocities. FOAW is the adaptive velocity estimate of Janabi-Sharifi et al.
+2000.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ SEGMENTS = 6  # number of equal segments of the tail; even, because the trend co
 # Factor on the noise bound of FOAW, slightly above 1, so that deviations of exactly one encoder count are admissible in
 # spite of rounding errors.
 SLACK = 1.0 + 1e-9
-# Use XLA's older loop emitters without splitting, because they halve the compile time at the same speed. Require full
-# optimization even if XLA_FLAGS sets a lower level, because a simulation runs for thousands of periods.
+# Use XLA's older loop emitters, and generate the code of a program in one part, because this halves the compile time
+# and does not change the run time. Require full optimization even if XLA_FLAGS sets a lower level, because a simulation
+# runs for thousands of periods.
 COMPILER_OPTIONS = (
     ("xla_cpu_use_fusion_emitters", False),
     ("xla_cpu_parallel_codegen_split_count", 1),
@@ -84,12 +86,12 @@ class PeriodInputs(NamedTuple):
 
     k: Array  # index of the period and of the sample at its start
     noise: Array  # error of the measured position
-    push: Array  # external force on the device
+    external_force: Array  # external force on the device
     durations: Array  # durations of constant force, (substeps, pieces, batch); used with jitter only
 
 
 def _write(rows: Array, row: Array, index: Array) -> Array:
-    """Return a copy of an array in which the row with an index along the first axis is replaced."""
+    """Return a copy of the array ``rows`` in which ``row`` replaces the entry at ``index`` along the first axis."""
     return jax.lax.dynamic_update_index_in_dim(rows, row, index, 0, allow_negative_indices=False)
 
 
@@ -145,7 +147,7 @@ def control(
         force = -(params.alpha * measured + params.beta * velocity)
     else:
         force = options.law(measured, velocity / params.period, k * params.period) / params.force
-        # With a force law, count a nonzero force as contact, because a law has no surface.
+        # With a force law, count a nonzero force as contact, because a force law defines no surface of the wall.
         touching &= force != 0
     force = jnp.where(touching, force, 0.0)
     force = jnp.where(params.pulling, force, jnp.minimum(force, 0.0))
@@ -190,7 +192,7 @@ def propagate(
     body: BodyState,
     work: Array,
     force: Array,
-    push: Array,
+    external_force: Array,
     indices: tuple[Array | int, Array | int],
     time: Array,
 ) -> tuple[BodyState, Array]:
@@ -202,7 +204,7 @@ def propagate(
         body: state of the bodies at the start of the piece.
         work: the four energies of `State` at the start of the piece.
         force: force of the wall (with an actuator, its command).
-        push: external force on the device.
+        external_force: external force on the device.
         indices: indices of the substep and of the piece.
         time: duration of the piece, in periods.
 
@@ -210,7 +212,7 @@ def propagate(
         The state of the bodies and the energies at the end of the piece.
     """
     zero, direct = 0.0 * body.x[0], params.rate.shape[1] == params.rate.shape[0] + 1
-    forces = jnp.stack([force + push + zero] if direct else [force + zero, push + zero])
+    forces = jnp.stack([force + external_force + zero] if direct else [force + zero, external_force + zero])
     step = None if options.jitter else Flow(*(read(read(part, indices[0], 1), indices[1], 1) for part in params.pieces))
     rubbed = zero
     if options.friction:
@@ -222,18 +224,18 @@ def propagate(
         z = jnp.concatenate([body.x, forces])
         after = BodyState(body.x + times(step.change[0], z), body.slip)
         lost = dot(z, times(step.loss[0], z))
-    pushed = push * dot(params.place[0], after.x - body.x)
+    pushed = external_force * dot(params.place[0], after.x - body.x)
     if direct:
         given = force * dot(params.place[0], after.x - body.x)
     else:
-        # Compute the work of the wall from the energy balance, because with an actuator or modes its force on the
-        # bodies varies within the piece.
+        # Compute the work of the wall from the energy balance, because with an actuator or modes the force of the wall
+        # on the bodies varies within the piece.
         given = stored_energy(params, after.x) - stored_energy(params, body.x) + lost + rubbed - pushed
     return after, work + jnp.stack([given, pushed, lost, rubbed])
 
 
 def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, int]) -> State:
-    """Return the state before the first sample: uniform motion so far, no commands, and modes at rest (T2).
+    """Return the state before the first sample, after uniform motion without commands and with modes at rest (T2).
 
     ``rings`` contains the lengths of the rings of positions and of commands.
     """
@@ -305,7 +307,9 @@ def _simulate_period(
         def one(carry: Any, piece: Any) -> Any:
             number, force = piece
             body, work = carry
-            return propagate(params, options, body, work, force, inputs.push, (j, number), read(lasting, number)), None
+            return propagate(
+                params, options, body, work, force, inputs.external_force, (j, number), read(lasting, number)
+            ), None
 
         # With friction or jitter, loop over the pieces by `scan`, because the program of one piece is then long and
         # should be compiled only once.
@@ -402,7 +406,7 @@ def run_batch(
         block = PeriodInputs(
             np.arange(first, first + BLOCK),
             _select_block(inputs.noise, first, (1,)),
-            params.push[None] + _select_block(inputs.history, first, (1,)),
+            params.external_force[None] + _select_block(inputs.history, first, (1,)),
             _select_block(inputs.durations, first, (0, 0, 1)),
         )
         # Allow rank promotion even if the caller's settings of JAX forbid it, because arrays without a batch axis must

@@ -27,7 +27,7 @@ DIGITS = 53  # number of binary digits of a float64 time below 2 periods: 1, 1/2
 
 
 class Flow(NamedTuple):
-    """Matrices of the change of state and of the dissipated energy over given times, which are the leading axes."""
+    """Matrices of the change of state and of the dissipated energy over given times; the leading axes are the times."""
 
     change: np.ndarray  # change of state per z, (..., n, n + forces)
     loss: np.ndarray  # quadratic form in z of the energy dissipated by dampers, (..., n + forces, n + forces)
@@ -72,8 +72,8 @@ def build_mechanics(chains: Sequence[Any]) -> Mechanics:
     motion = np.roll(place, count, axis=1)
     axes = np.eye(size)
     stretch, swing = axes[1:first_mode], axes[first_mode:count]
-    # Compute the energies with the absolute values of the modal masses. These energies are exact for a mode whose
-    # displacements at the actuator and at the sensor are equal.
+    # Compute the energies with the absolute values of the modal masses, because a modal mass may be negative. These
+    # energies are exact for a mode with equal displacements at the actuator and at the sensor.
     inertia = [np.abs(mode.mass) for mode in modes]
     springs = [mass * mode.rate**2 for mass, mode in zip(inertia, modes, strict=True)]
     dampers = [2.0 * mass * mode.damping_ratio * mode.rate for mass, mode in zip(inertia, modes, strict=True)]

@@ -65,7 +65,7 @@ class Settings(NamedTuple):
 
 
 class ExternalInputs(NamedTuple):
-    """Initial state, external forces and random numbers in normalized units, and the values of these units in SI."""
+    """Initial state, external forces and random numbers in normalized units, and the units of time and mass in SI."""
 
     positions: np.ndarray  # initial positions, (bodies, batch)
     velocities: np.ndarray  # initial velocities, (bodies, batch)
@@ -98,14 +98,14 @@ class Estimator(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """Parameters of the simulations of a batch, in the units of the module."""
+    """Parameters of the simulations of a batch, in units of sampling period, mass and m unless stated otherwise."""
 
     alpha: Array  # normalized stiffness
     beta: Array  # normalized virtual damping
     period: Array  # sampling period, in s
     force: Array  # unit of force, in N
     resolution: Array  # step of the encoder, in m
-    push: Array  # constant external force
+    external_force: Array  # constant external force
     bilateral: Array  # True if the wall acts on both sides of its surface
     pulling: Array  # True if the wall may pull the device
     late: Array  # integer delay, in periods
@@ -116,11 +116,11 @@ class Parameters(NamedTuple):
     motion: Array  # rows of the velocities of the bodies, (bodies, n, batch)
     energy: Array  # quadratic form in x of the kinetic and elastic energy, (n, n, batch)
     durations: Array  # durations of the pieces without jitter, (substeps, pieces, batch)
-    # Flows over the durations of the pieces, (1 or 2, substeps, pieces, ..., batch): while the first body slips and,
-    # with friction, while it is held.
+    # Matrices of the motion over each piece, for a first body that slips and, with friction, for one that is held; the
+    # axes are (1 or 2, substeps, pieces, ..., batch).
     pieces: Flow
-    # Flows over the binary digits of time, (1 or 2, DIGITS, ..., batch): while the first body slips and, with friction,
-    # while it is held.
+    # Matrices of the motion over each binary digit of time, for a first body that slips and, with friction, for one
+    # that is held; the axes are (1 or 2, DIGITS, ..., batch).
     digits: Flow
     longest: Array  # longest step with friction, in periods
 
@@ -209,7 +209,7 @@ def find_longest_steps(machine: Mechanics) -> np.ndarray:
 
 
 def build_flows(machine: Mechanics, durations: np.ndarray, which: np.ndarray, options: Options) -> dict[str, Any]:
-    """Return the matrices of the mechanisms and their flows by name, as fields of `Parameters`.
+    """Return the matrices of the mechanisms and of their motion over given times, keyed by the fields of `Parameters`.
 
     Args:
         machine: matrices of the mechanisms of all scenes.

@@ -211,7 +211,7 @@ class _Joint(NamedTuple):
         )
 
     def glide(self, state: _Slide, whole: Flow) -> _Slide:
-        """Propagate the batch entries without an event over their whole piece, in one step with a precomputed flow."""
+        """Propagate the batch entries without an event over their whole piece, in one step by precomputed matrices."""
         x, slip = state.body
 
         def go(_: Any) -> Any:
@@ -251,8 +251,8 @@ class _Joint(NamedTuple):
             """
             side = self.find_side(x, trip.far)
             wanted = jnp.stack([self.dips(x, slip, trip.far, side), self.reserve(trip.x, slip, side) < 0])
-            # Search 0 propagates all batch entries. For it, the index turn - 1 = -1 is out of range, but has no effect,
-            # because ``turn == 0`` is true for all entries.
+            # Search 0 applies to all batch entries, because ``turn == 0`` is true. The index turn - 1 = -1, which is
+            # out of range in this search, therefore has no effect.
             wanted = (turn == 0) | read(wanted, turn - 1)
 
             def keep(after: Array) -> Array:

@@ -56,7 +56,7 @@ BEYOND = 1e100  # distance from the surface of the wall in m; a motion beyond it
 
 FRAME = (
     *("velocity", "wall_force", "sticking"),
-    *("energy", "wall_work", "push_work", "damping_loss", "friction_loss"),
+    *("energy", "wall_work", "external_work", "damping_loss", "friction_loss"),
 )
 """Fields of `Motion` with one value per recorded instant, in the order of a frame, which begins with the positions."""
 READING = ("measured", "estimated_velocity", "command", "contact")
@@ -75,7 +75,7 @@ OF_MOTION = {
     "command": ("force commanded at the sample", "N"),
     "contact": ("contact at the sample", "1"),
     "wall_work": ("energy supplied by the wall since the start", "J"),
-    "push_work": ("energy supplied by the external force", "J"),
+    "external_work": ("energy supplied by the external force", "J"),
     "damping_loss": ("energy dissipated by dampers", "J"),
     "friction_loss": ("energy dissipated by friction", "J"),
     "energy": ("kinetic and elastic energy of all bodies", "J"),
@@ -88,16 +88,16 @@ OF_WHOLE = {
     "penetration": ("largest position at a sample", "m"),
     "bounces": ("number of times contact ends", "1"),
     "impact_velocity": ("velocity at the first sample in contact", "m/s"),
-    "energy_given": ("largest net energy supplied by the wall", "J"),
+    "wall_work_max": ("largest net energy supplied by the wall", "J"),
     "outcome": ("code of the observed behavior", "1"),
     "status": ("status code", "1"),
 }
 # Fields of `Motion` that are unknown for a linear system.
-OF_ENERGY = {"wall_work", "push_work", "damping_loss", "friction_loss", "energy", "energy_given"}
+OF_ENERGY = {"wall_work", "external_work", "damping_loss", "friction_loss", "energy", "wall_work_max"}
 
 
 def _draw(motion: Motion) -> str:
-    """Return a plot of position over time in text characters; "" unless the motion is single and recorded."""
+    """Return a plot of position over time in text characters; "" for a batch, and if no samples were recorded."""
     if motion.position is None or np.ndim(motion.position) != 1:
         return ""
     return draw_line(motion.time, motion.position, "position over time")
@@ -127,7 +127,7 @@ class Motion:
         wall_force: force of the wall from the instant on, in N; with an actuator, its commanded force.
         sticking: True if friction holds the device.
         measured, estimated_velocity, command, contact: result of the control program at each sample.
-        wall_work, push_work: energy supplied by the wall and by the external force since the start, in J.
+        wall_work, external_work: energy supplied by the wall and by the external force since the start, in J.
         damping_loss, friction_loss: energy dissipated by dampers and by friction, in J.
         energy: kinetic and elastic energy of all bodies; increases by the work and decreases by the losses.
         amplitude: half of the peak-to-peak position at the samples of the tail, in m; infinite if the motion diverged.
@@ -138,7 +138,7 @@ class Motion:
             contact while its force is nonzero.
         impact_velocity: velocity at the first sample at which contact begins, in m/s; NaN if no contact begins after
             the first sample.
-        energy_given: largest net energy supplied by the wall, at any sample, in J, at least 0.
+        wall_work_max: largest net energy supplied by the wall, at any sample, in J, at least 0.
         outcome: code of `zwidth.MotionKind`, the behavior observed in the tail.
         status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED if friction has more events
             within a period than the simulation follows, or if a force law returns no finite force.
@@ -156,7 +156,7 @@ class Motion:
     command: Any
     contact: Any
     wall_work: Any
-    push_work: Any
+    external_work: Any
     damping_loss: Any
     friction_loss: Any
     energy: Any
@@ -166,7 +166,7 @@ class Motion:
     penetration: Any
     bounces: Any
     impact_velocity: Any
-    energy_given: Any
+    wall_work_max: Any
     outcome: Any
     status: Any
 
@@ -204,7 +204,7 @@ class Motion:
 
 
 def _measure_width(summary: Any, start: int, stop: int) -> np.ndarray:
-    """Return the width of the motion of each body over segments ``start`` to ``stop - 1``; NaN if these are empty."""
+    """Return the width of the motion of each body over segments ``start`` to ``stop - 1``; NaN without samples."""
     width = summary.far[start:stop].max(0).sum(0)
     return np.where(width >= 0, width, np.nan)
 
@@ -282,7 +282,7 @@ def convert_to_si(
         "penetration": np.maximum(summary.far[:, 1, 0].max(0), 0.0),
         "bounces": summary.exits.astype(int),
         "impact_velocity": summary.impact / period,
-        "energy_given": summary.given * force,
+        "wall_work_max": summary.given * force,
         "outcome": outcome,
         "status": np.where(lost, Status.NOT_CONVERGED, Status.OK),
     }

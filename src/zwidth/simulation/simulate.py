@@ -44,8 +44,8 @@ def simulate(
     substeps: int = 1,
     start_position: ArrayLike | Mapping[str, ArrayLike] = 0.0,
     start_velocity: ArrayLike | Mapping[str, ArrayLike] = 0.0,
-    push: ArrayLike = 0.0,
-    push_history: ArrayLike | None = None,
+    external_force: ArrayLike = 0.0,
+    external_force_history: ArrayLike | None = None,
     hand_history: ArrayLike | None = None,
     contact: Contact = "bilateral",
     resolution: ArrayLike = 0.0,
@@ -82,8 +82,9 @@ def simulate(
         start_position: in m; one value for all bodies, or a mapping by their names in `Motion`, as ``{"position": 0,
             "hand_position": 1e-3}``; other bodies start with the device.
         start_velocity: in m/s, likewise. Before the start, the device moves at its start velocity.
-        push: constant external force on the device, in N; on a `LinearDevice` it acts where the wall acts.
-        push_history: external force in N, constant over each period, (..., periods); added to ``push``.
+        external_force: constant external force on the device, in N; on a `LinearDevice` it acts where the wall acts.
+        external_force_history: external force in N, constant over each period, (..., periods); added to
+            ``external_force``.
         hand_history: recorded position in m of the far end of the spring and damper of a rigid `zwidth.Operator`,
             (..., periods + 1), linear between samples; its force is averaged over each period.
         contact: "bilateral": the wall acts on both sides of its surface at 0; "unilateral": only at measured positions
@@ -136,8 +137,10 @@ def simulate(
         settings = settings._replace(law=trace_law(force, stiffness, virtual_damping))
         given |= {"stiffness": 0.0, "virtual_damping": 0.0}
     if hand_history is not None:
-        push_history = convert_hand(distinct, which, hand_history, push_history, periods)
-    numbers, which, good = read_arguments(distinct, which, spread_starts(distinct, given), seed, push_history, periods)
+        external_force_history = convert_hand(distinct, which, hand_history, external_force_history, periods)
+    numbers, which, good = read_arguments(
+        distinct, which, spread_starts(distinct, given), seed, external_force_history, periods
+    )
     refuse_bodies(distinct, which, numbers)
     check_memory(numbers, settings)
     shape, which = which.shape, which.ravel()
@@ -168,7 +171,7 @@ def simulate(
 
 
 def _build_time(distinct: list[Any], which: np.ndarray, steps: np.ndarray, drawn: np.ndarray | None) -> np.ndarray:
-    """Return the recorded instants in s: one axis if all simulations have the same sampling period, else one row each.
+    """Return the recorded instants in s: one array for equal sampling periods, otherwise one row per simulation.
 
     Args:
         distinct: distinct scenes.

@@ -39,7 +39,7 @@ from zwidth.numerics.root_finding import bracket_root, polish_root
 # Import JAX on first use, because NumPy computes the coefficients of few walls without it.
 jax: Any = lazy_loader.load("jax")
 
-NEAR_PI = np.pi * (1.0 - 1e-4)  # largest omega of the curve, because rounding errors grow as 1/(pi - omega)
+NEAR_PI = np.pi * (1.0 - 1e-4)  # largest omega of the curve; rounding errors grow as 1/(pi - omega)
 
 
 class Degree(NamedTuple):
@@ -55,7 +55,7 @@ class Degree(NamedTuple):
 
 
 def expand_polynomial(delta: Reals, d: Reals, degree: Degree) -> Affine:
-    """Return the coefficients of D, N1 and N2, highest power first, along a new last axis of degree.poles + 1."""
+    """Return the coefficients of D, N1 and N2, highest power first, along a last axis of length degree.poles + 1."""
     plant = discretize_mass(delta, d - degree.n if degree.fractional else None)
     xp, zero, one = namespace(plant.a2), 0.0 * plant.a2, 0.0 * plant.a2 + 1.0
     # For an integer delay N(z) is divided by z; ``plant.gap`` is then a2 - a1, without cancellation.

@@ -1,4 +1,4 @@
-"""Named tuples of results for any kind of device: stiffest wall, stability margins, and stability of walls."""
+"""Named tuples of results for any kind of device: stiffest stable wall, stability margins, and stability of walls."""
 
 from __future__ import annotations
 

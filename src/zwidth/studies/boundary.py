@@ -54,7 +54,7 @@ _RIDGE_POINTS = 101  # values of delta on the path of maximum stiffness
 
 @register
 class BoundaryStudy(CurvesStudy):
-    """Boundary of the stable virtual walls for each delta and d, or for a device with parts such as an actuator."""
+    """The boundary of the stable walls for each delta and d, or for a device with parts such as an actuator."""
 
     method = "Closed form of the boundary, to a few rounding errors; the stable side by counting poles."
     reads_scene = True
@@ -77,14 +77,14 @@ class BoundaryStudy(CurvesStudy):
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        if "device" in raw or (scene.parts_beyond and not {"delta", "d"} & set(raw)):
+        if "device" in raw or (scene.nonrigid_parts and not {"delta", "d"} & set(raw)):
             return {"device": scene.without_wall(), **raw}
         return super().fill(raw, scene)
 
     @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         given = [name for name in ("delta", "d") if name in raw]
-        if len(given) == 1 and "device" not in raw and scene.parts_beyond:
+        if len(given) == 1 and "device" not in raw and scene.nonrigid_parts:
             remedy = f"remove {given[0]!r}, or give both delta and d"
             raise problem(f"got {given[0]!r} for a scene with parts", "the device has its own delta and d", remedy)
 
@@ -119,11 +119,11 @@ class BoundaryStudy(CurvesStudy):
             if getattr(self, name).values().tolist() != [getattr(self.device, name)]:
                 message = f"got {name!r} together with a device"
                 yield (name,), problem(message, "the device has its own", "remove one", on_key=True)
-        if not self.device.parts_beyond:
+        if not self.device.nonrigid_parts:
             return
         defaults = {"plane": "alpha_beta", "ridge_path": False, "passivity": False}
         for name in [name for name, default in defaults.items() if getattr(self, name) != default]:
-            parts = name_parts(self.device.parts_beyond)
+            parts = name_parts(self.device.nonrigid_parts)
             allowed = f"it needs a rigid mass with the difference of two samples, without {parts}"
             yield (name,), problem(f"got {name!r}", allowed, "remove it", on_key=True)
 
@@ -132,7 +132,7 @@ class BoundaryStudy(CurvesStudy):
         return super().points * (_POINTS_PER_CURVE if self.plane == "alpha_beta" else 1)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        if self.device is not None and self.device.parts_beyond:
+        if self.device is not None and self.device.nonrigid_parts:
             return trace_device(self.device, self.device.label or self.name)
         deltas, delays = self.delta.values(), self.d.values()
         if self.plane == "delta_beta":
@@ -194,7 +194,7 @@ def tabulate_stable_intervals(deltas: np.ndarray, delays: np.ndarray) -> list[di
 
 @register
 class CompareStudy(ComputedStudy):
-    """Stable walls of several devices in one figure, and the stiffest stable wall of each device in a table."""
+    """The stable walls of several devices in one figure, and the stiffest wall of each device in a table."""
 
     method = "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge."
     from_scene = ()
@@ -247,7 +247,7 @@ def _complete(device: Any, scene: PhysicalScene) -> Any:
     supplied = {"mass": scene.mass, "damping": scene.damping, "delay": scene.delay, **list_parts(scene)}
     supplied |= {} if {"period", "rate"} & set(device) else {"period": scene.period}
     # Supply no mass, damping or mechanical parts to a linear system or measured response, because it contains them,
-    # and no system or response to a device with a mass, because only one of them is allowed.
+    # and no system or response to a device with a mass, because a device has only one of both.
     if "device" in device:
         supplied = {name: value for name, value in supplied.items() if name in ("period", "delay", "velocity")}
     elif "mass" in device:
@@ -262,7 +262,7 @@ _OUTPUTS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive": 
 
 @register
 class MapStudy(ComputedStudy):
-    """Stability, spectral radius and passivity on a grid of alpha, beta, delta and d."""
+    """The stability, spectral radius and passivity of walls on a grid of alpha, beta, delta and d."""
 
     method = "Stability by the phase at the gain crossover; radii by Newton's method, to some rounding errors."
     reads_scene = True

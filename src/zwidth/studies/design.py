@@ -70,7 +70,7 @@ Count = Annotated[int, Quantity(allowed=Range(2, 100_000), whole=True)]
 
 @register
 class DesignStudy(ComputedStudy):
-    """Parameter value at which K_max reaches a required stiffness, and the stable share of devices with tolerances."""
+    """The value of a parameter at which K_max reaches a required stiffness, and the effect of tolerances."""
 
     method = "The maximum stable stiffness, solved for the parameter to a relative error of 1e-11."
     from_scene = ("device", "stiffness")
@@ -175,7 +175,9 @@ class DesignStudy(ComputedStudy):
             rows.append(self._describe(nominal, stiffness, needed))
             notes += self._note(stiffness, needed)
             if needed.crossings and needed.status == Status.OK:
-                value = format_sufficient(needed.value, needed.enough, [one.value for one in needed.crossings], unit)
+                value = format_sufficient(
+                    needed.value, needed.sufficient_side, [one.value for one in needed.crossings], unit
+                )
                 answer.append(f"K_max = {with_unit(self.reserve * stiffness, units['N/m'])}: {self._name} of {value}")
         low, high = min(ends[0] for ends in ranges), max(ends[1] for ends in ranges)
         curve = self._trace(nominal, low, high)
@@ -204,8 +206,8 @@ class DesignStudy(ComputedStudy):
             "parameter": self.find,
             header("present", unit): self._list_parameters()[self.find],
             header("value", unit): needed.value,
-            "enough": needed.enough,
-            header("other_crossings", unit): "; ".join(f"{c.value!r} {c.enough}" for c in others),
+            "sufficient_side": needed.sufficient_side,
+            header("other_crossings", unit): "; ".join(f"{c.value!r} {c.sufficient_side}" for c in others),
             header("range_low", unit): needed.range[0],
             header("range_high", unit): needed.range[1],
             "status": Status(needed.status).name,
@@ -249,7 +251,7 @@ class DesignStudy(ComputedStudy):
         low, high = (with_unit(end, self.unit_system[PARAMETERS[self.find].unit]) for end in needed.range)
         if needed.status != Status.OK:
             yield f"{wanted}: {self._name} from {low} to {high}: {Status(needed.status).message}"
-        elif needed.enough == "everywhere":
+        elif needed.sufficient_side == "everywhere":
             yield f"{wanted}: any {self._name} from {low} to {high} is enough"
         elif len(needed.crossings) > 1:
             count = len(needed.crossings)
@@ -275,7 +277,7 @@ class DesignStudy(ComputedStudy):
 
 @register
 class FiltersStudy(ComputedStudy):
-    """K_max and velocity noise versus cut-off frequency of a low-pass filter or window length of a difference."""
+    """K_max and the velocity noise for low-pass filters and windowed differences of the velocity."""
 
     method = "The maximum over all boundary curves of the stable set, for each filter, to about 1e-13."
     from_scene = ("device",)

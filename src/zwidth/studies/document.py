@@ -250,7 +250,7 @@ def _simplify_schema(schema: Any, shared: dict[str, Any]) -> Any:
         name = kept.pop("shared")
         return {"$ref": f"#/$defs/{name}"} if shared.setdefault(name, kept) == kept else kept
     for key in ("allOf", "anyOf"):
-        # Replace a list of one alternative by this alternative, which remains after the removal of null types.
+        # If the removal of null types leaves a single alternative, use this alternative in place of the list.
         if len(kept.get(key, ())) == 1:
             return {**kept.pop(key)[0], **kept}
     return kept

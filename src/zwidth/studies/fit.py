@@ -1,9 +1,9 @@
-"""Study "fit": mass, damping and delay of a device from logs of its motion, from walls at the onset of instability
-("buzz"), or from both.
+"""Study "fit": mass, damping and delay of a device from logs of its motion, from walls at the onset, or from both.
 
-Fits to logs and to walls are computed separately (`zwidth.identification`); if both are given, a chi-squared test
-compares their parameters. The study writes a table of the fitted parameters, tables that show the quality of the fits
-(such as residuals and stability boundaries), and a scene file for each fit.
+The walls are at the onset of instability ("buzz"). Fits to logs and to walls are computed separately
+(`zwidth.identification`); if both are given, a chi-squared test compares their parameters. The study writes a table of
+the fitted parameters, tables that show the quality of the fits (such as residuals and stability boundaries), and a
+scene file for each fit.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _read_logs(raw: Any, handler: Any) -> Any:
 
 
 class _OneOrSeveral:
-    """Annotation that adds the form of a single entry to the JSON Schema of a list."""
+    """Annotation by which the JSON Schema of a list also accepts a single entry without a list."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -118,7 +118,7 @@ class _Fitted(NamedTuple):
 
 @register
 class FitStudy(ComputedStudy):
-    """Mass, damping and delay of a device, fitted to logs or to walls at the onset of instability."""
+    """The mass, damping and delay of a device, fitted to logs or to walls at the onset of instability."""
 
     method = "Least squares with exact derivatives; the band of the boundary by 200 devices drawn from the covariance."
     from_scene = ()
@@ -175,7 +175,8 @@ class FitStudy(ComputedStudy):
                 text = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in str(error))
                 path, message = parse_input_error(InputError(text))
                 is_key = len(path) == 1 and path[0] in LogSection.model_fields
-                # Omit the index from the path if there is one log, because it may be written without a list.
+                # Omit the index from the path if the study has only one log, because a single log may be written
+                # without a list.
                 place = ("log", *((k,) if len(self.log or ()) > 1 else ()))
                 yield (*place, *(path if is_key else ("csv",))), (message if is_key else parse_message(text))
         self._motions = tuple(motions)
@@ -199,7 +200,7 @@ class FitStudy(ComputedStudy):
     @property
     def extent(self) -> str:
         parts = [f"{len(self.log)} log{'' if len(self.log) == 1 else 's'}"] if self.log else []
-        return " and ".join(parts + ([f"{len(self.buzz)} buzzing walls"] if self.buzz else []))
+        return " and ".join(parts + ([f"{len(self.buzz)} onsets of instability"] if self.buzz else []))
 
     @property
     def points(self) -> int:
@@ -223,7 +224,7 @@ class FitStudy(ComputedStudy):
         answers, notes = [], []
         for each in fits:
             rows = [f"{label}: {text}" if label else text for label, text in summarize_fit(each.fit) if text]
-            answers += [f"fitted to {each.source}", *rows]
+            answers += [f"data: {each.source}", *rows]
             notes += [f"{each.source}: {label}: {text}" for label, text in detail_fit(each.fit, each.source)[1:]]
         answers += [_compare(fits[0].fit, fits[1].fit)] if len(fits) > 1 else []
         step = next((each.fit.resolution for each in fits if each.fit.motions), 0.0)
@@ -248,7 +249,7 @@ class FitStudy(ComputedStudy):
         if self.buzz:
             walls = tuple(BuzzPoint(each.stiffness, each.virtual_damping, each.frequency) for each in self.buzz)
             fit = fit_buzz(walls, period=period, velocity=velocity, noise=self.noise)
-            fits.append(_Fitted("buzz", f"{len(walls)} buzzing walls", fit, walls))
+            fits.append(_Fitted("buzz", f"{len(walls)} onsets of instability", fit, walls))
         return fits
 
 
@@ -257,7 +258,7 @@ def _tabulate(fit: DeviceFit, source: str) -> dict[str, Any]:
     row: dict[str, Any] = {"fitted_to": source, "status": Status(fit.status).name}
     errors = fit.errors | {"stiffness_max": fit.stiffness_error}
     log_parameters = [name for name in ("friction", "offset") if name in errors]
-    for name in (*fit.numbers[:3], "stiffness_max", *fit.numbers[3:], *log_parameters):
+    for name in (*fit.parameter_names[:3], "stiffness_max", *fit.parameter_names[3:], *log_parameters):
         ends = fit.intervals[name]
         numbers = {"": fit.value_of(name), "_error": errors[name], "_low": ends.low, "_high": ends.high}
         row |= {header(name + end, unit_of(name, fit.unit_system)): value for end, value in numbers.items()}
@@ -272,10 +273,10 @@ def _compare(one: DeviceFit, other: DeviceFit) -> str:
     """
     values = [np.array([fit.mass, fit.damping, fit.delay]) for fit in (one, other)]
     difference = values[0] - values[1]
-    covariance = sum((fit.reach / _NORMAL_95) ** 2 * fit.covariance[:3, :3] for fit in (one, other))
+    covariance = sum((fit.coverage_factor / _NORMAL_95) ** 2 * fit.covariance[:3, :3] for fit in (one, other))
     # Add a small value to the variances, because they are 0 for data without noise, and the matrix would be singular.
     floor = (1e-9 * np.maximum(np.abs(values[0]), np.abs(values[1]))) ** 2 + 1e-300
     statistic = float(difference @ np.linalg.solve(covariance + np.diag(floor), difference))
-    verdict = "log and buzzing walls agree" if statistic <= _CHI_SQUARED_95 else "log and buzzing walls do NOT agree"
+    verdict = "log and onsets agree" if statistic <= _CHI_SQUARED_95 else "log and onsets do NOT agree"
     distance = f"chi-squared = {plain(statistic, 3)}"
     return f"{verdict}: {distance} (95 % quantile {_CHI_SQUARED_95})"

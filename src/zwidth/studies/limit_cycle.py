@@ -34,12 +34,12 @@ from zwidth.units.formatting import format_short, header, with_unit
 from zwidth.units.quantities import POSITIVE
 
 _COLUMNS = {parameter.name: column for column, parameter in AXES.items()}
-_OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
+_OUTPUTS = ("amplitude", "frequency", "wall_work_max", "outcome", "status")
 _MAX_CURVES = 6  # largest number of values of a list that are drawn as curves; a longer list is drawn as a plane
 # Default of the largest amplitude that counts as a limit cycle: in m for linear devices (key False), in rad for rotary
 # devices (key True).
 WIDEST = {False: 1e-3, True: math.radians(20.0)}
-WIDEST_STEPS = 10.0  # encoder steps; lower bound of the default amplitude above
+WIDEST_STEPS = 10.0  # lower bound of this default, in encoder steps
 
 
 # Make every field of `SimulationConditions` optional, because a condition contains only the values that it overrides.
@@ -92,7 +92,7 @@ class CycleAxes(Strict, noun="the axes of a limit_cycle study"):
 
 @register
 class LimitCycleStudy(SimulatedStudy, SimulationConditions):
-    """Amplitude and frequency of simulated limit cycles over one or two parameters, under one or more conditions."""
+    """The amplitude and frequency of limit cycles over one or two parameters, under one or more conditions."""
 
     method = "Simulations, exact between samples; amplitude and frequency as observed in the last quarter."
     point_bytes = 8 * (1 + len(_OUTPUTS))
@@ -105,10 +105,10 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
     conditions: Annotated[tuple[CycleCondition, ...], WrapValidator(require_entries("conditions"))]
     """Conditions, one per panel, with the parameters that differ from those of the study. Default: one panel."""
 
-    silence: Annotated[float, Quantity("m", POSITIVE)] = 1e-6
+    smallest_amplitude: Annotated[float, Quantity("m", POSITIVE)] = 1e-6
     """Amplitude below which a motion counts as at rest, in m or rad or with a unit."""
 
-    widest: Annotated[float, Quantity("m", POSITIVE)] | None = None
+    largest_amplitude: Annotated[float, Quantity("m", POSITIVE)] | None = None
     """Largest amplitude still counted as a limit cycle, in m or rad or with a unit; larger motions are counted and
     plotted separately. Default: 1 mm (20 deg for a rotary device) or 10 encoder steps, whichever is larger."""
 
@@ -126,18 +126,25 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
                     message = "given twice, in the condition and as an axis"
                     yield ("conditions", index, name), problem(message, "each parameter once", "remove one")
         scene = self.device.to_scene()
-        silence, widest = self.bound_amplitudes(scene)
-        if widest <= silence:
-            low, high = (with_unit(end, scene.unit_system["m"]) for end in (silence, widest))
-            name = "silence" if self.widest is None else "widest"
-            received = f"got silence {low}, widest {high}"
-            yield (name,), problem(received, "silence must be less than widest", "raise widest or lower silence")
+        smallest_amplitude, largest_amplitude = self.bound_amplitudes(scene)
+        if largest_amplitude <= smallest_amplitude:
+            low, high = (with_unit(end, scene.unit_system["m"]) for end in (smallest_amplitude, largest_amplitude))
+            name = "smallest_amplitude" if self.largest_amplitude is None else "largest_amplitude"
+            received = f"got smallest_amplitude {low}, largest_amplitude {high}"
+            yield (
+                (name,),
+                problem(
+                    received,
+                    "smallest_amplitude must be less than largest_amplitude",
+                    "raise largest_amplitude or lower smallest_amplitude",
+                ),
+            )
         problems = [list(each.find_inconsistencies(scene)) for each in self.list_conditions()]
         for index, (condition, faults) in enumerate(zip(self.conditions, problems, strict=True)):
             for path, message in faults:
                 is_overridden = getattr(condition, str(path[0])) is not None
-                # Report a fault in a value of the study itself only for the first condition, because it is the same in
-                # all of them.
+                # Report a fault in a value of the study itself only once, for the first condition, because all
+                # conditions share this value.
                 if is_overridden or index == 0:
                     yield (("conditions", index, *path) if is_overridden else path), message
 
@@ -154,11 +161,11 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
 
     def bound_amplitudes(self, scene: Scene) -> tuple[float, float]:
         """Return the smallest and the largest amplitude that count as a limit cycle, in m or rad."""
-        if self.widest is not None:
-            return self.silence, self.widest
+        if self.largest_amplitude is not None:
+            return self.smallest_amplitude, self.largest_amplitude
         steps = [self.resolution, *(each.resolution or 0.0 for each in self.conditions)]
         steps += self.axes.resolution.values().tolist() if self.axes.resolution is not None else []
-        return self.silence, max(WIDEST[scene.unit_system.rotary], WIDEST_STEPS * max(steps))
+        return self.smallest_amplitude, max(WIDEST[scene.unit_system.rotary], WIDEST_STEPS * max(steps))
 
     @property
     def sizes(self) -> dict[str, int]:

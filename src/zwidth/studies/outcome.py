@@ -52,7 +52,8 @@ class Outcome:
 
     table: dict[str, np.ndarray] = field(default_factory=dict)  # columns of the study's CSV file, all of one length
     arrays: dict[str, np.ndarray] = field(default_factory=dict)  # arrays of the study's npz file
-    # Functions that draw a figure and return its Axes, by the suffix of the file name after the name of the study.
+    # Functions that draw a figure and return its Axes. The keys are the suffixes that the names of the figures' files
+    # have after the name of the study.
     figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
     documents: dict[str, str] = field(default_factory=dict)  # contents of text files, by the name of the file
     answer: tuple[str, ...] = ()  # main results, in one or two lines for a terminal
@@ -88,7 +89,7 @@ class ComputedStudy(Study):
     with the decorator `zwidth.studies.register`.
     """
 
-    # True if the results depend on the scene not only through the values that `fill` copies from it into the study.
+    # True if `compute` uses the scene itself, and not only the values that `fill` copies from the scene into the study.
     reads_scene: ClassVar[bool] = False
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
@@ -142,7 +143,7 @@ _WALL_KEYS = ("stiffness_fraction", "walls")
 def add_si_columns(
     table: dict[str, np.ndarray], delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None
 ) -> dict[str, np.ndarray]:
-    """Return a table of walls with columns in SI units added, if delta and d are those of a rigid device.
+    """Return a table of walls, to which columns in SI units are added if delta and d are those of a rigid device.
 
     Args:
         table: columns, with alpha and beta of the walls among them.
@@ -170,14 +171,14 @@ def find_device_share(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) 
 
 def _find_scene(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Scene | None:
     """Return the scene of a rigid device in SI units if the axes contain only its delta and d, otherwise None."""
-    if not isinstance(owner, PhysicalScene | PhysicalDevice) or owner.parts_beyond:
+    if not isinstance(owner, PhysicalScene | PhysicalDevice) or owner.nonrigid_parts:
         return None
     alone = [axis.values().tolist() for axis in (delta, d)] == [[owner.delta], [owner.d]]
     return owner.to_scene() if alone else None
 
 
 def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
-    """Return K, B, frequency and kind of a stiffest wall as a dict by the names of the columns of a table."""
+    """Return K, B, frequency and kind of a stiffest wall as a dict, keyed by the column names of a table."""
     columns = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
     return {**columns, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 

@@ -120,7 +120,7 @@ def _tabulate(columns: Iterable[str], exact: Iterable[Mapping[str, Any]], power:
 
 @register
 class Fig6Study(_PaperStudy):
-    """Fig. 6 of the paper: stable virtual damping for alpha -> 0 over delta, also with the paper's z^(1+d)."""
+    """The stable virtual damping over delta for alpha -> 0, also with the paper's z^(1+d), as in Fig. 6."""
 
     kind: Literal["paper_fig6"]
 
@@ -135,7 +135,7 @@ class Fig6Study(_PaperStudy):
 
 @register
 class Fig10Study(_PaperStudy):
-    """Fig. 10 of the paper: maximum stable stiffness over delta in two scalings, also with the paper's z^(1+d)."""
+    """The maximum stable stiffness over delta, also with the paper's z^(1+d), as in Fig. 10."""
 
     kind: Literal["paper_fig10"]
 

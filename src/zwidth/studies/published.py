@@ -136,13 +136,13 @@ def _maximize_alpha(delta: float, d: float) -> tuple[float, float]:
 
 def line_appears() -> float:
     """Compute the delta above which, for d = 0, walls with a real pole at z = -1 bound the stable set."""
-    # In the plane of alpha and beta, the walls with a real pole at z = -1 form a straight line. It starts at the
-    # corner, where the boundary curve ends with two poles at z = -1. The line therefore bounds the stable set (alpha >
-    # 0) above the delta at which the alpha of the corner becomes positive.
     # Import scipy.optimize here, because it loads slowly and no other study needs it.
     from scipy.optimize import root_scalar
 
-    # Set the tolerances to a few rounding errors, because the page of results prints 15 digits.
+    # In the plane of alpha and beta, the walls with a real pole at z = -1 form a straight line. It starts at the
+    # corner, where the boundary curve ends with two poles at z = -1. The line therefore bounds the stable set (alpha >
+    # 0) above the delta at which the alpha of the corner becomes positive. Set the tolerances of the search for this
+    # delta to a few rounding errors, because the page of results prints 15 digits.
     exact: dict[str, Any] = {"bracket": (1.0, 6.0), "method": "brentq", "xtol": 1e-15, "rtol": 1e-15}
     return float(root_scalar(lambda delta: float(boundary(np.pi, delta, 0).alpha), **exact).root)
 
@@ -155,7 +155,7 @@ def linear_from() -> float:
     limit = np.array([limit_slope(d) for d in FIG10_DELAYS])
 
     def excess(delta: np.ndarray) -> np.ndarray:
-        """Return the largest relative difference of d alpha_max/d delta from g of all curves, minus `LINEAR_WITHIN`."""
+        """Return the largest relative difference of d alpha_max/d delta from g on all curves, minus the tolerance."""
         step = 0.008  # step of delta in fourth-order central differences, whose errors move the root by 2e-10
         deltas = np.asarray(delta)[..., None] + step * np.array([-2.0, -1.0, 1.0, 2.0])
         values = np.array([maximize_alpha(deltas, d)[0] for d in FIG10_DELAYS])
@@ -248,9 +248,9 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         f"{SOURCE}.",
         "",
         f"{len(printed)} printed numbers, {len(computed)} of them results: {agreeing} of {len(computed)} agree.",
-        f"Agreement: the computed value lies within half a unit of the last printed digit.{cited}",
+        f"A value agrees if it differs from the printed one by at most half a unit of the last printed digit.{cited}",
         "",
-        "| quantity | where | printed | computed | agrees |",
+        "| quantity | location | printed | computed | agrees |",
         "|---|---|---|---|---|",
         *(
             f"| {row.quantity} | {row.where} | {row.printed} | {_spell(row)} | {_AGREEMENT[row.agrees]} |"
@@ -272,7 +272,7 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
 
 @register
 class PublishedStudy(ComputedStudy):
-    """Comparison of all numbers printed in the paper with computed ones."""
+    """The numbers that are printed in the paper, for comparison with the printed values."""
 
     method = "The paper's numbers, from closed forms."
     from_scene = ()

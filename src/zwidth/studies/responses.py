@@ -69,7 +69,7 @@ class ResponseStudy(ComputedStudy):
     def respond(
         self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
     ) -> tuple[dict[str, Any], str]:
-        """Compute the step response of a device with a wall; return its columns, and a note on settling (may be "").
+        """Compute the step response of a device with a wall; return its columns, and a note on the settling or "".
 
         Args:
             device: device without parts.
@@ -108,7 +108,7 @@ class ResponseStudy(ComputedStudy):
 
 @register
 class StepStudy(WallsStudy, ResponseStudy):
-    """Response of the position to a step of the external force, for one or more devices and walls."""
+    """The response of the position to a step of the external force, for one or more devices and walls."""
 
     method = "Exact solution between changes of the force; rounding errors only."
     from_scene = ("devices",)
@@ -124,7 +124,7 @@ class StepStudy(WallsStudy, ResponseStudy):
     def find_faults(self) -> Iterable[LocatedProblem]:
         yield from super().find_faults()
         for index, device in enumerate(self.devices):
-            if device.parts_beyond:
+            if device.nonrigid_parts:
                 yield ("devices", index), make_parts_error("step", list_parts(device))
         sizes = len(self.devices), len(self.walls or (None,))
         if min(sizes) > 1 and sizes[0] != sizes[1]:
@@ -186,7 +186,7 @@ _DEVICE_NAMES = ("mass", "damping", "period", "delay", "delta", "d")
 
 @register
 class RecommendStudy(ResponseStudy):
-    """Recommended virtual wall of a device at required margins, the limits of this wall, and its step response."""
+    """The recommended wall of a device with the required margins, its limits, and its step response."""
 
     method = "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings."
     from_scene = ("device",)
@@ -229,7 +229,7 @@ class RecommendStudy(ResponseStudy):
         recommendation = bare.recommend(**{name: getattr(self, name) for name in wanted})
         summary, notes, response = recommendation.as_dict(), list(recommendation.notes), None
         lines = (*recommendation.lines(), *self._simulate(recommendation, scene))
-        if not bare.parts_beyond and recommendation.verdict is not None:
+        if not bare.nonrigid_parts and recommendation.verdict is not None:
             # Use the normalized wall of the assessment instead of the wall in SI units, because a conversion has
             # rounding errors.
             wall = recommendation.verdict.alpha, recommendation.verdict.beta
@@ -272,8 +272,8 @@ def draw(recommendation: Recommendation, response: Table | None = None) -> Any:
 
     The figure is not registered with pyplot, so that the caller need not close it.
     """
-    # Omit the panel of the step response for a measured device, because no model exists that could be simulated. Its
-    # verdict has no frequency.
+    # Omit the panel of the step response for a measured device, because a simulation needs a model. The assessment of a
+    # measured device contains no frequency of the dominant pole.
     columns = 1 if recommendation.verdict is None or math.isnan(recommendation.verdict.frequency) else 2
     _, axes = new_figure(WIDTH if columns == 2 else 5.6, 3.5, 1, columns)
     return plotting.plot.recommendation(recommendation, axes, response=response)
@@ -301,10 +301,10 @@ def _describe(recommendation: Recommendation, summary: dict[str, Any], lines: It
     page = [
         *("# Recommended virtual wall", ""),
         "Device: {}, sampled every {}, force delayed by {}.".format(scene.device.spell(), *times),
-        *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),
+        *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.nonrigid_parts or scene.operator else []),
         *("", *(f"- {text}" for text in results), ""),
         *(text for note in recommendation.notes for text in (f"Note: {note}", "")),
-        *(("To gain stiffness under the same requirements:", "") if recommendation.steps else ()),
-        *(f"- {step.spell()}" for step in recommendation.steps),
+        *(("To gain stiffness under the same requirements:", "") if recommendation.improvements else ()),
+        *(f"- {step.spell()}" for step in recommendation.improvements),
     ]
     return "\n".join(page).rstrip() + "\n"

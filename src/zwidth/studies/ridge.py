@@ -48,7 +48,7 @@ _SLOPE_SAMPLES = 64  # samples of g(d) per unit of d; integer delays are include
 
 @register
 class RidgeStudy(CurvesStudy):
-    """Maximum stable stiffness over delta, one curve per d."""
+    """The maximum stable stiffness over delta, with one curve per d."""
 
     method = "Stationary points of the closed form and corners at z = -1, to some ten rounding errors."
 
@@ -95,7 +95,7 @@ def slope_table(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 @register
 class PassivityStudy(CurvesStudy):
-    """Maximum passive stiffness and maximum stable stiffness over delta, one pair of curves per d."""
+    """The maximum passive stiffness and the maximum stable stiffness over delta, with two curves per d."""
 
     method = "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms."
     reads_scene = True
@@ -123,7 +123,7 @@ def find_edges(scene: Scene) -> dict[str, Outlines]:
     The keys of the dict are "stable" and "passive".
     """
     edges: dict[str, Outlines] = {"stable": [(np.stack(piece[:2], -1), piece.hole) for piece in scene.stable_region()]}
-    if not scene.parts_beyond and scene.device.damping > 0:
+    if not scene.nonrigid_parts and scene.device.damping > 0:
         edges["passive"] = [(np.stack(trace_passivity_boundary(scene), -1), False)]
     return edges
 
@@ -214,7 +214,7 @@ class Poses(Strict, noun="a table of poses"):
 
 @register
 class WorkspaceStudy(ComputedStudy):
-    """Maximum stable stiffness over the workspace of a device, from its mass and damping in each pose."""
+    """The maximum stable stiffness over the workspace of a device, from its mass and damping in each pose."""
 
     method = "Maximum stable stiffness of a rigid device per pose, to some rounding errors."
     from_scene = ("period", "delay")

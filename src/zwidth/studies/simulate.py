@@ -49,7 +49,7 @@ class SimulationConditions(Strict):
 
     start_position: Annotated[float, quantity_of("start_position")] = 0.0
     start_velocity: Annotated[float, quantity_of("start_velocity")] = 0.0
-    push: Annotated[float, quantity_of("push")] = 0.0
+    external_force: Annotated[float, quantity_of("external_force")] = 0.0
 
     contact: Contact = "bilateral"
     """Contact of the wall: bilateral (the wall acts on both sides of its surface), unilateral (only for positive
@@ -114,7 +114,7 @@ class SimulatedStudy(ComputedStudy):
 
 @register
 class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
-    """Simulated motions of a device on one or several walls over time."""
+    """The motions of a device in one or several walls, by simulation."""
 
     method = "Matrix exponentials between events; transitions of friction located to rounding errors."
     remedy_if_too_large = "shorten the duration, lower substeps, or use fewer walls"

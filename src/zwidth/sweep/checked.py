@@ -3,7 +3,7 @@
 A *store* is the Zarr group with the results of one sweep (`sweep.store`); `zwidth.open_dataset` reads it through
 `CheckedStore`. A *chunk* is one block of the grid of a sweep (`sweep.plan`). Each variable of the store has one file
 of values per chunk, which ends with a checksum. A chunk is *finished* once all its files are written. The *description*
-of the store is a JSON document, of which the store contains two copies.
+of the store is a JSON document; the store contains two copies of it.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class CheckedStore(LocalStore):
         """
         assert byte_range is None, "chunks are read as a whole"
         file, is_chunk = self._checked_store.path / key, "c" in key.split("/")
-        # For "zarr.json", return the description whose checksum was verified, because this copy of it may be damaged.
+        # For "zarr.json", return the description whose checksum was verified, because the file itself may be damaged.
         data = json.dumps(self._checked_store.description).encode() if key == "zarr.json" else read_or_empty(file)
         if file in self._absent or not (data or is_chunk):
             return None

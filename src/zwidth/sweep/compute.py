@@ -28,7 +28,7 @@ from zwidth.stability.rigid.dominant_pole_grid import Area
 from zwidth.stability.rigid.dominant_poles import area_poles, list_poles
 from zwidth.stability.rigid.margins import margins_kernel
 from zwidth.stability.rigid.normalization import status_of_results
-from zwidth.stability.rigid.passivity import margin_at_one_delay
+from zwidth.stability.rigid.passivity import compute_margins
 from zwidth.stability.rigid.ridge import alpha_max
 from zwidth.stability.rigid.step_response import decay_time
 from zwidth.stability.rigid.stiffness_limit import row_limits
@@ -223,5 +223,4 @@ def _compute_margins(with_delay: bool, with_modulus: bool, columns: Columns) -> 
 
 def _compute_passivity(columns: Columns) -> Leaves:
     """Return the passivity margin of walls with the same delay, from flat arrays of alpha, beta, delta and d."""
-    *walls, d = columns
-    return (_map_pieces(partial(margin_at_one_delay, d=float(d[0])), walls, _WALL_PIECE),)
+    return (_map_pieces(compute_margins, columns, _WALL_PIECE),)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _CONNECT_SECONDS = 30  # timeout for connecting to the scheduler, in s
 # Time in s without a finished job after which the scheduler is queried; the scheduler must reply within the same time.
 _REPLY_SECONDS = 15
-# Longest time in s without any worker, because workers may have to wait in the queue of a batch system.
+# Longest time in s without any worker. It is long, because workers may have to wait in the queue of a batch system.
 _NO_WORKER_SECONDS = 600
 # Number of submitted jobs per worker thread, large enough to keep every worker busy and small enough to limit the
 # memory of the scheduler.

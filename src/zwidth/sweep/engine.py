@@ -67,7 +67,7 @@ class Sweeps:
     results: dict[str, SweepResult]  # outcome of each sweep, by name of the study
     fatal_error: str = ""  # error that ended the run because it affects every chunk, for example a full disk
     interrupted: bool = False  # True if the user stopped the run with Ctrl-C
-    lost: str = ""  # error of the cluster that ended the run
+    cluster_error: str = ""  # error of the cluster that ended the run
 
 
 def compute_sweeps(
@@ -124,7 +124,7 @@ def compute_sweeps(
             try:
                 _collect_outcomes(finished, jobs, stores, sweeps, progress)
             except LostSchedulerError as error:
-                sweeps.lost = f"scheduler: {scheduler} {error}"
+                sweeps.cluster_error = f"scheduler: {scheduler} {error}"
             _count_chunks(jobs, stores, sweeps)
         return sweeps
 
@@ -222,7 +222,7 @@ def _count_chunks(jobs: list[Job], stores: dict[str, Store], sweeps: Sweeps) -> 
         stores: The stores by path.
         sweeps: Outcome of all sweeps, which is updated.
     """
-    over = sweeps.fatal_error or sweeps.interrupted or sweeps.lost
+    over = sweeps.fatal_error or sweeps.interrupted or sweeps.cluster_error
     for path, task in jobs:
         store = stores[path]
         sweep = sweeps.results[store.study.name]

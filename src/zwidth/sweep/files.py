@@ -27,8 +27,8 @@ from zwidth.io.files import REMEDIES
 _FATAL_ERRORS = frozenset(list(REMEDIES)[:6])  # system error codes that would also affect every further write
 _PACKAGES = ("jax", "jaxlib", "numpy")  # packages whose version can change the last digit of a result
 LOCKS = ".locks"  # name of the folder of the locks, within a folder of results
-ELSEWHERE = "choose another folder with --out DIR"  # remedy in error messages, which always helps
-LOCK_TIMEOUT = 1.0  # longest time to wait for the lock, in s, because a killed run needs some time to end
+ELSEWHERE = "choose another folder with --out DIR"  # remedy in error messages that always works
+LOCK_TIMEOUT = 1.0  # longest time to wait for the lock, in s; a killed run needs some time to end
 # Error codes by which file systems report that they do not support locks.
 _NO_LOCKS = frozenset({errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK})
 

@@ -116,7 +116,7 @@ def perform(path: str, family: str, index: int) -> None:
         from zwidth.sweep.compute import compute_block
 
         values = compute_block(plan.family, plan.outputs, store.plan.grid.block(task.slices), store.study.accuracy)
-    # Check once more before writing, because a restarted scheduler or a resumed run may have assigned the chunk twice.
+    # Check again before writing, because a restarted scheduler or a resumed run may have assigned the chunk twice.
     if not store.is_done(task):
         store.write(task, values)
 
@@ -186,7 +186,7 @@ class _Worker:
 
         Interrupting a write is harmless, because a file appears under its name only when it is complete.
         """
-        # Close the pipe of an idle process, because the process then ends by itself.
+        # Close the pipe of an idle process; the process then ends by itself.
         if self.job is None:
             self.pipe.close()
         else:
@@ -234,7 +234,7 @@ def _end_with_parent() -> None:
 
 @lru_cache(maxsize=64)
 def _reuse_equal_scene(scene: Scene) -> Scene:
-    """Return an equal scene from the cache if it contains one, because its stability boundary is already computed."""
+    """Return an equal scene from the cache, whose stability boundary is known, or add this scene to the cache."""
     return scene
 
 

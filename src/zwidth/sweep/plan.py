@@ -27,7 +27,7 @@ from zwidth.units.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STA
 
 MEMORY = 2**28  # default memory for the computation of one chunk, in bytes, in addition to `IDLE_MEMORY`
 IDLE_MEMORY = 500 * 2**20  # memory of a worker before its first chunk, in bytes: Python, JAX and compiled kernels
-_CHUNK_SECONDS = 10.0  # longest computing time of a chunk on one core, in s, because a killed worker loses its chunk
+_CHUNK_SECONDS = 10.0  # longest computing time of a chunk on one core, in s; a killed worker loses its chunk
 _MAX_CHUNK = 2**25  # largest number of points per chunk
 _MIN_CHUNKS = 16  # desired number of chunks per family, so that workers share the work and progress is visible
 _MIN_CHUNK = 2**15  # smallest number of points per chunk; writing smaller chunks takes longer than computing them

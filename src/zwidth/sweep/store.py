@@ -117,8 +117,8 @@ class Store:
         with silence_zarr():
             group = zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=True)
             arrays: dict[str, Any] = {name: group[name] for family in self.plan.families for name in family.variables}
-        # Let Zarr also write chunks that contain only the fill value, because detecting them takes longer than writing
-        # them.
+        # Let Zarr write chunks that contain only the fill value as well, because detecting them takes longer than
+        # writing them.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
 
     def label(self, task: Task) -> str:
@@ -139,7 +139,7 @@ class Store:
         return self.status_file(task).exists()
 
     def is_visible(self, task: Task) -> bool:
-        """Return whether a chunk is marked as done, also if another machine has written it very recently."""
+        """Return whether a chunk is marked as done, even if another machine wrote it a moment ago."""
         if not self.is_done(task):
             # List the folders to refresh the cache of a network file system, which may still report a new file as
             # missing.

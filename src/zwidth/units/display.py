@@ -130,7 +130,7 @@ def format_value(value: Any, unit: Unit = "") -> str:
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
-        # The value is traced by JAX or a ragged list.
+        # The value cannot be converted to an array: it is traced by JAX, or it is a ragged list.
         return repr(value)
     if array.dtype.kind not in "biufc":
         text = repr(value)

@@ -55,7 +55,7 @@ LONGEST_DELAY = 1e5  # longest delay d, in periods
 # Smallest and largest magnitude of the nonzero values of each normalized parameter.
 SIZES = {"alpha": WALL_RANGE, "beta": WALL_RANGE, "delta": (0.0, LARGEST_DAMPING), "d": (0.0, LONGEST_DELAY)}
 MAX_DELAY_PERIODS = 10_000.0  # longest delay in files, in periods; a longer one indicates a wrong unit
-MOST_POLES = 4000  # largest number of poles that are computed, because this many already take minutes and 0.3 GB
+MOST_POLES = 4000  # largest number of poles that are computed; so many take minutes and 0.3 GB
 RECOMMENDED_SHARE = 0.75  # stiffness of a recommended wall, relative to the stiffest stable wall
 
 
@@ -164,7 +164,7 @@ _PARAMETERS = (
     ),
     Parameter(
         "velocity.cutoff", "cut-off frequency of the velocity filter", "f_c", POSITIVE, "Hz", (1.0, 5e3),
-        "below half the sampling rate", "cut-off",
+        "below half the sampling rate", "cut-off frequency",
     ),
     Parameter(
         "velocity.time_constant", "time constant of the velocity filter", r"\tau", POSITIVE, "s", (2e-5, 0.2),
@@ -211,7 +211,7 @@ _PARAMETERS = (
     Parameter("coupling.damping", "damping of the coupling", "c", NOT_NEGATIVE, "N s/m", (0.0, 50.0), "default: 0"),
     Parameter(
         "actuator.cutoff", "corner frequency of the actuator", "f_a", POSITIVE, "Hz", (10.0, 5e3),
-        short_name="corner of the actuator",
+        short_name="corner frequency of the actuator",
     ),
     Parameter(
         "actuator.time_constant", "time constant of the actuator", r"\tau_a", POSITIVE, "s", (2e-5, 0.02),
@@ -254,14 +254,14 @@ _OF_MOTIONS = (
         note="the surface of the wall is at 0, and positions inside the wall are positive",
     ),
     Parameter("start_velocity", "initial velocity", "v_0", ANY, "m/s"),
-    Parameter("push", "constant external force on the device", "F", ANY, "N"),
+    Parameter("external_force", "constant external force on the device", "F", ANY, "N"),
     Parameter(
         "resolution", "resolution of the encoder, one count", r"\Delta", NOT_NEGATIVE, "m",
         short_name="resolution of the encoder",
     ),
     Parameter("noise", "standard deviation of the noise of the measured position", r"\sigma", NOT_NEGATIVE, "m"),
     Parameter(
-        "coulomb", "Coulomb friction while the device moves", "F_c", NOT_NEGATIVE, "N", short_name="dry friction"
+        "coulomb", "Coulomb friction while the device moves", "F_c", NOT_NEGATIVE, "N", short_name="Coulomb friction"
     ),
     Parameter(
         "static", "static friction, the largest friction force at rest", "F_s", NOT_NEGATIVE, "N",
@@ -273,7 +273,8 @@ _OF_MOTIONS = (
     ),
 )  # fmt: skip
 OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
-# Parameters of encoder, friction and motor: arguments of `zwidth.diagnose` and `zwidth.simulate`.
+# Names of the parameters of encoder, friction and motor, which are arguments of `zwidth.diagnose` and
+# `zwidth.simulate`.
 HARDWARE = ("resolution", "coulomb", "static", "max_force", "max_rate")
 FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
@@ -302,8 +303,8 @@ OF_LOGS = {
 }
 
 Family: TypeAlias = Literal["wall", "device"]  # an output has one value per wall, or one value per device and delay
-# Kinds of color scales, in this order: for truth values; for numbers with a good and a bad side of a center; for other
-# numbers; for positive numbers; for positive numbers that may be infinite.
+# Kinds of color scales: "truth" for truth values, "diverging" for numbers with a good and a bad side of a center,
+# "logarithmic" for positive numbers, "steep" for positive numbers that may be infinite, "sequential" for other numbers.
 ColorScale: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
 NOT_COMPUTED = 255  # status of points whose chunk does not exist yet; the other codes are those of `zwidth.Status`
 
@@ -365,7 +366,6 @@ _OUTPUTS = (
     Output(
         "decay_rate", "decay rate of the dominant pole, -ln(spectral radius); negative for an unstable wall",
         r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", source="spectral_radius",
-        label="rate of decay",
     ),
     Output(
         "gain_margin", "common factor of stiffness and damping at the limit of stability; below 1 for an unstable wall",
@@ -401,7 +401,7 @@ _OUTPUTS = (
     ),
     Output(
         "beta_at_max", "normalized virtual damping of the wall with alpha_max", r"\beta", "sequential", "device",
-        source="alpha_max", label="virtual damping of that wall",
+        source="alpha_max", label="virtual damping of the stiffest wall",
     ),
     Output(
         "kind", "kind of the optimum at alpha_max: smooth, or a corner with a double pole at z = -1", family="device",
@@ -414,7 +414,8 @@ _OUTPUTS = (
     ),
     Output(
         "virtual_damping_at_max", "virtual damping B of the wall with stiffness_max", "B", "sequential", "device",
-        units="N s/m", physical_only=True, with_parts=True, source="alpha_max", label="virtual damping of that wall",
+        units="N s/m", physical_only=True, with_parts=True, source="alpha_max",
+        label="virtual damping of the stiffest wall",
     ),
 )  # fmt: skip
 OUTPUTS = {output.name: output for output in _OUTPUTS}

@@ -1,8 +1,9 @@
 """Parser of unit expressions: products, quotients and powers of unit symbols with SI prefixes.
 
-Examples are ``N m/deg``, ``mNm/°``, ``N*m*s / rad``, ``kgf/cm`` and ``ozf in``. The result is the conversion factor to
-SI and the exponents of kg, m, s and rad. Powers of ten are stored separately from other factors, because adding them to
-the decimal exponent of a number causes only one rounding error: 0.3 ms becomes exactly the float64 number 0.0003.
+Examples are ``N m/deg``, ``mNm/°``, ``N*m*s / rad``, ``kgf/cm`` and ``ozf in``. The result, the *size* of a unit, is
+its conversion factor to SI and its exponents of kg, m, s and rad. Powers of ten are stored separately from other
+factors, because adding them to the decimal exponent of a number causes only one rounding error: 0.3 ms becomes exactly
+the float64 number 0.0003.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Exponents = tuple[int, int, int, int]
 
 
 class UnitSize(NamedTuple):
-    """The size of a unit: its conversion factor to SI is ``factor * 10**power``."""
+    """Conversion factor of a unit to SI, ``factor * 10**power``, and the unit's exponents of kg, m, s and rad."""
 
     power: int
     factor: float
@@ -53,7 +54,7 @@ _SYMBOLS: dict[str, tuple[int, float, Exponents, str]] = {
     "ft": (0, 0.3048, _LENGTH, ""),
     "lb": (0, 0.45359237, _MASS, ""),
     "oz": (0, 0.028349523125, _MASS, ""),
-    # Force units use standard gravity, 9.80665 m/s^2.
+    # The factors of these force units contain the standard gravity, 9.80665 m/s^2.
     "gf": (-3, 9.80665, _FORCE, "k"),
     "kp": (0, 9.80665, _FORCE, ""),
     "lbf": (0, 4.4482216152605, _FORCE, ""),
@@ -86,7 +87,7 @@ def normalize_symbols(text: str) -> str:
 
 @lru_cache(maxsize=1024)
 def measure_unit(text: str, exponents: Exponents | None = None) -> UnitSize | None:
-    """Return the size of a unit; None if the unit is unknown or ambiguous.
+    """Return conversion factor and exponents of a unit as `UnitSize`; None if the unit is unknown or ambiguous.
 
     Letters may have several interpretations: "ms" denotes milliseconds or metre seconds. The required exponents select
     one of them.
@@ -105,7 +106,7 @@ def measure_unit(text: str, exponents: Exponents | None = None) -> UnitSize | No
 
 
 def _read_weights(text: str, exponents: Exponents) -> UnitSize | None:
-    """Return the size of a unit whose kg, g, lb or oz denotes a weight, as in "oz in"; None for other dimensions.
+    """Return the `UnitSize` of a unit whose kg, g, lb or oz denotes a weight, as in "oz in"; None for other dimensions.
 
     Args:
         text: the unit.
@@ -124,7 +125,7 @@ def _read_weights(text: str, exponents: Exponents) -> UnitSize | None:
 
 
 def _read(text: str) -> list[UnitSize]:
-    """Return the sizes of all interpretations of a unit, ordered by increasing number of symbols; at most 64."""
+    """Return a `UnitSize` for each interpretation of a unit, at most 64, in the order of their number of symbols."""
     text = re.sub(r"\s*/\s*", "/", text.strip())
     # Replace "N m/(rad/s)" by "N m s/rad".
     if inverse := _DIVIDED_RATE.search(text):
@@ -144,7 +145,7 @@ def _read(text: str) -> list[UnitSize]:
 
 
 def _read_run(atom: str) -> Iterator[UnitSize]:
-    """Yield the size of each interpretation of a text without separators, such as "mNm" or "cm2".
+    """Yield a `UnitSize` for each interpretation of a text without separators, such as "mNm" or "cm2".
 
     An exponent at the end applies to the last symbol only.
     """
@@ -165,13 +166,13 @@ def _read_run(atom: str) -> Iterator[UnitSize]:
 
 
 def _raise_to(size: UnitSize, power: int) -> UnitSize:
-    """Return the size of a unit that is raised to an integer power."""
+    """Return the `UnitSize` of an integer power of a unit, given the `UnitSize` of the unit."""
     kg, m, s, rad = size.exponents
     return UnitSize(size.power * power, size.factor**power, (kg * power, m * power, s * power, rad * power))
 
 
 def _join(first: UnitSize, second: UnitSize, sign: int) -> UnitSize:
-    """Return the size of the product of two units, or of their quotient if ``sign`` is -1."""
+    """Return the `UnitSize` of the product of two units or, if ``sign`` is -1, of their quotient."""
     (a, b, c, d), (e, f, g, h) = first.exponents, second.exponents
     exponents = (a + sign * e, b + sign * f, c + sign * g, d + sign * h)
     return UnitSize(first.power + sign * second.power, first.factor * second.factor**sign, exponents)

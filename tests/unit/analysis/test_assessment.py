@@ -1,4 +1,7 @@
-"""Verdicts on walls: passivity and margins of scenes with parts, walls that are marginal, and tables of many scenes."""
+"""Test `zwidth.assess` and `assess_many`: margins, passivity and marginal walls.
+
+References: a frequency scan of Colgate's condition, and eigenvalues of a state-space model.
+"""
 
 import csv
 import dataclasses
@@ -16,7 +19,7 @@ DEVICE, TIMING = zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3)
 WALL = zwidth.VirtualWall(3e3, 5)
 SLOW = zwidth.LowPass(cutoff=100)
 HAND = zwidth.Operator(0.5, 0, 100)
-FREE = {
+FREE_PARTS = {
     "rigid": {},
     "filter": {"velocity": SLOW},
     "hand": {"operator": zwidth.Operator(0.5, 0, 0, 1000, 2)},
@@ -26,12 +29,12 @@ FREE = {
 
 
 def free_scene(name, stiffness, damping):
-    parts = {"device": zwidth.Device(0.1, 0.0), "timing": zwidth.Timing(1e-3), **FREE[name]}
+    parts = {"device": zwidth.Device(0.1, 0.0), "timing": zwidth.Timing(1e-3), **FREE_PARTS[name]}
     return zwidth.Scene(**parts, wall=zwidth.VirtualWall(stiffness, damping))
 
 
 @pytest.mark.parametrize("parts", [{"velocity": SLOW}, {"operator": HAND}], ids=["filter", "hand"])
-def test_margins_and_passivity_are_those_of_the_scene(parts):
+def test_assess_reports_margins_and_passivity_of_the_scene(parts):
     scene = zwidth.Scene(DEVICE, TIMING, WALL, **parts)
     verdict, expected = zwidth.assess(scene), scene.margins(3e3, 5)
     for name in ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover"):
@@ -40,7 +43,7 @@ def test_margins_and_passivity_are_those_of_the_scene(parts):
     assert verdict.passive == bool(scene.is_passive(3e3, 5))
 
 
-def test_with_the_sensor_at_the_tip_passivity_is_not_known():
+def test_passivity_is_undefined_with_sensor_at_tip():
     coupling = zwidth.Coupling(0.05, 20e3, 1, sensor="tip")
     verdict = zwidth.assess(zwidth.Scene(zwidth.Device(0.1, 10, coupling), TIMING, WALL))
     assert verdict.passive is None
@@ -51,26 +54,26 @@ def test_with_the_sensor_at_the_tip_passivity_is_not_known():
 
 @pytest.mark.parametrize("parts", [{}, {"velocity": SLOW}, {"operator": HAND}], ids=["rigid", "filter", "hand"])
 @pytest.mark.parametrize("wall", [(3e3, 5.0), (60e3, 5.0), (3e3, 900.0)])
-def test_every_scene_has_its_intervals_and_the_ends_of_the_nearest(parts, wall):
+def test_assess_reports_stable_intervals_and_nearest_limits(parts, wall):
     scene = zwidth.Scene(DEVICE, TIMING, zwidth.VirtualWall(*wall), **parts)
     verdict = zwidth.assess(scene)
-    found = verdict.stable_stiffness, verdict.stable_damping
-    for told, expected in zip(found, (scene.stable_stiffness(), scene.stable_damping()), strict=True):
-        np.testing.assert_allclose(np.reshape(told, (-1, 2)), expected, rtol=1e-9, atol=1e-9)
+    interval_lists = verdict.stable_stiffness, verdict.stable_damping
+    for reported, expected in zip(interval_lists, (scene.stable_stiffness(), scene.stable_damping()), strict=True):
+        np.testing.assert_allclose(np.reshape(reported, (-1, 2)), expected, rtol=1e-9, atol=1e-9)
     ends = (verdict.stiffness_limit,), (verdict.virtual_damping_lower, verdict.virtual_damping_upper)
-    for value, intervals, told in zip(wall, found, ends, strict=True):
-        assert np.all(np.isnan(told)) == (not intervals)
+    for value, intervals, reported in zip(wall, interval_lists, ends, strict=True):
+        assert np.all(np.isnan(reported)) == (not intervals)
         if intervals:
-            assert any(told == ends[-len(told) :] for ends in intervals)
+            assert any(reported == ends[-len(reported) :] for ends in intervals)
         assert verdict.stable == any(low < value < high for low, high in intervals)
 
 
-@pytest.mark.parametrize("name", FREE)
-def test_a_damper_alone_is_marginal(name):
+@pytest.mark.parametrize("name", FREE_PARTS)
+def test_pure_damper_is_marginal(name):
     scene = free_scene(name, 0.0, 5.0)
     verdict = zwidth.assess(scene)
     sizes = np.sort(np.abs(np.linalg.eigvals(closed_loop_matrix(scene, 0.0, 5.0))))
-    # One pole at z = 1, the others inside: by an independent matrix.
+    # An independent state-space matrix has one pole at z = 1 and the others inside the unit circle.
     assert sizes[-1] == pytest.approx(1.0, abs=1e-9)
     assert sizes[-2] < 1 - 1e-6
     assert verdict.marginal
@@ -79,10 +82,10 @@ def test_a_damper_alone_is_marginal(name):
     assert verdict.time_constant == math.inf
 
 
-@pytest.mark.parametrize("name", FREE)
+@pytest.mark.parametrize("name", FREE_PARTS)
 @pytest.mark.parametrize("wall", [(0.0, 3e3), (0.0, 0.0), (0.0, -5.0), (50.0, 5.0)])
-def test_other_walls_are_not(name, wall):
-    # Too much damping, none at all (two poles at z = 1), a negative one; with a stiffness the wall is stable.
+def test_other_walls_are_not_marginal(name, wall):
+    # Too much damping, none (two poles at z = 1) and negative damping; the wall with stiffness is stable.
     verdict = zwidth.assess(free_scene(name, *wall))
     assert not verdict.marginal
     assert verdict.stable == (wall[0] > 0)
@@ -90,22 +93,22 @@ def test_other_walls_are_not(name, wall):
 
 @pytest.mark.parametrize("name", ["rigid", "filter", "delayed"])
 @pytest.mark.parametrize("damping", [0.3, 1.0, 7.7, 10.0])
-def test_a_wall_that_takes_all_damping_away_is_not(name, damping):
-    # Two poles at z = 1, which rounding may show as one at 1 and one a little inside: the device drifts.
-    for stays, share in ((False, 1.0), (True, 0.999)):
+def test_wall_that_cancels_all_damping_is_not_marginal(name, damping):
+    # Rounding errors may split the double pole at z = 1 into one at 1 and one slightly inside; the device drifts.
+    for is_marginal, share in ((False, 1.0), (True, 0.999)):
         scene = dataclasses.replace(free_scene(name, 0.0, -share * damping), device=zwidth.Device(0.1, damping))
-        assert zwidth.assess(scene).marginal is stays
+        assert zwidth.assess(scene).marginal is is_marginal
 
 
 @pytest.mark.parametrize("delay", [0.0, 1e-3, 1.4e-3])
-def test_an_undamped_device_has_no_stable_spring(delay):
+def test_undamped_device_without_damping_has_no_stable_stiffness(delay):
     scene = dataclasses.replace(free_scene("filter", 0.0, 0.0), timing=zwidth.Timing(1e-3, delay))
     verdict = zwidth.assess(scene)
     assert verdict.stable_stiffness == ()
     assert verdict.stable_damping == ()
 
 
-def test_many_scenes_make_a_table_and_a_bad_one_spoils_no_other():
+def test_assess_many_reports_invalid_scenes_separately():
     scenes = {
         "rigid": zwidth.Scene(DEVICE, TIMING, WALL),
         "refused": zwidth.Scene(DEVICE, TIMING, WALL, zwidth.LowPass(cutoff=900)),
@@ -133,13 +136,13 @@ def test_many_scenes_make_a_table_and_a_bad_one_spoils_no_other():
     assert [row["scene"] for row in csv.DictReader(text)] == list(scenes)
 
 
-def test_many_scenes_without_names_are_counted():
+def test_assess_many_numbers_unnamed_scenes():
     records = zwidth.assess_many(zwidth.Scene(DEVICE, TIMING, zwidth.VirtualWall(K, 40)) for K in (1e3, 50e3))
     assert [(record["scene"], record["stable"]) for record in records] == [(0, True), (1, False)]
     assert zwidth.assess_many([]) == []
 
 
-def test_parts_by_place():
+def test_scene_accepts_parts_by_position():
     scene = zwidth.Scene(DEVICE, TIMING, SLOW, HAND)  # pyright: ignore[reportArgumentType]
     assert scene == zwidth.Scene(DEVICE, TIMING, velocity=SLOW, operator=HAND)
     assert zwidth.Scene(DEVICE, TIMING, SLOW, operator=HAND) == scene  # pyright: ignore[reportArgumentType]
@@ -150,8 +153,9 @@ def test_parts_by_place():
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_hand_makes_no_wall_passive(seed):
-    # Colgate's condition by a dense scan: b > T/2 (1 - cos wT)^-1 Re[(1 - e^-jwT) H(e^jwT)] with b of the device alone.
+def test_passivity_margin_with_operator_matches_colgate_scan(seed):
+    # Reference: a dense scan of Colgate's condition, b > T/2 (1 - cos wT)^-1 Re[(1 - e^-jwT) H(e^jwT)], with b of the
+    # device, without the operator.
     rng = np.random.default_rng([seed, 7])
     device, timing = zwidth.Device(0.1, rng.uniform(1, 40)), zwidth.Timing(1e-3, 1e-3 * int(rng.integers(0, 3)))
     wall = zwidth.VirtualWall(10 ** rng.uniform(2, 4.5), rng.uniform(0, 40))
@@ -165,7 +169,7 @@ def test_a_hand_makes_no_wall_passive(seed):
     assert verdict.passive == bool(scene.is_passive()) == (device.damping > needed)
 
 
-def test_the_device_s_own_damping_counts():
+def test_passivity_margin_excludes_damping_of_operator():
     hand = zwidth.Operator(mass=0.5, damping=40)
     scene = zwidth.Scene(DEVICE, TIMING, zwidth.VirtualWall(10e3, 5), operator=hand)
     verdict = zwidth.assess(scene)
@@ -173,13 +177,13 @@ def test_the_device_s_own_damping_counts():
     assert verdict.passive is False
 
 
-def test_a_scene_without_a_wall_has_none_to_judge():
+def test_assess_rejects_scene_without_wall():
     with pytest.raises(InputError, match="the scene has no wall"):
         zwidth.assess(zwidth.Scene(DEVICE, TIMING))
     assert zwidth.assess_many([zwidth.Scene(DEVICE, TIMING)])[0]["status"] == "INVALID_INPUT"
 
 
-def test_too_many_poles_are_refused_before_minutes_are_spent(monkeypatch):
+def test_assess_many_rejects_too_many_poles_before_computing(monkeypatch):
     late = zwidth.Scene(DEVICE, zwidth.Timing(1e-3, 5.0), WALL, SLOW)
     monkeypatch.setattr(zwidth.Scene, "max_stiffness", lambda scene: pytest.fail("the boundary is laid out"))
     (row,) = zwidth.assess_many([late])

@@ -1,4 +1,4 @@
-"""The chosen dampings against a brute-force search of the stable interval."""
+"""Test `Scene.best_damping` against a brute-force search over the interval of stable dampings."""
 
 import numpy as np
 import pytest
@@ -13,42 +13,42 @@ SCENES: list[Scene] = [Scene(Device(1.0, delta), Timing(1.0, d)) for delta, d in
 
 @pytest.fixture(scope="module", params=SCENES)
 def case(request):
-    """A scene, half of its stiffest wall, and a fine row of stable dampings there."""
+    """Return a scene, half of its maximum stiffness, and a fine grid of stable dampings at that stiffness."""
     scene = request.param
     stiffness = 0.5 * float(scene.max_stiffness().stiffness)
     ((low, high),) = scene.stable_damping(stiffness).tolist()
     return scene, stiffness, np.linspace(low, high, 2001)[1:-1]
 
 
-def test_no_other_damping_settles_faster(case):
+def test_no_stable_damping_has_a_smaller_spectral_radius(case):
     scene, stiffness, trials = case
     best = scene.best_damping(stiffness)
     radius = scene.spectral_radius(stiffness, trials)
     assert best.status == Status.OK
     assert best.spectral_radius <= radius.min() + 1e-7
-    # A kink like a square root falls steeply between two trials, yet not farther than this.
+    # At a square-root kink the radius falls steeply between two grid points, but by less than this tolerance.
     assert best.spectral_radius > radius.min() - 0.05
     assert scene.spectral_radius(stiffness, best.virtual_damping) == pytest.approx(best.spectral_radius, rel=1e-12)
 
 
-def test_no_other_damping_is_more_robust(case):
+def test_no_stable_damping_has_a_larger_modulus_margin(case):
     scene, stiffness, trials = case
     best = scene.best_damping(stiffness, goal="robust")
-    some = trials[:: 400 if scene.parts_beyond else 10]
-    margin = scene.margins(stiffness, some).modulus_margin
+    sample = trials[:: 400 if scene.nonrigid_parts else 10]
+    margin = scene.margins(stiffness, sample).modulus_margin
     assert best.modulus_margin >= margin.max() - 1e-12
     assert scene.margins(stiffness, best.virtual_damping).modulus_margin == pytest.approx(best.modulus_margin, rel=1e-9)
     assert scene.is_stable(stiffness, best.virtual_damping, method="certified")
     assert best.modulus_margin >= scene.best_damping(stiffness).modulus_margin
 
 
-def test_no_damping_where_none_is_stable():
+def test_best_damping_above_maximum_stiffness_is_nan():
     best = FILTERED.best_damping(1.01 * float(FILTERED.max_stiffness().stiffness))
     assert best.status == Status.NO_BOUNDARY
     assert np.isnan(best[:3]).all()
 
 
-def test_an_island_is_left_out():
+def test_best_damping_ignores_islands():
     scene = FILTERED.replace(velocity=WindowedDifference(samples=24))
     (island,) = scene.islands()
     middle = float(np.mean(island.stiffness))
@@ -56,11 +56,11 @@ def test_an_island_is_left_out():
     assert scene.best_damping(middle).status == Status.NO_BOUNDARY
 
 
-def test_the_scene_s_own_wall_is_meant():
+def test_best_damping_defaults_to_the_wall_of_the_scene():
     assert FILTERED.replace(wall=VirtualWall(5e3)).best_damping() == FILTERED.best_damping(5e3)
 
 
-def test_the_fastest_undamped_wall_has_a_triple_pole():
+def test_best_damping_of_undamped_device_at_triple_pole():
     # (z - r)^3 = z (z - 1)^2 + (z + 1)(alpha z + beta (z - 1))/2 leaves (r + 1)^3 = 4.
     r = 4 ** (1 / 3) - 1
     alpha = 6 * r**2 - 2
@@ -71,6 +71,6 @@ def test_the_fastest_undamped_wall_has_a_triple_pole():
 
 
 @pytest.mark.parametrize("stiffness, options", [(-1.0, {}), (np.nan, {}), (1e3, {"goal": "soft"})])
-def test_what_is_refused(stiffness, options):
+def test_best_damping_rejects_invalid_arguments(stiffness, options):
     with pytest.raises(InputError, match=r"goal: got 'soft'|stiffness: got"):
         FILTERED.best_damping(stiffness, **options)

@@ -1,4 +1,7 @@
-"""Velocity estimates of a user's own class: the transfer function decides, never the class."""
+"""Test velocity estimates of user-defined classes: only the transfer function determines stability.
+
+Reference: roots of the characteristic polynomial, in NumPy.
+"""
 
 import math
 
@@ -14,7 +17,7 @@ MASS, DAMPING, PERIOD = 0.1, 10.0, 1e-3
 
 
 class Smoothed(zwidth.BackwardDifference):
-    """``(x_k - x_(k-1))/T`` behind a low-pass with the pole 0.8, in floats."""
+    """``(x_k - x_(k-1))/T`` with a first-order low-pass of pole 0.8, in floats."""
 
     def estimate(self, period):
         return Estimate(window=1, gain=0.2, lag=-1, poles=np.array([0.2 + 0j]))
@@ -24,7 +27,7 @@ class Smoothed(zwidth.BackwardDifference):
 
 
 class Weak(zwidth.BackwardDifference):
-    """Half of the difference."""
+    """Half of the backward difference."""
 
     def estimate(self, period):
         return Estimate(window=1, gain=0.5)
@@ -34,7 +37,7 @@ class Weak(zwidth.BackwardDifference):
 
 
 class Faster(zwidth.LowPass):
-    """A low-pass at three times the cut-off, computed with `math`."""
+    """A low-pass at three times the cutoff frequency, computed with `math`."""
 
     def estimate(self, period):
         offset = -math.expm1(-6.0 * math.pi * float(self.cutoff) * float(period))
@@ -46,31 +49,31 @@ class Faster(zwidth.LowPass):
 
 
 class Lead(zwidth.WindowedDifference):
-    """Two samples of a window behind a zero."""
+    """A windowed difference with an additional zero."""
 
     def estimate(self, period):
         return Estimate(window=self.samples, gain=2.0, lag=1, zeros=np.array([0.5 + 0j]))
 
     def fraction(self):
         n = self.samples
-        top = np.zeros(n + 1)
-        top[[0, -1]] = 1.0 / n, -1.0 / n
-        return 2.0 * np.convolve(top, [1.0, -0.5]) / PERIOD, np.append(1.0, np.zeros(n + 1))
+        numerator = np.zeros(n + 1)
+        numerator[[0, -1]] = 1.0 / n, -1.0 / n
+        return 2.0 * np.convolve(numerator, [1.0, -0.5]) / PERIOD, np.append(1.0, np.zeros(n + 1))
 
 
 ESTIMATES = [Smoothed(), Weak(), Faster(cutoff=40.0), Lead(samples=3)]
 
 
-def own_radius(velocity, stiffness, damping, delay):
-    """The largest pole magnitude, from a rigid mass under a held force and whole periods of delay."""
+def compute_radius(velocity, stiffness, damping, delay):
+    """Return the largest pole magnitude of a rigid mass with zero-order hold and an integer delay."""
     rate = DAMPING / MASS
     e = math.exp(-rate * PERIOD)
     b1 = (PERIOD - (1 - e) / rate) / DAMPING
     b0 = ((1 - e) / rate - PERIOD * e) / DAMPING
     device = np.convolve(np.convolve([1.0, -1.0], [1.0, -e]), np.append(1.0, np.zeros(delay)))
-    top, bottom = velocity.fraction()
-    wall = np.polyadd(stiffness * bottom, damping * top)
-    return np.abs(np.roots(np.polyadd(np.convolve(device, bottom), np.convolve([b1, b0], wall)))).max()
+    numerator, denominator = velocity.fraction()
+    wall = np.polyadd(stiffness * denominator, damping * numerator)
+    return np.abs(np.roots(np.polyadd(np.convolve(device, denominator), np.convolve([b1, b0], wall)))).max()
 
 
 def make_scene(velocity, delay):
@@ -79,36 +82,36 @@ def make_scene(velocity, delay):
 
 
 @pytest.mark.parametrize("velocity", ESTIMATES, ids=lambda each: type(each).__name__)
-def test_walls_are_those_of_the_transfer_function(velocity):
+def test_walls_match_polynomial_of_transfer_function(velocity):
     rng = np.random.default_rng(3)
     for delay in (0, 1, 2):
         scene = make_scene(velocity, delay)
         top = scene.max_stiffness()
         assert int(top.status) == Status.OK
         damping = float(top.virtual_damping)
-        assert own_radius(velocity, 0.999 * top.stiffness, damping, delay) < 1.0
-        assert own_radius(velocity, 1.001 * top.stiffness, damping, delay) > 1.0
+        assert compute_radius(velocity, 0.999 * top.stiffness, damping, delay) < 1.0
+        assert compute_radius(velocity, 1.001 * top.stiffness, damping, delay) > 1.0
         K, B = top.stiffness * rng.uniform(0.01, 1.5, 40), (abs(damping) + 5.0) * rng.uniform(0.0, 2.0, 40)
-        radii = np.array([own_radius(velocity, *wall, delay) for wall in zip(K, B, strict=True)])
+        radii = np.array([compute_radius(velocity, *wall, delay) for wall in zip(K, B, strict=True)])
         np.testing.assert_allclose(scene.spectral_radius(K, B), radii, rtol=1e-7)
         for method in ("auto", "companion", "certified"):
             if method == "certified":
                 pytest.importorskip("flint")
-            found = scene.decide_stability(K, B, method=method)
-            assert np.all(found.status == Status.OK)
-            np.testing.assert_array_equal(found.stable, radii < 1.0)
+            decision = scene.decide_stability(K, B, method=method)
+            assert np.all(decision.status == Status.OK)
+            np.testing.assert_array_equal(decision.stable, radii < 1.0)
 
 
-def test_coefficients_of_the_plain_difference_count_as_it():
-    """The same transfer function as a filter: negative dampings count by default for both, with the same K_max."""
+def test_filter_with_coefficients_of_backward_difference_has_its_maximum():
+    """For both, negative dampings are included by default."""
     device, timing = zwidth.Device(0.1, 1000.0), zwidth.Timing(1e-3)
     plain = zwidth.Scene(device, timing).max_stiffness()
     assert plain.virtual_damping < 0
-    found = zwidth.Scene(device, timing, velocity=zwidth.VelocityFilter([1000, -1000], [1, 0])).max_stiffness()
-    np.testing.assert_allclose(found[:2], plain[:2], rtol=1e-9)
+    filtered = zwidth.Scene(device, timing, velocity=zwidth.VelocityFilter([1000, -1000], [1, 0])).max_stiffness()
+    np.testing.assert_allclose(filtered[:2], plain[:2], rtol=1e-9)
 
 
-def test_a_class_of_a_user_has_no_name_in_configurations():
+def test_user_defined_class_has_no_name_in_configurations():
     from zwidth.model.parameter_paths import spell_estimate
 
     with pytest.raises(InputError, match="got Weak, which is not available in configurations"):
@@ -128,13 +131,13 @@ def test_a_class_of_a_user_has_no_name_in_configurations():
     ],
     ids=str,
 )
-def test_certified_labels_are_those_of_all_poles(velocity):
+def test_certified_decisions_match_companion_matrix(velocity):
     pytest.importorskip("flint")
     rng = np.random.default_rng(11)
     scene = make_scene(velocity, 1)
     top = scene.max_stiffness()
     K, B = top.stiffness * rng.uniform(0.01, 1.5, 40), abs(top.virtual_damping) * rng.uniform(0.0, 2.5, 40)
     K[0] = 0.0
-    found = scene.decide_stability(K, B, method="certified")
-    assert found.status.tolist() == [Status.ON_BOUNDARY] + 39 * [Status.OK]
-    np.testing.assert_array_equal(found.stable[1:], scene.is_stable(K, B, method="companion")[1:])
+    decision = scene.decide_stability(K, B, method="certified")
+    assert decision.status.tolist() == [Status.ON_BOUNDARY] + 39 * [Status.OK]
+    np.testing.assert_array_equal(decision.stable[1:], scene.is_stable(K, B, method="companion")[1:])

@@ -1,4 +1,4 @@
-"""Rotary devices: the same numbers as linear ones, in other units; the two are never mixed."""
+"""Test rotary devices: the values of linear devices in rotary units. Mixed unit systems are rejected."""
 
 import copy
 import dataclasses
@@ -28,7 +28,7 @@ def write_html(result: Any) -> str:
     return result._repr_html_()
 
 
-def test_units_of_a_rotary_device_make_it_one():
+def test_rotary_units_make_a_device_rotary():
     scene = make_rotary()
     assert scene.device == zwidth.Device(12e-7, 2e-5, rotary=True)
     assert scene.device != zwidth.Device(12e-7, 2e-5)
@@ -42,9 +42,9 @@ def test_units_of_a_rotary_device_make_it_one():
     assert zwidth.devices.find_device("haptic_wheel").to_device().rotary
 
 
-# Couplings, modes and neither, each with a filter and with a hand.
+# Devices with couplings, modes and neither, each with a filter and with an operator.
 @pytest.mark.parametrize("seed", [1, 2, 3, 5, 6, 10])
-def test_a_rotary_scene_has_the_numbers_of_the_linear_one(seed):
+def test_rotary_scene_has_the_values_of_the_linear_scene(seed):
     random = np.random.default_rng(seed)
     mass, damping, period = 10.0 ** random.uniform([-7, -6, -4], [-2, -3, -2])
     coupling = zwidth.Coupling(0.3 * mass, 0.5 * mass / period**2, 0.01 * mass / period) if seed % 3 == 0 else None
@@ -54,17 +54,20 @@ def test_a_rotary_scene_has_the_numbers_of_the_linear_one(seed):
     timing = zwidth.Timing(period, random.uniform(0, 2) * period)
     linear, rotary = (
         zwidth.Scene(
-            zwidth.Device(mass, damping, coupling, modes=modes, rotary=turns), timing, velocity=velocity, operator=hand
+            zwidth.Device(mass, damping, coupling, modes=modes, rotary=is_rotary),
+            timing,
+            velocity=velocity,
+            operator=hand,
         )
-        for turns in (False, True)
+        for is_rotary in (False, True)
     )
     top = linear.max_stiffness()
     K = top.stiffness * random.uniform(0.1, 1.5, 5)
     B = top.virtual_damping * random.uniform(0.0, 2.0, 5)
-    for question in ("max_stiffness", "sensitivities", "islands", "stable_region"):
-        np.testing.assert_equal(getattr(rotary, question)(), getattr(linear, question)())
-    for question in ("is_stable", "spectral_radius", "margins", "poles"):
-        np.testing.assert_equal(getattr(rotary, question)(K, B), getattr(linear, question)(K, B))
+    for name in ("max_stiffness", "sensitivities", "islands", "stable_region"):
+        np.testing.assert_equal(getattr(rotary, name)(), getattr(linear, name)())
+    for name in ("is_stable", "spectral_radius", "margins", "poles"):
+        np.testing.assert_equal(getattr(rotary, name)(K, B), getattr(linear, name)(K, B))
     np.testing.assert_array_equal(rotary.stable_stiffness(B), linear.stable_stiffness(B))
     one, other = (scene.recommend(stiffness_fraction=0.5) for scene in (linear, rotary))
     assert (one.stiffness, one.virtual_damping, one.limited_by) == (
@@ -78,13 +81,13 @@ def test_a_rotary_scene_has_the_numbers_of_the_linear_one(seed):
     walls = [scene.replace(stiffness=K[0], virtual_damping=B[0]) for scene in (linear, rotary)]
     first, second = (zwidth.assess(scene).as_dict() for scene in walls)
     np.testing.assert_equal(first, second)
-    # One of each: a program is compiled.
+    # Only for one scene of each kind, because the simulation is compiled for each.
     if seed <= 3:
         one, other = (scene.simulate(K[0], B[0], start_position=1e-3, periods=200).amplitude for scene in walls)
         np.testing.assert_array_equal(one, other)
 
 
-def test_results_are_shown_in_the_units_of_their_device():
+def test_results_are_shown_in_rotary_units():
     scene = make_rotary()
     top = scene.max_stiffness()
     assert "mN m/rad" in repr(top)
@@ -95,19 +98,19 @@ def test_results_are_shown_in_the_units_of_their_device():
         *(scene.boundary(300.0), *scene.stable_region(), *zwidth.limits_of(scene)),
         *(scene.simulate(start_position="1 deg"), scene.to_si(alpha=0.1), scene.required("damping", 0.2)),
     ):
-        for shown in (repr(result), write_html(result)):
-            assert not LINEAR_UNITS.search(shown), shown
-    found = scene.recommend()
-    assert "mN m/deg" in found.lines()[0]
-    assert "N m s/rad" in found.lines()[1]
-    assert found.as_dict()["units"]["stiffness"] == "N m/rad"
-    assert "angle in rad" in found.code()
-    assert "angle in rad" in found.code("python")
+        for text in (repr(result), write_html(result)):
+            assert not LINEAR_UNITS.search(text), text
+    recommendation = scene.recommend()
+    assert "mN m/deg" in recommendation.lines()[0]
+    assert "N m s/rad" in recommendation.lines()[1]
+    assert recommendation.as_dict()["units"]["stiffness"] == "N m/rad"
+    assert "angle in rad" in recommendation.code()
+    assert "angle in rad" in recommendation.code("python")
     assert "N m/rad" in zwidth.limits_of(scene)[0].spell()
     assert "N/m" in repr(zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3)).max_stiffness())
 
 
-def test_results_keep_their_units_when_they_are_copied():
+def test_copied_and_pickled_results_keep_their_units():
     top = make_rotary().max_stiffness()
     for each in (copy.deepcopy(top), pickle.loads(pickle.dumps(top)), top._replace(frequency=1.0)):
         assert "mN m/rad" in repr(each)
@@ -116,12 +119,12 @@ def test_results_keep_their_units_when_they_are_copied():
         assert "mN m/rad" in repr(each)
 
 
-def test_functions_of_numbers_answer_in_the_units_they_were_asked_in():
-    texts: dict[str, Any] = {"mass": "12 g cm^2", "damping": ["0.02 mN m s/rad"], "period": "1 ms"}
-    found = zwidth.sensitivities(**texts)
-    assert found.stiffness_max == zwidth.sensitivities(mass=12e-7, damping=[2e-5], period=1e-3).stiffness_max
-    assert "mN m/rad" in repr(found)
-    assert "per kg m^2" in repr(found)
+def test_functions_of_values_return_rotary_units_for_rotary_input():
+    arguments: dict[str, Any] = {"mass": "12 g cm^2", "damping": ["0.02 mN m s/rad"], "period": "1 ms"}
+    gains = zwidth.sensitivities(**arguments)
+    assert gains.stiffness_max == zwidth.sensitivities(mass=12e-7, damping=[2e-5], period=1e-3).stiffness_max
+    assert "mN m/rad" in repr(gains)
+    assert "per kg m^2" in repr(gains)
     with pytest.raises(zwidth.InputError, match=r"^damping: got '2 N s/m', in linear units, together with mass"):
         zwidth.max_stiffness(mass="12 g cm^2", damping=["2 N s/m"], period=1e-3)
 
@@ -157,20 +160,20 @@ TIMING = zwidth.Timing(1e-3)
         ("rotary", lambda: zwidth.Device(0.1, rotary="yes")),  # pyright: ignore[reportArgumentType]
     ],
 )
-def test_mixing_is_refused(field, make):
-    with pytest.raises(zwidth.InputError, match=rf"^{re.escape(field)}: got ") as refused:
+def test_mixed_unit_systems_are_rejected(field, make):
+    with pytest.raises(zwidth.InputError, match=rf"^{re.escape(field)}: got ") as error:
         make()
-    assert "; " in str(refused.value)
+    assert "; " in str(error.value)
 
 
-def test_no_typing_error_of_a_rotary_unit_is_taken_for_a_linear_one():
+def test_misspelled_rotary_unit_suggests_rotary_unit():
     with pytest.raises(zwidth.InputError, match=r"did you mean 'mN m s/rad'\?"):
         zwidth.Device(1e-6, "0.02 mN m s/rd")
     with pytest.raises(zwidth.InputError, match=r"a rotary unit for a linear device"):
         zwidth.Scene(LINEAR_DEVICE, TIMING).is_stable(10, "0.02 mN m s/rad")
 
 
-def test_every_unit_of_the_table_is_read_and_written():
+def test_unit_pairs_are_parsed_and_formatted():
     for linear, rotary in UNIT_PAIRS:
         assert (LINEAR[linear], ROTARY[linear], ROTARY[rotary]) == (linear, rotary, rotary)
         if linear != "m/N":
@@ -179,7 +182,7 @@ def test_every_unit_of_the_table_is_read_and_written():
     assert with_unit(2.0, ROTARY["N/m per kg"]) == "2.000 N m/rad per kg m^2"
 
 
-def test_results_of_both_kinds_of_device_have_one_class_and_one_pytree():
+def test_rotary_and_linear_results_share_class_and_pytree_structure():
     rotary, linear = make_rotary().max_stiffness(), zwidth.Scene(LINEAR_DEVICE, TIMING).max_stiffness()
     assert type(rotary) is type(linear)
     assert [find_unit(each, "N/m") for each in (rotary, linear)] == ["N m/rad", "N/m"]
@@ -197,29 +200,29 @@ def test_results_of_both_kinds_of_device_have_one_class_and_one_pytree():
         lambda wall: jax.vmap(lambda each: each)(jax.tree.map(np.atleast_1d, wall)),
     ],
 )
-def test_results_of_jax_are_shown_without_units_that_may_be_wrong(transform):
-    found = transform(make_rotary().max_stiffness())
-    assert type(found).__name__ == "StiffestWall"
-    assert found.unit_system is None
-    assert "Hz" in repr(found)
-    assert "N" not in repr(found).replace("NO_", "").removeprefix("StiffestWall")
+def test_jax_transformed_results_are_shown_without_force_units(transform):
+    transformed = transform(make_rotary().max_stiffness())
+    assert type(transformed).__name__ == "StiffestWall"
+    assert transformed.unit_system is None
+    assert "Hz" in repr(transformed)
+    assert "N" not in repr(transformed).replace("NO_", "").removeprefix("StiffestWall")
 
 
-def test_numbers_without_units_are_those_of_a_linear_device():
-    found = zwidth.sensitivities(mass=0.1, period=1e-3)
-    assert "kN/m" in repr(found)
-    assert "kN/m" in repr(found._replace(per_mass=1.0))
+def test_values_without_units_are_linear():
+    gains = zwidth.sensitivities(mass=0.1, period=1e-3)
+    assert "kN/m" in repr(gains)
+    assert "kN/m" in repr(gains._replace(per_mass=1.0))
     assert "kN/m" in repr(zwidth.denormalize(mass=0.1, period=1e-3, alpha=0.1))
     traced = jax.jit(lambda mass: zwidth.sensitivities(mass=mass, period=1e-3))(0.1)
-    assert float(traced.stiffness_max) == pytest.approx(float(found.stiffness_max), rel=1e-5)
+    assert float(traced.stiffness_max) == pytest.approx(float(gains.stiffness_max), rel=1e-5)
 
 
-def test_a_motion_has_its_units_in_a_dataset():
+def test_dataset_of_rotary_motion_has_rotary_units():
     data = make_rotary().simulate(start_position="1 deg", periods=50).to_dataset()
     assert (data.position.units, data.velocity.units, data.command.units) == ("rad", "rad/s", "N m")
 
 
-def test_walls_without_units_are_rotary_if_asked_for():
+def test_fit_buzz_accepts_rotary_argument():
     points = [(0.4, 0.0, 40.0), (0.9, 1e-3, 68.0), (1.1, 2e-3, 89.0)]
     fit = zwidth.fit_buzz(points, period="1 ms", noise=0.02, rotary=True)
     assert fit.scene.device.rotary

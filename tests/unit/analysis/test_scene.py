@@ -1,4 +1,7 @@
-"""Scenes, and the way between SI units and normalized numbers, against the paper's own example."""
+"""Test scenes, and the conversion between SI units and normalized parameters.
+
+References: eqs. (14) and (16) of the paper in mpmath, and the example of the paper.
+"""
 
 import dataclasses
 from typing import Any
@@ -17,47 +20,47 @@ from zwidth.core.errors import InputError
 WALL = {"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 2.5e-3, "stiffness": 14.9e3, "virtual_damping": -41.6}
 
 
-def test_normalize_is_eqs_14_and_16():
-    got = zwidth.normalize(**WALL)
+def test_normalize_equals_eqs_14_and_16():
+    point = zwidth.normalize(**WALL)
     exact = {name: mpf(value) for name, value in WALL.items()}
     m, T = exact["mass"], exact["period"]
     expected = [exact["stiffness"] * T**2 / m, exact["virtual_damping"] * T / m, exact["damping"] * T / m]
-    assert oracles.worst(got[:3], expected) <= tol.NORMALIZED.float64
-    assert oracles.relative_error(got.d, exact["delay"] / T) <= tol.NORMALIZED.float64
+    assert oracles.worst(point[:3], expected) <= tol.NORMALIZED.float64
+    assert oracles.relative_error(point.d, exact["delay"] / T) <= tol.NORMALIZED.float64
 
 
 @pytest.mark.parametrize("damping, delta", [(0.0, 0.0), (10.0, 0.1), (100.0, 1.0)])
-def test_the_paper_s_example(damping, delta):
-    got = zwidth.normalize(mass=0.1, damping=damping, period=1e-3, delay=1e-3)
-    assert got.delta == pytest.approx(delta, rel=tol.NORMALIZED.float64)
-    assert got.d == 1.0
-    assert got.alpha == got.beta == 0.0
+def test_normalize_paper_example(damping, delta):
+    point = zwidth.normalize(mass=0.1, damping=damping, period=1e-3, delay=1e-3)
+    assert point.delta == pytest.approx(delta, rel=tol.NORMALIZED.float64)
+    assert point.d == 1.0
+    assert point.alpha == point.beta == 0.0
 
 
 @pytest.mark.parametrize("periods", [1, 3, 11, 17, 29, 500])
 @pytest.mark.parametrize("period", [1e-4, 1e-3, 3e-4, 7e-3])
-def test_a_whole_delay_stays_whole(period, periods):
-    # The quotient of the two decimals may be off by a rounding error, which would raise the polynomial's degree.
+def test_normalize_keeps_integer_delays_exact(period, periods):
+    # The quotient of the two decimals may have a rounding error, which would raise the degree of the polynomial.
     delay = float(f"{periods * period:.12g}")
     assert zwidth.normalize(mass=1.0, period=period, delay=delay).d == periods
 
 
-def test_a_delay_near_a_whole_number_is_left_alone():
+def test_normalize_does_not_round_delays_near_integers():
     for quotient in (1 + 1e-13, 3 - 1e-13, 1e-18, 2.5):
         assert zwidth.normalize(mass=1.0, period=1.0, delay=quotient).d == quotient
 
 
-def test_denormalize_is_the_way_back():
-    there = zwidth.normalize(**WALL)
-    back = zwidth.denormalize(mass=WALL["mass"], period=WALL["period"], **there._asdict())
+def test_denormalize_inverts_normalize():
+    point = zwidth.normalize(**WALL)
+    back = zwidth.denormalize(mass=WALL["mass"], period=WALL["period"], **point._asdict())
     for name, value in WALL.items():
         assert getattr(back, name) == pytest.approx(value, rel=tol.NORMALIZED.float64), name
 
 
-def test_derivatives(x64):
+def test_normalize_gradients_in_delay_and_mass(x64):
     period = 1e-3
     slope = jax.grad(lambda delay: zwidth.normalize(mass=1.0, period=period, delay=delay).d)
-    # At a whole delay too, where the quotient is rounded.
+    # Also at an integer delay, where the quotient is rounded.
     assert float(slope(3e-3)) == pytest.approx(1 / period)
     by_mass = jax.grad(lambda mass: zwidth.normalize(mass=mass, period=period, stiffness=1e4).alpha)
     assert float(by_mass(0.1)) == pytest.approx(-1e4 * period**2 / 0.1**2)
@@ -82,15 +85,15 @@ def test_derivatives(x64):
         ({"mass": np.ones(2), "delay": np.ones(3)}, r"shapes do not broadcast: mass \(2,\), .*delay \(3,\)"),
     ],
 )
-def test_what_is_refused(changes, message):
+def test_normalize_rejects_invalid_arguments(changes, message):
     with pytest.raises(InputError, match=message):
         zwidth.normalize(**(WALL | changes))
 
 
 @pytest.mark.parametrize("d", [0.0, 1e-9, 0.5, 1e5])
 @pytest.mark.parametrize("delta", [0.0, 1e-9, 0.5, 1e12])
-def test_denormalize_takes_the_whole_domain_of_a_device(delta, d):
-    """By hand: b = delta m / T and a delay of d T."""
+def test_denormalize_accepts_the_full_range_of_delta_and_d(delta, d):
+    """Compare with b = delta m / T and t_d = d T."""
     back = zwidth.denormalize(mass=0.5, period=0.25, delta=delta, d=d)
     assert (back.damping, back.delay) == (2.0 * delta, 0.25 * d)
     for name in ("delta", "d"):
@@ -98,7 +101,7 @@ def test_denormalize_takes_the_whole_domain_of_a_device(delta, d):
             zwidth.denormalize(mass=0.5, period=0.25, **{name: -1e-12})
 
 
-def test_a_scene_is_the_same_as_its_numbers():
+def test_scene_properties_equal_normalize():
     scene = zwidth.Scene(
         zwidth.Device(mass=0.1, damping=10.0),
         zwidth.Timing(period=1e-3, delay=2.5e-3),
@@ -111,17 +114,17 @@ def test_a_scene_is_the_same_as_its_numbers():
     assert back.virtual_damping == pytest.approx(-41.6)
 
 
-def test_a_scene_cannot_be_changed():
+def test_scene_parts_are_immutable():
     with pytest.raises(dataclasses.FrozenInstanceError):
         zwidth.Device(mass=0.1).mass = 0.2  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_a_scene_without_a_wall_has_none():
+def test_scene_without_wall_has_zero_alpha_and_beta():
     scene = zwidth.Scene(zwidth.Device(mass=0.1), zwidth.Timing(period=1e-3))
     assert (scene.alpha, scene.beta, scene.delta, scene.d) == (0, 0, 0, 0)
 
 
-ASKED: tuple[Any, ...] = zwidth.assess, zwidth.limits_of, zwidth.plot.region
+FUNCTIONS: tuple[Any, ...] = zwidth.assess, zwidth.limits_of, zwidth.plot.region
 SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
 
 
@@ -137,9 +140,12 @@ SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
         (lambda: zwidth.VirtualWall(stiffness=np.nan), "stiffness: got nan; it must be finite"),
         (lambda: zwidth.Timing(period=1e-3, delay=-1.0), "delay: got -1 s; it must be at least 0 s"),
         *(
-            (lambda ask=ask, given=given: ask(given), "scene: got .*; pass a zwidth.Scene, such as zwidth.Scene")
-            for ask in ASKED
-            for given in (zwidth.Device(0.1), np.ones(2), 3)
+            (
+                lambda function=function, argument=argument: function(argument),
+                "scene: got .*; pass a zwidth.Scene, such as zwidth.Scene",
+            )
+            for function in FUNCTIONS
+            for argument in (zwidth.Device(0.1), np.ones(2), 3)
         ),
         (
             lambda: zwidth.plot.region({"one": SCENE, "two": zwidth.Device(0.1)}),  # pyright: ignore[reportArgumentType]
@@ -150,12 +156,12 @@ SCENE: Any = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
         (lambda: SCENE.best_damping(1e3, goal=np.ones(2)), "goal: got array"),
     ],
 )
-def test_what_a_scene_refuses(make, message):
+def test_scene_functions_reject_invalid_arguments(make, message):
     with pytest.raises(InputError, match=message):
         make()
 
 
-def test_assess_counts_a_hand_held_rigidly_as_mass():
+def test_assess_adds_mass_of_rigidly_coupled_operator():
     timing, wall = zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(10e3, 40)
     held = zwidth.assess(zwidth.Scene(zwidth.Device(0.1, 10), timing, wall, operator=zwidth.Operator(mass=0.4)))
     assert held == zwidth.assess(zwidth.Scene(zwidth.Device(0.5, 10), timing, wall))

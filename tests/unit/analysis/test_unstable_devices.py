@@ -1,4 +1,7 @@
-"""Devices unstable by themselves: every question answers for the stable region that exists."""
+"""Test devices that are unstable without a wall, with a stable region at positive K only.
+
+Reference: poles of the discretization by scipy.
+"""
 
 import json
 
@@ -15,17 +18,17 @@ from zwidth.core.status import Status
 PENDULUM = ["--device", "1 / 0.1 0.2 -3", "--rate", "1 kHz", "--delay", "1 ms"]
 
 
-def radius(coefficients, delay, stiffness, damping, period=1e-3):
-    """The largest pole magnitude under the backward difference, with scipy's discretization."""
+def compute_radius(coefficients, delay, stiffness, damping, period=1e-3):
+    """Return the largest pole magnitude with the backward difference, discretized by scipy."""
     *plant, _ = scipy.signal.cont2discrete(([1.0], coefficients), period)
-    top, bottom = np.trim_zeros(np.ravel(plant[0]), "f"), np.ravel(plant[1])
+    numerator, denominator = np.trim_zeros(np.ravel(plant[0]), "f"), np.ravel(plant[1])
     wall = np.polyadd(stiffness * np.array([1.0, 0.0]), damping * np.array([1.0, -1.0]) / period)
-    device = np.append(np.convolve(bottom, [1.0, 0.0]), np.zeros(delay))
-    return np.abs(np.roots(np.polyadd(device, np.convolve(top, wall)))).max()
+    device = np.append(np.convolve(denominator, [1.0, 0.0]), np.zeros(delay))
+    return np.abs(np.roots(np.polyadd(device, np.convolve(numerator, wall)))).max()
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_stiffest_wall_is_that_of_the_stable_region(seed):
+def test_max_stiffness_of_pendulums_matches_scipy_poles(seed):
     rng = np.random.default_rng(seed)
     for delay in (0, 1, 3):
         mass, pull = 10 ** rng.uniform(-2, 0), 10 ** rng.uniform(0, 2)
@@ -35,23 +38,28 @@ def test_the_stiffest_wall_is_that_of_the_stable_region(seed):
         top = scene.max_stiffness()
         assert top.status == Status.OK
         K, B = float(top.stiffness), float(top.virtual_damping)
-        assert radius(coefficients, delay, 0.9999 * K, B) < 1.0
-        assert min(radius(coefficients, delay, 1.001 * K, B * share) for share in np.linspace(0.3, 2.0, 35)) > 1.0
+        assert compute_radius(coefficients, delay, 0.9999 * K, B) < 1.0
+        assert (
+            min(compute_radius(coefficients, delay, 1.001 * K, B * share) for share in np.linspace(0.3, 2.0, 35)) > 1.0
+        )
         assert scene.loop.least_stiffness(0.0) * scene.units.stiffness == pytest.approx(pull, rel=1e-9)
-        assert min(radius(coefficients, delay, 0.99 * pull, B * share) for share in np.linspace(0.0, 2.0, 41)) > 1.0
+        assert (
+            min(compute_radius(coefficients, delay, 0.99 * pull, B * share) for share in np.linspace(0.0, 2.0, 41))
+            > 1.0
+        )
         assert scene.islands() == []
         if delay != (0, 1, 3)[seed % 3]:
-            continue  # a recommendation takes most of the time: one delay per seed
-        found = scene.recommend()
-        assert found.status == Status.OK
-        assert radius(coefficients, delay, found.stiffness, found.virtual_damping) < 1.0
+            continue  # recommend for one delay per seed, because recommendations take most of the time
+        recommendation = scene.recommend()
+        assert recommendation.status == Status.OK
+        assert compute_radius(coefficients, delay, recommendation.stiffness, recommendation.virtual_damping) < 1.0
 
 
-def test_commands_agree():
+def test_commands_report_the_same_maximum_stiffness():
     def run(*arguments):
-        found = CliRunner().invoke(cli, [*arguments, "--json"])
-        assert found.exit_code == 0, found.output
-        return json.loads(found.output)
+        result = CliRunner().invoke(cli, [*arguments, "--json"])
+        assert result.exit_code == 0, result.output
+        return json.loads(result.output)
 
     checked = run("check", *PENDULUM, "--stiffness", "1 kN/m", "--virtual-damping", "5 N s/m")
     assert checked["stable"]
@@ -64,50 +72,57 @@ def test_commands_agree():
 
 
 @pytest.mark.parametrize("pull", [5000])
-def test_a_wall_in_a_short_stable_range_of_stiffness_is_found(pull):
-    """All walls with K below the gravity stiffness are unstable, so a search that steps over the range finds none."""
+def test_recommend_finds_wall_in_narrow_stable_stiffness_range(pull):
+    """All walls with K below the gravity stiffness are unstable, so a coarse search misses the stable range."""
     coefficients = [0.1, 1.0, -pull]
     device = ["--device", f"1 / 0.1 1 {-pull}", "--rate", "1 kHz", "--delay", "1 ms"]
     for gain in (1.2,):
         result = CliRunner().invoke(cli, ["recommend", *device, "--gain-margin", str(gain), "--json"])
         assert result.exit_code == 0, result.output
-        found = json.loads(result.stdout)["recommended"]
-        K, B = found["stiffness"], found["virtual_damping"]
-        assert all(radius(coefficients, 1, share * K, share * B) < 1.0 for share in (1.0, 0.9999 * gain, 1.0001 / gain))
-        assert not all(radius(coefficients, 1, share * K, share * B) < 1.0 for share in (1.01 * gain, 0.99 / gain))
-        # No stiffer wall of a grid has the gain margin.
+        recommended = json.loads(result.stdout)["recommended"]
+        K, B = recommended["stiffness"], recommended["virtual_damping"]
+        assert all(
+            compute_radius(coefficients, 1, share * K, share * B) < 1.0 for share in (1.0, 0.9999 * gain, 1.0001 / gain)
+        )
+        assert not all(
+            compute_radius(coefficients, 1, share * K, share * B) < 1.0 for share in (1.01 * gain, 0.99 / gain)
+        )
+        # No stiffer wall on a grid satisfies the gain margin.
         for stiffer in np.linspace(1.01 * K, 1.2 * K, 4):
             for damping in np.linspace(0.5 * B, 1.5 * B, 21):
                 shares = 1.0, gain, 1.0 / gain
-                assert max(radius(coefficients, 1, each * stiffer, each * damping) for each in shares) > 1.0
+                assert max(compute_radius(coefficients, 1, each * stiffer, each * damping) for each in shares) > 1.0
 
 
-def test_tolerances_count_walls_of_the_stable_region():
+def test_tolerance_analysis_of_device_unstable_without_wall():
     wall = "--stiffness", "1 kN/m", "--virtual-damping", "5 N s/m", "--tolerance", "delay=10%"
     result = CliRunner().invoke(cli, ["design", *PENDULUM, *wall, "--samples", "40"])
     assert "note       the device is unstable without a wall: no wall softer than K = 3" in result.stdout
     result = CliRunner().invoke(cli, ["design", *PENDULUM, *wall, "--samples", "40", "--json"])
-    found = json.loads(result.stdout)["tolerances"]
-    assert found["stable"] == 1.0
-    # The limit lies between those of the shortest and the longest delay.
+    tolerances = json.loads(result.stdout)["tolerances"]
+    assert tolerances["stable"] == 1.0
+    # The limit lies between the limits at the shortest and the longest delay.
     scene = zwidth.Scene(zwidth.LinearDevice("1 / 0.1 0.2 -3"), zwidth.Timing(1e-3, 1e-3))
     ends = [float(scene.replace(delay=delay).stable_stiffness(5.0)[0, 1]) for delay in (1.1e-3, 0.9e-3)]
-    assert ends[0] <= found["stiffness"] <= ends[1]
+    assert ends[0] <= tolerances["stiffness"] <= ends[1]
 
 
-def test_no_grasps_are_required_of_a_device_without_a_mass():
-    assert zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 50"), zwidth.Timing(1e-3)).recommend().wanted.grasps == "none"
+def test_grasps_are_not_checked_for_linear_devices():
+    assert (
+        zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 50"), zwidth.Timing(1e-3)).recommend().requirements.grasps
+        == "none"
+    )
     result = CliRunner().invoke(cli, ["recommend", *PENDULUM])
     assert "(not checked in the reference grasps)" in " ".join(result.stdout.split())
 
 
-def test_a_stable_device_says_nothing():
+def test_describe_islands_is_empty_for_stable_devices():
     assert describe_islands(zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))) == []
     assert describe_islands(zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 50"), zwidth.Timing(1e-3, 1e-3))) == []
 
 
-def test_an_island_of_a_stable_device_stays_one():
-    """Soft walls are stable: the stiff piece apart from them does not count."""
+def test_island_of_stable_device_does_not_raise_max_stiffness():
+    """The region connected to K = 0 is stable; the island at higher K is separate from it."""
     timing, window = zwidth.Timing(period=1e-3, delay=1e-3), zwidth.WindowedDifference(samples=24)
     scene = zwidth.Scene(zwidth.LinearDevice("1 / 0.1 10 0"), timing, velocity=window)
     (island,) = scene.islands()

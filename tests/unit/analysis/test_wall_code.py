@@ -1,4 +1,4 @@
-"""Walls as programs: compiled without a warning, and driven sample by sample against simulations."""
+"""Test generated wall programs: they compile without warnings and return the forces of simulations."""
 
 import ctypes
 import shutil
@@ -32,30 +32,30 @@ ESTIMATES = {
     "number": zwidth.VelocityFilter([7.0], [1.0]),
     "late difference": zwidth.VelocityFilter([1000.0, -1000.0], [1.0, 0.0, 0.0, 0.0]),
 }
-# Beside the largest force: rounding of either side, and of the coefficients.
-CLOSE = 1e-12
+# Relative to the largest force: rounding errors of both programs and of the coefficients.
+TOLERANCE = 1e-12
 PERIODS = 400
 
 
-def scene_with(velocity):
+def make_scene(velocity):
     device, timing = zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1.5e-3)
     return zwidth.Scene(device, timing, zwidth.VirtualWall(2e3, 3.0), velocity)
 
 
 @pytest.fixture(scope="module")
-def motions():
-    """Pushed into the wall from in front of it, to fall out of it again and come back."""
-    push = 3.0 * np.sin(np.arange(PERIODS) / 20.0) + 1.0
-    scenes = [scene_with(velocity) for velocity in ESTIMATES.values()]
-    options = {"periods": PERIODS, "start_position": -1e-3, "push_history": push, "contact": "unilateral"}
-    found = zwidth.simulate(scenes, **options)
-    return {name: (found.measured[k], found.command[k]) for k, name in enumerate(ESTIMATES)}
+def trajectories():
+    """Simulate motions that enter and leave the wall several times under a sinusoidal external force."""
+    force = 3.0 * np.sin(np.arange(PERIODS) / 20.0) + 1.0
+    scenes = [make_scene(velocity) for velocity in ESTIMATES.values()]
+    options = {"periods": PERIODS, "start_position": -1e-3, "external_force_history": force, "contact": "unilateral"}
+    motions = zwidth.simulate(scenes, **options)
+    return {name: (motions.measured[k], motions.command[k]) for k, name in enumerate(ESTIMATES)}
 
 
-def drive_c(text, positions, folder):
+def drive_c(source, positions, folder):
     if shutil.which("cc") is None:
         pytest.skip("no C compiler on this machine")
-    (folder / "wall.c").write_text(text)
+    (folder / "wall.c").write_text(source)
     flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-shared", "-fPIC"]
     subprocess.run(["cc", *flags, "-o", folder / "wall.so", folder / "wall.c"], check=True)
     library = ctypes.CDLL(str(folder / "wall.so"))
@@ -66,66 +66,66 @@ def drive_c(text, positions, folder):
     return np.array([library.wall_force(state, x) for x in positions])
 
 
-def drive_python(text, positions):
+def drive_python(source, positions):
     names = {}
-    exec(text, names)
+    exec(source, names)
     wall = names["Wall"](positions[0])
     return np.array([wall.force(x) for x in positions.tolist()])
 
 
 @pytest.mark.parametrize("name", ESTIMATES)
-def test_programs_give_the_forces_of_the_simulation(name, motions, tmp_path):
-    scene, (positions, expected) = scene_with(ESTIMATES[name]), motions[name]
-    # In the wall and out of it, several times.
+def test_programs_return_forces_of_the_simulation(name, trajectories, tmp_path):
+    scene, (positions, expected) = make_scene(ESTIMATES[name]), trajectories[name]
+    # The motion enters and leaves the wall several times.
     assert np.count_nonzero(np.diff((positions > 0).astype(int))) >= 3
     scale = np.abs(expected).max()
     for forces in (
         drive_c(write_wall(scene, "c"), positions, tmp_path),
         drive_python(write_wall(scene, "python"), positions),
     ):
-        np.testing.assert_allclose(forces, expected, rtol=0, atol=CLOSE * scale)
+        np.testing.assert_allclose(forces, expected, rtol=0, atol=TOLERANCE * scale)
 
 
-def test_the_force_limit_is_that_of_the_simulation(motions, tmp_path):
-    scene, (positions, expected) = scene_with(ESTIMATES["difference"]), motions["difference"]
+def test_programs_limit_force_like_the_simulation(trajectories, tmp_path):
+    scene, (positions, expected) = make_scene(ESTIMATES["difference"]), trajectories["difference"]
     limit = 0.3 * np.abs(expected).max()
     for forces in (
         drive_c(write_wall(scene, "c", max_force=limit), positions, tmp_path),
         drive_python(write_wall(scene, "python", max_force=limit), positions),
     ):
-        np.testing.assert_allclose(forces, np.clip(expected, -limit, limit), rtol=0, atol=CLOSE * limit)
-    found = scene.recommend(stiffness_fraction=0.5)
-    assert found.code(max_force="3 N") == found.code(max_force=3) != found.code()
-    assert "Force limited to 3.000 N." in found.code(max_force=3)
+        np.testing.assert_allclose(forces, np.clip(expected, -limit, limit), rtol=0, atol=TOLERANCE * limit)
+    recommendation = scene.recommend(stiffness_fraction=0.5)
+    assert recommendation.code(max_force="3 N") == recommendation.code(max_force=3) != recommendation.code()
+    assert "Force limited to 3.000 N." in recommendation.code(max_force=3)
     with pytest.raises(zwidth.InputError, match=r"^max_force: got 0"):
-        found.code(max_force=0)
+        recommendation.code(max_force=0)
 
 
-def test_a_recommendation_writes_its_own_wall():
-    found = scene_with(zwidth.LowPass(cutoff=100)).recommend(stiffness_fraction=0.5)
-    text = found.code("python")
+def test_code_of_recommendation_returns_its_stiffness():
+    recommendation = make_scene(zwidth.LowPass(cutoff=100)).recommend(stiffness_fraction=0.5)
+    text = recommendation.code("python")
     force = drive_python(text, np.array([1e-3]))
-    assert force[0] == pytest.approx(-found.stiffness * 1e-3, rel=1e-14)
+    assert force[0] == pytest.approx(-recommendation.stiffness * 1e-3, rel=1e-14)
     with pytest.raises(zwidth.InputError, match="language: got 'java'"):
-        found.code("java")  # pyright: ignore[reportArgumentType]
+        recommendation.code("java")  # pyright: ignore[reportArgumentType]
 
 
-def test_where_there_is_no_wall_there_is_no_program():
-    bare = zwidth.Scene(zwidth.Device(0.1, 0.0), zwidth.Timing(1e-3, 1e-3))
+def test_code_without_recommended_wall_is_rejected():
+    undamped = zwidth.Scene(zwidth.Device(0.1, 0.0), zwidth.Timing(1e-3, 1e-3))
     with pytest.raises(zwidth.InputError, match="code: there is no wall: no passive wall exists"):
-        bare.recommend(passive=True).code()
+        undamped.recommend(passive=True).code()
 
 
 @pytest.mark.parametrize("name", ESTIMATES)
-def test_sections_are_the_estimate(name):
-    """Their product on the circle, by the sections' coefficients alone, against the jet of the estimate."""
+def test_filter_sections_multiply_to_the_estimate(name):
+    """Compare the product of the sections, from their coefficients, with the frequency response of the estimate."""
     estimate = ESTIMATES[name].estimate(1e-3)
     w = np.linspace(0.05, 3.1, 50)
     zeta = np.exp(1j * w) - 1.0
     value = estimate.gain * np.ones(50, complex)
-    for top, bottom in find_sections(estimate):
-        assert len(top) == len(bottom)
-        value *= np.polyval(top, zeta) / np.polyval(bottom, zeta)
+    for numerator, denominator in find_sections(estimate):
+        assert len(numerator) == len(denominator)
+        value *= np.polyval(numerator, zeta) / np.polyval(denominator, zeta)
     if estimate.window:
         value *= (1.0 - np.exp(-1j * w * estimate.window)) / estimate.window
     np.testing.assert_allclose(value, estimate.jet(circle_points(w)).value, rtol=1e-11)

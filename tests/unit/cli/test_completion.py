@@ -1,4 +1,4 @@
-"""Completion in shells, as docs/shell-completion.md tells: the scripts are made, and commands are completed."""
+"""Shell completion as described in docs/shell-completion.md: scripts are generated, and commands completed."""
 
 import os
 import shutil
@@ -12,25 +12,25 @@ from waiting import LONGEST
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "shell-completion.md"
 
 
-def zwidth(**variables):
+def run_zwidth(**variables):
     command = [sys.executable, "-m", "zwidth"]
-    done = subprocess.run(
+    result = subprocess.run(
         command, env={**os.environ, **variables}, capture_output=True, text=True, check=False, timeout=LONGEST
     )
-    return done.stdout
+    return result.stdout
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_script_of_a_shell_is_made_as_the_page_tells(shell):
+def test_completion_script_is_generated_as_documented(shell):
     assert f"`_ZWIDTH_COMPLETE={shell}_source zwidth > " in PAGE.read_text(encoding="utf-8")
-    script = zwidth(_ZWIDTH_COMPLETE=f"{shell}_source")
+    script = run_zwidth(_ZWIDTH_COMPLETE=f"{shell}_source")
     assert f"_ZWIDTH_COMPLETE={shell}_complete" in script
     if shutil.which(shell):
         subprocess.run([shell, "-n"], input=script, text=True, check=True, timeout=LONGEST)
 
 
 @pytest.mark.parametrize(
-    "words, place, expected",
+    "arguments, index, expected",
     [
         ("zwidth ver", 1, ["plain,verify"]),
         ("zwidth figures --ov", 2, []),
@@ -39,6 +39,6 @@ def test_the_script_of_a_shell_is_made_as_the_page_tells(shell):
         ("zwidth init --example tele", 3, ["plain,teleoperation"]),
     ],
 )
-def test_commands_options_and_examples_are_completed(words, place, expected):
-    told = zwidth(_ZWIDTH_COMPLETE="bash_complete", COMP_WORDS=words, COMP_CWORD=str(place))
-    assert told.split() == expected
+def test_commands_options_and_examples_are_completed(arguments, index, expected):
+    output = run_zwidth(_ZWIDTH_COMPLETE="bash_complete", COMP_WORDS=arguments, COMP_CWORD=str(index))
+    assert output.split() == expected

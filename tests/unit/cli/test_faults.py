@@ -1,4 +1,4 @@
-"""Faults of any command, as a terminal shows them: one line each, in one style."""
+"""Errors of all commands on a terminal: one line each, in one style."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCENE = ["--mass", "100 g", "--rate", "1 kHz"]
         (["report", "nowhere"], "Error: nowhere: contains no run"),
     ],
 )
-def test_a_fault_is_one_line(arguments, message, capsys, tmp_path, monkeypatch):
+def test_error_is_one_line(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
         main(arguments)

@@ -1,4 +1,4 @@
-"""`zwidth fit`: walls and logs as a shell gives them, and what it prints."""
+"""`zwidth fit`: walls and logs from a shell, against fit_buzz and true parameters; output and errors."""
 
 import json
 import re
@@ -29,61 +29,61 @@ def run(*arguments, code=0):
 def log(tmp_path_factory):
     force = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], 24), 25)
     scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=1e-3))
-    position = zwidth.simulate(scene, 0.0, 0.0, push_history=force, periods=600).position[:600]
+    position = zwidth.simulate(scene, 0.0, 0.0, external_force_history=force, periods=600).position[:600]
     file = tmp_path_factory.mktemp("log") / "log.csv"
     rows = [f"{k},{1e3 * x!r},{f!r}" for k, (x, f) in enumerate(zip(position.tolist(), force.tolist(), strict=True))]
     file.write_text("\n".join(["t,x,f", *rows]), encoding="utf-8")
     return str(file)
 
 
-def test_walls_are_fitted_as_in_python():
-    found = json.loads(run(*WALLS, "--period", "1 ms", "--noise", "2%", "--json"))
+def test_walls_agree_with_fit_buzz():
+    fit = json.loads(run(*WALLS, "--period", "1 ms", "--noise", "2%", "--json"))
     expected = fit_buzz(POINTS, period=1e-3, noise=0.02)
-    assert found["mass"] == expected.mass
-    assert found["next"] == expected.as_dict()["next"] != {}
-    assert found["safe_wall"]["stiffness"] == expected.safe_wall().stiffness
-    words = run(*WALLS, "--period", "1 ms", "--noise", "0.02")
-    assert words.startswith(f"SET        {expected.recommended.spell_wall()}\n")
-    assert "device     m = 100.0 g (95 %: " in words
-    assert "next       raise K at B = " in words
+    assert fit["mass"] == expected.mass
+    assert fit["next"] == expected.as_dict()["next"] != {}
+    assert fit["safe_wall"]["stiffness"] == expected.safe_wall().stiffness
+    text = run(*WALLS, "--period", "1 ms", "--noise", "0.02")
+    assert text.startswith(f"SET        {expected.recommended.spell_wall()}\n")
+    assert "device     m = 100.0 g (95 %: " in text
+    assert "next       raise K at B = " in text
 
 
-def test_a_log_in_millimeters_and_milliseconds(log):
-    found = json.loads(run(log, "--time", "t:ms", "--position", "x:mm", "--force", "f", "--json"))
-    np.testing.assert_allclose([found["mass"], found["damping"]], [0.1, 2.0], rtol=1e-6)
-    assert found["delay"] == pytest.approx(0.0, abs=1e-9)
-    # Nothing but the name says which column the force is, and which are the others.
-    assert json.loads(run(log, "--time", "t:ms", "--position", "x:mm", "--json")) == found
-    words = run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f", "--verbose")
-    assert "fitted to  log.csv" in words
-    assert "fitted to" not in run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f")
+def test_log_in_millimeters_and_milliseconds(log):
+    fit = json.loads(run(log, "--time", "t:ms", "--position", "x:mm", "--force", "f", "--json"))
+    np.testing.assert_allclose([fit["mass"], fit["damping"]], [0.1, 2.0], rtol=1e-6)
+    assert fit["delay"] == pytest.approx(0.0, abs=1e-9)
+    # Columns without options are recognized by their names.
+    assert json.loads(run(log, "--time", "t:ms", "--position", "x:mm", "--json")) == fit
+    text = run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f", "--verbose")
+    assert "data       log.csv" in text
+    assert "data  " not in run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f")
 
 
 @pytest.mark.parametrize(
-    "more, velocity",
+    "options, velocity",
     [
         ([], zwidth.BackwardDifference()),
         (["--velocity-cutoff", "300"], zwidth.LowPass(cutoff=300)),
         (["--velocity-samples", "3"], zwidth.WindowedDifference(samples=3)),
     ],
 )
-def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(unpainted, more, velocity, tmp_path):
-    text = run(*WALLS, "--period", "1 ms", "--yaml", *more)
-    assert text.startswith("# Fitted to 2 buzzing walls: 95 % between")
+def test_written_configuration_is_loadable_with_sources(unpainted, options, velocity, tmp_path):
+    text = run(*WALLS, "--period", "1 ms", "--yaml", *options)
+    assert text.startswith("# Fitted to 2 onsets of instability: 95 % between")
     assert text.count("# fitted, 95 % between") == 3
     file = tmp_path / "fitted.yaml"
     file.write_text(text, encoding="utf-8")
-    assert load_config(file).name == "fitted_2_buzzing_walls"
-    fitted = json.loads(run(*WALLS, "--period", "1 ms", "--json", *more))
+    assert load_config(file).name == "fitted_2_onsets_of_instability"
+    fitted = json.loads(run(*WALLS, "--period", "1 ms", "--json", *options))
     assert fitted["mass"] == fit_buzz(POINTS, period=1e-3, velocity=velocity).mass
     for name in ("mass", "damping", "delay"):
         written = float(re.findall(rf"{name}: (\S+) ", text)[0])
-        # Digits beyond a thousandth of the error say nothing.
+        # The parameters have digits up to a thousandth of their error.
         assert abs(written - fitted[name]) <= 1e-3 * fitted["errors"][name]
 
 
 @pytest.mark.parametrize(
-    "arguments, words",
+    "arguments, message",
     [
         ([], "give either --buzz"),
         ([*WALLS], "give --period or --rate"),
@@ -104,68 +104,68 @@ def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(unpain
         (["LOG", "--noise", "1%"], "--noise applies only to --buzz"),
     ],
 )
-def test_wrong_use_is_told(arguments, words, log):
+def test_invalid_arguments_exit_with_2(arguments, message, log):
     result = CliRunner().invoke(cli, ["fit", *(log if word == "LOG" else word for word in arguments)])
     assert result.exit_code == 2
-    assert words in result.output
+    assert message in result.output
 
 
 @pytest.mark.parametrize(
-    "columns, words",
+    "columns, message",
     [
         (["--time", "t", "--position", "y", "--force", "f"], "has no column 'y'"),
         (["--time", "t", "--position", "x:furlong", "--force", "f"], "got the unit 'furlong'"),
         (["--time", "t", "--position", "word", "--force", "f"], "bad.csv:3: got 'no' under 'word'; a number is needed"),
     ],
 )
-def test_columns_that_cannot_be_read_are_named(columns, words, tmp_path):
+def test_unreadable_columns_are_reported(columns, message, tmp_path):
     file = tmp_path / "bad.csv"
     file.write_text("t,x,f,word\n0,0,1,1\n1,0,1,no\n", encoding="utf-8")
     result = CliRunner().invoke(cli, ["fit", str(file), *columns])
     assert result.exit_code
-    assert words in (result.output or str(result.exception))
+    assert message in (result.output or str(result.exception))
 
 
-def test_several_logs_in_counts_and_a_figure(tmp_path):
+def test_several_logs_in_counts_with_a_figure(tmp_path):
     text = (CONFIGS / "fit_log.csv").read_text("utf-8")
     head, lines = text.splitlines()[2], text.splitlines()[3:]
     files = []
     for k, part in enumerate((lines[:1500], lines[1500:])):
         files.append(tmp_path / f"part{k}.csv")
         files[-1].write_text("\n".join([head, *part]), encoding="utf-8")
-    words = run(*map(str, files), "--resolution", "0.03mm", "--verbose", "--figure", str(tmp_path / "fit.png"))
-    assert "\nfitted to  part0.csv and part1.csv\n" in words
-    assert "friction 8" in words
-    assert "a constant force" in words
+    printed = run(*map(str, files), "--resolution", "0.03mm", "--verbose", "--figure", str(tmp_path / "fit.png"))
+    assert "\ndata       part0.csv and part1.csv\n" in printed
+    assert "friction 8" in printed
+    assert "a constant force" in printed
     assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
-    found = json.loads(run(*map(str, files), "--position", "encoder [counts]", "--resolution", "0.03 mm", "--json"))
-    for name, true in (("mass", 0.075), ("damping", 0.6), ("delay", 2.3e-3), ("friction", 0.08)):
-        low, high = found["intervals"][name]
-        assert low < true < high
-        assert high - low < 0.02 * true
+    fit = json.loads(run(*map(str, files), "--position", "encoder [counts]", "--resolution", "0.03 mm", "--json"))
+    for name, expected in (("mass", 0.075), ("damping", 0.6), ("delay", 2.3e-3), ("friction", 0.08)):
+        low, high = fit["intervals"][name]
+        assert low < expected < high
+        assert high - low < 0.02 * expected
 
 
-def test_a_rotary_axis_is_the_linear_one_in_other_units(tmp_path):
+def test_rotary_log_agrees_with_the_linear_one(tmp_path):
     text = (CONFIGS / "fit_log.csv").read_text("utf-8").replace("force [N]", "torque [Nm]")
     file = tmp_path / "rotary.csv"
     file.write_text(text, encoding="utf-8")
     linear = json.loads(run(str(CONFIGS / "fit_log.csv"), "--resolution", "0.03mm", "--json"))
-    turned = json.loads(run(str(file), "--resolution", "0.03mrad", "--json"))
+    rotary = json.loads(run(str(file), "--resolution", "0.03mrad", "--json"))
     for name in ("mass", "damping", "delay", "friction", "stiffness_max"):
-        assert turned[name] == pytest.approx(linear[name], rel=1e-9)
-    words = run(str(file), "--resolution", "0.03mrad")
-    # 1 kg m^2 is 10^7 g cm^2.
-    assert re.search(r"^device +J = 7500\d\d\.\d* g cm\^2 \(95 %: ", words, re.MULTILINE)
-    assert "mN m s/rad" in words
-    assert "kN m/rad" in words
+        assert rotary[name] == pytest.approx(linear[name], rel=1e-9)
+    text_rotary = run(str(file), "--resolution", "0.03mrad")
+    # 1 kg m^2 = 10^7 g cm^2.
+    assert re.search(r"^device +J = 7500\d\d\.\d* g cm\^2 \(95 %: ", text_rotary, re.MULTILINE)
+    assert "mN m s/rad" in text_rotary
+    assert "kN m/rad" in text_rotary
     scene = run(str(file), "--resolution", "0.03mrad", "--yaml")
     assert re.search(r"^  mass: \S+ kg m\^2 # fitted", scene, re.MULTILINE)
     assert re.search(r"^  damping: \S+ N m s/rad # fitted", scene, re.MULTILINE)
-    made = tmp_path / "fitted.yaml"
-    made.write_text(scene, encoding="utf-8")
-    device = load_config(made).scene.to_scene().device  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    scene_file = tmp_path / "fitted.yaml"
+    scene_file.write_text(scene, encoding="utf-8")
+    device = load_config(scene_file).scene.to_scene().device  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
     assert device.rotary
-    assert device.mass == pytest.approx(turned["mass"], rel=1e-6)
+    assert device.mass == pytest.approx(rotary["mass"], rel=1e-6)
     result = CliRunner().invoke(cli, ["fit", str(file), "--resolution", "0.03mm"])
     assert "a length belongs to a force" in result.output
 
@@ -173,16 +173,16 @@ def test_a_rotary_axis_is_the_linear_one_in_other_units(tmp_path):
 def test_walls_of_a_rotary_axis():
     walls = ["--buzz", "K=6.846 N m/rad B=0 f=40.1Hz", "--buzz", "K=276.809mNm/deg B=18.7 mNms/rad f=68.6"]
     options = ["--period", "1 ms", "--noise", "2%"]
-    found = json.loads(run(*walls, *options, "--json"))
+    fit = json.loads(run(*walls, *options, "--json"))
     expected = fit_buzz([(6.846, 0.0, 40.1), (0.276809 * 180 / np.pi, 0.0187, 68.6)], period=1e-3, noise=0.02)
-    assert found["mass"] == pytest.approx(expected.mass, rel=1e-12)
-    assert found["units"]["stiffness"] == "N m/rad"
-    words = run(*walls, *options)
-    assert re.search(r"^device +J = 1000 g cm\^2", words, re.MULTILINE)
-    assert "next       raise K at B = 80.4 mN m s/rad, to about 7.55 N m/rad" in words
+    assert fit["mass"] == pytest.approx(expected.mass, rel=1e-12)
+    assert fit["units"]["stiffness"] == "N m/rad"
+    text = run(*walls, *options)
+    assert re.search(r"^device +J = 1000 g cm\^2", text, re.MULTILINE)
+    assert "next       raise K at B = 80.4 mN m s/rad, to about 7.55 N m/rad" in text
 
 
-def test_what_is_not_ok_is_told_first():
+def test_failed_fit_prints_its_warning_first():
     arguments = [str(CONFIGS / "fit_log.csv"), "--resolution", "0.03mm", "--max-delay", "1 ms"]
     first, *others = run(*arguments, code=1).splitlines()
     assert not any(line.startswith("SET ") for line in others)
@@ -196,33 +196,32 @@ def test_what_is_not_ok_is_told_first():
     assert "no wall is safe" in result.stderr
 
 
-def test_a_rate_stands_for_the_period():
+def test_rate_is_equivalent_to_the_period():
     assert run(*WALLS, "--rate", "1 kHz", "--json") == run(*WALLS, "--period", "1 ms", "--json")
     result = CliRunner().invoke(cli, ["fit", *WALLS, "--rate", "1 kHz", "--period", "1 ms"])
     assert "--period and --rate are both given" in result.output
 
 
-def test_a_figure_needs_a_folder(tmp_path):
+def test_figure_in_a_missing_folder_raises(tmp_path):
     arguments = [*WALLS, "--period", "1 ms", "--figure", str(tmp_path / "nowhere" / "fit.png")]
     result = CliRunner().invoke(cli, ["fit", *arguments])
     assert "does not exist; create it first" in result.output
 
 
-def test_a_missing_file_is_an_input_error():
+def test_missing_file_raises():
     result = CliRunner().invoke(cli, ["fit", "nowhere.csv"])
     assert isinstance(result.exception, zwidth.InputError)
     assert "nowhere.csv: no such file" in str(result.exception)
 
 
-def test_a_long_log_is_announced_before_it_is_read(log, tmp_path, capsys):
-    """On the error stream, so that what is printed stays as it is."""
+def test_long_log_is_announced_on_stderr(log, tmp_path, capsys):
     long = tmp_path / "long.csv"
     long.write_text(Path(log).read_text() + "\n" + 9 * 2**10 * (1023 * " " + "\n"))
-    said = []
+    outputs = []
     for file in (log, str(long)):
         cli.main(["fit", file, "--time", "t:ms", "--position", "x:mm", "--force", "f:N"], standalone_mode=False)
-        said.append(capsys.readouterr())
-    short, told = said
-    assert told.out.replace("long.csv", "log.csv") == short.out
-    assert short.err == ""
-    assert told.err == "zwidth: reading long.csv, 9 MiB; the results follow\n"
+        outputs.append(capsys.readouterr())
+    short_output, long_output = outputs
+    assert long_output.out.replace("long.csv", "log.csv") == short_output.out
+    assert short_output.err == ""
+    assert long_output.err == "zwidth: reading long.csv, 9 MiB; the results follow\n"

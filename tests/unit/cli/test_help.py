@@ -1,4 +1,4 @@
-"""What a command says of itself and of a call that lacks something."""
+"""Help texts of commands, and messages for missing options."""
 
 import re
 import shlex
@@ -9,38 +9,38 @@ from click.testing import CliRunner
 from zwidth.cli.commands import cli
 
 
-def test_help_names_units_of_rotary_devices_and_walls_for_any_grasp():
-    text = " ".join(help_of("recommend").split())
+def test_help_mentions_rotary_units_and_grasps():
+    text = " ".join(read_help("recommend").split())
     assert "Largest force of the motor, in N (rotary: torque in N m)." in text
     assert "stable in any grasp" in text
 
 
-def help_of(name: str) -> str:
-    done = CliRunner().invoke(cli, [name, "--help"], terminal_width=80)
-    assert done.exit_code == 0
-    return done.stdout
+def read_help(name: str) -> str:
+    result = CliRunner().invoke(cli, [name, "--help"], terminal_width=80)
+    assert result.exit_code == 0
+    return result.stdout
 
 
 @pytest.mark.parametrize("name", ["check", "recommend", "ridge", "design", "fit", "excite"])
-def test_the_example_in_the_help_of_a_command_runs(name, tmp_path, monkeypatch):
+def test_example_in_the_help_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    example = help_of(name).partition("Example:\n")[2].replace("\\\n", " ")
-    words = shlex.split(example)
-    assert words[:2] == ["zwidth", name]
-    done = CliRunner().invoke(cli, words[1:])
-    assert done.exit_code == 0, done.output
-    assert "NO_BOUNDARY" not in done.output
+    example = read_help(name).partition("Example:\n")[2].replace("\\\n", " ")
+    arguments = shlex.split(example)
+    assert arguments[:2] == ["zwidth", name]
+    result = CliRunner().invoke(cli, arguments[1:])
+    assert result.exit_code == 0, result.output
+    assert "NO_BOUNDARY" not in result.output
 
 
 @pytest.mark.parametrize("name", sorted(cli.commands))
-def test_no_help_is_wider_than_a_terminal_or_has_the_unit_one(name):
-    text = help_of(name)
+def test_help_fits_80_columns_without_unit_one(name):
+    text = read_help(name)
     assert max(map(len, text.splitlines())) <= 80
     assert not re.search(r"in 1\b", text)
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("command", "message"),
     [
         ("check --stiffness 1 --mass 1", "give --rate or --period"),
         ("check --stiffness 1 --rate 1000", "give --mass or --device"),
@@ -48,13 +48,13 @@ def test_no_help_is_wider_than_a_terminal_or_has_the_unit_one(name):
         ("ridge --delta 0.1 --d 1 --mass 1", "give either --delta and --d alone, or also --rate or --period"),
     ],
 )
-def test_what_is_missing_is_named(words, message):
-    done = CliRunner().invoke(cli, words.split())
-    assert done.exit_code == 2
-    assert done.stderr.rstrip().endswith(f"Error: {message}")
+def test_missing_options_are_named(command, message):
+    result = CliRunner().invoke(cli, command.split())
+    assert result.exit_code == 2
+    assert result.stderr.rstrip().endswith(f"Error: {message}")
 
 
-def test_a_file_that_cannot_be_written_is_named_as_it_was_given(tmp_path):
+def test_unwritable_file_is_named_as_given(tmp_path):
     (tmp_path / "config.yaml").write_text(
         "version: 1\nname: first\nstudies:\n  - {kind: ridge, name: top, delta: [0, 1], d: 1}\n"
     )

@@ -1,4 +1,4 @@
-"""`zwidth init`: every example is written, can be read where it stands, and replaces nothing."""
+"""`zwidth init`: every example is written and loadable, and no file is replaced."""
 
 from pathlib import Path
 
@@ -23,22 +23,22 @@ def run(*arguments):
     return CliRunner().invoke(cli, ["init", *arguments], catch_exceptions=False).output.splitlines()
 
 
-def test_the_examples_are_the_configurations_of_the_project():
+def test_examples_are_the_shipped_configurations():
     assert list(find_examples()) == EXAMPLES != []
     assert all(path.read_bytes() == (CONFIGS / path.name).read_bytes() for path in find_examples().values())
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
-def test_what_is_written_runs_where_it_stands_under_its_own_name(example, folder):
+def test_written_example_is_loadable_under_its_new_name(example, folder):
     assert run("mine", "--example", example)[-1].startswith("run it with: zwidth run mine.yaml ")
     written, original = load_config(folder / "mine.yaml"), load_config(CONFIGS / f"{example}.yaml")
     assert written == original.model_copy(update={"name": "mine"})
-    # The schema's path holds in the project alone.
+    # The schema's relative path is valid inside the project only.
     assert "$schema" not in (folder / "mine.yaml").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
-    "arguments, file, like",
+    "arguments, file, example",
     [
         ((), "quickstart", "quickstart"),
         (("paper",), "paper", "paper"),
@@ -47,21 +47,21 @@ def test_what_is_written_runs_where_it_stands_under_its_own_name(example, folder
         (("paper", "--example", "design"), "paper", "design"),
     ],
 )
-def test_name_and_example_stand_in_for_each_other(arguments, file, like, folder):
+def test_name_and_example_default_to_each_other(arguments, file, example, folder):
     run(*arguments)
     assert [path.name for path in folder.iterdir()] == [f"{file}.yaml"]
-    assert load_config(folder / f"{file}.yaml").studies == load_config(CONFIGS / f"{like}.yaml").studies
+    assert load_config(folder / f"{file}.yaml").studies == load_config(CONFIGS / f"{example}.yaml").studies
 
 
 @pytest.mark.parametrize("name", ["devices.yaml", "devices.csv"])
-def test_nothing_is_replaced_or_half_written(name, folder):
+def test_existing_files_are_not_replaced(name, folder):
     (folder / name).write_text("mine", encoding="utf-8")
     with pytest.raises(InputError, match=rf"{name}: already exists.*another NAME"):
         run("devices")
     assert {path.name: path.read_text(encoding="utf-8") for path in folder.iterdir()} == {name: "mine"}
 
 
-def test_a_table_that_is_there_already_serves_a_second_configuration(folder):
+def test_existing_equal_table_is_reused(folder):
     assert run("devices")[:2] == ["wrote devices.yaml", "wrote devices.csv"]
     assert run("more", "--example", "devices")[0] == "wrote more.yaml"
     assert load_config(folder / "more.yaml").studies == load_config(folder / "devices.yaml").studies
@@ -75,13 +75,13 @@ def test_a_table_that_is_there_already_serves_a_second_configuration(folder):
         (("../outside",), "NAME: got '../outside'"),
     ],
 )
-def test_wrong_names_are_refused(arguments, message, folder):
+def test_invalid_names_raise(arguments, message, folder):
     with pytest.raises(InputError, match=message):
         run(*arguments)
     assert list(folder.iterdir()) == []
 
 
-def test_the_list_says_what_each_example_is():
+def test_list_describes_each_example():
     lines = run("--list")
     assert [line.split()[0] for line in lines if not line.startswith(" ")] == EXAMPLES
     assert lines[EXAMPLES.index("best_filter")] == "best_filter      Which filter is best?"

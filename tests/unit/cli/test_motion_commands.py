@@ -1,4 +1,4 @@
-"""`zwidth simulate` and `zwidth diagnose`, typed as a user types them."""
+"""`zwidth simulate` and `zwidth diagnose` from the command line, against simulations in Python."""
 
 import json
 
@@ -28,7 +28,7 @@ def parse(*arguments):
     return json.loads(run(*arguments, "--json"))
 
 
-def test_the_knob_of_2000_counts():
+def test_limit_cycle_of_a_knob_with_2000_counts():
     printed = run("diagnose", *KNOB, "--resolution", "2000 counts", "--friction", "0.1 mN m")
     cause, _, remedies = " ".join(printed.split()).partition("to stop it ")
     assert cause.startswith("LIMIT CYCLE ")
@@ -38,55 +38,55 @@ def test_the_knob_of_2000_counts():
     assert remedies.endswith("; simulated at these and larger changes: check the value that you choose with diagnose")
     frictionless = " ".join(run("diagnose", *KNOB, "--resolution", "2000 counts").split())
     assert "; without friction a finer encoder only reduces the amplitude, in proportion to its steps" in frictionless
-    found = parse("diagnose", *KNOB, "--resolution", "0.0005 rev", "--friction", "0.1 mN m")
-    assert found["cause"] == "quantization"
-    assert found["hardware"]["resolution"] == pytest.approx(2 * np.pi / 2000)
+    diagnosis = parse("diagnose", *KNOB, "--resolution", "0.0005 rev", "--friction", "0.1 mN m")
+    assert diagnosis["cause"] == "quantization"
+    assert diagnosis["hardware"]["resolution"] == pytest.approx(2 * np.pi / 2000)
 
 
-def test_an_unstable_wall_says_what_makes_it_stable():
+def test_remedy_of_an_unstable_wall_agrees_with_the_stable_interval():
     printed = run("diagnose", *HANDLE, *STIFF)
     assert printed.startswith("UNSTABLE ")
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(rate=1000, delay=1e-3))
-    ends = {each["parameter"]: each["high"] for each in parse("diagnose", *HANDLE, *STIFF)["remedies"]}
+    ends = {remedy["parameter"]: remedy["high"] for remedy in parse("diagnose", *HANDLE, *STIFF)["remedies"]}
     assert ends["stiffness"] == pytest.approx(scene.stable_stiffness(33.45)[0, 1], rel=1e-2)
 
 
-def test_without_encoder_a_stable_wall_comes_to_rest():
+def test_stable_wall_without_encoder_comes_to_rest():
     assert run("diagnose", *HANDLE, *SOFT).startswith("AT REST ")
 
 
-def test_a_hit(tmp_path):
+def test_hit_agrees_with_simulate(tmp_path):
     file = tmp_path / "hit.png"
     printed = run("simulate", *HANDLE, *SOFT, "--hit", "0.1 m/s", "--figure", str(file))
     assert "hit at 100 mm/s" in printed
     assert "leaves the wall after 1 contact" in printed
     assert file.read_bytes().startswith(b"\x89PNG")
-    found = parse("simulate", *HANDLE, *SOFT, "--hit", "0.1 m/s")
+    output = parse("simulate", *HANDLE, *SOFT, "--hit", "0.1 m/s")
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(rate=1000, delay=1e-3))
     motion = scene.simulate(
-        8008, 33.45, start_position=-2e-4, start_velocity=0.1, contact="unilateral", periods=found["periods"]
+        8008, 33.45, start_position=-2e-4, start_velocity=0.1, contact="unilateral", periods=output["periods"]
     )
-    assert found["penetration"] == pytest.approx(motion.penetration, rel=1e-12)
-    assert found["bounces"] == motion.bounces
+    assert output["penetration"] == pytest.approx(motion.penetration, rel=1e-12)
+    assert output["bounces"] == motion.bounces
 
 
-def test_a_push_and_a_release():
-    found = parse("simulate", *HANDLE, *SOFT, "--push", "2 N", "--duration", "500 periods")
-    assert found["periods"] == 500
-    # With a constant force the device rests at F/K, after one overshoot of less than twice that.
-    assert 2 / 8008 < found["penetration"] < 4 / 8008
-    assert found["outcome"] == "REST"
+def test_push_and_release():
+    output = parse("simulate", *HANDLE, *SOFT, "--external-force", "2 N", "--duration", "500 periods")
+    assert output["periods"] == 500
+    # Under a constant force the device rests at F/K after one overshoot of less than twice that.
+    assert 2 / 8008 < output["penetration"] < 4 / 8008
+    assert output["outcome"] == "REST"
     held = run("simulate", *HANDLE, *SOFT, "--hold", "0.2 mm", "--resolution", "20 um")
     assert "released at a depth of 200 µm" in held
     assert "caused by the encoder's steps of 20.0 µm" in held
 
 
-def test_a_transfer_function_is_pushed():
-    found = run(*("simulate", "--device", "1 / 0.1 10 0", "--rate", "1 kHz", *SOFT, "--virtual-damping", "33.45"))
-    assert "pushed with 8.01 N" in found
+def test_push_of_a_transfer_function():
+    output = run(*("simulate", "--device", "1 / 0.1 10 0", "--rate", "1 kHz", *SOFT, "--virtual-damping", "33.45"))
+    assert "external force 8.01 N" in output
 
 
-def test_a_scene_file(tmp_path):
+def test_scene_file(tmp_path):
     file = tmp_path / "knob.yaml"
     scene = "{mass: 60 g cm^2, damping: 0.02 mN m s/rad, period: 1 ms, stiffness: 0.1 N m/rad, virtual_damping: 1e-3}"
     file.write_text(
@@ -98,14 +98,14 @@ def test_a_scene_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("options", "message"),
     [
         (["--hit", "1 m/s", "--hold", "1 mm"], "--hold: given together with --hit"),
         (["--hit", "0"], "'--hit'"),
         (["--resolution", "20 kg"], "'--resolution'"),
     ],
 )
-def test_bad_input(given, said):
-    result = CliRunner().invoke(cli, ["simulate", *HANDLE, *SOFT, *given])
+def test_invalid_options_are_named(options, message):
+    result = CliRunner().invoke(cli, ["simulate", *HANDLE, *SOFT, *options])
     assert result.exit_code != 0
-    assert said in result.output + str(result.exception)
+    assert message in result.output + str(result.exception)

@@ -1,4 +1,4 @@
-"""`zwidth recommend`: what a person reads, what machines get, the picture and the program."""
+"""`zwidth recommend`: text, JSON, figure and code, against Scene.recommend."""
 
 import json
 import subprocess
@@ -21,21 +21,21 @@ def recommend(*arguments, code=0):
     return result
 
 
-def test_a_person_reads_what_to_set_and_what_to_buy():
+def test_text_lists_the_wall_its_margins_and_improvements():
     lines = recommend("--phase-margin", "30").stdout.splitlines()
-    found = SCENE.recommend(phase_margin=30)
-    assert " ".join(lines[0:2]).split() == f"SET {found.spell_wall()}; {found.spell_limit()}".split()
+    recommendation = SCENE.recommend(phase_margin=30)
+    assert " ".join(lines[0:2]).split() == f"SET {recommendation.spell_wall()}; {recommendation.spell_limit()}".split()
     assert "limited by 30 deg phase margin" in " ".join(" ".join(lines[:2]).split())
     text = "\n".join(lines)
     assert "margins    gain 1.93, phase 30.0 deg, delay 1.29 ms" in text
-    assert "in a hand  stable in all six reference grasps" in text
+    assert "grasps     stable in all six reference grasps" in text
     assert "twice the rate                   24.2" in text
     assert "(x 3.02; the delay stays 1 period)" in text
     assert "half the delay                   12.7" in text
     assert "CAUTION" not in text
 
 
-def test_a_wall_on_the_brink_carries_a_caution():
+def test_wall_with_small_margins_has_a_caution():
     text = " ".join(recommend("--passive").stdout.split())
     assert "CAUTION phase margin 0.89 deg, gain margin 1.04, delay margin" in text
     assert "rings for 470 ms; use recommend --phase-margin 30: K = 3.979 kN/m, B = 7.75" in text
@@ -44,32 +44,32 @@ def test_a_wall_on_the_brink_carries_a_caution():
     assert "requirements (not checked in the reference grasps):" in text
 
 
-def test_a_wall_stable_in_every_grasp():
+def test_wall_stable_in_every_grasp():
     text = " ".join(recommend("--stiffness-fraction", "95%").stdout.split())
-    assert "CAUTION: small margins, unstable in a hand device" in text
+    assert "CAUTION: small margins, unstable in a grasp device" in text
     assert "unstable in the hand (firm, light damping); use recommend --grasps all: K = 15." in text
     text = " ".join(recommend("--stiffness-fraction", "95%", "--grasps", "all").stdout.split())
     assert "limited by stability in all six reference grasps" in text
-    assert "in a hand stable in all six reference grasps" in text
+    assert "grasps stable in all six reference grasps" in text
     printed = json.loads(recommend("--stiffness-fraction", "95%", "--grasps", "all", "--json").stdout)
-    assert printed["wanted"]["grasps"] == "all"
+    assert printed["requirements"]["grasps"] == "all"
     assert printed["recommended"]["limited_by"] == "grasps"
     assert all(printed["grasps"].values())
     assert "Virtual wall: K = 15." in recommend("--stiffness-fraction", "95%", "--grasps", "all", "--code", "c").stdout
 
 
-def test_the_first_line_reports_a_limit_cycle():
+def test_first_line_reports_a_limit_cycle():
     lines = recommend("--resolution", "2 mm").stdout.splitlines()
     assert "CAUTION: limit cycle" in " ".join(lines[:2])
     assert "CAUTION    LIMIT CYCLE: " in "\n".join(lines)
 
 
-def test_a_delay_that_is_left_out_has_a_caution():
+def test_omitted_delay_has_a_caution():
     device, text = DEVICE[:6], "no delay given: the results hold only if the force acts at the sample"
     for command in ("recommend", "ridge", "check", "simulate", "diagnose"):
         wall = [] if command in ("recommend", "ridge") else ["--stiffness", "1 kN/m"]
-        said = CliRunner().invoke(cli, [command, *device, *wall]).stdout
-        assert " ".join(said.split()).count(f"CAUTION {text}") == 1
+        output = CliRunner().invoke(cli, [command, *device, *wall]).stdout
+        assert " ".join(output.split()).count(f"CAUTION {text}") == 1
         assert text not in CliRunner().invoke(cli, [command, *DEVICE, *wall]).stdout
     assert text in CliRunner().invoke(cli, ["recommend", *device, "--code", "c"]).output
     assert text in json.loads(CliRunner().invoke(cli, ["recommend", *device, "--json"]).stdout)["cautions"][0]
@@ -83,23 +83,23 @@ def test_encoder_and_motor_are_simulated():
 
 
 @pytest.mark.parametrize("columns", [60, 80])
-def test_lines_fit_a_terminal(columns, monkeypatch):
-    whole = recommend("--phase-margin", "30").stdout
+def test_lines_fit_the_terminal_width(columns, monkeypatch):
+    unfolded = recommend("--phase-margin", "30").stdout
     monkeypatch.setenv("COLUMNS", str(columns))
     folded = recommend("--phase-margin", "30").stdout
-    assert max(map(len, folded.splitlines())) <= columns < max(map(len, whole.splitlines())) <= 100
-    assert folded.split() == whole.split()
-    # No number stands without its unit.
+    assert max(map(len, folded.splitlines())) <= columns < max(map(len, unfolded.splitlines())) <= 100
+    assert folded.split() == unfolded.split()
+    # Numbers and their units stay on one line.
     assert "33.45 N s/m" in folded
     assert "30.0 deg" in folded
 
 
-def test_machines_get_the_same():
+def test_json_agrees_with_as_dict():
     printed = json.loads(recommend("--stiffness-fraction", "60%", "--json").stdout)
     assert printed == json.loads(json.dumps(SCENE.recommend(stiffness_fraction=0.6).as_dict()))
 
 
-def test_a_program_stands_alone():
+def test_generated_code_is_self_contained():
     assert recommend("--code", "c").stdout == SCENE.recommend().code("c")
     names = {}
     exec(recommend("--code", "python").stdout, names)
@@ -112,7 +112,7 @@ def test_a_program_stands_alone():
 
 
 @pytest.mark.parametrize("ending", ["pdf", "png"])
-def test_a_picture(ending, tmp_path):
+def test_figure_is_written(ending, tmp_path):
     file = tmp_path / f"chart.{ending}"
     assert recommend("--figure", str(file)).stdout.splitlines()[-1].endswith(str(file))
     assert file.stat().st_size > 5000
@@ -129,38 +129,38 @@ def test_no_wall_exits_with_1():
     message = "Error: no passive wall exists, because the device has no physical damping\n"
     assert (code.exit_code, code.output) == (1, message)
     assert json.loads(CliRunner().invoke(cli, ["recommend", *device, "--passive", "--json"]).stdout)["reason"]
-    # An unstable wall is an answer.
+    # An unstable wall is a valid result with exit code 0.
     assert CliRunner().invoke(cli, ["check", *device, "--stiffness", "1 MN/m"]).exit_code == 0
 
 
 @pytest.mark.parametrize("arguments", [["--gain-margin", "1"], ["--phase-margin", "0"], ["--stiffness-fraction", "x"]])
-def test_wrong_wishes_exit_with_2(arguments):
+def test_invalid_requirements_exit_with_2(arguments):
     recommend(*arguments, code=2)
 
 
-def test_a_rigid_device_needs_no_jax():
+def test_rigid_device_does_not_import_jax():
     program = (
         "import sys; from zwidth.cli import main\n"
         "try: main(sys.argv[1:])\nexcept SystemExit as end: assert not end.code\n"
         "assert not {'jax', 'pydantic', 'matplotlib'} & set(sys.modules)"
     )
-    for wanted in ([], ["--phase-margin", "30"]):
-        subprocess.run([sys.executable, "-c", program, "recommend", *DEVICE, *wanted], check=True, capture_output=True)
+    for options in ([], ["--phase-margin", "30"]):
+        subprocess.run([sys.executable, "-c", program, "recommend", *DEVICE, *options], check=True, capture_output=True)
 
 
 @pytest.mark.parametrize(
-    ("written", "meant"),
+    ("options", "requirements"),
     [(["--gain-margin", "6 dB"], {"gain_margin": 10**0.3}), (["--phase-margin", "30deg"], {"phase_margin": 30})],
 )
-def test_margins_are_written_as_people_do(written, meant):
-    # The degrees of a margin are no unit of a rotary device.
-    assert json.loads(recommend(*written, "--json").stdout) == json.loads(
-        json.dumps(SCENE.recommend(**meant).as_dict())
+def test_margins_accept_decibels_and_degrees(options, requirements):
+    # Degrees of a margin do not imply a rotary device.
+    assert json.loads(recommend(*options, "--json").stdout) == json.loads(
+        json.dumps(SCENE.recommend(**requirements).as_dict())
     )
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("options", "message"),
     [
         (
             ["--stiffness-fraction", "60"],
@@ -170,5 +170,5 @@ def test_margins_are_written_as_people_do(written, meant):
         (["--phase-margin", "large"], "'--phase-margin': got 'large'; write degrees, such as 30"),
     ],
 )
-def test_a_wish_that_makes_no_sense_is_told_by_its_option(wrong, told):
-    assert told in recommend(*wrong, code=2).output
+def test_invalid_requirement_names_its_option(options, message):
+    assert message in recommend(*options, code=2).output

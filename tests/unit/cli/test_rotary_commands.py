@@ -1,4 +1,6 @@
-"""Commands for rotary devices: units that tell them, published ones, and nothing mixed."""
+"""Commands for rotary devices: recognized by units or by name, printed in rotary units, never mixed with linear
+ones.
+"""
 
 import json
 import re
@@ -27,7 +29,7 @@ def run(*arguments):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_speaks_in_rotary_units(command):
+def test_every_command_prints_rotary_units(command):
     text = run(command, *DEVICE, *COMMANDS[command])
     assert "N m/rad" in text
     assert not LINEAR_UNITS.search(text), text
@@ -37,29 +39,31 @@ def test_every_command_speaks_in_rotary_units(command):
     assert not LINEAR_UNITS.search(as_json), as_json
 
 
-def test_the_answer_is_the_one_of_python():
-    found = json.loads(run("ridge", *DEVICE, "--json"))
+def test_ridge_agrees_with_python():
+    output = json.loads(run("ridge", *DEVICE, "--json"))
     scene = zwidth.Scene(zwidth.Device(12e-7, 2e-5, rotary=True), zwidth.Timing(1e-3, 1e-3))
-    assert found["stiffness_max"] == float(scene.max_stiffness().stiffness)
-    assert found["sensitivities"]["mass"]["unit"] == "N m/rad per kg m^2"
+    assert output["stiffness_max"] == float(scene.max_stiffness().stiffness)
+    assert output["sensitivities"]["mass"]["unit"] == "N m/rad per kg m^2"
 
 
-def test_a_published_device_brings_its_numbers_and_its_units():
+def test_published_device_supplies_parameters_and_units():
     wall = ["--rate", "1 kHz", "--stiffness", "20 mN m/deg"]
     text = run("check", "--device", "haptic_wheel", *wall)
     assert "4500 g cm^2, 1.300 mN m s/rad" in text
     assert "(20.00 mN m/deg)" in text
-    own = run("check", "--device", "haptic_wheel", "--damping", "2 mN m s/rad", "--rate", "1 kHz", "--stiffness", "1")
-    assert "4500 g cm^2, 2.000 mN m s/rad" in own
-    assert "K = 1.000 N m/rad" in own
-    known = next(device.name for device in zwidth.devices.DEVICES if not device.rotary and device.mass)
-    assert "kN/m" in run("ridge", "--device", known, "--damping", "1", "--rate", "1 kHz")
+    modified = run(
+        "check", "--device", "haptic_wheel", "--damping", "2 mN m s/rad", "--rate", "1 kHz", "--stiffness", "1"
+    )
+    assert "4500 g cm^2, 2.000 mN m s/rad" in modified
+    assert "K = 1.000 N m/rad" in modified
+    linear_name = next(device.name for device in zwidth.devices.DEVICES if not device.rotary and device.mass)
+    assert "kN/m" in run("ridge", "--device", linear_name, "--damping", "1", "--rate", "1 kHz")
     result = CliRunner().invoke(cli, ["check", "--device", "haptic_weel", *wall])
     assert result.exit_code
     assert "did you mean 'haptic_wheel'" in result.output
 
 
-def test_code_of_a_rotary_wall_says_what_goes_in_and_out():
+def test_code_of_a_rotary_wall_states_its_units():
     text = run("recommend", *DEVICE, "--code", "c")
     assert "angle in rad" in text
     assert "in N m," in text
@@ -67,7 +71,7 @@ def test_code_of_a_rotary_wall_says_what_goes_in_and_out():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
         (["ridge", "--mass", "12 g", "--damping", "0.02 mN m s/rad", "--rate", "1 kHz"], "--damping: got '0.02 mN m s"),
         (["ridge", "--device", "haptic_wheel", "--damping", "2 N s/m", "--rate", "1 kHz"], "together with --damping"),
@@ -78,9 +82,9 @@ def test_code_of_a_rotary_wall_says_what_goes_in_and_out():
         (["ridge", *DEVICE, "--modes-0-mass", "1 g"], "--modes-0-mass"),
     ],
 )
-def test_mixing_is_refused(arguments, words):
+def test_mixed_units_raise(arguments, message):
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code
     text = result.output + str(result.exception)
-    assert words in text
+    assert message in text
     assert "write all quantities in" in text

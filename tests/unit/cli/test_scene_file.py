@@ -1,4 +1,4 @@
-"""Commands take a scene from a configuration file or from the folder of a run; options override the file."""
+"""Scenes from a configuration file or the folder of a run, with options overriding the file."""
 
 import json
 
@@ -24,39 +24,39 @@ DEVICE = [f"--{name}={value}" for name, value in LINEAR.items()]
 
 
 @pytest.fixture
-def write(tmp_path):
-    def write(**keys):
+def write_scene(tmp_path):
+    def write_scene(**keys):
         file = tmp_path / "scene.yaml"
         file.write_text(SCENE.format(scene="\n".join(f"  {key}: {value}" for key, value in keys.items())))
         return str(file)
 
-    return write
+    return write_scene
 
 
-def run(*words):
-    return CliRunner().invoke(cli, [str(word) for word in words])
+def run(*arguments):
+    return CliRunner().invoke(cli, [str(word) for word in arguments])
 
 
-def refused(*words):
-    """Return the message of a refused call, which `main` prints on stderr."""
-    done = run(*words)
-    assert done.exit_code != 0, done.output
-    assert isinstance(done.exception, SystemExit | zwidth.ZwidthError)
-    return done.stderr if isinstance(done.exception, SystemExit) else str(done.exception)
+def run_invalid(*arguments):
+    """Return the error message of an invalid call, which `main` prints on stderr."""
+    result = run(*arguments)
+    assert result.exit_code != 0, result.output
+    assert isinstance(result.exception, SystemExit | zwidth.ZwidthError)
+    return result.stderr if isinstance(result.exception, SystemExit) else str(result.exception)
 
 
-def printed(*words):
-    done = run(*words, "--json")
-    assert done.exit_code == 0, done.output
-    return json.loads(done.stdout)
+def run_json(*arguments):
+    result = run(*arguments, "--json")
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
 
 
-def options_of(keys):
+def make_options(keys):
     return [word for key, value in keys.items() for word in (f"--{key.replace('_', '-')}", value)]
 
 
 @pytest.mark.parametrize(
-    ("command", "more"),
+    ("command", "options"),
     [
         ("check", []),
         ("check", ["--stiffness", "12 kN/m"]),
@@ -65,11 +65,11 @@ def options_of(keys):
         ("design", ["--stiffness", "30 kN/m", "--find", "rate"]),
     ],
 )
-def test_a_file_answers_as_the_same_options_do(command, more, write):
-    file = write(**LINEAR, **WALL)
-    wall = {key: value for key, value in WALL.items() if f"--{key.replace('_', '-')}" not in more}
-    given = options_of(LINEAR | (wall if command in ("check", "design") else {}))
-    assert printed(command, file, *more) == printed(command, *given, *more)
+def test_scene_file_is_equivalent_to_options(command, options, write_scene):
+    file = write_scene(**LINEAR, **WALL)
+    wall = {key: value for key, value in WALL.items() if f"--{key.replace('_', '-')}" not in options}
+    given = make_options(LINEAR | (wall if command in ("check", "design") else {}))
+    assert run_json(command, file, *options) == run_json(command, *given, *options)
 
 
 @pytest.mark.parametrize(
@@ -91,16 +91,18 @@ def test_a_file_answers_as_the_same_options_do(command, more, write):
     ],
     ids=lambda changed: next(iter(changed)),
 )
-def test_an_option_overrides_the_file(changed, write):
+def test_option_overrides_the_file(changed, write_scene):
     keys = LINEAR | WALL
     timing = {"rate"} if "period" in changed else set()
     both = {key: value for key, value in keys.items() if key not in timing} | changed
-    assert printed("check", write(**keys), *options_of(changed)) == printed("check", *options_of(both))
+    assert run_json("check", write_scene(**keys), *make_options(changed)) == run_json("check", *make_options(both))
 
 
-def test_options_change_single_parameters_of_a_part(write):
-    file = write(**LINEAR, **WALL, velocity="{kind: butterworth, cutoff: 100 Hz, order: 4}", operator="{mass: 500 g}")
-    changed = printed("check", file, "--velocity-cutoff", "200 Hz", "--operator-mass", "0.2")
+def test_option_changes_single_parameters_of_a_filter(write_scene):
+    file = write_scene(
+        **LINEAR, **WALL, velocity="{kind: butterworth, cutoff: 100 Hz, order: 4}", operator="{mass: 500 g}"
+    )
+    changed = run_json("check", file, "--velocity-cutoff", "200 Hz", "--operator-mass", "0.2")
     scene = zwidth.Scene(
         zwidth.Device(0.1, 10),
         zwidth.Timing(rate=1000, delay=1e-3),
@@ -111,30 +113,30 @@ def test_options_change_single_parameters_of_a_part(write):
     assert changed["spectral_radius"] == pytest.approx(float(scene.spectral_radius()), rel=1e-12)
 
 
-def test_a_device_on_the_command_line_replaces_that_of_the_file(write):
-    file = write(**LINEAR, **WALL, coupling="{mass: 20 g, stiffness: 20 kN/m}")
-    changed = printed("check", file, "--device", "1 / 0.1 10 0")
+def test_device_option_replaces_the_device_of_the_file(write_scene):
+    file = write_scene(**LINEAR, **WALL, coupling="{mass: 20 g, stiffness: 20 kN/m}")
+    changed = run_json("check", file, "--device", "1 / 0.1 10 0")
     assert changed["spectral_radius"] == pytest.approx(
-        printed("check", *options_of(LINEAR | WALL))["spectral_radius"], rel=1e-9
+        run_json("check", *make_options(LINEAR | WALL))["spectral_radius"], rel=1e-9
     )
 
 
-def test_a_rotary_file_is_read_in_rotary_units(write):
-    file = write(mass="60 g cm^2", damping="0.02 mN m s/rad", rate="1 kHz", delay="0.7 periods")
-    done = run("check", file, "--stiffness", "0.05")
-    assert done.exit_code == 0, done.output
-    assert "mN m/rad" in done.output
-    assert "in linear units, together with scene.yaml" in refused("check", file, "--stiffness", "10 N/m")
+def test_rotary_file_implies_rotary_units(write_scene):
+    file = write_scene(mass="60 g cm^2", damping="0.02 mN m s/rad", rate="1 kHz", delay="0.7 periods")
+    result = run("check", file, "--stiffness", "0.05")
+    assert result.exit_code == 0, result.output
+    assert "mN m/rad" in result.output
+    assert "in linear units, together with scene.yaml" in run_invalid("check", file, "--stiffness", "10 N/m")
 
 
-def test_the_folder_of_a_run_stands_for_its_configuration(write, tmp_path):
-    file = write(**LINEAR, **WALL)
+def test_run_folder_is_accepted_as_scene_file(write_scene, tmp_path):
+    file = write_scene(**LINEAR, **WALL)
     assert run("run", file, "--out", tmp_path / "out").exit_code == 0
-    assert printed("check", tmp_path / "out") == printed("check", file)
+    assert run_json("check", tmp_path / "out") == run_json("check", file)
 
 
 @pytest.mark.parametrize(
-    ("keys", "words", "message"),
+    ("keys", "arguments", "message"),
     [
         (LINEAR, ["check"], "give --stiffness: the scene of the file has no wall"),
         (LINEAR, ["check", "--virtual-damping", "3"], "give --stiffness: the scene of the file has no wall"),
@@ -147,15 +149,15 @@ def test_the_folder_of_a_run_stands_for_its_configuration(write, tmp_path):
         ),
     ],
 )
-def test_what_a_file_lacks_or_excludes_is_named(keys, words, message, write):
-    assert message in refused(words[0], write(**keys), *words[1:])
+def test_missing_or_conflicting_fields_are_named(keys, arguments, message, write_scene):
+    assert message in run_invalid(arguments[0], write_scene(**keys), *arguments[1:])
 
 
-def test_a_file_without_a_scene_or_that_is_missing_is_named(tmp_path):
+def test_missing_file_or_scene_is_named(tmp_path):
     file = tmp_path / "bare.yaml"
     file.write_text("version: 1\nname: bare\nstudies:\n  - {kind: ridge, name: top, delta: 0.1, d: 1}\n")
-    assert "add a section 'scene'" in refused("ridge", file)
-    assert "absent.yaml" in refused("ridge", tmp_path / "absent.yaml")
+    assert "add a section 'scene'" in run_invalid("ridge", file)
+    assert "absent.yaml" in run_invalid("ridge", tmp_path / "absent.yaml")
     with pytest.raises(zwidth.ConfigError):
         zwidth.load_scene(tmp_path / "absent.yaml")
 
@@ -168,33 +170,33 @@ studies: [{{kind: recommend, name: wall}}]
 """
 
 
-def test_encoder_and_friction_of_a_file_are_printed(tmp_path):
+def test_hardware_of_a_file_is_printed(tmp_path):
     file, wall = tmp_path / "fitted.yaml", ("--stiffness", "5 kN/m", "--virtual-damping", "30 N s/m")
     file.write_text(WITH_HARDWARE.format(", resolution: 20 um, coulomb: 50 mN, max_force: 3 N"))
     used = "encoder step 20.0 µm, friction 50.0 mN, largest motor output 3.00 N"
-    for words in (["recommend", str(file)], ["check", str(file), *wall]):
-        text = " ".join(CliRunner().invoke(cli, words).stdout.split())
+    for arguments in (["recommend", str(file)], ["check", str(file), *wall]):
+        text = " ".join(CliRunner().invoke(cli, arguments).stdout.split())
         assert f"hardware {used} (from fitted.yaml)" in text
         assert "no friction given" not in text
     for name in ("diagnose", "simulate"):
         text = " ".join(CliRunner().invoke(cli, [name, str(file), *wall, "--max-force", "4 N"]).stdout.split())
         assert "hardware encoder step 20.0 µm, friction 50.0 mN (from fitted.yaml)" in text
-    done = CliRunner().invoke(cli, ["run", str(file), "--out", str(tmp_path / "run")])
-    text = " ".join(done.stdout.split())
-    assert "in a hand: stable in all six reference grasps" in text
+    result = CliRunner().invoke(cli, ["run", str(file), "--out", str(tmp_path / "run")])
+    text = " ".join(result.stdout.split())
+    assert "grasps: stable in all six reference grasps" in text
     assert f"simulated with {used}: " in text
     assert f"simulated with {used}: " in (tmp_path / "run" / "recommendation.md").read_text("utf-8")
     assert "hardware" not in CliRunner().invoke(cli, ["check", *wall, *DEVICE, "--resolution", "20 um"]).stdout
 
 
-def test_an_encoder_simulated_without_friction_has_a_caution(tmp_path):
+def test_encoder_without_friction_has_a_caution(tmp_path):
     file, caution = tmp_path / "fitted.yaml", "no friction given: the encoder is simulated without friction"
     file.write_text(WITH_HARDWARE.format(", resolution: 20 um"))
     wall = "--stiffness", "5 kN/m", "--virtual-damping", "30 N s/m"
     options = [*DEVICE, "--resolution", "20 um"]
-    for words in (["check", str(file)], ["recommend", *options], ["simulate", *options], ["diagnose", str(file)]):
-        words += wall if words[0] != "recommend" else ()
-        text = " ".join(CliRunner().invoke(cli, words).stdout.split())
+    for arguments in (["check", str(file)], ["recommend", *options], ["simulate", *options], ["diagnose", str(file)]):
+        arguments += wall if arguments[0] != "recommend" else ()
+        text = " ".join(CliRunner().invoke(cli, arguments).stdout.split())
         assert text.count(f"CAUTION {caution}, which can stop a limit cycle; give") == 1
     assert "no friction given" not in CliRunner().invoke(cli, ["check", str(file), *wall, "--friction", "0"]).stdout
     assert caution in json.loads(CliRunner().invoke(cli, ["recommend", str(file), "--json"]).stdout)["cautions"][-1]
@@ -203,16 +205,16 @@ def test_an_encoder_simulated_without_friction_has_a_caution(tmp_path):
     assert "simulated with encoder step 20.0 µm, without friction: " in " ".join(run.split())
 
 
-def test_a_filter_of_sections_is_that_of_python(tmp_path):
+def test_filter_of_sections_agrees_with_python(tmp_path):
     file = tmp_path / "filtered.yaml"
     sections = {"numerator": [[1000, -1000], [0.2, 0.1]], "denominator": [[1, 0], [1, -0.7]]}
     filtered = (
         f", velocity: {{kind: filter, numerator: {sections['numerator']}, denominator: {sections['denominator']}}}"
     )
     file.write_text(WITH_HARDWARE.format(filtered))
-    found = json.loads(CliRunner().invoke(cli, ["ridge", str(file), "--json"]).stdout)["stiffness_max"]
+    maximum = json.loads(CliRunner().invoke(cli, ["ridge", str(file), "--json"]).stdout)["stiffness_max"]
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), velocity=zwidth.VelocityFilter(**sections))
-    assert found == float(scene.max_stiffness().stiffness)
+    assert maximum == float(scene.max_stiffness().stiffness)
     file.write_text(file.read_text().replace("[0.2, 0.1]", "3"))
     with pytest.raises(zwidth.ConfigError, match=r"numerator\[1\]: got 3; coefficients are a list"):
         CliRunner().invoke(cli, ["ridge", str(file)], catch_exceptions=False)

@@ -1,4 +1,4 @@
-"""The keys of simulations, and velocity estimates without a linear form: what is read, what is refused and where."""
+"""Keys of simulations, and velocity estimates without a linear form: accepted values and located errors."""
 
 import inspect
 import math
@@ -18,16 +18,16 @@ def simulate(keys, scene=DEVICE, kind="simulate", wall="walls: [{stiffness: 5 kN
     return f"scene: {{{scene}}}\nstudies: [{{kind: {kind}, name: s, {wall}{keys and ', ' + keys}}}]\n"
 
 
-CYCLE = {"kind": "limit_cycle", "wall": "axes: {stiffness: [1 kN/m, 2 kN/m], virtual_damping: 5}"}
+LIMIT_CYCLE = {"kind": "limit_cycle", "wall": "axes: {stiffness: [1 kN/m, 2 kN/m], virtual_damping: 5}"}
 
 
-def test_units_become_the_arguments_of_simulate():
-    given = SimulationConditions.model_validate(
+def test_fields_with_units_become_arguments_of_simulate():
+    conditions = SimulationConditions.model_validate(
         {
             "duration": "0.2 s",
             "start_position": "-1 mm",
             "start_velocity": "10 cm/s",
-            "push": "500 mN",
+            "external_force": "500 mN",
             "contact": "push_only",
             "resolution": "20 um",
             "noise": 1e-6,
@@ -39,36 +39,42 @@ def test_units_become_the_arguments_of_simulate():
             "seed": 7,
         }
     )
-    found = given.list_options(1e-3)
-    assert {name: value for name, value in found.items() if isinstance(value, str | int)} == {
+    options = conditions.list_options(1e-3)
+    assert {name: value for name, value in options.items() if isinstance(value, str | int)} == {
         "periods": 200,
         "contact": "push_only",
         "seed": 7,
     }
-    numbers = {name: value for name, value in found.items() if isinstance(value, float)}
+    numbers = {name: value for name, value in options.items() if isinstance(value, float)}
     assert numbers == pytest.approx(
         {
-            **{"start_position": -1e-3, "start_velocity": 0.1, "push": 0.5, "resolution": 2e-5, "noise": 1e-6},
+            **{
+                "start_position": -1e-3,
+                "start_velocity": 0.1,
+                "external_force": 0.5,
+                "resolution": 2e-5,
+                "noise": 1e-6,
+            },
             **{"coulomb": 0.3, "static": 0.4, "max_force": 8.5, "max_rate": 2e3, "jitter": 2e-4},
         }
     )
 
 
-def test_what_is_left_out_is_as_in_python():
-    defaults = {name: each.default for name, each in inspect.signature(zwidth.simulate).parameters.items()}
+def test_omitted_fields_have_the_defaults_of_simulate():
+    defaults = {name: parameter.default for name, parameter in inspect.signature(zwidth.simulate).parameters.items()}
     for name, value in SimulationConditions().list_options(1e-3).items():
         assert value == defaults[name], name
     assert {"static", "max_force", "max_rate"}.isdisjoint(SimulationConditions().list_options(1e-3))
     assert [defaults[name] for name in ("static", "max_force", "max_rate")] == [None, math.inf, math.inf]
 
 
-@pytest.mark.parametrize("kind", [{}, CYCLE], ids=["simulate", "limit_cycle"])
-def test_simulations_take_an_estimate_without_a_linear_form(load, kind):
+@pytest.mark.parametrize("kind", [{}, LIMIT_CYCLE], ids=["simulate", "limit_cycle"])
+def test_simulations_accept_nonlinear_velocity_estimates(load, kind):
     for text in (simulate("", f"{DEVICE}, {FOAW}", **kind), simulate(FOAW, **kind)):
         config = load(text)
         study = config.studies[0]
         assert study.set_velocity(study.device.to_scene()).velocity == zwidth.FOAW(2e-5, 12)
-        # What a run keeps of a configuration says the same.
+        # The dumped configuration is equal.
         assert Config.model_validate(config.model_dump(mode="json", exclude_none=True)) == config
 
 
@@ -84,7 +90,7 @@ def test_simulations_take_an_estimate_without_a_linear_form(load, kind):
         "kind: sweep, name: s, axes: {stiffness: [1, 2]}",
     ],
 )
-def test_a_scene_without_a_linear_form_is_refused_by_name(load, study):
+def test_linear_study_of_a_nonlinear_scene_raises(load, study):
     with pytest.raises(ConfigFileError) as caught:
         load(f"scene: {{{DEVICE}, {FOAW}}}\nstudies: [{{{study}}}]\n")
     (fault,) = caught.value.faults
@@ -100,7 +106,7 @@ def test_a_scene_without_a_linear_form_is_refused_by_name(load, study):
         "kind: step, name: r, devices: [{mass: 1, period: 1 ms}], stiffness_fraction: 0.5",
     ],
 )
-def test_a_study_that_takes_nothing_of_such_a_scene_is_not_refused(load, study):
+def test_study_independent_of_a_nonlinear_scene_is_accepted(load, study):
     assert load(f"scene: {{{DEVICE}, {FOAW}}}\nstudies: [{{{study}}}]\n").studies
 
 
@@ -112,7 +118,7 @@ def test_a_study_that_takes_nothing_of_such_a_scene_is_not_refused(load, study):
         (f"kind: compare, name: s, devices: [{{label: a, {FOAW}}}]", "studies[0].devices[0].velocity.kind"),
     ],
 )
-def test_a_device_without_a_linear_form_is_refused_where_it_is_written(load, study, field):
+def test_nonlinear_device_raises_at_its_location(load, study, field):
     with pytest.raises(ConfigFileError, match="no linear form; use the kind 'simulate'") as caught:
         load(f"scene: {{{DEVICE}}}\nstudies: [{{{study}}}]\n")
     assert [fault.field for fault in caught.value.faults] == [field]
@@ -138,12 +144,12 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("kind", [{}, CYCLE], ids=["simulate", "limit_cycle"])
+@pytest.mark.parametrize("kind", [{}, LIMIT_CYCLE], ids=["simulate", "limit_cycle"])
 @pytest.mark.parametrize("text", FAULTS)
-def test_faults_have_their_place(load, text, kind):
-    field, said = FAULTS[text]
+def test_invalid_fields_raise_at_their_location(load, text, kind):
+    field, message = FAULTS[text]
     with pytest.raises(ConfigFileError) as caught:
         load(simulate(text, **kind))
     (fault,) = caught.value.faults
     assert fault.field == f"studies[0].{field}"
-    assert said in str(fault)
+    assert message in str(fault)

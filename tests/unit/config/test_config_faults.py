@@ -1,4 +1,4 @@
-"""Every faulty file is reported in full, at the exact place, with a remedy."""
+"""Invalid configuration files: every error is reported with its exact location and a remedy."""
 
 import pickle
 import re
@@ -10,11 +10,11 @@ from zwidth.config.fields import ConfigFileError
 from zwidth.config.reader import _Tree, read_mapping
 from zwidth.studies.document import Config, load_config
 
-# The files by their names: texts below each other, each behind a line with its name, and those that are no plain text.
+# Files by name: sections of bad_configs.txt, each after a line with its name, and files that are not plain text.
 _PARTS = re.split(r"^=== (\w+)\n", (Path(__file__).parent / "bad_configs.txt").read_text(encoding="utf-8"), flags=re.M)
 FILES = {name: text.encode() for name, text in zip(_PARTS[1::2], _PARTS[2::2], strict=True)} | {
     "control_character": b"version: 1\nname: bad\ndescription: a\x07b\n",
-    "not_utf8": b"version: 1\nname: bad\ndescription: caf\xe9\n",
+    "not_utf8": b"version: 1\nname: bad\ndescription: caf\xe9\n",  # codespell:ignore
     "tab": b"version: 1\nname: bad\nscene:\n\tmass: 0.1 kg\n\tperiod: 1 ms\n",
     "too_many_values": b"version: 1\nname: bad\nstudies: [" + 50_001 * b"1," + b"]\n",
     "utf16": "version: 1\nname: bad\nstudies:\n  - kind: ridge\n    name: r\n    delta: [0, 1]\n    d: 1\n".encode(
@@ -24,8 +24,8 @@ FILES = {name: text.encode() for name, text in zip(_PARTS[1::2], _PARTS[2::2], s
 
 _DELAY_MODEL = "remove it; for the paper's z^(1+d), use the kinds 'paper_fig6' and 'paper_fig10'"
 
-# file: for each fault, in the order of their places, how its message begins (line:column: field: problem)
-# and how its remedy begins.
+# Expected per file, in the order of the locations: the start of each message (line:column: field: problem) and the
+# start of its remedy.
 FAULTS = {
     "a_list": [("1:1: got a list of 2 items", "write 'key: value' lines, or {key: value}")],
     "alias_bomb": [("1:29: e[5][5][7][3][7]: too many values", "write long axes as linear or log")],
@@ -177,15 +177,15 @@ FAULTS = {
 }
 
 
-def faults_of(path):
+def load_invalid(path):
     with pytest.raises(ConfigFileError) as caught:
         load_config(path)
     return caught.value
 
 
 @pytest.fixture
-def faulty(tmp_path):
-    """What writes one of the files."""
+def write_invalid(tmp_path):
+    """Return a function that writes one of the files."""
 
     def write(name):
         path = tmp_path / f"{name}.yaml"
@@ -195,14 +195,14 @@ def faulty(tmp_path):
     return write
 
 
-def test_every_file_has_its_faults():
+def test_every_file_has_expected_errors():
     assert set(FILES) == set(FAULTS)
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_faults_and_their_places(faulty, name):
-    path = faulty(name)
-    error = faults_of(path)
+def test_errors_and_their_locations(write_invalid, name):
+    path = write_invalid(name)
+    error = load_invalid(path)
     lines = str(error).splitlines()
     assert len(lines) == len(error.faults) == len(FAULTS[name])
     for line, fault, (start, remedy) in zip(lines, error.faults, FAULTS[name], strict=True):
@@ -212,60 +212,60 @@ def test_faults_and_their_places(faulty, name):
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_dict_has_the_faults_of_a_file_without_places(faulty, name):
-    file = faulty(name)
+def test_dict_has_the_errors_of_the_file_without_locations(write_invalid, name):
+    file = write_invalid(name)
     try:
         tree = _Tree(str(file), file.read_text(encoding="utf-8-sig"))
     except ValueError:
-        pytest.skip("no YAML, hence no values")
+        pytest.skip("not valid YAML, hence no dict")
     if tree.faults or not isinstance(tree.data, dict):
-        pytest.skip("a fault of the text, which values do not have")
+        pytest.skip("an error of the text, which a dict cannot have")
     with pytest.raises(ConfigFileError) as caught:
         read_mapping(tree.data, Config)
-    told = {(fault.field, fault.problem, fault.allowed, fault.remedy) for fault in faults_of(file).faults}
-    assert {(fault.field, fault.problem, fault.allowed, fault.remedy) for fault in caught.value.faults} == told
+    expected = {(fault.field, fault.problem, fault.allowed, fault.remedy) for fault in load_invalid(file).faults}
+    assert {(fault.field, fault.problem, fault.allowed, fault.remedy) for fault in caught.value.faults} == expected
     assert not any(line.startswith(":") or str(file) in line for line in str(caught.value).split("\n"))
 
 
-def test_a_dict_has_faults_of_its_own():
-    endless = {"version": 1, "name": "endless", 3: 4}
-    endless["studies"] = [endless]
+def test_dict_may_be_recursive_or_have_invalid_keys():
+    recursive = {"version": 1, "name": "endless", 3: 4}
+    recursive["studies"] = [recursive]
     with pytest.raises(ConfigFileError) as caught:
-        read_mapping(endless, Config)
+        read_mapping(recursive, Config)
     lines = str(caught.value).split("\n")
     assert "got the key 3; keys are text; write the name of a field" in lines
     assert any(line.endswith("the values are nested too deeply; at most 20 levels") for line in lines)
 
 
-def test_a_missing_file():
-    error = faults_of("no/such/file.yaml")
+def test_missing_file():
+    error = load_invalid("no/such/file.yaml")
     assert str(error) == "no/such/file.yaml: no such file; check the path"
     assert error.faults[0].line is None
 
 
-def test_a_folder(tmp_path):
-    assert str(faults_of(tmp_path)).startswith(f"{tmp_path}: got a folder; ")
+def test_folder_instead_of_a_file(tmp_path):
+    assert str(load_invalid(tmp_path)).startswith(f"{tmp_path}: got a folder; ")
 
 
-def test_a_file_that_is_too_large(tmp_path):
+def test_too_large_file(tmp_path):
     path = tmp_path / "large.yaml"
     path.write_text("#" * (2**20 + 1))
-    assert "too large; at most 1048576 bytes" in str(faults_of(path))
+    assert "too large; at most 1048576 bytes" in str(load_invalid(path))
 
 
 @pytest.mark.parametrize("path", ["a\0b", "x" * 5000, "", "line\nbreak.yaml", "esc\x1b[0m.yaml", "\udcff.yaml"])
-def test_a_path_that_cannot_be(path):
-    message = str(faults_of(path))
-    # One line that a terminal can show, whatever the name.
+def test_invalid_path(path):
+    message = str(load_invalid(path))
+    # The message is one printable line for any name.
     assert message.isprintable()
 
 
-def test_a_device_instead_of_a_file():
-    assert str(faults_of("/dev/zero")).startswith("/dev/zero: got no regular file; ")
+def test_device_file_instead_of_a_file():
+    assert str(load_invalid("/dev/zero")).startswith("/dev/zero: got no regular file; ")
 
 
-def test_the_error_travels_between_processes(faulty):
-    error = faults_of(faulty("many_faults"))
+def test_error_is_picklable(write_invalid):
+    error = load_invalid(write_invalid("many_faults"))
     copy = pickle.loads(pickle.dumps(error))
     assert str(copy) == str(error)
     assert copy.faults == error.faults
@@ -273,16 +273,16 @@ def test_the_error_travels_between_processes(faulty):
 
 @pytest.mark.parametrize("value", ["9" * 10**6, "1" + " x" * 10**5, "N" + "*" * 10**6, "1 N" + " " * 10**6 + "x"])
 @pytest.mark.parametrize("start", ["scene: {mass: '", "studies: [{kind: ridge, name: r, d: 0, delta: '"])
-def test_long_values_are_refused_soon(tmp_path, start, value):
+def test_long_values_are_rejected_in_linear_time(tmp_path, start, value):
     path = tmp_path / "long.yaml"
     path.write_text(f"{start}{value}'" + ("}" if "scene" in start else "}]"))
-    # In a time that grows as its length squared, this would not end.
-    faults_of(path)
+    # With quadratic run time this would not end.
+    load_invalid(path)
 
 
-def test_values_are_shown_in_one_line(tmp_path):
+def test_values_are_shown_in_one_printable_line(tmp_path):
     path = tmp_path / "shown.yaml"
     path.write_text('version: "\\e[31m\\n\\ud800"\nname: {}\n"k\\ny": 1\nstudies: []\n'.format("x" * 200))
-    for line in str(faults_of(path)).split("\n"):
+    for line in str(load_invalid(path)).split("\n"):
         assert line.isprintable()
         assert len(line) < len(str(path)) + 250

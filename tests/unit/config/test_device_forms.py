@@ -1,4 +1,4 @@
-"""Devices of a configuration that are given as a whole, by a linear system or a measured response."""
+"""Devices given as a linear system or a measured response, against the same rigid device."""
 
 import json
 from typing import Any
@@ -12,8 +12,8 @@ from zwidth.studies.document import Config
 
 STUDIES = "studies: [{kind: recommend, name: r}]\n"
 RIGID = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3))
-LINES = np.geomspace(1.0, 450.0, 300)
-RESPONSE = RIGID.frequency_response(1.0, 0.0, LINES)
+FREQUENCIES = np.geomspace(1.0, 450.0, 300)
+RESPONSE = RIGID.frequency_response(1.0, 0.0, FREQUENCIES)
 
 
 def scene_with(device: str, more: str = "period: 1 ms, delay: 1 ms") -> str:
@@ -21,9 +21,9 @@ def scene_with(device: str, more: str = "period: 1 ms, delay: 1 ms") -> str:
 
 
 @pytest.fixture
-def table(tmp_path):
-    """A response beside the configuration."""
-    zwidth.MeasuredDevice(LINES, RESPONSE, 1e-9).save(tmp_path / "response.csv")
+def response_file(tmp_path):
+    """Write a response next to the configuration."""
+    zwidth.MeasuredDevice(FREQUENCIES, RESPONSE, 1e-9).save(tmp_path / "response.csv")
 
 
 @pytest.mark.parametrize(
@@ -38,48 +38,48 @@ def table(tmp_path):
         "{A: [[0, 1], [0, -100]], B: [0, 10], C: [1, 0]}",
     ],
 )
-def test_every_form_of_a_rigid_mass_is_the_rigid_device(load, device):
+def test_every_form_of_a_rigid_mass_agrees_with_the_rigid_device(load, device):
     config = load(scene_with(device))
-    found, known = config.scene.to_scene().max_stiffness(), RIGID.max_stiffness()
-    np.testing.assert_allclose(found[:3], known[:3], rtol=1e-12)
-    # What a run keeps of a configuration says the same.
+    maximum, expected = config.scene.to_scene().max_stiffness(), RIGID.max_stiffness()
+    np.testing.assert_allclose(maximum[:3], expected[:3], rtol=1e-12)
+    # The dumped configuration is equal.
     assert Config.model_validate(config.model_dump(mode="json", exclude_none=True)) == config
 
 
-def test_complex_roots_come_with_their_conjugates(load):
+def test_complex_roots_with_their_conjugates(load):
     scene = load(scene_with("{poles: [0, '-3 + 40j', '-3 - 40j'], gain: 1e3}")).scene.to_scene()
     assert sorted(scene.device.poles, key=lambda pole: pole.imag) == pytest.approx([-3 - 40j, 0, -3 + 40j], rel=1e-15)
 
 
-def test_a_sampled_system_has_the_period_of_the_loop(load):
+def test_sampled_system_agrees_with_the_rigid_device(load):
     loop = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3)).open_loop(1.0, 0.0)
     matrices = {name: getattr(loop, name).tolist() for name in "AB"} | {"C": loop.C.tolist(), "sampled": "1 ms"}
     scene = load(scene_with(json.dumps(matrices), "period: 1 ms")).scene.to_scene()
-    known = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3)).max_stiffness()
-    np.testing.assert_allclose(scene.max_stiffness()[:3], known[:3], rtol=1e-9)
+    expected = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3)).max_stiffness()
+    np.testing.assert_allclose(scene.max_stiffness()[:3], expected[:3], rtol=1e-9)
 
 
-def test_a_response_is_read_beside_the_file_and_kept_by_its_numbers(load, table, tmp_path):
+def test_response_file_is_read_and_stored_by_its_values(load, response_file, tmp_path):
     config = load(scene_with("response.csv", "period: 1 ms"))
-    known = zwidth.MeasuredDevice(LINES, RESPONSE, 1e-9)
-    assert config.scene.to_scene().device == known
-    kept = config.model_dump(mode="json", exclude_none=True)
+    expected = zwidth.MeasuredDevice(FREQUENCIES, RESPONSE, 1e-9)
+    assert config.scene.to_scene().device == expected
+    dump = config.model_dump(mode="json", exclude_none=True)
     (tmp_path / "response.csv").unlink()
-    again: Any = Config.model_validate(kept).scene
-    assert again.to_scene().device == known
+    again: Any = Config.model_validate(dump).scene
+    assert again.to_scene().device == expected
     (study,) = config.studies
     (outcome,) = [study.compute(config.scene, True)]
-    told = json.loads(outcome.documents["recommendation.json"])
-    wall = told["recommended"]["stiffness"], told["recommended"]["virtual_damping"]
-    assert RIGID.is_stable(*wall), "every response in the band is stable, and this one is in it"
-    assert told["recommended"]["spectral_radius"] is None
+    report = json.loads(outcome.documents["recommendation.json"])
+    wall = report["recommended"]["stiffness"], report["recommended"]["virtual_damping"]
+    assert RIGID.is_stable(*wall), "every response in the uncertainty band is stable, including this one"
+    assert report["recommended"]["spectral_radius"] is None
     text = outcome.documents["recommendation.md"]
     assert "for every response in the band" in text
     assert "measured response, 300 lines from 1 to 450 Hz" in text
 
 
 @pytest.mark.parametrize(
-    ("device", "more", "place", "words"),
+    ("device", "more", "field", "message"),
     [
         ("nobody", "period: 1 ms", "scene.device", "published are"),
         ("phantom_2007", "period: 1 ms", "scene.device", "did you mean 'phantom_2006'?"),
@@ -98,20 +98,20 @@ def test_a_response_is_read_beside_the_file_and_kept_by_its_numbers(load, table,
         ("'1 / 0.1 10 0'", "period: 1 ms, mass: 1 kg", "scene.mass", "remove one"),
         ("'1 / 0.1 10 0'", "period: 1 ms, operator: {mass: 1}", "scene.operator", "remove one"),
         ("response.csv", "period: 1 ms, delay: 1 ms", "scene.delay", "includes all delays"),
-        ("response.csv", "period: 2 ms", "scene.device.frequency", "less than half the rate"),
+        ("response.csv", "period: 2 ms", "scene.device.frequency", "below the Nyquist frequency"),
         ("{frequency: [1, 2], real: [1, 2], imag: [1, 2]}", "period: 1 ms", "scene.device.frequency", "at least 8"),
     ],
 )
-def test_faults_have_their_place(load, table, device, more, place, words):
+def test_invalid_devices_raise_at_their_location(load, response_file, device, more, field, message):
     with pytest.raises(ConfigFileError) as error:
         load(scene_with(device, more))
     (fault,) = error.value.faults
-    assert fault.field == place
-    assert words in str(fault)
+    assert fault.field == field
+    assert message in str(fault)
 
 
 @pytest.mark.parametrize(
-    ("study", "words"),
+    ("study", "message"),
     [
         ("kind: passivity", "a device with a system or response in place of its mass"),
         ("kind: boundary, passivity: true", "without a system or response"),
@@ -119,12 +119,12 @@ def test_faults_have_their_place(load, table, device, more, place, words):
         ("kind: simulate, walls: [{stiffness: 1000}]", "a simulation needs mass"),
     ],
 )
-def test_what_needs_a_mass_or_a_model_is_refused(load, table, study, words):
-    with pytest.raises(ConfigFileError, match=words):
+def test_study_requiring_a_mass_or_model_raises(load, response_file, study, message):
+    with pytest.raises(ConfigFileError, match=message):
         load(scene_with("response.csv", "period: 1 ms").replace("kind: recommend", study))
 
 
-def test_devices_are_compared_whatever_they_are_given_by(load, table):
+def test_devices_of_different_forms_are_compared(load, response_file):
     text = scene_with("'1 / 0.2 10 0'").replace(
         "kind: recommend, name: r",
         "kind: compare, name: c, devices: [{label: of the scene}, {label: rigid, mass: 0.1, damping: 10}, "
@@ -132,7 +132,7 @@ def test_devices_are_compared_whatever_they_are_given_by(load, table):
     )
     config = load(text)
     (study,) = config.studies
-    found = study.compute(config.scene, True).table["stiffness_N_per_m"]
+    stiffness = study.compute(config.scene, True).table["stiffness_N_per_m"]
     heavy = zwidth.Scene(zwidth.Device(0.2, 10.0), RIGID.timing)
-    assert found[:2] == pytest.approx([heavy.max_stiffness().stiffness, RIGID.max_stiffness().stiffness], rel=1e-12)
-    assert 0.9 * found[1] < found[2] < found[1]
+    assert stiffness[:2] == pytest.approx([heavy.max_stiffness().stiffness, RIGID.max_stiffness().stiffness], rel=1e-12)
+    assert 0.9 * stiffness[1] < stiffness[2] < stiffness[1]

@@ -1,4 +1,4 @@
-"""Velocity estimate, hand and coupling as keys of a scene: what is read, what is refused and where."""
+"""Velocity filter, operator and coupling as keys of a scene: accepted values and located errors."""
 
 import json
 
@@ -13,7 +13,7 @@ SCENE = "scene: {mass: 100 g, damping: 10 N s/m, period: 1 ms, delay: 1 ms"
 BOUNDARY = "studies: [{kind: boundary, name: b}]\n"
 
 
-def part(text, studies=BOUNDARY):
+def add_to_scene(text, studies=BOUNDARY):
     return f"{SCENE}, {text}}}\n{studies}"
 
 
@@ -30,42 +30,46 @@ def part(text, studies=BOUNDARY):
     ],
 )
 def test_every_velocity_estimate(load, text, expected):
-    config = load(part(f"velocity: {text}", "studies: [{kind: simulate, name: s, walls: [{stiffness: 1000}]}]\n"))
+    config = load(
+        add_to_scene(f"velocity: {text}", "studies: [{kind: simulate, name: s, walls: [{stiffness: 1000}]}]\n")
+    )
     assert config.scene.to_scene().velocity == expected
-    # What a run keeps of a configuration says the same.
+    # The dumped configuration is equal.
     assert Config.model_validate(config.model_dump(mode="json", exclude_none=True)) == config
 
 
-def test_hand_and_coupling_in_units(load):
+def test_operator_and_coupling_with_units(load):
     hand = "operator: {mass: 554 g, damping: 6.45, stiffness: 135, coupling_stiffness: 1 N/mm, coupling_damping: 5}"
     scene = load(
-        part(f"{hand}, coupling: {{mass: 50 g, stiffness: 20 kN/m, damping: 1, sensor: tip}}")
+        add_to_scene(f"{hand}, coupling: {{mass: 50 g, stiffness: 20 kN/m, damping: 1, sensor: tip}}")
     ).scene.to_scene()
     assert scene.operator == zwidth.Operator(0.554, 6.45, 135, 1000, 5)
     assert scene.device.coupling == zwidth.Coupling(0.05, 20e3, 1, "tip")
 
 
-def test_a_delay_in_periods_is_exact_in_the_scene_too(load):
-    """Of its seconds the period makes 0.8869999999999999."""
+def test_delay_in_periods_is_exact(load):
+    """The delay in seconds divided by the period would be 0.8869999999999999."""
     scene = "scene: {mass: 0.1, period: 3e-4, delay: 0.887 periods, velocity: {kind: low_pass, cutoff: 100}}\n"
     config = load(scene + "studies: [{kind: recommend, name: r}]\n")
     assert zwidth.Timing(3e-4, 0.887 * 3e-4).d != 0.887
     assert config.scene.to_scene().d == 0.887
 
 
-def test_a_hand_held_rigidly_adds_to_the_mass_of_every_kind(load):
-    """Such a scene is the rigid one of both masses: the same walls in the same units."""
+def test_rigidly_coupled_operator_adds_to_the_mass(load):
+    """The scene equals a rigid one with the sum of both masses."""
     studies = "studies: [{kind: recommend, name: r}]\n"
-    held, heavy = (
+    with_operator, heavy = (
         load(text)
         for text in (
-            part("operator: {mass: 0.4}", studies),
+            add_to_scene("operator: {mass: 0.4}", studies),
             "scene: {mass: 0.5, damping: 10, period: 1 ms, delay: 1 ms}\n" + studies,
         )
     )
-    documents = [config.studies[0].compute(config.scene, True).documents for config in (held, heavy)]
-    found = [json.loads(each["recommendation.json"]) for each in documents]
-    assert [found[0][name] for name in ("maximum", "recommended")] == [found[1][n] for n in ("maximum", "recommended")]
+    documents = [config.studies[0].compute(config.scene, True).documents for config in (with_operator, heavy)]
+    reports = [json.loads(document["recommendation.json"]) for document in documents]
+    assert [reports[0][name] for name in ("maximum", "recommended")] == [
+        reports[1][n] for n in ("maximum", "recommended")
+    ]
 
 
 FAULTS = {
@@ -92,37 +96,37 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("text", FAULTS)
-def test_faults_have_their_place(load, text):
-    field, said = FAULTS[text]
+def test_invalid_fields_raise_at_their_location(load, text):
+    field, message = FAULTS[text]
     with pytest.raises(ConfigFileError) as caught:
-        load(part(text))
+        load(add_to_scene(text))
     (fault,) = caught.value.faults
     assert fault.field == f"scene.{field}"
-    # Line 3 of the file; right of the scene's own keys.
+    # Line 3 of the file, to the right of the scene's other keys.
     assert fault.line == 3
     assert fault.column is not None
     assert fault.column > len(SCENE)
-    assert said in str(fault)
+    assert message in str(fault)
 
 
-def test_a_normalized_scene_has_no_parts(load):
+def test_normalized_scene_with_a_filter_raises(load):
     with pytest.raises(ConfigFileError, match="a scene that is normalized has no parts") as caught:
         load("scene: {delta: 0.1, d: 1, velocity: {kind: low_pass, cutoff: 100}}\n" + BOUNDARY)
     assert [fault.field for fault in caught.value.faults] == ["scene.velocity"]
 
 
-def test_a_sweep_of_passivity_needs_the_sensor_where_the_force_acts(load):
+def test_sweep_of_passivity_with_the_sensor_at_the_tip_raises(load):
     walls = "axes: {stiffness: [1 kN/m, 5 kN/m], virtual_damping: [0, 10]}"
     sweep = f"studies: [{{kind: sweep, name: s, {walls}, outputs: [stable, passive]}}]\n"
     coupling = "coupling: {mass: 50 g, stiffness: 20 kN/m, sensor: SENSOR}"
-    assert load(part(coupling.replace("SENSOR", "motor"), sweep)).studies
+    assert load(add_to_scene(coupling.replace("SENSOR", "motor"), sweep)).studies
     with pytest.raises(ConfigFileError, match="got 'passive' with the sensor at the tip") as caught:
-        load(part(coupling.replace("SENSOR", "tip"), sweep))
+        load(add_to_scene(coupling.replace("SENSOR", "tip"), sweep))
     assert [fault.field for fault in caught.value.faults] == ["studies[0].outputs[1]"]
 
 
-def test_a_sweep_of_a_linear_device_has_no_passivity(load):
-    """It was computed, and refused wall by wall, whose labels were lost with it."""
+def test_sweep_of_passivity_of_a_linear_device_raises(load):
+    """Regression: such a sweep failed at every wall and lost the labels of the other outputs."""
     walls = "axes: {period: 1 ms, stiffness: [1 kN/m, 5 kN/m], virtual_damping: 10}"
     sweep = f"studies: [{{kind: sweep, name: s, device: 1 / 0.1 10 0, {walls}, outputs: OUTPUTS}}]\n"
     assert load(sweep.replace("OUTPUTS", "[stable]")).studies
@@ -131,23 +135,23 @@ def test_a_sweep_of_a_linear_device_has_no_passivity(load):
     assert [fault.field for fault in caught.value.faults] == ["studies[0].outputs[1]"]
 
 
-# What such studies cannot do without.
+# Required fields of some kinds.
 NEEDED = {"step": ", stiffness_fraction: 0.5", "map": ", alpha: 1, beta: 1"}
 
 
-# A fit finds a device and takes none, the paper has its own.
+# Kinds that use the scene but ignore filters and operators; a fit and the paper's figures use no scene.
 @pytest.mark.parametrize("kind", [name for name, model in KINDS.items() if model.from_scene and not model.takes_parts])
-def test_kinds_that_forget_parts_name_those_that_answer(load, kind):
+def test_kinds_without_filters_name_suitable_kinds(load, kind):
     studies = f"studies: [{{kind: {kind}, name: s{NEEDED.get(kind, '')}}}]\n"
     with pytest.raises(
         ConfigFileError, match=r"got a device with velocity and operator; .* 'boundary', 'compare'"
     ) as caught:
-        load(part("velocity: {kind: low_pass, cutoff: 100}, operator: {stiffness: 10}", studies))
+        load(add_to_scene("velocity: {kind: low_pass, cutoff: 100}, operator: {stiffness: 10}", studies))
     assert [fault.field for fault in caught.value.faults] == ["studies[0]"]
 
 
 @pytest.mark.parametrize(
-    ("study", "field", "said"),
+    ("study", "field", "message"),
     [
         ("kind: boundary, name: b, delta: 1", "studies[0]", "remove 'delta', or give both"),
         ("kind: boundary, name: b, passivity: true", "studies[0].passivity", "two samples, without velocity"),
@@ -175,8 +179,8 @@ def test_kinds_that_forget_parts_name_those_that_answer(load, kind):
         ("kind: filters, name: f, samples: {linear: {start: 1, stop: 4, num: 3}}", "studies[0].samples", "2.5 as one"),
     ],
 )
-def test_studies_of_a_scene_with_parts_are_refused_at_their_place(load, study, field, said):
+def test_invalid_studies_of_a_filtered_scene_raise_at_their_location(load, study, field, message):
     with pytest.raises(ConfigFileError) as caught:
-        load(part("velocity: {kind: low_pass, cutoff: 100}", f"studies: [{{{study}}}]\n"))
+        load(add_to_scene("velocity: {kind: low_pass, cutoff: 100}", f"studies: [{{{study}}}]\n"))
     assert [fault.field for fault in caught.value.faults] == [field]
-    assert said in str(caught.value)
+    assert message in str(caught.value)

@@ -1,4 +1,4 @@
-"""What a correct configuration turns into: defaults, the scene's values, SI units, YAML 1.2."""
+"""Reading of valid configurations: defaults, values from the scene, SI units, YAML 1.2, dumps and the JSON schema."""
 
 import json
 import pickle
@@ -29,7 +29,7 @@ def test_shipped_configs_are_valid_and_named_after_their_file(path):
     assert all(study.points > 0 and study.nbytes > 0 for study in config.studies)
 
 
-def test_the_paper_is_complete():
+def test_paper_configuration_is_complete():
     studies: dict[str, Any] = {study.name: study for study in load_config(CONFIGS / "paper.yaml").studies}
     figures = ["fig5", "fig6", "fig7", "fig8", "fig9", "fig10", "fig11"]
     assert list(studies) == [*figures, "passivity_cost", "published"]
@@ -43,7 +43,7 @@ def test_the_paper_is_complete():
     assert [device.d for device in devices] == [1, 1, 1]
 
 
-def test_the_scene_supplies_what_a_study_leaves_out(load):
+def test_scene_supplies_omitted_fields(load):
     config = load(
         PHYSICAL
         + "studies:\n"
@@ -64,7 +64,7 @@ def test_the_scene_supplies_what_a_study_leaves_out(load):
     assert (recommend.device.mass, recommend.device.period) == (0.1, 1e-3)
 
 
-def test_the_scene_supplies_its_wall_to_a_step(load):
+def test_scene_supplies_its_wall_to_a_step_study(load):
     wall = "scene: {mass: 100 g, rate: 1 kHz, stiffness: 10 kN/m, virtual_damping: 40 N s/m}\n"
     study = load(wall + "studies: [{kind: step, name: s}]\n").studies[0]
     assert study.walls == (PhysicalWall(stiffness=10e3, virtual_damping=40.0),)
@@ -73,18 +73,18 @@ def test_the_scene_supplies_its_wall_to_a_step(load):
     assert study.walls is None
 
 
-def test_a_physical_scene_in_si_units(load):
+def test_physical_scene_is_in_si_units(load):
     scene = load(PHYSICAL.replace("}", ", stiffness: 10 N/mm}") + RIDGE).scene
-    made = scene.to_scene()
-    assert isinstance(made, Scene)
-    assert (made.device.mass, made.device.damping) == (0.1, 10.0)
-    assert (made.timing.period, made.timing.delay) == (1e-3, 1.5e-3)
-    assert (made.wall.stiffness, made.wall.virtual_damping) == (10e3, 0.0)
+    converted = scene.to_scene()
+    assert isinstance(converted, Scene)
+    assert (converted.device.mass, converted.device.damping) == (0.1, 10.0)
+    assert (converted.timing.period, converted.timing.delay) == (1e-3, 1.5e-3)
+    assert (converted.wall.stiffness, converted.wall.virtual_damping) == (10e3, 0.0)
     assert scene.d == 1.5
     assert scene.delta == pytest.approx(0.1)
 
 
-def test_a_normalized_scene(load):
+def test_normalized_scene(load):
     scene = load("scene: {delta: 0.1, alpha: 0.2}\n" + RIDGE).scene
     assert (scene.delta, scene.d) == (0.1, 0.0)
     assert scene.wall == NormalizedWall(alpha=0.2, beta=0.0)
@@ -137,7 +137,7 @@ def test_aliases_and_a_byte_order_mark(tmp_path):
     assert first.delta == second.delta
 
 
-def test_configs_are_frozen_and_travel_between_processes():
+def test_configs_are_frozen_and_picklable():
     config = load_config(CONFIGS / "phantom.yaml")
     with pytest.raises(ValueError, match="frozen"):
         config.name = "other"
@@ -145,7 +145,7 @@ def test_configs_are_frozen_and_travel_between_processes():
 
 
 @pytest.mark.parametrize("text", ["1e-3", "no", "0o7", "0x1F", "~", "", "it: is\nmany", "- µ", "true", "1 kHz"])
-def test_what_is_written_is_read_as_it_was(tmp_path, text):
+def test_written_yaml_is_read_back_equal(tmp_path, text):
     study = {"kind": "ridge", "name": "r", "delta": [1e-7, 1e-22, 0.1 + 0.2], "d": 0}
     data = {"version": 1, "name": "n", "description": text, "studies": [study, {**study, "name": "again"}]}
     (tmp_path / "written.yaml").write_text(write_yaml(data), encoding="utf-8")
@@ -155,8 +155,8 @@ def test_what_is_written_is_read_as_it_was(tmp_path, text):
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_a_dump_leads_back_to_the_same_config(path, tmp_path, monkeypatch):
-    # Logs stay in their files.
+def test_dump_is_read_back_equal(path, tmp_path, monkeypatch):
+    # Dumps refer to log files, which are not embedded.
     for table in path.parent.glob("*.csv"):
         (tmp_path / table.name).write_bytes(table.read_bytes())
     monkeypatch.chdir(tmp_path)
@@ -167,7 +167,7 @@ def test_a_dump_leads_back_to_the_same_config(path, tmp_path, monkeypatch):
 
 
 def conforms(value, schema, root):
-    """Whether a value conforms to a JSON Schema, as far as this one uses the language."""
+    """Return whether a value conforms to a JSON Schema; supports only the keywords that this schema uses."""
     if "$ref" in schema:
         return conforms(value, root["$defs"][schema["$ref"].rsplit("/", 1)[1]], root)
     options = schema.get("anyOf") or schema.get("oneOf")
@@ -179,11 +179,11 @@ def conforms(value, schema, root):
     if "type" in schema and not isinstance(value, kinds[schema["type"]]):
         return False
     if isinstance(value, dict):
-        known = schema.get("properties", {})
+        properties = schema.get("properties", {})
         return (
             set(schema.get("required", [])) <= set(value)
-            and (set(value) <= set(known) or schema.get("additionalProperties", True))
-            and all(conforms(item, known.get(key, {}), root) for key, item in value.items())
+            and (set(value) <= set(properties) or schema.get("additionalProperties", True))
+            and all(conforms(item, properties.get(key, {}), root) for key, item in value.items())
         )
     if isinstance(value, list):
         return all(conforms(item, schema.get("items", {}), root) for item in value)
@@ -196,14 +196,14 @@ def schema():
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_the_schema_fits_the_shipped_configs(path, schema):
+def test_shipped_configs_conform_to_the_schema(path, schema):
     raw = yaml.safe_load(path.read_text(encoding="utf-8"))
     assert conforms(raw, schema, schema)
     raw["studies"][0]["colour"] = "red"
     assert not conforms(raw, schema, schema)
 
 
-def test_the_schema_describes_every_field(schema):
+def test_schema_describes_every_field(schema):
     assert set(schema["$defs"]) >= {model.__name__ for model in KINDS.values()}
     assert all("properties" in schema["$defs"][model.__name__] for model in KINDS.values())
     for model in [schema, *schema["$defs"].values()]:

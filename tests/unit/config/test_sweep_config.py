@@ -1,4 +1,4 @@
-"""Sweep studies in a configuration: axes with units, devices in tables and CSV files, and what is refused."""
+"""Sweep studies in configurations: axes with units, tables of devices in YAML and CSV, and located errors."""
 
 import json
 from pathlib import Path
@@ -35,21 +35,21 @@ def test_physical_axes_with_units(load):
     block = grid.block(tuple(slice(None) for _ in grid.dims))
     period = 1 / np.array([1000.0, 500.0])
     damping, stiffness = np.array([1.0, 10.0, 100.0]), np.array([1000.0, 2000.0])
-    at = np.ix_(range(2), range(2), range(3))
+    indices = np.ix_(range(2), range(2), range(3))
     device = normalize(mass=0.1, damping=damping, period=period[:, None, None] + np.zeros((1, 2, 1)))
     np.testing.assert_array_equal(block.delta.reshape(2, 2, 3), device.delta)
-    np.testing.assert_array_equal(block.d.reshape(2, 2, 3), at[1] + np.zeros((2, 1, 3)))
+    np.testing.assert_array_equal(block.d.reshape(2, 2, 3), indices[1] + np.zeros((2, 1, 3)))
     wall = normalize(mass=0.1, period=period[:, None], stiffness=stiffness, virtual_damping=stiffness / 100.0)
     np.testing.assert_array_equal(block.alpha.reshape(2, 2, 3, 2)[:, 1, 2], wall.alpha)
     np.testing.assert_array_equal(block.beta.reshape(2, 2, 3, 3)[:, 0, 0, 1:], wall.beta)
 
 
-def test_delays_in_seconds_are_whole_periods_where_they_can_be(load):
+def test_delays_in_seconds_are_exact_multiples_of_the_period(load):
     study = load(sweep("stiffness: 1, mass: 1, period: 0.1 ms, delay: [0.3 ms, 1.1 ms]")).studies[0]
     assert list(Grid(study).block((slice(None),)).d) == [3.0, 11.0]
 
 
-def test_the_scene_supplies_the_device(load):
+def test_scene_supplies_the_device(load):
     study = load(SCENE + sweep("stiffness: [1, 2]")).studies[0]
     assert set(study.axes.given) == {"period", "delay", "mass", "damping", "stiffness"}
     study = load(SCENE + sweep("alpha: [1, 2], d: 3")).studies[0]
@@ -57,7 +57,7 @@ def test_the_scene_supplies_the_device(load):
     assert study.axes.delta.values() == pytest.approx([0.1])
 
 
-def test_devices_move_together(load):
+def test_columns_of_a_device_table_form_one_axis(load):
     study = load(sweep("devices: {label: [a, b], mass: [100 g, 1], delay: [1 ms, 3]}, rate: 1 Hz, stiffness: [1, 2]"))
     grid = Grid(study.studies[0])
     assert grid.sizes == {"device": 2, "stiffness": 2}
@@ -67,13 +67,13 @@ def test_devices_move_together(load):
     assert list(grid.coordinates()["device"][1]) == ["a", "b"]
 
 
-def test_devices_from_a_csv_file_beside_the_configuration(load, tmp_path, monkeypatch):
+def test_devices_from_a_csv_file(load, tmp_path, monkeypatch):
     (tmp_path / "devices.csv").write_text(CSV, encoding="utf-8")
     config = load(SCENE + sweep("devices: {csv: devices.csv}, stiffness: 10"))
     table = config.studies[0].axes.devices
     assert table.labels == ("small", "large")
     assert table.columns == {"mass": (0.05, 2.0), "damping": (1.0, 30.0)}
-    # The dump stands for itself: whoever reads it needs no file.
+    # The dump contains the table and needs no file.
     dump = config.model_dump(mode="json", exclude_none=True)
     assert dump["studies"][0]["axes"]["devices"] == {
         "label": ["small", "large"],
@@ -89,27 +89,27 @@ def test_devices_of_a_spreadsheet_with_decimal_commas(load, tmp_path):
     assert (table.labels, table.columns) == (("arm, left",), {"mass": (0.0005,), "damping": (1.5,)})
 
 
-NORMAL = "alpha: 1, delta: 1, d: 1"
-PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
+NORMALIZED = "alpha: 1, delta: 1, d: 1"
+PHYSICAL = "stiffness: 1, mass: 1, rate: 1 kHz, "
 
 
 @pytest.mark.parametrize(
-    "axes, rest, place, words",
+    "axes, rest, field, message",
     [
-        (NORMAL + ", mass: 1 kg", "", "axes.mass", "never both"),
-        (NORMAL + ", rate: 1", "", "axes.rate", "never both"),
+        (NORMALIZED + ", mass: 1 kg", "", "axes.mass", "never both"),
+        (NORMALIZED + ", rate: 1", "", "axes.rate", "never both"),
         ("alpha: 1, d: 1", "", "axes", "delta missing"),
         ("stiffness: 1, mass: 1", "", "axes", "period missing"),
         ("stiffness: 1, rate: 1", "", "axes", "mass missing"),
         ("delta: 1, d: 1", "", "axes", "alpha missing"),
-        (NORMAL, ", outputs: [alpha_max]", "axes.alpha", "changes no output"),
+        (NORMALIZED, ", outputs: [alpha_max]", "axes.alpha", "changes no output"),
         ("delta: 1, d: 1", ", outputs: [stiffness_max]", "outputs[0]", "SI units"),
-        (NORMAL, ", outputs: [stabel]", "outputs[0]", "did you mean 'stable'?"),
-        (NORMAL, ", accuracy: 0", "accuracy", "at least"),
-        (NORMAL, ", accuracy: 1e-13", "accuracy", "at least 1e-12"),
-        (NORMAL, ", accuracy: tight", "accuracy", "one number"),
-        (NORMAL + ", betta: 1", "", "axes.betta", "did you mean 'beta'?"),
-        (NORMAL + ", d: 1", "", "axes.d", "occurs twice"),
+        (NORMALIZED, ", outputs: [stabel]", "outputs[0]", "did you mean 'stable'?"),  # codespell:ignore
+        (NORMALIZED, ", accuracy: 0", "accuracy", "at least"),
+        (NORMALIZED, ", accuracy: 1e-13", "accuracy", "at least 1e-12"),
+        (NORMALIZED, ", accuracy: tight", "accuracy", "one number"),
+        (NORMALIZED + ", betta: 1", "", "axes.betta", "did you mean 'beta'?"),
+        (NORMALIZED + ", d: 1", "", "axes.d", "occurs twice"),
         ("stiffness: 1, mass: 1, rate: 1, period: 1", "", "axes.period", "both given"),
         ("stiffness: 1, mass: 1, rate: 1, delay: [1 s, 1 periods]", "", "axes.delay[1]", "all in seconds"),
         ("stiffness: [1 N/m, 1], mass: 1, rate: 1", "", "axes.stiffness[1]", "twice"),
@@ -131,15 +131,15 @@ PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
         ("devices: {csv: empty.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "0 rows"),
         ("devices: {csv: wrong.csv, unit: g}, stiffness: 1", "", "axes.devices.unit", "has the keys 'csv'"),
         ("devices: {csv: 3}, stiffness: 1", "", "axes.devices.csv", "must be text"),
-        (PART + "velocity.samples: [2, 5]", "", "axes.velocity.samples", "{kind: windowed_difference, samples: 5}"),
+        (PHYSICAL + "velocity.samples: [2, 5]", "", "axes.velocity.samples", "{kind: windowed_difference, samples: 5}"),
         (
-            PART + "velocity.time_constant: [1 ms, 2 ms]",
+            PHYSICAL + "velocity.time_constant: [1 ms, 2 ms]",
             "",
             "axes.velocity.time_constant",
             "low_pass, time_constant: 2 ms",
         ),
-        (PART + "velocity.order: [1, 2]", "", "axes.velocity.order", "{kind: low_pass, cutoff: 100 Hz}"),
-        (PART + "modes.0.mass: [1, 2]", "", "axes.modes.0.mass", "damping_ratio: 0.03, mass: 2 kg}]"),
+        (PHYSICAL + "velocity.order: [1, 2]", "", "axes.velocity.order", "{kind: low_pass, cutoff: 100 Hz}"),
+        (PHYSICAL + "modes.0.mass: [1, 2]", "", "axes.modes.0.mass", "damping_ratio: 0.03, mass: 2 kg}]"),
         (
             "alpha: {linear: {start: 0, stop: 1, num: 9999999}}, beta: {linear: {start: 0, stop: 1, num: 9999999}}, "
             "delta: 1, d: 1",
@@ -149,7 +149,7 @@ PART = "stiffness: 1, mass: 1, rate: 1 kHz, "
         ),
     ],
 )
-def test_faults_have_their_place(load, tmp_path, axes, rest, place, words):
+def test_invalid_sweeps_raise_at_their_location(load, tmp_path, axes, rest, field, message):
     (tmp_path / "wrong.csv").write_text("mass\n1\n-1\n", encoding="utf-8")
     (tmp_path / "short.csv").write_text("mass,damping\n1\n", encoding="utf-8")
     (tmp_path / "typo.csv").write_text("mass,dampng\n1,2\n", encoding="utf-8")
@@ -158,14 +158,14 @@ def test_faults_have_their_place(load, tmp_path, axes, rest, place, words):
     with pytest.raises(ConfigFileError) as caught:
         load(sweep(axes, rest))
     fields = [fault.field.removeprefix("studies[0].") for fault in caught.value.faults]
-    assert place in fields, str(caught.value)
-    assert words in str(caught.value)
+    assert field in fields, str(caught.value)
+    assert message in str(caught.value)
     for fault in caught.value.faults:
         assert fault.line is not None
         assert fault.remedy, str(fault)
 
 
-def test_the_shipped_schema_is_what_zwidth_schema_prints():
+def test_shipped_schema_is_the_output_of_zwidth_schema():
     shipped = (ROOT / "src" / "zwidth" / "config" / "schema.json").read_text(encoding="utf-8")
     assert shipped == json.dumps(config_json_schema(), indent=2) + "\n", (
         "run: zwidth schema > src/zwidth/config/schema.json"
@@ -173,7 +173,7 @@ def test_the_shipped_schema_is_what_zwidth_schema_prints():
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem)
-def test_every_shipped_configuration_names_its_schema(path):
+def test_every_shipped_configuration_refers_to_the_schema(path):
     first = path.read_text(encoding="utf-8").splitlines()[0]
     marker = "# yaml-language-server: $schema="
     assert first.startswith(marker)
@@ -188,7 +188,7 @@ def test_every_shipped_configuration_names_its_schema(path):
         ("delta: [0.1, 0.2], stiffness: [1 kN/m, 2 kN/m]", "stiffness", "write 'alpha'"),
     ],
 )
-def test_mixed_axes_beside_a_scene_are_one_fault_at_their_key(load, axes, key, remedy):
+def test_mixed_axes_with_a_scene_are_one_error_at_their_key(load, axes, key, remedy):
     with pytest.raises(ConfigFileError) as refused:
         load(SCENE + sweep(axes))
     (line,) = str(refused.value).splitlines()

@@ -1,4 +1,4 @@
-"""Exceptions and status codes: their bases, and messages that name field, value, choice and remedy."""
+"""Test exceptions and status codes: base classes, and messages with field, value, allowed values and remedy."""
 
 import inspect
 
@@ -13,7 +13,7 @@ CLASSES = [value for _, value in inspect.getmembers(errors, inspect.isclass) if 
 
 
 @pytest.mark.parametrize("error", CLASSES)
-def test_every_error_is_a_zwidth_error(error):
+def test_every_error_is_a_documented_zwidth_error(error):
     assert issubclass(error, zwidth.ZwidthError)
     assert error.__doc__
 
@@ -27,11 +27,11 @@ def test_every_error_is_a_zwidth_error(error):
         (errors.TracedDelayError, TypeError),
     ],
 )
-def test_errors_are_also_the_usual_ones(error, base):
+def test_errors_have_standard_base_classes(error, base):
     assert issubclass(error, base)
 
 
-def test_a_choice_names_the_nearest():
+def test_describe_choice_suggests_the_nearest_value():
     assert describe_choice("hold", ("held", "fractional_power")) == (
         "got 'hold', allowed are 'held', 'fractional_power'; did you mean 'held'?"
     )
@@ -39,10 +39,10 @@ def test_a_choice_names_the_nearest():
     assert "did you mean" not in describe_choice(None, ("held",))
 
 
-def test_a_choice_is_checked():
+def test_check_choice_rejects_unknown_values():
     check_choice("side", "upper", ("lower", "upper"))
     with pytest.raises(errors.InputError, match=r"side: got 'uper', allowed are 'lower', 'upper'; did you mean"):
-        check_choice("side", "uper", ("lower", "upper"))
+        check_choice("side", "uper", ("lower", "upper"))  # codespell:ignore
 
 
 @pytest.mark.parametrize("status", Status)
@@ -51,8 +51,8 @@ def test_every_status_has_one_sentence(status):
     assert status.message[0].isupper()
 
 
-def test_codes_never_change():
-    # Stored datasets hold the numbers.
+def test_status_and_method_codes_are_stable():
+    # Stored datasets contain these numbers.
     statuses = "OK INVALID_INPUT NOT_CONVERGED NO_BOUNDARY UNDECIDED ON_BOUNDARY UNREACHABLE OUT_OF_RANGE"
     assert [(status.name, int(status)) for status in Status] == [(name, k) for k, name in enumerate(statuses.split())]
     methods = "COMPANION CROSSOVER CERTIFIED"

@@ -1,4 +1,8 @@
-"""Walls measured on devices with an actuator lag or a resonance: refused, or fitted with stable walls to set."""
+"""Test `zwidth.fit_buzz` on devices with an actuator lag or a resonance.
+
+The fit is rejected, or its recommended walls are stable. References: eigenvalues of the true devices, and scenes built
+from the same parameters.
+"""
 
 import numpy as np
 import pytest
@@ -32,31 +36,31 @@ def differ(function, theta):
 
 
 @pytest.mark.parametrize("lag, modes", KINDS)
-def test_the_critical_controller_is_that_of_the_sampled_device(lag, modes):
+def test_critical_controller_matches_the_sampled_device(lag, modes):
     device = describe_device(lag, modes)
-    at = circle_points(np.array([1e-3, 0.05, 0.3, 0.72, 1.9, 3.0]))
-    found, wanted = (
+    points = circle_points(np.array([1e-3, 0.05, 0.3, 0.72, 1.9, 3.0]))
+    controller, expected = (
         CriticalController(*device[1:]),
-        device.to_scene(PERIOD, VELOCITY).loop.roots.evaluate_controller(at),
+        device.to_scene(PERIOD, VELOCITY).loop.roots.evaluate_controller(points),
     )
-    np.testing.assert_allclose(found.evaluate(at), wanted.value, rtol=1e-12)
+    np.testing.assert_allclose(controller.evaluate(points), expected.value, rtol=1e-12)
     if not lag + modes:
-        np.testing.assert_allclose(found.evaluate_rigid(at).slope, wanted.slope, rtol=1e-12)
+        np.testing.assert_allclose(controller.evaluate_rigid(points).slope, expected.slope, rtol=1e-12)
 
 
 @pytest.mark.parametrize("lag, modes", KINDS)
-def test_the_parameters_of_a_device_are_those_of_its_scene(lag, modes):
+def test_parameters_of_dimensionless_device_match_its_scene(lag, modes):
     values = describe_device(lag, modes).to_parameters(PERIOD)
     scene = DimensionlessDevice.from_parameters(values, PERIOD, lag).to_scene(PERIOD, VELOCITY)
-    own = scene.parameters()
-    np.testing.assert_allclose([own[name] for name in name_parameters(scene)], values, rtol=1e-15)
+    by_name = scene.parameters()
+    np.testing.assert_allclose([by_name[name] for name in name_parameters(scene)], values, rtol=1e-15)
 
 
-def test_walls_and_parameters_have_the_derivatives_of_differences():
-    kappa, rub, w = np.array([[1e-3, 4e-3, 6e-3], [0.0, 0.01, 0.02], [0.1, 0.3, 0.4]])
-    onsets, theta = Onsets(kappa, rub, w, VELOCITY, PERIOD), np.array([np.log(0.1), 0.03, 1.3])
+def test_derivatives_of_walls_and_parameters_match_differences():
+    kappa, scaled_damping, w = np.array([[1e-3, 4e-3, 6e-3], [0.0, 0.01, 0.02], [0.1, 0.3, 0.4]])
+    onsets, theta = Onsets(kappa, scaled_damping, w, VELOCITY, PERIOD), np.array([np.log(0.1), 0.03, 1.3])
 
-    def follow(theta):
+    def predict_logarithms(theta):
         walls = onsets.predict_walls(theta)
         return np.log(np.stack([walls.kappa, walls.w], 1))
 
@@ -64,16 +68,16 @@ def test_walls_and_parameters_have_the_derivatives_of_differences():
         return onsets.normalize(theta).to_parameters(PERIOD)
 
     slopes = onsets.predict_walls(theta).differentiate()
-    np.testing.assert_allclose(slopes, differ(follow, theta), rtol=1e-6, atol=1e-8 * np.abs(slopes).max())
+    np.testing.assert_allclose(slopes, differ(predict_logarithms, theta), rtol=1e-6, atol=1e-8 * np.abs(slopes).max())
     np.testing.assert_allclose(differentiate(to_parameters, theta), differ(to_parameters, theta), rtol=1e-7, atol=1e-9)
 
 
-def begin_to_buzz(true, shares, noise=0.0, seed=0):
-    """Return walls at shares of the damping at K_max, by eigenvalues of the true device, with relative noise."""
+def find_onsets(true, shares, noise=0.0, seed=0):
+    """Return onsets of instability at shares of the damping at K_max, by eigenvalues, with relative noise."""
     A, B, C = true.sampled()
     size, rng, walls = B.size, np.random.default_rng(seed), []
 
-    def close(stiffness, damping):
+    def compute_dominant_pole(stiffness, damping):
         rate, closed = damping / true.period, np.zeros((size + 1, size + 1))
         closed[:size, :size] = A - np.outer(B, (stiffness + rate) * C)
         closed[:size, size], closed[size, :size] = rate * B, C
@@ -83,12 +87,12 @@ def begin_to_buzz(true, shares, noise=0.0, seed=0):
     scene = zwidth.Scene(zwidth.LinearDevice(true.matrices()), zwidth.Timing(true.period, true.delay))
     for damping in np.array(shares) * float(scene.max_stiffness().virtual_damping):
         low, high = 1.0, 1.02
-        while abs(close(high, damping)) < 1:
+        while abs(compute_dominant_pole(high, damping)) < 1:
             low, high = high, 1.04 * high
         while high - low > 1e-14 * high:
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if abs(close(middle, damping)) < 1 else (low, middle)
-        walls.append((low, damping, abs(np.angle(close(low, damping))) / (2 * np.pi * true.period)))
+            low, high = (middle, high) if abs(compute_dominant_pole(middle, damping)) < 1 else (low, middle)
+        walls.append((low, damping, abs(np.angle(compute_dominant_pole(low, damping))) / (2 * np.pi * true.period)))
     return np.array(walls) * (1 + noise * np.array([1, 0, 1]) * rng.standard_normal((len(walls), 3)))
 
 
@@ -99,11 +103,11 @@ def is_stable(true, stiffness, damping):
 
 @pytest.mark.parametrize("true", [MODE, BOTH], ids=["mode", "both"])
 @pytest.mark.parametrize("noise", [1e-3, 0.01])
-def test_walls_that_no_rigid_device_has_are_refused(true, noise):
-    fit = zwidth.fit_buzz(begin_to_buzz(true, SHARES, noise, seed=1), period=PERIOD, noise=noise)
+def test_onsets_that_no_rigid_device_has_are_rejected(true, noise):
+    fit = zwidth.fit_buzz(find_onsets(true, SHARES, noise, seed=1), period=PERIOD, noise=noise)
     assert fit.status == Status.NO_BOUNDARY
-    assert "no rigid device has these walls" in " ".join(fit.doubts)
-    assert all(len(doubt.split()) <= 25 for doubt in fit.doubts)
+    assert "no rigid device has these walls" in " ".join(fit.warnings)
+    assert all(len(warning.split()) <= 25 for warning in fit.warnings)
     assert np.isnan([fit.stiffness_max, fit.safe_wall().stiffness]).all()
     assert fit.recommended.status == Status.UNREACHABLE
     assert fit.next is None
@@ -111,12 +115,12 @@ def test_walls_that_no_rigid_device_has_are_refused(true, noise):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("true", [LAG, MODE, BOTH], ids=["lag", "mode", "both"])
-def test_walls_to_set_on_a_device_that_is_not_rigid_are_stable(true, seed):
-    walls = begin_to_buzz(true, SHARES, noise=0.02, seed=seed)
+def test_recommended_walls_of_non_rigid_devices_are_stable(true, seed):
+    walls = find_onsets(true, SHARES, noise=0.02, seed=seed)
     for noise in (0.02, None):
         fit = zwidth.fit_buzz(walls, period=PERIOD, noise=noise)
         assert not fit.is_structured
-        if fit.is_doubted:
+        if fit.is_unreliable:
             assert np.isnan(fit.safe_wall().stiffness)
             continue
         safe, wall = fit.safe_wall(), fit.recommended
@@ -127,22 +131,28 @@ def test_walls_to_set_on_a_device_that_is_not_rigid_are_stable(true, seed):
 
 
 @pytest.mark.parametrize("seed, noise", [(0, 0.02), (1, 0.02), (2, 0.02), (3, 0.02), (4, None)])
-def test_walls_of_a_rigid_mass_are_not_refused(seed, noise):
+def test_onsets_of_rigid_mass_are_accepted(seed, noise):
     rigid = TrueDevice("", 0.1, 2.0, 0.0, (), 0.7e-3, PERIOD, 1e-5, 3.0)
-    walls = begin_to_buzz(rigid, (0.0, 0.4, 0.8, 1.1), noise=0.02, seed=seed)
+    walls = find_onsets(rigid, (0.0, 0.4, 0.8, 1.1), noise=0.02, seed=seed)
     fit = zwidth.fit_buzz(walls, period=PERIOD, noise=noise)
-    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert (fit.status, fit.warnings) == (Status.OK, ())
 
 
-def test_the_interval_at_an_unmeasured_damping_includes_the_measured_stiffness():
-    """A resonance of 270 Hz lowers the boundary at dampings above the measured ones only."""
+def test_interval_at_unmeasured_damping_includes_measured_stiffness():
+    """A resonance at 270 Hz lowers the boundary only at dampings above the measured ones."""
     true = OtherDevice.of(OTHERS["compliance of 300 Hz, encoder at the motor"])
     walls = [(494.7, 0.0, 10.92), (4044.0, 8.053, 33.66), (6577.0, 16.11, 45.92), (8703.0, 24.16, 54.96)]
     fit = zwidth.fit_buzz(walls, period=PERIOD, noise=0.02)
     assert not fit.is_structured
-    assert fit.damping_tried == 24.16
+    assert fit.measured_damping == 24.16
     assert fit.virtual_damping > 24.16
-    bar, spread = fit.intervals["stiffness_max"], np.exp(fit.reach * fit.stiffness_error / fit.stiffness_max)
-    assert bar == (pytest.approx(8703 * (1 - 0.02 * fit.reach)), pytest.approx(fit.stiffness_max * spread))
-    assert bar.low < true.limit_of_walls() < bar.high
+    interval, spread = (
+        fit.intervals["stiffness_max"],
+        np.exp(fit.coverage_factor * fit.stiffness_error / fit.stiffness_max),
+    )
+    assert interval == (
+        pytest.approx(8703 * (1 - 0.02 * fit.coverage_factor)),
+        pytest.approx(fit.stiffness_max * spread),
+    )
+    assert interval.low < true.limit_of_walls() < interval.high
     assert fit.safe_wall().stiffness <= fit.bound_measured_stiffness(0.99)

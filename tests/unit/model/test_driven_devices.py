@@ -1,4 +1,7 @@
-"""Actuators and modes: what they refuse, and that every question about a scene knows them."""
+"""Test actuators and modes: validation, and their effect on the results of a scene.
+
+References: finite differences, certified pole counts, and limits of fast actuators and heavy modes.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ def scene():
 
 
 @pytest.mark.parametrize(
-    "make, words",
+    "make, message",
     [
         (lambda: zwidth.Actuator(), "actuator: got neither cutoff nor"),
         (lambda: zwidth.Actuator(100, 1e-3), "actuator: got cutoff and time_constant; pass either"),
@@ -41,13 +44,13 @@ def scene():
         (lambda: zwidth.Device(1, actuator=cast(Any, 3)), "actuator: got 3; it must be a zwidth.Actuator or None"),
     ],
 )
-def test_bad_numbers_are_named(make, words):
-    with pytest.raises(zwidth.InputError, match=words):
+def test_invalid_actuators_and_modes_are_rejected(make, message):
+    with pytest.raises(zwidth.InputError, match=message):
         make()
 
 
 @pytest.mark.parametrize("part", ["actuator", "modes"])
-def test_what_is_too_fast_for_the_period_is_refused(part):
+def test_parts_too_fast_for_the_period_are_rejected(part):
     parts = {"actuator": zwidth.Actuator(1e8), "modes": [zwidth.Mode(1e8, 0.1, 1)]}[part]
     scene = zwidth.Scene(zwidth.Device(0.1, 1.0), zwidth.Timing(1e-3)).replace(**{part: parts})
     with pytest.raises(zwidth.InputError, match=f"{part}.*oscillates 1e\\+05 times per period"):
@@ -55,48 +58,48 @@ def test_what_is_too_fast_for_the_period_is_refused(part):
 
 
 @pytest.mark.parametrize("path", ["actuator.cutoff", "modes.0.frequency", "modes.1.mass", "modes.0.damping_ratio"])
-def test_sensitivities_are_slopes_of_the_stiffest_wall(scene, path):
+def test_sensitivities_match_differences_of_max_stiffness(scene, path):
     value = scene.parameters()[path]
 
-    def stiffest(share: float) -> float:
-        return float(scene.replace(**{path: value * (1.0 + share)}).max_stiffness().stiffness)
+    def stiffest(change: float) -> float:
+        return float(scene.replace(**{path: value * (1.0 + change)}).max_stiffness().stiffness)
 
     h = 1e-4
-    around = (8.0 * (stiffest(h) - stiffest(-h)) - (stiffest(2 * h) - stiffest(-2 * h))) / (12.0 * h * value)
-    assert scene.sensitivities().per[path] == pytest.approx(around, rel=1e-6)
+    difference = (8.0 * (stiffest(h) - stiffest(-h)) - (stiffest(2 * h) - stiffest(-2 * h))) / (12.0 * h * value)
+    assert scene.sensitivities().per[path] == pytest.approx(difference, rel=1e-6)
 
 
-def test_traced_slopes_are_the_same(scene, x64):
+def test_traced_gradient_equals_sensitivity(scene, x64):
     slope = jax.grad(lambda value: scene.replace(**{"modes.1.mass": value}).max_stiffness().stiffness)(-3.0)
     assert float(slope) == pytest.approx(scene.sensitivities().per["modes.1.mass"], rel=1e-7)
 
 
-def test_certified_verdicts_are_those_of_balls(scene):
+def test_certified_verdicts_match_certified_pole_counts(scene):
     top = scene.max_stiffness()
     stiffness = np.array([0.5, 1.0 - 1e-10, 1.0 + 1e-10]) * top.stiffness
     expected = [proved_loop.count_outside(scene, each, float(top.virtual_damping)) == 0 for each in stiffness]
-    found = scene.is_stable(stiffness, top.virtual_damping, method="certified")
-    assert found.tolist() == expected == [True, True, False]
+    verdicts = scene.is_stable(stiffness, top.virtual_damping, method="certified")
+    assert verdicts.tolist() == expected == [True, True, False]
 
 
 @pytest.mark.parametrize("part", ["actuator", "modes"])
-def test_no_passivity_is_claimed(scene, part):
-    alone = zwidth.Scene(zwidth.Device(0.1, 2.0), scene.timing, zwidth.VirtualWall(1e3, 1.0))
-    alone = alone.replace(**{part: getattr(scene.device, part)})
+def test_passivity_is_undefined_with_actuator_or_modes(scene, part):
+    single = zwidth.Scene(zwidth.Device(0.1, 2.0), scene.timing, zwidth.VirtualWall(1e3, 1.0))
+    single = single.replace(**{part: getattr(scene.device, part)})
     with pytest.raises(zwidth.InputError, match=f"passivity with {'an ' if part == 'actuator' else ''}{part}"):
-        alone.passivity_margin()
-    assert zwidth.assess(alone).passive is None
+        single.passivity_margin()
+    assert zwidth.assess(single).passive is None
 
 
-def test_a_fast_actuator_and_a_heavy_mode_are_not_felt():
+def test_fast_actuator_and_heavy_mode_have_no_effect():
     plain = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1.5e-3))
     wall = plain.max_stiffness().stiffness
     for part in ({"actuator": zwidth.Actuator(1e6)}, {"modes": [zwidth.Mode(100.0, 0.5, 1e9)]}):
         assert plain.replace(**part).max_stiffness().stiffness == pytest.approx(wall, rel=1e-3)
 
 
-def test_a_lag_of_a_third_period_costs_what_a_delay_of_it_does():
+def test_actuator_lag_is_nearly_equivalent_to_a_delay():
     plain = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3))
     lag = plain.replace(actuator=zwidth.Actuator(time_constant=1e-4)).max_stiffness().stiffness
-    late = plain.replace(delay=1e-4).max_stiffness().stiffness
-    assert lag == pytest.approx(late, rel=0.02)
+    delayed = plain.replace(delay=1e-4).max_stiffness().stiffness
+    assert lag == pytest.approx(delayed, rel=0.02)

@@ -1,4 +1,7 @@
-"""Devices given as linear systems: every form, the same answers as parts of the same matrices, and random systems."""
+"""Test devices given as linear systems: input forms, equivalence with devices from parts, and random systems.
+
+References: rigid devices, state-space matrices of the parts, and certified pole counts.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ import scipy.signal
 import zwidth
 from zwidth.stability.linear.curve import evaluate_curve
 
-# A mass of 0.1 kg with 10 N s/m.
+# A mass of 0.1 kg with a physical damping of 10 N s/m.
 TIMING = zwidth.Timing(1e-3, 1.5e-3)
 COEFFICIENTS = [1.0], [0.1, 10.0, 0.0]
 MATRICES = [[0.0, 1.0], [0.0, -100.0]], [[0.0], [10.0]], [[1.0, 0.0]]
@@ -32,7 +35,7 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS.values(), ids=FORMS.keys())
-def test_every_form_of_a_rigid_mass_is_the_rigid_device(form):
+def test_every_form_of_a_rigid_mass_is_equivalent_to_the_device(form):
     scene = zwidth.Scene(zwidth.LinearDevice(form), TIMING, zwidth.VirtualWall(4e3, 10.0))
     rigid = zwidth.Scene(zwidth.Device(0.1, 10.0), TIMING, scene.wall)
     assert scene.units == pytest.approx(rigid.units, rel=1e-15)
@@ -42,41 +45,46 @@ def test_every_form_of_a_rigid_mass_is_the_rigid_device(form):
     assert scene.spectral_radius() == pytest.approx(rigid.spectral_radius(), rel=1e-12)
 
 
-def same_matrices(scene: zwidth.Scene) -> Any:
-    """The scene with its device, hand and all as one linear system."""
-    table, _, seen = any_loop.rate_table(scene)
-    own = np.array(table)[:-1]
-    return zwidth.Scene(zwidth.LinearDevice((own[:, :-1], own[:, -1], seen)), scene.timing, velocity=scene.velocity)
+def convert_to_linear(scene: zwidth.Scene) -> Any:
+    """Return the scene with its device, operator included, as one linear system."""
+    table, _, output = any_loop.rate_table(scene)
+    rates = np.array(table)[:-1]
+    return zwidth.Scene(
+        zwidth.LinearDevice((rates[:, :-1], rates[:, -1], output)), scene.timing, velocity=scene.velocity
+    )
 
 
 @pytest.mark.parametrize("kind", ["tip", "motor", "all", "driven"])
-def test_parts_and_their_matrices_give_the_same_answers(kind):
+def test_device_from_parts_equals_its_linear_system(kind):
     generator = np.random.default_rng(5)
     for _ in range(4):
         scene = any_loop.random_scene(kind, generator)
         if scene.device.coupling is not None:
-            # Without any damping, soft walls are stable or not by the last bit.
+            # Without any damping, the stability of soft walls depends on the last bit.
             scene = scene.replace(**{"coupling.damping": scene.device.coupling.damping + 1.0, "damping": 1.0})
-        system, units = same_matrices(scene), scene.units
+        system, units = convert_to_linear(scene), scene.units
         K = 10 ** generator.uniform(-4, 0.5, 12) * units.stiffness
         B = generator.uniform(-0.1, 0.3, 12) * units.virtual_damping
         assert np.all(scene.is_stable(K, B) == system.is_stable(K, B))
         np.testing.assert_allclose(scene.spectral_radius(K, B), system.spectral_radius(K, B), rtol=1e-12)
-        top, found = scene.max_stiffness(), system.max_stiffness()
-        assert top.status == found.status
-        if top.status == zwidth.Status.OK:
-            np.testing.assert_allclose(found[:3], top[:3], rtol=1e-12, atol=1e-12 * units.virtual_damping)
-            own, other = scene.sensitivities().per, system.sensitivities().per
-            assert other["delay"] == pytest.approx(own["delay"], rel=1e-6, nan_ok=True)
-        ends, others = scene.stable_stiffness(B[0]), system.stable_stiffness(B[0])
-        np.testing.assert_allclose(others, ends, rtol=1e-10, atol=1e-9 * units.stiffness)
+        expected, system_top = scene.max_stiffness(), system.max_stiffness()
+        assert expected.status == system_top.status
+        if expected.status == zwidth.Status.OK:
+            np.testing.assert_allclose(system_top[:3], expected[:3], rtol=1e-12, atol=1e-12 * units.virtual_damping)
+            per_parameter, per_system = scene.sensitivities().per, system.sensitivities().per
+            assert per_system["delay"] == pytest.approx(per_parameter["delay"], rel=1e-6, nan_ok=True)
+        ranges, system_ranges = scene.stable_stiffness(B[0]), system.stable_stiffness(B[0])
+        np.testing.assert_allclose(system_ranges, ranges, rtol=1e-10, atol=1e-9 * units.stiffness)
         response = system.state_space(0.1 * K[0], 0.1 * B[0]).step(40)
         if scene.device.actuator is None and not scene.device.modes:
             np.testing.assert_allclose(response, scene.state_space(0.1 * K[0], 0.1 * B[0]).step(40), rtol=1e-9)
 
 
 def random_system(generator: np.random.Generator, period: float) -> tuple[list[complex], list[complex], float]:
-    """Roots of 1 to 12 states: integrators, resonances of 0.1 to 20 % damping, lags, unstable poles, zeros anywhere."""
+    """Return zeros, poles and gain of a random system with 1 to 12 states.
+
+    The poles are integrators, modes with damping ratios of 0.1 to 20 %, lags, and unstable poles.
+    """
 
     def draw(count: int, unstable: float) -> list[complex]:
         roots: list[complex] = []
@@ -91,70 +99,71 @@ def random_system(generator: np.random.Generator, period: float) -> tuple[list[c
         return roots
 
     size = int(generator.integers(1, 13))
-    still = min(int(generator.integers(0, 3)), size)
-    poles = [0j] * still + draw(size - still, 0.07)
+    n_integrators = min(int(generator.integers(0, 3)), size)
+    poles = [0j] * n_integrators + draw(size - n_integrators, 0.07)
     zeros = draw(int(generator.integers(0, max(size - 1, 1))), 0.2)
-    at = 1j * 10 ** generator.uniform(-1.5, -0.5) / period
-    answer = np.prod([abs(at - zero) for zero in zeros]) / np.prod([abs(at - pole) for pole in poles])
-    return zeros, poles, float(10 ** generator.uniform(-5, -3) / answer)
+    point = 1j * 10 ** generator.uniform(-1.5, -0.5) / period
+    response = np.prod([abs(point - zero) for zero in zeros]) / np.prod([abs(point - pole) for pole in poles])
+    return zeros, poles, float(10 ** generator.uniform(-5, -3) / response)
 
 
 @pytest.mark.parametrize("path", ["delay", "period"])
-def test_without_inertia_slopes_at_a_whole_delay_are_those_of_a_little_more(path):
+def test_delay_and_period_sensitivity_at_integer_delay_without_inertia(path):
+    """The derivative is one-sided: that of a slightly larger delay or period."""
     scene = zwidth.Scene(zwidth.LinearDevice(([-2000.0], [-30.0, 0.0], 0.02)), zwidth.Timing(1e-3, 2e-3))
-    more = scene.replace(**{path: scene.parameters()[path] + 1e-9}).max_stiffness().stiffness
-    slope = (more - scene.max_stiffness().stiffness) / 1e-9
+    larger = scene.replace(**{path: scene.parameters()[path] + 1e-9}).max_stiffness().stiffness
+    slope = (larger - scene.max_stiffness().stiffness) / 1e-9
     assert scene.sensitivities().per[path] == pytest.approx(slope, rel=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_random_systems_are_judged_as_balls_do(seed):
-    generator, judged = np.random.default_rng(seed), 0
+def test_random_systems_match_certified_pole_counts(seed):
+    generator, n_decided = np.random.default_rng(seed), 0
     for _ in range(6):
         period = 10 ** generator.uniform(-4, -2.5)
-        periods = float(generator.choice(np.array([0.0, 1.0, generator.integers(0, 6), generator.uniform(0, 4)])))
+        d = float(generator.choice(np.array([0.0, 1.0, generator.integers(0, 6), generator.uniform(0, 4)])))
         device = zwidth.LinearDevice(random_system(generator, period))
-        scene = zwidth.Scene(device, zwidth.Timing(period, periods * period))
+        scene = zwidth.Scene(device, zwidth.Timing(period, d * period))
         units, curve = scene.units, evaluate_curve(scene.loop.roots, generator.choice(scene.loop.boundary.w, 6))
         side = 1.0 + 10 ** generator.uniform(-6, -2, 6) * generator.choice([-1.0, 1.0], 6)
         K = np.append(10 ** generator.uniform(-4, 1, 4), curve.alpha * side) * units.stiffness
         B = np.append(generator.uniform(-0.1, 0.15, 4), curve.beta * side) * units.virtual_damping
-        fine = (np.abs(K) < 1e8 * units.stiffness) & (np.abs(K) > 1e-9 * units.stiffness)
-        K, B = K[fine], B[fine]
+        in_range = (np.abs(K) < 1e8 * units.stiffness) & (np.abs(K) > 1e-9 * units.stiffness)
+        K, B = K[in_range], B[in_range]
         labels = np.atleast_1d(scene.is_stable(K, B))
-        for place, (stiffness, damping) in enumerate(zip(K, B, strict=True)):
+        for index, (stiffness, damping) in enumerate(zip(K, B, strict=True)):
             outside = proved_loop.count_outside(scene, stiffness, damping, 250)
-            assert outside is None or (outside == 0) == labels[place], (device, periods, stiffness, damping)
-            judged += outside is not None
+            assert outside is None or (outside == 0) == labels[index], (device, d, stiffness, damping)
+            n_decided += outside is not None
         certified = scene.decide_stability(K[:2], B[:2], method="certified")
-        known = certified.status == zwidth.Status.OK
-        assert np.all(certified.stable[known] == labels[:2][known])
-    assert judged > 30
+        is_decided = certified.status == zwidth.Status.OK
+        assert np.all(certified.stable[is_decided] == labels[:2][is_decided])
+    assert n_decided > 30
 
 
-def test_a_sampled_system_is_the_held_one():
+def test_sampled_system_is_equivalent_to_its_continuous_system():
     device = zwidth.Device(0.1, 5.0, zwidth.Coupling(0.05, 20e3, 2.0, "tip"))
     scene = zwidth.Scene(device, zwidth.Timing(1e-3, 1e-3), velocity=zwidth.LowPass(cutoff=80.0))
-    matrices = same_matrices(scene).device.system
-    numbers = ([float(c) for c in part] for part in matrices[:2])
-    held = control.c2d(control.ss(control.tf(*numbers)), 1e-3, "zoh")
-    later = zwidth.Scene(zwidth.LinearDevice(held), zwidth.Timing(1e-3, 1e-3), velocity=scene.velocity)
-    own, found = scene.max_stiffness(), later.max_stiffness()
-    # Rounding of the sampled coefficients moves slow poles.
-    assert found.stiffness == pytest.approx(own.stiffness, rel=1e-6)
-    assert later.is_stable(0.9 * own.stiffness, own.virtual_damping, method="certified")
-    assert later.margins(0.5 * own.stiffness, own.virtual_damping).gain_margin == pytest.approx(
-        scene.margins(0.5 * own.stiffness, own.virtual_damping).gain_margin, rel=1e-5
+    matrices = convert_to_linear(scene).device.system
+    coefficients = ([float(c) for c in part] for part in matrices[:2])
+    sampled = control.c2d(control.ss(control.tf(*coefficients)), 1e-3, "zoh")
+    sampled_scene = zwidth.Scene(zwidth.LinearDevice(sampled), zwidth.Timing(1e-3, 1e-3), velocity=scene.velocity)
+    expected, sampled_top = scene.max_stiffness(), sampled_scene.max_stiffness()
+    # Rounding errors of the sampled coefficients shift slow poles.
+    assert sampled_top.stiffness == pytest.approx(expected.stiffness, rel=1e-6)
+    assert sampled_scene.is_stable(0.9 * expected.stiffness, expected.virtual_damping, method="certified")
+    assert sampled_scene.margins(0.5 * expected.stiffness, expected.virtual_damping).gain_margin == pytest.approx(
+        scene.margins(0.5 * expected.stiffness, expected.virtual_damping).gain_margin, rel=1e-5
     )
-    assert np.isnan(later.sensitivities().per["period"])
+    assert np.isnan(sampled_scene.sensitivities().per["period"])
 
 
 @pytest.mark.parametrize("mass, damping", [(0.1, 2.0), (0.5, 10.0), (1.0, 2.0)])
-def test_the_rounding_of_a_sampled_system_takes_no_soft_wall_away(mass, damping):
-    # What SciPy makes of a mass and a damper has its pole at z = 1 beyond it, by 1e-14: alone it is unstable.
-    top, bottom, _ = scipy.signal.cont2discrete(([1.0], [mass, damping, 0.0]), 1e-3)
-    assert sum(bottom) < 0
-    sampled = zwidth.LinearDevice(SIGNAL.dlti(np.trim_zeros(np.ravel(top), "f"), bottom, dt=1e-3))
+def test_rounding_of_sampled_system_keeps_soft_walls_stable(mass, damping):
+    # SciPy's discretization of a mass with a damper has its pole at 1 + 1e-14: without a wall the system is unstable.
+    numerator, denominator, _ = scipy.signal.cont2discrete(([1.0], [mass, damping, 0.0]), 1e-3)
+    assert sum(denominator) < 0
+    sampled = zwidth.LinearDevice(SIGNAL.dlti(np.trim_zeros(np.ravel(numerator), "f"), denominator, dt=1e-3))
     scene = zwidth.Scene(sampled, zwidth.Timing(1e-3))
     exact = zwidth.Scene(zwidth.Device(mass, damping), zwidth.Timing(1e-3)).max_stiffness()
     assert scene.max_stiffness().stiffness == pytest.approx(exact.stiffness, rel=1e-6)
@@ -164,60 +173,60 @@ def test_the_rounding_of_a_sampled_system_takes_no_soft_wall_away(mass, damping)
 
 
 @pytest.mark.parametrize(
-    "change, words",
+    "change, message",
     [
         ({"period": 2e-3}, "got a system sampled at 0.001 s in a loop of 0.002 s"),
         ({"delay": 0.5e-3}, "got 0.5 periods; a sampled device"),
         ({"operator": zwidth.Operator(0.1)}, "operator: allowed only with a zwidth.Device"),
     ],
 )
-def test_a_sampled_system_belongs_to_its_period(change, words):
+def test_sampled_system_requires_its_period_and_integer_delay(change, message):
     device = zwidth.LinearDevice(SIGNAL.TransferFunction([1e-5], [1.0, -1.9, 0.9], dt=1e-3))
     scene = zwidth.Scene(device, zwidth.Timing(1e-3))
     assert scene.max_stiffness().stiffness > 0
-    with pytest.raises(zwidth.InputError, match=words):
+    with pytest.raises(zwidth.InputError, match=message):
         scene.replace(**change).is_stable(1.0)
 
 
 @pytest.mark.parametrize("zeros", [[0.0, 0.0], [1.0, 1.0], [-1.0, 0.2 + 0.6j, 0.2 - 0.6j, 1.0]], ids=str)
 @pytest.mark.parametrize("gain", [1e-4, -1e-4])
-def test_a_sampled_system_with_zeros_at_rest_and_on_the_circle(zeros, gain):
-    # Its closed loop as a polynomial: spring alone, and with the difference of two samples.
+def test_sampled_system_with_zeros_at_0_and_on_the_unit_circle(zeros, gain):
+    # Reference: roots of the closed loop as a polynomial, for the spring and for the backward difference.
     poles = [0.9, 0.7, 0.5 + 0.2j, 0.5 - 0.2j, -0.3]
-    for whole in (0, 1):
+    for n_delay in (0, 1):
         scene = zwidth.Scene(
-            zwidth.LinearDevice(SIGNAL.dlti(zeros, poles, gain, dt=1e-3)), zwidth.Timing(1e-3, whole * 1e-3)
+            zwidth.LinearDevice(SIGNAL.dlti(zeros, poles, gain, dt=1e-3)), zwidth.Timing(1e-3, n_delay * 1e-3)
         )
-        loop, top = np.poly(poles + [0.0] * (whole + 1)), gain * np.poly(zeros)
+        loop, numerator = np.poly(poles + [0.0] * (n_delay + 1)), gain * np.poly(zeros)
 
-        def radius(K: float, B: float, loop: Any = loop, top: Any = top) -> float:
-            return np.abs(np.roots(np.polyadd(loop, np.convolve(top, [K + B / 1e-3, -B / 1e-3])))).max()
+        def compute_radius(K: float, B: float, loop: Any = loop, numerator: Any = numerator) -> float:
+            return np.abs(np.roots(np.polyadd(loop, np.convolve(numerator, [K + B / 1e-3, -B / 1e-3])))).max()
 
         for B in (0.0, 0.3, -0.3):
             K = np.linspace(-2e4, 2e4, 81) + 17.0
-            radii = np.array([radius(stiffness, B) for stiffness in K])
+            radii = np.array([compute_radius(stiffness, B) for stiffness in K])
             np.testing.assert_array_equal(scene.is_stable(K, B), radii < 1.0)
             np.testing.assert_allclose(scene.spectral_radius(K, B), radii, rtol=1e-9)
             for end in scene.stable_stiffness(B)[0]:
-                assert radius(end, B) == pytest.approx(1.0, abs=1e-9)
+                assert compute_radius(end, B) == pytest.approx(1.0, abs=1e-9)
         wall = scene.max_stiffness(negative_damping=False)
-        # Of two poles that meet there roots know half the digits.
-        assert (wall.status, radius(*wall[:2])) == (zwidth.Status.OK, pytest.approx(1.0, abs=1e-7))
+        # At a double pole the roots have only half the digits.
+        assert (wall.status, compute_radius(*wall[:2])) == (zwidth.Status.OK, pytest.approx(1.0, abs=1e-7))
 
 
-def test_a_factor_of_numerator_and_denominator_is_not_there():
-    # As sums of two responses have it: each has an integrator.
+def test_common_factors_of_numerator_and_denominator_cancel():
+    # As in a sum of two responses, where each has an integrator.
     both: Any = control.tf([1.0], [0.1, 10.0, 0.0]) + control.tf([1.0], [1.0, 200.0, 0.0])
     assert zwidth.LinearDevice(both) == zwidth.LinearDevice(([1.1, 210.0], [0.1, 30.0, 2000.0, 0.0]))
     assert zwidth.LinearDevice(SIGNAL.dlti([1.0], [1.0, 1.0, 0.5], 1e-5, dt=1e-3)).zeros.size == 0
-    # Matrices say that there is such a motion.
+    # State-space matrices define the uncontrollable mode explicitly.
     hidden = [[0.0, 1.0, 0.0], [0.0, -100.0, 0.0], [0.0, 0.0, 0.5]], [0.0, 10.0, 0.0], [1.0, 0.0, 0.0]
     with pytest.raises(zwidth.InputError, match=r"the mode s = 0.5 does not decay"):
         zwidth.LinearDevice(hidden)
 
 
 @pytest.mark.parametrize(
-    "system, words",
+    "system, message",
     [
         (3, "got '3'; it must be finite numbers as"),
         ({}, "got '{}'; it must be finite numbers as"),
@@ -231,14 +240,14 @@ def test_a_factor_of_numerator_and_denominator_is_not_there():
         (control.ss(np.eye(2), np.eye(2), np.eye(2), np.zeros((2, 2))), "finite numbers"),
     ],
 )
-def test_what_is_no_such_system_is_refused(system, words):
-    with pytest.raises(zwidth.InputError, match=words):
+def test_invalid_systems_are_rejected(system, message):
+    with pytest.raises(zwidth.InputError, match=message):
         zwidth.LinearDevice(system)
 
 
-def test_what_needs_bodies_is_refused():
+def test_functions_that_need_a_mass_are_rejected():
     scene = zwidth.Scene(zwidth.LinearDevice(COEFFICIENTS), TIMING)
-    with pytest.raises(zwidth.InputError, match=r"use push or push_history, or a zwidth\.Device"):
+    with pytest.raises(zwidth.InputError, match=r"use external_force or external_force_history, or a zwidth\.Device"):
         scene.simulate(1e3, 1.0, start_velocity=0.1)
     with pytest.raises(zwidth.InputError, match="passivity with a linear device"):
         scene.passivity_margin(1e3, 1.0)
@@ -248,14 +257,14 @@ def test_what_needs_bodies_is_refused():
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.4e-3, 2e-3])
-def test_a_zero_at_rest_is_a_sampled_zero_at_one(delay):
-    """A velocity sensor with a centering spring: s/(s^2 + 2 s + 1), against eigenvalues of the sampled system."""
+def test_zero_at_s_0_is_a_sampled_zero_at_z_1(delay):
+    """A velocity sensor with a centering spring, s/(s^2 + 2 s + 1), against eigenvalues of the sampled system."""
     timing = zwidth.Timing(1e-3, delay)
     scene = zwidth.Scene(zwidth.LinearDevice("1 0 / 1 2 1"), timing, velocity=zwidth.LowPass(cutoff=100))
     assert np.sum(scene.loop.roots.zeros == 0) == 1
     top = scene.max_stiffness()
     assert top.status == zwidth.Status.OK
     damping = float(top.virtual_damping)
-    for share, stable in ((1 - 1e-6, True), (1 + 1e-6, False)):
-        matrix = scene.state_space(share * top.stiffness, damping).A
+    for factor, stable in ((1 - 1e-6, True), (1 + 1e-6, False)):
+        matrix = scene.state_space(factor * top.stiffness, damping).A
         assert (np.abs(np.linalg.eigvals(matrix)).max() < 1.0) == stable

@@ -1,4 +1,4 @@
-"""Measured devices: what a response must be, and tables of it in the units that people have."""
+"""Test measured devices: validation of the frequency response, and files in the units and formats of analyzers."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ def device(frequency: Any = F, response: Any = G, deviation: Any = None) -> zwid
 
 
 REFUSED = {
-    "lines that fall": (lambda: device(F[::-1]), "frequency", "sort"),
-    "double lines": (lambda: device(np.repeat(F[:20], 2)), "frequency", "remove duplicates"),
-    "a line at rest": (lambda: device(F - F[0]), "frequency", "> 0"),
-    "few lines": (lambda: device(F[:5], G[:5]), "frequency", "at least 8"),
-    "other count": (lambda: device(F[1:]), "response", "one value per frequency"),
+    "decreasing frequencies": (lambda: device(F[::-1]), "frequency", "sort"),
+    "repeated frequencies": (lambda: device(np.repeat(F[:20], 2)), "frequency", "remove duplicates"),
+    "zero frequency": (lambda: device(F - F[0]), "frequency", "> 0"),
+    "few frequencies": (lambda: device(F[:5], G[:5]), "frequency", "at least 8"),
+    "unequal lengths": (lambda: device(F[1:]), "response", "one value per frequency"),
     "NaN": (lambda: device(response=np.where(F > 300, np.nan, G)), "response", "not finite"),
-    "no numbers": (lambda: device(response=["fast"] * 40), "response", "list of complex"),
+    "text": (lambda: device(response=["fast"] * 40), "response", "list of complex"),
     "complex frequency": (lambda: device(F + 0j), "frequency", "list of float"),
-    "a matrix": (lambda: device(response=G[:, None]), "response", "list of numbers"),
-    "negative radius": (lambda: device(deviation=-1e-9), "deviation", ">= 0"),
-    "dead": (lambda: device(response=0 * G), "response", "column of the position"),
+    "matrix": (lambda: device(response=G[:, None]), "response", "list of numbers"),
+    "negative deviation": (lambda: device(deviation=-1e-9), "deviation", ">= 0"),
+    "zero response": (lambda: device(response=0 * G), "response", "column of the position"),
 }
 
 
 @pytest.mark.parametrize("make, field, remedy", REFUSED.values(), ids=REFUSED)
-def test_what_is_no_response_is_refused(make, field, remedy):
+def test_invalid_responses_are_rejected(make, field, remedy):
     with pytest.raises(InputError, match=rf"^{field}: .*{remedy}"):
         make()
 
 
-def test_a_device_is_a_value():
+def test_measured_device_is_an_immutable_value():
     assert device(deviation=1e-9) == device(deviation=np.full(40, 1e-9))
     assert device() != device(deviation=1e-9)
     assert hash(device()) == hash(device())
@@ -51,7 +51,7 @@ def test_a_device_is_a_value():
         device().response[0] = 1.0
 
 
-def test_a_table_returns_with_every_digit(tmp_path):
+def test_saved_table_is_read_back_exactly(tmp_path):
     first = device(deviation=np.abs(G) * 0.01)
     first.save(tmp_path / "response.csv", "measured on Monday")
     assert zwidth.MeasuredDevice.read(tmp_path / "response.csv") == first
@@ -77,12 +77,12 @@ TABLES = {
 def test_units_of_analyzers_are_read(tmp_path, head, columns):
     (tmp_path / "table.csv").write_text(f"{head}\n{rows(*columns)}\n")
     read = zwidth.MeasuredDevice.read(tmp_path / "table.csv")
-    # As many digits as decibels and angles keep.
+    # Conversion from decibels and angles has rounding errors.
     np.testing.assert_allclose(read.frequency, F, rtol=1e-14)
     np.testing.assert_allclose(read.response, G, rtol=1e-12)
 
 
-def test_complex_numbers_are_read_as_other_programs_spell_them(tmp_path):
+def test_complex_numbers_with_i_are_read(tmp_path):
     lines = [f"{f!r};{g.real!r}{g.imag:+.17g}i" for f, g in zip(F.tolist(), G.tolist(), strict=True)]
     (tmp_path / "table.csv").write_text("\n".join(["frequency [Hz];response [m/N]", *lines]))
     np.testing.assert_allclose(zwidth.MeasuredDevice.read(tmp_path / "table.csv").response, G, rtol=1e-15)
@@ -92,14 +92,14 @@ PREAMBLE = "Analyzer 7, averages: 20\nwindow: none\n\n"
 BLANKS = "\n".join(f"{f!r}  {g.real!r} {g.imag!r}" for f, g in zip(F.tolist(), G.tolist(), strict=True))
 FILES = {
     "blanks": "f_Hz  real_m/N  imag_m/N\n" + BLANKS,
-    "a preamble": PREAMBLE + "freq [Hz],re [m/N],im [m/N]\n" + rows(F, G.real, G.imag),
-    "a row of units": "freq,real,imag\nHz,m/N,m/N\n" + rows(F, G.real, G.imag),
-    "a remark of numpy.savetxt": "# f/Hz real imag\n" + BLANKS,
+    "preamble": PREAMBLE + "freq [Hz],re [m/N],im [m/N]\n" + rows(F, G.real, G.imag),
+    "line of units": "freq,real,imag\nHz,m/N,m/N\n" + rows(F, G.real, G.imag),
+    "header in comment": "# f/Hz real imag\n" + BLANKS,
 }
 
 
 @pytest.mark.parametrize("text", FILES.values(), ids=FILES)
-def test_texts_of_programs_are_read(tmp_path, text):
+def test_text_formats_are_read(tmp_path, text):
     (tmp_path / "table.csv").write_text(text)
     read = zwidth.MeasuredDevice.read(tmp_path / "table.csv")
     np.testing.assert_array_equal(read.frequency, F)
@@ -111,29 +111,29 @@ def test_arrays_of_numpy_and_matlab_are_read(tmp_path):
     scipy.io.savemat(tmp_path / "table.mat", {"omega_rad/s": 1.0, "f_Hz": F, "H": G, "deviation": np.abs(G)})
     for name in ("table.npz", "table.mat"):
         assert zwidth.MeasuredDevice.read(tmp_path / name) == device(deviation=np.abs(G))
-    # A log has no complex column.
+    # In a log, complex numbers are rejected.
     np.savez(tmp_path / "log.npz", t=F, x=G, F=F)
     with pytest.raises(InputError, match="got complex numbers in 'x'"):
         read_log(tmp_path / "log.npz", {"time": "t:s", "position": "x:m", "force": "F:N"})
 
 
 BAD_TABLES = {
-    "no unit of the phase": ("frequency [Hz],magnitude [m/N],phase", "no unit for column phase"),
-    "no unit of the frequency": ("frequency,magnitude [m/N],phase [deg]", "no unit for column frequency"),
-    "a speed": ("frequency [Hz],magnitude [m/s],phase [deg]", "got m/s for column magnitude"),
+    "no phase unit": ("frequency [Hz],magnitude [m/N],phase", "no unit for column phase"),
+    "no frequency unit": ("frequency,magnitude [m/N],phase [deg]", "no unit for column frequency"),
+    "velocity": ("frequency [Hz],magnitude [m/s],phase [deg]", "got m/s for column magnitude"),
     "no phase": ("frequency [Hz],magnitude [m/N],force [N]", "required are"),
     "two phases": ("frequency [Hz],phase [deg],arg [deg]", "rename one"),
 }
 
 
-@pytest.mark.parametrize("head, said", BAD_TABLES.values(), ids=BAD_TABLES)
-def test_what_a_table_does_not_say_is_not_guessed(tmp_path, head, said):
+@pytest.mark.parametrize("head, message", BAD_TABLES.values(), ids=BAD_TABLES)
+def test_incomplete_tables_are_rejected(tmp_path, head, message):
     (tmp_path / "table.csv").write_text(f"{head}\n{rows(F, np.abs(G), np.angle(G))}\n")
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         zwidth.MeasuredDevice.read(tmp_path / "table.csv")
 
 
-def test_a_cell_that_is_no_number_is_named_by_its_line(tmp_path):
+def test_cell_that_is_not_a_number_is_reported_by_its_line(tmp_path):
     (tmp_path / "table.csv").write_text("frequency [Hz],real [m/N],imag [m/N]\n1,2,3\n2,overload,3\n")
     with pytest.raises(InputError, match=r"table.csv:3: got 'overload' under 'real \[m/N\]'"):
         zwidth.MeasuredDevice.read(tmp_path / "table.csv")

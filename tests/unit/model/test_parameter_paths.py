@@ -1,4 +1,4 @@
-"""Parameters by dotted path: every number of every part is listed, and each can be replaced."""
+"""Test `Scene.parameters` and `Scene.replace`: every parameter is listed by its dotted path and can be replaced."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ SCENE = zwidth.Scene(
     zwidth.LowPass(cutoff=100, order=2),
     zwidth.Operator(0.5, 6.0, 135.0, 800.0, 4.0),
 )
-LISTED = {
+PARAMETERS = {
     "mass": 0.1,
     "damping": 10.0,
     "period": 1e-3,
@@ -34,28 +34,28 @@ LISTED = {
 }
 
 
-def test_every_number_is_listed():
-    assert SCENE.parameters() == LISTED
+def test_parameters_lists_every_parameter():
+    assert SCENE.parameters() == PARAMETERS
     bare = zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(1e-3))
     assert list(bare.parameters()) == ["mass", "damping", "period", "delay", "stiffness", "virtual_damping"]
 
 
-@pytest.mark.parametrize("path", LISTED)
-def test_each_is_replaced_alone(path):
-    value = 1 if path == "velocity.order" else 0.7 * LISTED[path]
-    assert SCENE.replace(**{path: value}).parameters() == LISTED | {path: value}
+@pytest.mark.parametrize("path", PARAMETERS)
+def test_replace_changes_only_the_given_parameter(path):
+    value = 1 if path == "velocity.order" else 0.7 * PARAMETERS[path]
+    assert SCENE.replace(**{path: value}).parameters() == PARAMETERS | {path: value}
 
 
-def test_several_at_once_and_what_is_no_number():
+def test_replace_of_several_parameters_and_of_sensor_and_rate():
     changed = SCENE.replace(**{"mass": 0.2, "coupling.sensor": "motor", "coupling.mass": 0.01, "period": 2e-3})
-    assert changed.parameters() == LISTED | {"mass": 0.2, "coupling.mass": 0.01, "period": 2e-3}
+    assert changed.parameters() == PARAMETERS | {"mass": 0.2, "coupling.mass": 0.01, "period": 2e-3}
     assert changed.device.coupling is not None
     assert changed.device.coupling.sensor == "motor"
     assert SCENE.replace(rate=4000).timing.period == 0.25e-3
     assert SCENE.replace() == SCENE
 
 
-def test_whole_parts():
+def test_replace_of_parts():
     free = SCENE.replace(operator=None, coupling=None, velocity=zwidth.WindowedDifference(3), **{"velocity.samples": 5})
     assert free == zwidth.Scene(zwidth.Device(0.1, 10), SCENE.timing, SCENE.wall, zwidth.WindowedDifference(5), None)
 
@@ -72,20 +72,20 @@ def test_whole_parts():
         ({"operator": 3}, "operator: got 3; pass an object such as"),
     ],
 )
-def test_what_is_refused(changes, message):
+def test_replace_rejects_invalid_paths_and_values(changes, message):
     with pytest.raises(InputError, match=message):
         SCENE.replace(**changes)
 
 
 @pytest.mark.parametrize("name", ["actuator", "coupling", "modes"])
-def test_a_device_given_as_a_whole_has_no_parts_of_its_own(name):
-    whole = zwidth.Scene(zwidth.LinearDevice(([1], [0.1, 10, 0])), zwidth.Timing(1e-3))
+def test_linear_device_has_no_replaceable_parts(name):
+    scene = zwidth.Scene(zwidth.LinearDevice(([1], [0.1, 10, 0])), zwidth.Timing(1e-3))
     with pytest.raises(InputError, match=f"parameter: got '{name}', allowed are 'system', .*'operator', 'safe_limit'$"):
-        whole.replace(**{name: None})
+        scene.replace(**{name: None})
 
 
-def test_the_fields_of_parts_are_told_apart():
-    """Bare names would otherwise lie."""
+def test_field_names_of_parts_are_unique():
+    """Paths without a prefix would be ambiguous otherwise."""
     names = [
         item.name for part in (zwidth.Device, zwidth.Timing, zwidth.VirtualWall) for item in dataclasses.fields(part)
     ]

@@ -1,4 +1,4 @@
-"""The safe limit of a scene: the walls within it, and the ways in which it is given and kept."""
+"""Test the safe limit of a scene: the walls it allows, its input forms, and its effect on recommendations."""
 
 import re
 
@@ -14,7 +14,7 @@ SCENE = zwidth.Scene(DEVICE, TIMING, safe_limit=LIMIT)
 
 
 @pytest.mark.parametrize(
-    "wall, within",
+    "wall, allowed",
     [
         ((484, 1.13), True),
         ((100, 1.13), True),
@@ -26,24 +26,24 @@ SCENE = zwidth.Scene(DEVICE, TIMING, safe_limit=LIMIT)
         ((-1, 0.5), False),
     ],
 )
-def test_walls_within_the_limit_are_softer_or_scaled_down(wall, within):
-    assert LIMIT.allows(*wall) == within
+def test_limit_allows_softer_and_scaled_walls(wall, allowed):
+    assert LIMIT.allows(*wall) == allowed
 
 
-def test_a_limit_of_no_stiffness_allows_no_wall():
-    none = zwidth.SafeLimit(0, warnings=["turn the sign of the force"])
-    assert none.forbids_all
-    assert not none.allows(0, 0)
-    found = SCENE.replace(safe_limit=none).recommend()
-    assert found.status == zwidth.Status.UNREACHABLE
-    assert "turn the sign of the force" in found.reason
+def test_limit_with_zero_stiffness_allows_no_wall():
+    no_wall = zwidth.SafeLimit(0, warnings=["turn the sign of the force"])
+    assert no_wall.forbids_all
+    assert not no_wall.allows(0, 0)
+    recommendation = SCENE.replace(safe_limit=no_wall).recommend()
+    assert recommendation.status == zwidth.Status.UNREACHABLE
+    assert "turn the sign of the force" in recommendation.reason
     with pytest.raises(zwidth.InputError, match="turn the sign of the force"):
-        found.code("c")
-    assert SCENE.replace(safe_limit=none).recommend(beyond_safe=True).stiffness > 1e3
+        recommendation.code("c")
+    assert SCENE.replace(safe_limit=no_wall).recommend(beyond_safe=True).stiffness > 1e3
 
 
 @pytest.mark.parametrize(
-    "given, words",
+    "arguments, message",
     [
         ({"stiffness": -1}, "it must be >= 0"),
         ({"stiffness": 1, "warnings": 3}, "it must be a list of strings"),
@@ -51,12 +51,12 @@ def test_a_limit_of_no_stiffness_allows_no_wall():
         ({"stiffness": "1 kg"}, "got '1 kg'"),
     ],
 )
-def test_a_wrong_limit_is_refused(given, words):
-    with pytest.raises(zwidth.InputError, match=re.escape(words)):
-        zwidth.SafeLimit(**given)
+def test_invalid_limits_are_rejected(arguments, message):
+    with pytest.raises(zwidth.InputError, match=re.escape(message)):
+        zwidth.SafeLimit(**arguments)
 
 
-def test_a_limit_in_rotary_units_belongs_to_a_rotary_device():
+def test_rotary_limit_requires_a_rotary_device():
     with pytest.raises(zwidth.InputError, match="safe_limit"):
         SCENE.replace(safe_limit=zwidth.SafeLimit("484 N m/rad"))
     rotary = zwidth.Scene(zwidth.Device("60 g cm^2", "0.02 mN m s/rad"), TIMING)
@@ -66,7 +66,7 @@ def test_a_limit_in_rotary_units_belongs_to_a_rotary_device():
 
 
 @pytest.mark.parametrize("change", [{"mass": 0.1}, {"rate": 2e3}, {"velocity": zwidth.LowPass(cutoff=100)}])
-def test_a_changed_loop_keeps_the_limit_and_warns(change):
+def test_changed_loop_keeps_the_limit_and_adds_a_warning(change):
     limit = SCENE.replace(**change).replace(**change).safe_limit
     assert limit is not None
     assert limit.allows(484, 1.13)
@@ -76,7 +76,7 @@ def test_a_changed_loop_keeps_the_limit_and_warns(change):
 
 
 @pytest.mark.parametrize(
-    "wanted",
+    "requirements",
     [
         {},
         {"phase_margin": 30},
@@ -86,37 +86,41 @@ def test_a_changed_loop_keeps_the_limit_and_warns(change):
         {"passive": True},
     ],
 )
-def test_recommendations_stay_within_the_limit(wanted):
-    found = SCENE.recommend(**wanted)
-    assert found.status == zwidth.Status.OK
-    assert LIMIT.allows(found.stiffness, found.virtual_damping)
-    assert found.stiffness <= wanted.get("stiffness_fraction", 0.75) * 484
-    assert any("a resonance may hide in the log" in note for note in found.notes)
-    # Without the limit each of these walls is stiffer.
-    free = SCENE.recommend(**wanted, beyond_safe=True)
-    assert free.stiffness > 2 * found.stiffness or wanted == {"passive": True}
-    assert free.stiffness == pytest.approx(SCENE.replace(safe_limit=None).recommend(**wanted).stiffness, rel=1e-12)
-    assert found.steps == []
-    assert "limited by" in found.lines()[0]
-    assert "safe limit" in found.lines()[0]
+def test_recommendations_stay_within_the_limit(requirements):
+    recommendation = SCENE.recommend(**requirements)
+    assert recommendation.status == zwidth.Status.OK
+    assert LIMIT.allows(recommendation.stiffness, recommendation.virtual_damping)
+    assert recommendation.stiffness <= requirements.get("stiffness_fraction", 0.75) * 484
+    assert any("a resonance may hide in the log" in note for note in recommendation.notes)
+    # Without the limit each of these walls is stiffer, except the passive one.
+    unlimited = SCENE.recommend(**requirements, beyond_safe=True)
+    assert unlimited.stiffness > 2 * recommendation.stiffness or requirements == {"passive": True}
+    assert unlimited.stiffness == pytest.approx(
+        SCENE.replace(safe_limit=None).recommend(**requirements).stiffness, rel=1e-12
+    )
+    assert recommendation.improvements == []
+    assert "limited by" in recommendation.lines()[0]
+    assert "safe limit" in recommendation.lines()[0]
 
 
-def test_a_limit_that_does_not_bind_changes_no_wall():
-    free = SCENE.replace(safe_limit=None).recommend()
-    found = SCENE.replace(safe_limit=zwidth.SafeLimit(16e3, 39.0)).recommend()
-    assert (found.stiffness, found.virtual_damping) == pytest.approx((free.stiffness, free.virtual_damping), rel=1e-3)
-    assert found.limited_by == free.limited_by
+def test_inactive_limit_does_not_change_the_recommendation():
+    unlimited = SCENE.replace(safe_limit=None).recommend()
+    limited = SCENE.replace(safe_limit=zwidth.SafeLimit(16e3, 39.0)).recommend()
+    assert (limited.stiffness, limited.virtual_damping) == pytest.approx(
+        (unlimited.stiffness, unlimited.virtual_damping), rel=1e-3
+    )
+    assert limited.limited_by == unlimited.limited_by
 
 
-def test_maxima_and_verdicts_ignore_the_limit():
-    free = SCENE.replace(safe_limit=None)
-    assert SCENE.max_stiffness() == free.max_stiffness()
+def test_maximum_stiffness_and_verdicts_ignore_the_limit():
+    unlimited = SCENE.replace(safe_limit=None)
+    assert SCENE.max_stiffness() == unlimited.max_stiffness()
     assert SCENE.is_stable(5e3, 30)
     assert zwidth.assess(SCENE.replace(stiffness=5e3, virtual_damping=30)).stable
 
 
 @pytest.mark.parametrize("language", ["c", "python"])
-def test_programs_name_the_limit_and_its_warnings(language):
+def test_programs_contain_the_limit_and_its_warnings(language):
     text = 'ends here */ """ \\'
     limit = zwidth.SafeLimit(484, 1.13, reason=text, warnings=["look at the log"])
     scene = SCENE.replace(safe_limit=limit)
@@ -133,7 +137,7 @@ def test_programs_name_the_limit_and_its_warnings(language):
         assert code.count("*/") == 1
 
 
-def test_a_file_carries_the_limit(tmp_path):
+def test_limit_is_read_from_a_configuration(tmp_path):
     file = tmp_path / "scene.yaml"
     file.write_text(
         "version: 1\nname: a\nscene:\n  mass: 80 g\n  damping: 0.5\n  period: 1 ms\n  delay: 0.7 ms\n  safe_limit:\n"
@@ -151,26 +155,30 @@ def test_a_file_carries_the_limit(tmp_path):
 
 
 @pytest.mark.parametrize("reserve", [0.6, "0.6 N s/m", "600 mN s/m", np.float64(0.6)])
-def test_a_passive_wall_counts_only_certain_damping(reserve):
+def test_passive_recommendation_subtracts_the_damping_reserve(reserve):
     limit = zwidth.SafeLimit(15e3, 37.0, damping_reserve=reserve)
     assert limit.damping_reserve == 0.6
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing("1 ms", "1 ms"), safe_limit=limit)
-    found = scene.recommend(passive=True)
-    margin = scene.passivity_margin(found.stiffness, found.virtual_damping)
+    recommendation = scene.recommend(passive=True)
+    margin = scene.passivity_margin(recommendation.stiffness, recommendation.virtual_damping)
     assert 0.6 <= margin < 0.601
-    assert found.spell_passive() == "yes"
-    # Colgate's condition on the device with the least damping, by a grid of frequencies: the wall with its delay is C.
+    assert recommendation.spell_passive() == "yes"
+    # Reference: Colgate's condition on a frequency grid for the device with the smallest damping; C includes the delay.
     wT = np.linspace(1e-4, np.pi, 20_001)
-    C = (found.stiffness + found.virtual_damping * (1 - np.exp(-1j * wT)) / 1e-3) * np.exp(-1j * wT)
-    needed = 0.5e-3 / (1 - np.cos(wT)) * np.real((1 - np.exp(-1j * wT)) * C)
-    assert 9.399 < needed.max() <= 9.4
-    free = scene.recommend(passive=True, beyond_safe=True)
-    assert scene.passivity_margin(free.stiffness, free.virtual_damping) < 0.1
+    C = (recommendation.stiffness + recommendation.virtual_damping * (1 - np.exp(-1j * wT)) / 1e-3) * np.exp(-1j * wT)
+    required = 0.5e-3 / (1 - np.cos(wT)) * np.real((1 - np.exp(-1j * wT)) * C)
+    assert 9.399 < required.max() <= 9.4
+    unlimited = scene.recommend(passive=True, beyond_safe=True)
+    assert scene.passivity_margin(unlimited.stiffness, unlimited.virtual_damping) < 0.1
 
 
-def test_a_reserve_of_all_damping_leaves_no_passive_wall():
+def test_reserve_of_all_damping_leaves_no_passive_wall():
     limit = zwidth.SafeLimit(15e3, 37.0, damping_reserve=10)
-    found = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), safe_limit=limit).recommend(passive=True)
-    assert found.reason.startswith("no wall is passive for certain, because the device may have no physical damping")
+    recommendation = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), safe_limit=limit).recommend(
+        passive=True
+    )
+    assert recommendation.reason.startswith(
+        "no wall is passive for certain, because the device may have no physical damping"
+    )
     with pytest.raises(zwidth.InputError, match=r"safe_limit\.damping_reserve: got -1"):
         zwidth.SafeLimit(15e3, 37.0, damping_reserve=-1)

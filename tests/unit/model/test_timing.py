@@ -1,4 +1,7 @@
-"""A delay keeps the unit in which it was given, seconds or periods, if the period changes."""
+"""Test that a delay keeps the unit in which it was given, seconds or periods, if the period changes.
+
+References: `alpha_max` of the normalized device, and finite differences.
+"""
 
 import numpy as np
 import pytest
@@ -12,11 +15,11 @@ PARTS = {"rigid": {}, "filter": {"velocity": zwidth.LowPass(cutoff="100 Hz")}}
 
 
 def stiffness_max(mass, damping, period, d):
-    """K_max from alpha_max of the normalized device."""
+    """Return K_max from alpha_max of the normalized device."""
     return float(zwidth.alpha_max(damping * period / mass, d).alpha) * mass / period**2
 
 
-def test_a_delay_in_periods_stays_in_periods():
+def test_delay_in_periods_is_constant_in_periods():
     faster = PERIODS.replace(rate=2000)
     assert (faster.d, faster.timing.delay) == (1.0, 0.5e-3)
     assert SECONDS.replace(rate=2000).d == 2.0
@@ -25,47 +28,47 @@ def test_a_delay_in_periods_stays_in_periods():
     assert faster.replace(delay=0.5e-3).replace(rate=1000).d == 0.5
 
 
-def test_the_repr_keeps_the_unit():
+def test_repr_keeps_the_unit_of_the_delay():
     timing = zwidth.Timing(rate="4 kHz", delay="1.5 periods")
-    again = eval(repr(timing), {"Timing": zwidth.Timing})
-    assert again.in_periods
-    assert again.d == 1.5
+    restored = eval(repr(timing), {"Timing": zwidth.Timing})
+    assert restored.in_periods
+    assert restored.d == 1.5
     assert repr(SECONDS.timing) == "Timing(period=0.001, delay=0.001)"
 
 
 @pytest.mark.parametrize("parts", PARTS.values(), ids=PARTS)
 @pytest.mark.parametrize("scene", [PERIODS, SECONDS], ids=["periods", "seconds"])
-def test_sensitivity_to_the_period(scene, parts):
+def test_sensitivity_to_period_matches_difference(scene, parts):
     scene, step = scene.replace(**parts), 1e-9
     low, high = (scene.replace(period=1e-3 + side * step).max_stiffness().stiffness for side in (-1, 1))
-    # A central difference of K_max; its rounding error is some 1e-13 K_max / step.
+    # A central difference of K_max, with a rounding error of about 1e-13 K_max/step.
     assert scene.sensitivities().per["period"] == pytest.approx((high - low) / (2 * step), rel=1e-5)
 
 
-def test_the_rate_needed_for_a_stiffness():
-    needed = PERIODS.required("rate", "30 kN/m").value
-    assert stiffness_max(0.1, 10, 1 / needed, 1.0) == pytest.approx(30e3, rel=1e-9)
-    needed = SECONDS.required("rate", "30 kN/m").value
-    assert stiffness_max(0.1, 10, 1 / needed, 1e-3 * needed) == pytest.approx(30e3, rel=1e-9)
+def test_required_rate_matches_alpha_max():
+    rate = PERIODS.required("rate", "30 kN/m").value
+    assert stiffness_max(0.1, 10, 1 / rate, 1.0) == pytest.approx(30e3, rel=1e-9)
+    rate = SECONDS.required("rate", "30 kN/m").value
+    assert stiffness_max(0.1, 10, 1 / rate, 1e-3 * rate) == pytest.approx(30e3, rel=1e-9)
 
 
 @pytest.mark.parametrize("parts", PARTS.values(), ids=PARTS)
-def test_tolerances_of_the_period(parts):
+def test_tolerances_of_period_and_delay(parts):
     scene = PERIODS.replace(stiffness="16 kN/m", virtual_damping=30.0, **parts)
-    found = zwidth.simulate_tolerances(scene, {"period": 0.2, "delay": 0.2}, samples=40)
-    drawn = found.drawn
-    for k, stable in enumerate(found.labels):
-        timing = zwidth.Timing(period=drawn["period"][k], delay=drawn["delay"][k])
+    simulation = zwidth.simulate_tolerances(scene, {"period": 0.2, "delay": 0.2}, samples=40)
+    draws = simulation.drawn
+    for k, stable in enumerate(simulation.labels):
+        timing = zwidth.Timing(period=draws["period"][k], delay=draws["delay"][k])
         assert bool(scene.replace(timing=timing).is_stable()) == stable
-    ratio = drawn["delay"] / drawn["period"]
+    ratio = draws["delay"] / draws["period"]
     assert np.all((ratio > 0.8) & (ratio < 1.2))
-    only = zwidth.simulate_tolerances(scene, {"period": 0.2}, samples=40)
-    for period, stable in zip(only.drawn["period"], only.labels, strict=True):
+    period_only = zwidth.simulate_tolerances(scene, {"period": 0.2}, samples=40)
+    for period, stable in zip(period_only.drawn["period"], period_only.labels, strict=True):
         timing = zwidth.Timing(period=period, delay="1 periods")
         assert bool(scene.replace(timing=timing).is_stable()) == stable
 
 
-def test_gradient_in_the_period():
+def test_gradient_in_the_period_equals_sensitivity():
     jax = pytest.importorskip("jax")
     with jax.enable_x64(True):
         for scene in (PERIODS, SECONDS):

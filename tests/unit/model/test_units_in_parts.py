@@ -1,4 +1,4 @@
-"""Texts with units in Python: parts and functions read them as configuration files do."""
+"""Test that parts and functions accept strings with units, with the same results as values in SI units."""
 
 import dataclasses
 from typing import Any
@@ -11,7 +11,7 @@ import zwidth
 from zwidth.model.checks import Span
 
 
-def test_parts_read_texts_with_units():
+def test_parts_accept_strings_with_units():
     assert zwidth.Device(mass="70 g", damping="3 mN s/mm") == zwidth.Device(mass=0.07, damping=3.0)
     assert zwidth.Timing(rate="4 kHz", delay="0.3 ms") == zwidth.Timing(period=0.25e-3, delay=0.3e-3)
     assert zwidth.Timing("1 ms").period == 1e-3
@@ -23,10 +23,10 @@ def test_parts_read_texts_with_units():
     assert zwidth.VirtualWall("5 kN/m", "10 N s/m") == zwidth.VirtualWall(5e3, 10.0)
 
 
-# Divisions that miss the delay in periods by a rounding error, or only by chance do not.
+# For some of these pairs, delay/period differs from the number of periods by a rounding error.
 @pytest.mark.parametrize("periods", [0.1, 0.3, 1.0, 1.1, 2.7, 11.0, 123.4])
 @pytest.mark.parametrize("rate", [1e3, 3e3, 7e3, 44100.0])
-def test_a_delay_in_periods_is_exact_in_periods(periods, rate):
+def test_delay_in_periods_is_exact(periods, rate):
     timing = zwidth.Timing(rate=rate, delay=f"{periods} periods")
     scene = zwidth.Scene(zwidth.Device(0.1), timing)
     assert timing.d == scene.d == scene.normalized.d == periods
@@ -34,13 +34,13 @@ def test_a_delay_in_periods_is_exact_in_periods(periods, rate):
     assert zwidth.Timing(rate=rate, delay=Span(periods, "periods")).d == periods
 
 
-def test_a_delay_in_seconds_is_divided_and_a_changed_one_forgets_its_periods():
+def test_delay_in_seconds_is_divided_by_the_period():
     assert zwidth.Timing(1e-4, 1.1e-3).d == 11.0
     changed = dataclasses.replace(zwidth.Timing(1e-3, "2 periods"), delay=0.5e-3)
     assert changed.d == 0.5
 
 
-def test_periods_of_a_traced_period():
+def test_delay_in_periods_of_a_traced_period():
     d = []
 
     def seconds(period):
@@ -52,12 +52,12 @@ def test_periods_of_a_traced_period():
     assert d == [1.5]
 
 
-def test_functions_read_texts_with_units():
-    numbers: dict[str, Any] = {"mass": 0.07, "damping": 10.0, "period": 1e-3, "delay": 1.5e-3}
+def test_functions_accept_strings_with_units():
+    values: dict[str, Any] = {"mass": 0.07, "damping": 10.0, "period": 1e-3, "delay": 1.5e-3}
     texts: dict[str, Any] = {"mass": "70 g", "damping": "10 N s/m", "period": "1 ms", "delay": "1.5 periods"}
-    assert zwidth.max_stiffness(**texts) == zwidth.max_stiffness(**numbers)
-    assert zwidth.sensitivities(**texts) == zwidth.sensitivities(**numbers)
-    assert zwidth.normalize(**texts, stiffness="5 kN/m") == zwidth.normalize(**numbers, stiffness=5e3)
+    assert zwidth.max_stiffness(**texts) == zwidth.max_stiffness(**values)
+    assert zwidth.sensitivities(**texts) == zwidth.sensitivities(**values)
+    assert zwidth.normalize(**texts, stiffness="5 kN/m") == zwidth.normalize(**values, stiffness=5e3)
     worst = zwidth.robust_max_stiffness(mass=zwidth.Interval("60 g", "80 g"), period="1 ms", delay="1 periods")
     assert worst == zwidth.robust_max_stiffness(mass=zwidth.Interval(0.06, 0.08), period=1e-3, delay=1e-3)
     arrays = zwidth.max_stiffness(mass=np.array([0.07, 0.1]), period="1 ms")
@@ -65,8 +65,8 @@ def test_functions_read_texts_with_units():
 
 
 SCENE = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3))
-# The same question with texts and with numbers.
-QUESTIONS = {
+# Each function with strings and with values.
+FUNCTIONS = {
     "is_stable": (lambda *wall: SCENE.is_stable(*wall), ("10 kN/m", 40), (10e3, 40)),
     "a list": (lambda *wall: SCENE.is_stable(*wall), (["10 kN/m", 30e3], "40 N s/m"), ([10e3, 30e3], 40)),
     "an array": (lambda *wall: SCENE.is_stable(*wall), (np.array(["10 kN/m"]), 40), (np.array([10e3]), 40)),
@@ -80,10 +80,14 @@ QUESTIONS = {
         ("25 kN/m", ("1 N s/m", "0.1 kN s/m")),
         (25e3, (1, 100)),
     ),
-    "frequency_response": (lambda *at: SCENE.frequency_response(*at), (10e3, 40, "0.1 kHz"), (10e3, 40, 100)),
+    "frequency_response": (
+        lambda *arguments: SCENE.frequency_response(*arguments),
+        (10e3, 40, "0.1 kHz"),
+        (10e3, 40, 100),
+    ),
     "state_space": (lambda *wall: SCENE.state_space(*wall).A, ("10 kN/m", 40), (10e3, 40)),
     "simulate": (
-        lambda K, x, push: SCENE.simulate(K, 40, start_position=x, push=push, periods=3).position,
+        lambda K, x, push: SCENE.simulate(K, 40, start_position=x, external_force=push, periods=3).position,
         ("10 kN/m", "0.1 mm", ["1 N", "2 N"]),
         (10e3, 1e-4, [1, 2]),
     ),
@@ -100,19 +104,19 @@ QUESTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", QUESTIONS)
-def test_questions_read_texts_with_units(name):
-    ask, texts, numbers = QUESTIONS[name]
-    np.testing.assert_array_equal(ask(*texts), ask(*numbers))
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_scene_methods_accept_strings_with_units(name):
+    function, texts, values = FUNCTIONS[name]
+    np.testing.assert_array_equal(function(*texts), function(*values))
 
 
-def test_a_rotary_hand_with_a_coupling_is_given_in_units():
+def test_rotary_operator_with_coupling_accepts_units():
     hand = zwidth.Operator(mass="2000 g cm^2", coupling_stiffness="2 N m/rad", coupling_damping="10 mN m s/rad")
     assert (hand.mass, hand.coupling_stiffness, hand.coupling_damping) == (2e-4, 2.0, 0.01)
     device = zwidth.Device("60 g cm^2", "0.02 mN m s/rad")
-    told = zwidth.Scene(device, zwidth.Timing("1 ms"), operator=hand)
-    plain = zwidth.Scene(device, zwidth.Timing(1e-3), operator=zwidth.Operator(2e-4, 0, 0, 2.0, 0.01))
-    assert told.max_stiffness().stiffness == plain.max_stiffness().stiffness
+    scene = zwidth.Scene(device, zwidth.Timing("1 ms"), operator=hand)
+    expected = zwidth.Scene(device, zwidth.Timing(1e-3), operator=zwidth.Operator(2e-4, 0, 0, 2.0, 0.01))
+    assert scene.max_stiffness().stiffness == expected.max_stiffness().stiffness
     with pytest.raises(zwidth.InputError, match=r"operator.mass: got 0 kg m\^2; it must be greater than 0"):
         zwidth.Operator(mass="0 g cm^2", coupling_stiffness="2 N m/rad")
 
@@ -141,12 +145,12 @@ def test_a_rotary_hand_with_a_coupling_is_given_in_units():
         ),
     ],
 )
-def test_what_is_refused(make, message):
+def test_invalid_strings_and_values_are_rejected(make, message):
     with pytest.raises(zwidth.InputError, match=message):
         make()
 
 
-def test_a_scene_is_shown_as_a_short_call_that_makes_it_again():
+def test_repr_of_scene_is_short_and_evaluates_to_the_scene():
     scene = zwidth.Scene(
         zwidth.Device("100 g", 10, modes=[zwidth.Mode(100, 0.01, 1)]),
         zwidth.Timing("1 ms"),

@@ -1,4 +1,7 @@
-"""Linear devices in a core install: python-flint is not there, and every number is the same."""
+"""Test linear devices without python-flint: the results equal those with python-flint.
+
+References: partial fractions in mpmath, and the closed form of masses without damping.
+"""
 
 import json
 import subprocess
@@ -38,50 +41,50 @@ print(json.dumps(found))
 """
 
 
-def test_a_core_install_finds_the_same_walls():
-    blocked = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
-    assert blocked.returncode == 0, blocked.stderr
+def test_results_without_flint_equal_results_with_flint():
+    without_flint = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
+    assert without_flint.returncode == 0, without_flint.stderr
     pytest.importorskip("flint")
     program = PROGRAM.replace('sys.modules["flint"] = None', "pass")
     with_flint = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    np.testing.assert_allclose(json.loads(blocked.stdout), json.loads(with_flint.stdout), rtol=1e-13)
-    # m = 0.1 kg, b = 10 N s/m and a period of delay.
-    assert json.loads(blocked.stdout)[2][0] == pytest.approx(19864.93, rel=1e-6)
+    np.testing.assert_allclose(json.loads(without_flint.stdout), json.loads(with_flint.stdout), rtol=1e-13)
+    # m = 0.1 kg, b = 10 N s/m and a delay of one period.
+    assert json.loads(without_flint.stdout)[2][0] == pytest.approx(19864.93, rel=1e-6)
 
 
-def response(zeros, poles, gain, period, fraction, z):
+def evaluate_response(zeros, poles, gain, period, fraction, z):
     """Return G(z), times z for a fractional delay, of a sampled system with simple poles, by partial fractions."""
     total = mp.mpc(0)
     for k, p in enumerate(poles):
         residue = mp.mpf(gain) * mp.fprod(p - q for q in zeros)
         residue /= mp.fprod(p - q for i, q in enumerate(poles) if i != k)
-        a, late = mp.exp(p * period), mp.expm1(p * period * (1 - fraction)) / p
+        a, partial = mp.exp(p * period), mp.expm1(p * period * (1 - fraction)) / p
         full = mp.expm1(p * period) / p
-        total += residue * (z * late + full - late if fraction else full) / (z - a)
+        total += residue * (z * partial + full - partial if fraction else full) / (z - a)
     return total
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 1e-3])
-def test_zeros_between_samples_are_those_of_the_response(fraction):
+def test_sampled_zeros_reproduce_the_frequency_response(fraction):
     rng = np.random.default_rng(5)
     for count in (1, 2, 4, 5):
         poles = [*(-(10 ** rng.uniform(0, 4, count))).tolist(), -30 + 800j, -30 - 800j]
         zeros = (-(10 ** rng.uniform(0, 4, count - 1))).tolist()
         device = zwidth.LinearDevice((zeros, poles, 3.0))
-        lead, found = find_sampled_zeros(device, 1e-3, fraction)
+        lead, zeros_minus_one = find_sampled_zeros(device, 1e-3, fraction)
         with mp.workdps(80):
             exact = [mp.mpc(pole) for pole in poles]
             for angle in (0.01, 0.3, 1.0, 3.0):
                 z = mp.expj(angle)
-                value = mp.mpf(lead) * mp.fprod(z - 1 + mp.mpc(zero) for zero in found.tolist())
+                value = mp.mpf(lead) * mp.fprod(z - 1 + mp.mpc(zero) for zero in zeros_minus_one.tolist())
                 value /= mp.fprod(z - mp.exp(pole * mp.mpf(1e-3)) for pole in exact)
-                expected = response([mp.mpf(q) for q in zeros], exact, 3.0, mp.mpf(1e-3), mp.mpf(fraction), z)
+                expected = evaluate_response([mp.mpf(q) for q in zeros], exact, 3.0, mp.mpf(1e-3), mp.mpf(fraction), z)
                 assert abs(value / expected - 1) < 1e-13
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.3e-3, 1.5e-3])
-def test_undamped_masses_have_the_walls_of_the_closed_form(delay):
-    """1/(m s^2), a chain of integrators: no coefficient of the denominator sets a time scale."""
+def test_undamped_mass_as_linear_device_matches_closed_form(delay):
+    """In 1/(m s^2), a chain of integrators, no coefficient of the denominator sets a time scale."""
     mass = zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(1e-3, delay)).max_stiffness()
     system = zwidth.Scene(zwidth.LinearDevice("10 / 1 0 0"), zwidth.Timing(1e-3, delay)).max_stiffness()
     assert system.stiffness == pytest.approx(mass.stiffness, rel=1e-12)
@@ -89,12 +92,12 @@ def test_undamped_masses_have_the_walls_of_the_closed_form(delay):
 
 
 def test_roots_of_exact_polynomials():
-    """A triple root, a root at 0 and a conjugate pair on the imaginary axis, without rounding."""
+    """A triple root, a root at 0 and a conjugate pair on the imaginary axis, without rounding errors."""
     factors = [trim([1, 3]), trim([1, 3]), trim([1, 3]), trim([1, 0]), trim([1, 0, 49]), trim([1, -1e-9])]
     product = trim([2])
     for factor in factors:
         product = multiply(product, factor)
-    found = sorted(find_roots(product).tolist(), key=lambda root: (root.real, root.imag))
-    assert found == [-3, -3, -3, -7j, 0, 7j, 1e-9]
+    roots = sorted(find_roots(product).tolist(), key=lambda root: (root.real, root.imag))
+    assert roots == [-3, -3, -3, -7j, 0, 7j, 1e-9]
     assert sorted(find_roots(trim([1, -1.5, 0.5]), offsets=True).tolist(), key=abs) == [0, 0.5]
     assert find_common_factor(product, multiply(trim([5, 15]), trim([1, 2]))) == trim([1, 3])

@@ -1,4 +1,4 @@
-"""The folder of compiled kernels: before or after JAX is imported, and of the user's choice."""
+"""Test the directory of compiled kernels: set after the import of JAX, and chosen by the user."""
 
 import os
 import subprocess
@@ -18,7 +18,7 @@ print(empty.nbytes, full.nbytes > 1000, full.folder == empty.folder)
 """
 
 
-def test_it_may_be_called_after_jax_was_imported(tmp_path):
+def test_cache_may_be_enabled_after_the_import_of_jax(tmp_path):
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
     environment["XDG_CACHE_HOME"] = str(tmp_path)
     result = subprocess.run(
@@ -29,7 +29,7 @@ def test_it_may_be_called_after_jax_was_imported(tmp_path):
     assert list((tmp_path / "zwidth" / "jax").glob("*-cache"))
 
 
-def test_a_folder_of_the_users_choice_is_kept(monkeypatch, tmp_path):
+def test_directory_chosen_by_the_user_is_kept(monkeypatch, tmp_path):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
     assert use_compilation_cache().folder == tmp_path
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == str(tmp_path)

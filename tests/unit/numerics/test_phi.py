@@ -1,4 +1,4 @@
-"""The phi-functions and their derivatives against Kummer's function in mpmath, which cancels nowhere."""
+"""Test the phi-functions and their derivatives against Kummer's function in mpmath, evaluated without cancellation."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ def kummer(a, b, x):
     return hyp1f1(a, b, -x)
 
 
-# name -> value, first and second derivative: 1F1(a; b; -x)' = -(a/b) 1F1(a + 1; b + 1; -x)
+# Name: value, first and second derivative, with 1F1(a; b; -x)' = -(a/b) 1F1(a + 1; b + 1; -x).
 EXACT = {
     "c": [lambda x: mp.exp(-x), lambda x: -mp.exp(-x), lambda x: mp.exp(-x)],
     "phi1": [lambda x: kummer(1, 2, x), lambda x: -kummer(2, 3, x) / 2, lambda x: kummer(3, 4, x) / 3],
@@ -35,7 +35,7 @@ EXACT = {
 TOLERANCES = [tol.PHI, tol.PHI_SLOPE, tol.PHI_CURVATURE]
 
 
-def derivative(name, order):
+def compile_derivative(name, order):
     def function(x):
         return getattr(phi_functions(x), name)
 
@@ -44,13 +44,13 @@ def derivative(name, order):
     return jax.jit(jax.vmap(function), compiler_options=QUICKLY)
 
 
-def errors(name, order, arguments, got):
-    """Relative errors; where the derivatives of gap = phi2 - psi pass zero, relative to those of psi."""
+def compute_errors(name, order, arguments, values):
+    """Yield relative errors; near zeros of the derivatives of gap = phi2 - psi, relative to the derivatives of psi."""
     with mp.workdps(40):
-        for x, value in zip(arguments, got, strict=True):
+        for x, value in zip(arguments, values, strict=True):
             exact = EXACT[name][order](mpf(float(x)))
             terms = EXACT["psi"][order](mpf(float(x))) if name == "gap" and order else 0
-            # What underflows in e^-x, or in a denormal argument, is lost in any form.
+            # Values that underflow in e^-x, or for a denormal argument, have no relative accuracy in any form.
             scale = max(abs(exact), abs(terms), mpf(1e-300))
             yield float(abs(mpf(float(value)) - exact) / scale)
 
@@ -58,19 +58,19 @@ def errors(name, order, arguments, got):
 @pytest.mark.parametrize("order", [0, 1, 2])
 @pytest.mark.parametrize("name", EXACT)
 def test_values_and_derivatives_in_float64(name, order, x64):
-    got = derivative(name, order)(jnp.asarray(ARGUMENTS))
-    assert got.dtype == jnp.float64
-    assert max(errors(name, order, ARGUMENTS, got)) <= TOLERANCES[order].float64
+    values = compile_derivative(name, order)(jnp.asarray(ARGUMENTS))
+    assert values.dtype == jnp.float64
+    assert max(compute_errors(name, order, ARGUMENTS, values)) <= TOLERANCES[order].float64
 
 
 @pytest.mark.parametrize("name", EXACT)
 def test_values_in_float32(name):
     arguments = np.float32(ARGUMENTS[(ARGUMENTS > 1e-30) & (ARGUMENTS < 80)])
-    got = derivative(name, 0)(jnp.asarray(arguments))
-    assert got.dtype == jnp.float32
-    assert max(errors(name, 0, arguments, got)) <= tol.PHI.float32
+    values = compile_derivative(name, 0)(jnp.asarray(arguments))
+    assert values.dtype == jnp.float32
+    assert max(compute_errors(name, 0, arguments, values)) <= tol.PHI.float32
 
 
 @pytest.mark.parametrize("name", EXACT)
 def test_nan_stays_nan(name, x64):
-    assert np.isnan(derivative(name, 0)(jnp.array([np.nan]))[0])
+    assert np.isnan(compile_derivative(name, 0)(jnp.array([np.nan]))[0])

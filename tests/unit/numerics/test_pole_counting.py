@@ -1,4 +1,7 @@
-"""Counts of poles inside a circle against enclosures of every pole by arb balls, and against closed forms."""
+"""Test `count_poles`, the number of poles inside a circle.
+
+References: enclosures of every pole by arb balls, and closed forms.
+"""
 
 from collections import Counter
 
@@ -17,7 +20,7 @@ BITS = 200
 
 
 def exact_poly(zeros, poles, gain, lag):
-    """z^lag prod(z - poles) + gain prod(z - zeros), of exactly the given floats."""
+    """Return z^lag prod(z - poles) + gain prod(z - zeros) with exact coefficients."""
 
     def product(start, roots):
         for root in roots:
@@ -31,27 +34,27 @@ def exact_poly(zeros, poles, gain, lag):
 
 
 def reference(zeros, poles, gain, lag, radius):
-    """Count and the relative distance of the nearest pole from the circle, by balls around every pole.
+    """Return the count and the relative distance of the nearest pole from the circle, by balls around every pole.
 
-    The count is None where a ball meets the circle or, as for repeated poles, none can be found.
+    The count is None if a ball meets the circle or if, as for multiple poles, no balls are found.
     """
     with ctx.workprec(BITS):
         poly = exact_poly(zeros, poles, gain, lag)
         if poly.degree() < 1:
             return 0, np.inf
         try:
-            found = poly.roots(tol=arb(2) ** -120, maxprec=4000)
+            enclosures = poly.roots(tol=arb(2) ** -120, maxprec=4000)
         except ValueError:
             return None, 0.0
         circle = arb(float(radius))
-        inside = sum(bool(abs(pole) < circle) for pole in found)
-        outside = sum(bool(abs(pole) > circle) for pole in found)
-        nearest = min(float(abs(abs(pole) / circle - 1).mid()) for pole in found)
-        return inside if inside + outside == len(found) else None, nearest
+        inside = sum(bool(abs(pole) < circle) for pole in enclosures)
+        outside = sum(bool(abs(pole) > circle) for pole in enclosures)
+        nearest = min(float(abs(abs(pole) / circle - 1).mid()) for pole in enclosures)
+        return inside if inside + outside == len(enclosures) else None, nearest
 
 
 def compare(loops):
-    """Fail at the first wrong count; return how many were compared, and how near the undecided loops' poles are."""
+    """Compare counts with the reference; return the number of comparisons and the pole distances of undecided loops."""
     distances, compared = [], 0
     for loop in loops:
         count, (expected, nearest) = count_poles(*loop), reference(*loop)
@@ -64,17 +67,17 @@ def compare(loops):
 
 
 def random_roots(rng, size, conjugate=True):
-    """Real ones, the ends of the axis and the origin among them, and pairs, some of them near the circle."""
-    found = []
-    while len(found) < size:
-        if size - len(found) > 1 and rng.random() < 0.4:
+    """Return real roots, including 1, -1 and 0, and pairs, some of them near the unit circle."""
+    roots = []
+    while len(roots) < size:
+        if size - len(roots) > 1 and rng.random() < 0.4:
             root = complex(*rng.normal(size=2))
             if rng.random() < 0.2:
                 root *= (1 - rng.choice([1e-8, 1e-4, -1e-4])) / abs(root)
-            found += [root, root.conjugate() if conjugate else complex(*rng.normal(size=2))]
+            roots += [root, root.conjugate() if conjugate else complex(*rng.normal(size=2))]
         else:
-            found.append(rng.choice([rng.normal(), 1.0, -1.0, 0.0, rng.uniform(0.9, 1)], p=[0.5, 0.15, 0.05, 0.1, 0.2]))
-    return np.array(found)
+            roots.append(rng.choice([rng.normal(), 1.0, -1.0, 0.0, rng.uniform(0.9, 1)], p=[0.5, 0.15, 0.05, 0.1, 0.2]))
+    return np.array(roots)
 
 
 def random_loop(rng, conjugate=True):
@@ -84,7 +87,7 @@ def random_loop(rng, conjugate=True):
 
 
 def haptic_loop(rng, lag):
-    """Device under a wall whose velocity passes a low-pass, model.md section 7; sometimes a second filter."""
+    """Return the loop of a wall with low-pass filtered velocity (model.md, section 7), sometimes with two filters."""
     delta, a = 10 ** rng.uniform(-6, 1), rng.uniform(0, 0.97)
     c, phi1 = np.exp(-delta), -np.expm1(-delta) / delta
     phi2 = (1 - phi1) / delta if delta > 1e-3 else 0.5 - delta / 6
@@ -97,27 +100,27 @@ def haptic_loop(rng, lag):
 
 
 @pytest.mark.parametrize("conjugate", [True, False])
-def test_random_loops(conjugate):
+def test_random_loops_match_reference(conjugate):
     rng = np.random.default_rng(81)
     compared, distances = compare(random_loop(rng, conjugate) for _ in range(600))
-    # Undecided are poles exactly on the circle (both products vanish at 1 or -1), and few others that nearly are.
+    # Only loops with poles exactly on the circle (both products vanish at 1 or -1) or nearly on it are undecided.
     assert compared > 540
     assert len(distances) < 36
     assert (distances < 1e-7).all()
 
 
-def test_near_a_pole():
-    # The circle passes a pole at a relative distance of 1e-5 to 1e-16.
+def test_circle_near_a_pole():
+    # The relative distance of the circle from a pole is 1e-5 to 1e-16.
     rng = np.random.default_rng(82)
     undecided = Counter()
     for _ in range(600):
         zeros, poles, gain, lag, _ = random_loop(rng, rng.random() < 0.5)
         with ctx.workprec(BITS):
             try:
-                found = exact_poly(zeros, poles, gain, lag).roots(tol=arb(2) ** -120, maxprec=4000)
+                enclosures = exact_poly(zeros, poles, gain, lag).roots(tol=arb(2) ** -120, maxprec=4000)
             except ValueError:
                 continue
-        sizes = [float(abs(pole).mid()) for pole in found]
+        sizes = [float(abs(pole).mid()) for pole in enclosures]
         sizes = [size for size in sizes if size > 1e-2]
         if not sizes:
             continue
@@ -132,8 +135,8 @@ def test_near_a_pole():
     assert sum(undecided[step] for step in (9, 10, 11)) < 0.05 * sum(undecided["all", step] for step in (9, 10, 11))
 
 
-def test_touching_crossovers():
-    # The gain makes |T| = |B| an extremum on the circle, to a relative 1e-15 or 1e-9: two crossovers or none.
+def test_nearly_touching_crossovers():
+    # With this gain |T| = |B| at an extremum on the circle, up to 1e-15 or 1e-9: two crossovers or none.
     rng = np.random.default_rng(83)
     circle = np.exp(2j * np.pi * np.linspace(0, 1, 20001))
 
@@ -149,11 +152,11 @@ def test_touching_crossovers():
 
     compared, distances = compare(loops())
     assert compared > 150
-    # An extremum at w = 0 or pi where T = -B is a pole on the circle; those make most of the undecided.
+    # An extremum at w = 0 or pi with T = -B is a pole on the circle; most undecided loops are of this kind.
     assert (distances < 1e-6).all()
 
 
-def test_filtered_walls():
+def test_filtered_walls_match_reference():
     rng = np.random.default_rng(84)
 
     def loops():
@@ -168,7 +171,7 @@ def test_filtered_walls():
 
 
 def rigid_loop(alpha, beta, delta, n):
-    """The rigid loop of whole delay n, and its verdict by model.md, Theorem 2, in 200 digits."""
+    """Return the rigid loop with integer delay n, and its verdict by Theorem 2 of model.md, with 200 digits."""
     with mp.workdps(200):
         alpha, beta, delta = mp.mpf(float(alpha)), mp.mpf(float(beta)), mp.mpf(float(delta))
         c = mp.exp(-delta)
@@ -188,7 +191,7 @@ def rigid_loop(alpha, beta, delta, n):
         return (zeros, [1.0, float(c)], float(phi2 * (alpha + beta)), n + 1), stable
 
 
-def test_rigid_walls_soft_and_hard_at_any_delay():
+def test_rigid_walls_at_any_stiffness_and_delay_match_theorem_2():
     rng = np.random.default_rng(86)
     seen = Counter()
     for power in (-100, -60, -30, -12, -6, -3, -1, 0, 30):
@@ -205,41 +208,44 @@ def test_rigid_walls_soft_and_hard_at_any_delay():
 
 
 @pytest.mark.parametrize("lag", [1, 10, 10**5, 10**12])
-def test_delay_alone(lag):
-    # z^n + g has all its zeros at |g|^(1/n).
+def test_delay_without_poles_and_zeros(lag):
+    # All zeros of z^n + g have the magnitude |g|^(1/n).
     for gain, size in [(0.5, -np.log(2)), (-3.0, np.log(3)), (1e-300, -300 * np.log(10))]:
         root = np.exp(size / lag)
         assert count_poles([], [], gain, lag, [root * (1 - 1e-3 / lag), root * (1 + 1e-3 / lag)]).tolist() == [0, lag]
 
 
 def test_more_zeros_than_poles():
-    # gain (z - 1)(z - 2)(z - 0.5) + 1 at gain 1e6: the three zeros; at 1e-6: none within 10.
+    # gain (z - 1)(z - 2)(z - 0.5) + 1: at gain 1e6 the roots are near the three zeros, at 1e-6 none is within |z| < 10.
     for radius, expected in [(0.9, 1), (1.5, 2), (2.5, 3)]:
         assert count_poles([1.0, 2.0, 0.5], [], 1e6, 0, radius) == expected
         assert count_poles([1.0, 2.0, 0.5], [], 1e-6, 0, radius) == 0
 
 
-def test_no_gain_leaves_the_poles():
+def test_zero_gain_counts_the_poles_of_the_device():
     assert count_poles([0.3, 2.0], [0.2, 0.9, 1.2, -1j], 0, 7, 0.95) == 9
     for pole in (1.0, -1.0, 1j, 0.6 + 0.8j, *np.exp(1j * np.arange(1, 40))):
         assert count_poles([0.3], [0.2, pole], 0, 3) == -1
-        # The real ones are moved by 1e-40, which the count sees; of the others rounding leaves no more than 1e-16.
+        # A gain of 1e-40 moves the real poles detectably; for complex ones the rounding error of about 1e-16 prevails.
         assert (count_poles([0.3], [0.2, pole], 1e-40, 3) == -1) == (np.imag(pole) != 0)
 
 
-def test_a_zero_on_the_circle_where_the_other_part_is_larger():
-    # A root of one part alone may lie on the circle, on the real axis or not: the count has no jump there.
+def test_zero_of_one_part_on_the_circle():
+    # A root of one part may lie on the circle, on the real axis or elsewhere, where the other part is larger: the count
+    # does not change there.
     for root in (1.0, -1.0, 1j, 0.6 + 0.8j, np.exp(2j)):
-        around = [reference([root, np.conj(root)], [0.3, -0.2], 0.05, 2, radius)[0] for radius in (0.999, 1.0, 1.001)]
+        expected = [reference([root, np.conj(root)], [0.3, -0.2], 0.05, 2, radius)[0] for radius in (0.999, 1.0, 1.001)]
         assert (
-            count_poles([root, np.conj(root)], [0.3, -0.2], 0.05, 2, [0.999, 1.0, 1.001]).tolist() == around == [4] * 3
+            count_poles([root, np.conj(root)], [0.3, -0.2], 0.05, 2, [0.999, 1.0, 1.001]).tolist()
+            == expected
+            == [4] * 3
         )
-        around = [reference([0.3, -0.2], [root, np.conj(root)], 9.0, 2, radius)[0] for radius in (0.999, 1.0, 1.001)]
-        assert count_poles([0.3, -0.2], [root, np.conj(root)], 9.0, 2, [0.999, 1.0, 1.001]).tolist() == around
+        expected = [reference([0.3, -0.2], [root, np.conj(root)], 9.0, 2, radius)[0] for radius in (0.999, 1.0, 1.001)]
+        assert count_poles([0.3, -0.2], [root, np.conj(root)], 9.0, 2, [0.999, 1.0, 1.001]).tolist() == expected
 
 
-def test_parts_of_equal_size_at_both_ends():
-    # Small roots: T and B nearly as large at z = 1, -1, j and -j, where the plane is turned before counting.
+def test_parts_of_nearly_equal_size_on_the_circle():
+    # Small roots make T and B nearly equal at z = 1, -1, j and -j; the plane is rotated before counting.
     rng = np.random.default_rng(91)
 
     def loops():
@@ -250,8 +256,8 @@ def test_parts_of_equal_size_at_both_ends():
     assert compare(loops())[0] == 300
 
 
-def test_clusters():
-    # Roots that coincide on the polynomial's way to the crossovers, most of them far from those.
+def test_multiple_roots_and_clusters():
+    # Roots that coincide on the path of the polynomial to the crossovers, most of them far from the crossovers.
     loops = [
         ([0.3] * 6, [0.2] * 6, 1e-3, 2, 1.0),
         ([0.3] * 6, [0.2] * 6, 1.0, 2, 1.0),
@@ -265,8 +271,8 @@ def test_clusters():
     assert [count_poles(*loop) for loop in loops] == [reference(*loop)[0] for loop in loops]
 
 
-def test_poles_on_the_circle_are_not_counted():
-    # In order: P(1) = 0, P(-1) = 0, |z| = 1 for all, a common factor, T = B everywhere (nothing to compare).
+def test_poles_on_the_circle_are_undecided():
+    # In order: P(1) = 0; P(-1) = 0; |z| = 1 for all; a common factor; |T| = |B| everywhere.
     loops = [
         ([0.5], [0.5, 0.9], -0.1, 4),
         ([0.0], [0.5], 1.5, 1),
@@ -278,7 +284,7 @@ def test_poles_on_the_circle_are_not_counted():
         assert count_poles(*loop) == -1
 
 
-def test_arrays_broadcast_and_bad_members_stay_alone():
+def test_arrays_broadcast_and_invalid_entries_are_separate():
     rng = np.random.default_rng(87)
     zeros, poles = rng.normal(size=(4, 1, 2)), rng.uniform(-1, 1, size=(3, 3))
     gain, lag, radius = rng.normal(size=(4, 3)), np.array([1, 50, 10**5]), np.array([[1.0], [0.9], [1.1], [1.0]])
@@ -287,25 +293,25 @@ def test_arrays_broadcast_and_bad_members_stay_alone():
     assert counts.dtype == np.int64
     for i, j in np.ndindex(4, 3):
         assert counts[i, j] == count_poles(zeros[i, 0], poles[j], gain[i, j], lag[j], radius[i, 0])
-    good = count_poles([0.5], [0.9], 0.01, 3)
-    assert count_poles([0.5], [0.9], [0.01, np.nan, np.inf, 0.01], 3).tolist() == [good, -1, -1, good]
-    assert count_poles([0.5], [0.9], 0.01, [3, -1, 2.5, np.nan, 2.0**60]).tolist() == [good, -1, -1, -1, -1]
-    assert count_poles([0.5], [0.9], 0.01, 3, [1, 0, -1, np.inf, np.nan]).tolist() == [good, -1, -1, -1, -1]
-    assert count_poles([[0.5], [np.nan], [complex(0, np.inf)]], [0.9], 0.01, 3).tolist() == [good, -1, -1]
+    valid = count_poles([0.5], [0.9], 0.01, 3)
+    assert count_poles([0.5], [0.9], [0.01, np.nan, np.inf, 0.01], 3).tolist() == [valid, -1, -1, valid]
+    assert count_poles([0.5], [0.9], 0.01, [3, -1, 2.5, np.nan, 2.0**60]).tolist() == [valid, -1, -1, -1, -1]
+    assert count_poles([0.5], [0.9], 0.01, 3, [1, 0, -1, np.inf, np.nan]).tolist() == [valid, -1, -1, -1, -1]
+    assert count_poles([[0.5], [np.nan], [complex(0, np.inf)]], [0.9], 0.01, 3).tolist() == [valid, -1, -1]
     assert count_poles(np.zeros((0, 2)), [0.9], 0.01, 3).shape == (0,)
 
 
-def test_blocks_change_nothing():
+def test_block_size_does_not_affect_counts():
     rng = np.random.default_rng(88)
     size = 2 * counting.BLOCK_SIZE + 3
     zeros, gain = rng.normal(size=(size, 2)), rng.normal(size=size)
     counts = count_poles(zeros, [1.0, 0.9], gain, 4)
-    some = rng.integers(0, size, 40)
-    assert counts[some].tolist() == [count_poles(zeros[i], [1.0, 0.9], gain[i], 4) for i in some]
+    sample = rng.integers(0, size, 40)
+    assert counts[sample].tolist() == [count_poles(zeros[i], [1.0, 0.9], gain[i], 4) for i in sample]
 
 
 @pytest.mark.parametrize(
-    "arguments, words",
+    "arguments, message",
     [
         (([0.5], [0.9], 1j, 3), "gain: got 1j, .* real"),
         (([0.5], [0.9], np.nan, 3), "gain: got nan, a finite number"),
@@ -318,12 +324,12 @@ def test_blocks_change_nothing():
         (([[0.5]] * 2, [0.9], [0.1] * 3, 3), r"do not broadcast: zeros \(2,\)"),
     ],
 )
-def test_wrong_arguments(arguments, words):
-    with pytest.raises(InputError, match=words):
+def test_invalid_arguments_are_rejected(arguments, message):
+    with pytest.raises(InputError, match=message):
         count_poles(*arguments)
 
 
-def test_traced_counts_are_the_direct_ones(x64):
+def test_traced_counts_equal_direct_counts(x64):
     rng = np.random.default_rng(89)
     size = 300
     zeros, poles = rng.normal(size=(size, 2)), rng.normal(size=(size, 3)) * np.array([1, 1j, 1])
@@ -335,27 +341,27 @@ def test_traced_counts_are_the_direct_ones(x64):
     assert (direct[40:50] == -1)[radius[40:50] == 1].all()
     assert direct[65] == -1
     for traced in (jax.vmap(count_poles), count_poles):
-        found = jax.jit(traced, compiler_options=QUICKLY)(zeros, poles, gain, lag, radius)
-        np.testing.assert_array_equal(found, direct)
+        counts = jax.jit(traced, compiler_options=QUICKLY)(zeros, poles, gain, lag, radius)
+        np.testing.assert_array_equal(counts, direct)
 
 
-def test_traced_numbers_in_lists_and_plain_numbers_alone(x64):
+def test_traced_values_in_lists_and_constant_arguments(x64):
     def mixed(gain):
         return count_poles([gain], [1.0], 0.1 * gain, 3), count_poles([0.2], [1.0, 0.9], 0.01, 3)
 
     gain = np.linspace(-2, 2, 20)
-    traced, plain = jax.jit(jax.vmap(mixed), compiler_options=QUICKLY)(gain)
+    traced, constant = jax.jit(jax.vmap(mixed), compiler_options=QUICKLY)(gain)
     assert traced.tolist() == [count_poles([g], [1.0], 0.1 * g, 3) for g in gain]
-    assert (plain == count_poles([0.2], [1.0, 0.9], 0.01, 3)).all()
+    assert (constant == count_poles([0.2], [1.0, 0.9], 0.01, 3)).all()
 
 
-def test_single_precision_is_traced_with_its_own_rounding():
-    # JAX's default: of values that float32 holds, no count may be wrong, only more of them undecided.
+def test_traced_float32_counts_are_correct_if_decided():
+    # In JAX's default precision, values that float32 represents may be undecided more often, but no count may be wrong.
     rng = np.random.default_rng(90)
     zeros, poles, gain = (rng.normal(size=shape).astype(np.float32) for shape in ((1000, 2), (1000, 3), (1000,)))
     direct = count_poles(zeros, poles, gain, 4)
     single = jax.jit(count_poles, compiler_options=QUICKLY)(zeros, poles, gain, 4)
     assert single.dtype == np.int32
-    told = np.asarray(single) >= 0
-    np.testing.assert_array_equal(np.asarray(single)[told], direct[told])
-    assert told.mean() > 0.99
+    is_decided = np.asarray(single) >= 0
+    np.testing.assert_array_equal(np.asarray(single)[is_decided], direct[is_decided])
+    assert is_decided.mean() > 0.99

@@ -1,4 +1,4 @@
-"""Figures are tested by the data they draw and the words on them, not by pixels."""
+"""Figures of all kinds, tested by their plotted data and texts instead of pixels."""
 
 import csv
 import inspect
@@ -40,29 +40,29 @@ from zwidth.studies.outcome import csv_text
 
 
 def draw(name, axes=None, **keywords):
-    """Draw one of the figures; returns its Axes."""
+    """Draw one of the figures and return its axes."""
     return getattr(plotting, name.split()[0])(*EVERY_FIGURE[name], axes, **keywords)
 
 
-def curves(ax):
-    """The labelled curves of an Axes, as (x, y)."""
+def get_curves(ax):
+    """Return the labeled curves of an axes, as (x, y)."""
     return {str(line.get_label()): line.get_xydata().T for line in ax.lines if not line.get_label().startswith("_")}
 
 
 def assert_drawn(ax, label, x, y):
-    line = curves(ax)[label]
+    line = get_curves(ax)[label]
     np.testing.assert_allclose(line[0], x, rtol=1e-15)
     np.testing.assert_allclose(line[1], y, rtol=1e-15)
 
 
-def words(figure):
-    """All text of a figure."""
+def get_text(figure):
+    """Return all text of a figure."""
     return " ".join(text.get_text() for text in figure.findobj(Text))
 
 
 @cache
-def drawn(name):
-    """One of the figures, laid out once for all tests, with every warning an error."""
+def draw_cached(name):
+    """Draw one of the figures, cached for all tests, with every warning an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         figure = style.figure_of(draw(name))
@@ -71,103 +71,107 @@ def drawn(name):
 
 
 @pytest.mark.parametrize("name", EVERY_FIGURE)
-def test_a_figure_leaves_no_trace_in_matplotlib(name):
+def test_figure_does_not_change_global_state_of_matplotlib(name):
     import matplotlib.pyplot as plt
 
-    before, known = matplotlib.rcParams.copy(), plt.get_fignums()
-    assert isinstance(drawn(name), Figure)
+    before, fignums = matplotlib.rcParams.copy(), plt.get_fignums()
+    assert isinstance(draw_cached(name), Figure)
     assert matplotlib.rcParams == before
-    assert plt.get_fignums() == known
+    assert plt.get_fignums() == fignums
 
 
 @pytest.mark.parametrize("name", EVERY_FIGURE)
-def test_a_figure_is_drawn_into_a_given_axes_which_is_returned(name):
+def test_figure_is_drawn_into_given_axes(name):
     figure = Figure()
     ax = figure.subplots()
-    drawn_into = draw(name, ax)
-    assert drawn_into is ax if name.startswith("draw_zero_stiffness") else list(drawn_into) == [ax]
+    result = draw(name, ax)
+    assert result is ax if name.startswith("draw_zero_stiffness") else list(result) == [ax]
     assert ax.has_data()
     assert ax.get_xlabel()
     assert ax.get_ylabel()
-    # A color bar is all that comes beside it.
+    # At most a color bar is added.
     assert len(figure.axes) <= 2
     assert not figure.legends
 
 
 @pytest.mark.parametrize("name", ["draw_boundary", "draw_step", "draw_passivity_cost", "draw_map of many"])
-def test_every_panel_is_drawn_into_axes_of_ones_own(name):
-    expected = drawn(name).axes
+def test_every_panel_is_drawn_into_given_axes(name):
+    expected = draw_cached(name).axes
     part = Figure(layout="constrained").subfigures(1, 2, squeeze=False)[0, 1]
     axes = part.subplots(1, len(expected))
     assert list(draw(name, axes)) == list(axes)
-    for ax, alike in zip(axes, expected, strict=True):
-        assert {name: line.tolist() for name, line in curves(ax).items()} == {
-            name: line.tolist() for name, line in curves(alike).items()
+    for ax, reference in zip(axes, expected, strict=True):
+        assert {name: line.tolist() for name, line in get_curves(ax).items()} == {
+            name: line.tolist() for name, line in get_curves(reference).items()
         }
         assert ax.get_xlabel() or name == "draw_step"
 
 
-def test_delays_go_into_one_axes_or_one_each():
+def test_delays_share_one_axes_or_have_one_each():
     axes = Figure().subplots(1, 3)
-    (alone,) = plotting.draw_boundary(BOUNDARY, axes[0])
-    assert len(curves(alone)) == 6
-    given = stack([outline(0.5, d) for d in (0.0, 1.0, 2.0)])
+    (shared,) = plotting.draw_boundary(BOUNDARY, axes[0])
+    assert len(get_curves(shared)) == 6
+    table_of_delays = stack([outline(0.5, d) for d in (0.0, 1.0, 2.0)])
     with pytest.raises(InputError, match="got 2 for 3 delays"):
-        plotting.draw_boundary(given, axes[:2])
+        plotting.draw_boundary(table_of_delays, axes[:2])
 
 
-def test_responses_that_are_alike_are_two_all_the_same():
+def test_equal_responses_are_drawn_separately():
     positions, forces = plotting.draw_step(stack([response(), response()]))
     for ax in (positions, forces):
         assert [line.get_xdata().size for line in ax.lines if line.get_xdata()[-1] > 50] == [100, 100]
 
 
-def test_every_function_takes_axes_last_and_returns_them():
+def test_every_function_has_axes_as_last_argument():
     for name in (name for name in dir(plotting) if name.startswith("draw_")):
         signature = inspect.signature(getattr(plotting, name))
-        places = [each for each in signature.parameters.values() if each.kind is not inspect.Parameter.KEYWORD_ONLY]
-        (where,) = [each for each in places if each.default is None]
-        assert where is places[-1], name
-        assert where.name == ("ax" if name == "draw_zero_stiffness" else "axes"), name
-        assert signature.return_annotation == ("Axes" if where.name == "ax" else "np.ndarray"), name
+        heights = [
+            parameter
+            for parameter in signature.parameters.values()
+            if parameter.kind is not inspect.Parameter.KEYWORD_ONLY
+        ]
+        (axes_parameter,) = [parameter for parameter in heights if parameter.default is None]
+        assert axes_parameter is heights[-1], name
+        assert axes_parameter.name == ("ax" if name == "draw_zero_stiffness" else "axes"), name
+        assert signature.return_annotation == ("Axes" if axes_parameter.name == "ax" else "np.ndarray"), name
 
 
-def test_a_figure_is_drawn_from_what_its_csv_file_holds():
+def test_figure_is_drawn_from_its_csv_file():
     header, *rows = csv.reader(io.StringIO(csv_text(BOUNDARY)))
     read = {name: np.array(column) for name, column in zip(header, zip(*rows, strict=True), strict=True)}
     read = {name: column if name == "curve" else column.astype(float) for name, column in read.items()}
-    for ax, alike in zip(plotting.draw_boundary(read), drawn("draw_boundary").axes, strict=True):
-        assert {name: line.tolist() for name, line in curves(ax).items()} == {
-            name: line.tolist() for name, line in curves(alike).items()
+    for ax, reference in zip(plotting.draw_boundary(read), draw_cached("draw_boundary").axes, strict=True):
+        assert {name: line.tolist() for name, line in get_curves(ax).items()} == {
+            name: line.tolist() for name, line in get_curves(reference).items()
         }
 
 
-def test_a_data_frame_serves_as_a_table():
+def test_data_frame_is_accepted_as_table():
     pandas = pytest.importorskip("pandas")
     assert isinstance(plotting.draw_zero_stiffness(pandas.DataFrame(EVERY_FIGURE["draw_zero_stiffness"][0])), Axes)
     for name in ("draw_boundary", "draw_ridge", "draw_step", "draw_passivity_cost"):
         frame = pandas.DataFrame(EVERY_FIGURE[name][0])
-        for ax, alike in zip(getattr(plotting, name)(frame), drawn(name).axes, strict=True):
-            assert curves(ax).keys() == curves(alike).keys()
+        for ax, reference in zip(getattr(plotting, name)(frame), draw_cached(name).axes, strict=True):
+            assert get_curves(ax).keys() == get_curves(reference).keys()
 
 
-def test_curves_are_told_apart_by_their_keys():
-    given = {"d": [0.0, 0.0, 1.0, 0.0], "kind": ["a", "a", "a", "b"], "x": [1.0, 2.0, 3.0, 4.0]}
-    found = table.curves(given, "d", "kind")
-    assert [(curve.d, curve.kind, curve.x.tolist()) for curve in found] == [
+def test_curves_are_grouped_by_their_keys():
+    columns = {"d": [0.0, 0.0, 1.0, 0.0], "kind": ["a", "a", "a", "b"], "x": [1.0, 2.0, 3.0, 4.0]}
+    groups = table.curves(columns, "d", "kind")
+    assert [(curve.d, curve.kind, curve.x.tolist()) for curve in groups] == [
         (0.0, "a", [1.0, 2.0]),
         (1.0, "a", [3.0]),
         (0.0, "b", [4.0]),
     ]
-    assert [curve.x.tolist() for curve in table.curves(given, "kind", d=0.0)] == [[1.0, 2.0], [4.0]]
-    assert table.curves(given, "d", kind="c") == []
+    assert [curve.x.tolist() for curve in table.curves(columns, "kind", d=0.0)] == [[1.0, 2.0], [4.0]]
+    assert table.curves(columns, "d", kind="c") == []
 
 
 @pytest.mark.parametrize("name", EVERY_FIGURE)
-def test_every_text_stays_on_the_page(name):
-    figure = drawn(name)
+def test_every_text_is_inside_the_figure(name):
+    figure = draw_cached(name)
     page = figure.bbox
-    # Ticks beyond the range exist, but are not drawn.
+    # Ticks outside of the range exist but are not drawn.
     ticks = {label for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
     for text in figure.findobj(Text):
         if text in ticks or not text.get_visible() or not text.get_text().strip():
@@ -180,14 +184,14 @@ def test_every_text_stays_on_the_page(name):
 
 
 @pytest.mark.parametrize("name", EVERY_FIGURE)
-def test_no_two_names_overlap(name):
-    for ax in drawn(name).axes:
+def test_annotations_do_not_overlap(name):
+    for ax in draw_cached(name).axes:
         boxes = [Text.get_window_extent(text) for text in ax.texts if isinstance(text, Annotation)]
-        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+        assert not any(first.overlaps(second) for first, second in combinations(boxes, 2))
 
 
 @pytest.mark.parametrize("name", ["draw_boundary with a line", "draw_map of stable"])
-def test_the_same_figure_is_written_in_the_same_bytes(name, tmp_path):
+def test_equal_figures_have_equal_files(name, tmp_path):
     written = []
     before = matplotlib.rcParams.copy()
     for attempt in ("first", "second"):
@@ -200,8 +204,8 @@ def test_the_same_figure_is_written_in_the_same_bytes(name, tmp_path):
     assert b"<text" not in written[0][1], "text is drawn as outlines"
 
 
-def test_boundaries_show_the_given_curves_in_one_panel_for_each_delay():
-    figure = drawn("draw_boundary")
+def test_boundaries_have_one_panel_per_delay():
+    figure = draw_cached("draw_boundary")
     assert [ax.get_title(loc="left") for ax in figure.axes] == ["$d = 0$", "$d = 2$"]
     for ax, d in zip(figure.axes, (0.0, 2.0), strict=True):
         for delta in (0.5, 1.0):
@@ -212,16 +216,16 @@ def test_boundaries_show_the_given_curves_in_one_panel_for_each_delay():
         assert any(np.array_equal(xy[:21], np.c_[outline(1.0, d)["alpha"], outline(1.0, d)["beta"]]) for xy in shaded)
 
 
-def test_axes_carry_the_symbols_with_their_definitions():
-    text = words(drawn("draw_boundary"))
+def test_axis_labels_define_their_symbols():
+    text = get_text(draw_cached("draw_boundary"))
     assert r"\alpha = K\,T^2\!/m" in text
     assert r"\beta = B\,T/m" in text
     assert r"$\delta = 0.5$" in text
-    assert r"\delta = b\,T/m" in words(drawn("draw_ridge"))
+    assert r"\delta = b\,T/m" in get_text(draw_cached("draw_ridge"))
 
 
-def test_a_real_pole_at_minus_one_has_a_line_of_its_own():
-    ax = drawn("draw_boundary with a line").axes[0]
+def test_line_of_minus_one_is_drawn_separately():
+    ax = draw_cached("draw_boundary with a line").axes[0]
     given = outline(3.0, line=True)
     assert_drawn(ax, "boundary, delta = 3, d = 0", given["alpha"][:21], given["beta"][:21])
     assert_drawn(ax, "z = -1, delta = 3, d = 0", given["alpha"][20:], given["beta"][20:])
@@ -229,8 +233,8 @@ def test_a_real_pole_at_minus_one_has_a_line_of_its_own():
     assert styles["boundary, delta = 3, d = 0"] != styles["z = -1, delta = 3, d = 0"]
 
 
-def test_passivity_is_dash_dotted_and_si_axes_are_added():
-    ax = drawn("draw_boundary with passivity in SI").axes[0]
+def test_passive_outline_and_si_axes():
+    ax = draw_cached("draw_boundary with passivity in SI").axes[0]
     assert_drawn(ax, "passive, delta = 0.5, d = 0", [0.0, 1.0, 0.0], [-0.5, 0.0, 0.5])
     top, right = ax.child_axes
     assert "kN/m" in top.get_xlabel()
@@ -239,14 +243,14 @@ def test_passivity_is_dash_dotted_and_si_axes_are_added():
     np.testing.assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) * 100.0, rtol=1e-12)
 
 
-def test_the_larger_delta_is_darker():
-    ax = drawn("draw_boundary").axes[0]
+def test_larger_delta_is_darker():
+    ax = draw_cached("draw_boundary").axes[0]
     gray = {line.get_label(): np.dot(to_rgb(line.get_color()), [0.299, 0.587, 0.114]) for line in ax.lines}
     assert gray["boundary, delta = 1, d = 0"] < gray["boundary, delta = 0.5, d = 0"] - 0.1
 
 
-def test_zero_stiffness_shows_both_models_and_the_lower_bound():
-    figure = drawn("draw_zero_stiffness")
+def test_zero_stiffness_shows_both_delay_models():
+    figure = draw_cached("draw_zero_stiffness")
     ax = figure.axes[0]
     for given in (interval(), interval(0.5), interval(0.5, "fractional_power")):
         assert_drawn(ax, f"beta_upper, d = {given['d']:g}, {given['delay_model']}", given["delta"], given["beta_upper"])
@@ -255,18 +259,18 @@ def test_zero_stiffness_shows_both_models_and_the_lower_bound():
     styles = {line.get_label(): line.get_linestyle() for line in ax.lines}
     assert styles["beta_upper, d = 0.5, held"] == "-"
     assert styles["beta_upper, d = 0.5, fractional_power"] == "--"
-    assert "fractional power" in words(figure)
+    assert "fractional power" in get_text(figure)
 
 
-def test_the_ridge_comes_in_two_scalings():
+def test_ridge_has_two_scalings():
     near, far = plotting.draw_ridge(RIDGE, two_scalings=True)
     assert near.get_xlim() == (0.0, 1.0)
     assert far.get_xlim() == (0.0, 10.0)
-    for each in (ridge(), ridge(0.5), ridge(0.5, "fractional_power")):
-        label = f"alpha_max, d = {each['d']:g}, {each['delay_model']}"
-        assert_drawn(far, label, each["delta"], each["alpha_max"])
-        inside = each["delta"] <= 1.0
-        assert_drawn(near, label, each["delta"][inside], each["alpha_max"][inside])
+    for table_of_ridge in (ridge(), ridge(0.5), ridge(0.5, "fractional_power")):
+        label = f"alpha_max, d = {table_of_ridge['d']:g}, {table_of_ridge['delay_model']}"
+        assert_drawn(far, label, table_of_ridge["delta"], table_of_ridge["alpha_max"])
+        inside = table_of_ridge["delta"] <= 1.0
+        assert_drawn(near, label, table_of_ridge["delta"][inside], table_of_ridge["alpha_max"][inside])
 
 
 def test_one_scaling_is_drawn_if_no_delta_is_small():
@@ -274,63 +278,68 @@ def test_one_scaling_is_drawn_if_no_delta_is_small():
     assert len(plotting.draw_ridge(large, two_scalings=True)) == 1
 
 
-def test_the_slope_is_drawn_beside_its_limit():
-    ratio, limit = drawn("draw_slope").axes
-    for each in (ridge(model=""), ridge(0.5, "")):
-        shown = each["delta"] >= 0.1
-        label = f"alpha_max/delta, d = {each['d']:g}"
-        assert_drawn(ratio, label, each["delta"][shown], each["alpha_max"][shown] / each["delta"][shown])
-        value = LIMITS[each["d"]]
-        lines = [line for line in ratio.lines if line.get_label() == f"g, d = {each['d']:g}"]
+def test_slope_is_drawn_with_its_limit():
+    ratio, limit = draw_cached("draw_slope").axes
+    for table_of_ridge in (ridge(model=""), ridge(0.5, "")):
+        shown = table_of_ridge["delta"] >= 0.1
+        label = f"alpha_max/delta, d = {table_of_ridge['d']:g}"
+        assert_drawn(
+            ratio,
+            label,
+            table_of_ridge["delta"][shown],
+            table_of_ridge["alpha_max"][shown] / table_of_ridge["delta"][shown],
+        )
+        value = LIMITS[table_of_ridge["d"]]
+        lines = [line for line in ratio.lines if line.get_label() == f"g, d = {table_of_ridge['d']:g}"]
         assert any(np.all(np.asarray(line.get_ydata()) == value) for line in lines)
     assert_drawn(limit, "g", SLOPES["d"], SLOPES["slope"])
-    # The name of a delay is at the end of its curve.
-    places = {text.get_text(): text.xy[1] for text in ratio.texts if isinstance(text, Annotation)}
+    # The label of a delay is at the end of its curve.
+    heights = {text.get_text(): text.xy[1] for text in ratio.texts if isinstance(text, Annotation)}
     low, high = np.log(ratio.get_ylim())
-    assert places["$d = 0.5$"] == pytest.approx((np.log(2.5) - low) / (high - low), abs=0.03)
+    assert heights["$d = 0.5$"] == pytest.approx((np.log(2.5) - low) / (high - low), abs=0.03)
 
 
 def test_passivity_cost_shows_both_maxima_and_their_ratio():
-    maxima, ratio = drawn("draw_passivity_cost").axes
+    maxima, ratio = draw_cached("draw_passivity_cost").axes
     for d in (0.0, 1.0):
         given = cost(d)
         for name in ("alpha_max", "alpha_max_passive"):
             assert_drawn(maxima, f"{name}, d = {d:g}", given["delta"], given[name])
-        share = 100.0 * given["alpha_max_passive"] / given["alpha_max"]
-        assert_drawn(ratio, f"passive share, d = {d:g}", given["delta"], share)
+        percentage = 100.0 * given["alpha_max_passive"] / given["alpha_max"]
+        assert_drawn(ratio, f"passive share, d = {d:g}", given["delta"], percentage)
 
 
-def test_step_responses_are_drawn_in_readable_units():
-    figure = drawn("draw_step")
+def test_step_responses_have_readable_units():
+    figure = draw_cached("draw_step")
     positions, forces = figure.axes
     given = response()
     text = r"first  ($\alpha = 0.1$, $\beta = 0.4$)"
-    line = curves(positions)[text]
+    line = get_curves(positions)[text]
     np.testing.assert_allclose(line[0], given["time_s"] * 1e3, rtol=1e-14)
     np.testing.assert_allclose(line[1], given["position_m"] * 1e6, rtol=1e-14)
-    np.testing.assert_array_equal(curves(forces)["wall_force, first"][1], given["wall_force_N"])
+    np.testing.assert_array_equal(get_curves(forces)["wall_force, first"][1], given["wall_force_N"])
     assert "µm" in positions.get_ylabel()
     assert "ms" in forces.get_xlabel()
-    assert "not settled" in words(figure)
+    assert "not settled" in get_text(figure)
 
 
-def test_a_map_shows_the_grid_and_the_edge_of_stability():
-    figure = drawn("draw_map of radius")
+def test_map_shows_values_and_the_stability_boundary():
+    figure = draw_cached("draw_map of radius")
     mesh = figure.axes[0].collections[0]
     np.testing.assert_array_equal(np.asarray(mesh.get_array()).T, grid_map()["spectral_radius"][:, :, 0, 0])
     contour = figure.axes[0].collections[1]
     assert isinstance(contour, ContourSet)
     assert list(contour.levels) == [1.0]
-    stable = drawn("draw_map of stable").axes[0].collections[0]
+    stable = draw_cached("draw_map of stable").axes[0].collections[0]
     np.testing.assert_array_equal(np.asarray(stable.get_array()).T, grid_map()["stable"][:, :, 0, 0])
 
 
-def test_a_map_of_many_deltas_shows_the_ends_and_the_middle():
-    titles = [ax.get_title(loc="left") for ax in drawn("draw_map of many").axes]
+def test_map_of_many_deltas_shows_ends_and_middle():
+    titles = [ax.get_title(loc="left") for ax in draw_cached("draw_map of many").axes]
     assert titles == [rf"$\delta = {delta:g}$,  $d = 1$" for delta in (0, 0.5, 1)]
 
 
-def test_a_wall_to_be_set_is_written_no_stiffer_than_it_is():
+def test_recommended_stiffness_is_rounded_down():
     outlines = {"label": np.full(3, ""), "number": np.ones(3), "piece": np.full(3, "outline")}
     outlines |= {"stiffness_N_per_m": np.array([0, 2e4, 0]), "virtual_damping_N_s_per_m": np.array([0, 40.0, 90])}
     walls = {"label": np.array([""]), "wall": np.array(["recommended (75 %)"])}
@@ -349,7 +358,7 @@ def test_a_wall_to_be_set_is_written_no_stiffer_than_it_is():
         ([5.0], 1.0, [5.0]),
     ],
 )
-def test_labels_are_spread_no_further_than_needed(positions, gap, expected):
+def test_labels_are_moved_as_little_as_necessary(positions, gap, expected):
     np.testing.assert_allclose(style.spread(positions, gap), expected, atol=1e-12)
 
 
@@ -364,6 +373,6 @@ def test_labels_are_spread_no_further_than_needed(positions, gap, expected):
     ],
 )
 def test_units_have_a_readable_prefix(largest, unit, factor, text):
-    found, name = style.si_unit(largest, unit)
-    assert found == pytest.approx(factor)
+    prefix_factor, name = style.si_unit(largest, unit)
+    assert prefix_factor == pytest.approx(factor)
     assert name == text

@@ -1,4 +1,4 @@
-"""Values in any order, as a list of a configuration may have them, draw the figure of the same values in order."""
+"""Figures are independent of the order of values in a configuration."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ FILTERS = stack(
     )
 )
 AMPLITUDES = np.geomspace(2e-6, 1e-4, 24).reshape(1, 4, 6)
-BUZZES = {
+LIMIT_CYCLES = {
     "condition": np.array(["plain"]),
     "stiffness_N_per_m": np.linspace(1e3, 4e3, 4),
     "resolution_m": np.geomspace(1e-6, 1e-4, 6),
@@ -37,7 +37,7 @@ ORDER = [2, 0, 3, 1]
 
 
 def shuffle_rows(table):
-    """The rows of every curve over delta, or of every kind of filter, the other way round."""
+    """Return the table with the rows of every curve reversed."""
     keys = [name for name in ("curve", "d", "delay_model", "damping_N_s_per_m", "estimate") if name in table]
     count = len(table[keys[0]])
     curve = [tuple(table[key][row] for key in keys) for row in range(count)]
@@ -46,28 +46,30 @@ def shuffle_rows(table):
 
 
 def shuffle_grid(arrays, name, dimension):
-    """A grid whose axis is out of order."""
-    count, most = arrays[name].size, max(values.ndim for values in arrays.values())
-    order = [place for place in (*ORDER, *range(4, count)) if place < count]
-    grids = {each: values.take(order, dimension) for each, values in arrays.items() if values.ndim == most}
+    """Return a grid with one axis in shuffled order."""
+    count, ndim = arrays[name].size, max(values.ndim for values in arrays.values())
+    order = [index for index in (*ORDER, *range(4, count)) if index < count]
+    grids = {key: values.take(order, dimension) for key, values in arrays.items() if values.ndim == ndim}
     return {**arrays, **grids, name: arrays[name][order]}
 
 
 def list_drawn(axes):
-    """What is drawn: lines, the colors of cells, and where the names of curves stand."""
-    found = []
+    """Return the drawn lines, cell colors, annotations and axis limits."""
+    contents = []
     for ax in np.asarray(axes, dtype=object).ravel():
-        found += [line.get_xydata().tolist() for line in ax.lines]
-        found += [
-            np.ma.filled(each.get_array(), -1).tolist() for each in ax.collections if each.get_array() is not None
+        contents += [line.get_xydata().tolist() for line in ax.lines]
+        contents += [
+            np.ma.filled(collection.get_array(), -1).tolist()
+            for collection in ax.collections
+            if collection.get_array() is not None
         ]
-        found += [(text.get_text(), text.xy) for text in ax.texts if isinstance(text, Annotation)]
-        found += [(*ax.get_xlim(), *ax.get_ylim(), ax.get_xscale(), ax.get_title(loc="left"))]
-    return found
+        contents += [(text.get_text(), text.xy) for text in ax.texts if isinstance(text, Annotation)]
+        contents += [(*ax.get_xlim(), *ax.get_ylim(), ax.get_xscale(), ax.get_title(loc="left"))]
+    return contents
 
 
-def assert_alike(one, other):
-    assert repr(list_drawn(one)) == repr(list_drawn(other))
+def assert_equal_figures(first, second):
+    assert repr(list_drawn(first)) == repr(list_drawn(second))
 
 
 @pytest.mark.parametrize(
@@ -81,30 +83,32 @@ def assert_alike(one, other):
         (plotting.draw_filter_noise, FILTERS, (np.nan,)),
     ],
 )
-def test_curves_over_values_in_any_order(draw, table, more):
-    assert_alike(draw(shuffle_rows(table), *more), draw(table, *more))
+def test_curves_are_independent_of_the_order(draw, table, more):
+    assert_equal_figures(draw(shuffle_rows(table), *more), draw(table, *more))
 
 
-def test_maps_over_values_in_any_order():
+def test_maps_are_independent_of_the_order():
     arrays = grid_map((0.0, 0.1, 0.5))
     for dimension, name in enumerate(("alpha", "beta", "delta")):
-        other = shuffle_grid(arrays, name, dimension)
-        assert_alike(plotting.draw_map(other, "spectral_radius"), plotting.draw_map(arrays, "spectral_radius"))
+        shuffled = shuffle_grid(arrays, name, dimension)
+        assert_equal_figures(
+            plotting.draw_map(shuffled, "spectral_radius"), plotting.draw_map(arrays, "spectral_radius")
+        )
 
 
 @pytest.mark.parametrize("family", ["", "stiffness_N_per_m"])
-def test_buzz_over_values_in_any_order(family):
+def test_limit_cycles_are_independent_of_the_order(family):
     for dimension, name in enumerate(("stiffness_N_per_m", "resolution_m"), start=1):
-        pairs = [BUZZES, shuffle_grid(BUZZES, name, dimension)]
+        pairs = [LIMIT_CYCLES, shuffle_grid(LIMIT_CYCLES, name, dimension)]
         if family:
-            assert_alike(*(plotting.draw_limit_cycle_curves(each, {}, BOUNDS, family) for each in pairs))
+            assert_equal_figures(*(plotting.draw_limit_cycle_curves(arrays, {}, BOUNDS, family) for arrays in pairs))
         else:
-            assert_alike(*(plotting.draw_limit_cycles(each, {}, BOUNDS) for each in pairs))
+            assert_equal_figures(*(plotting.draw_limit_cycles(arrays, {}, BOUNDS) for arrays in pairs))
 
 
 @pytest.fixture
 def sweep():
-    """A made-up sweep over walls and delays, as a store holds it."""
+    """Return a synthetic sweep over walls and delays, in the form of a store."""
     axes = {"alpha": np.linspace(0.1, 1.0, 7), "beta": np.linspace(0.0, 1.0, 8), "d": np.array([0.0, 0.5, 1.0, 2.0])}
     alpha, beta, d = np.meshgrid(*axes.values(), indexing="ij")
     outputs = {"margin": 0.5 - alpha - (beta - 0.4) ** 2 - 0.1 * d, "status": np.zeros(alpha.shape, int)}
@@ -117,18 +121,18 @@ def sweep():
 
 
 @pytest.mark.parametrize("name", ["alpha", "beta", "d"])
-def test_sweeps_over_values_in_any_order(sweep, name):
+def test_sweeps_are_independent_of_the_order(sweep, name):
     order = [*ORDER, *range(4, sweep.sizes[name])]
-    other = sweep.isel({name: order})
-    assert_alike(plotting.draw_plane(other, "margin"), plotting.draw_plane(sweep, "margin"))
-    assert_alike(plotting.draw_curves(other, "alpha_max"), plotting.draw_curves(sweep, "alpha_max"))
-    assert_alike(plotting.draw_outlines(other), plotting.draw_outlines(sweep))
-    slices = [list(find_slices(each)) for each in (sweep, other)]
+    shuffled = sweep.isel({name: order})
+    assert_equal_figures(plotting.draw_plane(shuffled, "margin"), plotting.draw_plane(sweep, "margin"))
+    assert_equal_figures(plotting.draw_curves(shuffled, "alpha_max"), plotting.draw_curves(sweep, "alpha_max"))
+    assert_equal_figures(plotting.draw_outlines(shuffled), plotting.draw_outlines(sweep))
+    slices = [list(find_slices(data)) for data in (sweep, shuffled)]
     assert slices[0]
     assert slices[0] == slices[1]
 
 
-def test_names_of_curves_stand_where_they_end():
+def test_labels_of_curves_are_at_their_ends():
     (ax,) = plotting.draw_ridge(shuffle_rows(RIDGE))
     heights = [text.xy[1] for text in ax.texts]
     assert [text.get_text() for text in ax.texts] == ["$d = 0$", "$d = 0.5$"]

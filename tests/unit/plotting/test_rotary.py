@@ -1,4 +1,4 @@
-"""Labels and legends of figures of rotary devices, and units as people write them."""
+"""Labels, legends and units in figures of rotary devices."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ KNOB = {"mass": "60 g cm^2", "damping": "0.02 mN m s/rad", "rate": "1 kHz", "del
 
 
 def draw(addition="", **study):
-    """The Axes of a study of the knob."""
+    """Return the axes of a study of the knob."""
     with read_in_units(ROTARY), style_sheet(system=ROTARY):
-        config = Config.model_validate({"version": 1, "name": "k", "scene": KNOB, "studies": [{"name": "it", **study}]})
-        (made,) = config.studies
-        assert isinstance(made, ComputedStudy)
-        return made.compute(config.scene, True).figures[addition]()
+        config = Config.model_validate(
+            {"version": 1, "name": "k", "scene": KNOB, "studies": [{"name": "study", **study}]}
+        )
+        (study_model,) = config.studies
+        assert isinstance(study_model, ComputedStudy)
+        return study_model.compute(config.scene, True).figures[addition]()
 
 
-def texts(axes):
+def legend_texts(axes):
     legends = [*axes[0].figure.legends, *(ax.get_legend() for ax in axes if ax.get_legend())]
     return [text.get_text() for legend in legends for text in legend.get_texts()]
 
@@ -30,13 +32,13 @@ def texts(axes):
 FILTERS = {"kind": "filters", "damping": ["0 N m s/rad", "0.02 mN m s/rad"], "cutoff": ["100 Hz", "30 Hz"]}
 
 
-def test_dampings_and_stiffnesses_in_legends_have_prefixes():
-    assert texts(draw(**FILTERS, samples=[2, 5]))[:2] == ["$b$ = 0 N m s/rad", "$b$ = 20.0 µN m s/rad"]
+def test_legends_have_unit_prefixes():
+    assert legend_texts(draw(**FILTERS, samples=[2, 5]))[:2] == ["$b$ = 0 N m s/rad", "$b$ = 20.0 µN m s/rad"]
     noisy = draw("_noise", **FILTERS, samples=[2, 5], resolution="0.18 deg", noise_limit="20 deg/s")
-    assert texts(noisy)[1].endswith(" mN m/rad")
+    assert legend_texts(noisy)[1].endswith(" mN m/rad")
 
 
-def test_a_rotary_device_has_an_inertia():
+def test_rotary_device_has_an_inertia():
     (ax,) = draw(kind="design", find="mass", stiffness=["1 N m/rad"], within=["10 g cm^2", "5000 g cm^2"])
     assert ax.get_xlabel() == "inertia  $J$  in g cm$^2$"
     assert "48.3 g cm$^2$ or more" in [text.get_text() for text in ax.texts]
@@ -45,7 +47,7 @@ def test_a_rotary_device_has_an_inertia():
     assert ax.get_ylabel().endswith(r"$\beta = B\,T/J$")
 
 
-def test_a_sweep_has_its_units_as_people_write_them(tmp_path):
+def test_sweep_figures_have_readable_units(tmp_path):
     axes = {"stiffness": ["0.1 N m/rad", "0.5 N m/rad"], "virtual_damping": ["1 mN m s/rad", "2 mN m s/rad"]}
     study = {"kind": "sweep", "name": "s", "axes": axes | {"delay": ["0.7 periods", "1 periods"]}}
     masses = {"kind": "sweep", "name": "m", "axes": {"mass": ["60 g cm^2", "90 g cm^2"]}, "outputs": ["stiffness_max"]}

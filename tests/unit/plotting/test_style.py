@@ -1,4 +1,4 @@
-"""What all figures share: legends that fit, spacing of axes, names beside panels, and the kinds of files."""
+"""The common style of figures: legends, logarithmic axes, cell edges and file formats."""
 
 from itertools import combinations
 
@@ -13,10 +13,12 @@ from zwidth.plotting import grid, style
 LONG = "a device with a filter, a coupling and a hand, number {}"
 
 
-@pytest.mark.parametrize("words, columns", [("short {}", 5), ("a scene {}", 4), (LONG, 1), (LONG + ", " + LONG * 2, 1)])
-def test_a_legend_is_no_wider_than_its_figure(words, columns):
+@pytest.mark.parametrize(
+    "label_format, columns", [("short {}", 5), ("a scene {}", 4), (LONG, 1), (LONG + ", " + LONG * 2, 1)]
+)
+def test_legend_is_not_wider_than_its_figure(label_format, columns):
     panels = style.panels(None, 1, 6.4, 4.0)
-    style.legend(panels, [style.line(words.format(k, k, k)) for k in range(5)], outside=True, ncols=5)
+    style.legend(panels, [style.line(label_format.format(k, k, k)) for k in range(5)], outside=True, ncols=5)
     figure = style.figure_of(panels)
     figure.draw_without_rendering()
     (legend,) = figure.legends
@@ -25,13 +27,13 @@ def test_a_legend_is_no_wider_than_its_figure(words, columns):
     assert box.x0 >= 0
     assert box.x1 <= figure.bbox.x1
     boxes = [text.get_window_extent() for text in legend.get_texts()]
-    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+    assert not any(first.overlaps(second) for first, second in combinations(boxes, 2))
     assert [" ".join(text.get_text().split()) for text in legend.get_texts()] == [
-        words.format(k, k, k) for k in range(5)
+        label_format.format(k, k, k) for k in range(5)
     ]
 
 
-def test_a_legend_fits_the_size_that_is_wanted():
+def test_figure_has_the_configured_size():
     with style.style_sheet(size=(3.0, 2.0)):
         panels = style.panels(None, 1, 6.4, 4.0)
     figure = style.figure_of(panels)
@@ -39,11 +41,11 @@ def test_a_legend_fits_the_size_that_is_wanted():
     assert style.figure_of(style.panels(None, 1, 6.4, 4.0)).get_size_inches().tolist() == [6.4, 4.0]
 
 
-def test_the_look_is_a_style_of_matplotlib():
+def test_house_style_is_a_matplotlib_style():
     with style.house_style():
-        ours = dict(matplotlib.rcParams)
+        house = dict(matplotlib.rcParams)
     with matplotlib.style.context("zwidth.plotting.house"):
-        assert dict(matplotlib.rcParams) == ours
+        assert dict(matplotlib.rcParams) == house
 
 
 @pytest.mark.parametrize(
@@ -60,7 +62,7 @@ def test_the_look_is_a_style_of_matplotlib():
         (1e-3, 1e4),
     ],
 )
-def test_a_logarithmic_axis_has_plain_numbers(low, high):
+def test_logarithmic_axis_has_plain_numbers(low, high):
     (ax,) = style.panels(None, 1, 5.0, 3.0)
     style.use_logarithmic(ax, "x", (low, high))
     ax.set_xlim(low, high)
@@ -71,13 +73,13 @@ def test_a_logarithmic_axis_has_plain_numbers(low, high):
     assert [float(tick.get_text()) for tick in shown] == pytest.approx([tick.get_position()[0] for tick in shown])
 
 
-def test_a_logarithmic_axis_of_one_value_is_near_it():
+def test_logarithmic_axis_of_a_single_value():
     (ax,) = style.panels(None, 1, 5.0, 3.0)
     style.use_logarithmic(ax, "x", [100.0])
     assert ax.get_xlim() == (50.0, 200.0)
 
 
-def test_many_decades_have_their_powers_of_ten_where_two_and_five_have_no_room():
+def test_many_decades_have_ticks_only_at_powers_of_ten():
     (ax,) = style.panels(None, 1, 5.0, 3.0)
     style.use_logarithmic(ax, "x", (1.0, 2000.0), style.DECADES)
     ax.set_xlim(1e-12, 2.0)
@@ -104,17 +106,17 @@ def test_many_decades_have_their_powers_of_ten_where_two_and_five_have_no_room()
         ([5, 5, 5], False),
     ],
 )
-def test_ratios_that_are_nearly_equal_are_logarithmic(values, expected):
+def test_nearly_equal_ratios_are_logarithmic(values, expected):
     assert grid.logarithmic(np.asarray(values, dtype=float)) is expected
 
 
-def test_cells_end_half_way_between_their_values():
+def test_cell_edges_are_midway_between_values():
     np.testing.assert_allclose(grid.find_edges(np.array([1.0, 2.0, 3.0])), [0.5, 1.5, 2.5, 3.5], rtol=1e-15)
     edges = grid.find_edges(np.array([1.0, 10.0, 100.0]))
     np.testing.assert_allclose(edges, 10.0 ** np.array([-0.5, 0.5, 1.5, 2.5]), rtol=1e-14)
 
 
-def test_dampings_in_equal_ratios_are_on_a_logarithmic_axis():
+def test_dampings_in_equal_ratios_have_a_logarithmic_axis():
     delta = np.geomspace(0.1, 1e4, 41)
     columns = {name: values[:41] for name, values in RIDGE.items()}
     (ax,) = plotting.draw_ridge({**columns, "delta": delta, "alpha_max": 3 * delta + 1})
@@ -124,12 +126,12 @@ def test_dampings_in_equal_ratios_are_on_a_logarithmic_axis():
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_text_is_kept_as_text_where_a_style_sheet_says_so(tmp_path, text):
+def test_style_sheet_may_keep_text_as_text(tmp_path, text):
     sheet = tmp_path / "text.mplstyle"
     sheet.write_text("svg.fonttype: none\n", encoding="utf-8")
     with style.style_sheet(sheet if text else None):
         (file,) = plotting.save(plotting.draw_ridge(RIDGE), tmp_path / "ridge", ("svg",))
     written = file.read_text(encoding="utf-8")
     assert ("<text" in written) is text
-    # A comment in the outlines says it, too.
+    # Otherwise the text appears in no comment of the outlines either.
     assert (">held delay (exact)<" in written) is text

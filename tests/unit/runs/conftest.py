@@ -1,9 +1,9 @@
-"""Configurations of runs, runs of them, and what their folders hold."""
+"""Fixtures with configurations of runs, finished runs and failing studies."""
 
 import shutil
 
 import pytest
-from run_folders import BOTH, SMALL
+from run_folders import SMALL, SMALL_WITH_SWEEP
 from unpainted import painting_nothing
 
 from zwidth.runs import run
@@ -18,17 +18,17 @@ def config(tmp_path):
 
 
 @pytest.fixture
-def both(tmp_path):
+def config_with_sweep(tmp_path):
     file = tmp_path / "both.yaml"
-    file.write_text(BOTH, encoding="utf-8")
+    file.write_text(SMALL_WITH_SWEEP, encoding="utf-8")
     return file
 
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory):
-    """The folder of a run that nothing disturbed."""
+    """Return the folder of an undisturbed run."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    (folder / "both.yaml").write_text(BOTH, encoding="utf-8")
+    (folder / "both.yaml").write_text(SMALL_WITH_SWEEP, encoding="utf-8")
     with painting_nothing():
         result = run(folder / "both.yaml", out=folder / "out")
     assert result.ok
@@ -40,13 +40,13 @@ def undisturbed(tmp_path_factory):
 
 @pytest.fixture
 def finished(undisturbed, tmp_path):
-    """A copy of it, for a test to do with as it likes."""
+    """Return a copy of the undisturbed run, which the test may modify."""
     return shutil.copytree(undisturbed, tmp_path / "out")
 
 
 @pytest.fixture
 def fail(monkeypatch):
-    """Makes the study ``one`` fail until the test is done with it."""
+    """Make the study ``one`` fail; ``fail.undo()`` ends that."""
     real = MapStudy.compute
 
     def compute(self, scene, alone):

@@ -1,12 +1,12 @@
-"""Figures from the store of a sweep: which there are, what they show, and at which slices."""
+"""Figures of stored sweeps: which are drawn, their contents and slices."""
 
 import json
 
 import numpy as np
 import pytest
-from chunks import failing_on_2
+from chunks import fail_on_2
 from matplotlib.figure import Figure
-from sweeping import config_of, main_of, run_sweeps, study
+from sweeping import make_config, run_main, run_sweeps, study
 
 import zwidth
 from zwidth.core.errors import InputError, StoreError
@@ -39,18 +39,18 @@ def folder(tmp_path_factory):
         study("devices", axes=DEVICES, outputs=("stiffness_max", "virtual_damping_at_max")),
         study("point", axes={"alpha": 0.1, "beta": 0.1, "delta": 0.1, "d": 1}),
     ]
-    assert run_sweeps(config_of(*studies), folder).ok
+    assert run_sweeps(make_config(*studies), folder).ok
     return folder
 
 
 @pytest.fixture(scope="module")
 def plane(folder):
-    """The results over walls, devices and delays."""
+    """Return the results over walls, devices and delays."""
     return open_dataset(folder / "plane.zarr").load()
 
 
-def meshes(axes):
-    """What is drawn as colors, panel by panel."""
+def color_values(axes):
+    """Return the values drawn as colors, per panel."""
     return [ax.collections[0].get_array() for ax in axes]
 
 
@@ -59,13 +59,13 @@ def titles(axes):
 
 
 def test_every_sweep_is_drawn(folder, tmp_path, monkeypatch):
-    told = []
-    # To write the files takes longer than all the rest; another test does.
+    reported = []
+    # Do not write the files, which is slow and tested elsewhere.
     monkeypatch.setattr(
         draw, "save", lambda drawn, stem, *_, **__: (stem.with_suffix(".png"), stem.with_suffix(".svg"))
     )
-    files = draw_stores(folder, tmp_path, progress=told.append)
-    assert told == list(files)
+    files = draw_stores(folder, tmp_path, progress=reported.append)
+    assert reported == list(files)
     names = {file.stem for file in files}
     assert names == {
         *(f"plane_{name}" for name in ALL if name not in ("kind", "passive")),
@@ -74,11 +74,11 @@ def test_every_sweep_is_drawn(folder, tmp_path, monkeypatch):
     assert {file.suffix for file in files} == {".png", ".svg"}
 
 
-def test_panels_whose_values_lie_close_together_have_titles_of_their_own(plane):
+def test_panels_of_nearly_equal_values_have_distinct_titles(plane):
     close = plane.assign_coords(d=[1.0, 1.00001], delta=[0.1, 0.100002, 0.5, 1.0])
-    told = titles(draw_plane(close, "margin"))
-    assert told[0] == r"$d = 1$,  $\delta = 0.1$"
-    assert len(set(told)) == len(told)
+    panel_titles = titles(draw_plane(close, "margin"))
+    assert panel_titles[0] == r"$d = 1$,  $\delta = 0.1$"
+    assert len(set(panel_titles)) == len(panel_titles)
 
 
 def test_panels_of_inertias_have_their_unit(tmp_path):
@@ -92,47 +92,47 @@ def test_panels_of_inertias_have_their_unit(tmp_path):
         assert rf"$J = {inertia}\,\mathrm{{g~cm^2}}$" in title
 
 
-def test_a_plane_holds_the_values_of_the_store(plane):
+def test_plane_agrees_with_the_store(plane):
     axes = draw_plane(plane, "margin")
-    # Two delays, and three of the four dampings.
-    places = [{"d": d, "delta": delta} for d in (0, 1) for delta in (0, 2, 3)]
+    # Both delays, and three of the four dampings.
+    selections = [{"d": d, "delta": delta} for d in (0, 1) for delta in (0, 2, 3)]
     assert titles(axes) == [rf"$d = {d}$,  $\delta = {delta}$" for d in (0, 1) for delta in (0.05, 0.5, 1)]
     peaks = []
-    for place, ax, mesh in zip(places, axes, meshes(axes), strict=True):
-        np.testing.assert_array_equal(mesh, plane.margin.isel(place).values.T)
+    for selection, ax, mesh in zip(selections, axes, color_values(axes), strict=True):
+        np.testing.assert_array_equal(mesh, plane.margin.isel(selection).values.T)
         peaks += [line.get_xydata().tolist() for line in ax.lines if line.get_label() == "stiffest stable wall"]
-        wall = plane[["alpha_max", "beta_at_max"]].isel(place)
-        # Without delay the stiffest wall of the third damping lies beyond the axis.
+        wall = plane[["alpha_max", "beta_at_max"]].isel(selection)
+        # Without delay the maximum at the third damping lies outside of the axes.
         if wall.alpha_max <= plane.alpha.max() and wall.beta_at_max <= plane.beta.max():
             assert peaks[-1] == [[float(wall.alpha_max), float(wall.beta_at_max)]]
     assert 0 < len(peaks) < 6
 
 
-def test_a_region_is_bounded_by_the_contour_of_a_number(plane):
+def test_region_is_bounded_by_a_contour_of_the_margin(plane):
     axes = draw_plane(plane, "stable")
     figure = axes[0].figure
     assert list(figure.axes) == list(axes)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["stable", "passive", "stiffest stable wall"]
     assert figure.get_supxlabel() == r"normalized stiffness  $\alpha = K\,T^2\!/m$"
-    np.testing.assert_array_equal(meshes(axes)[0], plane.stable.isel(d=0, delta=0).values.T)
-    # The contour of truth values runs along grid lines and half way between them, that of the margin anywhere.
+    np.testing.assert_array_equal(color_values(axes)[0], plane.stable.isel(d=0, delta=0).values.T)
+    # A contour of booleans runs along or midway between grid lines, that of the margin anywhere.
     edge, step = axes[0].collections[1].get_paths()[0].vertices, float(np.diff(plane.alpha)[0])
-    off = np.abs(edge[:, :1] - plane.alpha.values).min(axis=1) / step
-    assert np.count_nonzero((off > 0.01) & (off < 0.49)) > 3
+    offset = np.abs(edge[:, :1] - plane.alpha.values).min(axis=1) / step
+    assert np.count_nonzero((offset > 0.01) & (offset < 0.49)) > 3
 
 
-def test_a_part_of_a_dataset_is_drawn_into_axes_of_ones_own(plane):
+def test_part_of_a_dataset_is_drawn_into_given_axes(plane):
     figure = Figure(layout="constrained")
     left, right = figure.subplots(1, 2)
     part = plane.sel(d=1, delta=0.1)
     assert list(draw_plane(part, "margin", left)) == [left]
-    np.testing.assert_array_equal(meshes([left])[0], part.margin.values.T)
+    np.testing.assert_array_equal(color_values([left])[0], part.margin.values.T)
     assert left.get_title(loc="left") == r"$d = 1$,  $\delta = 0.1$"
     assert left.get_xlabel()
     assert left.get_ylabel()
     assert list(draw_curves(part.isel(beta=3), "margin", right)) == [right]
     np.testing.assert_array_equal(right.lines[0].get_ydata(), part.margin.isel(beta=3).values)
-    # The data is as it was.
+    # The data must not be modified.
     assert "units" in plane.alpha.attrs
     assert "factor" not in plane.alpha.attrs
 
@@ -146,41 +146,41 @@ def test_every_device_has_its_boundary(plane):
     assert len(ax.collections) == 4
     for outline, device in zip(ax.collections, range(4), strict=True):
         for alpha, beta in outline.get_paths()[0].vertices[::5]:
-            # The end of a line may lie a rounding error outside of the grid.
+            # The end of a line may lie outside of the grid by a rounding error.
             alpha = np.clip(alpha, part.alpha.min(), part.alpha.max())
             beta = np.clip(beta, part.beta.min(), part.beta.max())
-            # Between points of the grid the margin is all but linear.
+            # Between grid points the margin is nearly linear.
             assert abs(float(part.margin.isel(delta=device).interp(alpha=alpha, beta=beta))) < 1e-3
 
 
 @pytest.mark.parametrize("draw", [draw_plane, lambda data, name: draw_curves(data.isel(alpha=0), name)])
-def test_a_single_value_is_no_figure(plane, draw):
+def test_figure_of_a_single_value_raises(plane, draw):
     with pytest.raises(InputError, match="'stable' varies over"):
         draw(plane.isel(beta=0, delta=0, d=0), "stable")
     with pytest.raises(InputError, match="contains no boundaries of several devices"):
         draw_outlines(plane.isel(delta=0, d=0))
 
 
-def test_slices_are_the_nearest_values(folder, capsys, tmp_path, monkeypatch):
-    found = []
+def test_slices_are_at_the_nearest_values(folder, capsys, tmp_path, monkeypatch):
+    figures = []
     with monkeypatch.context() as patch:
-        patch.setattr(draw, "save", lambda drawn, stem, *_, **__: found.append((stem.name, drawn)) or ())
+        patch.setattr(draw, "save", lambda drawn, stem, *_, **__: figures.append((stem.name, drawn)) or ())
         notes: list[str] = []
-        draw_stores(folder / "devices.zarr", tmp_path, at={"rate": "2.1 kHz"}, note=notes.append)
-        draw_stores(folder / "devices.zarr", tmp_path, at={"rate": "2kHz"}, note=notes.append)
-        draw_stores(folder / "plane.zarr", tmp_path, at={"delta": "0.12", "d": 0.9})
-        draw_stores(folder / "devices.zarr", tmp_path, at={"device": "heavy"})
+        draw_stores(folder / "devices.zarr", tmp_path, selection={"rate": "2.1 kHz"}, note=notes.append)
+        draw_stores(folder / "devices.zarr", tmp_path, selection={"rate": "2kHz"}, note=notes.append)
+        draw_stores(folder / "plane.zarr", tmp_path, selection={"delta": "0.12", "d": 0.9})
+        draw_stores(folder / "devices.zarr", tmp_path, selection={"device": "heavy"})
     assert notes == ["devices.zarr: rate = 2000 Hz, the value of the sweep nearest to 2.1 kHz"]
-    drawn = dict(found)
+    drawn = dict(figures)
     assert titles(drawn["plane_stable"]) == [r"$d = 1$,  $\delta = 0.1$"]
     assert titles(drawn["devices_stiffness_max"]) == ["heavy"]
-    words = ["figures", folder / "plane.zarr", "--at", "delta=0.12", "--at", "d=1", "--out", tmp_path, "--json"]
-    assert main_of(*words) == 0
+    arguments = ["figures", folder / "plane.zarr", "--at", "delta=0.12", "--at", "d=1", "--out", tmp_path, "--json"]
+    assert run_main(*arguments) == 0
     assert len(json.loads(capsys.readouterr().out)["files"]) == 8
     assert all(file.stat().st_size > 1000 for file in tmp_path.iterdir())
 
 
-def test_curves_have_units_one_can_read(folder):
+def test_curves_have_readable_units(folder):
     kept = open_dataset(folder / "devices.zarr")
     axes = draw_curves(kept, "stiffness_max")
     figure = axes[0].figure
@@ -194,18 +194,18 @@ def test_curves_have_units_one_can_read(folder):
     assert [text.get_text() for text in figure.legends[0].get_texts()] == names
 
 
-def test_what_is_not_computed_is_left_blank_and_said(tmp_path):
+def test_missing_points_are_blank_and_in_the_legend(tmp_path):
     axes = {**PLANE, "alpha": {"linear": {"start": 0.01, "stop": 1.0, "num": 2000}}, "delta": [0.1], "d": [0, 1, 2]}
-    run_sweeps(config_of(study(axes=axes)), tmp_path, perform=failing_on_2)
+    run_sweeps(make_config(study(axes=axes)), tmp_path, perform=fail_on_2)
     drawn = draw_plane(open_dataset(tmp_path), "stable")
-    assert any(np.ma.getmaskarray(mesh).any() for mesh in meshes(drawn))
-    # A grid finer than a page is thinned.
-    assert [mesh.shape for mesh in meshes(drawn)] == [(13, 500)] * 3
-    assert "no answer" in [text.get_text() for text in drawn[0].figure.legends[0].get_texts()]
+    assert any(np.ma.getmaskarray(mesh).any() for mesh in color_values(drawn))
+    # A grid finer than the page is thinned.
+    assert [mesh.shape for mesh in color_values(drawn)] == [(13, 500)] * 3
+    assert "no result" in [text.get_text() for text in drawn[0].figure.legends[0].get_texts()]
 
 
 @pytest.mark.parametrize(
-    "at, says",
+    "at, message",
     [
         ({"mu": 1}, "at: no sweep in .* varies 'mu'; choose from .*d, delta"),
         ({"delta": "x"}, "at: delta: got 'x'; write a number$"),
@@ -215,15 +215,15 @@ def test_what_is_not_computed_is_left_blank_and_said(tmp_path):
         ({"device": "x"}, "at: no device 'x' in the sweep; choose from light, heavy"),
     ],
 )
-def test_slices_that_do_not_exist_are_refused(folder, tmp_path, at, says):
-    with pytest.raises(InputError, match=says):
-        draw_stores(folder, tmp_path / "no", at=at)
+def test_invalid_slices_raise(folder, tmp_path, at, message):
+    with pytest.raises(InputError, match=message):
+        draw_stores(folder, tmp_path / "no", selection=at)
     assert not (tmp_path / "no").exists()
 
 
-def test_a_folder_without_stores_is_refused(tmp_path, capsys):
+def test_folder_without_stores_raises(tmp_path, capsys):
     with pytest.raises(StoreError, match="contains no store of a sweep"):
         draw_stores(tmp_path)
-    assert main_of("figures", tmp_path) == 2
-    assert main_of("figures", tmp_path, "--at", "delta") == 2
+    assert run_main("figures", tmp_path) == 2
+    assert run_main("figures", tmp_path, "--at", "delta") == 2
     assert "write NAME=VALUE, such as delta=0.1" in capsys.readouterr().err

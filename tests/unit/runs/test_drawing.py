@@ -1,10 +1,10 @@
-"""Figures of sweeps as somebody wants them: slices, axes, kinds of files, sizes, and why there are none."""
+"""Options for figures of sweeps: slices, axes, file formats and sizes, and the messages if no figure is possible."""
 
 import matplotlib
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from sweeping import config_of, main_of, run_sweeps, study
+from sweeping import make_config, run_main, run_sweeps, study
 
 from zwidth.core.errors import InputError
 from zwidth.plotting import draw_curves, draw_plane
@@ -31,27 +31,29 @@ def folder(tmp_path_factory):
         study("walls", axes=WALLS, outputs=("stable", "margin")),
         study("point", axes={"alpha": 0.1, "beta": 0.1, "delta": 0.1, "d": 1}),
     ]
-    assert run_sweeps(config_of(*studies), folder).ok
+    assert run_sweeps(make_config(*studies), folder).ok
     return folder
 
 
 @pytest.fixture
-def drawn(monkeypatch, tmp_path):
-    """Draws without writing, and returns the Axes of each figure by its name, and the notes."""
-    found, notes = {}, []
-    monkeypatch.setattr(draw, "save", lambda axes, stem, *_, **__: found.setdefault(stem.name, axes) is None or (stem,))
+def draw_without_writing(monkeypatch, tmp_path):
+    """Return a function that draws without writing; it returns the axes of each figure by name, and the notes."""
+    figures, notes = {}, []
+    monkeypatch.setattr(
+        draw, "save", lambda axes, stem, *_, **__: figures.setdefault(stem.name, axes) is None or (stem,)
+    )
 
     def draw_at(path, at=None):
-        found.clear()
+        figures.clear()
         notes.clear()
-        draw_stores(path, tmp_path, at=at, note=notes.append)
-        return found, notes
+        draw_stores(path, tmp_path, selection=at, note=notes.append)
+        return figures, notes
 
     return draw_at
 
 
 @pytest.mark.parametrize(
-    "wanted, taken, told",
+    "requested, selected, expected_notes",
     [
         ("0.2", 0.2, []),
         (0.2 * (1 + 1e-12), 0.2, []),
@@ -60,22 +62,22 @@ def drawn(monkeypatch, tmp_path):
         ("0.06", 0.1, ["ridge.zarr: mass = 0.1 kg, the value of the sweep nearest to 0.06"]),
     ],
 )
-def test_a_value_that_the_sweep_has_not_is_told(folder, drawn, wanted, taken, told):
-    found, notes = drawn(folder / "ridge.zarr", {"mass": wanted})
-    assert rf"$m = {1e3 * taken:g}\,\mathrm{{g}}$" in found["ridge_stiffness_max"][0].get_title(loc="left")
-    assert notes == told
+def test_nearest_value_is_selected_and_noted(folder, draw_without_writing, requested, selected, expected_notes):
+    figures, notes = draw_without_writing(folder / "ridge.zarr", {"mass": requested})
+    assert rf"$m = {1e3 * selected:g}\,\mathrm{{g}}$" in figures["ridge_stiffness_max"][0].get_title(loc="left")
+    assert notes == expected_notes
 
 
-@pytest.mark.parametrize("wanted", ["9", "0.66", "0.04", "-0.1"])
-def test_a_value_beyond_half_a_step_is_refused(folder, drawn, wanted):
-    with pytest.raises(InputError, match=rf"at: mass: got {wanted} kg, the sweep has 0.1 kg to 0.5 kg; choose"):
-        drawn(folder / "ridge.zarr", {"mass": wanted})
-    # A single value has no steps.
+@pytest.mark.parametrize("requested", ["9", "0.66", "0.04", "-0.1"])
+def test_value_beyond_half_a_step_raises(folder, draw_without_writing, requested):
+    with pytest.raises(InputError, match=rf"at: mass: got {requested} kg, the sweep has 0.1 kg to 0.5 kg; choose"):
+        draw_without_writing(folder / "ridge.zarr", {"mass": requested})
+    # A single value has no step size.
     with pytest.raises(InputError, match=r"at: mass: got 0.11 kg, the sweep has 0.1 kg; choose"):
         draw._find_nearest(open_dataset(folder / "ridge.zarr").isel(mass=[0]), "mass", 0.11)
 
 
-def test_curves_over_the_axes_that_are_wanted(folder):
+def test_curves_over_given_axes(folder):
     data = open_dataset(folder / "ridge.zarr")
     axes = draw_curves(data, "stiffness_max", x="rate", hue="delay", col="mass")
     kept = data.stiffness_max.isel(damping=0)
@@ -87,7 +89,7 @@ def test_curves_over_the_axes_that_are_wanted(folder):
             np.testing.assert_allclose(line.get_ydata(), kept.isel(mass=mass, delay=delay).values / 1e3, rtol=1e-15)
 
 
-def test_a_plane_over_the_axes_that_are_wanted(folder):
+def test_plane_over_given_axes(folder):
     data = open_dataset(folder / "ridge.zarr")
     axes = draw_plane(data, "stiffness_max", x="rate", y="mass", col="delay")
     kept = data.stiffness_max.isel(damping=0)
@@ -98,24 +100,24 @@ def test_a_plane_over_the_axes_that_are_wanted(folder):
     assert figure_of(axes).get_supxlabel().startswith("sampling rate")
 
 
-def test_an_axis_alone_leaves_the_others_to_the_program(folder):
+def test_remaining_axes_are_chosen_automatically(folder):
     data = open_dataset(folder / "walls.zarr").load()
     (ax, *_) = draw_plane(data, "margin", x="delta")
     assert ax.collections[0].get_array().shape == (3, 4)
-    # Those of the walls, which come first, are taken for colors and panels.
+    # Without colors and panels given, the axes of walls are used for these first.
     axes = draw_curves(data, "margin", hue="alpha", col="beta")
     assert len(axes) == 2
     np.testing.assert_array_equal(axes[1].lines[2].get_xdata(), data.delta.values)
     np.testing.assert_array_equal(axes[1].lines[2].get_ydata(), data.margin.isel(d=0, beta=1, alpha=2).values)
 
 
-def test_files_of_the_kind_size_and_style_that_are_wanted(folder, tmp_path, capsys):
+def test_files_have_the_given_format_size_and_style(folder, tmp_path, capsys):
     sheet = tmp_path / "mine.mplstyle"
     sheet.write_text("lines.linewidth: 4\n", encoding="utf-8")
-    words = ["--at", "delay=0", "--at", "damping=1", "--style", sheet]
-    words += ["--format", "png", "--format", "pdf", "--dpi", "50", "--size", "6x3"]
+    arguments = ["--at", "delay=0", "--at", "damping=1", "--style", sheet]
+    arguments += ["--format", "png", "--format", "pdf", "--dpi", "50", "--size", "6x3"]
     before = dict(matplotlib.rcParams)
-    assert main_of("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
+    assert run_main("figures", folder / "ridge.zarr", *arguments, "--out", tmp_path / "out") == 0
     assert dict(matplotlib.rcParams) == before
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [
         "ridge_stiffness_max.pdf",
@@ -124,7 +126,7 @@ def test_files_of_the_kind_size_and_style_that_are_wanted(folder, tmp_path, caps
     assert imread(tmp_path / "out" / "ridge_stiffness_max.png").shape[:2] == (150, 300)
     assert (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes().startswith(b"%PDF")
     first = (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes()
-    assert main_of("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
+    assert run_main("figures", folder / "ridge.zarr", *arguments, "--out", tmp_path / "out") == 0
     assert (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes() == first
     with draw.style_sheet(sheet):
         (ax,) = draw_curves(open_dataset(folder / "ridge.zarr").isel(delay=0, damping=0), "stiffness_max", x="rate")
@@ -133,7 +135,7 @@ def test_files_of_the_kind_size_and_style_that_are_wanted(folder, tmp_path, caps
 
 
 @pytest.mark.parametrize(
-    "words, says",
+    "arguments, message",
     [
         (["--size", "7"], "got '7'; write width x height"),
         (["--size", "0x4"], "got '0x4'; write width x height"),
@@ -143,19 +145,19 @@ def test_files_of_the_kind_size_and_style_that_are_wanted(folder, tmp_path, caps
         (["--style", "no/such.mplstyle"], "style: no/such.mplstyle: No such file"),
     ],
 )
-def test_kinds_of_files_that_cannot_be_are_refused(folder, tmp_path, capsys, words, says):
-    assert main_of("figures", folder, *words, "--out", tmp_path / "out") == 2
-    assert says in capsys.readouterr().err
+def test_invalid_figure_options_raise(folder, tmp_path, capsys, arguments, message):
+    assert run_main("figures", folder, *arguments, "--out", tmp_path / "out") == 2
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_a_command_that_draws_nothing_says_why(folder, tmp_path, capsys):
-    assert main_of("figures", folder / "point.zarr", "--out", tmp_path / "out") == 1
+def test_command_without_figures_states_the_reason(folder, tmp_path, capsys):
+    assert run_main("figures", folder / "point.zarr", "--out", tmp_path / "out") == 1
     assert "point.zarr: no figure, because it is a single point" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_a_panel_has_the_values_that_fit_above_it(folder):
+def test_panel_titles_fit_above_the_panel(folder):
     values = {"period": (1e-3, "s"), "delay": (1.0, "sampling periods"), "damping": (10.0, "N s/m")}
     data = open_dataset(folder / "ridge.zarr").drop_vars(["damping", "delay"]).isel(damping=0, delay=0, rate=0)
     few, many = (
@@ -163,12 +165,12 @@ def test_a_panel_has_the_values_that_fit_above_it(folder):
         for count in (2, 3)
     )
 
-    def name(data, masses):
+    def panel_titles(data, masses):
         _, axes = new_figure(7.0, 3.0, 1, len(masses))
         name_panels(axes[0], [data.isel(mass=k).drop_vars("rate", errors="ignore") for k in masses])
         return [ax.get_title() for ax in axes[0]]
 
-    assert [title.count("=") for title in name(few, (0, 1, 2))] == [3, 3, 3]
-    # What all have in common would run into the next one's.
-    assert [title.count("=") for title in name(many, (0, 1, 2))] == [1, 1, 1]
-    assert [title.count("=") for title in name(many, (0,))] == [4]
+    assert [title.count("=") for title in panel_titles(few, (0, 1, 2))] == [3, 3, 3]
+    # Long common values would overlap the next title.
+    assert [title.count("=") for title in panel_titles(many, (0, 1, 2))] == [1, 1, 1]
+    assert [title.count("=") for title in panel_titles(many, (0,))] == [4]

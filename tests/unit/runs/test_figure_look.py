@@ -1,4 +1,4 @@
-"""The width and the kind of a run's figures, as a configuration and the command line ask for them."""
+"""Width, format and resolution of a run's figures, from the configuration or the command line."""
 
 import json
 
@@ -21,9 +21,9 @@ CONFIG = {"version": 1, "name": "small", "scene": SCENE, "studies": STUDIES}
 
 
 @pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
-def test_figures_have_the_width_and_the_kind_that_are_asked_for(ending, tmp_path):
-    found = zwidth.run({**CONFIG, "figure": {"width": "85 mm", "format": ending}}, out=tmp_path / "r")
-    assert found.ok
+def test_figures_have_the_configured_width_and_format(ending, tmp_path):
+    result = zwidth.run({**CONFIG, "figure": {"width": "85 mm", "format": ending}}, out=tmp_path / "r")
+    assert result.ok
     drawn = sorted(file.name for file in (tmp_path / "r").glob("*.*") if file.suffix in (".png", ".svg", ".pdf"))
     assert drawn == [f"answer.{ending}", f"best.{ending}"]
     if ending == "png":
@@ -32,49 +32,49 @@ def test_figures_have_the_width_and_the_kind_that_are_asked_for(ending, tmp_path
                 assert picture.width == int(85 / 25.4 * style.PNG_DPI)
 
 
-def test_the_resolution_is_that_of_the_configuration_or_of_the_command(tmp_path):
+def test_resolution_is_set_by_configuration_or_command(tmp_path):
     widths = []
     for look, options in (({}, []), ({"dpi": 90}, []), ({}, ["--dpi", "360"]), ({"dpi": 90}, ["--dpi", "360"])):
         file, out = tmp_path / "c.json", tmp_path / f"r{len(widths)}"
         file.with_suffix(".yaml").write_text(json.dumps({**CONFIG, "figure": look}), encoding="utf-8")
-        done = CliRunner().invoke(cli, ["run", str(file.with_suffix(".yaml")), "--out", str(out), *options])
-        assert done.exit_code == 0, done.output
+        result = CliRunner().invoke(cli, ["run", str(file.with_suffix(".yaml")), "--out", str(out), *options])
+        assert result.exit_code == 0, result.output
         with Image.open(out / "best.png") as picture:
             widths.append(picture.width / picture.info["dpi"][0])
             assert round(picture.info["dpi"][0]) == (360 if options else look.get("dpi", 180))
     assert widths == pytest.approx(widths[:1] * 4, rel=0.01)
-    done = CliRunner().invoke(cli, ["figures", str(tmp_path / "r0")])
-    assert "contains no sweep" in str(done.exception)
-    assert "--overwrite --size 85mm --dpi 300" in str(done.exception)
+    result = CliRunner().invoke(cli, ["figures", str(tmp_path / "r0")])
+    assert "contains no sweep" in str(result.exception)
+    assert "--overwrite --size 85mm --dpi 300" in str(result.exception)
 
 
-def test_another_look_is_another_run(tmp_path):
+def test_resuming_with_another_figure_format_raises(tmp_path):
     assert zwidth.run(CONFIG, out=tmp_path / "r").ok
     with pytest.raises(zwidth.ZwidthError):
         zwidth.run({**CONFIG, "figure": {"width": 0.085}}, out=tmp_path / "r", resume=True)
 
 
-def test_type_is_legible_at_that_width():
-    """No text is smaller than 7 points, and no label stands out of the figure."""
+def test_text_is_legible_at_column_width():
+    """No text is smaller than 7 points, and no label extends beyond the figure."""
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
     with style.style_sheet(size=(85 / 25.4, None)):
         axes = draw(scene.recommend())
     figure = style.figure_of(axes)
     assert len(axes) == 2
     assert figure.get_figwidth() == pytest.approx(85 / 25.4)
-    # The first time, ticks come to be that the layout then knows of.
+    # Draw twice, because the layout uses ticks that the first drawing creates.
     for _ in range(2):
         figure.draw_without_rendering()
     for text in figure.findobj(Text):
         if isinstance(text, Text) and text.get_text() and text.get_visible():
             assert float(text.get_fontsize()) >= 7.0, text.get_text()
-    for text in [each for ax in axes for each in (ax.xaxis.label, ax.yaxis.label, *ax.texts)]:
+    for text in [label for ax in axes for label in (ax.xaxis.label, ax.yaxis.label, *ax.texts)]:
         box = text.get_window_extent()
         assert -1 <= box.x0 < box.x1 <= figure.bbox.width + 1, text.get_text()
 
 
 @pytest.mark.parametrize(
-    ("look", "words"),
+    ("look", "message"),
     [
         ("{width: 85}", "figure.width: got 85 m; it must be at least 0.05"),
         ("{format: jpg}", "figure.format: got 'jpg'; allowed are 'png', 'svg', 'pdf'"),
@@ -83,10 +83,10 @@ def test_type_is_legible_at_that_width():
         ("wide", "figure: got 'wide'; the look of figures is a mapping"),
     ],
 )
-def test_a_look_that_there_is_not(look, words, tmp_path):
+def test_invalid_figure_settings_raise(look, message, tmp_path):
     file = tmp_path / "c.yaml"
     file.write_text(f"version: 1\nname: c\nfigure: {look}\nstudies: [{{kind: ridge, name: r, delta: 0.1, d: 1}}]\n")
-    with pytest.raises(zwidth.ConfigError, match=words):
+    with pytest.raises(zwidth.ConfigError, match=message):
         zwidth.load_config(file)
 
 

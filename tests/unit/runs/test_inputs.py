@@ -1,11 +1,11 @@
-"""A run holds the files that it reads: it can be repeated from its own folder."""
+"""Copies of input files in a run's folder, from which the run can be repeated."""
 
 import hashlib
 import shutil
 from typing import Any
 
 import pytest
-from run_folders import record_of
+from run_folders import read_record
 
 import zwidth
 from zwidth.core.errors import StoreError, StoreExistsError
@@ -26,25 +26,25 @@ studies:
 """
 
 
-def write(folder, named, text=TABLE):
-    """A configuration that names a table below its folder."""
-    file = folder / named.strip("'\"")
+def write_config(folder, table_path, text=TABLE):
+    """Write a table and a configuration that refers to it; return the latter."""
+    file = folder / table_path.strip("'\"")
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(text, encoding="utf-8")
-    (folder / "own.yaml").write_text(SWEEP % named, encoding="utf-8")
+    (folder / "own.yaml").write_text(SWEEP % table_path, encoding="utf-8")
     return folder / "own.yaml"
 
 
-@pytest.mark.parametrize("named", ["devices.csv", "of mine/dévices, #1.csv", "'it: is.csv'", '"quoted.csv"'])
-def test_a_run_holds_what_it_reads(tmp_path, named):
-    if not named.startswith(("'", '"')) and "," in named:
-        named = f"'{named}'"
-    config = write(tmp_path / "source", named)
+@pytest.mark.parametrize("table_path", ["devices.csv", "of mine/dévices, #1.csv", "'it: is.csv'", '"quoted.csv"'])
+def test_run_is_repeatable_from_its_own_folder(tmp_path, table_path):
+    if not table_path.startswith(("'", '"')) and "," in table_path:
+        table_path = f"'{table_path}'"
+    config = write_config(tmp_path / "source", table_path)
     out = tmp_path / "out"
     assert zwidth.run(config, out=out).ok
     (copy,) = (out / "inputs").iterdir()
     assert copy.read_text(encoding="utf-8") == TABLE
-    assert record_of(out)["inputs"] == {copy.name: hashlib.sha256(TABLE.encode()).hexdigest()}
+    assert read_record(out)["inputs"] == {copy.name: hashlib.sha256(TABLE.encode()).hexdigest()}
     text = (out / "config.yaml").read_text(encoding="utf-8")
     assert f"csv: inputs/{copy.name}}}, rate: 1 kHz, delay: 1 periods}}  # of the workshop" in text
     shutil.rmtree(config.parent)
@@ -53,8 +53,8 @@ def test_a_run_holds_what_it_reads(tmp_path, named):
     assert again.ok
     assert (again.folder / "config.yaml").read_text(encoding="utf-8") == text
     assert open_dataset(again.folder).equals(open_dataset(moved))
-    going: list[dict[str, Any]] = [{"resume": True}, {"overwrite": True}]
-    for options in going:
+    option_sets: list[dict[str, Any]] = [{"resume": True}, {"overwrite": True}]
+    for options in option_sets:
         assert zwidth.run(moved / "config.yaml", out=moved, **options).ok
         assert copy.name in {file.name for file in (moved / "inputs").iterdir()}
     (moved / "inputs" / copy.name).unlink()
@@ -64,15 +64,15 @@ def test_a_run_holds_what_it_reads(tmp_path, named):
     assert "inputs</code> of the run" in zwidth.write_report(moved).read_text(encoding="utf-8")
 
 
-def test_a_configuration_that_is_read_already_finds_its_files(tmp_path, monkeypatch):
-    config = zwidth.load_config(write(tmp_path / "source", "devices.csv"))
+def test_loaded_configuration_stores_its_tables(tmp_path, monkeypatch):
+    config = zwidth.load_config(write_config(tmp_path / "source", "devices.csv"))
     monkeypatch.chdir(tmp_path)
-    # What a table holds is written out.
+    # The contents of the table are part of the written configuration.
     assert zwidth.run(config, out="out").ok
     assert zwidth.run("out/config.yaml", out="again").ok
 
 
-def test_results_of_a_table_that_has_changed_are_not_kept(tmp_path):
+def test_changed_table_is_not_resumed(tmp_path):
     poses, config = tmp_path / "arm.csv", tmp_path / "arm.yaml"
     poses.write_text("x,y,mass [kg],damping\n0,0,0.1,1\n1,0,0.2,1\n", encoding="utf-8")
     study = "{kind: workspace, name: w, poses: {csv: arm.csv, across: x, up: y}, period: 1 ms, delay: 0 s}"
@@ -85,7 +85,7 @@ def test_results_of_a_table_that_has_changed_are_not_kept(tmp_path):
         zwidth.run(config, out=tmp_path / "out", resume=True)
 
 
-def test_files_of_one_name_anchors_and_quotes(tmp_path):
+def test_inputs_with_equal_names_anchors_and_quotes(tmp_path):
     for name in ("a/x.csv", "b/x.csv", "b/X-2.csv", "c.csv"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(name, encoding="utf-8")
@@ -94,31 +94,31 @@ def test_files_of_one_name_anchors_and_quotes(tmp_path):
         "four: {csv: *first}\n"
         "five: {csv: none.csv, name: c.csv}\nsix: {csv: 'c.csv'}\n"
     )
-    found, files, names = gather_inputs(text, tmp_path)
-    assert found == (
+    rewritten, files, names = gather_inputs(text, tmp_path)
+    assert rewritten == (
         "one: {csv: &first inputs/x.csv}\ntwo: {csv: inputs/x-2.csv}  # b\nthree:\n  csv: inputs/X-2-2.csv\n"
         "four: {csv: *first}\nfive: {csv: none.csv, name: c.csv}\nsix: {csv: inputs/c.csv}\n"
     )
     assert {name: files[copy.removeprefix("inputs/")].decode() for name, copy in names.items()} == {
         name: name for name in names
     }
-    # A copy's own name stays.
-    place = tmp_path / "run" / "inputs"
-    place.mkdir(parents=True)
+    # Gathering again does not rename the copies.
+    folder = tmp_path / "run" / "inputs"
+    folder.mkdir(parents=True)
     for name, data in files.items():
-        (place / name).write_bytes(data)
-    assert gather_inputs(found, place.parent)[:2] == (found, files)
+        (folder / name).write_bytes(data)
+    assert gather_inputs(rewritten, folder.parent)[:2] == (rewritten, files)
 
 
-def test_what_is_somebodys_own_stays(tmp_path):
-    config = write(tmp_path / "source", "devices.csv")
+def test_files_not_written_by_the_run_are_kept(tmp_path):
+    config = write_config(tmp_path / "source", "devices.csv")
     out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     assert zwidth.run(config, out=out).ok
     shutil.rmtree(out / "inputs")
     elsewhere.mkdir()
     (out / "inputs").symlink_to(elsewhere)
-    going: list[dict[str, Any]] = [{"resume": True}, {"overwrite": True}]
-    for options in going:
+    option_sets: list[dict[str, Any]] = [{"resume": True}, {"overwrite": True}]
+    for options in option_sets:
         with pytest.raises(StoreExistsError, match="was not written by this run"):
             zwidth.run(config, out=out, **options)
     assert list(elsewhere.iterdir()) == []

@@ -1,11 +1,13 @@
-"""The record of a run: it names files of its own folder alone, and may be lost."""
+"""The record of a run: references outside of the folder are rejected, links are not followed, and a loss is
+recoverable.
+"""
 
 import json
 import os
 
 import numpy as np
 import pytest
-from run_folders import record_of, states
+from run_folders import read_record, read_states
 
 from zwidth.app.report.page import write_report
 from zwidth.core.errors import InputError, StoreError, StoreExistsError
@@ -14,23 +16,23 @@ from zwidth.runs import run
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 
-def tree(folder):
-    """All that is in a folder: what each file holds, and where each link leads."""
-    found = {}
+def list_tree(folder):
+    """Return the entries of a folder: contents of files and targets of links."""
+    contents = {}
     for path in sorted(folder.rglob("*")):
-        found[path.relative_to(folder).as_posix()] = (
+        contents[path.relative_to(folder).as_posix()] = (
             f"-> {os.readlink(path)}" if path.is_symlink() else path.read_bytes() if path.is_file() else None
         )
-    return found
+    return contents
 
 
 OUTSIDE = ["../victim/a.txt", "{victim}/a.txt", "../victim/store.zarr", "..", ".", "", "sub/../../victim/a.txt", "a\0b"]
 
 
-@pytest.mark.parametrize("where", ["files", "name", "inputs"])
+@pytest.mark.parametrize("key", ["files", "name", "inputs"])
 @pytest.mark.parametrize("name", OUTSIDE)
 @pytest.mark.parametrize("options", [{"resume": True}, {"overwrite": True}], ids=str)
-def test_a_record_that_names_files_elsewhere_is_refused(tmp_path, both, name, where, options):
+def test_record_naming_files_outside_raises(tmp_path, config_with_sweep, name, key, options):
     victim = tmp_path / "victim"
     (victim / "store.zarr").mkdir(parents=True)
     for file in ("a.txt", "store.zarr/zarr.json", "store.zarr/chunk"):
@@ -39,51 +41,51 @@ def test_a_record_that_names_files_elsewhere_is_refused(tmp_path, both, name, wh
     out.mkdir()
     name, entry = name.format(victim=victim), {"name": "one", "kind": "map", "state": "open", "inputs": {}, "files": {}}
     record = {"format": 2, "versions": {}, "studies": [entry], "inputs": {}}
-    if where == "name":
+    if key == "name":
         entry["name"] = name
     else:
-        (entry if where == "files" else record)[where][name] = "0"
+        (entry if key == "files" else record)[key][name] = "0"
     (out / "run.json").write_text(json.dumps(record), encoding="utf-8")
-    before = tree(victim), tree(out)
+    before = list_tree(victim), list_tree(out)
     with pytest.raises(StoreError, match="which is not the name of a file in its folder; choose another folder"):
-        run(both, out=out, **options)
+        run(config_with_sweep, out=out, **options)
     with pytest.raises(StoreError, match="not the name of a file in its folder"):
         write_report(out)
-    assert (tree(victim), tree(out)) == before
+    assert (list_tree(victim), list_tree(out)) == before
 
 
 @pytest.mark.parametrize("content", [[], {}, {"studies": 1}, {"studies": [1]}, {"studies": [], "versions": 1},
                                      {"studies": [{"name": "a", "files": "b"}]}, {"studies": [{}]}])  # fmt: skip
-def test_what_is_no_record_is_told(tmp_path, both, content):
+def test_invalid_record_raises(tmp_path, config_with_sweep, content):
     (tmp_path / "run.json").write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(StoreError, match=r"run.json: .*; choose another folder"):
-        run(both, out=tmp_path, resume=True)
+        run(config_with_sweep, out=tmp_path, resume=True)
 
 
 @pytest.mark.parametrize("options", [{"resume": True}, {"overwrite": True}], ids=str)
-def test_links_in_a_run_are_replaced_and_what_they_lead_to_stays(finished, both, tmp_path, options):
+def test_links_in_a_run_are_replaced_without_touching_their_targets(finished, config_with_sweep, tmp_path, options):
     victim = tmp_path / "victim"
     (victim / "tree").mkdir(parents=True)
     (victim / "tree" / "zarr.json").write_text("dear", encoding="utf-8")
     (victim / "two.npz").write_bytes((finished / "two.npz").read_bytes())
     (victim / "secret.svg").write_text("<svg>dear</svg>", encoding="utf-8")
-    before = tree(victim)
+    before = list_tree(victim)
     for name, target in (("two.npz", "two.npz"), ("one_stable.svg", "secret.svg")):
         (finished / name).unlink()
         (finished / name).symlink_to(victim / target)
-    # Another study's leavings, which the record names.
+    # A link left by another study and named in the record.
     (finished / "left.zarr").symlink_to(victim / "tree")
-    record = record_of(finished)
+    record = read_record(finished)
     record["studies"][0]["files"]["left.zarr"] = None
     record["studies"][0]["state"] = "open"
     (finished / "run.json").write_text(json.dumps(record), encoding="utf-8")
-    assert run(both, out=finished, **options).ok
-    assert tree(victim) == before
+    assert run(config_with_sweep, out=finished, **options).ok
+    assert list_tree(victim) == before
     assert not (finished / "two.npz").is_symlink()
     assert not (finished / "one_stable.svg").is_symlink()
 
 
-def test_a_report_shows_no_link(finished, tmp_path):
+def test_report_does_not_follow_links(finished, tmp_path):
     secret = tmp_path / "secret.svg"
     secret.write_text("<svg>dear</svg>", encoding="utf-8")
     (finished / "one_stable.svg").unlink()
@@ -94,32 +96,36 @@ def test_a_report_shows_no_link(finished, tmp_path):
 
 
 @pytest.mark.parametrize("options", [{"resume": True}, {"overwrite": True}], ids=str)
-def test_a_lost_record_is_told_and_written_anew(finished, both, options):
+def test_lost_record_is_reported_and_restored(finished, config_with_sweep, options):
     values = np.load(finished / "two.npz")["stable"]
     (finished / "run.json").unlink()
     (finished / "mine.txt").write_text("mine", encoding="utf-8")
     with pytest.raises(StoreExistsError, match=r"without its record run.json; replace .* --overwrite, .* --resume"):
-        run(both, out=finished)
-    result = run(both, out=finished, **options)
+        run(config_with_sweep, out=finished)
+    result = run(config_with_sweep, out=finished, **options)
     assert result.ok
-    assert states(finished) == {"one": "done", "two": "done", "swept": "done"}
+    assert read_states(finished) == {"one": "done", "two": "done", "swept": "done"}
     assert result.sweeps["swept"].computed == (0 if "resume" in options else 1)
     np.testing.assert_array_equal(np.load(finished / "two.npz")["stable"], values)
     assert (finished / "mine.txt").read_text(encoding="utf-8") == "mine"
-    assert [study.state for study in run(both, out=finished, resume=True).studies] == ["kept", "kept", "done"]
+    assert [study.state for study in run(config_with_sweep, out=finished, resume=True).studies] == [
+        "kept",
+        "kept",
+        "done",
+    ]
 
 
 @pytest.mark.parametrize("options", [{}, {"overwrite": True}], ids=str)
-def test_another_configurations_files_are_not_taken_for_a_lost_runs(finished, config, options):
+def test_files_of_another_configuration_are_not_overwritten(finished, config, options):
     (finished / "run.json").unlink()
-    before = tree(finished)
+    before = list_tree(finished)
     with pytest.raises(StoreExistsError, match="contains no run"):
         run(config, out=finished, **options)
-    assert tree(finished) == before
+    assert list_tree(finished) == before
 
 
 @pytest.mark.parametrize("kind", ["link", "dangling", "linked folder"])
-def test_a_lock_writes_into_no_file_elsewhere(config, tmp_path, kind):
+def test_lock_does_not_follow_links(config, tmp_path, kind):
     victim = tmp_path / "victim"
     victim.mkdir()
     (victim / "run").write_text("dear", encoding="utf-8")
@@ -136,4 +142,4 @@ def test_a_lock_writes_into_no_file_elsewhere(config, tmp_path, kind):
         make[kind]()
     with pytest.raises((InputError, OSError)):
         run(config, out=tmp_path / "out")
-    assert tree(victim) == {"run": b"dear"}
+    assert list_tree(victim) == {"run": b"dear"}

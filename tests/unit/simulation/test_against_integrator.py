@@ -1,4 +1,4 @@
-"""Simulations against an independent integrator: scipy's `solve_ivp` with events, in absolute coordinates."""
+"""Test simulations against an independent integrator: `solve_ivp` of SciPy with events, in absolute coordinates."""
 
 from __future__ import annotations
 
@@ -12,39 +12,44 @@ from random_motions import PERIODS, RandomMotion, condition, judge, nearest_deci
 
 from zwidth import Motion
 
-# Decided by rounding, or so unstable that the integrator's own error shows (random_motions).
+# Differences are allowed if an event is decided by rounding (distance below NEAR), or if the motion amplifies errors of
+# the integrator by more than CHAOTIC (random_motions).
 NEAR, CHAOTIC = 1e-8, 1e4
 
 
 def simulate(motion: RandomMotion, seed: int) -> tuple[Motion, RandomMotion]:
-    """The motion simulated, and the same with the instants that were drawn."""
+    """Return the simulated motion, and the same arguments with the sampled jitter."""
     period = motion.scene.timing.period
-    given = dict(motion.arguments)
-    jitter = given.pop("jitter_samples")
+    call_options = dict(motion.arguments)
+    jitter = call_options.pop("jitter_samples")
     options: dict[str, Any] = {
-        "start_position": given.pop("position"),
-        "start_velocity": given.pop("velocity"),
+        "start_position": call_options.pop("position"),
+        "start_velocity": call_options.pop("velocity"),
         "jitter": 0.0 if jitter is None else float(np.max(jitter)) * period,
     }
-    found = motion.scene.simulate(**given, **options, periods=PERIODS, seed=seed)
+    response = motion.scene.simulate(**call_options, **options, periods=PERIODS, seed=seed)
     if jitter is None:
-        return found, motion
-    late = np.append(np.asarray(found.time) / period - np.arange(PERIODS), 0.0)
-    return found, motion._replace(arguments=motion.arguments | {"jitter_samples": late})
+        return response, motion
+    lateness = np.append(np.asarray(response.time) / period - np.arange(PERIODS), 0.0)
+    return response, motion._replace(arguments=motion.arguments | {"jitter_samples": lateness})
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_motions_are_those_of_an_independent_integrator(kind):
-    rng, own = np.random.default_rng([12, KINDS.index(kind)]), kind in ("rigid", "filter")
+def test_motion_matches_independent_integrator(kind):
+    rng, has_closed_form = np.random.default_rng([12, KINDS.index(kind)]), kind in ("rigid", "filter")
     compared = 0
     for seed in range(3):
-        found, motion = simulate(random_motion(kind, rng), seed)
-        history = judge(motion, closed_form=own)
-        # The first body, at the start of every period.
+        response, motion = simulate(random_motion(kind, rng), seed)
+        history = judge(motion, closed_form=has_closed_form)
+        # The first body at the start of every period.
         first = (part.reshape(PERIODS + 1, -1)[:PERIODS, 0] for part in (history.position, history.velocity))
-        pairs = zip((np.asarray(found.position), np.asarray(found.velocity)), first, strict=True)
-        alike = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs) < tolerances.JUDGE.float64
-        compared += alike
-        # Who differs is asked why, and has one excuse.
-        assert alike or nearest_decision(history) <= NEAR or condition(motion, history, closed_form=own) >= CHAOTIC
+        pairs = zip((np.asarray(response.position), np.asarray(response.velocity)), first, strict=True)
+        agrees = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs) < tolerances.JUDGE.float64
+        compared += agrees
+        # A difference must have one of the two causes above.
+        assert (
+            agrees
+            or nearest_decision(history) <= NEAR
+            or condition(motion, history, closed_form=has_closed_form) >= CHAOTIC
+        )
     assert compared >= 2

@@ -1,4 +1,4 @@
-"""The design study: against the closed search of the rigid loop, K_max on both sides, tolerances and refusals."""
+"""The design study, against root finding on the rigid closed form, K_max next to the solution, and Monte Carlo runs."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def design(find, stiffness, device=DEVICE, **more):
 UNITS = {"damping": "N_s_per_m", "rate": "Hz", "delay": "s", "velocity.cutoff": "Hz", "mass": "kg"}
 
 
-def test_damping_rate_and_delay_are_those_of_the_closed_search():
+def test_required_damping_rate_and_delay_agree_with_the_closed_form():
     rigid = {"mass": 0.1, "period": 1e-3, "delay": 1e-3}
     expected = {
         "damping": find_required("damping", 30e3, 1.0, 100.0, **rigid),
@@ -32,99 +32,101 @@ def test_damping_rate_and_delay_are_those_of_the_closed_search():
         "delay": find_required("delay", 30e3, 0.0, 5e-3, mass=0.1, damping=10.0, period=1e-3),
     }
     for find, value in expected.items():
-        found = design(find, "30 kN/m", num=3).compute(None, True)
-        table, unit = found.table, UNITS[find].replace("_per_", "/").replace("_", " ")
-        assert found.answer[0].startswith(f"K_max = 30.00 kN/m: {find} of {with_unit(value, unit)} or ")
+        outcome = design(find, "30 kN/m", num=3).compute(None, True)
+        table, unit = outcome.table, UNITS[find].replace("_per_", "/").replace("_", " ")
+        assert outcome.answer[0].startswith(f"K_max = 30.00 kN/m: {find} of {with_unit(value, unit)} or ")
         assert table[f"value_{UNITS[find]}"][0] == pytest.approx(value, rel=1e-9)
-        assert table["enough"][0] == ("below" if find == "delay" else "above")
+        assert table["sufficient_side"][0] == ("below" if find == "delay" else "above")
         assert table["stiffness_max_N_per_m"][0] >= 30e3
 
 
 @pytest.mark.parametrize("find, stiffness", [("velocity.cutoff", 15e3), ("mass", 10e3)])
-def test_the_value_is_enough_and_its_other_side_is_not(find, stiffness):
+def test_required_value_separates_sufficient_from_insufficient(find, stiffness):
     study = design(find, stiffness, FILTERED, num=3)
     table = study.compute(None, True).table
-    (value,), (enough,) = table[f"value_{UNITS[find]}"], table["enough"]
+    (value,), (enough,) = table[f"value_{UNITS[find]}"], table["sufficient_side"]
     nominal = study.device.to_scene()
     side = {"above": 1, "below": -1}[enough]
-    more, less = (nominal.replace(**{find: value * (1 + k * side * 1e-3)}).max_stiffness().stiffness for k in (1, -1))
-    assert less < stiffness < more
+    sufficient, insufficient = (
+        nominal.replace(**{find: value * (1 + k * side * 1e-3)}).max_stiffness().stiffness for k in (1, -1)
+    )
+    assert insufficient < stiffness < sufficient
 
 
-def test_a_rate_is_searched_within_its_own_range():
+def test_rate_is_searched_within_the_given_range():
     table = design("rate", [25e3, 90e3], within=["200 Hz", "20 kHz"], num=3).compute(None, True).table
     assert table["range_low_Hz"] == pytest.approx([200, 200])
     assert table["range_high_Hz"] == pytest.approx([20e3, 20e3])
     assert table["present_Hz"].tolist() == pytest.approx([1000, 1000])
-    # The delay of 1 ms in seconds stays, which no rate makes up for.
+    # The delay of 1 ms is fixed in seconds, so that no rate suffices.
     assert table["status"].tolist() == ["OK", "UNREACHABLE"]
     assert np.isnan(table["value_Hz"][1])
-    assert table["enough"][1] == "nowhere"
+    assert table["sufficient_side"][1] == "nowhere"
 
 
-def test_what_is_out_of_reach_or_always_enough_is_said():
+def test_unreachable_and_always_sufficient_values_are_reported():
     outcome = design("damping", [1e3, 30e3, 1e9], within=[1, 100], num=3).compute(None, True)
-    assert outcome.table["enough"].tolist() == ["everywhere", "above", "nowhere"]
+    assert outcome.table["sufficient_side"].tolist() == ["everywhere", "above", "nowhere"]
     assert len(outcome.notes) == 2
     assert len(outcome.figures[""]()) == 1
 
 
-def test_tolerances_judge_the_wanted_wall_on_the_device_that_was_found():
-    shares = {"mass": 0.05, "damping": 0.2}
-    table = design("damping", 30e3, reserve=1.1, tolerances=shares, samples=2000, num=3).compute(None, True).table
+def test_tolerances_are_simulated_at_the_required_value():
+    tolerances = {"mass": 0.05, "damping": 0.2}
+    table = design("damping", 30e3, reserve=1.1, tolerances=tolerances, samples=2000, num=3).compute(None, True).table
     device = zwidth.Device(0.1, float(table["value_N_s_per_m"][0]))
     scene = zwidth.Scene(device, zwidth.Timing(1e-3, 1e-3))
     top = scene.max_stiffness()
     assert top.stiffness == pytest.approx(33e3, rel=1e-9)
     wall = zwidth.VirtualWall(30e3, float(top.virtual_damping))
-    drawn = zwidth.simulate_tolerances(scene.replace(wall=wall), shares, samples=2000)
+    drawn = zwidth.simulate_tolerances(scene.replace(wall=wall), tolerances, samples=2000)
     assert table["stable_share"][0] == drawn.stable
     assert table["borne_by_99_percent_N_per_m"][0] == drawn.stiffness
     assert 0.5 < drawn.stable < 1
 
 
-def test_the_figure_marks_what_is_needed_on_the_curve():
+def test_figure_marks_the_required_values_on_the_curve():
     outcome = design("damping", [20e3, 30e3], reserve=1.1, within=[1, 100], num=41).compute(None, True)
     (ax,) = outcome.figures[""]()
     drawn = {}
     for line in ax.lines:
         drawn.setdefault(line.get_label(), []).append(line)
-    found = outcome.table["value_N_s_per_m"].tolist()
-    assert [float(line.get_xdata()[0]) for line in drawn["required"]] == found
+    values = outcome.table["value_N_s_per_m"].tolist()
+    assert [float(line.get_xdata()[0]) for line in drawn["required"]] == values
     assert [float(line.get_ydata()[0]) for line in drawn["required"]] == pytest.approx([22.0, 33.0])
     assert float(drawn["present"][0].get_xdata()[0]) == 10.0
-    for line, value in zip(drawn["enough"], found, strict=True):
+    for line, value in zip(drawn["sufficient"], values, strict=True):
         x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
         assert x[np.isfinite(y)].min() == value
-    # Written with three digits, on the side that is enough.
-    for text, value in zip(ax.texts, found, strict=True):
+    # The label has three digits, rounded towards the sufficient side.
+    for text, value in zip(ax.texts, values, strict=True):
         written = float(text.get_text().split(" ")[0])
         assert value <= written < 1.01 * value
     curve = {"parameter": np.array(["damping"] * 2), "value_N_s_per_m": np.array([1.0, 50.0])}
     curve[SI_COLUMNS[0]] = np.array([15e3, 45e3])
-    borne = outcome.table | {"stable_share": np.array([0.9996, 1.0])}
-    assert list(plotting.draw_requirement(curve, borne, ax)) == [ax]
-    words = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert [text.partition(": ")[2] for text in words[:2]] == [
+    with_share = outcome.table | {"stable_share": np.array([0.9996, 1.0])}
+    assert list(plotting.draw_requirement(curve, with_share, ax)) == [ax]
+    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert [text.partition(": ")[2] for text in labels[:2]] == [
         "stable on 99.9 % of devices",
         "stable on 100 % of devices",
     ]
 
 
-def test_a_stiffness_that_every_value_reaches_is_told_with_units():
+def test_always_sufficient_range_is_reported_with_units():
     outcome = design("damping", [5e3], within=[1, 100], num=5).compute(None, True)
     assert outcome.notes == ("5.000 kN/m: any damping from 1.000 N s/m to 100.0 N s/m is enough",)
 
 
-REFUSED = {
+MESSAGES = {
     "num: 5": "add 'find: damping', or another",
-    "find: dampin": "did you mean 'damping'",
+    "find: dampin": "did you mean 'damping'",  # codespell:ignore
     "find: velocity.cutoff": "this device has",
     "find: velocity.samples": "allowed are 'period'",
     "find: delay": "add 'within: [0.1, 100]'",
     "find: damping, within: [2, 1]": "write the lower end first",
     "find: damping, within: [1 kg, 2 kg]": "kg",
-    "find: dampin, within: [1 N s/m, 2 N s/m]": "got a list of 2 items; its unit is that of the parameter in 'find'",
+    "find: dmping, within: [1 N s/m, 2 N s/m]": "got a list of 2 items; its unit is that of the parameter in 'find'",
     "find: damping, tolerances: {mas: 0.1}": "this device has",
     "find: damping, tolerances: 0.1": "got 0.1; it must be a mapping; write 'key: value' lines, or {key: value}",
     "find: damping, tolerances: {mass: 1.1}": "write 75 % as 0.75",
@@ -133,18 +135,18 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("fields", REFUSED)
-def test_refusals(fields, tmp_path):
+@pytest.mark.parametrize("fields", MESSAGES)
+def test_invalid_fields_raise(fields, tmp_path):
     wall = "" if "stiffness" in fields else ", stiffness: 20 kN/m"
     text = "{version: 1, name: a, scene: {mass: 0.1, damping: 1, rate: 1000}, studies: [{kind: design, name: d, %s%s}]}"
     file = tmp_path / "a.yaml"
     file.write_text(text % (fields, wall))
     with pytest.raises(ConfigError) as refusal:
         load_config(file)
-    assert REFUSED[fields] in str(refusal.value)
+    assert MESSAGES[fields] in str(refusal.value)
 
 
-def test_the_scene_supplies_device_and_stiffness(tmp_path):
+def test_scene_supplies_device_and_stiffness(tmp_path):
     file = tmp_path / "a.yaml"
     scene = "{mass: 0.1, damping: 1, rate: 1000, stiffness: 5 kN/m, velocity: {kind: low_pass, cutoff: 50}}"
     file.write_text(f"{{version: 1, name: a, scene: {scene}, studies: [{{kind: design, name: d, find: damping}}]}}")

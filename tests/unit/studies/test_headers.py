@@ -1,4 +1,4 @@
-"""The headers of tables: a quantity in SI units carries its unit, a normalized one, a count or a word carries none."""
+"""Column headers of tables: quantities in SI units have a unit suffix; normalized ones, counts and texts have none."""
 
 from pathlib import Path
 
@@ -9,9 +9,20 @@ from zwidth.studies import Config, load_config
 from zwidth.units.formatting import header
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
-WORDS = {"fitted_to", "label", "curve", "kind", "delay_model", "estimate", "parameter", "enough", "status", "piece"}
+WORDS = {
+    "fitted_to",
+    "label",
+    "curve",
+    "kind",
+    "delay_model",
+    "estimate",
+    "parameter",
+    "sufficient_side",
+    "status",
+    "piece",
+}
 COUNTS = {"log", "number", "islands", "samples", "best"}
-SHARES = {
+RATIOS = {
     "autocorrelation",
     "band",
     "stiffness_residual",
@@ -23,7 +34,7 @@ SHARES = {
 }
 NORMALIZED = {"d", "delta", "omega", "alpha", "beta", "beta_lower", "beta_upper", "alpha_max"}
 NORMALIZED |= {"alpha_max_passive", "beta_passive"}
-PLAIN = WORDS | COUNTS | SHARES | NORMALIZED
+WITHOUT_UNIT = WORDS | COUNTS | RATIOS | NORMALIZED
 UNITS = tuple(header("", unit) for unit in ("N/m", "N s/m", "s", "m", "m/s", "N", "Hz", "kg"))
 
 
@@ -37,8 +48,8 @@ FILTERS = {
 }
 
 
-def cheap():
-    """Studies of every kind that writes tables, those that take a second."""
+def quick_studies():
+    """Yield studies of every kind that writes tables, without the slow ones."""
     configs = [
         load_config(CONFIGS / f"{name}.yaml") for name in ("quickstart", "compliance", "requirements", "paper", "fit")
     ]
@@ -50,14 +61,14 @@ def cheap():
                 yield pytest.param(study, config.scene, id=f"{config.name}-{study.name}")
 
 
-@pytest.mark.parametrize("study, scene", list(cheap()))
-def test_every_header_says_its_unit(study, scene):
+@pytest.mark.parametrize("study, scene", list(quick_studies()))
+def test_every_header_has_its_unit(study, scene):
     outcome = study.compute(scene, True)
     headers = [list(outcome.table)]
     headers += [text.splitlines()[0].split(",") for name, text in outcome.documents.items() if name.endswith(".csv")]
-    assert [name for names in headers for name in names if name not in PLAIN and not name.endswith(UNITS)] == []
-    numbers = [name for name in outcome.table if np.asarray(outcome.table[name]).dtype.kind == "U"]
-    assert [name for name in numbers if name not in WORDS and not name.startswith("other_crossings_")] == []
+    assert [name for names in headers for name in names if name not in WITHOUT_UNIT and not name.endswith(UNITS)] == []
+    text_columns = [name for name in outcome.table if np.asarray(outcome.table[name]).dtype.kind == "U"]
+    assert [name for name in text_columns if name not in WORDS and not name.startswith("other_crossings_")] == []
 
 
 @pytest.mark.parametrize(

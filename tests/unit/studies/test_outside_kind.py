@@ -1,4 +1,4 @@
-"""A kind of study that the package does not know: one class, from outside, and it is run like every other."""
+"""A study kind defined outside of the package: registered, run, resumed and checked like a built-in one."""
 
 import json
 from importlib.metadata import EntryPoint
@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from sweeping import main_of
+from sweeping import run_main
 
 import zwidth
 from zwidth.config.values import DeltaAxis
@@ -15,7 +15,7 @@ from zwidth.studies import ComputedStudy, Outcome, document, register
 
 
 class RatioStudy(ComputedStudy):
-    """How much stiffer the stiffest stable wall is than the stiffest passive one, without delay."""
+    """Ratio of the maximum stable to the maximum passive stiffness, without delay."""
 
     method = "Closed forms, without delay."
     from_scene = ("delta",)
@@ -23,7 +23,7 @@ class RatioStudy(ComputedStudy):
     kind: Literal["ratio"]
 
     delta: DeltaAxis
-    """Normalized damping of the device, an axis; the scene's where left out."""
+    """Normalized damping of the device, an axis; taken from the scene if omitted."""
 
     @property
     def points(self):
@@ -35,7 +35,7 @@ class RatioStudy(ComputedStudy):
 
     def compute(self, scene, alone):
         delta = self.delta.values()
-        # Eq. (21) of the paper: without delay the stiffest passive wall has alpha = 2 delta.
+        # Eq. (21) of the paper: without delay the maximum passive stiffness is alpha = 2 delta.
         return Outcome(table={"delta": delta, "ratio": zwidth.alpha_max(delta, 0.0).alpha / (2 * delta)})
 
 
@@ -50,12 +50,12 @@ def config(tmp_path):
     document.KINDS.pop("ratio", None)
 
 
-def test_it_is_run_resumed_and_refused_like_every_other(config, tmp_path, capsys):
+def test_external_study_is_run_and_resumed(config, tmp_path, capsys):
     register(RatioStudy)
     out = tmp_path / "out"
-    assert main_of("run", config, "--dry-run", "--out", out) == 0
+    assert run_main("run", config, "--dry-run", "--out", out) == 0
     assert "study r\n  1 points (delta = 1)" in capsys.readouterr().out
-    assert main_of("run", config, "--out", out) == 0
+    assert run_main("run", config, "--out", out) == 0
     header, row = (out / "r.csv").read_text(encoding="utf-8").split()
     assert header == "delta,ratio"
     np.testing.assert_allclose([float(text) for text in row.split(",")], [0.5, zwidth.alpha_max(0.5, 0).alpha / 1.0])
@@ -70,7 +70,7 @@ def test_it_is_run_resumed_and_refused_like_every_other(config, tmp_path, capsys
         zwidth.run(config, out=out, resume=True)
 
 
-def test_its_faults_are_told_and_its_schema_is_known(config):
+def test_external_study_has_errors_and_schema(config):
     register(RatioStudy)
     config.write_text(CONFIG.replace("name: r", "name: r, delta: -1"), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"studies\[0\]\.delta: got -1"):
@@ -78,9 +78,9 @@ def test_its_faults_are_told_and_its_schema_is_known(config):
     assert "RatioStudy" in document.config_json_schema()["$defs"]
 
 
-def test_a_package_brings_it_by_its_entry_point(config, monkeypatch):
+def test_external_study_is_found_by_its_entry_point(config, monkeypatch):
     with pytest.raises(ConfigError, match="got 'ratio'; the kinds are"):
         zwidth.load_config(config)
-    found = EntryPoint("ratio", f"{__name__}:RatioStudy", "zwidth.studies")
-    monkeypatch.setattr(document, "entry_points", lambda group, name: [found] if name == "ratio" else [])
+    entry_point = EntryPoint("ratio", f"{__name__}:RatioStudy", "zwidth.studies")
+    monkeypatch.setattr(document, "entry_points", lambda group, name: [entry_point] if name == "ratio" else [])
     assert zwidth.load_config(config).studies[0].kind_name() == "ratio"

@@ -1,4 +1,4 @@
-"""Figs. 6 and 10 with the paper's z^(1+d): against 60-digit values, the definition in mpmath, and the exact delay."""
+"""The paper's figs. 6 and 10 with the fractional power z^(1+d), against 60 digits, mpmath and the exact delay."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ REFERENCE = Path(__file__).resolve().parents[2] / "reference" / "ridge_extended.
 ROWS = [row for row in json.loads(REFERENCE.read_text()) if row["model"] == "fractional_power"]
 
 
-def test_the_maximum_against_60_digits():
+def test_maximum_agrees_with_60_digits():
     assert len(ROWS) > 70
     for row in ROWS:
         delta, d = float(row["delta"]), float(row["d"])
@@ -29,9 +29,9 @@ def test_the_maximum_against_60_digits():
 
 
 @pytest.mark.parametrize("d", [0.05, 0.125, 0.5, 0.9, 1.5, 3.7])
-def test_the_largest_damping_is_where_the_curve_returns_to_alpha_zero(d):
+def test_largest_damping_is_the_end_of_the_curve(d):
     deltas = np.array([0.0, 0.1, 1.0, 2.5, 10.0])
-    for delta, found in zip(deltas, find_upper_damping(deltas, d), strict=True):
+    for delta, upper in zip(deltas, find_upper_damping(deltas, d), strict=True):
         with mp.workdps(50):
 
             def alpha(omega, delta=delta):
@@ -41,23 +41,23 @@ def test_the_largest_damping_is_where_the_curve_returns_to_alpha_zero(d):
             last = next(k for k, omega in enumerate(grid) if alpha(omega) < 0)
             end = mp.findroot(alpha, (grid[last - 1], grid[last]), solver="anderson")
             exact = oracles.boundary(end, delta, d, "fractional_power")[1]
-        assert found == pytest.approx(float(exact), rel=4e-15)
+        assert upper == pytest.approx(float(exact), rel=4e-15)
 
 
 @pytest.mark.parametrize("d", [0.0, 0.05, 0.2, 0.5, 0.8, 1.0, 1.3, 2.6, 10.0])
-def test_the_slope_is_the_limit_for_strong_damping(d):
+def test_slope_is_the_limit_for_strong_damping(d):
     for delta in (1e6, 1e8):
         assert maximize_alpha(np.array([delta]), d)[0][0] / delta == pytest.approx(limit_slope(d), rel=30 / delta)
 
 
-def test_integer_delays_are_exact():
+def test_integer_delays_agree_with_the_exact_delay():
     delta = np.array([0.0, 0.3, 4.0])
     for d in (0.0, 2.0):
         np.testing.assert_array_equal(maximize_alpha(delta, d), zwidth.alpha_max(delta, d)[:3])
         assert limit_slope(d) == zwidth.stiffness_slope(d)
 
 
-def test_both_delay_models_are_in_the_tables():
+def test_tables_contain_both_delay_models():
     axes = {"delta": [2, 0, 1], "d": [0, 0.25, 1]}
     fig6 = Fig6Study.model_validate({"kind": "paper_fig6", "name": "a", **axes}).compute(None, alone=True)
     fig10 = Fig10Study.model_validate({"kind": "paper_fig10", "name": "b", **axes}).compute(None, alone=True)
@@ -76,7 +76,7 @@ def test_both_delay_models_are_in_the_tables():
 
 
 @pytest.mark.parametrize("kind", ["paper_fig6", "paper_fig10"])
-def test_a_configuration_as_a_user_writes_it(kind, tmp_path):
+def test_configuration_with_and_without_axes_runs(kind, tmp_path):
     file = tmp_path / "paper.yaml"
     file.write_text(
         f"version: 1\nname: a\nscene: {{delta: 0.5, d: 0.5}}\nstudies:\n"

@@ -1,4 +1,4 @@
-"""The simulate study: the motions that it writes, what it says of them, and what its figures draw."""
+"""The simulate study, against zwidth.simulate; its notes on final states, and its figures."""
 
 import csv
 
@@ -12,16 +12,16 @@ from zwidth.plotting.table import select
 from zwidth.studies.simulate import SimulateStudy
 
 DEVICE = {"mass": 0.1, "damping": 0.1, "period": 1e-3, "delay": "1 periods"}
-IMPACT = {"start_position": -1e-3, "start_velocity": 0.1, "push": 0.5, "contact": "unilateral"}
+IMPACT = {"start_position": -1e-3, "start_velocity": 0.1, "external_force": 0.5, "contact": "unilateral"}
 
 
-def study_of(**keys):
+def make_study(**keys):
     return SimulateStudy.model_validate({"kind": "simulate", "name": "s", "device": DEVICE, **keys})
 
 
 @pytest.fixture(scope="module")
 def impact():
-    study = study_of(**IMPACT, stiffness_fraction=[0.6, 0.95, 1.05], duration="0.3 s", substeps=2)
+    study = make_study(**IMPACT, stiffness_fraction=[0.6, 0.95, 1.05], duration="0.3 s", substeps=2)
     return study.compute(None, True)
 
 
@@ -33,36 +33,36 @@ def motion():
     return zwidth.simulate(scene, walls, top.virtual_damping, periods=300, substeps=2, **IMPACT)
 
 
-def summary_of(outcome):
+def read_summary(outcome):
     return list(csv.DictReader(outcome.documents["s_summary.csv"].splitlines()))
 
 
-def test_the_table_is_the_motion(impact, motion):
+def test_table_agrees_with_the_simulation(impact, motion):
     table = impact.table
     assert table["label"][:: 2 * 300].tolist() == ["0.6 of K_max", "0.95 of K_max", "1.05 of K_max"]
     names = {"position_m": "position", "wall_force_N": "wall_force", "wall_work_J": "wall_work", "energy_J": "energy"}
     for column, name in {**names, "velocity_m_per_s": "velocity"}.items():
         np.testing.assert_array_equal(table[column], getattr(motion, name).ravel())
     np.testing.assert_array_equal(table["time_s"], np.tile(motion.time, 3))
-    # What the program makes of a sample is there at both instants of its period.
+    # The command is constant over the instants of a sampling period.
     np.testing.assert_array_equal(table["command_N"], np.repeat(motion.command.ravel(), 2))
 
 
-def test_the_summary_has_what_is_said_of_each_motion(impact, motion):
-    rows = summary_of(impact)
+def test_summary_agrees_with_the_simulation(impact, motion):
+    rows = read_summary(impact)
     for name, column in {
         "penetration": "penetration_m",
-        "energy_given": "energy_given_J",
+        "wall_work_max": "wall_work_max_J",
         "bounces": "bounces",
     }.items():
         np.testing.assert_array_equal([float(row[column]) for row in rows], getattr(motion, name))
     assert [row["linearly_stable"] for row in rows] == ["True", "True", "False"]
-    # At rest nothing has a frequency.
+    # A response at rest has no frequency.
     assert rows[0]["frequency_Hz"] == "nan"
     assert float(rows[1]["frequency_Hz"]) == motion.frequency[1]
 
 
-def test_words_tell_how_motions_end(impact):
+def test_notes_state_the_final_state(impact):
     assert impact.notes[:2] == (
         "0.6 of K_max (linearly stable): comes to rest within 300 ms",
         "0.95 of K_max (linearly stable): decays within 300 ms",
@@ -71,7 +71,7 @@ def test_words_tell_how_motions_end(impact):
 
 
 @pytest.mark.parametrize(
-    ("keys", "said"),
+    ("keys", "text"),
     [
         ({"start_position": 1e-4, "walls": [{"stiffness": 30e3}]}, "unstable): grows within 1.00 s"),
         (
@@ -87,17 +87,17 @@ def test_words_tell_how_motions_end(impact):
             "unstable): keeps oscillating at 81.",
         ),
     ],
-    ids=["growing", "diverged", "gone", "limit cycle"],
+    ids=["growing", "diverged", "leaves the wall", "limit cycle"],
 )
-def test_words_of_other_ends(keys, said):
-    (note,) = study_of(**keys).compute(None, True).notes
-    assert said in note
+def test_notes_on_other_final_states(keys, text):
+    (note,) = make_study(**keys).compute(None, True).notes
+    assert text in note
 
 
-def test_walls_have_names_and_may_be_normalized():
+def test_walls_are_labeled_and_may_be_normalized():
     walls = [{"stiffness": 2e3, "virtual_damping": 5}, {"alpha": 0.05, "beta": 0.1}]
-    outcome = study_of(walls=walls, start_position=1e-4, duration="50 periods").compute(None, True)
-    assert [row["label"] for row in summary_of(outcome)] == [
+    outcome = make_study(walls=walls, start_position=1e-4, duration="50 periods").compute(None, True)
+    assert [row["label"] for row in read_summary(outcome)] == [
         "K = 2.000 kN/m, B = 5.000 N s/m",
         "K = 5.000 kN/m, B = 10.00 N s/m",
     ]
@@ -108,9 +108,9 @@ def test_walls_have_names_and_may_be_normalized():
     np.testing.assert_allclose(outcome.table["position_m"], expected.position.ravel(), rtol=1e-12)
 
 
-def test_an_adaptive_window_is_simulated_and_has_no_share():
+def test_adaptive_window_is_simulated_but_has_no_maximum():
     keys = {"velocity": {"kind": "foaw", "noise": "20 um", "samples": 8}, "resolution": "20 um"}
-    outcome = study_of(**keys, walls=[{"stiffness": 5e3, "virtual_damping": 20}], start_position=1e-3).compute(
+    outcome = make_study(**keys, walls=[{"stiffness": 5e3, "virtual_damping": 20}], start_position=1e-3).compute(
         None, True
     )
     scene = zwidth.Scene(zwidth.Device(0.1, 0.1), zwidth.Timing(period=1e-3, delay=1e-3), velocity=zwidth.FOAW(2e-5, 8))
@@ -118,10 +118,10 @@ def test_an_adaptive_window_is_simulated_and_has_no_share():
     np.testing.assert_array_equal(outcome.table["position_m"], expected)
     assert "linearly" not in outcome.notes[0]
     with pytest.raises(ValueError, match="no linear form and no such maximum; write walls"):
-        study_of(**keys, stiffness_fraction=0.5)
+        make_study(**keys, stiffness_fraction=0.5)
 
 
-def test_the_scene_supplies_device_and_wall(tmp_path):
+def test_scene_supplies_device_and_wall(tmp_path):
     file = tmp_path / "a.yaml"
     text = (
         "scene: {mass: 0.1, period: 1 ms, stiffness: 3 kN/m, virtual_damping: 7}\nstudies: [{kind: simulate, name: s}]"
@@ -133,7 +133,7 @@ def test_the_scene_supplies_device_and_wall(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("keys", "said"),
+    ("keys", "message"),
     [
         ({}, "stiffness_fraction or walls is missing"),
         ({"stiffness_fraction": 0.5, "walls": [{"stiffness": 1}]}, "are both given"),
@@ -142,12 +142,12 @@ def test_the_scene_supplies_device_and_wall(tmp_path):
         ({"walls": [{"stiffness": 1}], "delay_model": "held"}, "remove it; for the paper's"),
     ],
 )
-def test_bad_input_is_told(keys, said):
-    with pytest.raises(ValueError, match=said):
-        study_of(**keys)
+def test_invalid_fields_raise(keys, message):
+    with pytest.raises(ValueError, match=message):
+        make_study(**keys)
 
 
-def test_a_normalized_scene_has_no_motion(tmp_path):
+def test_normalized_scene_raises(tmp_path):
     file = tmp_path / "a.yaml"
     file.write_text(
         "version: 1\nname: a\nscene: {delta: 0.1, d: 1}\nstudies: [{kind: simulate, name: s, walls: [{alpha: 0.1}]}]\n",
@@ -157,7 +157,7 @@ def test_a_normalized_scene_has_no_motion(tmp_path):
         zwidth.load_config(file)
 
 
-def test_figures_draw_the_motions(impact):
+def test_figures_agree_with_the_table(impact):
     table = impact.table
     assert list(impact.figures) == ["", "_phase", "_energy"]
     position, force = impact.figures[""]()
@@ -176,21 +176,21 @@ def test_figures_draw_the_motions(impact):
     lines = {line.get_label(): line.get_ydata() for line in energies[2].lines}
     rows = select(table, label="1.05 of K_max")
     np.testing.assert_allclose(lines["work of the wall"], rows["wall_work_J"] * 1e3)
-    # There is no friction, and nothing of it is drawn.
+    # Without friction its energy is not drawn.
     assert "dissipated by friction" not in lines
 
 
-def test_a_motion_without_end_does_not_hide_the_others():
+def test_diverging_response_does_not_determine_the_axis_limits():
     walls = [{"stiffness": 5e3, "virtual_damping": 20}, {"stiffness": 40e3}]
-    table = study_of(walls=walls, start_position=1e-4, duration="300 periods").compute(None, True).table
+    table = make_study(walls=walls, start_position=1e-4, duration="300 periods").compute(None, True).table
     assert np.abs(table["position_m"]).max() > 1.0
     position, _ = plotting.draw_motion(table)
     low, high = position.get_ylim()
-    # 0.1 mm, in µm: eight times as far is shown.
+    # In µm: the initial position is 0.1 mm, and eight times that is shown.
     assert -1000 < low < -500 < 500 < high < 1000
 
 
-def test_a_run_writes_everything(tmp_path):
+def test_run_writes_all_files(tmp_path):
     file = tmp_path / "a.yaml"
     file.write_text(
         "version: 1\nname: a\nscene: {mass: 0.1 kg, period: 1 ms}\nstudies:\n"

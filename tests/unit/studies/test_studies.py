@@ -1,4 +1,4 @@
-"""What the studies compute, against the library's own functions and pole counts."""
+"""Boundary, ridge, passivity, step, recommend and map studies, against the library's functions and pole counts."""
 
 import json
 import re
@@ -23,38 +23,38 @@ DELAYS = np.array([0.0, 0.25, 0.9, 1.0, 4.0])
 
 
 def read_csv(text):
-    """A table as text columns."""
+    """Return a CSV table as text columns."""
     header, *rows = [line.split(",") for line in text.splitlines()]
     return dict(zip(header, np.array(rows).T, strict=True))
 
 
-def test_the_interval_at_zero_stiffness_is_where_poles_cross():
-    # Close enough to alpha = 0 that beta moves by less than the step, far enough that the pole near 1 is counted.
+def test_stable_interval_at_zero_stiffness_agrees_with_poles():
+    # alpha is small enough that beta moves by less than the step, and large enough that the pole near 1 is counted.
     alpha, step = 1e-7, 1e-3
-    for found in tabulate_stable_intervals(DELTAS, DELAYS):
-        lower, upper, d = found["beta_lower"], found["beta_upper"], found["d"]
+    for interval in tabulate_stable_intervals(DELTAS, DELAYS):
+        lower, upper, d = interval["beta_lower"], interval["beta_upper"], interval["d"]
         inside = radius_by_companion(alpha, np.stack([lower + step, upper - step]), DELTAS, d)
-        beyond = radius_by_companion(alpha, np.stack([lower - step, upper + step]), DELTAS, d)
+        outside = radius_by_companion(alpha, np.stack([lower - step, upper + step]), DELTAS, d)
         assert np.all(inside < 1), d
-        assert np.all(beyond >= 1), d
+        assert np.all(outside >= 1), d
 
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.0, 2.0])
-def test_the_passive_edge_separates_passive_from_not(d):
+def test_passive_outline_separates_passive_walls(d):
     alpha, beta = trace_unit_outline(d)
     for delta in (0.1, 3.0):
         inside = zwidth.is_passive(delta * alpha * (1 - 1e-9), delta * beta * (1 - 1e-9), delta, d)
-        beyond = zwidth.is_passive(delta * alpha * (1 + 1e-9), delta * beta * (1 + 1e-9), delta, d)
+        outside = zwidth.is_passive(delta * alpha * (1 + 1e-9), delta * beta * (1 + 1e-9), delta, d)
         assert np.all(inside)
-        assert not np.any(beyond)
+        assert not np.any(outside)
 
 
-def test_without_delay_the_passive_set_is_colgates_triangle():
+def test_passive_region_without_delay_is_colgates_triangle():
     alpha, beta = trace_unit_outline(0.0)
     np.testing.assert_allclose(alpha / 2 + np.abs(beta), 1.0, rtol=1e-13)
 
 
-def test_a_passive_wall_is_never_stiffer_than_a_stable_one():
+def test_maximum_passive_stiffness_is_below_the_stable_one():
     study = PassivityStudy.model_validate(
         {"kind": "passivity", "name": "p", "delta": [0.1, 1.0, 10.0], "d": [0, 0.5, 2]}
     )
@@ -62,13 +62,13 @@ def test_a_passive_wall_is_never_stiffer_than_a_stable_one():
     assert np.all(table["alpha_max_passive"] < table["alpha_max"])
     np.testing.assert_allclose(table["alpha_max"], zwidth.alpha_max(table["delta"], table["d"]).alpha, rtol=1e-13)
     for d in (0.0, 0.5, 2.0):
-        here = table["d"] == d
-        slopes = np.outer(table["delta"][here], passive_stiffness_slope(d)).T
-        np.testing.assert_array_equal((table["alpha_max_passive"][here], table["beta_passive"][here]), slopes)
+        selected = table["d"] == d
+        slopes = np.outer(table["delta"][selected], passive_stiffness_slope(d)).T
+        np.testing.assert_array_equal((table["alpha_max_passive"][selected], table["beta_passive"][selected]), slopes)
 
 
-def test_a_hand_that_holds_the_device_makes_no_wall_passive():
-    """Passive is what is so for any hand: the device's own damping counts, a seventh of both here."""
+def test_operator_does_not_affect_the_passivity_study():
+    """Passivity holds for any operator, so only the device's damping counts, here a seventh of the total."""
     device = {"mass": 0.1, "damping": 1.0, "period": "1 ms", "delay": "1 ms"}
     scene = PhysicalScene.model_validate({**device, "operator": {"mass": 0.5, "damping": 6.0}})
     study = PassivityStudy.model_validate({"kind": "passivity", "name": "p", "delta": scene.delta, "d": scene.d})
@@ -78,7 +78,7 @@ def test_a_hand_that_holds_the_device_makes_no_wall_passive():
     assert abs(scene.to_scene().passivity_margin(edge, damping)) < 1e-12
 
 
-def test_ridges_are_those_of_the_library():
+def test_ridge_table_agrees_with_alpha_max():
     delta, d = np.linspace(0.0, 10.0, 7), np.array([0.0, 0.125, 3.0])
     table, notes = ridge_table(delta, d)
     assert notes == []
@@ -90,12 +90,12 @@ def test_ridges_are_those_of_the_library():
     assert table["kind"][6] == "corner"
 
 
-def test_points_without_an_answer_are_noted():
+def test_points_without_result_are_noted():
     _, notes = ridge_table(np.array([0.1, np.nan, np.inf]), np.array([0.0, 1.0]))
     assert notes == [f"alpha_max: 2 of 3 points have no result for d = {d}" for d in (0, 1)]
 
 
-def test_a_ridge_study_tables_every_curve():
+def test_ridge_study_tabulates_every_curve():
     study = RidgeStudy.model_validate({"kind": "ridge", "name": "r", "delta": [0, 1], "d": [0.5, 1]})
     outcome = study.compute(None, alone=True)
     assert list(outcome.table["d"]) == [0.5, 0.5, 1, 1]
@@ -103,7 +103,7 @@ def test_a_ridge_study_tables_every_curve():
     assert list(outcome.figures) == [""]
 
 
-def test_strong_damping_is_drawn_with_its_limit():
+def test_slope_at_strong_damping_approaches_its_limit():
     study = RidgeStudy.model_validate({"kind": "ridge", "name": "r", "delta": [1, 1e4], "d": [0, 1]})
     outcome = study.compute(None, alone=True)
     assert list(outcome.figures) == ["", "_slope"]
@@ -112,23 +112,23 @@ def test_strong_damping_is_drawn_with_its_limit():
     assert limits == pytest.approx((4.0, 1.0), rel=1e-14)
     strongest = outcome.table["alpha_max"][outcome.table["delta"] == 1e4] / 1e4
     assert strongest == pytest.approx(limits, rel=1e-3)
-    # A delay that no sample meets is there as well.
+    # Delays without tabulated samples are included.
     assert 0.3 in slope_table({"d": np.array([0.3])})["d"]
 
 
-def test_an_outline_has_names_for_its_pieces():
+def test_outline_has_named_pieces():
     edge = tabulate_boundary(3.0, 0.0)
     assert set(edge["piece"]) == {"complex_pair", "minus_one"}
 
 
-def test_a_boundary_study_tables_boundaries_ridge_and_passivity():
+def test_boundary_study_tabulates_boundary_ridge_and_passivity():
     study = BoundaryStudy.model_validate(
         {"kind": "boundary", "name": "b", "delta": [0, 0.5], "d": [0, 1], "ridge_path": True, "passivity": True}
     )
     table = study.compute(None, alone=True).table
     assert "stiffness_N_per_m" not in table
     curve = (table["curve"] == "boundary") & (table["piece"] == "complex_pair")
-    # The first and last vertex of a lobe lie at alpha = 0 by definition.
+    # The first and last vertex of a lobe have alpha = 0 by definition.
     curve &= table["alpha"] > 1e-9
     expected = zwidth.boundary(table["omega"][curve], table["delta"][curve], table["d"][curve])
     np.testing.assert_allclose(table["alpha"][curve], expected.alpha, rtol=1e-12)
@@ -143,7 +143,7 @@ def test_a_boundary_study_tables_boundaries_ridge_and_passivity():
     assert set(table["delta"][table["curve"] == "passive"]) == {0.5}
 
 
-def test_a_boundary_of_the_scene_alone_is_in_si_units_too():
+def test_boundary_of_the_scene_itself_has_si_units():
     scene = PhysicalScene.model_validate({"mass": 0.1, "damping": 50, "period": "1 ms", "delay": "1 ms"})
     study = {"kind": "boundary", "name": "b", "delta": scene.delta, "d": scene.d}
     table = BoundaryStudy.model_validate(study).compute(scene, alone=True).table
@@ -153,7 +153,7 @@ def test_a_boundary_of_the_scene_alone_is_in_si_units_too():
     assert "stiffness_N_per_m" not in other
 
 
-def test_step_responses_of_devices_and_walls():
+def test_step_study_agrees_with_step_response():
     device = {"mass": 0.1, "damping": "10 N s/m", "period": "1 ms", "delay": "1 periods"}
     study = StepStudy.model_validate(
         {"kind": "step", "name": "s", "devices": [device], "stiffness_fraction": 0.75, "duration": "50 periods"}
@@ -168,17 +168,17 @@ def test_step_responses_of_devices_and_walls():
     np.testing.assert_allclose(table["settling_time_s"], expected.settling_time * 1e-3, rtol=1e-12)
 
 
-def test_a_recommendation_is_a_share_of_the_stiffest_wall():
-    """Of the published device m = 0.1 kg, T = 1 ms, delta = 0.1, d = 1; alpha m / T^2 and beta m / T by hand."""
+def test_recommendation_is_a_fraction_of_the_maximum():
+    """Values of the published device m = 0.1 kg, T = 1 ms, delta = 0.1, d = 1; unit conversion by hand."""
     device = {"mass": 0.1, "damping": "10 N s/m", "period": "1 ms", "delay": "1 periods"}
     study = RecommendStudy.model_validate(
         {"kind": "recommend", "name": "r", "device": device, "stiffness_fraction": 0.6, "duration": "50 periods"}
     )
     outcome = study.compute(None, alone=True)
-    found = json.loads(outcome.documents["recommendation.json"])
+    report = json.loads(outcome.documents["recommendation.json"])
     ridge = zwidth.alpha_max(0.1, 1)
-    assert found["maximum"]["stiffness"] == pytest.approx(1e5 * float(ridge.alpha), rel=1e-12)
-    best = found["recommended"]
+    assert report["maximum"]["stiffness"] == pytest.approx(1e5 * float(ridge.alpha), rel=1e-12)
+    best = report["recommended"]
     assert best["stiffness"] == pytest.approx(0.6e5 * float(ridge.alpha), rel=1e-12)
     assert best["virtual_damping"] == pytest.approx(1e2 * float(ridge.beta), rel=1e-12)
     assert best["stable"] is True
@@ -186,20 +186,20 @@ def test_a_recommendation_is_a_share_of_the_stiffest_wall():
 
 
 @pytest.mark.parametrize("mass", np.linspace(0.05, 0.5, 6).tolist())
-def test_a_recommendation_is_written_no_stiffer_than_it_is(mass):
-    """Rounded to the nearest, half of all walls would miss what is wanted of them."""
+def test_recommended_stiffness_is_rounded_down(mass):
+    """A stiffness rounded to nearest would violate the required margins at half of all devices."""
     device = {"mass": mass, "damping": "10 N s/m", "period": "1 ms", "delay": "1 periods"}
     study = RecommendStudy.model_validate({"kind": "recommend", "name": "r", "device": device, "phase_margin": 30})
     outcome = study.compute(None, alone=True)
-    told = re.search(r"- K = (.*?), B = ", outcome.documents["recommendation.md"])
-    assert told is not None
+    stiffness_text = re.search(r"- K = (.*?), B = ", outcome.documents["recommendation.md"])
+    assert stiffness_text is not None
     exact = json.loads(outcome.documents["recommendation.json"])["recommended"]["stiffness"]
-    assert (1 - 1e-3) * exact < read_texts("stiffness", told[1], "N/m") <= exact * (1 + 1e-12)
+    assert (1 - 1e-3) * exact < read_texts("stiffness", stiffness_text[1], "N/m") <= exact * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("fraction", [0.3, 0.45, 0.6, 0.7, 0.85])
-def test_the_wall_that_is_judged_is_the_one_that_is_simulated(fraction):
-    """To the last digit, for the number is handed on: one that is computed twice differs here and there."""
+def test_recommended_wall_is_simulated_bit_for_bit(fraction):
+    """The values are passed on, because computing them twice may differ in the last digit."""
     device = {"mass": 0.37, "damping": "3.1 N s/m", "period": "0.7 ms", "delay": "1.3 periods"}
     study = RecommendStudy.model_validate(
         {"kind": "recommend", "name": "r", "device": device, "stiffness_fraction": fraction, "duration": "50 periods"}
@@ -210,7 +210,7 @@ def test_the_wall_that_is_judged_is_the_one_that_is_simulated(fraction):
     assert set(outcome.table["beta"]) == {best["beta"]}
 
 
-def test_a_response_that_does_not_settle_is_noted():
+def test_response_that_does_not_settle_is_noted():
     study = StepStudy.model_validate(
         {
             "kind": "step",
@@ -225,7 +225,7 @@ def test_a_response_that_does_not_settle_is_noted():
     assert "position" in outcome.table
 
 
-def test_a_map_holds_every_output_on_the_grid():
+def test_map_study_contains_every_output():
     study = MapStudy.model_validate(
         {
             "kind": "map",
@@ -246,7 +246,7 @@ def test_a_map_holds_every_output_on_the_grid():
     assert "stiffness_N_per_m" not in arrays
 
 
-def test_walls_out_of_range_leave_the_rest_of_a_map_alone():
+def test_walls_out_of_range_do_not_affect_others():
     study = {"kind": "map", "name": "m", "alpha": [0.1, 1e70], "beta": [0.1, 0.4], "delta": [0.1, 1], "d": 1}
     outcome = MapStudy.model_validate({**study, "outputs": ["stable", "spectral_radius"]}).compute(None, alone=True)
     good = np.zeros((2, 2, 2, 1), bool)
@@ -257,10 +257,10 @@ def test_walls_out_of_range_leave_the_rest_of_a_map_alone():
     assert outcome.notes == ("4 of 8 points have no result: 4 out of range",)
     for draw in outcome.figures.values():
         (legend,) = draw()[0].figure.legends
-        assert "no answer" in [text.get_text() for text in legend.get_texts()]
+        assert "no result" in [text.get_text() for text in legend.get_texts()]
 
 
-def test_a_map_of_the_scene_alone_is_in_si_units_too():
+def test_map_of_the_scene_itself_has_si_units():
     scene = PhysicalScene.model_validate({"mass": 0.1, "damping": 50, "period": "1 ms", "delay": "1 ms"})
     study = {"kind": "map", "name": "m", "alpha": [0.1, 0.2], "beta": 0.1, "delta": scene.delta, "d": scene.d}
     arrays = MapStudy.model_validate(study).compute(scene, alone=True).arrays
@@ -268,10 +268,10 @@ def test_a_map_of_the_scene_alone_is_in_si_units_too():
     np.testing.assert_allclose(arrays["virtual_damping_N_s_per_m"], 1e2 * arrays["beta"], rtol=1e-15)
 
 
-def test_tables_keep_every_digit():
+def test_csv_tables_have_every_digit():
     value = np.array([0.1 + 0.2, 1e-300, np.nan])
     table = stack([{"curve": "a", "x": value}, {"curve": "b", "x": value[:1], "y": 2.0}])
-    read = read_csv(csv_text(table))
-    assert list(read["curve"]) == ["a", "a", "a", "b"]
-    np.testing.assert_array_equal(read["x"].astype(float), [*value, value[0]])
-    np.testing.assert_array_equal(read["y"].astype(float), [np.nan, np.nan, np.nan, 2.0])
+    columns = read_csv(csv_text(table))
+    assert list(columns["curve"]) == ["a", "a", "a", "b"]
+    np.testing.assert_array_equal(columns["x"].astype(float), [*value, value[0]])
+    np.testing.assert_array_equal(columns["y"].astype(float), [np.nan, np.nan, np.nan, 2.0])

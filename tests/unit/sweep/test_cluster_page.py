@@ -1,4 +1,4 @@
-"""The job script of docs/cluster.md, run by a shell as SLURM runs it."""
+"""The SLURM job script of docs/cluster.md, executed by a shell with a stub in place of zwidth."""
 
 import json
 import os
@@ -8,12 +8,12 @@ import sys
 from pathlib import Path
 
 PAGE = Path(__file__).parents[3] / "docs" / "cluster.md"
-# Stands in for the program, and says what it was given.
+# Replaces zwidth and prints its arguments.
 STUB = f"#!{sys.executable}\nimport json, sys\nprint(json.dumps(sys.argv[1:]))\n"
 
 
-def words_of(tmp_path):
-    """Return the arguments that the script passes to the program."""
+def run_script(tmp_path):
+    """Return the arguments that the script passes to zwidth."""
     (script,) = re.findall(r"```bash\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     program = tmp_path / "zwidth"
     program.write_text(STUB, encoding="utf-8")
@@ -24,10 +24,10 @@ def words_of(tmp_path):
         "SCRATCH": "/scratch/of somebody",
         "SLURM_CPUS_PER_TASK": "16",
     }
-    done = subprocess.run(["bash", "-eu", "-c", script], env=environment, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
+    result = subprocess.run(["bash", "-eu", "-c", script], env=environment, capture_output=True, text=True, check=True)
+    return json.loads(result.stdout)
 
 
-def test_the_job_uses_the_processors_that_it_was_given(tmp_path):
+def test_job_script_uses_the_allocated_processors(tmp_path):
     expected = ["run", "configs/dense.yaml", "--out", "/scratch/of somebody/dense", "--resume", "--workers", "16"]
-    assert words_of(tmp_path) == expected
+    assert run_script(tmp_path) == expected

@@ -1,11 +1,11 @@
-"""Results outside the store: lazily in xarray, as netCDF, as a table."""
+"""Access to finished stores: lazy xarray datasets, netCDF and CSV."""
 
 import csv
 
 import numpy as np
 import pytest
 import xarray
-from sweeping import config_of, run_sweeps, study
+from sweeping import make_config, run_sweeps, study
 
 from zwidth.core.errors import StoreError, StoreExistsError
 from zwidth.sweep import dataset
@@ -17,11 +17,11 @@ AXES = {"devices": {"label": ["a", "b"], "mass": [0.1, 1], "damping": [1, 2]}, "
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    assert run_sweeps(config_of(study(axes=AXES), study("other", axes=AXES)), folder).ok
+    assert run_sweeps(make_config(study(axes=AXES), study("other", axes=AXES)), folder).ok
     return folder
 
 
-def test_a_dataset_is_lazy_and_says_what_it_is(folder):
+def test_dataset_is_lazy_with_metadata(folder):
     data = open_dataset(folder / "map.zarr")
     assert data.stable.chunks is not None
     assert data.stable.dtype == bool
@@ -39,7 +39,7 @@ def test_a_dataset_is_lazy_and_says_what_it_is(folder):
     assert not data.stable.sel(stiffness=1e6).values.any()
 
 
-def test_netcdf_holds_the_same(folder, tmp_path):
+def test_netcdf_has_equal_contents(folder, tmp_path):
     to_netcdf(folder / "map.zarr", tmp_path / "map.nc")
     with xarray.open_dataset(tmp_path / "map.nc") as read, open_dataset(folder / "map.zarr") as data:
         assert read.stable.dtype == bool
@@ -51,7 +51,7 @@ def test_netcdf_holds_the_same(folder, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["map.nc"]
 
 
-def test_a_table_has_a_row_a_point(folder, tmp_path, monkeypatch):
+def test_csv_has_one_row_per_point(folder, tmp_path, monkeypatch):
     to_csv(folder / "map.zarr", tmp_path / "map.csv")
     with open(tmp_path / "map.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -66,7 +66,7 @@ def test_a_table_has_a_row_a_point(folder, tmp_path, monkeypatch):
         to_csv(folder / "map.zarr", tmp_path / "again.csv")
 
 
-def test_a_folder_of_several_stores_asks_for_one(folder, tmp_path):
+def test_folder_without_a_unique_store_raises(folder, tmp_path):
     with pytest.raises(StoreError, match=r"contains several stores; name one of map\.zarr, other\.zarr"):
         open_dataset(folder)
     with pytest.raises(StoreError, match="contains no store of a sweep"):

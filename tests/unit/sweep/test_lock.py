@@ -1,4 +1,4 @@
-"""The lock of a folder of results: one run at a time, and a killed run blocks no other."""
+"""The lock of an output folder: exclusive between runs, and released if the process is killed."""
 
 import errno
 import os
@@ -10,7 +10,7 @@ import sys
 
 import pytest
 import yaml
-from sweeping import assert_same, config_of, main_of, run_sweeps, study, values_of
+from sweeping import assert_equal_stores, make_config, read_values, run_main, run_sweeps, study
 
 import zwidth
 from zwidth.core.errors import InputError, StoreBusyError
@@ -20,7 +20,7 @@ from zwidth.sweep.files import lock_folder
 from zwidth.sweep.jobs import perform
 from zwidth.sweep.store import Store
 
-# Holds the folder until it is killed, and says when it does.
+# Locks the folder until the process is killed; prints "held" once locked.
 HOLD = """
 import sys, time
 from pathlib import Path
@@ -38,7 +38,7 @@ def _impatient(monkeypatch):
 
 @pytest.fixture
 def holder():
-    """Starts processes that hold a folder; whatever becomes of the test, they end with it."""
+    """Return a function that starts a process locking a folder; all processes end with the test."""
     started = []
 
     def start(folder):
@@ -59,10 +59,10 @@ def kill(process):
         process.communicate()
 
 
-def test_a_second_run_is_refused_and_told_who_holds_the_folder(holder, tmp_path):
+def test_second_run_raises_with_the_holder_of_the_lock(holder, tmp_path):
     process = holder(tmp_path)
     with pytest.raises(StoreBusyError) as caught:
-        run_sweeps(config_of(), tmp_path, resume=True)
+        run_sweeps(make_config(), tmp_path, resume=True)
     message = str(caught.value)
     assert message.startswith(f"out: {tmp_path}: another run is writing to this folder (process {process.pid} on ")
     assert f" on {socket.gethostname()}, since 20" in message
@@ -70,18 +70,18 @@ def test_a_second_run_is_refused_and_told_who_holds_the_folder(holder, tmp_path)
     assert list(tmp_path.glob("*.zarr")) == []
 
 
-def test_a_killed_holder_does_not_block_a_run(holder, tmp_path):
+def test_killed_holder_does_not_block_a_run(holder, tmp_path):
     kill(holder(tmp_path))
-    # Its files stay behind.
+    # The files of the killed process remain.
     assert f" on {socket.gethostname()}, since " in (tmp_path / ".locks" / "holder").read_text(encoding="utf-8")
-    assert run_sweeps(config_of(), tmp_path, resume=True).ok
+    assert run_sweeps(make_config(), tmp_path, resume=True).ok
 
 
-def test_the_folder_is_free_again_after_a_run_and_after_one_that_failed(tmp_path):
-    assert run_sweeps(config_of(), tmp_path).ok
+def test_lock_is_released_after_success_and_failure(tmp_path):
+    assert run_sweeps(make_config(), tmp_path).ok
     with pytest.raises(ZeroDivisionError), lock_folder(tmp_path):
         raise ZeroDivisionError
-    assert run_sweeps(config_of(), tmp_path, resume=True).ok
+    assert run_sweeps(make_config(), tmp_path, resume=True).ok
 
 
 def test_two_runs_of_one_process_exclude_each_other(tmp_path):
@@ -90,35 +90,35 @@ def test_two_runs_of_one_process_exclude_each_other(tmp_path):
         pass
 
 
-def test_the_command_line_says_it_in_one_line_and_ends_with_exit_code_2(holder, tmp_path, capsys):
+def test_command_reports_a_locked_folder_with_exit_code_2(holder, tmp_path, capsys):
     path, out = tmp_path / "sweep.yaml", tmp_path / "out"
     path.write_text(yaml.safe_dump({"version": 1, "name": "sweep", "studies": [study()]}), encoding="utf-8")
-    assert main_of("run", path, "--out", out) == 0
-    before = values_of(out)
+    assert run_main("run", path, "--out", out) == 0
+    before = read_values(out)
     process = holder(out)
     capsys.readouterr()
-    for words in (["--resume"], ["--overwrite"]):
-        assert main_of("run", path, "--out", out, *words) == 2
+    for arguments in (["--resume"], ["--overwrite"]):
+        assert run_main("run", path, "--out", out, *arguments) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"Error: out: {out}: another run is writing to this folder (process {process.pid} on ")
-    # Who only reads has nothing to wait for.
-    assert main_of("verify", out) == 0
-    assert main_of("export", out, "--csv", tmp_path / "table.csv") == 0
-    assert main_of("run", path, "--out", out, "--dry-run") == 0
-    assert values_of(out).keys() == before.keys()
+    # Commands that only read need no lock.
+    assert run_main("verify", out) == 0
+    assert run_main("export", out, "--csv", tmp_path / "table.csv") == 0
+    assert run_main("run", path, "--out", out, "--dry-run") == 0
+    assert read_values(out).keys() == before.keys()
     kill(process)
-    assert main_of("run", path, "--out", out, "--overwrite") == 0
+    assert run_main("run", path, "--out", out, "--overwrite") == 0
 
 
-def test_other_studies_neither_replace_nor_enter_a_folder_that_is_held(holder, tmp_path, capsys):
+def test_locked_folder_is_neither_overwritten_nor_extended(holder, tmp_path, capsys):
     ridge = {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0}
     path, out = tmp_path / "both.yaml", tmp_path / "out"
     path.write_text(yaml.safe_dump({"version": 1, "name": "both", "studies": [ridge, study()]}), encoding="utf-8")
     process = holder(out)
-    assert main_of("run", path, "--out", out) == 2
+    assert run_main("run", path, "--out", out) == 2
     assert f"another run is writing to this folder (process {process.pid} " in capsys.readouterr().err
     kill(process)
-    assert main_of("run", path, "--out", out) == 0
+    assert run_main("run", path, "--out", out) == 0
     holder(out)
     with pytest.raises(StoreBusyError):
         zwidth.run(path, out=out, overwrite=True)
@@ -126,31 +126,31 @@ def test_other_studies_neither_replace_nor_enter_a_folder_that_is_held(holder, t
     assert verify(out)[0].ok
 
 
-def test_a_store_in_the_place_of_another_is_computed_as_itself(tmp_path):
+def test_store_copied_over_another_is_computed_from_its_own_files(tmp_path):
     for name, alpha in (("first", 0.1), ("second", 0.3)):
         axes = {"alpha": [alpha, 2 * alpha], "beta": 0.1, "delta": 0.1, "d": 1}
-        assert run_sweeps(config_of(study(axes=axes, outputs=["spectral_radius"])), tmp_path / name).ok
+        assert run_sweeps(make_config(study(axes=axes, outputs=["spectral_radius"])), tmp_path / name).ok
     path = tmp_path / "first" / "map.zarr"
-    # Over the files that were there, which keep their numbers; a new store may get those of one that is gone.
+    # The copied files keep their inode numbers; a new store may reuse those of a deleted one.
     shutil.copytree(tmp_path / "second" / "map.zarr", path, dirs_exist_ok=True)
     store = Store(path)
     for task in store.plan.tasks():
         store.status_file(task).unlink()
         perform(str(path), task.family, task.index)
-    assert_same(path.parent, tmp_path / "second")
+    assert_equal_stores(path.parent, tmp_path / "second")
 
 
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
-def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch, number):
-    def refused(file, how):
+def test_file_system_without_locks_is_accepted(tmp_path, monkeypatch, number):
+    def raise_unsupported(file, operation):
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr("fcntl.flock", refused)
+    monkeypatch.setattr("fcntl.flock", raise_unsupported)
     with lock_folder(tmp_path), lock_folder(tmp_path):
         pass
 
 
-def test_a_missing_name_of_the_holder_costs_only_the_name(holder, tmp_path):
+def test_missing_holder_file_shortens_the_message_only(holder, tmp_path):
     holder(tmp_path)
     (tmp_path / ".locks" / "holder").unlink()
     with (
@@ -160,13 +160,13 @@ def test_a_missing_name_of_the_holder_costs_only_the_name(holder, tmp_path):
         pass
 
 
-def test_a_file_in_the_place_of_the_folder(tmp_path):
+def test_file_instead_of_a_folder_raises(tmp_path):
     (tmp_path / "out").touch()
     with pytest.raises(InputError, match="is a file"), lock_folder(tmp_path / "out"):
         pass
 
 
-# Counts in a file, without any other protection against the other processes.
+# Increments a number in a file, protected by the lock only.
 COUNT = """
 import sys, time
 from pathlib import Path
@@ -181,7 +181,7 @@ for _ in range(10):
 """
 
 
-def test_processes_that_compete_hold_the_folder_one_at_a_time(tmp_path):
+def test_competing_processes_lock_the_folder_one_at_a_time(tmp_path):
     (tmp_path / "number").write_text("0", encoding="utf-8")
     processes = [subprocess.Popen([sys.executable, "-c", COUNT, str(tmp_path)]) for _ in range(4)]
     assert [process.wait() for process in processes] == [0] * 4

@@ -1,4 +1,4 @@
-"""Plans: chunks that cover every point once, and refusals before any work."""
+"""Plans of sweeps: chunks cover every point once, and runs that exceed the resources are rejected."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sweeping import config_of, study, sweep_of
+from sweeping import make_config, make_sweep, study
 
 from zwidth.core.errors import ResourceError
 from zwidth.runs import plan_run
@@ -20,9 +20,9 @@ HUGE = {
 }
 
 
-def plans_of(described) -> list[Plan]:
-    """What a run of one sweep plans to do."""
-    plans = plan_run(config_of(described))
+def make_plans(sweep) -> list[Plan]:
+    """Return the plans of a run of one sweep."""
+    plans = plan_run(make_config(sweep))
     return [plan for plan in plans if isinstance(plan, Plan)]
 
 
@@ -43,36 +43,36 @@ def test_chunks_cover_every_point_once(shape, target):
 
 @pytest.mark.parametrize("outputs", [("stable",), ("spectral_radius", "passive"), ("alpha_max", "stable")])
 @pytest.mark.parametrize("memory", [2**27, MEMORY, 2**30])
-def test_a_chunk_stays_within_its_memory(outputs, memory):
-    plan = make_plan(sweep_of(study(axes=HUGE, outputs=outputs)), memory=memory)
+def test_chunk_stays_within_its_memory_limit(outputs, memory):
+    plan = make_plan(make_sweep(study(axes=HUGE, outputs=outputs)), memory=memory)
     assert plan.memory <= memory
 
 
-def test_the_plan_that_a_store_keeps_is_the_plan():
-    small = sweep_of(study(outputs=("stable", "alpha_max")))
+def test_stored_plan_is_restored_unchanged():
+    small = make_sweep(study(outputs=("stable", "alpha_max")))
     plan = make_plan(small, memory=2**27)
     assert restore_plan(small, plan.as_dict()).families == plan.families
     assert restore_plan(small, plan.as_dict()).methods == plan.methods
 
 
-def test_a_map_of_a_thousand_million_points_takes_megabytes():
+def test_grid_of_one_billion_points_needs_megabytes():
     axes = {**HUGE, "alpha": {"linear": {"start": 0, "stop": 1, "num": 10_000}}, "delta": 1}
-    (plan,) = plans_of(study(axes=axes))
+    (plan,) = make_plans(study(axes=axes))
     assert plan.family("wall").shape == (10_000, 100_000)
     assert plan.disk < 256 * 2**20
 
 
-def test_what_does_not_fit_is_refused(tmp_path):
-    plans = plans_of(study(axes=HUGE, outputs=("spectral_radius", "margin", "passivity_margin")))
-    says = r"free, but the results may take 2\.\d+ TiB, most of them for studies\[map\]\.axes \(.* x beta \d+\)"
-    with pytest.raises(ResourceError, match=says):
+def test_run_exceeding_disk_or_memory_raises(tmp_path):
+    plans = make_plans(study(axes=HUGE, outputs=("spectral_radius", "margin", "passivity_margin")))
+    message = r"free, but the results may take 2\.\d+ TiB, most of them for studies\[map\]\.axes \(.* x beta \d+\)"
+    with pytest.raises(ResourceError, match=message):
         check_resources(plans, tmp_path / "not" / "there", workers=1)
     with pytest.raises(ResourceError, match=r"workers: 100000 workers may take .*; choose fewer with --workers"):
-        check_resources(plans_of(study()), tmp_path, workers=100_000)
+        check_resources(make_plans(study()), tmp_path, workers=100_000)
 
 
-def test_a_plan_tells_what_it_will_do():
-    text = "\n".join(plans_of(study(outputs=("stable", "alpha_max")))[0].lines())
+def test_plan_lists_points_chunks_methods_and_resources():
+    text = "\n".join(make_plans(study(outputs=("stable", "alpha_max")))[0].lines())
     for word in (
         "study map",
         "192,000",
@@ -85,13 +85,13 @@ def test_a_plan_tells_what_it_will_do():
         assert word in text
 
 
-def test_the_plan_says_how_radii_are_found_and_what_is_proved_of_them():
+def test_plan_states_method_and_certified_accuracy_of_radii():
     axes = {**HUGE, "d": [1, 70.5]}
-    plan = make_plan(sweep_of(study(axes=axes, outputs=("margin", "stable"), accuracy=1e-6)))
+    plan = make_plan(make_sweep(study(axes=axes, outputs=("margin", "stable"), accuracy=1e-6)))
     assert plan.as_dict()["methods"] == {"spectral_radius": "newton", "stable": "crossover"}
     lines = "\n".join(plan.lines())
     assert "spectral_radius by newton: certified to 1e-06" in lines
     assert "stable by crossover: stability limit of each line of constant B" in lines
     assert "polynomials of degree up to 74" in lines
-    usual = make_plan(sweep_of(study(axes=HUGE, outputs=("margin",))))
-    assert "certified to 1e-09" in usual.methods["spectral_radius"][1]
+    default_plan = make_plan(make_sweep(study(axes=HUGE, outputs=("margin",))))
+    assert "certified to 1e-09" in default_plan.methods["spectral_radius"][1]

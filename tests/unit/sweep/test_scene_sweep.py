@@ -1,9 +1,9 @@
-"""Sweeps over the parameters of a velocity filter, a hand and a coupling, against scenes asked one by one."""
+"""Sweeps over parameters of filters, operators and couplings, against independent matrices and single scenes."""
 
 import numpy as np
 import pytest
 from any_loop import closed_loop_matrix
-from sweeping import config_of, run_sweeps, study
+from sweeping import make_config, run_sweeps, study
 
 import zwidth
 from zwidth.config.fields import ConfigFileError
@@ -28,7 +28,7 @@ def scene_of(cutoff, damping):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    config = config_of(
+    config = make_config(
         study("walls", {**AXES, **WALLS}, ("stable",), **FILTER),
         study("devices", AXES, ("stiffness_max", "virtual_damping_at_max"), **FILTER),
     )
@@ -37,58 +37,58 @@ def folder(tmp_path_factory):
     return out
 
 
-def test_walls_are_those_whose_poles_lie_inside(folder):
-    """The reference: eigenvalues of a state space of the closed loop that is written apart from the library."""
+def test_labels_agree_with_eigenvalues(folder):
+    """Compare with eigenvalues of a closed-loop state space that is independent of the library."""
     data = open_dataset(folder / "walls.zarr")
     assert data.stable.dims == ("damping", "velocity_cutoff", "stiffness", "virtual_damping")
     assert (data.status == Status.OK).all()
-    wrong = near = 0
+    wrong = undecided = 0
     for damping in DAMPINGS:
         for cutoff in CUTOFFS:
             scene = scene_of(cutoff, damping)
-            found = data.stable.sel(damping=damping, velocity_cutoff=cutoff).values
+            stable = data.stable.sel(damping=damping, velocity_cutoff=cutoff).values
             for k, stiffness in enumerate(STIFFNESS):
                 for j, virtual in enumerate(VIRTUAL):
                     radius = np.abs(np.linalg.eigvals(closed_loop_matrix(scene, stiffness, virtual))).max()
-                    near += abs(radius - 1) < 1e-9
-                    wrong += abs(radius - 1) >= 1e-9 and found[k, j] != (radius < 1)
-    # Without physical damping a wall without virtual damping is never far from the boundary.
-    assert (wrong, near) == (0, 0)
+                    undecided += abs(radius - 1) < 1e-9
+                    wrong += abs(radius - 1) >= 1e-9 and stable[k, j] != (radius < 1)
+    # No wall may be near the boundary; without physical damping, B = 0 is close to it.
+    assert (wrong, undecided) == (0, 0)
 
 
-def test_the_stiffest_walls_are_at_the_edge(folder):
+def test_maximum_stiffness_is_on_the_boundary(folder):
     data = open_dataset(folder / "devices.zarr").load()
     for damping in DAMPINGS:
         for cutoff in CUTOFFS:
-            one = data.sel(damping=damping, velocity_cutoff=cutoff)
-            stiffness, virtual = float(one.stiffness_max), float(one.virtual_damping_at_max)
+            selected = data.sel(damping=damping, velocity_cutoff=cutoff)
+            stiffness, virtual = float(selected.stiffness_max), float(selected.virtual_damping_at_max)
             scene = scene_of(cutoff, damping)
             assert virtual >= 0
             assert list(scene.is_stable(stiffness * np.array([1 - 1e-6, 1 + 1e-6]), virtual)) == [True, False]
-            # No row of a fine comb of dampings reaches further.
+            # No line of constant B of a fine grid reaches a larger stiffness.
             ends = scene.stable_stiffness(np.linspace(0, 100, 2001))
             assert np.nanmax(ends) <= stiffness * (1 + 1e-9)
 
 
-def test_radii_and_passivity_are_those_of_the_scenes(tmp_path):
+def test_radii_and_passivity_agree_with_single_scenes(tmp_path):
     walls = {"stiffness": [500.0, 5000.0], "virtual_damping": [0.0, 5.0, 60.0]}
     outputs = ("stable", "spectral_radius", "passive")
-    config = config_of(study("s", {**DEVICE, "velocity.cutoff": [30, 100], **walls}, outputs, **FILTER))
+    config = make_config(study("s", {**DEVICE, "velocity.cutoff": [30, 100], **walls}, outputs, **FILTER))
     assert zwidth.run(config, out=tmp_path).ok
     data = open_dataset(tmp_path).load()
     assert (data.status == Status.OK).all()
     np.testing.assert_array_equal(data.stable, data.spectral_radius < 1)
     for damping in DAMPINGS:
         for cutoff in (30.0, 100.0):
-            one, scene = data.sel(damping=damping, velocity_cutoff=cutoff), scene_of(cutoff, damping)
+            selected, scene = data.sel(damping=damping, velocity_cutoff=cutoff), scene_of(cutoff, damping)
             grid = np.meshgrid(*walls.values(), indexing="ij")
-            np.testing.assert_array_equal(one.passive, scene.is_passive(*grid))
+            np.testing.assert_array_equal(selected.passive, scene.is_passive(*grid))
             exact = np.abs(scene.poles(*grid)).max(-1)
-            np.testing.assert_allclose(one.spectral_radius, exact, rtol=1e-9)
+            np.testing.assert_allclose(selected.spectral_radius, exact, rtol=1e-9)
     assert 0 < data.passive.mean() < 1
 
 
-def test_names_in_stores_tables_and_netcdf_have_no_dots(folder, tmp_path):
+def test_names_in_stores_csv_and_netcdf_have_no_dots(folder, tmp_path):
     to_csv(folder / "devices.zarr", tmp_path / "devices.csv")
     header = (tmp_path / "devices.csv").read_text().splitlines()[0].split(",")
     assert header[:2] == ["damping_N_s_per_m", "velocity_cutoff_Hz"]
@@ -98,28 +98,28 @@ def test_names_in_stores_tables_and_netcdf_have_no_dots(folder, tmp_path):
     assert not [name for name in data.variables if "." in str(name)]
 
 
-def test_figures_are_drawn_and_sliced_by_path(folder, tmp_path):
-    files = {file.name for file in draw_stores(folder, tmp_path, at={"velocity.cutoff": 40.0})}
+def test_figures_are_sliced_by_parameter_path(folder, tmp_path):
+    files = {file.name for file in draw_stores(folder, tmp_path, selection={"velocity.cutoff": 40.0})}
     assert {"walls_stable.png", "walls_boundaries.png", "devices_stiffness_max.png"} <= files
 
 
-def test_a_run_goes_on_and_is_verified(folder, tmp_path):
-    config = config_of(
+def test_interrupted_run_is_resumed_and_verified(folder, tmp_path):
+    config = make_config(
         study("walls", {**AXES, **WALLS}, ("stable",), **FILTER), study("other", AXES, ("stiffness_max",), **FILTER)
     )
-    done = []
+    result = []
 
     def stop_after_one(path, family, index):
-        if done:
+        if result:
             raise KeyboardInterrupt
         perform(path, family, index)
-        done.append(family)
+        result.append(family)
 
     run_sweeps(config, tmp_path, perform=stop_after_one)
     assert zwidth.run(config, out=tmp_path, resume=True).ok
     assert all(each.ok for each in verify(tmp_path))
-    one, other = (open_dataset(place / "walls.zarr").load() for place in (folder, tmp_path))
-    np.testing.assert_array_equal(one.stable, other.stable)
+    first, second = (open_dataset(path / "walls.zarr").load() for path in (folder, tmp_path))
+    np.testing.assert_array_equal(first.stable, second.stable)
 
 
 @pytest.mark.parametrize(
@@ -139,27 +139,27 @@ def test_a_run_goes_on_and_is_verified(folder, tmp_path):
         ("coupling.damping", [0.5, 2], {"coupling": {"mass": 0.1, "stiffness": 2e4, "sensor": "tip"}}),
     ],
 )
-def test_every_parameter_of_every_part_is_an_axis(path, values, parts, tmp_path):
+def test_every_parameter_of_a_component_may_be_an_axis(path, values, parts, tmp_path):
     axes = {"mass": 0.1, "damping": 2, "period": 1e-3, path: values}
-    config = config_of(study("s", axes, ("stiffness_max",), **parts))
+    config = make_config(study("s", axes, ("stiffness_max",), **parts))
     assert zwidth.run(config, out=tmp_path).ok
-    found = open_dataset(tmp_path).load()
-    assert (found.ridge_status == Status.OK).all()
+    data = open_dataset(tmp_path).load()
+    assert (data.ridge_status == Status.OK).all()
     sweep = config.studies[0]
     assert isinstance(sweep, SweepStudy)
     axis = getattr(sweep.axes, path).values().tolist()
-    for value, stiffness in zip(axis, found.stiffness_max.values, strict=True):
+    for value, stiffness in zip(axis, data.stiffness_max.values, strict=True):
         scene = sweep.make_scene({"mass": 0.1, "damping": 2.0, "period": 1e-3, path: value})
         assert scene.parameters()[path] == value
-        # Rows that are stable from soft walls on lead to no island.
+        # Stable lines that start at K = 0 belong to no island.
         low, high = np.moveaxis(scene.stable_stiffness(np.linspace(0, 300, 601)), -1, 0)
         assert np.max(high[low <= 0]) <= stiffness * (1 + 1e-9)
 
 
-def test_a_device_that_its_parts_refuse_spoils_no_other(tmp_path):
-    """At 100 Hz a cut-off of 80 Hz cannot be; at 1 kHz it can."""
+def test_invalid_device_does_not_affect_others(tmp_path):
+    """A cutoff of 80 Hz is above the Nyquist frequency of 100 Hz sampling, but valid at 1 kHz."""
     axes = {**DEVICE, "damping": 10, "period": ["1 ms", "10 ms"], "velocity.cutoff": [20, 80], "stiffness": [100, 200]}
-    config = config_of(study("s", axes, ("stable", "stiffness_max"), **FILTER))
+    config = make_config(study("s", axes, ("stable", "stiffness_max"), **FILTER))
     assert zwidth.run(config, out=tmp_path).ok
     data = open_dataset(tmp_path).load()
     bad = np.array([[False, False], [False, True]])
@@ -168,13 +168,13 @@ def test_a_device_that_its_parts_refuse_spoils_no_other(tmp_path):
     np.testing.assert_array_equal((data.status == Status.INVALID_INPUT).all("stiffness"), bad)
 
 
-def test_devices_of_a_table_have_parts_of_their_own(tmp_path):
+def test_table_of_devices_may_vary_component_parameters(tmp_path):
     devices = {"label": ["a", "b"], "mass": [0.1, 0.2], "velocity.cutoff": ["30 Hz", "0.1 kHz"]}
     axes = {"devices": devices, "period": 1e-3, "delay": 1e-3, "damping": 0}
-    config = config_of(study("s", axes, ("stiffness_max",), **FILTER))
+    config = make_config(study("s", axes, ("stiffness_max",), **FILTER))
     assert zwidth.run(config, out=tmp_path).ok
-    found = open_dataset(tmp_path).stiffness_max.values
-    np.testing.assert_allclose(found, [2795.31, 2 * 7279.64], rtol=1e-5)
+    stiffness = open_dataset(tmp_path).stiffness_max.values
+    np.testing.assert_allclose(stiffness, [2795.31, 2 * 7279.64], rtol=1e-5)
 
 
 FAULTS = {
@@ -191,23 +191,23 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("axes", FAULTS)
-def test_axes_of_parts_that_are_not_there(axes, tmp_path):
+def test_axes_of_missing_components_raise(axes, tmp_path):
     file = tmp_path / "c.yaml"
-    given, parts = axes
+    axis, parts = axes
     rest = f", {parts}" if parts else ""
     file.write_text(
         "version: 1\nname: c\nstudies:\n"
-        f"  - {{kind: sweep, name: s, axes: {{stiffness: 1, mass: 1, period: 1 ms, {given}}}{rest}}}\n"
+        f"  - {{kind: sweep, name: s, axes: {{stiffness: 1, mass: 1, period: 1 ms, {axis}}}{rest}}}\n"
     )
-    field, said = FAULTS[axes]
+    field, text = FAULTS[axes]
     with pytest.raises(ConfigFileError) as caught:
         zwidth.load_config(file)
     assert {fault.field for fault in caught.value.faults} == {f"studies[0].{field}"}
     assert caught.value.faults[0].line == 4
-    assert said in str(caught.value)
+    assert text in str(caught.value)
 
 
-def test_a_rigid_scene_takes_the_rigid_path():
+def test_rigid_scene_uses_the_rigid_solver():
     config = Config.model_validate(
         {
             **{"version": 1, "name": "c", "scene": {"mass": 0.1, "period": 1e-3}},
@@ -219,16 +219,16 @@ def test_a_rigid_scene_takes_the_rigid_path():
     assert not sweep.with_parts
 
 
-def test_devices_given_as_a_whole_are_swept(tmp_path):
-    """A linear system over delays and filters, and a response whose table is gone when the sweep goes on."""
-    timing, lines = {"period": 1e-3}, np.geomspace(1.0, 450.0, 300)
+def test_linear_and_measured_devices_are_swept(tmp_path):
+    """Sweep a linear system over delays and filters, and a measured response whose file is deleted before the run."""
+    timing, frequencies = {"period": 1e-3}, np.geomspace(1.0, 450.0, 300)
     rigid = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3), velocity=zwidth.LowPass(cutoff=30.0))
-    # Without its filter the open loop of K = 1 is the device.
-    response = rigid.replace(velocity=zwidth.BackwardDifference()).frequency_response(1.0, 0.0, lines)
-    zwidth.MeasuredDevice(lines, response, 1e-9).save(tmp_path / "response.csv")
+    # With K = 1 and no filter the open loop is the device.
+    response = rigid.replace(velocity=zwidth.BackwardDifference()).frequency_response(1.0, 0.0, frequencies)
+    zwidth.MeasuredDevice(frequencies, response, 1e-9).save(tmp_path / "response.csv")
     system, measured = "1 / 0.1 10 0", str(tmp_path / "response.csv")
     delays = {"delay": ["0 ms", "1 ms"], "velocity.cutoff": [30.0, 100.0]}
-    config = config_of(
+    config = make_config(
         study("system", {**timing, **delays}, ("stiffness_max",), device=system, **FILTER),
         study(
             "measured",
@@ -240,52 +240,54 @@ def test_devices_given_as_a_whole_are_swept(tmp_path):
     )
     (tmp_path / "response.csv").unlink()
     assert zwidth.run(config, out=tmp_path / "run", workers=2).ok
-    found = open_dataset(tmp_path / "run" / "system.zarr").stiffness_max
+    computed = open_dataset(tmp_path / "run" / "system.zarr").stiffness_max
     for delay in (0.0, 1e-3):
         for cutoff in (30.0, 100.0):
-            alone = rigid.replace(**{"delay": delay, "velocity.cutoff": cutoff}).max_stiffness().stiffness
-            assert float(found.sel(delay=delay, velocity_cutoff=cutoff)) == pytest.approx(float(alone), rel=1e-12)
-    found = open_dataset(tmp_path / "run" / "measured.zarr").stable
+            single = rigid.replace(**{"delay": delay, "velocity.cutoff": cutoff}).max_stiffness().stiffness
+            assert float(computed.sel(delay=delay, velocity_cutoff=cutoff)) == pytest.approx(float(single), rel=1e-12)
+    computed = open_dataset(tmp_path / "run" / "measured.zarr").stable
     stable = rigid.is_stable(STIFFNESS[:, None], VIRTUAL)
-    assert not (found.values & ~stable).any(), "stable for every response in the band, of which this is one"
-    assert found.values.sum() > 0.9 * stable.sum()
+    assert not (computed.values & ~stable).any(), "stable for every response in the band, of which this is one"
+    assert computed.values.sum() > 0.9 * stable.sum()
 
 
 @pytest.mark.parametrize("axis", ["mass", "damping", "actuator.cutoff"])
-def test_a_device_given_as_a_whole_holds_its_mass(axis):
+def test_linear_device_with_a_mass_axis_raises(axis):
     with pytest.raises(ValueError, match="together with a system or response"):
-        config_of(study("s", {"period": 1e-3, axis: [1.0, 2.0]}, ("stiffness_max",), device="1 / 0.1 10 0"))
+        make_config(study("s", {"period": 1e-3, axis: [1.0, 2.0]}, ("stiffness_max",), device="1 / 0.1 10 0"))
 
 
-def test_walls_that_a_measured_response_leaves_open_are_undecided(tmp_path):
-    """They are not stable for every response in the band, and not unstable for every one either."""
-    lines = np.geomspace(1.0, 450.0, 300)
-    response = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3)).frequency_response(1.0, 0.0, lines)
-    device = zwidth.MeasuredDevice(lines, response, 0.1 * np.abs(response))
+def test_walls_within_the_uncertainty_of_a_measurement_are_undecided(tmp_path):
+    """Such walls are neither stable nor unstable for every response in the uncertainty band."""
+    frequencies = np.geomspace(1.0, 450.0, 300)
+    response = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3)).frequency_response(
+        1.0, 0.0, frequencies
+    )
+    device = zwidth.MeasuredDevice(frequencies, response, 0.1 * np.abs(response))
     device.save(tmp_path / "response.csv")
-    config = config_of(study("s", {"period": 1e-3, **WALLS}, ("stable",), device=str(tmp_path / "response.csv")))
+    config = make_config(study("s", {"period": 1e-3, **WALLS}, ("stable",), device=str(tmp_path / "response.csv")))
     result = zwidth.run(config, out=tmp_path / "run")
     assert result.ok
-    found = open_dataset(tmp_path / "run")
-    told = zwidth.Scene(device, zwidth.Timing(1e-3)).decide_stability(STIFFNESS[:, None], VIRTUAL)
-    assert set(told.status.ravel().tolist()) == {Status.OK, Status.UNDECIDED}
-    np.testing.assert_array_equal(found.stable, told.stable)
-    np.testing.assert_array_equal(found.status, told.status)
-    many, failed = told.status.size, np.count_nonzero(told.status)
-    note = f"{failed} of {many} walls have no result: {failed} undecided"
+    data = open_dataset(tmp_path / "run")
+    decision = zwidth.Scene(device, zwidth.Timing(1e-3)).decide_stability(STIFFNESS[:, None], VIRTUAL)
+    assert set(decision.status.ravel().tolist()) == {Status.OK, Status.UNDECIDED}
+    np.testing.assert_array_equal(data.stable, decision.stable)
+    np.testing.assert_array_equal(data.status, decision.status)
+    total, failed = decision.status.size, np.count_nonzero(decision.status)
+    note = f"{failed} of {total} walls have no result: {failed} undecided"
     assert (result.studies[0].notes, zwidth.run(config, out=tmp_path / "run", resume=True).studies[0].notes) == (
         (note,),
     ) * 2
 
 
-def test_walls_of_devices_with_parts_that_are_out_of_range_say_so(tmp_path):
+def test_walls_out_of_range_have_their_status(tmp_path):
     device = {"mass": 1e-30, "damping": 1e-30, "period": 1e3}
     scene = zwidth.Scene(zwidth.Device(1e-30, 1e-30), zwidth.Timing(1e3), velocity=zwidth.LowPass(cutoff=1e-4))
     # alpha = K T^2/m is 1e66.
-    stiffness, told = [1e-20, 1e30], [Status.OK, Status.OUT_OF_RANGE]
-    assert scene.decide_stability(stiffness, 0.0).status.tolist() == told
+    stiffness, statuses = [1e-20, 1e30], [Status.OK, Status.OUT_OF_RANGE]
+    assert scene.decide_stability(stiffness, 0.0).status.tolist() == statuses
     for output in ("stable", "spectral_radius", "passive"):
         axes = {**device, "stiffness": stiffness}
-        config = config_of(study("s", axes, (output,), velocity={"kind": "low_pass", "cutoff": 1e-4}))
+        config = make_config(study("s", axes, (output,), velocity={"kind": "low_pass", "cutoff": 1e-4}))
         assert zwidth.run(config, out=tmp_path, overwrite=True).ok
-        assert open_dataset(tmp_path).status.values.tolist() == told
+        assert open_dataset(tmp_path).status.values.tolist() == statuses

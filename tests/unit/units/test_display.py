@@ -1,4 +1,4 @@
-"""Results at the prompt and in notebooks: short, with units and names, and every NaN explained."""
+"""Test the display of results at the prompt and in notebooks: concise, with units, and with a reason for every NaN."""
 
 from collections.abc import Callable
 from functools import cache
@@ -13,10 +13,10 @@ from zwidth.core.status import RidgeKind, Status
 from zwidth.units.display import draw_line, format_value
 
 SCENE = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(10e3, 40.0))
-# Nothing is stable where the estimate has the wrong sign and nothing damps.
+# With a velocity estimate of the wrong sign and no damping, no wall is stable.
 BACKWARDS = zwidth.VelocityFilter([-1000.0, 1000.0], [1.0, 0.0])
 NOWHERE = zwidth.Scene(zwidth.Device(0.1, 0.0), zwidth.Timing(1e-3, 1e-3), velocity=BACKWARDS)
-# What is asked for each, when a test asks: whoever only collects tests computes nothing.
+# Functions, so that collecting the tests computes nothing.
 RESULTS: dict[str, Callable[[], Any]] = {
     "wall": lambda: SCENE.max_stiffness(),
     "ridge": lambda: zwidth.alpha_max(0.1, 1),
@@ -44,12 +44,12 @@ RESULTS: dict[str, Callable[[], Any]] = {
 
 
 @cache
-def find(name: str) -> Any:
-    """A result by its name."""
+def compute_result(name: str) -> Any:
+    """Return a result by its name."""
     return RESULTS[name]()
 
 
-def test_a_list_of_results_has_tables():
+def test_lists_of_results_have_html_tables():
     lists: list[Any] = [zwidth.limits_of(SCENE), SCENE.stable_region()]
     for results in lists:
         assert results._repr_html_().count("<table>") == len(results) > 0
@@ -57,8 +57,8 @@ def test_a_list_of_results_has_tables():
 
 
 @pytest.mark.parametrize("name", RESULTS)
-def test_a_result_is_short_and_has_a_table(name):
-    result = find(name)
+def test_result_has_a_short_repr_and_one_html_table(name):
+    result = compute_result(name)
     text = repr(result)
     assert text.startswith(f"{type(result).__name__}(")
     assert len(text) < 1200
@@ -68,41 +68,43 @@ def test_a_result_is_short_and_has_a_table(name):
     assert table.count("<table>") == table.count("</table>") == 1
 
 
-def test_units_and_names_in_place_of_numbers():
-    assert repr(find("wall")) == (
+def test_repr_shows_units_and_names():
+    assert repr(compute_result("wall")) == (
         "StiffestWall(stiffness=19.8649 kN/m, virtual_damping=41.5989 N s/m, frequency=93.1993 Hz, "
         "kind=SMOOTH, status=OK)"
     )
-    assert "alpha=array (1000), 0.144469 to 0.874821" in repr(find("ridges"))
-    assert "1000 OK" in repr(find("ridges"))
-    # A scene's are in s and Hz, those of the normalized loop in periods and radians a period.
-    margins = find("margins")
+    assert "alpha=array (1000), 0.144469 to 0.874821" in repr(compute_result("ridges"))
+    assert "1000 OK" in repr(compute_result("ridges"))
+    # Margins of a scene are in s and Hz, those of the normalized loop in periods and rad per period.
+    margins = compute_result("margins")
     assert f"delay_margin={1e6 * margins.delay_margin:.6g} µs" in repr(margins)
     assert f"gain_crossover={margins.gain_crossover:.6g} Hz" in repr(margins)
     assert "periods" in repr(zwidth.margins(0.1, 0.4, 0.1, 1))
 
 
-def test_every_nan_has_a_reason():
+def test_repr_gives_a_reason_for_nan():
     nowhere = NOWHERE.max_stiffness()
     assert Status(int(nowhere.status)) == Status.NO_BOUNDARY
     assert "stiffness=NaN" in repr(nowhere)
     assert f"status=NO_BOUNDARY: {Status.NO_BOUNDARY.message}" in repr(nowhere)
-    assert "impact_velocity=NaN, the device does not enter the wall after the first sample" in repr(find("motion"))
+    assert "impact_velocity=NaN, the device does not enter the wall after the first sample" in repr(
+        compute_result("motion")
+    )
     assert "[OK, INVALID_INPUT]" in repr(zwidth.alpha_max(np.array([0.1, -1.0]), 1))
     assert "stiffness_max=NaN, no wall is stable" in repr(zwidth.assess(NOWHERE.replace(stiffness=1e3)))
     assert "reason=no stiffness is stable at any damping" in repr(NOWHERE.recommend())
 
 
-def test_a_motion_has_a_picture_and_many_have_none():
-    assert "<svg" in find("motion")._repr_html_()
-    assert '<td style="text-align:left">REST</td>' in find("motion")._repr_html_()
-    assert "<svg" not in find("motions")._repr_html_()
+def test_single_recorded_motion_has_a_plot():
+    assert "<svg" in compute_result("motion")._repr_html_()
+    assert '<td style="text-align:left">REST</td>' in compute_result("motion")._repr_html_()
+    assert "<svg" not in compute_result("motions")._repr_html_()
     unrecorded: Any = SCENE.simulate(start_position=1e-4, periods=10, record=False)
     assert "<svg" not in unrecorded._repr_html_()
 
 
-def test_poles_are_a_table_of_poles():
-    assert find("labels")._repr_html_().count("<tr>") == 1 + find("labels").stable.size
+def test_html_table_of_decisions_has_a_row_per_wall():
+    assert compute_result("labels")._repr_html_().count("<tr>") == 1 + compute_result("labels").stable.size
 
 
 @pytest.mark.parametrize(
@@ -121,39 +123,46 @@ def test_poles_are_a_table_of_poles():
         ({"mass": 1.0}, "", "{mass: 1}"),
     ],
 )
-def test_values_in_words(value, unit, text):
+def test_format_value(value, unit, text):
     assert format_value(value, unit) == text
 
 
-def test_the_largest_stiffness_is_not_shown_larger():
+def test_repr_rounds_maximum_stiffness_down():
     wall = SCENE.max_stiffness()
     for stiffness in 19876.5432 * np.geomspace(1.0, 10.0, 40):
         shown = repr(wall._replace(stiffness=stiffness)).partition("stiffness=")[2].partition(" kN/m")[0]
         assert 0 <= stiffness - 1e3 * float(shown) <= 1e-5 * stiffness
 
 
-def test_what_jax_traces_is_shown_as_it_is():
-    seen = []
+def test_repr_of_traced_results():
+    texts = []
 
-    def height(delta):
-        found = zwidth.alpha_max(delta, 1)
-        seen.append(repr(found))
-        return found.alpha
+    def compute_alpha_max(delta):
+        ridge = zwidth.alpha_max(delta, 1)
+        texts.append(repr(ridge))
+        return ridge.alpha
 
-    jax.jit(height)(0.1)
-    assert seen[0].startswith("RidgePoint(")
+    jax.jit(compute_alpha_max)(0.1)
+    assert texts[0].startswith("RidgePoint(")
 
 
-def test_a_line_of_nothing_is_no_picture():
+def test_draw_line_without_finite_values_is_empty():
     assert draw_line(np.arange(3.0), np.full(3, np.nan), "nothing") == ""
     assert draw_line(np.arange(3.0), np.ones(3), "<flat>").count("&lt;flat&gt;") == 1
 
 
-def test_modules_show_their_own_names():
-    assert dir(zwidth.devices) == ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_device"]
+def test_dir_of_modules_lists_only_public_names():
+    assert dir(zwidth.devices) == [
+        "DEVICES",
+        "HAND",
+        "PublishedDevice",
+        "PublishedHand",
+        "PublishedValue",
+        "find_device",
+    ]
 
 
-def test_an_array_says_why_it_has_nan_and_a_zero_has_no_sign():
+def test_arrays_show_the_reason_for_nan_and_no_negative_zero():
     motions = repr(SCENE.simulate([10e3, 1e3], 40.0, start_velocity=0.1, periods=100))
     assert "impact_velocity=[NaN, NaN]; NaN: the device does not enter the wall after the first sample" in motions
     assert format_value(np.array([-0.0, 1.0])) == "[0, 1]"

@@ -1,4 +1,4 @@
-"""Numbers for people, against texts written by hand from the rule: so many digits, no exponent from 1e-4 below 1e6."""
+"""Test the formatting of values against texts written by hand: significant digits, no exponent from 1e-4 to 1e6."""
 
 import math
 
@@ -50,12 +50,12 @@ def test_with_unit(value, text):
     assert with_unit(value, "N/m") == text
 
 
-def test_digits_are_those_asked_for():
+def test_number_of_digits():
     assert (with_unit(0.01, "", 1), with_unit(-1234.5, "1")) == ("0.01", "-1234")
     assert (plain(2 / 3, 2), with_unit(2 / 3, "s", 2), with_unit(996.0, "s", 2)) == ("0.67", "670 ms", "1.0 ks")
 
 
-def test_two_ends_that_differ_read_differently_and_lie_inside():
+def test_interval_ends_are_distinct_and_rounded_inward():
     assert format_interval(-3.45678, 19844.99, "N/m") == ("-3.456 N/m", "19.84 kN/m")
     assert format_interval(1.23411, 1.23499) == ("1.2342", "1.2349")
     assert format_interval(10.5953e3, 10.5971e3, "N/m") == ("10.596 kN/m", "10.597 kN/m")
@@ -70,18 +70,18 @@ def test_two_ends_that_differ_read_differently_and_lie_inside():
     ("value", "enough", "rounded"),
     [(1.23456, "above", 1.235), (1.23456, "below", 1.234), (-1.23456, "above", -1.234), (-1.23456, "below", -1.235)],
 )
-def test_a_number_is_rounded_to_the_side_on_which_there_is_enough(value, enough, rounded):
+def test_round_conservatively_rounds_to_the_sufficient_side(value, enough, rounded):
     assert round_conservatively(value, enough) == pytest.approx(rounded, rel=1e-12)
     assert round_conservatively(rounded, enough) == pytest.approx(rounded, rel=1e-12)
 
 
-def test_what_has_no_digits_stays():
+def test_round_conservatively_keeps_zero_infinity_and_undirected_values():
     assert round_conservatively(0.0, "above") == 0.0
     assert round_conservatively(float("inf"), "below") == float("inf")
     assert round_conservatively(1.23456, "") == 1.23456
 
 
-def test_a_range_in_which_there_is_enough_is_read_inside_of_it():
+def test_sufficient_range_is_rounded_inward():
     assert format_sufficient(40.653e-6, "above", [40.653e-6, 224.97e-6], "s") == "40.66 µs to 224.9 µs"
     assert format_sufficient(224.97e-6, "below", [40.653e-6, 1.0], "s") == "40.66 µs to 224.9 µs"
     assert format_sufficient(1.00001, "above", [1.00002], "1") == "1.00001 to 1.00002"

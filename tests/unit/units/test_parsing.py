@@ -1,4 +1,4 @@
-"""Quantities: every spelling of a unit, exact conversion, and spans in periods."""
+"""Test the parsing of quantities: spellings of units, exact conversion, and times in periods."""
 
 import math
 import re
@@ -76,7 +76,7 @@ from zwidth.units.parsing import (
         (RATE, ".5e-3 MHz", 500.0),
     ],
 )
-def test_a_quantity_is_the_number_nearest_to_what_is_written(dimension, text, value):
+def test_quantity_is_the_float_nearest_to_the_text(dimension, text, value):
     assert read_quantity(text, dimension)[0] == value
 
 
@@ -105,18 +105,18 @@ def test_a_quantity_is_the_number_nearest_to_what_is_written(dimension, text, va
         (INERTIA, "60 g cm²", 6e-6),
     ],
 )
-def test_units_that_no_table_lists_are_read(dimension, text, value):
-    # Several factors round several times.
+def test_compound_and_customary_units_are_read(dimension, text, value):
+    # Products of several factors have several rounding errors.
     assert read_quantity(text, dimension)[0] == pytest.approx(value, rel=4e-16, abs=0)
 
 
-def test_counts_per_revolution_or_length_are_the_step_of_an_encoder():
+def test_counts_per_revolution_or_length_are_an_encoder_step():
     step = math.pi / 1000
     for text in ("2000 counts/rev", "2000 cpr", "2,000.0 counts/turn", "2e3 ticks/rev"):
         assert read_quantity(text, ANGLE)[0] == pytest.approx(step, rel=1e-15)
     assert read_quantity("2000 counts", ANGLE, counts=True)[0] == pytest.approx(step, rel=1e-15)
     assert read_quantity("14 bit", ANGLE)[0] == 2 * math.pi / 2**14
-    # Elsewhere counts are not an angle, because the number of counts per turn is not known.
+    # Without the number of counts per turn, counts are not an angle.
     with pytest.raises(UnusableValueError, match="units allowed are rad"):
         read_quantity("20 counts", ANGLE)
     assert read_quantity("50 counts/mm", LENGTH)[0] == pytest.approx(2e-5, rel=1e-15)
@@ -141,14 +141,14 @@ def test_counts_per_revolution_or_length_are_the_step_of_an_encoder():
         (TIME, "1 Mhz"),
     ],
 )
-def test_no_suggestion_changes_the_magnitude(dimension, text):
+def test_no_suggestion_has_another_magnitude(dimension, text):
     with pytest.raises(UnusableValueError, match="units allowed are") as caught:
         read_quantity(text, dimension)
     assert "did you mean" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("dimension", "text", "meant"),
+    ("dimension", "text", "suggestion"),
     [
         (MASS, "0.1 KG", "kg"),
         (RATE, "1 khz", "kHz"),
@@ -157,21 +157,21 @@ def test_no_suggestion_changes_the_magnitude(dimension, text):
         (ANGULAR_DAMPING, "1 mN m s/rd", "mN m s/rad"),
     ],
 )
-def test_a_suggestion_has_the_same_magnitude(dimension, text, meant):
-    with pytest.raises(UnusableValueError, match=f"did you mean '{meant}'"):
+def test_suggestion_has_the_same_magnitude(dimension, text, suggestion):
+    with pytest.raises(UnusableValueError, match=f"did you mean '{suggestion}'"):
         read_quantity(text, dimension)
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("1,000 N/m", "the comma is ambiguous: decimal or thousands separator; write '1000 N/m' or '1.000 N/m'"),
         ("1,00,0.5 N/m", "not in groups of three"),
         ("1,5", "have no separators; write 1.5"),
     ],
 )
-def test_separators_that_may_mean_two_numbers_are_refused(text, words):
-    with pytest.raises(UnusableValueError, match=re.escape(words)):
+def test_ambiguous_separators_are_rejected(text, message):
+    with pytest.raises(UnusableValueError, match=re.escape(message)):
         read_quantity(text, STIFFNESS)
 
 
@@ -201,12 +201,12 @@ def test_separators_that_may_mean_two_numbers_are_refused(text, words):
         (ANGLE, "10 m"),
     ],
 )
-def test_what_is_no_quantity(dimension, value):
+def test_invalid_quantities_are_rejected(dimension, value):
     with pytest.raises(UnusableValueError):
         read_quantity(value, dimension)
 
 
-def test_spans():
+def test_span_in_periods_and_seconds():
     assert Span(3.0, "periods").periods(1e-4) == 3.0
     assert Span(3.0, "periods").seconds(0.5) == 1.5
     assert Span(1.1e-3, "s").periods(1e-4) == 11.0
@@ -230,10 +230,10 @@ def test_spans():
         (1.7976931348623157e308, "N/m", None),
     ],
 )
-def test_a_spelled_quantity_is_read_back_bit_by_bit(value, unit, text):
-    spelled = format_exactly(value, unit)
-    assert text is None or spelled == text
-    mantissa, _, shown = spelled.partition(" ")
+def test_exactly_formatted_quantity_is_read_back_bit_by_bit(value, unit, text):
+    formatted = format_exactly(value, unit)
+    assert text is None or formatted == text
+    mantissa, _, prefixed_unit = formatted.partition(" ")
     assert len(mantissa) <= 25
     digits, _, exponent = mantissa.partition("E")
-    assert DIMENSIONS[unit].in_base(digits, int(exponent or 0), shown) == value
+    assert DIMENSIONS[unit].in_base(digits, int(exponent or 0), prefixed_unit) == value

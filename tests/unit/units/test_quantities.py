@@ -1,4 +1,4 @@
-"""Ranges and units of the quantities, against what their definitions say."""
+"""Test ranges of quantities and units of outputs against their definitions."""
 
 import math
 
@@ -9,7 +9,7 @@ from zwidth.units.quantities import OUTPUTS, Range
 
 @pytest.mark.parametrize("low_open", [False, True])
 @pytest.mark.parametrize("high_open", [False, True])
-def test_the_ends_belong_to_a_range_unless_open(low_open, high_open):
+def test_range_contains_its_ends_unless_open(low_open, high_open):
     allowed = Range(0.0, 1.0, low_open, high_open)
     assert (allowed.holds(0.0), allowed.holds(1.0)) == (not low_open, not high_open)
     assert allowed.holds(0.5)
@@ -23,5 +23,5 @@ def test_the_ends_belong_to_a_range_unless_open(low_open, high_open):
     "name, normalized, physical",
     [("settling_time", "sampling periods", "s"), ("decay_rate", "1/period", "1/s"), ("spectral_radius", "1", "1")],
 )
-def test_units_are_those_of_the_sweep(name, normalized, physical):
+def test_output_units_of_a_sweep(name, normalized, physical):
     assert (OUTPUTS[name].units_in(False), OUTPUTS[name].units_in(True)) == (normalized, physical)

@@ -136,7 +136,7 @@ class Controls:
 
     @property
     def sliders(self) -> dict[str, Slider]:
-        """The sliders of all parameters for this kind of device, linear or rotary, by path."""
+        """The sliders of all parameters of this kind of device (linear or rotary); keys such as "coupling.mass"."""
         return ROTARY_SLIDERS if self.rotary else SLIDERS
 
     def shown(self) -> dict[str, Any]:
@@ -147,8 +147,8 @@ class Controls:
         forms = {name: _find_form(part) for name, part in find_parts(scene).items() if name in PARTS}
         numbers = {name: value * self.sliders[name].per_si for name, value in values.items() if name in SLIDERS}
         for part, form in forms.items():
-            # Hide the sliders of parameters that have no effect in this form of the part, for example the damper
-            # parallel to a spring if there is no spring.
+            # Hide the sliders of parameters that have no effect with this preset of the part, for example the damper
+            # parallel to a spring if the part has no spring.
             idle = {f"{part}.{item.name}" for item in fields(PARTS[part]) if item.name not in PARTS[part].usual[form]}
             numbers = {name: value for name, value in numbers.items() if name not in idle}
         choices = {"mode": "physical", "motion": "rotary" if self.rotary else "linear"}
@@ -256,7 +256,7 @@ def _round(value: float, digits: int) -> float:
 
 
 def _find_form(part: Any) -> str:
-    """Return the name of the preset of a part that has the same values in all fields that are not floats."""
+    """Return the name of the preset that agrees with a part in all fields that are not floats."""
 
     def shape(part: Any) -> dict[str, Any]:
         values = {item.name: getattr(part, item.name) for item in fields(part)}
@@ -352,7 +352,7 @@ def to_yaml(controls: Controls) -> str:
     """Return a configuration with the scene and studies of its stable walls and, if rigid, its step response."""
     scene = controls.scene
     studies: list[dict[str, Any]] = [{"kind": "boundary", "name": "stable_walls"}]
-    if not scene.parts_beyond:
+    if not scene.nonrigid_parts:
         studies[0] |= {"passivity": True} if scene.operator is None else {}
         studies.append({"kind": "step", "name": "response"})
     return write_yaml({"version": 1, "name": "explored", "scene": _spell_section(controls), "studies": studies})

@@ -41,7 +41,7 @@ LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)  # spectral radii of the contours
 _GRIDS = ((1, (72, 56)), (12, (48, 40)), (inf, (36, 30)))
 _DIRECTIONS = 181  # points on the boundary of the passive walls
 _RIDGE_POINTS = 61  # points on the ridge
-_MOST_DAMPING = 4.0  # largest damping on the ridge, in dampings of the device
+_MOST_DAMPING = 4.0  # largest damping on the ridge, relative to the damping of the device
 _SHORTEST = 30  # sampling periods; shortest response
 _LONGEST = 3000  # sampling periods; longest response
 _IMPACT = 0.1  # speed of a hit on the wall, in m/s; for normalized scenes without a unit
@@ -49,7 +49,7 @@ _APPROACH = 5.0  # sampling periods of motion before contact
 
 
 def show_outlines(scene: Scene) -> Update:
-    """Return the outlines of the stable region: the data of lines, of areas with holes, and of labels of islands."""
+    """Return the outlines of the stable region as data of lines, of areas with holes, and of labels of islands."""
     pieces = scene.stable_region()
     lines = [piece.stiffness for piece in pieces], [piece.virtual_damping for piece in pieces]
     xs, ys = ([np.append(line, line[:1]) for line in each] for each in lines)
@@ -58,7 +58,7 @@ def show_outlines(scene: Scene) -> Update:
 
 
 def choose_ranges(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
-    """Return rounded axis ranges that contain a curve, and the wall unless it is very far (two ranges) from it."""
+    """Return rounded axis ranges that contain a curve and, unless it is more than two ranges away, the wall."""
     ranges = []
     for axis in (0, 1):
         values = np.append(curve[axis][np.isfinite(curve[axis])], 0.0)
@@ -74,7 +74,7 @@ def choose_ranges(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range
 
 
 def place_arrow(wall: tuple[float, float], across: Range, up: Range) -> dict[str, list[Any]]:
-    """Return the data of an arrow at the border of a chart that points to a wall outside; empty if it is inside."""
+    """Return the data of an arrow at the border of a chart toward a wall outside the chart; empty for a wall inside."""
     sides = [int(value > high) - int(value < low) for value, (low, high) in zip(wall, (across, up), strict=True)]
     if not any(sides):
         return {"x": [], "y": [], "angle": [], "text": [], "align": []}
@@ -132,7 +132,7 @@ def compute_step_response(scene: Scene, periods: int) -> Curve:
 
 
 def find_passive_boundary(scene: Scene) -> Curve | None:
-    """Return points on the boundary of the passive walls; none if no wall is passive, None without a condition."""
+    """Return points on the boundary of the passive walls; None for a device without a passivity condition."""
     if find_unsupported_reason(**vars(scene.device)):
         return None
     return trace_passivity_boundary(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))

@@ -176,7 +176,7 @@ class Page:
         return plot
 
     def _draw_bode(self, column: str, critical: float) -> figure:
-        """Return the figure of magnitude or phase of L over frequency, with a line at the critical value."""
+        """Return the figure of magnitude or phase of L over frequency, with a line at the value ``critical``."""
         plot = self._new(170, x_axis_type="log")
         self._add(plot, "line", "bode", "edge", x="x", y=column, line_width=2)
         line = Span(location=critical, dimension="width", line_dash=[4, 4], line_width=1.5)
@@ -279,7 +279,7 @@ class Page:
             self.executor.submit(self._compute, self.generation, controls.scene, *self.frame, **wanted)
 
     def _show_at_once(self, controls: Controls, rest: bool) -> None:
-        """Compute and show the fast results, and if the slider rests also the texts that reproduce the scene."""
+        """Compute and show the fast results and, if the slider rests, the texts that reproduce the scene."""
         scene = controls.scene
         stable, poles = bool(scene.decide_stability(method="companion").stable), scene.poles()
         device = replace(scene, wall=VirtualWall(0.0)), controls.normalized

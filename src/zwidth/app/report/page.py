@@ -161,7 +161,7 @@ def _write_section(where: Path, entry: dict[str, Any]) -> str:
     """Return the HTML section of a study, from the folder of the run and the entry of the study."""
     kind, name = str(entry["kind"]), escape(str(entry["name"]))
     remarks = [*entry.get("answer", ()), *entry.get("notes", ())]
-    notes = f'<div class="told">{"".join(f"<p>{escape(str(each))}</p>" for each in remarks)}</div>' if remarks else ""
+    notes = f'<div class="notes">{"".join(f"<p>{escape(str(each))}</p>" for each in remarks)}</div>' if remarks else ""
     method = f'<p class="soft">{escape(KINDS[kind].method)}</p>' if kind in KINDS and KINDS[kind].method else ""
     body = "".join(_write_contents(where, entry))
     listed = ", ".join(escape(file) for file in sorted(entry.get("files", {})))
@@ -227,7 +227,7 @@ def _write_comparison(content: dict[str, Any]) -> str:
         f'<td class="number">{_format_computed(row)}</td><td>{_AGREEMENT[row["agrees"]]}</td>'
         for row in content["published"]
     ]
-    head = "".join(f'<th scope="col">{word}</th>' for word in ("quantity", "where", "printed", "computed", ""))
+    head = "".join(f'<th scope="col">{word}</th>' for word in ("quantity", "location", "printed", "computed", ""))
     title = "Printed and computed numbers"
     return f"<h3>{title}</h3>{_write_table(title, rows, f'<thead><tr>{head}</tr></thead>')}"
 

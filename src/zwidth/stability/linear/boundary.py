@@ -37,28 +37,28 @@ from zwidth.stability.linear.curve import (
 )
 from zwidth.stability.linear.roots import LoopRoots
 
-# Newton's method for the angle w of a crossing. The first constant is the largest number of steps.
+# Largest number of steps of Newton's method for the angle w of a crossing.
 MAX_STEPS = 120
 CONVERGED_STEP = 1e-10  # relative to w; the error after it is of the order of its square
 
 # Relative changes of beta, tried in this order if rounding errors make the crossings of a line ambiguous (V15).
 SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
-# Distance between an end of an interval, where the curve may be infinite, and an additional point of the curve,
-# relative to the distance of the next node.
+# Distance of an additional point of the curve from an end of an interval, at which the curve may be infinite, relative
+# to the distance of the nearest node from this end.
 PROBE_DISTANCE = 1e-6
-# Ratio of radial to total displacement below which a pole leaves a zero of G along the unit circle (V14).
+# A pole leaves a zero of G along the circle if the radial part of its displacement is below this fraction (V14).
 TANGENT_TOLERANCE = 1e-9
 EQUAL_DAMPING = 1e-12  # dampings with a smaller relative difference are equal up to rounding errors
 BLOCK_SIZE = 1 << 17  # pairs of lines and arcs per batch; its arrays fit in the cache
 
 
 class Crossings(NamedTuple):
-    """Crossings of lines of constant B with the boundary: shape (rows, columns), NaN where a line misses a column."""
+    """Crossings of lines of constant B with the boundary: shape (rows, columns), NaN without a crossing."""
 
     alpha: np.ndarray
     w: np.ndarray
     leaving: np.ndarray
-    consistent: np.ndarray  # of each row: its crossings account for the count far below and the count far above (V15)
+    consistent: np.ndarray  # of each row: the crossings agree with the counts far below and far above (V15)
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Boundary:
         return cls(loop, w, tuple(arcs), tuple(lines), asymptotes, limits, lossless)
 
     def are_lossless(self, beta: np.ndarray) -> np.ndarray:
-        """Return a mask of the dampings beta at which the loop is lossless and no wall is stable (`find_lossless`)."""
+        """Return a mask of the dampings at which the loop is lossless (`find_lossless`), so that no wall is stable."""
         with np.errstate(invalid="ignore"):
             return np.abs(beta - self.lossless) <= EQUAL_DAMPING * np.abs(self.lossless)
 
@@ -118,7 +118,7 @@ class Boundary:
         return out
 
     def find_alpha(self, column: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return the alpha at which each line of constant B crosses a column, one column per line.
+        """Return the alpha at which each line of constant B crosses its column, i.e. one arc or crossing line per line.
 
         Args:
             column: column of each line, shape (rows,).
@@ -158,9 +158,9 @@ class Boundary:
         Returns:
             Angle and alpha of each crossing.
         """
-        # Solve ``ratio(w) = 0``, where ``ratio`` is Im(q - beta F) divided by factors with the signs ``signs``. It is
-        # rising or falling at the crossing: Im(q - beta F) increases with w if a pole pair leaves the circle (V11).
-        # Converged crossings are removed from the iteration.
+        # Solve ``ratio(w) = 0`` with ``ratio = Im(q - beta F)/common``. The sign of its derivative at the crossing
+        # follows from ``leaving`` and from the ``signs`` of the factors of ``common``, because Im(q - beta F) increases
+        # with w if a pole pair leaves the circle (V11). Converged crossings are removed from the iteration.
         joined, nodes = self._joined, self._node_values
         lower = np.where(joined.w[k - 1] < joined.w[k], k - 1, k)
         upper = 2 * k - 1 - lower
@@ -199,7 +199,7 @@ class Boundary:
         return angle, alpha
 
     def _evaluate_loop(self, w: np.ndarray) -> _LoopValues:
-        """Return q, F and their derivatives at angles w, which do not depend on the damping."""
+        """Return q, F and their derivatives at angles w; these values do not depend on the damping."""
         points, common, slope = circle_points(w), np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
         for angle in self._pair_angles:
             factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
@@ -229,7 +229,7 @@ class Boundary:
 
     @cached_property
     def alpha_nodes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Angles between which alpha is monotone along the curve, and alpha at them; NaN where it is infinite."""
+        """Angles between which alpha is monotone along the curve, and alpha at these angles (NaN if infinite)."""
         nodes = np.union1d(self.w, self.alpha_extrema)
         pieces, values = [], []
         for a, b in pairwise(sorted(self.limits)):
@@ -269,7 +269,7 @@ class Boundary:
         return beta, mismatch == 0
 
     def _count_mismatch(self, beta: np.ndarray) -> np.ndarray:
-        """Return per line: count below all crossings + sum of ``leaving`` - count above; 0 if consistent."""
+        """Return, for each line, the count below all crossings plus the sum of ``leaving`` minus the count above."""
         return self.count_below(beta) - self.count_above(beta) + self._sum_leaving(beta)
 
     def _sum_leaving(self, beta: np.ndarray, limit: float = np.inf) -> np.ndarray:
@@ -294,7 +294,7 @@ class Boundary:
     def _sum_below(
         self, alpha: np.ndarray, beta: np.ndarray, excluded: np.ndarray | int = -1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Sum ``leaving`` over the crossings below each wall, except in the column ``excluded``.
+        """Sum ``leaving`` over the crossings below each wall, except the crossing in the column ``excluded``.
 
         Returns:
             The sums, and whether the crossings of each wall's line of constant B are consistent.
@@ -322,7 +322,7 @@ class Boundary:
         return total.astype(int), consistent
 
     def are_stable_edges(self, w: np.ndarray) -> np.ndarray:
-        """Return a mask of the angles at which the curve bounds the stable set, which lies on one side of it (V18)."""
+        """Return a mask of the angles at which the curve bounds the stable set, i.e. one side is stable (V18)."""
         curve = evaluate_curve(self.loop, w)
         result = np.isfinite(curve.alpha) & np.isfinite(curve.beta)
         # Exclude most lines of constant B without stable walls before solving for crossings: with a long delay, fewer
@@ -332,8 +332,8 @@ class Boundary:
         arc, block = self.find_arc(w), max(1, BLOCK_SIZE // max(1, len(self.arcs)))
         for part in np.array_split(np.flatnonzero(result), 1 + result.sum() // block):
             sums, consistent = self._sum_below(curve.alpha[part], curve.beta[part], arc[part])
-            # Use the value of ``leaving`` that holds for the whole arc, because its sign at a single angle may be wrong
-            # by rounding errors.
+            # Use the value of ``leaving`` that holds for the whole arc, because rounding errors may change its sign at
+            # a single angle.
             below = self.count_below(curve.beta[part])
             result[part] = consistent & (below + sums == np.where(self._joined.leaving[arc[part]] > 0, 0, 2))
         return result
@@ -380,8 +380,8 @@ class Boundary:
             power = -side / (rest.value * (1j * points.z) ** order)
             x = power ** (1.0 / order) * np.exp(2j * np.pi * np.arange(order) / order)
             if np.isfinite(self.lossless):
-                # In a lossless loop, alpha moves the pole along the circle, and only a difference of beta from the
-                # lossless damping moves it off the circle: x becomes x (1 - (beta - lossless) F/alpha).
+                # In a lossless loop, alpha moves the pole along the circle. Only a difference of beta from the lossless
+                # damping moves the pole off the circle: x becomes x (1 - (beta - lossless) F/alpha).
                 leaving += int(np.sum(side * excess * loop.estimate.jet(points).value.imag * x.real > 0))
                 continue
             # If x is real, the pole leaves the zero along the circle. The imaginary part of the next term of its

@@ -38,7 +38,7 @@ NO_ESTIMATE = Estimate(0, 0.0)
 
 
 def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Decide with a certificate whether walls are stable, in arithmetic of sufficient precision.
+    """Decide with a certificate whether walls are stable, in ball arithmetic of sufficient precision.
 
     Args:
         scene: the scene.

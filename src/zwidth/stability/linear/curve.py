@@ -23,7 +23,7 @@ from zwidth.model.circle_functions import are_on_circle, circle_points
 from zwidth.numerics.root_finding import find_zeros_between
 from zwidth.stability.linear.roots import LoopRoots
 
-# Settings of the nodes.
+# Settings for the placement of the nodes.
 NODE_SPACING = 0.08  # relative change of q and F between neighboring nodes, estimated
 MAX_ROUNDS = 60  # largest number of rounds in which intervals between nodes are halved
 LAST_NODE = 1e-4  # pi - w of the last node, for a loop without delay and without roots near z = -1
@@ -60,14 +60,15 @@ def place_nodes(loop: LoopRoots) -> np.ndarray:
     from_one, from_minus_one = np.abs(roots), np.abs(roots - 2.0)
     delay_angle = 1.0 / (loop.lag + loop.estimate.window + 1.0)
     first = 1e-3 * min([delay_angle, *from_one[from_one > 1e-13]])
-    # Let x = pi - w. Near z = -1, imaginary parts have a relative rounding error of eps/x, and beta changes in
-    # proportion to (x/from_minus_one)^2. Place the last node as close to pi as the resulting error of d beta/dw allows.
+    # Let x = pi - w, and let rho be the smallest distance of a root from z = -1. Near z = -1, imaginary parts have a
+    # relative rounding error of eps/x, and beta changes in proportion to (x/rho)^2. Place the last node as close to pi
+    # as the resulting error of d beta/dw allows.
     last = LAST_NODE * min([delay_angle, *from_minus_one[from_minus_one > 1e-13]]) ** (2.0 / 3.0)
     w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - last, 32)[1:]])
     nodes, low, high = [w], w[:-1], w[1:]
     for _ in range(MAX_ROUNDS):
         half = 0.5 * (high - low)
-        # Estimate the change of q and F over each interval from two bounds of their derivatives: over the whole
+        # Estimate the change of q and F over each interval from two bounds on their derivatives: over the whole
         # interval (first row) and at its midpoint (second row). Accept a 16 times larger change by the first bound,
         # because this bound overestimates the change near roots.
         change = 2.0 * half * loop.bound_variation(low + half, half * np.array([[1.0], [0.0]]))
@@ -137,8 +138,8 @@ def find_lines(loop: LoopRoots, angles: ArrayLike) -> list[CrossingLine]:
         q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
         real = is_end | (np.abs(q.value.imag) <= REAL_TOLERANCE * np.abs(q.value))
     values = np.stack([w, q.value.real, f.value.real, q.slope.imag, f.slope.imag], -1)
-    # Treat a zero of G as located at e^(jw) if its distance is at most ``reach``, because zeros have rounding errors.
-    # ``reach`` is smallest at z = 1, because the offsets of zeros near z = 1 have small errors.
+    # Treat a zero of G as located at e^(jw) if its distance from this point is at most ``reach``, because zeros have
+    # rounding errors. ``reach`` is smallest at z = 1, because the offsets of zeros near z = 1 have small errors.
     reach = np.where(w == 0.0, 1e-15, np.where(is_end, 1e-12, 1e-9))
     near = np.abs(points.z_minus_1[:, None] + loop.zeros) <= reach[:, None]
     selected = np.flatnonzero(real & ~near.any(1) & np.isfinite(values).all(1))
@@ -155,7 +156,7 @@ def list_circle_zeros(loop: LoopRoots) -> np.ndarray:
 # Parts of the error bound of alpha between two nodes, relative to `CurvePoints.size`. If linear interpolation is not
 # accurate, the bound is COARSE_TOLERANCE plus 1.5 times the difference of alpha between the nodes.
 COARSE_TOLERANCE = 0.02
-ROUNDING_TOLERANCE = 1e-6  # bound of the rounding errors
+ROUNDING_TOLERANCE = 1e-6  # bound on the rounding errors
 
 
 class Arc(NamedTuple):
@@ -217,7 +218,7 @@ def cut_arcs(
         parts = [np.concatenate([[end[0]], part, [end[1]]]) for part, end in zip(parts, edges, strict=True)]
         if not rising:
             parts = [part[::-1] for part in parts]
-        # Drop nodes at which rounding errors break the monotone order of beta. Such nodes lie near the ends of the arc.
+        # Drop nodes near the ends of the arc at which rounding errors break the monotone order of beta.
         beta = parts[1]
         ordered = np.maximum.accumulate(beta) == beta
         ordered &= np.minimum.accumulate(beta[::-1])[::-1] == beta
@@ -269,10 +270,10 @@ def build_level_arc(w: np.ndarray, curve: CurvePoints, beta: float) -> Arc:
 def bound_interpolation(
     w: np.ndarray, alpha: np.ndarray, alpha_slope: np.ndarray, beta_slope: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a mask of the steps over which alpha may be interpolated linearly in beta, and bounds of its error.
+    """Return a mask of the steps between nodes over which alpha is nearly linear in beta, and bounds on its error.
 
     A step is the interval between two neighboring nodes. Where the mask is False, alpha is approximated by the mean of
-    both ends, with the returned bound of the error.
+    both ends, with the returned bound on the error.
 
     Args:
         w: angles of the nodes of all arcs, joined, shape (nodes,).
@@ -305,7 +306,7 @@ class JoinedArcs(NamedTuple):
     beta: np.ndarray
     alpha: np.ndarray
     straight: np.ndarray  # of each step: alpha may be interpolated linearly in beta; else use the mean of both ends
-    room: np.ndarray  # of each step: bound of the error of this alpha
+    room: np.ndarray  # of each step: bound on the error of this alpha
     keys: np.ndarray  # of each node: index of its arc times the number of dampings, plus index of its damping
     dampings: np.ndarray  # of all nodes, sorted
     first: np.ndarray  # of each arc: its first node

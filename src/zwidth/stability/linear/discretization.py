@@ -33,14 +33,14 @@ from zwidth.stability.linear.sampled_zeros import find_sampled_zeros
 
 # Settings for the zeros of G.
 SLOW_ZERO = 0.1  # |zeta| below which a zero starts from its continuous-time counterpart
-MAX_STEPS = 30  # Aberth steps
+MAX_STEPS = 30  # largest number of Aberth steps
 CONVERGED_STEP = 1e-13  # last Aberth step, relative to |zeta|
 CLUSTER_RADIUS = 1e-2  # |z| of zeros near z = 0 that rounding errors may make inseparable
 RESPONSE_TOLERANCE = 1e-11  # relative difference of q by roots and by matrices, above which the cluster is not refined
-TEST_ANGLE = 0.5  # rad per sample at which the two are compared
-FAR_ZERO = 1e-17  # inverse |zeta| beyond which a zero is dropped
+TEST_ANGLE = 0.5  # angle in rad per sample at which the two are compared
+FAR_ZERO = 1e-17  # 1/|zeta| of a zero below which the zero is dropped
 
-# Settings of the matrix exponential: number of terms of its series, largest number of doublings.
+# Number of terms of the series for the matrix exponential, and largest number of doublings of the time.
 SERIES_TERMS = 15
 MAX_DOUBLINGS = 36  # 2^36 exceeds twice the largest rate that `Chain.check` allows
 
@@ -49,9 +49,9 @@ def compute_transition(A: Any, B: Any, time: Any) -> tuple[Any, Any]:
     """Return ``e^(A t) - 1`` and Gamma(t), the state after a unit force held for time t from rest."""
     # Evaluate the series for the time divided by a power of 2, then double the time repeatedly: y(2 t) = y(t) (2 +
     # y(t)) for y = e^(A t) - 1, and similarly Gamma. This keeps the relative accuracy of slow and of strongly damped
-    # modes. Use two loops, because they make the program short and the compile time of derivatives is proportional to
-    # its length: with JAX's own exponential, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long
-    # to compile.
+    # modes. Write the evaluation as two program loops, because these make the program short, and the compile time of
+    # derivatives is proportional to its length: with JAX's own exponential, derivatives of `zwidth.Scene.max_stiffness`
+    # took 1.2 to 1.7 times as long to compile.
     xp = namespace(A)
     norm = stop_gradient(xp.abs(A * time).sum(0).max(), xp)
     doublings = xp.ceil(xp.log2(xp.maximum(2.0 * norm, 1.0)))
@@ -132,7 +132,7 @@ def find_roots(chain: AnyChain) -> LoopRoots:
             lead, zeros = find_sampled_zeros(chain.device, float(chain.period), float(chain.d) - chain.n_delay)
             gain = lead * float(chain.mass) / float(chain.period) ** 2
             poles = -np.expm1(chain.device.poles * float(chain.period))
-        # Count poles at z = 0 as periods of delay (``lag``), of which zeros at z = 0 cancel one each.
+        # Count each pole at z = 0 as a period of delay (``lag``); each zero at z = 0 cancels one of them.
         lag, at_origin = int(lag + np.sum(poles == 1)), int(np.sum(zeros == 1))
         zeros = np.append(zeros[zeros != 1], np.ones(max(at_origin - lag, 0)))
         return LoopRoots(gain, max(lag - at_origin, 0), zeros, poles[poles != 1], chain.estimate)
@@ -215,7 +215,7 @@ def _refine_zeros(discretized: DiscreteChain, zeros: np.ndarray, is_refined: np.
 
 
 def _log_derivative(matrix: np.ndarray, change: np.ndarray) -> complex:
-    """Return the derivative of log det(matrix) for a given derivative of the matrix; infinite if it is singular."""
+    """Return the derivative of log det(matrix) for a given derivative of the matrix; infinite for a singular matrix."""
     try:
         return np.trace(np.linalg.solve(matrix, change))
     except np.linalg.LinAlgError:
@@ -262,7 +262,7 @@ def add_input_delay(discretized: DiscreteChain, n: int) -> StateSpace:
 
 
 def realize_open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
-    """Return ``L = (alpha + beta F) G`` in state space, from the position at the wall to the sampled position."""
+    """Return ``L = (alpha + beta F) G`` in state space, from the wall's input position to the sampled position."""
     f = realize_estimate(chain.estimate)
     return connect_in_series(StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D), realize_device(chain))
 

@@ -6,10 +6,11 @@ beta F`` is nearly 0 are halved. Between neighboring nodes |L| and its phase har
 changes between nodes, and next to a minimum of the magnitude from which tangents at both nodes reach zero.
 
 Delay margin: one more period of delay changes the phase of L by the angle w and nothing else. At a gain crossover with
-the phase ``p = arg(-L)``, a pole is therefore on the unit circle after m more periods if ``p - m w`` is a multiple of
-2 pi. Therefore loops with delays within one period suffice for all longer delays: if m passes an integer between two of
+the phase ``p = arg(-L)``, a pole is therefore on the unit circle after m more periods if ``p - m w`` is a multiple of 2
+pi. Therefore loops with delays within one period suffice for all longer delays: if m passes an integer between two of
 them, Newton's method solves for the delay, with the exact loop of each iterate. A real pole reaches z = -1 where
-``|L(-1)|`` passes 1. Counts of the unstable poles below and above must confirm the smallest of these delays.
+``|L(-1)|`` passes 1. Counts of the unstable poles below and above must confirm the smallest of these delays. A *chain*
+is the plant of a scene with its delay (`stability.linear.discretization`).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from zwidth.stability.linear.rows import label_walls
 from zwidth.stability.results import Margins
 from zwidth.units.quantities import WALL_RANGE
 
-# Refinement of the nodes near a zero of the controller: largest number of halvings, and criterion.
+# Largest number of halvings of an interval between two nodes near a zero of the controller.
 MAX_HALVINGS = 40
 MAX_CONTROLLER_CHANGE = 0.25  # largest change of the controller between neighboring nodes, relative to its magnitude
 
@@ -107,7 +108,7 @@ class OpenLoop(NamedTuple):
         # Add the angle pi, because L is always real there.
         w = np.append(self._find_zeros(phase_sine, stop=-1), np.pi)
         L = self.evaluate(w)
-        # Exclude zeros of L, at which the phase jumps, because no change of the gain moves a pole to these points.
+        # Exclude zeros of L, at which the phase jumps, because no change of the gain puts a pole at these points.
         return w[(L.value.real < 0) & (np.abs(L.value) > ZERO_OF_L * w * np.abs(L.slope))]
 
     def _find_zeros(
@@ -135,7 +136,7 @@ class OpenLoop(NamedTuple):
         value: np.ndarray,
         slope: np.ndarray,
     ) -> np.ndarray:
-        """Return the angles of minima of |function| between nodes with equal signs at which a tangent crosses zero."""
+        """Return the angles of minima of |function| between nodes where it has equal signs and a tangent reaches 0."""
         step, sign = np.diff(w), np.sign(value[:-1])
         approaching = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
         size, descent = np.abs(value), np.abs(slope)
@@ -242,8 +243,9 @@ N_PARTS = 8  # number of these delays per period
 # The number of crossovers may differ between two neighboring delays. The crossovers at both delays whose m (see the
 # module docstring) differs from an integer by at most START_ERROR/N_PARTS are then starting points of Newton's method.
 START_ERROR = 1.5
-# Further delays just below each integer: their distances from it, in time constants of the fastest pole. They are
-# needed because a strongly damped device tolerates less delay within ln 2 time constants below an integer than at it.
+# Distances of further delays from the integer above them, in time constants of the fastest pole. These delays are
+# needed because a strongly damped device tolerates less delay within ln 2 time constants below an integer than at the
+# integer.
 EARLY_DELAYS = np.array([1.0, 0.5, 0.25, 0.1])
 FAST_RATE = 2.0  # decay rate of the fastest pole, per period, above which these delays are added
 
@@ -259,7 +261,7 @@ UNSTABLE_MULTIPLE = 1.0 + 1e-5  # the wall must be unstable
 
 
 def build_delayed_loops(chain: AnyChain) -> dict[float, tuple[LoopRoots, np.ndarray]]:
-    """Return a dictionary of loops and nodes by delay in periods, from the chain's delay to one period more."""
+    """Return the loops with delays from that of the chain to one period more, and their nodes, by delay in periods."""
     d = float(chain.d)
     fastest = -float(np.linalg.eigvals(chain.realize().A).real.min())
     early = 1.0 - EARLY_DELAYS / fastest if fastest > FAST_RATE else np.empty(0)
@@ -302,7 +304,7 @@ def find_delay_margin(
     above = np.abs(at_nyquist) - 1.0
     k = np.flatnonzero((above[1:] > 0) != (above[:-1] > 0))
     real = find_zeros_between(lambda each: np.abs([*map(evaluate_at_nyquist, each)]) - 1.0, np.array(delays), above, k)
-    # Add one period of delay if L(-1) = 1, because this changes the sign of L(-1).
+    # A pole is at z = -1 if L(-1) = -1. If L(-1) = 1, add one period of delay, because this changes the sign of L(-1).
     limits += (real + np.where(at_nyquist[k] < 0, 0.0, 1.0)).tolist()
     limits = [limit - float(chain.d) for limit in limits if limit > chain.d]
     if not limits:
@@ -326,7 +328,7 @@ def _list_starts(
     more = [phase / w for phase, w in zip(phases, crossovers, strict=True)]
     for k, (w, after) in enumerate(pairwise(crossovers)):
         if w.size != after.size:
-            # Two crossovers appear or merge between these delays, and m of one of them may pass through an integer.
+            # Two crossovers appear or merge between these delays, and the m of one of them may pass through an integer.
             # Start from all crossovers of both loops whose m is nearly an integer.
             for i, turn in product((k, k + 1), (0.0, 2.0 * np.pi)):
                 m = (phases[i] - turn) / crossovers[i]

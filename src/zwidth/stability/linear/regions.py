@@ -30,14 +30,14 @@ BEYOND = 0.05  # distance in beta of the first and last line from the stable nod
 # Refinement near meetings. New lines of constant B have these offsets in beta from a meeting, relative to the gap
 # between the two lines that enclose the meeting.
 MEETING_OFFSETS = np.array([-1e-3, -1e-7, 1e-7, 1e-3])
-# Largest final gap between two lines that enclose a meeting, relative to the gap before refinement.
+# Largest gap in beta between two lines that enclose a meeting, after refinement, relative to the gap before it.
 ENCLOSED_GAP = 3e-7
 MAX_ROUNDS = 60  # rounds in which lines are added
 MAX_CORNER_STEPS = 60  # steps of false position for a corner
 DAMPING_TOLERANCE = 1e-13  # relative accuracy of the damping of a corner
 
 # Tabulation of edges.
-MIN_NODES = 5  # least number of nodes of the curve on an edge; an edge with fewer nodes is tabulated at N_FILLED points
+MIN_NODES = 5  # an edge with fewer nodes of the curve is tabulated at N_FILLED points
 N_FILLED = 33  # number of points of such an edge
 NEAR_EDGE = 1e-9  # relative distance in beta from a meeting within which rounding errors may select a neighboring edge
 
@@ -107,8 +107,8 @@ class StableSet:
             return reached
         margin = BEYOND * (np.ptp(reached) + abs(reached[0]) + 1e-300)
         across = np.linspace(reached.min() - margin, reached.max() + margin, N_ACROSS)
-        # If no node is on an edge, add the line beta = 0. The set may contain such walls, because on a device that
-        # comes to rest by itself all sufficiently soft walls are stable.
+        # If no node is on an edge, add the line beta = 0. The set may contain walls on this line, because on a device
+        # that comes to rest by itself all sufficiently soft walls are stable.
         across = across if is_edge.any() else np.union1d(across, 0.0)
         # Drop lines outside the range of ``across``, because they may lie near an asymptote of the curve.
         return np.union1d(across, near[(near > across[0]) & (near < across[-1])])
@@ -196,7 +196,7 @@ class StableSet:
         )
 
     def _subtract_columns(self, columns: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return alpha of the crossing with one column minus that with another, per line; NaN unless both exist."""
+        """Return the difference in alpha between the crossings of each line with two columns; NaN unless both exist."""
         return np.subtract(*self.boundary.find_alpha(columns.T.ravel(), np.tile(beta, 2)).reshape(2, -1))
 
     @cached_property
@@ -320,7 +320,7 @@ class StableSet:
         for piece in {edge.piece for edge in self.edges} - self.main:
             walls = np.concatenate([edge[-2:] for edge in self.edges if edge.piece == piece], 1)
             islands.append(Island(*(tuple(pair) for pair in np.stack([walls.min(1), walls.max(1)], 1).tolist())))
-        # Drop islands that consist of walls with K <= 0, although rounding errors may make their largest alpha
+        # Drop islands that consist of walls with K <= 0. Rounding errors may make their largest alpha slightly
         # positive.
         islands = [one for one in islands if one.stiffness[1] > NEAR_EDGE * np.ptp(one.stiffness)]
         islands = [one for one in islands if one.virtual_damping[1] > least]
@@ -376,9 +376,9 @@ def _pair_ends(rows: _Rows, corners: np.ndarray) -> _Meetings:
     Args:
         rows: stable intervals on the lines.
     """
-    # Find the columns that bound an interval on one line but not on the next. Each of them has a meeting with another
-    # one between these lines, where an interval begins, ends, splits, or changes a column. In order of alpha, two
-    # successive columns form a pair.
+    # Find the columns that bound an interval on one line but not on the next. Between these lines, each of them meets
+    # another one, where an interval begins, ends, splits, or changes a column. In order of alpha, two successive
+    # columns form a pair.
     alpha = np.pad(rows.alpha, ((1, 1), (0, 0)), constant_values=np.nan)
     bounds = np.isfinite(alpha)
     gap, column = np.nonzero(bounds[1:] != bounds[:-1])

@@ -31,7 +31,7 @@ from zwidth.model.circle_functions import (
 from zwidth.model.velocity import Estimate
 from zwidth.numerics.polynomials import Affine
 
-# Coefficients below this fraction of the largest one are rounding errors of zero.
+# Coefficients below this fraction of the largest one are regarded as rounding errors of 0.
 NEGLIGIBLE_COEFFICIENT = 1e-12
 
 
@@ -106,7 +106,7 @@ class LoopRoots:
         return replace(self, lag=lags[0], zeros=roots[0], poles=roots[1], estimate=slow), k
 
     def bound_variation(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """Return a bound of the relative derivatives of q and F in w, over the angles within ``reach`` of w."""
+        """Return a bound on the relative derivatives of q and F in w, over the angles within ``reach`` of w."""
         z_minus_1 = circle_points(w).z_minus_1[..., None]
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         distance = np.abs(z_minus_1 + roots) - reach[..., None]
@@ -134,7 +134,7 @@ def compute_aberth_step(roots: Array, rate: Array) -> Array:
 
 
 def _expand(*offsets: np.ndarray) -> np.ndarray:
-    """Return the coefficients of the monic polynomial with the given offsets; real, because roots occur in pairs."""
+    """Return the real coefficients of the monic polynomial whose roots, in conjugate pairs, have the given offsets."""
     return np.atleast_1d(np.poly(1.0 - np.concatenate(offsets))).real
 
 
@@ -151,7 +151,7 @@ def expand_estimate(loop: LoopRoots) -> tuple[np.ndarray, np.ndarray]:
 
 
 def affine_polynomial(loop: LoopRoots) -> Affine:
-    """Return the coefficients of D, N1 and N2, from which P follows for any wall."""
+    """Return the coefficients of D, N1 and N2, which determine P for any wall."""
     f_numerator, f_denominator = expand_estimate(loop)
     denominator, numerator = np.pad(_expand(loop.poles), (0, loop.lag)), loop.gain * _expand(loop.zeros)
     parts = [

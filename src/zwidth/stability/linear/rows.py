@@ -84,8 +84,8 @@ def _list_intervals(boundary: Boundary, beta: np.ndarray) -> tuple[np.ndarray, .
     w = np.pad(np.take_along_axis(crossings.w, order, 1), sides, constant_values=np.nan)
     below = np.broadcast_to(boundary.count_below(beta), beta.shape)[:, None]
     outside = below + np.concatenate([np.zeros((beta.size, 1)), np.cumsum(leaving, 1)], 1)
-    # Treat two crossings as one if they are closer than the smallest alpha in range. For example, at beta = 0 of an
-    # undamped device both are 0 up to rounding errors.
+    # Treat two crossings as one if the difference of their alphas is below the smallest alpha in range. For example, at
+    # beta = 0 of an undamped device both alphas are 0 up to rounding errors.
     wide = ends[:, 1:] > ends[:, :-1] + WALL_RANGE[0]
     usable = np.isfinite(beta) & crossings.consistent & ~boundary.are_lossless(beta)
     stable = (np.round(outside) == 0) & wide & usable[:, None]
@@ -158,8 +158,8 @@ END_TOLERANCE = 1e-7
 
 def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     """Return the stable intervals of beta on a line of constant K, ascending, as an array of shape (intervals, 2)."""
-    # Compute the intersections of the line with the boundary. All of them are found, because alpha is monotone between
-    # the nodes, which include its extrema along the curve. Between two intersections, the walls are all stable or all
+    # Compute the intersections of the line with the boundary. None is missed, because alpha is monotone between the
+    # nodes, which include its extrema along the curve. Between two intersections, the walls are all stable or all
     # unstable; test the middle one. If walls next to an end contradict this, bisect for the end with the stability
     # test.
     on_lines = np.array([(line.q - alpha) / line.f for line in boundary.lines if line.f != 0.0])
@@ -197,8 +197,8 @@ def find_stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
 
 
 # An interval counts as starting at K = 0 if its lower end is below this fraction of its upper end. Rounding errors of
-# the coefficients of a sampled device may move its pole at z = 1 outside the circle, so the softest walls are unstable;
-# starts of up to 3e-8 were observed for devices of 12th order.
+# the coefficients of a sampled device may move its pole at z = 1 outside the circle, so that the softest walls are
+# unstable. Lower ends of up to 3e-8 of the upper end were observed for devices of 12th order.
 CONNECTED_START = 1e-6
 
 

@@ -22,7 +22,8 @@ from zwidth.model.linear_device import LinearDevice
 # Largest relative difference between the results of two precisions that counts as agreement: a tenth of the resolution
 # of float64.
 PRECISION_TOLERANCE = 1e-17
-# With n decimal digits, leading coefficients below 10^(-2n/NEGLIGIBLE_DIGITS) of the largest are rounding errors of 0.
+# With n decimal digits, leading coefficients below 10^(-2n/NEGLIGIBLE_DIGITS) of the largest one are regarded as
+# rounding errors of 0.
 NEGLIGIBLE_DIGITS = 3
 
 
@@ -50,7 +51,7 @@ def find_sampled_zeros(device: LinearDevice, period: float, fraction: float) -> 
 
 
 def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> bool:
-    """Return whether the gains and the zeros of two precisions differ by at most `PRECISION_TOLERANCE`."""
+    """Return whether gains and zeros from computations in two precisions differ by at most `PRECISION_TOLERANCE`."""
     (gain, zeros), (gain2, zeros2) = one, other
     if len(zeros) != len(zeros2) or abs(gain - gain2) > Decimal(PRECISION_TOLERANCE) * abs(gain2):
         return False

@@ -186,7 +186,7 @@ def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
     # Evaluate both angles in one vmap, so that the function is compiled only once.
     r, stationary = jax.vmap(evaluate_both)(jnp.stack([w1, w2]))
     fixed = unknowns[2:] - start[2:] / scales[2:]
-    # Require r = 0 for a pole pair, and Re r = 0 and a fixed w for a real pole.
+    # Require r = 0 for a pole pair; for a real pole, require Re r = 0 and a fixed w.
     poles = jnp.stack([r.real, jnp.where(conditions == Condition.PAIR, r.imag, fixed)], -1)
     index = jnp.maximum(conditions[1] - Condition.PLUS_ONE, 0)
     second = jnp.stack([poles[1], jnp.stack([stationary[0], fixed[1]]), jnp.stack([unknowns[1], fixed[1]])])[index]

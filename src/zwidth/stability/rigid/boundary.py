@@ -159,7 +159,7 @@ def boundary_point(
     line = side if beta is None else "row"
     arguments = {"delta": delta, "d": d, name: value}
     if method == "optimistix":
-        # Import the solvers only if this method is requested, because the import takes a second.
+        # Import the solvers only if the method "optimistix" is requested, because the import takes a second.
         from zwidth.stability.rigid.exact_points import point_kernel
 
         return BoundaryPoint(*evaluate(point_kernel, arguments, line, route="jax"))
@@ -167,7 +167,7 @@ def boundary_point(
 
 
 def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -> BoundaryPoint:
-    """Return the point of the stability boundary at a given beta (a line of constant beta) or at a given alpha.
+    """Return the point of the stability boundary at a given beta or at a given alpha, elementwise.
 
     Args:
         delta: Normalized physical damping.
@@ -303,7 +303,7 @@ def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     return StableRegion(alpha, beta, omega, piece)
 
 
-LOBE_NODES = 48  # Gauss-Legendre nodes along the lobe; the integrand alpha d(beta) is analytic there
+LOBE_NODES = 48  # number of Gauss-Legendre nodes along the lobe, on which the integrand alpha d(beta) is analytic
 LOBE_WEIGHT = 16  # computing time and memory per point of `stable_area`, relative to other kernels
 
 

@@ -48,19 +48,19 @@ def find_degree(d: float) -> Degree:
 def map_by_degree(
     kernel: Callable[..., Any], values: tuple[ArrayLike, ...], *static: Any, lead: bool = False, route: Route = "auto"
 ) -> Any:
-    """Evaluate a kernel for all points, one degree of P after the other, and return its vectors as one array.
+    """Evaluate a kernel for all points, grouped by the degree of P, and return the vectors of all points as one array.
 
     The kernel is called as ``kernel(alpha, beta, delta, d, degree, *static)``.
 
     Args:
-        kernel: Function of columns of points of one degree; returns an array (points, length).
-        values: alpha, beta, delta and d, of any delays.
+        kernel: Function of columns whose points have the same degree; returns an array of shape (points, length).
+        values: alpha, beta, delta and d; the delays may differ.
         *static: Further arguments of the kernel.
         lead: Fill shorter vectors with leading zeros, for coefficients; otherwise with NaN at the end, for poles.
         route: Route of `evaluate_columns`; with "numpy" the kernel receives all points of a degree at once.
 
     Returns:
-        Array of the broadcast shape and a last axis of the greatest length.
+        Array of the broadcast shape with an additional last axis, whose length is that of the longest vector.
     """
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
@@ -101,7 +101,7 @@ def map_by_degree(
 
 
 def _pad_vectors(part: Any, longest: int, lead: bool, xp: Any) -> Any:
-    """Pad the vectors of one degree to the length ``longest``: with leading zeros, or with NaN at the end."""
+    """Pad vectors of equal length to the length ``longest``: with leading zeros (``lead``), or with NaN at the end."""
     missing = longest - part.shape[1]
     if not lead:
         return xp.pad(part, ((0, 0), (0, missing)), constant_values=xp.nan)
@@ -111,7 +111,7 @@ def _pad_vectors(part: Any, longest: int, lead: bool, xp: Any) -> Any:
 
 
 def count_uncompiled_points(degree: Degree) -> int:
-    """Return the largest number of points of one degree for which NumPy is faster than compiling."""
+    """Return the largest number of points with the given degree for which NumPy is faster than compiling."""
     return max(1, FEW // max(8, degree.poles**2))
 
 
@@ -166,7 +166,7 @@ def restore_shape(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def fold(array: np.ndarray) -> np.ndarray:
-    """Return the array with every axis along which its values are constant reduced to length 1."""
+    """Reduce every axis along which the values of an array are constant to length 1, and return the array."""
     # Decide before folding whether values are compared, because folding an axis reduces the size of the array.
     compare = array.size >= MIN_COMPARED_SIZE
     for axis in range(array.ndim):
@@ -189,7 +189,7 @@ def _is_constant(array: np.ndarray, axis: int, compare: bool) -> bool:
 def group_by_value(
     arrays: tuple[np.ndarray, ...], key: np.ndarray
 ) -> Iterator[tuple[Any, tuple[np.ndarray, ...], Any]]:
-    """Yield each distinct value of a key, with the arguments of the points with this value and their index.
+    """Yield each distinct value of a key array, with the arguments and the index of the points that have this value.
 
     Args:
         arrays: Arguments.

@@ -79,7 +79,8 @@ class Sized:
     def __add__(self, other: Any) -> Sized:
         other = other if isinstance(other, Sized) else Sized(other)
         value = self.value + other.value
-        # If both terms are exact, the size is that of the sum, because its rounding error is the only error.
+        # If both terms are exact, the size is the magnitude of the sum, because the rounding error of the sum is the
+        # only error.
         return Sized(value, abs(value) + TINY if self.exact and other.exact else self.size + other.size)
 
     __radd__ = __add__
@@ -141,7 +142,7 @@ def size_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
     """Return the discretized device of exact delta and d as `Sized` numbers, NaN if out of range."""
     plant = discretize(delta, d, kind)
     if kind.fractional and kind.long:
-        plant = materialize(plant, delta)  # because several loops of the compiled program use it
+        plant = materialize(plant, delta)  # compute it once, although several loops of the program use it
     sized = DiscretePlant(*(Sized(value, abs(value) + TINY) for value in plant))
     sized = sized._replace(delta=Sized(plant.delta), f=Sized(plant.f), whole=plant.whole, a0=None)
     if kind.fractional:
@@ -152,7 +153,7 @@ def size_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
 
 
 def enclose_root(coefficients: tuple[Sized, ...]) -> tuple[Sized, Array]:
-    """Return the zero u of the cubic, and whether sign changes of the cubic prove its error to be `CROSSOVER_WIDTH`."""
+    """Return the zero u of the cubic, and whether a sign change proves the error bound `CROSSOVER_WIDTH`."""
     u = find_first_root(tuple(h.value for h in coefficients))
     low, high = (horner(Sized(u * (1.0 + side)), coefficients) for side in (-CROSSOVER_WIDTH, CROSSOVER_WIDTH))
     changes_sign = (low.value > CUBIC_TOLERANCE * low.size) & (high.value < -CUBIC_TOLERANCE * high.size)
@@ -183,7 +184,7 @@ def certify_labels(points: Points) -> tuple[np.ndarray, np.ndarray]:
 
 def filter_walls(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Return UNSTABLE, STABLE, OPEN or EDGE for each wall; OPEN if it is out of range."""
-    # Replace negative delta and d by NaN in NumPy, because XLA treats numbers below 2^-1022 as 0.
+    # Replace negative delta and d by NaN in NumPy, because XLA would treat negative numbers above -2^-1022 as 0.
     device = (np.where(value < 0, np.nan, value) for value in (delta, d))
     return evaluate_columns(compute_wall_codes, [*nan_beyond(WALL_RANGE, alpha, beta), *device], classify_delays(d))
 
@@ -238,7 +239,8 @@ def device(delta: float, d: float, bits: int) -> DiscretePlant:
     """Return the discretized device of exact delta and d in balls, cached because all walls of a grid share it."""
     import flint
 
-    # Use 64 additional bits, because the phi-functions amplify the rounding error of their argument delta (1 - f).
+    # Compute with 64 additional bits, because the phi-functions amplify the rounding error of their argument delta (1 -
+    # f).
     with flint.ctx.workprec(bits + 64):
         x, f = flint.arb(delta), flint.arb(d - int(d))
         phis_delta, phis_late, plant = _phi(x), _phi(x * (1 - f)), discretize_mass(x, f if f != 0 else None, _phi)

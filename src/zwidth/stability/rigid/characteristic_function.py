@@ -21,7 +21,7 @@ from zwidth.core.xp import COSINE, SINE, epsilon, horner, materialize, namespace
 from zwidth.numerics.polynomials import abs2
 from zwidth.stability.rigid.pole_count import LoopFactors
 
-# Bound of the rounding error of P, in rounding units of the sum of the moduli of its terms. The rounding error of the
+# Bound on the rounding error of P, in rounding units of the sum of the moduli of its terms. The rounding error of the
 # angle p im is added separately.
 FACTOR_ROUNDING = 16.0
 # Longest step of Halley's method, relative to the distance 1/(1 + n) between neighboring poles of a long delay; longer
@@ -61,8 +61,8 @@ class Pair:
 
 def make_complex(re: Array, im: Array) -> Array:
     """Return the complex array re + j im."""
-    # For JAX, create one complex array, which XLA computes in a single loop. It would compute two real arrays in two
-    # loops that both repeat the shared operations.
+    # For JAX, create one complex array, which XLA computes in a single loop. XLA would compute two real arrays in two
+    # loops, both of which repeat the shared operations.
     if namespace(re) is not np:
         from jax.lax import complex as make_complex
 
@@ -73,12 +73,12 @@ def make_complex(re: Array, im: Array) -> Array:
 
 
 class PolynomialValue(NamedTuple):
-    """P, scaled by the larger of |z^p| and 1, with its derivatives in log z and a bound of its rounding error."""
+    """P, divided by the larger of |z^p| and 1, with its derivatives in log z and a bound on its rounding error."""
 
     p: Any
     first: Any  # first derivative in log z
     second: Any  # second derivative in log z
-    rounding: Array  # bound of the rounding error of p
+    rounding: Array  # bound on the rounding error of p
 
 
 def _sine_and_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
@@ -92,13 +92,13 @@ def _sine_and_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
 
 def _store_pair(value: Any, witness: Array) -> Any:
     """Return the pair unchanged, but make XLA compute it only once, although several loops use it."""
-    # Without this, each of five loops would repeat the power series of the pair, and a step would take 1.4 times as
-    # long.
+    # Without `materialize`, five loops would each repeat the power series of the pair, and a step would take 1.4 times
+    # as long.
     return Pair(*materialize((value.real, value.imag), witness))
 
 
 def evaluate_polynomial(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> PolynomialValue:
-    """Evaluate P and its derivatives at ``e^(re + j im)``, |im| <= pi."""
+    """Evaluate P and its derivatives at ``e^(re + j im)``, |im| <= pi; ``fractional`` is True for fractional delays."""
     xp = namespace(re, loop.alpha)
     number: Any = make_complex if xp is np else Pair
     if xp is np and not np.ndim(re):
@@ -161,7 +161,7 @@ class NewtonStep(NamedTuple):
 
 
 def newton_step(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> NewtonStep:
-    """Compute one Newton step from ``e^(re + j im)``, |im| <= pi."""
+    """Compute one Newton step for log z from ``re + j im``, |im| <= pi, and error bounds of the step."""
     xp = namespace(re, loop.alpha)
     value = evaluate_polynomial(re, im, loop, fractional)
     norm = abs2(value.first)

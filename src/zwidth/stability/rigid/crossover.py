@@ -58,8 +58,8 @@ from zwidth.numerics.held_mass import ANY, DelayClasses, DiscretePlant, discreti
 from zwidth.numerics.root_finding import attach_root_derivatives
 from zwidth.units.quantities import WALL_RANGE
 
-# Newton steps for the cubic. The starting value is within 11 % of the root and each step squares the relative error:
-# 0.11^16 < 5e-16.
+# Number of Newton steps for the cubic. The starting value is within 11 % of the root, and each step squares the
+# relative error: 0.11^16 < 5e-16.
 NEWTON_STEPS = 4
 
 
@@ -142,11 +142,11 @@ def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]
     """Expand |B|^2 - |T|^2 in powers of u, in any arithmetic.
 
     There are three coefficients if a0 is None, i.e. for integer d, otherwise four. For alpha > 0 the polynomial is
-    positive at u = 0 and has at most one root in (0, 2), the gain crossover, beyond which it is negative.
+    positive at u = 0 and has at most one root in (0, 2), the gain crossover, above which it is negative.
     """
     p1_squared, cross, alpha_squared = plant.p1 * plant.p1, beta * (alpha + beta) * 2, alpha * alpha
-    # Compute bend = cross/2 - delta^2 in factored form, which avoids cancellation near beta = delta. The code uses
-    # |W|^2 = alpha^2 + cross u.
+    # With ``|W|^2 = alpha^2 + cross u``, compute ``bend = cross/2 - delta^2`` in factored form, to avoid cancellation
+    # near beta = delta.
     bend = (beta - plant.delta) * (beta + plant.delta) + alpha * beta
     # The expansion of V is phi1^2 - 2 m1 u + product u^2; for integer d, a0 = 0 and therefore product = 0.
     if plant.a0 is None:
@@ -172,8 +172,8 @@ def decide_short_delay(alpha: Any, beta: Any, plant: Any) -> Verdict:
         left, right = alpha * plant.a1 * (plant.p1 + plant.a2 * b), plant.p1 * b * (1.0 - plant.a1 * beta)
         return Verdict(crosses & (left < right), crosses_nowhere | (left > right))
     (u0, u1), modulus, stiffness = expand_short_delay_curve(plant)
-    # The lobe has this beta where V b = y (u0 + u1 y), i.e. quadratic y^2 - linear y + constant = 0. Compute the first
-    # positive root y.
+    # The lobe has this beta where ``V b = y (u0 + u1 y)`` with b = beta + delta, that is, where ``quadratic y^2 -
+    # linear y + constant = 0``. Compute the first positive root y.
     constant, linear, quadratic = modulus[0] * b, u0 - b * modulus[1], b * modulus[2] - u1
     discriminant = linear * linear - constant * quadratic * 4.0
     y = constant * 2.0 / (linear + square_roots(discriminant)[0])
@@ -269,8 +269,7 @@ def find_first_root(coefficients: tuple[Array, ...]) -> Array:
     # Start from the quadratic in which the cubic term h3 u^3 is replaced by (h3/2) u^2.
     negative_h2 = -(h2 + 0.5 * rest[0]) if rest else -h2
     discriminant_root = xp.sqrt(xp.maximum(h1 * h1 + 4.0 * negative_h2 * h0, 0.0))
-    # Of the two forms of the quadratic formula, choose the one that adds terms of equal sign and so avoids
-    # cancellation.
+    # Choose the form of the quadratic formula that adds terms of equal sign, to avoid cancellation.
     falling = h1 < 0
     root = xp.where(falling, 2.0 * h0, h1 + discriminant_root) / xp.where(
         falling, discriminant_root - h1, 2.0 * negative_h2
@@ -280,7 +279,7 @@ def find_first_root(coefficients: tuple[Array, ...]) -> Array:
     h3 = rest[0]
     # If the start is outside (0, 1], the cubic term is not small; start from 1 instead.
     root = xp.where((root > 0) & (root < 1.0), root, 1.0)
-    # Unroll the iteration, because XLA then fuses all steps into a single loop over the points.
+    # Unroll the Newton steps, because XLA then fuses all of them into a single loop over the points.
     for _ in range(NEWTON_STEPS):
         value, slope = h0 + root * (h1 + root * (h2 + root * h3)), h1 + root * (2.0 * h2 + 3.0 * root * h3)
         new = root - value / slope

@@ -61,7 +61,7 @@ class LobePoint(NamedTuple):
 
 
 class Peak(NamedTuple):
-    """The point of the lobe with the largest alpha, i.e. of maximum stiffness."""
+    """The point of the lobe with the largest alpha."""
 
     x: Array
     alpha: Array
@@ -90,7 +90,7 @@ def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
 
 
 def _find_short_end(short_curve: Any) -> tuple[Array, Array]:
-    """Return, for n = 0, y at the end of the lobe (where alpha is 0, or 1), and whether alpha > 0 up to y = 1."""
+    """Return, for n = 0, y at the end of the lobe (1, or the zero of alpha), and whether alpha > 0 up to y = 1."""
     a, s, t = short_curve[2]
     xp = namespace(a)
     discriminant = s * s - 4.0 * a * t
@@ -100,7 +100,7 @@ def _find_short_end(short_curve: Any) -> tuple[Array, Array]:
 
 
 def evaluate_lobe(x: Array, lobe: Lobe) -> LobePoint:
-    """Return the point of the curve at x."""
+    """Return the point of the lobe at the parameter x."""
     if lobe.long_lobe is None:
         return _evaluate_short(x, lobe.short_curve)
     if lobe.short_curve is None:

@@ -44,10 +44,10 @@ from zwidth.stability.rigid.pole_count import LoopFactors, count_poles_in_cell, 
 
 # Sides of the cells of a square grid, in walls. Cells of other grids have as many walls and the grid's proportions.
 CELL_SIDES = (128, 64, 32, 16, 8)
-# Batch sizes, chosen such that the working arrays stay in the cache.
-CELLS_PER_LIST = 1 << 9
-CELLS_PER_BATCH = 1 << 7  # cells whose series are computed at once
-WALLS_PER_WRITE = 1 << 16
+# Sizes of batches, chosen such that the working arrays stay in the cache.
+CELLS_PER_LIST = 1 << 9  # number of cells whose poles are searched at once
+CELLS_PER_BATCH = 1 << 7  # number of cells whose series are computed at once
+WALLS_PER_WRITE = 1 << 16  # number of walls whose poles are evaluated and stored at once
 # Number of Halley steps from each starting point of the search for the two largest poles at the center of a cell.
 HALLEY_STEPS = 5
 # Distance in log z, relative to the distance between neighboring poles of a long delay. A sequence of Halley steps has
@@ -113,7 +113,7 @@ class _AxisPieces:
         self._tables: dict[Any, np.ndarray] = {}
 
     def table(self, function: Callable[[np.ndarray, int], np.ndarray], order: int, pieces: Any) -> np.ndarray:
-        """Return ``function`` (powers or interpolation weights) at all walls of some pieces: (pieces, walls, ...)."""
+        """Return ``function`` (powers or interpolation weights) at the walls of pieces, shape (pieces, walls, ...)."""
         if self._positions.size > MAX_CACHED:
             return function(self._positions[pieces], order)
         if (function, order) not in self._tables:
@@ -127,7 +127,7 @@ def pad_to_16(index: np.ndarray) -> np.ndarray:
 
 
 def _bound_on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds: log radii minus and plus an error, but kept at a distance on one side of the unit circle."""
+    """Return ``re - error`` and ``re + error``, limited so that both are on the same side of the unit circle as re."""
     gap = 2.0 * VERDICT_WIDTH
     return (
         np.where(re > 0, np.maximum(re - error, gap), re - error),
@@ -136,7 +136,7 @@ def _bound_on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.nda
 
 
 def _find_two_poles(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return re and im of the two largest distinct poles that Halley's method finds in each cell: (2, cells)."""
+    """Return re and im of the two largest distinct poles that Halley's method finds per cell, of shape (2, cells)."""
     previous = re, im = list_starts(loop, fractional)
     distance = SAME_POLE_DISTANCE / loop.n_plus_1
     for _ in range(HALLEY_STEPS):
@@ -164,7 +164,7 @@ class _ResultArrays:
     """Result arrays of a window that is extended to whole cells, and a list of the special walls."""
 
     def __init__(self, area: Area, sides: tuple[int, int], with_rate: bool) -> None:
-        # Extend the window to whole cells of the largest size.
+        # Extend the window to whole cells of the largest size, because only whole cells are computed.
         windows = list(zip(area.window, sides, strict=True))
         starts = [part.start // side * side for part, side in windows]
         sizes = [-(-part.stop // side) * side - start for (part, side), start in zip(windows, starts, strict=True)]
@@ -265,7 +265,7 @@ class _CellGrid:
         return positions[:, :count][:, ~certified[:count]]
 
     def _evaluates_logarithms(self, k: int) -> bool:
-        """Return whether series are evaluated at each wall (for rates, in small cells) instead of interpolated."""
+        """Return whether series of the order ``ORDERS[k]`` are evaluated at each wall instead of interpolated."""
         return self.errors.with_rate or min(self.sides) <= _list_chebyshev_nodes(ORDERS[k]).size
 
     def _index_axes(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -277,7 +277,7 @@ class _CellGrid:
         ]
 
     def _certify(self, groups: list[Group], positions: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
-        """Store the poles of cells whose groups provably contain all dominant poles; return a mask (C4 to C6)."""
+        """Store the poles of cells whose groups provably contain all dominant poles (C4 to C6); return their mask."""
         enclosed = np.logical_and.reduce([group.order < len(ORDERS) for group in groups])
         if len(groups) == 2:
             enclosed &= groups[0].is_disjoint(groups[1])
@@ -288,7 +288,8 @@ class _CellGrid:
         ]
         counts = [sum(group.n_poles for group in groups)] * len(circles)
         if self.errors.is_coarse:
-            # Accept slightly larger other poles, too: up to the reserve, and on the same side of the unit circle.
+            # Also accept other poles that are larger by at most `AllowedErrors.reserve` and on the same side of the
+            # unit circle.
             low = np.maximum.reduce([group.low for group in groups])
             circles.append(_bound_on_one_side(low, self.errors.reserve)[1])
             counts.append(0 * counts[0])
@@ -304,7 +305,7 @@ class _CellGrid:
         return certified
 
     def _certify_uniform(self, re: np.ndarray, positions: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
-        """Store one radius per cell if all its spectral radii agree within the accuracy (C6); return a mask."""
+        """Store one radius for each cell whose spectral radii agree within the accuracy (C6); return a mask of them."""
         loop, a, b = select_cells(cells, np.tile(np.arange(re.size), 2))
         circles = np.concatenate(_bound_on_one_side(re, self.errors.accuracy))
         outside, certain = (part.reshape(2, -1) for part in count_poles_in_cell(circles, loop, (a, b), fractional))

@@ -44,16 +44,16 @@ from zwidth.stability.rigid.characteristic_function import (
 from zwidth.stability.rigid.normalization import valid_wall
 from zwidth.stability.rigid.pole_count import LoopFactors, count_poles, factor_loop
 
-# Halley steps.
-STEPS_ON_BOTH = 2  # on both starting points
-STEPS_ON_LARGER = 3  # then on the larger of the two
-STEPS_AGAIN = 6  # without a certificate: on the result, and on the starting point that is farther from it
-STEPS_ON_ALL = 10  # without a certificate again: on four starting points
+# Numbers of Halley steps.
+STEPS_ON_BOTH = 2  # from both starting points
+STEPS_ON_LARGER = 3  # then from the larger of both results
+STEPS_AGAIN = 6  # without a certificate: from the result, and from the starting point that is farther from it
+STEPS_ON_ALL = 10  # without a certificate again: from four starting points
 
 # Distance in log z between a point and a pole below which a sequence of steps has converged.
 CONVERGED_RADIUS = 1e-6
-# Largest ratio of the distance to a pole after a Newton step to the bound R before the step. R = N |P/P'| with the
-# degree N >= 3 of P, and the step has the length R/N.
+# Before a Newton step, the distance to the nearest pole is at most R = N |P/P'|, with the degree N >= 3 of P. After the
+# step, of length R/N, this pole is at a distance of at most RADIUS_AFTER_STEP R.
 RADIUS_AFTER_STEP = 1.4
 # Distance in log r from a pole to the circle on which poles are counted: the larger of the following two, but at most
 # the tolerance of the radius.
@@ -131,9 +131,9 @@ def approximate_slow_pole(loop: LoopFactors) -> tuple[Array, Array]:
 
 
 def approximate_first_pair(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
-    """Approximate the first pair: its angle from the delay, its radius r from |T| = |B| with r only in r^(1+n).
+    """Approximate the first pair: its angle from the delay, and its radius r from |T| = |B| with simplified factors.
 
-    All other factors of T and B are evaluated on the unit circle.
+    Only the factor r^(1+n) depends on r; all other factors of T and B are evaluated on the unit circle.
     """
     xp = namespace(loop.alpha)
     im = np.pi / (loop.d_plus_1 + 1.0)
@@ -171,9 +171,9 @@ def find_candidate(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
 
 
 def certification_width(re: Array, tolerance: Any) -> Array:
-    """Return the distance of the counting circle from a pole.
+    """Return the distance, in log |z|, from a pole to the circle on which poles are counted.
 
-    It is as small as the rounding error of the count permits, because decay rates depend on it.
+    The distance is as small as the rounding error of the count permits, because it adds to the error of decay rates.
     """
     xp = namespace(re)
     return xp.minimum(tolerance, xp.maximum(COUNT_ROUNDING * epsilon(re), RATE_WIDTH * xp.abs(re)))
@@ -220,7 +220,7 @@ def _certify_largest(
     starts: tuple[np.ndarray, np.ndarray], steps: int, tolerance: float, loop: LoopFactors, fractional: bool
 ) -> DominantPoles:
     """Certify the largest of the poles to which starting points lead, by a count with any number of crossovers."""
-    re, im = iterate(steps, lambda at: halley_step(*at, loop, fractional), starts, np)
+    re, im = iterate(steps, lambda point: halley_step(*point, loop, fractional), starts, np)
     converged = newton_step(re, im, loop, fractional).radius < CONVERGED_RADIUS
     best = np.where(converged, re, -np.inf).argmax(0), np.arange(re.shape[1])
     return certify_pole(re[best], im[best], tolerance, loop, fractional, False)
@@ -258,7 +258,7 @@ def certify_starts(_: DominantPoles, tolerance: float, loop: LoopFactors, fracti
 
 
 def bisect_radius(_: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
-    """Find the dominant pole by bisecting the radius with counts, then by a few Halley steps."""
+    """Find the dominant pole by bisecting the radius by means of counts, and refine the pole by a few Halley steps."""
     # Count on several circles at once, because for few walls this does not take longer than on one circle.
     parts = 2**BISECTIONS_PER_COUNT
 
@@ -335,8 +335,8 @@ def _find_in_rounds(begin: Any, end: Any, loop: LoopFactors, fractional: bool) -
     Round 0 refines and certifies the larger pole, round 1 bisects the radius, and round 2 refines and certifies the
     pole on the bisected circle.
     """
-    # Call the Newton step and the count only once each, in a loop whose range depends on the round, because both take
-    # long to compile.
+    # Newton step and count take long to compile. Therefore each of them is called at a single place, inside a program
+    # loop, and the number of the round determines the first and the last iteration of this loop.
     import jax.numpy as xp
     from jax.lax import fori_loop, while_loop
 

@@ -51,7 +51,7 @@ REAL_AXIS_WIDTH = 1e-6
 # Smallest number of walls per device with which a grid is computed by cells; for fewer walls, computing them one by one
 # is faster.
 SMALLEST_MAP = 1 << 11
-# Number of walls per batch in NumPy, because smaller batches take longer per wall.
+# Number of walls per batch in NumPy. Smaller batches take longer per wall.
 BATCH_SIZE = 1 << 13
 # Largest number of walls that are computed one by one without testing whether they form a grid.
 FEW_FOR_CELLS = 1 << 13
@@ -141,7 +141,7 @@ def _map_in_batches(function: Callable[[list[np.ndarray]], Any], columns: list[n
 
 
 def arrange_as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
-    """Arrange points as a grid of alpha and beta for one or more devices; None if they form no grid or a small one.
+    """Return points arranged as a grid over alpha and beta for one or more devices; None without a large enough grid.
 
     A line of walls is a grid, too: its missing axis is the first one, which must have length 1.
 
@@ -214,7 +214,7 @@ def find_dominant_pole(wall: tuple[float, float, float, float]) -> tuple[float, 
 def _find_listed(
     columns: list[np.ndarray], accuracy: float, with_rate: bool, route: Route
 ) -> tuple[WallPoles, DominantPoles]:
-    """Return the radii of columns of walls and, if requested, the rates; and the dominant poles."""
+    """Return the radii of walls given as columns (1-D arrays) and, if requested, the rates; and the dominant poles."""
     dominant = compute_dominant_poles(columns, accuracy, route)
     rate = compute_rates(dominant, columns, accuracy) if with_rate else NO_RATE
     radius = np.exp(np.where(np.isinf(dominant.error), np.nan, dominant.re))

@@ -49,7 +49,7 @@ N_FRACTIONS = 64
 GRADING = 50.0
 # Value of delta below which the samples are practically evenly spaced.
 LIGHT_DAMPING = 1e-3
-# Golden-section steps to a local minimum between these samples.
+# Number of golden-section steps to a local minimum between these samples.
 GOLDEN_SECTION_STEPS = 24
 # A stable wall (alpha, beta, delta, d and an arbitrary phase), which replaces unstable ones in the delay margin search.
 STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
@@ -57,7 +57,7 @@ STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
 LEAST_MARGIN = float(np.finfo(np.float32).tiny)
 # Phase in rad below which the sign of a computed phase may be wrong because of rounding errors.
 SMALL_PHASE = 0.1
-# Value of delta whose square underflows in float64.
+# Values of delta below this one are set to 0, because their squares underflow in float64.
 NEGLIGIBLE_DAMPING = 1e-150
 # Phase in rad assumed if |L| is above 1 at every frequency; negative, because the loop is then unstable.
 NO_CROSSOVER_PHASE = -1e-3
@@ -123,7 +123,8 @@ def margins_kernel(
     nan_if_invalid = nan_with_nan_derivatives(ok, alpha, beta, delta, d)
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
-    # Set delta to 0 if its square or its inverse under- or overflows, because it then has no effect on the margins.
+    # Set delta to 0 if its square underflows or its inverse overflows, because so small a delta has no effect on the
+    # margins.
     delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), NEGLIGIBLE_DAMPING)), 0.0, delta)
     plant = materialize(discretize_plant(delta, d), delta)
     w, phase, crosses = evaluate_at_crossover(alpha, beta, plant)
@@ -164,19 +165,19 @@ def _place_by_verdict(margin: Array, edge: float, least: float, stable: Array, x
         xp: Array namespace.
     """
     nearest = xp.where(stable, edge + least, edge)
-    # Add a difference that is 0, because it keeps the derivatives of the margin.
+    # Add a difference whose value is 0 but whose derivatives are those of the margin.
     return xp.where((margin < nearest) == stable, nearest + (margin - stop_gradient(margin, xp)), margin)
 
 
 def _find_gain_margin(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> tuple[Array, Array]:
     """Return the factor on alpha and beta at which the loop becomes unstable, and the frequency of this onset."""
     # The phase does not depend on a common factor of alpha and beta, and the gain crossover increases with it. So the
-    # loop is stable until the crossover reaches the first zero of the phase; if the phase has no zero below z = -1,
-    # until ``|L(-1)| = 1``.
+    # loop is stable until the crossover reaches the first zero of the phase or, if the phase has no zero below the
+    # Nyquist frequency (z = -1), until ``|L(-1)| = 1``.
 
     def evaluate_phase(log_w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Array:
         # Multiply the phase by a positive factor that makes it of order 1 on both sides of w = sqrt(em), because for
-        # light damping it is smaller than its rounding error long before its sign changes.
+        # light damping the phase is smaller than its rounding error even far from its zero.
         w, n, em = xp.exp(log_w), plant.whole, plant.em
         (u0, u1), modulus_terms, stiffness_terms = expand_short_delay_curve(plant)
         phase_at_w = evaluate_gain_and_phase(w, alpha, beta, plant)[1]
@@ -265,7 +266,7 @@ def _find_delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any)
         return xp.where(exists, phase - n_lost * w, NO_CROSSOVER_PHASE)
 
     high, excess_high = sample(grid, index), xp.minimum(sample(excesses, index), 0.0)
-    # Stop at the rounding error of the total delay.
+    # Stop if the bracket is as narrow as the rounding error of the total delay.
     width = 4e-16 * (1.0 + n_lost)
     f = false_position(
         lambda f: excess(f, n_lost, *frozen_wall), low, high, excess_low, excess_high, FALSE_POSITION_STEPS, width

@@ -64,16 +64,17 @@ def evaluate_at_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tu
     return w, evaluate_gain_and_phase(w, alpha, beta, plant)[1], exists
 
 
-# Computing cost of a wall, relative to other kernels, because |1 + L| is sampled at many frequencies. The kernel is not
-# compiled, because compiling takes many seconds and the compiled kernel is not faster.
+# Computing cost of a wall, relative to other kernels. The cost is high, because |1 + L| is sampled at many frequencies.
+# The kernel is not compiled, because compiling takes many seconds and the compiled kernel is not faster.
 SAMPLES_WEIGHT = 8
-# Numbers of sampled frequencies: evenly spaced over the whole range, and logarithmically below and above the crossover.
+# Numbers of sampled frequencies: evenly spaced over the whole range, and logarithmically spaced below and above the
+# gain crossover.
 SAMPLES_PER_TURN = 48
 SAMPLES_BELOW = 32
 SAMPLES_ABOVE = 48
 # Number of local minima that are refined, the lowest ones first.
 MAX_DIPS = 5
-# Newton steps from each of these minima.
+# Number of Newton steps from each of these minima.
 NEWTON_STEPS = 8
 
 
@@ -184,7 +185,8 @@ def _find_lowest(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> Ar
     refined = newton(
         lambda w: _differentiate_distance(w, *wall), take_neighbor(-2), take_neighbor(2), middle, NEWTON_STEPS
     )[0]
-    # Compare both candidates, because at an end of the range the minimum may be the end itself.
+    # Compare each refined minimum with the sample from which the refinement started, because the minimum may be an end
+    # of the range.
     candidates = xp.concatenate([refined, middle], axis=-1)
     lowest = xp.argmin(compute_squared_distance(candidates, *wall), axis=-1)[..., None]
     return xp.take_along_axis(candidates, lowest, axis=-1)[..., 0]

@@ -86,7 +86,7 @@ def quantity_status(**values: Array) -> Array:
 
 
 def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """Return a mask of the walls that are valid and in range, together with their device."""
+    """Return a mask that is True if all four values of a wall and its device are numbers in their ranges."""
     return is_valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
 
 
@@ -114,8 +114,8 @@ def status_of_results(
     status = np.full(shape, Status.OK, np.uint8)
     for values in results:
         status[np.isnan(values)] = Status.NOT_CONVERGED
-    # First test if all arguments are in range, because this is the usual case and the test is faster than a status per
-    # point.
+    # First test if all arguments are in range, because this is the usual case and the test is faster than computing a
+    # status per point.
     if not (is_valid_device(*device).all() and all(within(part, WALL_RANGE).all() for part in walls)):
         input_status = wall_status(*walls, *device)
         np.copyto(status, input_status, where=input_status != Status.OK, casting="unsafe")

@@ -3,26 +3,21 @@
 The wall with the normalized stiffness alpha and damping beta is passive if the physical damping delta exceeds a bound
 at every frequency (docs/theory/passivity.md). The *needed damping* is the maximum of this bound over frequency
 (`stability.rigid.required_damping`). It is convex and homogeneous in (alpha, beta), so the passive walls of all devices
-with the same delay d form one convex set, scaled by delta. On grids of one delay, the needed damping is evaluated from
-a polynomial in one variable that represents the *direction* beta/alpha.
+with the same delay d form one convex set, scaled by delta.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any
-
 import numpy as np
 
 from zwidth.core.types import Array, ArrayLike
-from zwidth.core.xp import horner, is_traced, namespace, nan_with_nan_derivatives, stop_gradient
-from zwidth.numerics.evaluate import FEW, as_number, check_scalars, evaluate, evaluate_columns, to_caller
+from zwidth.core.xp import is_traced, namespace, nan_with_nan_derivatives, stop_gradient
+from zwidth.numerics.evaluate import as_number, check_scalars, evaluate, to_caller
 from zwidth.numerics.held_mass import ANY, DelayClasses, classify_delays, is_valid_device
 from zwidth.numerics.root_finding import integrate
-from zwidth.stability.rigid.broadcasting import NAMES, Points, fold_arguments, group_by_value, restore_shape
+from zwidth.stability.rigid.broadcasting import NAMES
 from zwidth.stability.rigid.normalization import valid_wall
-from zwidth.stability.rigid.required_damping import compute_needed_damping, find_directions, solve_larger_root
-from zwidth.units.quantities import LONGEST_DELAY
+from zwidth.stability.rigid.required_damping import compute_needed_damping, find_directions
 
 # Terms of the Chebyshev series; the last one is below 1e-16 for every delay.
 N_TERMS = 30
@@ -48,87 +43,10 @@ def _limit_margin(margin: Array, alpha: Array) -> Array:
     return xp.where(alpha < 0, xp.minimum(margin, alpha), margin)
 
 
-@lru_cache(maxsize=256)
-def fit_needed_damping(d: float) -> tuple[float, ...]:
-    """Fit the needed damping at one delay by a polynomial in a variable that represents the direction beta/alpha.
-
-    Between the directions ``lower`` and ``upper`` (`find_directions`), with x = beta - lower alpha,
-    ``needed/(beta + (width - lower) alpha)`` is an analytic function of ``x/(x + width alpha)``, up to beta = infinity.
-    The terms of its Chebyshev series decrease by a factor of 4, for every delay.
-
-    Returns:
-        The arguments of `_evaluate_fit` after the wall and delta.
-    """
-    lower, upper = find_directions(np.float64(d))
-    width = 0.5 * (d + 0.5)
-    span = upper - lower
-    end = span / (span + width) if np.isfinite(span) else 1.0
-    # Reduce the angles by integer arithmetic, because an angle of 30 pi would lose the last digits of its cosine.
-    multiples = np.outer(np.arange(N_TERMS), 2 * np.arange(N_TERMS) + 1) % (4 * N_TERMS)
-    cosines = np.cos(np.pi * multiples / (2 * N_TERMS))
-    nodes = cosines[1]
-    variable = 0.5 * end * (nodes + 1.0)
-    alpha = 1.0 - variable
-    beta = lower * alpha + variable * width
+def compute_margins(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Compute `passivity_margin` of walls with one delay in NumPy; no result depends on the other points."""
     with np.errstate(all="ignore"):
-        needed = compute_needed_damping(alpha, beta, np.full(N_TERMS, d))
-    # Divide by the width, because the scale ``beta + (width - lower) alpha`` equals the width at all nodes.
-    terms = cosines @ needed * (2.0 / (N_TERMS * width))
-    terms[0] *= 0.5
-    # Convert the Chebyshev series to powers, because Clenshaw's recurrence would lose two digits at the ends of the
-    # interval. The coefficients of the powers decrease as well.
-    powers = np.polynomial.chebyshev.cheb2poly(terms)
-    limit = float(end) if np.isfinite(span) else np.inf
-    return d - np.floor(d), d + 0.5, float(lower), width, float(end), limit, *powers.tolist()
-
-
-def _evaluate_fit(alpha: Array, beta: Array, delta: Array, *fit: Any) -> Array:
-    """Evaluate `passivity_margin` at one delay, from the fitted polynomial of the needed damping.
-
-    Args:
-        alpha: Normalized stiffness.
-        beta: Normalized virtual damping.
-        delta: Normalized physical damping.
-        *fit: Result of `fit_needed_damping`: the fraction f of the delay; for integer d, the derivative in alpha of the
-            damping needed at w = 0; the lower direction; the width; the upper end of the polynomial's variable; the
-            same as a limit, infinite if there is no upper direction; and the coefficients, lowest power first.
-    """
-    xp = namespace(alpha)
-    f, zero_slope, lower, width, end, limit, *powers = fit
-    valid = valid_wall(alpha, beta, delta, 0.0 * delta)
-    safe_alpha = xp.maximum(alpha, 0.0)
-    excess = beta - lower * safe_alpha
-    scale = excess + width * safe_alpha
-    variable = excess / xp.where(excess > 0, scale, 1.0)
-    y = 2.0 * variable / end - 1.0
-    peak_value = scale * horner(y, powers)
-    zero_value, _ = solve_larger_root(zero_slope * safe_alpha - beta, f * (1.0 - f) * safe_alpha * safe_alpha, xp)
-    pi_value = (1.0 - f) * (beta + 0.5 * safe_alpha)
-    needed = xp.where(excess > 0, xp.where(variable < limit, peak_value, pi_value), zero_value)
-    return xp.where(valid, _limit_margin(delta - needed, alpha), xp.nan)
-
-
-def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: float) -> np.ndarray:
-    """Compute `passivity_margin` at one delay in NumPy; the result at a point does not depend on the other points."""
-    if not 0 <= d <= LONGEST_DELAY:
-        return np.full(alpha.shape, np.nan)
-    with np.errstate(all="ignore"):
-        return _evaluate_fit(alpha, beta, delta, *fit_needed_damping(d))
-
-
-def _compute_on_grid(values: tuple[ArrayLike, ...]) -> Array | None:
-    """Compute `passivity_margin` of many walls that share few delays; return None for other arguments."""
-    points, shape = fold_arguments(values)
-    if points.size <= FEW or np.unique(points.d).size * FEW > points.size:
-        return None
-    margins = np.full(points.shape, np.nan)
-    for delay, arrays, index in group_by_value(points, points.d):
-        if not 0 <= delay <= LONGEST_DELAY:
-            continue
-        walls = Points(*arrays)
-        columns = [*walls.columns()[:3], *map(np.atleast_1d, fit_needed_damping(float(delay)))]
-        margins[index] = evaluate_columns(_evaluate_fit, columns, route="jax").reshape(walls.shape)
-    return to_caller(restore_shape(margins, shape), values)
+        return _margin_kernel(alpha, beta, delta, d, NO_DELAY if classify_delays(d) == NO_DELAY else ANY)
 
 
 def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -149,10 +67,10 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
 
     Numerics:
         The error is about 1e-15 of the damping needed, at a cost independent of d. The frequency of the maximum is
-        proved for integer d and was verified numerically for fractional d (`stability.rigid.required_damping`). For
-        many walls with one delay, a polynomial in the direction is evaluated. Traceable, with two derivatives. In d at
-        integer d and in alpha at alpha = 0 they are those from the right; in beta at beta = 0 and d = 0 that from
-        below; without a wall (alpha = beta = 0) they are 0 if the maximum is a peak.
+        proved for integer d and was verified numerically for fractional d (`stability.rigid.required_damping`).
+        Traceable, with two derivatives. In d at integer d and in alpha at alpha = 0 they are those from the right; in
+        beta at beta = 0 and d = 0 that from below; without a wall (alpha = beta = 0) they are 0 if the maximum is a
+        peak.
 
     References:
         Colgate, Schenkel 1994; Hulin, Preusche, Hirzinger 2006, eqs. (20), (21), here extended to any delay.
@@ -166,11 +84,6 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
     arguments = dict(zip(NAMES, values, strict=True))
     if is_traced(*values):
         return evaluate(_margin_kernel, arguments, ANY)
-    if not all(isinstance(value, int | float | np.number) for value in values):
-        check_scalars(arguments)
-        margins = _compute_on_grid(values)
-        if margins is not None:
-            return margins
     return evaluate(_margin_kernel, arguments, NO_DELAY if classify_delays(d) == NO_DELAY else ANY)
 
 
@@ -220,7 +133,7 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
         return alpha / needed, beta / needed
 
     lower, upper = -0.49 * np.pi, 0.49 * np.pi
-    # The passive set is convex, so alpha has a single maximum over the direction.
+    # The passive set is convex, so its boundary, parameterized by the angle of (alpha, beta), has one maximum of alpha.
     with np.errstate(all="ignore"):
         for _ in range(SEARCH_ROUNDS):
             angles = np.linspace(lower, upper, 17)
@@ -230,8 +143,8 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
     return float(alpha[0]), float(beta[0])
 
 
-# Numbers of Gauss-Legendre nodes on the three parts of the range of directions, on each of which the integrand is
-# analytic.
+# Numbers of Gauss-Legendre nodes on the three parts of the range of directions; the integrand is analytic on each
+# part.
 AREA_NODES = (64, 64, 32)
 # Computing cost of a point relative to other kernels, because the integrand is evaluated at all nodes.
 AREA_WEIGHT = 64

@@ -48,12 +48,12 @@ RATE_ACCURACY = 1e-6
 MIN_LOG_RADIUS = 1e-5
 # Value of |sin(im)| below which a pole counts as real.
 REAL_AXIS_WIDTH = 1e-7
-# Number of Newton steps to the center of a group of two poles.
+# Number of Newton steps to the center of a group of two poles, the zero of A' between them.
 NEWTON_STEPS = 4
 # Radii of the circles that are tried, relative to the largest radius.
 CIRCLE_RADII = 2.0 ** (-0.5 * np.arange(14))
-# By number of poles in a group: distance, in indices of `CIRCLE_RADII`, from the chosen circle to the smaller and the
-# larger circle that bound the error of its means (C3).
+# Distance, in indices of `CIRCLE_RADII`, from the chosen circle to the smaller and the larger circle that bound the
+# error of its means (C3), for each number of poles in a group.
 CIRCLE_OFFSET = {1: 2, 2: 1}
 # Ratio R above which the choice of a circle does not depend on R, because the truncation error is then negligible.
 AMPLE_RATIO = 100.0
@@ -287,7 +287,7 @@ def enclose_poles(
 
 
 def _compute_powers(x: Any, count: int, factor: Any = 1.0) -> np.ndarray:
-    """Return factor x^k, k = 0, 1, ..., for points x on circles.
+    """Return ``factor x^k``, k = 0, 1, ..., for points x on circles.
 
     Args:
         x: Points (cells, points).
@@ -333,7 +333,8 @@ def expand_sums(group: Group, cells: Cells, order: int) -> list[np.ndarray]:
     for k in range(1, poles + 1):
         weight = weights * (u / (1.0 + u) if poles == 1 else k * points**k)
         series = _compute_powers(powers_eta, order + 1, weight) @ powers_xi * binomials
-        # Replace the constant term, which is the value for the poles of the wall at the center of the cell.
+        # Compute the constant term separately, because the weights of C1 do not apply to it. It is the value for the
+        # poles of the wall at the center of the cell.
         center_sum = (log_derivative * (weights * points**k)).sum(1)
         series[:, 0, 0] = np.log1p(group.disk * center_sum).real if poles == 1 else center_sum.real
         sums.append(series)
@@ -350,10 +351,9 @@ def compute_larger(first: np.ndarray, second: np.ndarray, disk: Any) -> tuple[np
 
 
 def is_larger_accurate(discriminant: np.ndarray, disk: Any, error: Any, limit: Any) -> np.ndarray:
-    """Return whether the larger pole is accurate to ``limit``, if the sums have errors of ``error`` and 2 ``error``."""
+    """Return whether the larger pole is accurate to ``limit``, for errors ``error`` and 2 ``error`` of the two sums."""
     discriminant_error = 2.01 * error
-    # Bound the error of sqrt(D) by two values: the square root of the error of D, and the error of D divided by
-    # sqrt(D).
+    # Two values bound the error of sqrt(D): the square root of the error of D, and the error of D divided by sqrt(D).
     remaining = np.maximum(limit * ((1.0 - disk) ** 2 / disk) - 0.5 * error - discriminant_error, 0.0)
     return np.abs(discriminant) * remaining**2 >= np.where(
         discriminant_error <= remaining**2, -1.0, discriminant_error**2

@@ -33,9 +33,9 @@ from zwidth.stability.rigid.normalization import valid_wall
 CUBIC_STEPS = 6
 # Factor by which the bounds of a cell are widened, to cover their rounding errors.
 WIDENING = 1.0 + 1e-12
-# Within a cell the wall varies, and therefore the angle w of a crossover varies in an interval. The interval is divided
-# into four equal pieces, and the change of the phase is bounded on each of them. PIECE_POINTS are the positions, from 0
-# to 1 in the interval, of the ends of the pieces (even indices) and of their midpoints (odd indices).
+# If the wall varies within a cell, the angle w of a crossover varies within an interval. This interval is divided into
+# four equal pieces, and the phase change is bounded on each piece. The positions are those of the ends of the pieces
+# (even indices) and of their midpoints (odd indices), from 0 to 1 in the interval.
 PIECE_POINTS = np.arange(9)[:, None, None] / 8.0
 
 
@@ -292,8 +292,8 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
         device_larger = device_larger != valid
         certain = certain & (~valid | (0.5 - xp.abs(turns - nearest) > tolerance + 4.0 * eps * shift))
         crossovers.append(w)
-    # Mark the count as uncertain if the parity of the number of crossovers contradicts the larger of |T| and |B| at z =
-    # -r.
+    # At each crossover the larger of |T| and |B| changes. Mark the count as uncertain if this contradicts the larger
+    # one at z = -r.
     certain = certain & (device_larger == device_larger_at_end)
     return PoleCount(loop.n_plus_1 + 2.0 - (stop - start + 2.0 * full_turns), certain, crossovers)
 
@@ -310,7 +310,7 @@ def count_poles_in_cell(
         fractional: Whether any delay is fractional.
 
     Returns:
-        The number of poles outside for each cell, and whether it is certain for every wall of the cell.
+        The number of poles outside, and whether it is certified for every wall of the cell.
     """
     circle = _evaluate_on_circle(log_r, loop, fractional, np)
     a, b = half

@@ -25,9 +25,10 @@ from zwidth.core.xp import ARCSINE, COSINE, SINE, epsilon, horner, namespace, st
 from zwidth.numerics.held_mass import ANY, DelayClasses, split_delay
 from zwidth.numerics.root_finding import newton
 
-# Newton steps to the peak, from a start that is within a few percent.
+# Number of Newton steps to the peak; the error of the starting value is a few percent.
 PEAK_STEPS = 3
-# Newton steps to the smallest direction beta/alpha with a peak; the start is at most twice the solution.
+# Number of Newton steps to the smallest direction beta/alpha with a peak; the starting value is at most twice the
+# solution.
 DIRECTION_STEPS = 12
 
 
@@ -55,7 +56,7 @@ def compute_delay_terms(d: Array) -> DelayTerms:
 
 
 def solve_larger_root(A: Array, S: Array, xp: Any) -> tuple[Array, Array]:
-    """Return N and 2 N - A of ``N^2 - A N - S/4 = 0`` without cancellation; finite derivatives for A = S = 0."""
+    """Return the larger root N of ``N^2 - A N - S/4 = 0``, and 2 N - A, with finite derivatives at A = S = 0."""
     discriminant = A * A + S
     root = xp.where(discriminant > 0, xp.sqrt(xp.where(discriminant > 0, discriminant, 1.0)), 0.0)
     difference = root - A
@@ -136,7 +137,7 @@ def evaluate_condition(u: Array, a: Array, beta: Array, delay: DelayTerms) -> Pe
 
 
 def _compute_cosine_and_sine(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:
-    """Return the cosine and sine of ``k w`` in [0, pi], for u in (0, 1]."""
+    """Return cos(k w) and sin(k w) for u in (0, 1] and 0 < k w <= pi."""
     if xp is np:
         x = 2.0 * k * np.arcsin(np.sqrt(0.5 * u))
         return np.cos(x), np.sin(x)
@@ -148,8 +149,8 @@ def _compute_cosine_and_sine(u: Array, k: Array, xp: Any) -> tuple[Array, Array]
 
 def find_peak(a: Array, beta: Array, delay: DelayTerms, rise: Array) -> Array:
     """Return u of the only peak between w = 0 and pi, if a peak exists; ``rise`` is E at u = 0."""
-    # With x = (d + 1) w, the start follows from ``(1 - x cot x)/x^2 = 2 sum_i 1/(i^2 pi^2 - x^2)`` and is within a few
-    # percent of the peak. The error of N is of second order in that of u.
+    # Compute a starting value, within a few percent of the peak, from ``(1 - x cot x)/x^2 = 2 sum_i 1/(i^2 pi^2 -
+    # x^2)`` with x = (d + 1) w. The error of N is of second order in that of u.
     f, k, _ = delay
     xp = namespace(a, f)
     periods = k + f
@@ -158,12 +159,12 @@ def find_peak(a: Array, beta: Array, delay: DelayTerms, rise: Array) -> Array:
     y = np.pi**2 - 2.0 * ratio / xp.maximum(1.0 - 0.1307 * ratio, 0.5)
     y = np.pi**2 - 2.0 * ratio / xp.maximum(1.0 - (0.1307 + 0.00216 * y) * ratio, 0.5)
     largest_u = xp.where(k == 1, 2.0, 2.0 * xp.sin(0.5 * np.pi / k) ** 2)
-    # For smaller u the peak equals N at w = 0 within rounding error.
+    # If u at the peak is below this value, N at the peak equals N at w = 0 within rounding error.
     floor = epsilon(a) ** 0.5 * largest_u
     # Convert y = w^2 to u by the series of 1 - cos w, whose error is below 1e-3.
     y = xp.maximum(y, 0.0) / (periods * periods)
     u = xp.minimum(xp.maximum(0.5 * y * (1.0 - y * (1.0 / 12.0 - y * (1.0 / 360.0))), floor), largest_u)
-    # Unroll the iteration, because XLA then fuses all steps into a single loop over the points.
+    # Unroll the Newton steps, because XLA then fuses all of them into a single loop over the points.
     for _ in range(PEAK_STEPS):
         point = evaluate_condition(u, a, beta, delay)
         # Near u = 0, E is nearly linear, and Newton's method may leave (0, largest_u]; then use the secant from u = 0.

@@ -26,7 +26,7 @@ from zwidth.numerics.held_mass import ANY, DelayClasses, DiscretePlant, Plant
 
 
 class Curve(NamedTuple):
-    """The coefficients of E, H and V of one device; they do not depend on D."""
+    """The coefficients of E, H and V of one device, which do not depend on the integer delay."""
 
     E: tuple[Array, Array, Array]  # in powers of y
     H: tuple[Array, Array]  # in powers of y
@@ -47,7 +47,7 @@ def expand_curve(plant: Plant | DiscretePlant) -> Curve:
 
 
 class Wave(NamedTuple):
-    """The terms of the boundary curve that depend only on the frequency and on D."""
+    """The terms of the boundary curve that depend only on the frequency omega and on D."""
 
     y: Array
     q: Array
@@ -117,7 +117,7 @@ def _evaluate_polynomials(wave: Wave, curve: Curve) -> tuple[Array, Array, Array
     xp = namespace(wave.y, curve.sigma)
     E = curve.E[0] + wave.y * (curve.E[1] + wave.y * curve.E[2])
     H = curve.H[0] + wave.y * curve.H[1]
-    # Of two forms of m, choose the one without cancellation.
+    # Choose the form of m without cancellation.
     m = xp.where(wave.y < 0.5, curve.at_one - 2.0 * curve.sigma * wave.y, 2.0 * curve.sigma * wave.q - curve.gap)
     return E, H, m, m * m + curve.mu * curve.mu * (4.0 * wave.y * wave.q)
 

@@ -27,7 +27,7 @@ from zwidth.stability.rigid.broadcasting import Points, group_by_value
 from zwidth.stability.rigid.crossover import expand_long_delay_curve, expand_short_delay_curve
 from zwidth.units.quantities import WALL_RANGE
 
-# Numbers of Newton steps. Each step doubles the number of correct digits.
+# Numbers of Newton steps, each of which doubles the number of correct digits.
 END_STEPS = 6  # to the end of a lobe; the last step only confirms convergence
 ROW_STEPS = 2  # to the frequency of a limit; the relative error is then 2e-9, and a last step in alpha squares it
 
@@ -52,8 +52,8 @@ class LongLobe(NamedTuple):
     excess2: Array
     end: Any = None  # w at the end of the lobe
     end_b: Any = None  # b at the end of the lobe
-    # Newton's method for w at a given b starts from the solution of sqrt(b/end_b) = sin(start_angle w/end)/start_sine,
-    # plus a correction.
+    # Newton's method for w at a given b starts from the solution of ``sqrt(b/end_b) = sin(start_angle
+    # w/end)/start_sine``, plus a correction. At the end of the lobe, w = end and b = end_b.
     start_angle: Any = None
     start_sine: Any = None
     start_correction: Any = None
@@ -120,10 +120,10 @@ def build_long_lobe(plant: DiscretePlant) -> LongLobe:
     end = _find_lobe_end(lobe, em / (p1 + f * em), n + f)
     numerator, d_numerator, denominator, d_denominator = evaluate_offset(LobeTerms(end, lobe))
     end_b = numerator / denominator
-    # Approximate the lobe by sqrt(b/end_b) = sin(start_angle w/end)/sin(start_angle). This curve has the right
-    # derivative at w = ``end``, where strong damping makes the lobe nearly flat; `start_correction` corrects the
-    # derivative at w = 0. The error is at most 0.4 %. The relative derivative at the end is
-    # start_angle/tan(start_angle); a rational function inverts it.
+    # Approximate the lobe by ``sqrt(b/end_b) = sin(start_angle w/end)/sin(start_angle)``, where w = end and b = end_b
+    # at the end of the lobe. This curve has the right derivative at w = end, where strong damping makes the lobe nearly
+    # flat; `start_correction` corrects the derivative at w = 0. The error is at most 0.4 %. The relative derivative at
+    # the end is start_angle/tan(start_angle); a rational function inverts it.
     flat = xp.clip(1.0 - 0.5 * end * (d_numerator / numerator - d_denominator / denominator), 0.0, 1.0)
     start_angle = xp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
     start_sine = xp.sin(start_angle)
@@ -138,7 +138,7 @@ def build_long_lobe(plant: DiscretePlant) -> LongLobe:
 
 
 class LobeTerms:
-    """E, H, V and sines and cosines of w/2 (s, c) and k w (sin_k, cos_k) at one w; d... is a derivative in w."""
+    """E, H, V, and sines and cosines of w/2 (s, c) and k w (sin_k, cos_k) at one w; the prefix d denotes d/dw."""
 
     def __init__(self, omega: Array, lobe: LongLobe):
         _, k, E0, E1, E2, H0, H1, V0, V1, V2, excess1, excess2, *_ = lobe
@@ -258,7 +258,7 @@ def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
     terms = LobeTerms(omega, lobe)
     alpha_terms = evaluate_alpha_terms(terms)
     numerator, denominator = 2.0 * terms.s * alpha_terms.projection, terms.c * terms.V
-    # Apply the last Newton step in w to the numerator of alpha, to first order.
+    # Add the effect of the last Newton step in w to the numerator of alpha, to first order.
     step = _compute_newton_step(target_b, terms)
     numerator -= step * (terms.c * alpha_terms.projection + 2.0 * terms.s * alpha_terms.d_projection)
     denominator -= step * (terms.c * terms.dV - 0.5 * terms.s * terms.V)

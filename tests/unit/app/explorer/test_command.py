@@ -1,4 +1,4 @@
-"""The command: what it says where it cannot begin."""
+"""`zwidth explore`: messages if the explorer cannot start."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from zwidth.cli.commands import cli
 from zwidth.core.errors import ConfigError, InputError
 
 
-def test_without_bokeh_there_is_one_message(monkeypatch):
+def test_missing_bokeh_raises_with_the_install_command(monkeypatch):
     monkeypatch.delitem(sys.modules, "zwidth.app.explorer.server", raising=False)
     monkeypatch.delitem(sys.modules, "zwidth.app.explorer.page", raising=False)
     for name in [name for name in sys.modules if name.partition(".")[0] == "bokeh"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "bokeh", None)
-    done = CliRunner().invoke(cli, ["explore", "--no-browser"])
-    assert isinstance(done.exception, InputError)
-    assert str(done.exception).endswith(("pip install 'zwidth[explore]'", "scripts/setup explore"))
+    result = CliRunner().invoke(cli, ["explore", "--no-browser"])
+    assert isinstance(result.exception, InputError)
+    assert str(result.exception).endswith(("pip install 'zwidth[explore]'", "scripts/setup explore"))
 
 
-def test_a_port_in_use_is_said():
+def test_port_in_use_raises():
     pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        done = CliRunner().invoke(cli, ["explore", "--no-browser", "--port", str(taken.getsockname()[1])])
-    assert isinstance(done.exception, InputError)
-    assert "choose another" in str(done.exception)
+        result = CliRunner().invoke(cli, ["explore", "--no-browser", "--port", str(taken.getsockname()[1])])
+    assert isinstance(result.exception, InputError)
+    assert "choose another" in str(result.exception)
 
 
-def test_a_file_that_is_not_there_is_said():
-    done = CliRunner().invoke(cli, ["explore", "--no-browser", "nowhere.yaml"])
-    assert isinstance(done.exception, ConfigError)
-    assert "nowhere.yaml: no such file; check the path" in str(done.exception)
+def test_missing_file_raises():
+    result = CliRunner().invoke(cli, ["explore", "--no-browser", "nowhere.yaml"])
+    assert isinstance(result.exception, ConfigError)
+    assert "nowhere.yaml: no such file; check the path" in str(result.exception)

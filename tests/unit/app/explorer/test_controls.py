@@ -1,4 +1,4 @@
-"""The numbers and parts of the page: back and forth, from configurations, and what is refused."""
+"""Controls of the explorer: conversion to scenes and back, configurations, links and invalid input."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONFIGS = Path(__file__).parents[4] / "configs"
 DEVICE = "mass: 0.1, period: 1 ms, delay: 1.5 periods"
 
 
-def written(folder, scene):
+def write_config(folder, scene):
     file = folder / "a.yaml"
     file.write_text(
         f"{{version: 1, name: a, scene: {{{scene}}}, studies: [{{kind: boundary, name: b, delta: 0, d: 0}}]}}",
@@ -36,7 +36,7 @@ def written(folder, scene):
 @pytest.mark.parametrize("velocity", [kind for kind in CHOICES["velocity"] if kind != "VelocityFilter"])
 @pytest.mark.parametrize("operator", CHOICES["operator"])
 @pytest.mark.parametrize("coupling", CHOICES["coupling"])
-def test_every_choice_is_a_scene_and_every_number_of_it_can_be_moved(velocity, operator, coupling):
+def test_every_choice_is_a_scene_with_adjustable_parameters(velocity, operator, coupling):
     controls = Controls().change({"velocity": velocity, "operator": operator, "coupling": coupling})
     shown = controls.shown()
     assert type(controls.scene.velocity).__name__ == velocity
@@ -47,13 +47,13 @@ def test_every_choice_is_a_scene_and_every_number_of_it_can_be_moved(velocity, o
     }
     assert controls.change(shown) == controls
     for name in set(shown) & set(SLIDERS):
-        moved = controls.change({name: shown[name] + 1})
-        assert moved.shown()[name] == pytest.approx(shown[name] + 1, rel=1e-15)
-        others = {other: value for other, value in moved.shown().items() if other != name}
+        changed = controls.change({name: shown[name] + 1})
+        assert changed.shown()[name] == pytest.approx(shown[name] + 1, rel=1e-15)
+        others = {other: value for other, value in changed.shown().items() if other != name}
         assert others == {other: value for other, value in shown.items() if other != name}
 
 
-def test_the_units_are_changed_there_and_back():
+def test_units_are_converted_and_restored():
     normalized = Controls().change({"mode": "normalized"})
     shown = normalized.shown()
     assert shown.pop("mode") == "normalized"
@@ -65,7 +65,7 @@ def test_the_units_are_changed_there_and_back():
 
 
 @pytest.mark.parametrize(
-    "change, says",
+    "change, message",
     [
         ({"mass": -1}, "mass m: got -1 g; it must be greater than 0 g"),
         ({"mass": "1"}, "mass m: got '1'"),
@@ -83,28 +83,28 @@ def test_the_units_are_changed_there_and_back():
         ({"velocity": "WindowedDifference", "velocity.samples": 900}, "delay: the loop has"),
     ],
 )
-def test_what_cannot_be_is_refused_by_its_name(change, says):
+def test_invalid_value_raises_with_its_name(change, message):
     with pytest.raises(zwidth.InputError) as refusal:
         Controls().change(change)
-    assert says in str(refusal.value)
+    assert message in str(refusal.value)
     assert len(str(refusal.value)) < 250
 
 
 @pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda file: file.stem)
-def test_configurations_set_their_own_scene_or_say_why_not(file):
-    given: Any = zwidth.load_config(file).scene
-    if given is None or getattr(given, "device", None) is not None:
-        says = "scene: missing" if given is None else "scene.device: the page needs a model for all rates"
-        with pytest.raises(zwidth.InputError, match=says):
+def test_shipped_configurations_set_the_scene_or_raise(file):
+    expected_scene: Any = zwidth.load_config(file).scene
+    if expected_scene is None or getattr(expected_scene, "device", None) is not None:
+        message = "scene: missing" if expected_scene is None else "scene.device: the page needs a model for all rates"
+        with pytest.raises(zwidth.InputError, match=message):
             read_controls(file)
         return
     controls = read_controls(file)
-    expected = given.to_scene() if not controls.normalized else None
+    expected = expected_scene.to_scene() if not controls.normalized else None
     if expected is not None:
         assert controls.scene.replace(stiffness=0, virtual_damping=0) == expected.replace(
             stiffness=0, virtual_damping=0
         )
-    if given.wall is None:
+    if expected_scene.wall is None:
         assert controls.scene.is_stable(*controls.wall)
         assert controls.wall == tuple(float(f"{value:.4g}") for value in controls.wall)
 
@@ -118,31 +118,31 @@ def test_configurations_set_their_own_scene_or_say_why_not(file):
         "{kind: butterworth, cutoff: 50, order: 3}",
     ],
 )
-def test_any_estimate_of_a_configuration_is_kept(tmp_path, velocity):
-    file = written(tmp_path, f"{DEVICE}, stiffness: 1000, virtual_damping: 2, velocity: {velocity}")
+def test_filter_of_a_configuration_is_preserved(tmp_path, velocity):
+    file = write_config(tmp_path, f"{DEVICE}, stiffness: 1000, virtual_damping: 2, velocity: {velocity}")
     controls = read_controls(file)
-    given: Any = zwidth.load_config(file).scene
-    assert controls.scene == given.to_scene()
+    expected_scene: Any = zwidth.load_config(file).scene
+    assert controls.scene == expected_scene.to_scene()
     assert controls.change({"mass": 200}).scene.velocity == controls.scene.velocity
     assert controls.change(controls.shown()).scene.d == 1.5
 
 
-def test_a_delay_model_and_other_folders_are_refused(tmp_path):
+def test_obsolete_keys_and_folders_without_a_run_raise(tmp_path):
     with pytest.raises(zwidth.ConfigError, match="delay_model: key of an earlier release"):
-        read_controls(written(tmp_path, f"{DEVICE}, delay_model: fractional_power"))
+        read_controls(write_config(tmp_path, f"{DEVICE}, delay_model: fractional_power"))
     with pytest.raises(zwidth.InputError, match="no run with a recorded configuration"):
         find_config(tmp_path)
 
 
-def test_a_run_has_recorded_its_scene(tmp_path, unpainted):
-    file = written(tmp_path, f"{DEVICE}, stiffness: 1000")
+def test_run_folder_supplies_its_scene(tmp_path, unpainted):
+    file = write_config(tmp_path, f"{DEVICE}, stiffness: 1000")
     assert zwidth.run(file, out=tmp_path / "run").ok
     assert read_controls(find_config(tmp_path / "run")) == read_controls(file)
 
 
 @pytest.mark.parametrize("operator", CHOICES["operator"])
 @pytest.mark.parametrize("coupling", CHOICES["coupling"])
-def test_a_rotary_device_keeps_its_numbers_in_every_form_of_the_view(operator, coupling):
+def test_rotary_device_is_preserved_by_every_conversion(operator, coupling):
     controls = Controls().change({"motion": "rotary"}).change({"operator": operator, "coupling": coupling})
     shown = controls.shown()
     assert controls.scene.device.rotary
@@ -150,9 +150,9 @@ def test_a_rotary_device_keeps_its_numbers_in_every_form_of_the_view(operator, c
     assert read_link(to_link(controls)) == controls
     assert "rotary=True" in to_python(controls)
     for name in set(shown) & set(ROTARY_SLIDERS):
-        moved = controls.change({name: shown[name] * 1.5 + 1})
-        assert moved.shown()[name] == pytest.approx(shown[name] * 1.5 + 1, rel=1e-15)
+        changed = controls.change({name: shown[name] * 1.5 + 1})
+        assert changed.shown()[name] == pytest.approx(shown[name] * 1.5 + 1, rel=1e-15)
         assert ROTARY_SLIDERS[name].low <= shown[name] <= ROTARY_SLIDERS[name].high
-    if not controls.scene.parts_beyond and operator == "none":
+    if not controls.scene.nonrigid_parts and operator == "none":
         assert controls.change({"mode": "normalized"}).change({"mode": "physical"}) == controls
     assert not controls.change({"motion": "linear"}).scene.device.rotary

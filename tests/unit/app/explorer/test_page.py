@@ -1,4 +1,4 @@
-"""The page without a browser: messages in, figures and texts out."""
+"""The explorer page without a browser: incoming messages, resulting figures and texts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
 
 from click.testing import CliRunner
-from open_pages import open_page, say
+from open_pages import open_page, send_message
 
 import zwidth
 from zwidth.app.explorer.controls import Controls, read_controls, read_link
@@ -20,8 +20,8 @@ def page():
     return open_page(Controls())
 
 
-def test_a_drag_shows_edge_wall_poles_and_verdict_alone(page):
-    say(page, serial=1, set={"damping": 20})
+def test_drag_updates_only_outline_wall_poles_and_verdict(page):
+    send_message(page, serial=1, set={"damping": 20})
     scene = Controls().change({"damping": 20}).scene
     (edge,) = scene.stable_region()
     closed = [*edge[0], edge[0][0], np.nan]
@@ -34,41 +34,41 @@ def test_a_drag_shows_edge_wall_poles_and_verdict_alone(page):
     assert len(page.sources["contours"].data["xs"]) == 0
 
 
-@pytest.mark.parametrize("parts", [{}, {"velocity": "LowPass"}])
-def test_at_rest_the_words_are_those_of_check(page, parts):
-    say(page, set=parts, rest=True)
+@pytest.mark.parametrize("components", [{}, {"velocity": "LowPass"}])
+def test_text_at_rest_agrees_with_check(page, components):
+    send_message(page, set=components, rest=True)
     page.queue.work()
-    options = ["--velocity-cutoff", "100"] if parts else []
+    options = ["--velocity-cutoff", "100"] if components else []
     device = ["--mass", "0.1", "--damping", "10", "--period", "1e-3", "--delay", "1e-3"]
-    done = CliRunner().invoke(cli, ["check", "--stiffness", "10e3", "--virtual-damping", "40", *device, *options])
-    assert page.texts["verdict"] + "\n" == done.stdout
+    result = CliRunner().invoke(cli, ["check", "--stiffness", "10e3", "--virtual-damping", "40", *device, *options])
+    assert page.texts["verdict"] + "\n" == result.stdout
     assert page.texts["busy"] is False
     assert len(page.sources["contours"].data["xs"]) > 3
     assert len(page.sources["passive"].data["x"]) > 3
 
 
-def test_a_drag_shows_the_outlines_of_a_scene_with_parts(page):
-    say(page, set={"velocity": "LowPass"})
+def test_drag_updates_the_outline_of_a_filtered_scene(page):
+    send_message(page, set={"velocity": "LowPass"})
     (outline,) = page.controls.scene.stable_region()
     np.testing.assert_array_equal(page.sources["edge"].data["x"][:-2], outline.stiffness)
     np.testing.assert_array_equal(page.sources["area"].data["ys"][0][0][0][:-1], outline.virtual_damping)
 
 
-def test_what_is_of_another_device_is_taken_away_at_once(page):
-    say(page, set={}, rest=True)
+def test_results_of_another_device_are_removed_immediately(page):
+    send_message(page, set={}, rest=True)
     page.queue.work()
     assert len(page.sources["ridge"].data["x"]) > 0
-    say(page, set={"stiffness": 5e3})
+    send_message(page, set={"stiffness": 5e3})
     assert len(page.sources["ridge"].data["x"]) > 0
-    say(page, set={"damping": 11})
+    send_message(page, set={"damping": 11})
     for name in ("contours", "passive", "ridge", "best"):
         assert not any(len(column) for column in page.sources[name].data.values())
     assert page.texts["slopes"] == ""
 
 
-def test_what_is_no_longer_wanted_is_not_shown(page):
-    say(page, set={"damping": 20}, rest=True)
-    say(page, set={"damping": 30}, rest=True)
+def test_outdated_computation_is_discarded(page):
+    send_message(page, set={"damping": 20}, rest=True)
+    send_message(page, set={"damping": 30}, rest=True)
     old, *page.queue.tasks = page.queue.tasks
     old()
     assert "verdict" not in page.texts
@@ -76,24 +76,24 @@ def test_what_is_no_longer_wanted_is_not_shown(page):
     assert "30.00 N s/m" in page.texts["verdict"]
 
 
-def test_parts_show_their_ridge_and_slopes(page):
-    say(page, set={"velocity": "LowPass"}, rest=True)
+def test_filtered_scene_shows_ridge_and_sensitivities(page):
+    send_message(page, set={"velocity": "LowPass"}, rest=True)
     page.queue.work()
     assert len(page.sources["ridge"].data["x"]) > 3
     assert "velocity.cutoff" in page.texts["slopes"]
 
 
-def test_what_a_newer_wall_has_cut_short_is_computed_for_it(page):
-    say(page, set={"damping": 11}, rest=True)
+def test_interrupted_computation_is_repeated_for_the_new_wall(page):
+    send_message(page, set={"damping": 11}, rest=True)
     (work,), page.queue.tasks = page.queue.tasks, []
-    say(page, set={"stiffness": 5e3}, rest=True)
+    send_message(page, set={"stiffness": 5e3}, rest=True)
     work()
     assert len(page.sources["ridge"].data["x"]) == 0
     page.queue.work()
     assert len(page.sources["ridge"].data["x"]) > 3
 
 
-NO_MESSAGES = [
+INVALID_MESSAGES = [
     {},
     {"json": []},
     {"json": ["{"]},
@@ -107,108 +107,108 @@ NO_MESSAGES = [
 ]
 
 
-def test_what_is_no_message_is_said_and_changes_nothing(page):
-    for data in NO_MESSAGES:
+def test_invalid_message_is_reported_and_changes_nothing(page):
+    for data in INVALID_MESSAGES:
         before = page.controls
         page.receive(data)
         assert "invalid message" in page.texts["error"], data
         assert page.controls == before, data
-        say(page, set={"mass": 200})
+        send_message(page, set={"mass": 200})
         assert page.texts["error"] == "", data
 
 
-def test_a_refused_number_leaves_the_last_good_view(page):
-    say(page, set={"mass": 200})
-    say(page, set={"mass": -1})
+def test_invalid_value_keeps_the_last_valid_view(page):
+    send_message(page, set={"mass": 200})
+    send_message(page, set={"mass": -1})
     assert page.texts["error"].startswith("mass m: got -1 g")
     assert page.texts["state"]["mass"] == 200
     assert page.controls.scene.mass == 0.2
 
 
-def test_a_refused_number_leaves_the_computation_of_the_shown_state(page):
-    say(page, set={"mass": 200}, rest=True)
-    say(page, set={"mass": -1}, rest=True)
+def test_invalid_value_keeps_the_running_computation(page):
+    send_message(page, set={"mass": 200}, rest=True)
+    send_message(page, set={"mass": -1}, rest=True)
     page.queue.work()
     assert "200.0 g" in page.texts["verdict"]
     assert len(page.sources["contours"].data["xs"]) > 3
     assert page.texts["busy"] is False
 
 
-def test_what_goes_wrong_while_computing_is_said(page, monkeypatch):
+def test_failed_computation_is_reported(page, monkeypatch):
     def fail(scene):
         raise ZeroDivisionError("far away")
 
     monkeypatch.setattr("zwidth.app.explorer.model.assess", fail)
-    say(page, rest=True)
+    send_message(page, rest=True)
     page.queue.work()
     assert page.texts["error"].startswith("the computation failed (ZeroDivisionError: far away); ")
     assert page.texts["busy"] is False
-    # Nothing is left that is of the wall before.
+    # Results of the previous wall are removed.
     assert page.texts["verdict"] == ""
 
 
-def test_a_dark_page_has_other_inks(page):
-    say(page, dark=True)
+def test_dark_page_has_different_colors(page):
+    send_message(page, dark=True)
     dark = [getattr(glyph, name) for glyph, name, _ in page.inks]
-    say(page, dark=False)
+    send_message(page, dark=False)
     assert all(before != getattr(glyph, name) for before, (glyph, name, _) in zip(dark, page.inks, strict=True))
 
 
-def test_a_figure_is_a_table(page):
-    say(page, set={"velocity": "WindowedDifference"})
-    say(page, set={"velocity.samples": 24}, rest=True)
+def test_figures_are_exported_as_csv(page):
+    send_message(page, set={"velocity": "WindowedDifference"})
+    send_message(page, set={"velocity.samples": 24}, rest=True)
     page.queue.work()
-    say(page, csv="plane")
+    send_message(page, csv="plane")
     rows = [line.split(",") for line in page.texts["csv"].splitlines()]
     assert rows[0] == ["curve", "piece", "stiffness K in N/m", "damping B in N s/m"]
     pieces = [[row for row in rows if row[:2] == ["stable", number]] for number in ("1", "2", "3")]
     outlines = page.controls.scene.stable_region()
-    assert [len(piece) for piece in pieces] == [*(one.stiffness.size + 1 for one in outlines), 0]
+    assert [len(piece) for piece in pieces] == [*(outline.stiffness.size + 1 for outline in outlines), 0]
     for piece, outline in zip(pieces, outlines, strict=False):
         np.testing.assert_allclose([float(row[2]) for row in piece[:-1]], outline.stiffness, rtol=1e-7, atol=1e-7)
     assert ["your wall", "1", "10000", "40"] in rows
-    say(page, csv="gain")
+    send_message(page, csv="gain")
     assert page.texts["csv"].splitlines()[0] == "curve,piece,frequency in Hz,|L| in dB"
 
 
-def test_an_address_is_opened_and_an_empty_one_is_the_first_visit(page):
-    say(page, open="mass=200+g&period=2+ms&stiffness=1+kN/m&virtual_damping=3+N+s/m", rest=True)
+def test_link_sets_the_scene_and_an_empty_one_resets_it(page):
+    send_message(page, open="mass=200+g&period=2+ms&stiffness=1+kN/m&virtual_damping=3+N+s/m", rest=True)
     assert page.controls.scene.mass == 0.2
     assert page.texts["link"] == "mass=200+g&damping=0+N+s/m&period=2+ms&stiffness=1+kN/m&virtual_damping=3+N+s/m"
-    say(page, open="mass=heavy&period=1+ms")
+    send_message(page, open="mass=heavy&period=1+ms")
     assert "scene.mass: got 'heavy'" in page.texts["error"]
     assert page.controls.scene.mass == 0.2
-    say(page, open="", rest=True)
+    send_message(page, open="", rest=True)
     assert page.controls == Controls()
 
 
-def test_a_linear_system_is_shown_by_what_it_has(tmp_path):
+def test_linear_device_is_shown_and_copied(tmp_path):
     file = tmp_path / "system.yaml"
     scene = "{device: 1900 / 0.1 191 1900 0, period: 1 ms, stiffness: 5 kN/m, virtual_damping: 30}"
     file.write_text(f"version: 1\nname: s\nscene: {scene}\nstudies: [{{kind: boundary, name: b}}]\n")
     page = open_page(read_controls(file))
-    say(page, set={"delay": 0.5}, rest=True, contact=True)
+    send_message(page, set={"delay": 0.5}, rest=True, contact=True)
     page.queue.work()
     assert page.texts["error"] == ""
     assert page.texts["busy"] is False
     system = zwidth.LinearDevice(([1900.0], [0.1, 191.0, 1900.0, 0.0]))
-    known = zwidth.Scene(system, zwidth.Timing(1e-3, 0.5e-3), zwidth.VirtualWall(5e3, 30.0))
-    assert page.controls.scene == known
-    done = CliRunner().invoke(
+    expected = zwidth.Scene(system, zwidth.Timing(1e-3, 0.5e-3), zwidth.VirtualWall(5e3, 30.0))
+    assert page.controls.scene == expected
+    result = CliRunner().invoke(
         cli,
         "check --device '1900 / 0.1 191 1900 0' --period 1ms --delay 0.5ms --stiffness 5e3 --virtual-damping 30",
     )
-    assert page.texts["verdict"] + "\n" == done.stdout
+    assert page.texts["verdict"] + "\n" == result.stdout
     assert len(page.sources["step"].data["x"]) > 10
     assert len(page.sources["contact"].data["x"]) == 0
     assert "no body" in page.texts["contact_words"]
-    # What the page copies gives the same scene.
+    # The copied code, link and configuration reproduce the scene.
     names: dict = {}
     exec(page.texts["python"].partition("verdict =")[0], names)
-    assert names["scene"] == known
-    assert read_link(page.texts["link"]).scene == known
+    assert names["scene"] == expected
+    assert read_link(page.texts["link"]).scene == expected
     (tmp_path / "copied.yaml").write_text(page.texts["yaml"])
-    assert zwidth.load_config(tmp_path / "copied.yaml").scene.to_scene() == known  # pyright: ignore
+    assert zwidth.load_config(tmp_path / "copied.yaml").scene.to_scene() == expected  # pyright: ignore
     for name, value in (("mode", "normalized"), ("coupling", "tip"), ("motion", "rotary"), ("operator", "rigid")):
         with pytest.raises(zwidth.InputError, match=f"^{name}: "):
             page.controls.change({name: value})

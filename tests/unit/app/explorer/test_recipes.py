@@ -1,4 +1,4 @@
-"""What is copied reproduces the view."""
+"""Copied configurations, scripts and links reproduce the view."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ VIEWS = {
     "unstable": Controls().change({"stiffness": 1e6}),
     "pushing": Controls().change({"stiffness": -5, "virtual_damping": -1}),
     "normalized": normalized_controls(0.1, 0.4, 0.1, 1.5),
-    "hand": Controls().change({"operator": "rigid"}),
-    "massive hand": Controls().change({"operator": "rigid"}).change({"operator.stiffness": 0, "damping": 0}),
+    "rigid operator": Controls().change({"operator": "rigid"}),
+    "operator mass only": Controls().change({"operator": "rigid"}).change({"operator.stiffness": 0, "damping": 0}),
     "all": Controls().change({"velocity": "Butterworth", "operator": "grasp", "coupling": "tip"}),
     "filter": Controls(
         Controls().scene.replace(velocity=zwidth.VelocityFilter([500, 0, -500], [1, 0, 0])),
     ),
-    "lagging": Controls().change({"actuator": "second order"}),
-    "ringing": Controls(
+    "actuator lag": Controls().change({"actuator": "second order"}),
+    "resonance": Controls(
         zwidth.Scene(
             zwidth.Device(0.1, 1 / 3, modes=(zwidth.Mode(frequency=80, damping_ratio=0.02, mass=0.5),)),
             zwidth.Timing(period=1e-3),
@@ -42,7 +42,7 @@ VIEWS = {
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_the_configuration_runs_and_is_the_view(tmp_path, view):
+def test_copied_configuration_runs_and_reproduces_the_view(tmp_path, view):
     file = tmp_path / "copied.yaml"
     file.write_text(to_yaml(VIEWS[view]), encoding="utf-8")
     assert read_controls(file) == VIEWS[view]
@@ -50,12 +50,12 @@ def test_the_configuration_runs_and_is_the_view(tmp_path, view):
     assert result.ok, [study.error for study in result.studies]
 
 
-def test_a_number_of_a_copied_scene_stands_on_a_line_with_its_unit():
+def test_copied_configuration_has_one_quantity_per_line():
     assert "\n  virtual_damping: 40 mN m s/rad\n" in to_yaml(Controls().change({"motion": "rotary"}))
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_the_script_runs_and_has_the_view_s_scene(capsys, view):
+def test_copied_script_runs_and_reproduces_the_scene(capsys, view):
     scene, names = VIEWS[view].scene, {}
     try:
         exec(to_python(VIEWS[view]), names)
@@ -63,20 +63,20 @@ def test_the_script_runs_and_has_the_view_s_scene(capsys, view):
         plt.close("all")
     assert names["scene"] == scene
     verdict = zwidth.assess(scene)
-    word = "stable" if verdict.stable else "UNSTABLE"
-    assert f"{word} spectral radius {verdict.spectral_radius:.6f}" in capsys.readouterr().out
+    verdict_word = "stable" if verdict.stable else "UNSTABLE"
+    assert f"{verdict_word} spectral radius {verdict.spectral_radius:.6f}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_the_address_is_the_view(view):
+def test_link_reproduces_the_view(view):
     link = to_link(VIEWS[view])
     assert read_link(link) == VIEWS[view]
-    # No browser spells these signs otherwise.
+    # These characters are encoded differently by some browsers.
     assert not set(link) & set(' "<>`#')
 
 
 @pytest.mark.parametrize(
-    "link, says",
+    "link, message",
     [
         ("nonsense", "address: the text after # is not a scene"),
         ("a=1&" * 200, "address: the text after # is not a scene"),
@@ -88,17 +88,17 @@ def test_the_address_is_the_view(view):
         ("file=/etc/passwd", "scene.file: unknown key"),
     ],
 )
-def test_an_address_that_is_no_scene_is_refused(link, says):
+def test_invalid_link_raises(link, message):
     with pytest.raises((zwidth.InputError, zwidth.ConfigError)) as refusal:
         read_link(link)
-    assert says in str(refusal.value)
+    assert message in str(refusal.value)
 
 
-def test_what_is_copied_has_units_and_no_digits_of_rounding():
+def test_copied_values_have_units_without_rounding_digits():
     view = Controls().change({"mass": 70.1, "delay": 0.7, "stiffness": 12340, "velocity": "LowPass"})
     assert "mass: 70.1 g\n" in to_yaml(view)
     assert "delay: 700 us\n  stiffness: 12.34 kN/m\n" in to_yaml(view)
     assert 'Timing(period="1 ms", delay="700 us")' in to_python(view)
     assert 'LowPass(cutoff="100 Hz")' in to_python(view)
-    there_and_back = Controls().change({"mode": "normalized"}).change({"mode": "physical"})
-    assert to_link(there_and_back) == to_link(Controls())
+    restored = Controls().change({"mode": "normalized"}).change({"mode": "physical"})
+    assert to_link(restored) == to_link(Controls())

@@ -1,4 +1,4 @@
-"""A run as one page: what it shows, what it lets a browser do, and what it refuses."""
+"""The HTML report of a run: contents, content security policy, and errors for damaged or missing files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def page(run):
     return zwidth.write_report(run).read_text(encoding="utf-8")
 
 
-def test_the_page_asks_for_nothing_and_allows_its_own_script_and_style_alone(page):
+def test_page_loads_nothing_and_allows_only_its_own_script_and_style(page):
     policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page)
     assert policy is not None
     assert policy[1].startswith("default-src 'none'; img-src data:;")
@@ -48,42 +48,42 @@ def test_the_page_asks_for_nothing_and_allows_its_own_script_and_style_alone(pag
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
 
 
-def test_texts_of_the_configuration_are_shown_and_not_run(page):
+def test_configuration_texts_are_escaped(page):
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert" in page
 
 
-def test_figures_versions_and_studies_are_there(page):
+def test_page_contains_figures_versions_and_studies(page):
     assert 'src="data:image/svg+xml;base64,' in page
     assert 'id="top"' in page
     assert 'id="plane"' in page
     assert zwidth.__version__ in page
 
 
-def test_what_a_study_found_is_said(tmp_path):
+def test_page_contains_the_answer_of_a_study(tmp_path):
     device = {"mass": 0.1, "damping": 10, "period": 1e-3, "delay": 1e-3}
     config = {"version": 1, "name": "r", "scene": device, "studies": [{"kind": "recommend", "name": "wall"}]}
     result = zwidth.run(Config.model_validate(config), out=tmp_path / "r")
-    said = result.studies[0].answer
-    assert said[0].startswith("K = 7.989 kN/m")
+    answer_lines = result.studies[0].answer
+    assert answer_lines[0].startswith("K = 7.989 kN/m")
     page = zwidth.write_report(result.folder).read_text(encoding="utf-8")
-    assert all(f"<p>{line}</p>" in page for line in said)
+    assert all(f"<p>{line}</p>" in page for line in answer_lines)
 
 
-def test_slices_hold_what_the_store_holds(run, page):
+def test_slices_agree_with_the_store(run, page):
     blocks = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page)]
-    # In their order among all outputs, whatever that of the store.
+    # Blocks have the order of all outputs, not that of the store.
     assert [block["name"] for block in blocks] == ["stable", "spectral_radius"]
-    named = {block["name"]: block for block in blocks}
-    found = named["spectral_radius"]
-    values = np.frombuffer(base64.b64decode(found["values"]), "<f4").reshape(2, 20, 30)
+    blocks_by_name = {block["name"]: block for block in blocks}
+    block_radius = blocks_by_name["spectral_radius"]
+    values = np.frombuffer(base64.b64decode(block_radius["values"]), "<f4").reshape(2, 20, 30)
     with zwidth.open_dataset(run / "plane.zarr") as data:
         stored = data["spectral_radius"].squeeze("d", drop=True) if "d" in data.dims else data["spectral_radius"]
         expected = stored.transpose("delta", "beta", "alpha").values
     np.testing.assert_allclose(values, expected, rtol=1e-6)
-    assert found["others"][0]["values"] == [0.1, 0.5]
-    assert named["stable"]["truth"] is True
-    for edges, delta in zip(found["edges"], (0.1, 0.5), strict=True):
+    assert block_radius["others"][0]["values"] == [0.1, 0.5]
+    assert blocks_by_name["stable"]["truth"] is True
+    for edges, delta in zip(block_radius["edges"], (0.1, 0.5), strict=True):
         region = zwidth.stable_region(delta, 1.0)
         ((ring,), (passive, *_)) = (
             [np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, 2) for text in edges[name]]
@@ -94,42 +94,42 @@ def test_slices_hold_what_the_store_holds(run, page):
         assert zwidth.is_passive(alpha, beta, delta, 1.0)
 
 
-def test_a_folder_without_a_run_is_refused(tmp_path):
+def test_folder_without_a_run_raises(tmp_path):
     with pytest.raises(StoreError, match="contains no run"):
         zwidth.write_report(tmp_path)
 
 
-def test_the_command_names_its_file(run, tmp_path):
+def test_command_reports_its_file(run, tmp_path):
     result = CliRunner().invoke(cli, ["report", str(run), "--out", str(tmp_path / "it.html"), "--json"])
     assert result.exit_code == 0
     assert json.loads(result.output)["bytes"] == (tmp_path / "it.html").stat().st_size
 
 
-def test_what_is_damaged_or_missing_is_named_and_not_shown(run, tmp_path):
+def test_damaged_or_missing_files_raise(run, tmp_path):
     damages = {
-        "run.json is damaged": lambda out: edit(out / "run.json", '"seconds": ', '"seconds": 1'),
-        "config.yaml is damaged": lambda out: edit(out / "config.yaml", "num: 30", "num: 31"),
+        "run.json is damaged": lambda out: replace_in_file(out / "run.json", '"seconds": ', '"seconds": 1'),
+        "config.yaml is damaged": lambda out: replace_in_file(out / "config.yaml", "num: 30", "num: 31"),
         "config.yaml is missing": lambda out: (out / "config.yaml").unlink(),
         "plane.zarr is missing": lambda out: shutil.rmtree(out / "plane.zarr"),
         "plane.zarr: chunks are missing": lambda out: shutil.rmtree(out / "plane.zarr" / "status" / "c"),
-        "top.svg is damaged": lambda out: edit(out / "top.svg", "</svg>", "</svg> "),
+        "top.svg is damaged": lambda out: replace_in_file(out / "top.svg", "</svg>", "</svg> "),
     }
-    for number, (says, damage) in enumerate(damages.items()):
+    for number, (message, damage) in enumerate(damages.items()):
         out = tmp_path / str(number)
         shutil.copytree(run, out, ignore=shutil.ignore_patterns("report.html"))
         damage(out)
-        with pytest.raises(StoreError, match=f"{re.escape(says)}.*'zwidth run CONFIG --resume'"):
+        with pytest.raises(StoreError, match=f"{re.escape(message)}.*'zwidth run CONFIG --resume'"):
             zwidth.write_report(out)
         assert not (out / "report.html").exists()
 
 
-def edit(file, old, new):
+def replace_in_file(file, old, new):
     text = file.read_text(encoding="utf-8")
     assert old in text
     file.write_text(text.replace(old, new, 1), encoding="utf-8")
 
 
-def test_a_store_behind_a_link_is_not_shown(run, tmp_path):
+def test_linked_store_is_not_shown(run, tmp_path):
     shutil.copytree(run, tmp_path / "out")
     (tmp_path / "out" / "plane.zarr").rename(tmp_path / "elsewhere.zarr")
     (tmp_path / "out" / "plane.zarr").symlink_to(tmp_path / "elsewhere.zarr")
@@ -138,18 +138,20 @@ def test_a_store_behind_a_link_is_not_shown(run, tmp_path):
     assert "application/json" not in text
 
 
-def test_labelled_devices_are_sliders_by_name(tmp_path):
+def test_labeled_devices_are_sliders_by_name(tmp_path):
     devices = {"label": ["=one", "two"], "mass": [0.1, 0.2], "damping": [1, 2]}
     axes = {"devices": devices, "rate": "1 kHz", "delay": "1 periods", "stiffness": [1e3, 2e3, 3e3]}
     study = {"kind": "sweep", "name": "s", "axes": axes | {"virtual_damping": [0, 1, 2]}, "outputs": ["stable"]}
     zwidth.run({"version": 1, "name": "n", "studies": [study]}, out=tmp_path / "out")
     text = zwidth.write_report(tmp_path / "out").read_text(encoding="utf-8")
-    slices = [json.loads(found) for found in re.findall(r'<script type="application/json">(.*?)</script>', text)]
+    slices = [
+        json.loads(text_block) for text_block in re.findall(r'<script type="application/json">(.*?)</script>', text)
+    ]
     assert [other["values"] for other in slices[0]["others"]] == [["=one", "two"]]
 
 
-def test_of_walls_without_an_answer_a_slice_says_none(tmp_path):
-    """Beyond the range of the model no wall is called unstable; a settling time without end is infinite."""
+def test_walls_without_result_are_nan_in_slices(tmp_path):
+    """Walls out of range are not shown as unstable; the settling time of an unstable wall is infinite."""
     axes = {"alpha": [0.1, 0.9, 1e61], "beta": [0.1, 0.2], "delta": 0.1, "d": 1}
     outputs = ["stable", "settling_time"]
     study = {"kind": "sweep", "name": "s", "axes": axes, "outputs": outputs}
@@ -165,7 +167,7 @@ def test_of_walls_without_an_answer_a_slice_says_none(tmp_path):
     assert len(re.findall(r'<script type="application/json">', text)) == 2
 
 
-def test_a_sweep_over_one_parameter_has_its_curve_and_a_map_without_edges_names_none(tmp_path):
+def test_sweep_over_one_parameter_has_a_curve(tmp_path):
     top = study("top", {"delta": [0.0, 0.5, 1.0], "d": 1.0}, ("alpha_max",))
     plane = study(
         "tops", {"delta": {"linear": {"start": 0, "stop": 1, "num": 8}}, "d": [0, 1, 2, 3, 4, 5, 6]}, ("alpha_max",)
@@ -179,11 +181,11 @@ def test_a_sweep_over_one_parameter_has_its_curve_and_a_map_without_edges_names_
     assert "exact boundary" not in page
 
 
-def test_the_day_of_a_run_is_told_as_people_write_it(page):
+def test_date_of_the_run_is_readable(page):
     assert re.search(r"Computed on \d{4}-\d\d-\d\d at \d\d:\d\d UTC, in float64", page)
 
 
-def test_a_study_that_an_interrupted_run_never_began_is_named(tmp_path, monkeypatch):
+def test_study_not_started_is_listed_as_missing(tmp_path, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
@@ -195,7 +197,7 @@ def test_a_study_that_an_interrupted_run_never_began_is_named(tmp_path, monkeypa
         assert f"<strong>{name} is missing</strong> because it is not finished; " in page
 
 
-def test_a_study_that_failed_is_told_and_has_no_section(tmp_path, monkeypatch):
+def test_failed_study_is_reported_without_a_section(tmp_path, monkeypatch):
     def fail(*_, **__):
         raise ValueError("<no luck>")
 
@@ -208,8 +210,8 @@ def test_a_study_that_failed_is_told_and_has_no_section(tmp_path, monkeypatch):
     assert 'id="walls"' in page
 
 
-def test_a_map_has_the_colors_of_its_figure(tmp_path):
-    """The scale of alpha_max has its whole range, that of a decay time ends at 100 times its least, with an arrow."""
+def test_slices_have_the_colors_of_the_figure(tmp_path):
+    """The color scale of alpha_max covers its range; that of a time ends at 100 times its minimum, with an arrow."""
     wide = {"delta": [1e-6, 1.0, 1e5], "d": [0.0, 4.0, 20.0]}
     walls = {"alpha": {"log": {"start": 1e-5, "stop": 0.3, "num": 40}}, "beta": [0.1, 0.2, 0.4], "delta": 0.1, "d": 1}
     outputs = ("settling_time", "delay_margin", "spectral_radius")

@@ -1,4 +1,6 @@
-"""Random scenes of every part against a state matrix in absolute coordinates (tests/oracles/any_loop.py)."""
+"""Poles, zeros and stable intervals of random scenes, against a state matrix in absolute coordinates
+(oracles/any_loop).
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,10 @@ from zwidth.stability.linear.curve import evaluate_curve
 from zwidth.stability.linear.poles import compute_poles_minus_one
 
 SCENES = 6
-# Poles against balls: their distance, or how far from this loop one is that has them.
-POLE, MISSED = 1e-12, 1e-15
-# Zeros relative to themselves: float64 takes 3 of 16 digits from those that nearly cancel poles.
-ZERO = 1e-12
-# The end of an interval against a bisected scan: what is left of 16 digits after alpha is a difference.
-END = 1e-9
+POLE = 1e-12  # distance between a pole and the pole certified in balls
+MISSED = 1e-15  # or: relative change of the loop that makes the computed pole exact
+ZERO = 1e-12  # relative error of zeros; those that nearly cancel poles lose 3 of 16 digits in float64
+END = 1e-9  # relative error of an interval's end, because alpha is a difference
 
 
 def scenes(kind: str, seed: int, count: int = SCENES) -> list[zwidth.Scene]:
@@ -28,8 +28,8 @@ def scenes(kind: str, seed: int, count: int = SCENES) -> list[zwidth.Scene]:
     return [any_loop.random_scene(kind, generator) for _ in range(count)]
 
 
-def walls_of(scene: zwidth.Scene, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Normalized walls anywhere, and beside the curve at a relative distance of 1e-9 to 1e-2."""
+def draw_walls(scene: zwidth.Scene, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return normalized walls, some random, others next to the boundary at a relative distance of 1e-9 to 1e-2."""
     curve = evaluate_curve(scene.loop.roots, generator.choice(scene.loop.boundary.w, 15))
     side = 10 ** generator.uniform(-9, -2, 15) * generator.choice([-1.0, 1.0], 15)
     fine = (np.abs(curve.alpha) < 1e6) & (np.abs(curve.beta) < 1e6) & (np.abs(curve.alpha) > 1e-6)
@@ -39,79 +39,79 @@ def walls_of(scene: zwidth.Scene, generator: np.random.Generator) -> tuple[np.nd
 
 
 @pytest.mark.parametrize("kind", any_loop.KINDS)
-def test_poles_outside_are_those_of_the_matrix(kind):
-    generator, units_apart, judged = np.random.default_rng(11), 0, 0
+def test_number_of_unstable_poles_agrees_with_the_matrix(kind):
+    generator, undecided, compared = np.random.default_rng(11), 0, 0
     for scene in scenes(kind, 10):
         units = scene.units
-        walls = walls_of(scene, generator)
+        walls = draw_walls(scene, generator)
         for alpha, beta, outside in zip(*walls, scene.loop.boundary.count_outside(*walls), strict=True):
             wall = alpha * units.stiffness, beta * units.virtual_damping
             sizes = np.abs(np.linalg.eigvals(any_loop.closed_loop_matrix(scene, *wall)))
             expected: int | None = int(np.sum(sizes > 1))
             if expected != outside:
                 expected = proved_loop.count_outside(scene, *wall)
-            units_apart += expected is None
-            judged += 1
+            undecided += expected is None
+            compared += 1
             assert expected is None or outside == expected, (scene, wall)
-    # Undecided: an open-loop pole of an undamped device that the wall does not move.
-    assert units_apart < 0.02 * judged
+    # Undecided are open-loop poles of an undamped device that no wall moves.
+    assert undecided < 0.02 * compared
 
 
 @pytest.mark.parametrize("kind", any_loop.KINDS)
-def test_poles_are_proved_ones(kind):
+def test_poles_agree_with_certified_poles(kind):
     generator, compared = np.random.default_rng(21), 0
     for scene in scenes(kind, 20, 40):
         alpha, beta = 10 ** generator.uniform(-3, 0), 10 ** generator.uniform(-2, 0) * generator.choice([0.0, 1.0, 1.0])
         wall = alpha * scene.units.stiffness, beta * scene.units.virtual_damping
-        found = compute_poles_minus_one(scene.loop.roots, np.array([alpha]), np.array([beta]))[0]
+        computed = compute_poles_minus_one(scene.loop.roots, np.array([alpha]), np.array([beta]))[0]
         try:
-            expected, missed = proved_loop.proved_poles(scene, *wall, found)
+            expected, missed = proved_loop.proved_poles(scene, *wall, computed)
         except ValueError:
-            # A multiple pole, of a low-pass that a wall without damping leaves alone.
+            # Skip multiple poles, of a low-pass filter that has no effect without virtual damping.
             continue
-        distance = np.abs(found[:, None] - expected)
-        own, other = linear_sum_assignment(distance)
-        # Of poles next to each other no more can be asked than that a loop next to this one has them.
-        right = (distance[own, other] < POLE) | (missed[own] < MISSED)
+        distance = np.abs(computed[:, None] - expected)
+        matched, other = linear_sum_assignment(distance)
+        # Clustered poles are ill-conditioned: accept those that are exact poles of a nearby loop.
+        right = (distance[matched, other] < POLE) | (missed[matched] < MISSED)
         assert right.all(), (scene, wall)
-        # Those at 0 exactly are left out by the balls.
-        assert expected.size == own.size
-        assert np.all(np.abs(1.0 + np.delete(found, own)) < 1e-3), (scene, wall)
-        compared += own.size
+        # The certified poles exclude those at exactly 0.
+        assert expected.size == matched.size
+        assert np.all(np.abs(1.0 + np.delete(computed, matched)) < 1e-3), (scene, wall)
+        compared += matched.size
     assert compared > 150
 
 
 @pytest.mark.parametrize("stiffness", [1e-14, 1e-11, 1e-8, 1e-5, 1e-2])
 @pytest.mark.parametrize("sensor", ["motor", "tip"])
-def test_zeros_beside_soft_modes_keep_their_digits(sensor, stiffness):
+def test_zeros_near_soft_modes_are_accurate(sensor, stiffness):
     generator, period = np.random.default_rng(41), 1e-3
     for _ in range(12):
         spring, mass, damped = stiffness / period**2, 10 ** generator.uniform(-1, 1.5), generator.choice([0.0, 0.1])
         damping = damped * np.sqrt(spring * mass)
         device = zwidth.Device(1.0, generator.choice([0.0, 10.0]), zwidth.Coupling(mass, spring, damping, sensor))
-        behind = {"coupling_stiffness": spring * 10 ** generator.uniform(-2, 2)}
-        held = zwidth.Operator(3.0, damping, spring * 1e-3, **behind)
-        hand = held if generator.random() < 0.5 else None
+        link = {"coupling_stiffness": spring * 10 ** generator.uniform(-2, 2)}
+        grounded = zwidth.Operator(3.0, damping, spring * 1e-3, **link)
+        hand = grounded if generator.random() < 0.5 else None
         scene = zwidth.Scene(device, zwidth.Timing(period, generator.choice([0, 1, 0.4]) * period), operator=hand)
         expected = proved_loop.proved_zeros(scene)
         distance = np.abs(-scene.loop.roots.zeros[:, None] - expected) / np.abs(expected)
-        own, other = linear_sum_assignment(distance)
-        assert own.size == expected.size == scene.loop.roots.zeros.size
-        assert distance[own, other].max() < ZERO, scene
+        matched, other = linear_sum_assignment(distance)
+        assert matched.size == expected.size == scene.loop.roots.zeros.size
+        assert distance[matched, other].max() < ZERO, scene
 
 
 @pytest.mark.parametrize("kind", any_loop.KINDS)
-def test_intervals_of_rows_are_those_of_a_dense_scan(kind):
+def test_stable_stiffness_intervals_agree_with_matrix_crossings(kind):
     generator = np.random.default_rng(31)
     compared = 0
     for scene in scenes(kind, 30, 6):
         units = scene.units
         for beta in generator.choice([-0.03, 0.0, 0.02, 0.1, 0.4], 2, replace=False):
             damping = float(beta * units.virtual_damping + scene.damping * 0.01)
-            ours = scene.stable_stiffness(damping)
+            intervals = scene.stable_stiffness(damping)
             crossings, _ = any_loop.row_ends(scene, damping)
             crossings = np.sort(crossings)
-            size = np.max(np.abs(ours), initial=0.0, where=np.isfinite(ours)) or units.stiffness
+            size = np.max(np.abs(intervals), initial=0.0, where=np.isfinite(intervals)) or units.stiffness
             cuts = crossings[np.abs(crossings) < 3 * size]
             cuts = np.concatenate([[-size], cuts, [3 * size]]) if cuts.size else np.array([-size, 3 * size])
             for low, high in pairwise(cuts):
@@ -121,9 +121,9 @@ def test_intervals_of_rows_are_those_of_a_dense_scan(kind):
                 radius = any_loop.spectral_radius(scene, middle, damping)
                 if abs(radius - 1) < 1e-8:
                     continue
-                inside = np.any((middle > ours[:, 0]) & (middle < ours[:, 1]))
+                inside = np.any((middle > intervals[:, 0]) & (middle < intervals[:, 1]))
                 assert inside == (radius < 1), (scene, damping, middle)
                 compared += 1
-            for end in ours[np.isfinite(ours)]:
+            for end in intervals[np.isfinite(intervals)]:
                 assert np.abs(crossings - end).min() <= END * size, (scene, damping, end)
     assert compared > 20

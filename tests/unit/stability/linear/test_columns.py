@@ -1,4 +1,4 @@
-"""Stable intervals of the damping at a stiffness, against poles proved in balls."""
+"""Stable intervals of virtual damping at a given stiffness, against poles certified in ball arithmetic."""
 
 import any_loop
 import numpy as np
@@ -10,12 +10,12 @@ from zwidth.stability.linear.rows import find_stable_dampings
 
 
 @pytest.mark.parametrize("alpha", [0.3, 5.0, np.nan, np.inf])
-def test_a_column_beyond_the_stable_set_is_empty(alpha):
+def test_no_stable_damping_above_the_maximum_stiffness(alpha):
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
     assert find_stable_dampings(scene.loop.boundary, alpha).shape == (0, 2)
 
 
-# Columns that a curve crosses next to its ends, beyond its first or last node, or between two narrow turns.
+# The curve crosses these lines near their ends, outside of its first or last node, or between two close extrema.
 STEEP = {
     "order 4 at 3 Hz": (
         zwidth.Device(0.1, 10),
@@ -34,37 +34,39 @@ STEEP = {
 
 
 @pytest.mark.parametrize("name", STEEP)
-def test_columns_behind_steep_filters(name):
+def test_stable_dampings_with_filters_of_low_cutoff(name):
     device, timing, velocity, stiffnesses = STEEP[name]
     scene = zwidth.Scene(device, timing, velocity=velocity)
     for stiffness in stiffnesses:
         assert check_column(scene, stiffness) is not None
 
 
-def test_an_end_near_0_of_a_soft_wall_keeps_its_digits():
-    # An undamped tip and 2e-7 of K_max: 1 part in 60 of the damping is stable, and rows there move hardly at all.
+def test_end_near_zero_damping_of_a_soft_wall_is_accurate():
+    # An undamped tip at 2e-7 of K_max: 1/60 of the damping range is stable, and the intervals hardly depend on K.
     coupling = zwidth.Coupling(2.906851785633506, 205186.7108746703, 0.0, "tip")
     timing = zwidth.Timing(0.00038470647865914017, 0.00011541194359774204)
     scene = zwidth.Scene(zwidth.Device(2.9043679345862086, 0.0, coupling), timing)
-    exact, found = proved_loop.proved_column(scene, 0.04824013422078757), scene.stable_damping(0.04824013422078757)
+    exact, computed = proved_loop.proved_column(scene, 0.04824013422078757), scene.stable_damping(0.04824013422078757)
     assert exact is not None
-    np.testing.assert_allclose(found, exact, rtol=1e-8)
+    np.testing.assert_allclose(computed, exact, rtol=1e-8)
 
 
 def check_column(scene, stiffness):
-    """One column against balls; the share of each end by which it is off, of the larger one where it is nearly 0."""
+    """Compare the intervals with certified ones; return the latter, or None if balls cannot decide."""
     exact = proved_loop.proved_column(scene, stiffness)
     if exact is None:
         return None
-    found = find_stable_dampings(scene.loop.boundary, stiffness / scene.units.stiffness) * scene.units.virtual_damping
-    assert found.shape == exact.shape, (scene, stiffness, found, exact)
+    computed = (
+        find_stable_dampings(scene.loop.boundary, stiffness / scene.units.stiffness) * scene.units.virtual_damping
+    )
+    assert computed.shape == exact.shape, (scene, stiffness, computed, exact)
     if exact.size:
-        np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-12 * np.abs(exact).max())
+        np.testing.assert_allclose(computed, exact, rtol=1e-9, atol=1e-12 * np.abs(exact).max())
     return exact
 
 
-def test_columns_agree_with_proved_ones():
-    known = 0
+def test_stable_dampings_agree_with_certified_intervals():
+    decided = 0
     for seed in range(21):
         rng = np.random.default_rng([seed, 41])
         scene = any_loop.random_scene(any_loop.KINDS[seed % len(any_loop.KINDS)], rng)
@@ -73,7 +75,7 @@ def test_columns_agree_with_proved_ones():
             scene = scene.replace(velocity=zwidth.Butterworth(cutoff, int(rng.integers(1, 8))))
         top = float(scene.max_stiffness().stiffness)
         top = top if np.isfinite(top) else float(scene.units.stiffness)
-        shares = 10 ** rng.uniform(-7, -1), rng.uniform(0.1, 1.0)
-        known += sum(check_column(scene, top * share) is not None for share in shares)
-    # Poles next to the circle for every wall, as of an undamped coupling, are not counted.
-    assert known >= 36
+        fractions = 10 ** rng.uniform(-7, -1), rng.uniform(0.1, 1.0)
+        decided += sum(check_column(scene, top * fraction) is not None for fraction in fractions)
+    # Not counted are scenes with poles near the unit circle for every wall, for example of an undamped coupling.
+    assert decided >= 36

@@ -1,4 +1,4 @@
-"""Families of hard scenes: every count against poles in balls, every row against the counts at its two ends."""
+"""Ill-conditioned scenes: pole counts against poles in balls, crossings of each line against the counts at its ends."""
 
 from __future__ import annotations
 
@@ -22,68 +22,70 @@ def device(delta: float, coupling: zwidth.Coupling | None = None) -> zwidth.Devi
     return zwidth.Device(1.0, delta / T, coupling)
 
 
-def tied(stiffness: float, damping: float, sensor: str, mass: float = 1.0) -> zwidth.Coupling:
+def couple(stiffness: float, damping: float, sensor: str, mass: float = 1.0) -> zwidth.Coupling:
     return zwidth.Coupling(mass, stiffness / T**2, damping / T, sensor)  # type: ignore[arg-type]
 
 
-def scene(part: zwidth.Device, d: float, velocity=None, hand=None) -> zwidth.Scene:
-    return zwidth.Scene(part, zwidth.Timing(T, d * T), velocity=velocity or zwidth.BackwardDifference(), operator=hand)
+def scene(device_model: zwidth.Device, d: float, velocity=None, hand=None) -> zwidth.Scene:
+    return zwidth.Scene(
+        device_model, zwidth.Timing(T, d * T), velocity=velocity or zwidth.BackwardDifference(), operator=hand
+    )
 
 
 WINDOW = zwidth.WindowedDifference
 CIRCLE_ZEROS = zwidth.VelocityFilter([1 / T, -2 / T, 2 / T, -1 / T], [1.0, 0.0, 0.0, 0.0])
 SCENES = {
-    # Im F and Im q vanish together: whole lines of walls put a pair on the circle.
+    # Im F and Im q vanish together: on whole lines of walls a pair is on the unit circle.
     "undamped, d = 1, window 3": scene(device(0.0), 1, WINDOW(3)),
     "undamped, d = 3, window 7": scene(device(0.0), 3, WINDOW(7)),
     "undamped, d = 2, window 10": scene(device(0.0), 2, WINDOW(10)),
     "zeros of F on the circle, undamped": scene(device(0.0), 2.5, CIRCLE_ZEROS),
     "zeros of F on the circle": scene(device(0.1), 1, CIRCLE_ZEROS),
-    "nothing damped, motor": scene(device(0.0, tied(0.2, 0.0, "motor")), 0),
-    "nothing damped, tip": scene(device(0.0, tied(0.2, 0.0, "tip")), 1, WINDOW(5)),
-    "undamped link of a damped motor": scene(device(0.03, tied(0.09, 0.0, "motor", 0.2)), 2),
-    "soft link": scene(device(0.01, tied(1e-7, 1e-6, "motor")), 1),
-    "stiff link": scene(device(0.01, tied(1e4, 1.0, "tip")), 0.4),
-    "strongly damped motor of a link": scene(device(1e5, tied(0.1, 1e-3, "motor", 0.5)), 0.4),
-    "strong damper in a light link": scene(device(0.01, tied(0.1, 1e4, "motor", 1e-3)), 1),
-    "hand with a strong damper": scene(device(0.01), 0.4, hand=zwidth.Operator(0.1, 1.0, 100.0, 1e3, 1e9)),
-    "mode that creeps, on a strongly damped motor": scene(
+    "nothing damped, motor": scene(device(0.0, couple(0.2, 0.0, "motor")), 0),
+    "nothing damped, tip": scene(device(0.0, couple(0.2, 0.0, "tip")), 1, WINDOW(5)),
+    "undamped link of a damped motor": scene(device(0.03, couple(0.09, 0.0, "motor", 0.2)), 2),
+    "soft link": scene(device(0.01, couple(1e-7, 1e-6, "motor")), 1),
+    "stiff link": scene(device(0.01, couple(1e4, 1.0, "tip")), 0.4),
+    "strongly damped motor of a link": scene(device(1e5, couple(0.1, 1e-3, "motor", 0.5)), 0.4),
+    "strong damper in a light link": scene(device(0.01, couple(0.1, 1e4, "motor", 1e-3)), 1),
+    "operator with a strong damper": scene(device(0.01), 0.4, hand=zwidth.Operator(0.1, 1.0, 100.0, 1e3, 1e9)),
+    "overdamped mode on a strongly damped motor": scene(
         zwidth.Device(1.0, 1e5 / T, modes=[zwidth.Mode(0.01, 3.3, 1.0)]), 1
     ),
-    "coupling that creeps": scene(
-        device(0.01, tied(1e-8, 4e5, "motor", 0.03)), 3, hand=zwidth.Operator(1e3, 1e-5 / T, 1e-9 / T**2)
+    "overdamped coupling": scene(
+        device(0.01, couple(1e-8, 4e5, "motor", 0.03)), 3, hand=zwidth.Operator(1e3, 1e-5 / T, 1e-9 / T**2)
     ),
-    "heavy hand": scene(device(0.01), 1, hand=zwidth.Operator(1e3, 5.0, 100.0, coupling_stiffness=1e3)),
-    "light hand": scene(device(0.01), 1, hand=zwidth.Operator(1e-3, 5.0, 100.0, coupling_stiffness=1e3)),
+    "heavy operator": scene(device(0.01), 1, hand=zwidth.Operator(1e3, 5.0, 100.0, coupling_stiffness=1e3)),
+    "light operator": scene(device(0.01), 1, hand=zwidth.Operator(1e-3, 5.0, 100.0, coupling_stiffness=1e3)),
     "strong damping": scene(device(1e6), 0.5, zwidth.LowPass(cutoff=100.0)),
     "slight damping": scene(device(1e-12), 1, WINDOW(5)),
     "long delay": scene(device(0.1), 60.3, WINDOW(5)),
-    "an ulp below a whole delay": scene(device(0.1), float(np.nextafter(4, 0)), zwidth.LowPass(cutoff=100.0)),
+    "an ulp below an integer delay": scene(device(0.1), float(np.nextafter(4, 0)), zwidth.LowPass(cutoff=100.0)),
     "an ulp of delay": scene(device(0.1), 2.0**-52, WINDOW(2)),
     "long window": scene(device(0.1), 1, WINDOW(60)),
     "low cut-off": scene(device(0.1), 1, zwidth.LowPass(cutoff=0.01)),
     "high cut-off": scene(device(0.1), 0.4, zwidth.Butterworth(cutoff=499.999, order=4)),
     "order 8": scene(device(0.0), 0.4, zwidth.Butterworth(cutoff=20.0, order=8)),
-    "window 200": scene(device(0.1, tied(0.05, 0.01, "tip", 0.5)), 2, WINDOW(200)),
-    "zero of G beside the filter's at -1": scene(
-        device(0.0, tied(0.013, 0.0, "motor", 3.0)),
+    "window 200": scene(device(0.1, couple(0.05, 0.01, "tip", 0.5)), 2, WINDOW(200)),
+    "zero of G near the filter's at -1": scene(
+        device(0.0, couple(0.013, 0.0, "motor", 3.0)),
         5,
         zwidth.Butterworth(cutoff=20.0, order=4),
         zwidth.Operator(2.4, 6e-5, 1.3e-6 / T**2, coupling_stiffness=7e-5 / T**2, coupling_damping=1.3e-4 / T),
     ),
-    "soft link to a sensor at the tip": scene(device(0.01, tied(1e-6, 0.0, "tip", 30.0)), 1),
+    "soft link to a sensor at the tip": scene(device(0.01, couple(1e-6, 0.0, "tip", 30.0)), 1),
     "filter's pole on the device's": scene(device(0.1), 1, zwidth.LowPass(time_constant=T / 0.1, order=2)),
     "filter of another period": scene(device(0.1), 1, zwidth.LowPass(cutoff=20.0, coded_period=T / 10)),
 }
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_counts_are_those_of_proved_poles(name):
+def test_unstable_pole_counts_agree_with_certified_poles(name):
     loop, generator = SCENES[name], np.random.default_rng(5)
     boundary, units = loop.loop.boundary, loop.units
     curve = evaluate_curve(loop.loop.roots, generator.choice(boundary.w, 10))
     side = 10 ** generator.uniform(-7, -2, 10) * generator.choice([-1.0, 1.0], 10)
-    # Next to w = 0 and to undamped modes, alpha is what rounding leaves of larger numbers.
+    # Near w = 0 and undamped modes, alpha is dominated by rounding errors of larger terms.
     fine = (np.abs(curve.alpha) < 1e5) & (np.abs(curve.alpha) > 1e-7) & (np.abs(curve.beta) < 1e5)
     alpha = np.concatenate([10 ** generator.uniform(-3, 0, 6), (curve.alpha * (1 + side))[fine]])
     beta = np.concatenate([generator.uniform(-0.1, 0.5, 6), curve.beta[fine]])
@@ -94,26 +96,26 @@ def test_counts_are_those_of_proved_poles(name):
         decided += expected is not None
         assert expected is None or outside == expected, (a, b)
     if not decided and flint.__version__ < "0.9":
-        pytest.skip("this version of python-flint parts no roots of a polynomial of so high a degree")
+        pytest.skip("this version of python-flint cannot isolate the roots of polynomials of such degree")
     assert decided > 0.8 * alpha.size
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_every_row_s_crossings_lead_from_the_count_below_to_the_one_above(name):
+def test_crossings_of_a_line_connect_the_pole_counts_at_its_ends(name):
     boundary, generator = SCENES[name].loop.boundary, np.random.default_rng(6)
-    through_nodes = generator.choice(np.concatenate([arc.beta for arc in boundary.arcs]), 300)
-    rows = np.concatenate([generator.uniform(-1, 1.5, 300) * 10 ** generator.uniform(-6, 1, 300), through_nodes, [0.0]])
+    node_betas = generator.choice(np.concatenate([arc.beta for arc in boundary.arcs]), 300)
+    rows = np.concatenate([generator.uniform(-1, 1.5, 300) * 10 ** generator.uniform(-6, 1, 300), node_betas, [0.0]])
     rows = rows[np.isfinite(rows)]
-    found = boundary.find_crossings(rows)
-    assert found.consistent.all()
-    crossed = np.where(np.isfinite(found.alpha), found.leaving, 0.0).sum(1)
+    crossings = boundary.find_crossings(rows)
+    assert crossings.consistent.all()
+    crossed = np.where(np.isfinite(crossings.alpha), crossings.leaving, 0.0).sum(1)
     np.testing.assert_array_equal(boundary.count_below(rows) + crossed, boundary.count_above(rows))
 
 
 @pytest.mark.parametrize("before", [1e-5, 1e-7, 1e-8, 1e-9, 1e-11, 1e-13])
 @pytest.mark.parametrize("parts", ["lag", "tip and lag"])
-def test_roots_just_before_a_whole_delay_are_those_of_the_exact_response(before, parts):
-    tip = tied(0.02, 0.02, "tip", 0.5) if parts != "lag" else None
+def test_controller_just_below_an_integer_delay_agrees_with_the_state_space(before, parts):
+    tip = couple(0.02, 0.02, "tip", 0.5) if parts != "lag" else None
     driven = zwidth.Device(1.0, 5.0 / T, tip, zwidth.Actuator(cutoff=30.0, order=2))
     loop = scene(driven, 2.0 - before).loop
     response = discretize_states(loop.chain)
@@ -122,10 +124,10 @@ def test_roots_just_before_a_whole_delay_are_those_of_the_exact_response(before,
         np.testing.assert_allclose(loop.roots.evaluate_controller(circle_points(w)).value, exact, rtol=1e-11)
 
 
-def test_zeros_that_a_period_forgets_are_right_together():
-    # Next to z = 0 no determinant tells them from one another: each by itself they were off by a millionth.
+def test_ill_conditioned_zeros_near_the_origin_are_jointly_accurate():
+    # Near z = 0 no determinant separates these zeros; computed individually they had errors of 1e-6.
     slow = zwidth.Actuator(cutoff=2.7e-5 / T, order=2)
-    damped = zwidth.Device(1.0, 240.0 / T, tied(5.3, 0.37, "motor", 1.5e-3), actuator=slow)
+    damped = zwidth.Device(1.0, 240.0 / T, couple(5.3, 0.37, "motor", 1.5e-3), actuator=slow)
     hand = zwidth.Operator(2.4e-6, 718.0 / T, 2.7 / T**2, 0.042 / T**2, 0.048 / T)
     loop = scene(damped, 3.0, hand=hand).loop
     response = discretize_states(loop.chain)
@@ -134,21 +136,21 @@ def test_zeros_that_a_period_forgets_are_right_together():
         np.testing.assert_allclose(loop.roots.evaluate_controller(circle_points(w)).value, exact, rtol=1e-10)
 
 
-def test_a_device_without_any_damping_is_not_stable_behind_a_spring_alone():
-    # b = 0, B = 0: the row runs through the point where curve and line of z = 1 meet.
+def test_undamped_device_is_unstable_with_a_spring_alone():
+    # b = 0, B = 0: the line passes through the intersection of the curve and the line of z = 1.
     for d in (0.0, 0.3, 1.0, 2.0):
         for velocity in (WINDOW(3), zwidth.LowPass(cutoff=50.0)):
             assert not scene(device(0.0), d, velocity).is_stable([1e2, 1e4, 1e5], 0.0).any()
 
 
 @pytest.mark.parametrize("sensor", ["motor", "tip"])
-def test_without_any_damping_no_stiffness_is_stable_however_small(sensor):
-    # The row through the end of an arc at z = 1: between the arc and the line there are no walls.
+def test_undamped_motor_has_no_stable_stiffness_at_zero_damping(sensor):
+    # The line passes through the end of an arc at z = 1: no walls exist between the arc and the line.
     for d in (0.0, 0.3):
-        assert not scene(device(0.0, tied(0.2, 0.01, sensor)), d).stable_stiffness(0.0).size
+        assert not scene(device(0.0, couple(0.2, 0.01, sensor)), d).stable_stiffness(0.0).size
 
 
-def test_walls_of_a_row_that_contradicts_itself_are_told_by_their_poles(monkeypatch):
+def test_walls_on_an_inconsistent_line_are_decided_by_poles(monkeypatch):
     loop = scene(device(0.1), 1.3, WINDOW(5))
     stiffness, damping = np.linspace(1e3, 3e5, 12), np.array([[0.0], [50.0], [300.0]])
     expected = loop.is_stable(stiffness, damping)
@@ -160,8 +162,8 @@ def test_walls_of_a_row_that_contradicts_itself_are_told_by_their_poles(monkeypa
 
 
 @pytest.mark.parametrize("damping", [-0.5, 5.0, 20.0])
-def test_poles_are_found_where_eigenvalues_take_a_pair_for_two_real_ones(damping):
-    # Beside modes and a hand next to z = 1 the coefficients keep few digits of the poles there.
+def test_poles_where_eigenvalues_return_two_real_poles_for_a_pair(damping):
+    # Near modes and an operator close to z = 1, the coefficients hardly determine the poles there.
     tip = zwidth.Coupling(12.0, 7e3, 0.7)
     modes = [zwidth.Mode(30, 0.0075, -50), zwidth.Mode(70, 0.2, 50), zwidth.Mode(25, 0.07, 0.2)]
     hand = zwidth.Operator(14.0, 390.0, 540e3, coupling_stiffness=45e6, coupling_damping=7.5)
@@ -173,10 +175,10 @@ def test_poles_are_found_where_eigenvalues_take_a_pair_for_two_real_ones(damping
     )
     stiffness = np.linspace(0.0, 20e3, 1001)
     labels = resonant.is_stable(stiffness, damping)
-    found = resonant.decide_stability(stiffness, damping, method="companion")
-    np.testing.assert_array_equal(found.stable, labels)
+    decision = resonant.decide_stability(stiffness, damping, method="companion")
+    np.testing.assert_array_equal(decision.stable, labels)
     np.testing.assert_array_equal(resonant.spectral_radius(stiffness, damping) < 1, labels)
-    for stiff in (70.0, 115.0, 390.0):
-        exact = np.linalg.eigvals(resonant.state_space(stiff, damping).A)
-        size = np.abs(resonant.poles(stiff, damping)).max()
+    for stiffness_value in (70.0, 115.0, 390.0):
+        exact = np.linalg.eigvals(resonant.state_space(stiffness_value, damping).A)
+        size = np.abs(resonant.poles(stiffness_value, damping)).max()
         np.testing.assert_allclose(size, np.abs(exact).max(), rtol=1e-9)

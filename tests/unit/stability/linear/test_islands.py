@@ -1,4 +1,6 @@
-"""Rows with several stable intervals, against ends bisected in 80 digits (tests/reference/islands.json)."""
+"""Lines of constant B with several stable intervals, against ends bisected in 80 digits
+(tests/reference/islands.json).
+"""
 
 from __future__ import annotations
 
@@ -10,11 +12,10 @@ import numpy as np
 import pytest
 
 ROWS = json.loads((Path(__file__).parents[3] / "reference" / "islands.json").read_text())
-# The ends in float64: alpha is a difference of numbers some thousand times larger at worst.
-END = 1e-9
+END = 1e-9  # relative error of the ends in float64, because alpha is a difference of terms up to 1000 times larger
 
 
-def test_there_are_enough_of_several_kinds():
+def test_reference_contains_enough_scenes_of_several_kinds():
     assert len(ROWS) >= 30
     kinds = {
         (row["scene"]["device"].get("coupling", {}).get("sensor"), row["scene"]["velocity"]["kind"]) for row in ROWS
@@ -24,14 +25,14 @@ def test_there_are_enough_of_several_kinds():
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row["scene"]["velocity"]["kind"])
-def test_every_interval_is_found_and_none_besides(row):
+def test_stable_intervals_agree_with_80_digits(row):
     scene, damping = any_loop.scene_of(row["scene"]), row["virtual_damping"]
     expected = np.array(row["stiffness"], float)
-    found = scene.stable_stiffness(damping)
-    found = found[np.isfinite(found[:, 0])]
-    assert found.shape == expected.shape
-    np.testing.assert_allclose(found, expected, rtol=0, atol=END * np.max(np.abs(expected)))
+    intervals = scene.stable_stiffness(damping)
+    intervals = intervals[np.isfinite(intervals[:, 0])]
+    assert intervals.shape == expected.shape
+    np.testing.assert_allclose(intervals, expected, rtol=0, atol=END * np.max(np.abs(expected)))
     low, high = expected.T
-    beside = 1e-6 * np.max(np.abs(expected))
-    assert scene.is_stable([*(low + beside), *(high - beside)], damping).all()
-    assert not scene.is_stable([*(low - beside), *(high + beside)], damping).any()
+    offset = 1e-6 * np.max(np.abs(expected))
+    assert scene.is_stable([*(low + offset), *(high - offset)], damping).all()
+    assert not scene.is_stable([*(low - offset), *(high + offset)], damping).any()

@@ -1,4 +1,6 @@
-"""Sampled plants without damping: at B = 0 every pole is on the unit circle, and every answer says so."""
+"""Sampled plants without damping: at B = 0 every pole is on the unit circle, which every function must report as
+unstable.
+"""
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from zwidth.core.status import Status
 
 
 def make_joints(rng, bodies, period):
-    """Undamped joints in a row in semi-implicit Euler; force and sensor at the first."""
+    """Return undamped joints in series, discretized by semi-implicit Euler, with force and sensor at the first."""
     mass, springs = rng.uniform(0.02, 0.5, bodies), rng.uniform(1.0, 200.0, bodies - 1)
     stiffness = np.zeros((bodies, bodies))
     for k, spring in enumerate(springs):
@@ -21,8 +23,8 @@ def make_joints(rng, bodies, period):
     return A, B, np.eye(1, 2 * bodies)[0], mass[0]
 
 
-def radius(A, B, C, period, wall, pole):
-    """The largest pole magnitude of a wall with the backward difference behind a low-pass with this pole."""
+def compute_radius(A, B, C, period, wall, pole):
+    """Return the largest pole magnitude of a wall whose backward difference passes a low-pass filter with this pole."""
     size = len(A)
     gain = (1.0 - pole) / period
     velocity = np.concatenate([gain * C, [-gain, pole]])
@@ -36,7 +38,7 @@ def radius(A, B, C, period, wall, pole):
 
 @pytest.mark.parametrize("filtered", [False, True])
 @pytest.mark.parametrize("bodies", [1, 2, 3])
-def test_one_label_without_damping_and_eigenvalues_with_it(bodies, filtered):
+def test_lossless_plants_are_unstable_at_zero_damping_and_agree_with_eigenvalues(bodies, filtered):
     rng = np.random.default_rng(bodies)
     for period in rng.choice([5e-4, 1e-3, 2e-3, 5e-3], 5).tolist():
         A, B, C, mass = make_joints(rng, bodies, period)
@@ -48,23 +50,25 @@ def test_one_label_without_damping_and_eigenvalues_with_it(bodies, filtered):
         assert top.virtual_damping == 0.0
         stiffness = np.linspace(0.02, 1.2, 60) * top.stiffness
         for method in ("auto", "companion", "crossover"):
-            found = scene.decide_stability(stiffness, 0.0, method=method)
-            assert not found.stable.any()
-            assert np.all(found.status == Status.OK)
+            decision = scene.decide_stability(stiffness, 0.0, method=method)
+            assert not decision.stable.any()
+            assert np.all(decision.status == Status.OK)
         assert scene.stable_stiffness(0.0).size == 0
         low, high = scene.stable_damping(0.5 * top.stiffness)[0]
         assert low == 0.0 < high
         pole = np.exp(-0.2 * np.pi) if filtered else 0.0
         walls = np.stack([rng.uniform(0.01, 1.2, 60) * top.stiffness, rng.uniform(-0.1, 1.0, 60) * mass / period], -1)
-        radii = np.array([radius(A, B, C, period, wall, pole) for wall in walls])
+        radii = np.array([compute_radius(A, B, C, period, wall, pole) for wall in walls])
         clear = np.abs(radii - 1.0) > 1e-9
         np.testing.assert_array_equal(scene.is_stable(*walls.T)[clear], radii[clear] < 1.0)
-        found = scene.recommend(stiffness_fraction=0.7)
-        assert radius(A, B, C, period, (found.stiffness, found.virtual_damping), pole) < 1.0
+        recommendation = scene.recommend(stiffness_fraction=0.7)
+        assert compute_radius(A, B, C, period, (recommendation.stiffness, recommendation.virtual_damping), pole) < 1.0
 
 
-def test_a_public_report_of_semi_implicit_euler():
-    """The unit plant z/(z - 1)^2 of ten stiffnesses: scattered labels with status OK before."""
+def test_semi_implicit_euler_plant_is_unstable_at_zero_damping():
+    """Regression: for the plant z/(z - 1)^2, labels at ten stiffnesses were inconsistent although their status
+    was OK.
+    """
     system = scipy.signal.TransferFunction([1.0, 0.0], [1.0, -2.0, 1.0], dt=1.0)
     scene = zwidth.Scene(zwidth.LinearDevice(system), zwidth.Timing(1.0))
     stiffness = np.linspace(0.05, 0.95, 10) * 4
@@ -77,8 +81,8 @@ def test_a_public_report_of_semi_implicit_euler():
     assert scene.is_stable(2.0, 0.1)
 
 
-def test_damping_inside_the_plant_moves_the_row():
-    """Implicit damping kv = 2, explicit stiffness: K < 8.8 kN/m at B = 0; at B = -2 N s/m the plant is lossless."""
+def test_implicit_damping_of_the_plant_allows_zero_virtual_damping():
+    """With implicit damping kv = 2, K < 8.8 kN/m is stable at B = 0; at B = -2 N s/m the plant is lossless."""
     inertia, period, damping = 0.05, 5e-3, 2.0
     gain = 1.0 / (inertia + period * damping)
     A = np.array([[1.0, period * gain * inertia], [0.0, gain * inertia]])

@@ -1,4 +1,6 @@
-"""Passivity of scenes: the condition on a fine frequency grid and by energies in time, and rejected scenes."""
+"""Passivity of linear scenes, against the condition on a fine frequency grid and energies of trajectories; invalid
+scenes.
+"""
 
 import numpy as np
 import pytest
@@ -12,22 +14,22 @@ import zwidth
 from zwidth.core.errors import InputError
 
 
-def needed_on_a_grid(scene, stiffness, damping):
-    """The condition of a held delay as it is derived, at 40,000 frequencies, in N s/m."""
+def required_on_grid(scene, stiffness, damping):
+    """Return the damping in N s/m required by the condition for fractional delays, at 40,000 frequencies."""
     period = scene.timing.period
-    whole, part = scene.integer_delay, scene.d - scene.integer_delay
+    n_delay, fraction = scene.integer_delay, scene.d - scene.integer_delay
     w = np.concatenate([np.geomspace(1e-4, 0.1, 4000), np.linspace(0.1, np.pi, 36000)])
     z = np.exp(1j * w)
     top, bottom = velocity_polynomials(scene)
     wall = stiffness + damping * np.polyval(top, z) / np.polyval(bottom, z)
-    g = np.conj(wall) * (z - 1) * z**whole / 2
-    real, u = (((1 - part) + part * z) * g).real, 1 - np.cos(w)
-    # b/T solves 2 u x^2 + 2 x Re(...) - f (1 - f) |g|^2 = 0, and g is in N/m.
-    root = np.sqrt(real**2 + 2 * u * part * (1 - part) * np.abs(g) ** 2)
+    g = np.conj(wall) * (z - 1) * z**n_delay / 2
+    real, u = (((1 - fraction) + fraction * z) * g).real, 1 - np.cos(w)
+    # b/T solves 2 u x^2 + 2 x Re(...) - f (1 - f) |g|^2 = 0, with g in N/m.
+    root = np.sqrt(real**2 + 2 * u * fraction * (1 - fraction) * np.abs(g) ** 2)
     return period * np.max((-real + root) / (2 * u))
 
 
-def filtered(rng):
+def draw_filtered_scene(rng):
     period = 10 ** rng.uniform(-4, -2.5)
     return zwidth.Scene(
         zwidth.Device(10 ** rng.uniform(-1.5, 0.5), 10 ** rng.uniform(-1, 1.5)),
@@ -36,24 +38,24 @@ def filtered(rng):
     )
 
 
-def test_no_frequency_needs_more():
+def test_required_damping_agrees_with_a_frequency_grid():
     rng = np.random.default_rng(1)
     for _ in range(15):
-        scene = filtered(rng)
+        scene = draw_filtered_scene(rng)
         unit = scene.device.damping
         stiffness, damping = unit / scene.timing.period * rng.uniform(0, 2), unit * rng.uniform(-1, 2)
-        needed = scene.device.damping - scene.passivity_margin(stiffness, damping)
-        grid = needed_on_a_grid(scene, stiffness, damping)
-        # The subtraction and the grid's own rounding at low frequencies.
-        assert grid <= needed * (1 + 1e-6) + 1e-9 * unit
-        assert grid >= needed * (1 - 1e-4) - 1e-9 * unit
+        required = scene.device.damping - scene.passivity_margin(stiffness, damping)
+        grid = required_on_grid(scene, stiffness, damping)
+        # Allow for rounding errors of the subtraction and of the grid at low frequencies.
+        assert grid <= required * (1 + 1e-6) + 1e-9 * unit
+        assert grid >= required * (1 - 1e-4) - 1e-9 * unit
 
 
 def delayed(values, count):
     return np.concatenate([np.zeros_like(values[:count]), values])[: len(values)]
 
 
-def least_damping(scene, wall, periods):
+def smallest_dissipative_damping(scene, wall, periods):
     """Return the damping below which some trajectory of that many periods extracts energy, in N s/m."""
     f, period, n = scene.d - scene.integer_delay, scene.timing.period, periods
     # One column per free position: the samples, then the positions at which delayed forces arrive between samples.
@@ -73,7 +75,7 @@ def least_damping(scene, wall, periods):
 
 
 @pytest.mark.parametrize("kind", ["rigid", "filter", "hand", "coupled hand", "motor"])
-def test_trajectories_need_at_most_what_the_condition_requires_and_approach_it(kind):
+def test_required_damping_is_the_limit_of_finite_trajectories(kind):
     rng = np.random.default_rng(2)
     for _ in range(6):
         scene = random_scene(kind, rng)
@@ -83,12 +85,12 @@ def test_trajectories_need_at_most_what_the_condition_requires_and_approach_it(k
         scene = scene.replace(device=device, timing=zwidth.Timing(period, delay * period))
         angle = rng.uniform(-0.5, 0.5) * np.pi
         wall = np.cos(angle) * device.damping / period, np.sin(angle) * device.damping
-        needed = device.damping - float(scene.passivity_margin(*wall))
-        found = [least_damping(scene, wall, periods) for periods in (40, 80, 160)]
-        assert found == sorted(found)
-        assert found[-1] <= needed * (1 + LEAST_DAMPING.float64)
-        # The difference falls as 1/periods^2.
-        assert needed - found[-1] < 0.6 * (needed - found[0])
+        required = device.damping - float(scene.passivity_margin(*wall))
+        damping_by_length = [smallest_dissipative_damping(scene, wall, periods) for periods in (40, 80, 160)]
+        assert damping_by_length == sorted(damping_by_length)
+        assert damping_by_length[-1] <= required * (1 + LEAST_DAMPING.float64)
+        # The difference decreases as 1/periods^2.
+        assert required - damping_by_length[-1] < 0.6 * (required - damping_by_length[0])
 
 
 @pytest.mark.parametrize("kind", ["filter", "hand", "coupled hand", "motor"])
@@ -105,27 +107,27 @@ def test_passive_walls_are_stable(kind):
             operator=scene.operator,
         )
         stiffness, damping = b / scene.timing.period * rng.uniform(0.01, 1, 12), b * rng.uniform(-0.8, 0.8, 12)
-        found = scene.is_passive(stiffness, damping)
-        passive += found.sum()
-        assert np.all(scene.is_stable(stiffness, damping)[found])
+        is_passive = scene.is_passive(stiffness, damping)
+        passive += is_passive.sum()
+        assert np.all(scene.is_stable(stiffness, damping)[is_passive])
     assert passive > 5
 
 
-def test_the_hand_s_damping_does_not_count():
+def test_damping_of_the_operator_does_not_affect_passivity():
     device, timing = zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3)
-    alone, held = (zwidth.Scene(device, timing, operator=hand) for hand in (None, zwidth.Operator(0.5, 100.0)))
-    assert held.passivity_margin(1e3, 1.0) == pytest.approx(alone.passivity_margin(1e3, 1.0), rel=1e-12)
+    free, coupled = (zwidth.Scene(device, timing, operator=hand) for hand in (None, zwidth.Operator(0.5, 100.0)))
+    assert coupled.passivity_margin(1e3, 1.0) == pytest.approx(free.passivity_margin(1e3, 1.0), rel=1e-12)
 
 
-def test_a_wall_that_pushes_and_one_that_is_not_finite():
+def test_passivity_margin_of_negative_and_nan_stiffness():
     scene = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3), velocity=zwidth.LowPass(cutoff=100))
-    found = scene.passivity_margin([-100.0, np.nan])
-    assert found[0] == pytest.approx(-100.0 * 1e-3)
-    assert np.isnan(found[1])
+    margin = scene.passivity_margin([-100.0, np.nan])
+    assert margin[0] == pytest.approx(-100.0 * 1e-3)
+    assert np.isnan(margin[1])
     assert not scene.is_passive(np.nan)
 
 
-def test_with_the_sensor_at_the_tip_there_is_no_such_condition():
+def test_passivity_with_the_sensor_at_the_tip_raises():
     coupling = zwidth.Coupling(0.05, 20e3, 1.0, "tip")
     scene = zwidth.Scene(zwidth.Device(0.1, 10.0, coupling), zwidth.Timing(1e-3))
     with pytest.raises(InputError, match="with the sensor at the tip: there is no passivity condition"):

@@ -1,10 +1,12 @@
-"""Maps by the closed-form boundary: each way of comparing alpha with the ends of the rows gives the same labels."""
+"""Stability grids from the closed-form boundary: every array layout must yield the labels of the direct comparison
+alpha < limit(beta).
+"""
 
 import numpy as np
 import pytest
 
 from zwidth.numerics.held_mass import discretize_plant
-from zwidth.stability.rigid import stiffness_limit as maps
+from zwidth.stability.rigid import stiffness_limit as stiffness_limit
 from zwidth.stability.rigid.stiffness_limit import build_long_lobe, find_limit_long_delay, row_limits
 from zwidth.stability.rigid.verdict import is_stable
 
@@ -43,7 +45,7 @@ ALPHAS = (ascending, with_repeats, without_positive, with_infinities, descending
 
 @pytest.mark.parametrize("make", ALPHAS)
 @pytest.mark.parametrize("layout", ["alpha along the last axis", "alpha along the first axis", "stacked"])
-def test_every_layout_is_the_plain_comparison(make, layout):
+def test_every_layout_equals_the_direct_comparison(make, layout):
     alpha, limit = make()[None, :], LIMITS
     if layout == "alpha along the first axis":
         alpha, limit = alpha.T, limit.T
@@ -51,44 +53,44 @@ def test_every_layout_is_the_plain_comparison(make, layout):
         limit = np.stack([limit, 0.5 * limit])
         alpha = alpha[None]
     expected = (alpha > 0) & (alpha < limit)
-    assert expected.size >= maps.MIN_PATTERN_SIZE
-    got = maps._compare_with_limits(alpha, limit)
+    assert expected.size >= stiffness_limit.MIN_PATTERN_SIZE
+    got = stiffness_limit._compare_with_limits(alpha, limit)
     assert got.dtype == bool
     np.testing.assert_array_equal(got, expected)
 
 
-def test_few_long_rows_and_more_values_than_places():
+def test_few_long_rows_and_shuffled_alpha():
     alpha = np.linspace(0.0, 1.0, 70_001)[None, :]
     for rows in (3, 9):
         limit = np.linspace(0.2, 0.9, rows)[:, None]
-        np.testing.assert_array_equal(maps._compare_with_limits(alpha, limit), (alpha > 0) & (alpha < limit))
-    shuffled = np.random.default_rng(4).permutation(alpha[0])[None, :]
-    np.testing.assert_array_equal(maps._compare_with_limits(shuffled, limit), (shuffled > 0) & (shuffled < limit))
+        np.testing.assert_array_equal(stiffness_limit._compare_with_limits(alpha, limit), (alpha > 0) & (alpha < limit))
+    mixed = np.random.default_rng(4).permutation(alpha[0])[None, :]
+    np.testing.assert_array_equal(stiffness_limit._compare_with_limits(mixed, limit), (mixed > 0) & (mixed < limit))
 
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.0, 4.3, 50.0])
-def test_a_map_and_its_points_one_by_one_agree(d):
+def test_grid_and_point_list_agree(d):
     alpha, beta = np.linspace(-0.01, 0.9, 301)[None, :], np.linspace(-0.3, 1.1, 303)[:, None]
     stable = is_stable(alpha, beta, 0.2, d)
-    # A pair of columns of one length is no map: each point is a row of its own.
-    columns = [np.ravel(part) for part in np.broadcast_arrays(alpha, beta)]
-    np.testing.assert_array_equal(stable.ravel(), is_stable(*columns, delta=0.2, d=d))
+    # Two raveled arrays are not recognized as a grid: every point is evaluated as a row of its own.
+    points = [np.ravel(part) for part in np.broadcast_arrays(alpha, beta)]
+    np.testing.assert_array_equal(stable.ravel(), is_stable(*points, delta=0.2, d=d))
     assert 0 < stable.sum() < stable.size
 
 
 @pytest.mark.parametrize("d", [1.0, 2.5, 8.0, 60.0, 500.0])
 @pytest.mark.parametrize("delta", [0.0, 1e-8, 0.3, 4.0, 1e3, 1e6])
-def test_rows_are_solved_to_the_last_digits(d, delta, monkeypatch):
+def test_row_limits_are_converged_to_rounding_error(d, delta, monkeypatch):
     fields = build_long_lobe(discretize_plant(np.float64(delta), np.float64(d)))
     beta = np.linspace(0.0, 0.999, 500)[1:] * fields.end_b - delta
     limit = row_limits(beta, np.array([delta]), np.array([d]))
     monkeypatch.setattr("zwidth.stability.rigid.stiffness_limit.ROW_STEPS", 6)
-    more = find_limit_long_delay(beta, fields)[0]
-    # beta itself is known to an ulp of delta, which near the lobe's end is more of the limit.
-    np.testing.assert_allclose(limit, more, rtol=1e-13, atol=2e-13 * more.max())
+    refined = find_limit_long_delay(beta, fields)[0]
+    # beta is accurate to one ulp of delta only, which near the end of the lobe is a larger relative error of the limit.
+    np.testing.assert_allclose(limit, refined, rtol=1e-13, atol=2e-13 * refined.max())
 
 
-def test_rows_that_are_compiled_are_those_that_are_not():
+def test_numpy_and_jax_routes_give_equal_row_limits():
     random = np.random.default_rng(4)
     delta, d = 10.0 ** random.uniform(-8, 6, 400), random.uniform(0, 6, 400)
     d[::2] = np.floor(d[::2])

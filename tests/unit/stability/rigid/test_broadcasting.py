@@ -1,4 +1,4 @@
-"""Arguments grouped by a key and put together again, against the same work on plainly broadcast arrays."""
+"""Folding of repeated values in broadcast arguments, against evaluation on fully broadcast arrays."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ import zwidth
 from zwidth.stability.rigid.broadcasting import fold, fold_arguments
 
 
-def test_an_axis_along_which_values_repeat_is_shortened_and_no_other():
+def test_fold_shortens_only_axes_of_repeated_values():
     values = np.arange(6.0).reshape(2, 1, 3)
     assert fold(np.broadcast_to(values, (2, 4, 3))).shape == (2, 1, 3)
-    # Equal ends do not make a repetition.
+    # Equal first and last values do not imply a constant axis.
     ends = np.ones((64, 64))
     ends[5] = 2.0
     assert fold(ends).shape == (64, 1)
@@ -17,7 +17,7 @@ def test_an_axis_along_which_values_repeat_is_shortened_and_no_other():
     assert fold(ends).shape == (1, 1)
 
 
-def test_a_contiguous_meshgrid_is_folded_as_a_sparse_one():
+def test_dense_meshgrid_is_folded_like_a_sparse_one():
     alpha, beta = np.linspace(0.01, 0.5, 512), np.linspace(0.01, 1.0, 300)
     full = np.meshgrid(alpha, beta)
     constant = np.full(full[0].shape, 0.1), np.ones(full[0].shape)

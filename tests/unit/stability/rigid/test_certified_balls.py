@@ -1,4 +1,4 @@
-"""Ball arithmetic: verdicts against independent poles, and what is exactly on the unit circle."""
+"""Verdicts in ball arithmetic, against poles computed by mpmath and loops with poles exactly on the unit circle."""
 
 import itertools
 
@@ -16,7 +16,7 @@ flint = pytest.importorskip("flint")
 
 @pytest.mark.parametrize("d", [0.0, 5e-324, 0.3, 1.0 - 2.0**-53, 1.0, 1.75, 4.0])
 @pytest.mark.parametrize("delta", [0.0, 1e-8, 0.4, 6.0])
-def test_verdict_is_that_of_the_poles(d, delta):
+def test_verdict_agrees_with_poles(d, delta):
     rng = np.random.default_rng(31)
     for alpha, beta in zip(rng.uniform(0, 1 + delta, 6), rng.uniform(-delta, 2 + delta, 6), strict=True):
         with mp.workdps(oracles.digits_for(delta)):
@@ -29,10 +29,10 @@ def test_verdict_is_that_of_the_poles(d, delta):
 
 @pytest.mark.parametrize("d", [0.0, 0.3, 1.0, 1.75, 4.0])
 @pytest.mark.parametrize("delta", [0.0, 0.4])
-def test_without_stiffness_the_other_poles_decide(d, delta):
-    # P = (z - 1) R; the roots of R by synthetic division of the polynomial as printed.
+def test_zero_stiffness_is_decided_by_the_remaining_poles(d, delta):
+    # P = (z - 1) R; synthetic division of the paper's polynomial yields R.
     rng = np.random.default_rng(41)
-    seen = set()
+    statuses = set()
     for beta in delta + rng.uniform(0.01, 4.0, 8) / (1.0 + d):
         with mp.workdps(60):
             p = oracles.polynomial(0.0, beta, delta, d)
@@ -40,39 +40,39 @@ def test_without_stiffness_the_other_poles_decide(d, delta):
             radius = max(abs(z) for z in mp.polyroots(r[::-1], maxsteps=400, asc=True))
         stable, status = certified.decide(0.0, float(beta), delta, d)
         assert (status, stable) == (Status.ON_BOUNDARY if radius < 1 else Status.OK, False)
-        seen.add(status)
-    assert len(seen) == 2
+        statuses.add(status)
+    assert len(statuses) == 2
 
 
 @pytest.mark.parametrize(("delta", "d"), [(0.0, 0.0), (0.4, 0.6), (0.0, 1.0), (0.4, 2.5), (6.0, 4.0)])
-def test_polynomial_is_the_printed_one(delta, d):
+def test_ball_polynomial_is_the_polynomial_of_the_paper(delta, d):
     with mp.workdps(60):
         exact = oracles.polynomial(0.3, 0.2, delta, d)[::-1]
-        found = ball_polynomial(0.3, 0.2, delta, d, 200)
-        assert len(found) == len(exact)
-        for ball, value in zip(found, exact, strict=True):
+        computed = ball_polynomial(0.3, 0.2, delta, d, 200)
+        assert len(computed) == len(exact)
+        for ball, value in zip(computed, exact, strict=True):
             assert abs(float(ball) - float(value)) <= 1e-15 * (1 + abs(float(value)))
 
 
-def test_enclosures_shrink_with_the_precision():
+def test_enclosures_of_plant_shrink_with_precision():
     for delta, d in itertools.product((5e-324, 1e-300, 1e-8, 0.5, 750.0, 1e12), (0.0, 0.5, 1.0 - 2.0**-53, 1.5)):
         for bits in (128, 512):
-            here = certified.device(delta, d, bits)
-            assert min(a.rel_accuracy_bits() for a in here if isinstance(a, flint.arb) and a != 0) >= bits - 45
+            plant = certified.device(delta, d, bits)
+            assert min(a.rel_accuracy_bits() for a in plant if isinstance(a, flint.arb) and a != 0) >= bits - 45
 
 
 @pytest.mark.parametrize("bits", [128, 1024, 4096])
-def test_zeros_on_the_circle_are_never_labelled_by_precision(bits):
-    # R = z^2 + 1 is left of P at alpha = 0, beta = 2, without delay and damping.
-    found = certified.compute_verdict(0.0, 2.0, 0.0, 0.0, bits)
-    assert not found.stable
-    assert not found.unstable
+def test_zeros_on_the_unit_circle_stay_undecided_at_any_precision(bits):
+    # At alpha = 0, beta = 2, without delay and damping, the remaining factor of P is R = z^2 + 1.
+    verdict = certified.compute_verdict(0.0, 2.0, 0.0, 0.0, bits)
+    assert not verdict.stable
+    assert not verdict.unstable
 
 
-def curve(n, x):
-    """The rational wall of delta = 0, whole d = n whose loop has a pole at ``e^(j w)``, ``cos w = x``, by its formula.
+def wall_with_pole_on_circle(n, x):
+    """Return the rational wall (alpha, beta) of delta = 0, integer d = n whose loop has a pole at e^(j w), x = cos w.
 
-    There ``alpha + beta (1 - 1/z) = -2 z^n (z - 1)^2/(z + 1)``.
+    On the boundary ``alpha + beta (1 - 1/z) = -2 z^n (z - 1)^2/(z + 1)``.
     """
     chebyshev, second = [flint.fmpq(1), x], [flint.fmpq(0), flint.fmpq(1)]
     for _ in range(n):
@@ -83,9 +83,9 @@ def curve(n, x):
     return real - beta * (1 - x), beta
 
 
-def test_what_is_exactly_on_the_circle_stays_undecided():
+def test_poles_exactly_on_the_unit_circle_are_undecided():
     assert certified.decide(0.0, 2.0, 0.0, 0.0) == (False, Status.UNDECIDED)
-    # Poles exactly at +-j, others outside.
+    # Poles at exactly +-j, others outside the unit circle.
     assert certified.decide(0.0, 2.0, 0.0, 4.0)[1] == Status.OK
     for beta in (np.nextafter(2.0, 1.0), np.nextafter(2.0, 3.0)):
         expected = Status.ON_BOUNDARY if beta < 2 else Status.OK
@@ -94,8 +94,8 @@ def test_what_is_exactly_on_the_circle_stays_undecided():
         assert first.stable or first.unstable
 
 
-def at_precision(alpha, beta, bits):
-    """The verdict of a rational wall at delta = 0, d = 1."""
+def decide_at_precision(alpha, beta, bits):
+    """Return the verdict on a rational wall at delta = 0, d = 1, computed with this many bits."""
     with flint.ctx.workprec(bits):
         wall = flint.arb(alpha), flint.arb(beta)
         return certified.decide_long_delay(
@@ -108,10 +108,10 @@ def at_precision(alpha, beta, bits):
 
 
 @pytest.mark.parametrize("bits", [64, 256, 1024])
-def test_twice_the_precision_decides_walls_closer_to_the_boundary(bits):
-    # The gain crossover is enclosed to half of the bits.
-    alpha, beta = curve(1, flint.fmpq(3, 4))
+def test_doubled_precision_decides_walls_closer_to_the_boundary(bits):
+    # The gain crossover is enclosed to half of the bits only.
+    alpha, beta = wall_with_pole_on_circle(1, flint.fmpq(3, 4))
     for side in (-1, 1):
         near = alpha + flint.fmpq(side, 2 ** (bits // 2 + 10))
-        assert not any(at_precision(near, beta, bits))
-        assert at_precision(near, beta, 2 * bits) == (side < 0, side > 0)
+        assert not any(decide_at_precision(near, beta, bits))
+        assert decide_at_precision(near, beta, 2 * bits) == (side < 0, side > 0)

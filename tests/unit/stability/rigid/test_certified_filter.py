@@ -1,4 +1,4 @@
-"""The static error bound of the certified filter, against the same source code in balls of python-flint.
+"""Static error bounds of the certified filter, against the same source code evaluated in balls of python-flint.
 
 `test_certified_balls` compares those balls with poles computed by mpmath.
 """
@@ -6,8 +6,8 @@
 import jax
 import numpy as np
 import pytest
+from certified_labels import certified_stable
 from mpmath import mp
-from proved import certified_stable
 
 import oracles
 from zwidth.numerics.held_mass import classify_delays, phi_functions
@@ -49,7 +49,7 @@ def errors(computed, exact, index, precision=BITS):
         ]
 
 
-def numbers(plant, exact):
+def collect_terms(plant, exact):
     """Return the terms of a device and the coefficients of its curve, with their exact values."""
     names = [
         name
@@ -137,36 +137,36 @@ def computed_differences(monkeypatch, operation):
 
 
 @pytest.mark.parametrize("d", DELAYS)
-def test_bounds_of_the_crossover_hold(d, monkeypatch):
+def test_error_bounds_of_the_crossover_hold(d, monkeypatch):
     alpha, beta, delta, d = walls(60, 11, d)
     wall = Sized(alpha), Sized(beta)
     with np.errstate(all="ignore"):
         plant = size_device(delta, d, classify_delays(d))
         cubic = expand_gain_difference(*wall, plant)
-        u, found = enclose_root(cubic)
+        u, exists = enclose_root(cubic)
         computed = certified.size_phase(u, np.floor(d))
     differences = computed_differences(
         monkeypatch, lambda: decide_long_delay(*wall, plant.whole, plant, enclose_root, certified.size_phase)
     )
-    seen = 0
+    compared = 0
     for index in range(alpha.size):
         exact = certified.device(delta[index], d[index], BITS)
         with flint.ctx.workprec(BITS):
             x, y = flint.arb(alpha[index]), flint.arb(beta[index])
             true_cubic = expand_gain_difference(x, y, exact)
             assert max(errors(cubic, true_cubic, index)) < CUBIC_TOLERANCE / 2
-            assert max(errors(*numbers(plant, exact), index)) < CUBIC_TOLERANCE / 2
-            if not found[index]:
+            assert max(errors(*collect_terms(plant, exact), index)) < CUBIC_TOLERANCE / 2
+            if not exists[index]:
                 continue
-            root, sure = certified._enclose_root_in_balls(true_cubic)
-            assert sure
+            root, converged = certified._enclose_root_in_balls(true_cubic)
+            assert converged
             assert float(abs(root / u.value[index] - 1).upper()) < CROSSOVER_WIDTH
             lag = certified._evaluate_phase_in_balls(root, int(d[index]))
             assert not computed.within[index] or lag.within
             assert not computed.beyond[index] or lag.beyond
             if not lag.within:
                 continue
-            seen += 1
+            compared += 1
             assert max(errors(computed[:3], lag[:3], index)) < 4 * CROSSOVER_WIDTH
 
             def judge(a, b, terms, root=root, whole=int(d[index]), lag=lag):
@@ -176,19 +176,19 @@ def test_bounds_of_the_crossover_hold(d, monkeypatch):
             true = exact_differences(judge, (x, y), exact)
             assert len(true) == len(differences)
             assert max(errors(differences, true, index)) < TOLERANCE / 2
-    assert seen > 15
+    assert compared > 15
 
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1e-9, 5e-324, 0.125, 0.93, 1.0 - 2.0**-53])
-def test_bounds_of_a_short_device_hold(d):
+def test_error_bounds_of_plants_with_short_delay_hold(d):
     with np.errstate(all="ignore"):
         plant = size_device(DELTAS, np.full(DELTAS.size, d), classify_delays(d))
     for index, delta in enumerate(DELTAS):
-        assert max(errors(*numbers(plant, certified.device(float(delta), d, 1600)), index)) < CUBIC_TOLERANCE / 2
+        assert max(errors(*collect_terms(plant, certified.device(float(delta), d, 1600)), index)) < CUBIC_TOLERANCE / 2
 
 
 @pytest.mark.parametrize("d", [0.0, 0.3, 0.93])
-def test_bounds_of_a_short_verdict_hold(d, monkeypatch):
+def test_error_bounds_of_verdicts_with_short_delay_hold(d, monkeypatch):
     alpha, beta, delta, _ = walls(80, 13, d)
     plant = size_device(delta, np.full(80, d), classify_delays(d))
     differences = computed_differences(monkeypatch, lambda: decide_short_delay(Sized(alpha), Sized(beta), plant))
@@ -198,21 +198,21 @@ def test_bounds_of_a_short_verdict_hold(d, monkeypatch):
             wall, exact = (flint.arb(alpha[index]), flint.arb(beta[index])), certified.device(delta[index], d, BITS)
             true = exact_differences(decide_short_delay, wall, exact)
             assert len(true) == len(differences)
-            # Skip differences without a finite value, because beyond the end of the lobe the root does not exist.
+            # Skip differences without a finite value, because the root does not exist beyond the end of the lobe.
             kept = [k for k, value in enumerate(true) if value.is_finite()]
             compared += len(kept) == len(true)
             assert max(errors([differences[k] for k in kept], [true[k] for k in kept], index)) < TOLERANCE / 2
     assert compared > 40
 
 
-def test_a_bound_too_small_is_noticed():
+def test_error_bound_of_half_an_ulp_is_exceeded():
     _, _, delta, d = walls(60, 11, [1.5, 4.2, 2.5])
     plant = size_device(delta, d, classify_delays(d))
-    worst = [max(errors(*numbers(plant, certified.device(delta[i], d[i], BITS)), i)) for i in range(60)]
+    worst = [max(errors(*collect_terms(plant, certified.device(delta[i], d[i], BITS)), i)) for i in range(60)]
     assert max(worst) > UNIT / 2
 
 
-def test_exponentials_and_phi_functions_are_as_accurate_as_assumed():
+def test_phi_functions_satisfy_the_assumed_error_bounds():
     x = np.concatenate([np.random.default_rng(5).uniform(0, 4, 1500), DELTAS])
     with jax.enable_x64(True):
         compiled = [np.asarray(part) for part in jax.jit(phi_functions)(x)]
@@ -225,12 +225,12 @@ def test_exponentials_and_phi_functions_are_as_accurate_as_assumed():
             for c, phi1, phi2, psi, gap in (phi_functions(x), compiled):
                 assert oracles.relative_error(c[index], exact.c, floor=1e-280) <= 17 * UNIT
                 pairs = (phi1, exact.phi1), (phi2, exact.phi2), (psi, exact.psi), (gap, exact.phi2 - exact.psi)
-                for found, truth in pairs:
-                    assert oracles.relative_error(found[index], truth, floor=1e-300) <= 30 * UNIT
+                for computed, truth in pairs:
+                    assert oracles.relative_error(computed[index], truth, floor=1e-300) <= 30 * UNIT
 
 
 @pytest.mark.parametrize("d", [0.0, 0.4, 1.0, 3.0, 1.7, 40.0])
-def test_labels_of_the_filter_are_those_of_balls(d):
+def test_filter_labels_agree_with_balls(d):
     alpha, beta, delta, _ = walls(4000, 19, d)
     truth = certified_stable(alpha, beta, delta, d)
     code = certified.filter_walls(alpha, beta, delta, np.full(1, d))

@@ -1,4 +1,4 @@
-"""The distance within which Newton's steps prove a pole, against mpmath."""
+"""The radius that a Newton step certifies to contain a pole, against poles computed by mpmath."""
 
 import numpy as np
 import pytest
@@ -25,17 +25,17 @@ def walls(d, count=12):
     ]
 
 
-def loop_at(alpha, beta, delta, d):
+def build_loop(alpha, beta, delta, d):
     return factor_loop(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d), d % 1.0 != 0.0)
 
 
 @pytest.mark.parametrize("d", [0.0, 3.0, 0.5, 2.25])
-def test_a_pole_is_as_near_as_is_said(d):
+def test_newton_radius_contains_a_pole(d):
     for alpha, beta, delta, re, im in walls(d):
-        loop, fractional = loop_at(alpha, beta, delta, d), d % 1.0 != 0.0
+        loop, fractional = build_loop(alpha, beta, delta, d), d % 1.0 != 0.0
         with mp.workdps(60):
             poles = oracles.roots(oracles.polynomial(alpha, beta, delta, d))
-        # From far away to where Newton's method stands still.
+        # Iterate from a remote start until Newton's method has converged.
         for _ in range(8):
             step = newton_step(np.float64(re), np.float64(im), loop, fractional)
             with mp.workdps(60):

@@ -1,4 +1,4 @@
-"""The ends of the domain belong to it, and the next number beyond does not."""
+"""The supported domain includes its limits and excludes the next float64 beyond each."""
 
 import jax
 import numpy as np
@@ -10,37 +10,37 @@ from zwidth.stability.rigid.normalization import device_status, wall_status
 from zwidth.units.quantities import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE
 
 
-@pytest.mark.parametrize("place, end", [(0, LARGEST_DAMPING), (1, LONGEST_DELAY)])
-def test_ends_of_a_device(place, end):
-    for value, status in ((end, Status.OK), (np.nextafter(end, np.inf), Status.OUT_OF_RANGE)):
+@pytest.mark.parametrize("index, limit", [(0, LARGEST_DAMPING), (1, LONGEST_DELAY)])
+def test_limits_of_device_parameters(index, limit):
+    for value, status in ((limit, Status.OK), (np.nextafter(limit, np.inf), Status.OUT_OF_RANGE)):
         device = [np.float64(0.5), np.float64(0.5)]
-        device[place] = np.float64(value)
+        device[index] = np.float64(value)
         assert device_status(*device) == status
         assert wall_status(np.float64(0.1), np.float64(0.1), *device) == status
-        device[place] = -device[place]
+        device[index] = -device[index]
         assert device_status(*device) == Status.INVALID_INPUT
 
 
-@pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.parametrize("index", [0, 1])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_ends_of_a_wall(place, sign):
-    least, most = WALL_RANGE
+def test_limits_of_wall_parameters(index, sign):
+    smallest, largest = WALL_RANGE
     for value, status in (
         (0.0, Status.OK),
-        (least, Status.OK),
-        (most, Status.OK),
-        (np.nextafter(least, 0.0), Status.OUT_OF_RANGE),
-        (np.nextafter(most, np.inf), Status.OUT_OF_RANGE),
+        (smallest, Status.OK),
+        (largest, Status.OK),
+        (np.nextafter(smallest, 0.0), Status.OUT_OF_RANGE),
+        (np.nextafter(largest, np.inf), Status.OUT_OF_RANGE),
     ):
         wall = [np.float64(0.1), np.float64(0.1)]
-        wall[place] = np.float64(sign * value)
+        wall[index] = np.float64(sign * value)
         assert wall_status(wall[0], wall[1], np.float64(0.0), np.float64(0.0)) == status
 
 
 @pytest.mark.parametrize(
     "mark", [lambda ok, x: nan_unless(ok, x)[0] ** 2, lambda ok, x: x * x + nan_with_nan_derivatives(ok, x)]
 )
-def test_a_bad_point_is_nan_with_its_derivatives_and_a_good_one_untouched(mark):
+def test_invalid_points_are_nan_with_nan_derivatives(mark):
     for order in range(3):
         value = lambda x: mark(x < 2.0, x)  # noqa: E731
         for _ in range(order):

@@ -1,4 +1,4 @@
-"""The corners of the model: which method still tells stable from unstable, judged by proofs."""
+"""Accuracy of every method at extremes of the parameters, judged by certified verdicts."""
 
 import numpy as np
 import pytest
@@ -8,52 +8,52 @@ import zwidth
 from methods import extremes
 from zwidth.core.status import Status
 
-# method -> the farthest relative distance from the boundary at which a label may be wrong.
-HELD = {
+# Largest relative distance from the boundary at which each method may return a wrong label.
+LARGEST_ERROR = {
     "crossover": 1e-15,
-    # Where poles nearly coincide, eigenvalues keep half of their digits, and a quarter at delta = 1e12.
+    # At nearly multiple poles, eigenvalues have half of their digits, and a quarter at delta = 1e12.
     "companion": 1e-2,
 }
 DELAYS = [0.0, float(np.nextafter(1.0, 0.0)), 1.0, 50.0, 500.0, 1e5]
 
 
 @pytest.mark.parametrize("d", DELAYS, ids=str)
-def test_every_method_holds_where_it_says(d, monkeypatch):
+def test_every_method_is_right_outside_its_error_band(d, monkeypatch):
     if d >= 50:
-        # All poles of long delays take long, and show nothing new.
+        # The companion matrices of long delays are slow and exercise nothing new.
         monkeypatch.setattr(extremes, "METHODS", ["crossover"])
     outcomes = list(extremes.judge(d))
     assert {outcome.points >= 60 for outcome in outcomes} == {True}
     for outcome in outcomes:
         if outcome.method == "crossover" and np.isnan(outcome.farthest):
             pytest.fail(f"{outcome}: beside the start and for soft walls the closed form is exact")
-        # Soft walls and those beside the start are told apart by less than a rounding error of the coefficients.
-        assert np.isnan(outcome.farthest) or outcome.farthest <= HELD[outcome.method], outcome
+        # Near the start of the boundary and for soft walls, a rounding error of the coefficients exceeds the distance.
+        assert np.isnan(outcome.farthest) or outcome.farthest <= LARGEST_ERROR[outcome.method], outcome
 
 
 @pytest.mark.parametrize("d", [np.float64(np.inf), np.float64(np.nan), np.float64(-np.inf), np.inf])
-def test_what_is_no_delay_has_a_status_and_no_warning(d):
-    # The remainder of NumPy's infinity by 1 warns.
+def test_non_finite_delay_has_a_status_and_no_warning(d):
+    # NumPy warns when it computes the remainder of infinity by 1.
     assert not zwidth.is_stable(0.1, 0.4, 0.1, d)
     assert zwidth.alpha_max(0.1, d).status == Status.INVALID_INPUT
 
 
-def test_softer_walls_at_the_damping_of_a_corner_are_stable():
-    """There the lobe meets the line of z = -1, at y = 1 but for rounding errors, and both end the row."""
+def test_softer_walls_at_the_beta_of_a_corner_are_stable():
+    """At the corner the lobe meets the line of z = -1 (y = 1 up to rounding errors), and both limit the row."""
     random = np.random.default_rng(5)
     delta, d = 10 ** random.uniform(-3, 3, 6000), np.append(random.uniform(0, 1, 5990), np.zeros(10))
     top = zwidth.alpha_max(delta, d)
     corner = np.flatnonzero(top.kind == zwidth.RidgeKind.CORNER)
     assert corner.size > 400
     alpha, beta, delta, d = top.alpha[corner], top.beta[corner], delta[corner], d[corner]
-    for share in (1e-9, 0.5, 1.0 - 1e-9):
-        assert zwidth.is_stable(share * alpha, beta, delta, d).all()
-        assert zwidth.decide_stability(share * alpha, beta, delta, d, method="certified").stable.all()
+    for ratio in (1e-9, 0.5, 1.0 - 1e-9):
+        assert zwidth.is_stable(ratio * alpha, beta, delta, d).all()
+        assert zwidth.decide_stability(ratio * alpha, beta, delta, d, method="certified").stable.all()
     assert not zwidth.is_stable((1.0 + 1e-9) * alpha, beta, delta, d).any()
 
 
-def test_a_wall_that_is_the_larger_part_at_every_frequency_is_unstable():
-    """Far beyond ``|L(-1)| = 1`` the formulas of the row hold nothing but rounding errors."""
+def test_wall_with_gain_above_one_at_every_frequency_is_unstable():
+    """Far above ``|L(-1)| = 1`` the formulas of the row contain only rounding errors."""
     random = np.random.default_rng(0)
     delta, d = 10 ** random.uniform(-15, -6, 20000), 10 ** random.uniform(-15, -8, 20000)
     d[::2] = 1.0 - d[::2]
@@ -63,30 +63,30 @@ def test_a_wall_that_is_the_larger_part_at_every_frequency_is_unstable():
 
 
 @pytest.mark.parametrize("method", ["crossover", "companion", "certified"])
-def test_bad_input_among_good(method):
+def test_invalid_points_do_not_affect_valid_ones(method):
     bad = [np.nan, np.inf, -np.inf]
     alpha = np.array([0.1, *bad, 0.1, 0.1, 0.1, 0.1, 0.1])
     delta = np.array([0.1, 0.1, 0.1, 0.1, *bad, -1.0, 0.1])
-    found = zwidth.decide_stability(alpha, 0.3, delta, 1.0, method=method)
-    assert found.status.tolist() == [0, *[Status.INVALID_INPUT] * 7, 0]
-    assert found.stable.tolist() == [True, *[False] * 7, True]
+    result = zwidth.decide_stability(alpha, 0.3, delta, 1.0, method=method)
+    assert result.status.tolist() == [0, *[Status.INVALID_INPUT] * 7, 0]
+    assert result.stable.tolist() == [True, *[False] * 7, True]
     for d in (np.nan, np.inf, -1.0):
         assert zwidth.decide_stability(0.1, 0.3, 0.1, d, method=method).status == Status.INVALID_INPUT
 
 
 @pytest.mark.parametrize("delta", extremes.DELTAS, ids=str)
-def test_the_radius_of_a_stiff_wall_and_a_soft_one(delta):
+def test_radius_of_a_very_soft_and_a_very_stiff_wall(delta):
     walls = (np.array([1e-30, 1e3 * (1 + delta)]), 0.1 * (1 + delta), delta, 0.0)
-    found = bound_radius(*walls)
-    assert (found.status == Status.OK).all()
-    # The soft wall's slowest pole is at 1, to rounding; the stiff one's is far outside.
-    assert found.radius[0] == pytest.approx(1.0, abs=1e-8)
-    assert found.radius[1] > 1
+    result = bound_radius(*walls)
+    assert (result.status == Status.OK).all()
+    # The dominant pole of the soft wall is 1 up to rounding, that of the stiff wall far outside the unit circle.
+    assert result.radius[0] == pytest.approx(1.0, abs=1e-8)
+    assert result.radius[1] > 1
     exact = zwidth.spectral_radius(*walls, method="companion")
-    np.testing.assert_allclose(found.radius, exact, rtol=1e-7)
+    np.testing.assert_allclose(result.radius, exact, rtol=1e-7)
 
 
-def test_the_report_names_every_method_and_delay():
+def test_report_lists_every_method_and_delay():
     text = extremes.report((0.0,))
     assert text.count("## ") == text.count(f"| d | {' | '.join(extremes.METHODS)} |") == 4
     assert text.count("\n| 0 | ") == 4

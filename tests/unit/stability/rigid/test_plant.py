@@ -1,4 +1,4 @@
-"""The held plant, and the paper's transfer functions made of it, against the printed formulas in mpmath."""
+"""The discretized mass, and the paper's transfer functions computed from it, against the printed formulas in mpmath."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ GRID = np.array([(delta, fraction) for delta in DAMPINGS for fraction in FRACTIO
 
 
 def digits(delta, fraction):
-    """Enough to see 1 - f beside f, and both beside the cancellation in delta."""
+    """Return digits sufficient for 1 - f, f and the cancellation in delta."""
     return oracles.digits_for(delta) + oracles.digits_for(fraction)
 
 
@@ -30,12 +30,12 @@ def test_gap_is_the_numerator_at_minus_one(plants):
     for row, (delta, fraction) in enumerate(GRID):
         with mp.workdps(digits(delta, fraction)):
             a2, a1, a0 = oracles.numerator(delta, fraction)
-            # The gap changes sign with the fraction; its error is measured by the terms it is made of.
+            # The gap changes sign with the fraction, so its error is relative to the sum of its terms.
             error = abs(mpf(float(plants.gap[row])) - (a2 - a1 + a0)) / (a2 + a1 + a0)
         assert error <= tol.PLANT.float64, (delta, fraction)
 
 
-def test_one_minus_c_keeps_its_digits(plants):
+def test_c_and_one_minus_c_are_accurate(plants):
     for row, (delta, _) in enumerate(GRID):
         with mp.workdps(oracles.digits_for(delta)):
             assert oracles.relative_error(plants.em[row], 1 - mp.exp(-mpf(delta))) <= tol.PLANT.float64
@@ -43,7 +43,7 @@ def test_one_minus_c_keeps_its_digits(plants):
 
 
 @pytest.mark.parametrize(
-    "d, whole, fraction",
+    "d, n_expected, fraction",
     [
         (0.0, 0, 0.0),
         (2.0, 2, 0.0),
@@ -53,16 +53,18 @@ def test_one_minus_c_keeps_its_digits(plants):
         (500.5, 500, 0.5),
     ],
 )
-def test_split_is_exact(d, whole, fraction, x64):
+def test_split_delay_is_exact(d, n_expected, fraction, x64):
     n, f = split_delay(np.float64(d))
-    assert (float(n), float(f)) == (whole, fraction)
+    assert (float(n), float(f)) == (n_expected, fraction)
 
 
 PHYSICAL = [(0.1, 10.0, 1e-3), (0.1, 100.0, 1e-3), (2.0, 1e-9, 5e-4), (0.045, 300.0, 2e-2)]
 
 
 def transfers(mass, damping, period):
-    """Numerator and denominator of the paper's H_v and H_x, from held force in N to sampled velocity and position."""
+    """Return numerators and denominators of the paper's H_v and H_x, from held force in N to sampled velocity and
+    position.
+    """
     delta = np.float64(damping * period / mass)
     plant = discretize_mass(delta)
     gain = period * period / mass
@@ -71,7 +73,7 @@ def transfers(mass, damping, period):
 
 
 @pytest.mark.parametrize("mass, damping, period", PHYSICAL)
-def test_transfers_are_eqs_5_and_9(mass, damping, period):
+def test_transfer_functions_are_eqs_5_and_9(mass, damping, period):
     velocity, position = transfers(mass, damping, period)
     allowed = tol.TRANSFER.float64 * (1 + damping * period / mass)
     with mp.workdps(60):
@@ -79,16 +81,16 @@ def test_transfers_are_eqs_5_and_9(mass, damping, period):
         c = mp.exp(-T * b / m)
         assert oracles.worst(velocity[0], [(1 - c) / b]) <= tol.TRANSFER.float64
         assert oracles.worst(velocity[1], [mpf(1), -c]) <= allowed
-        # T b (z - c) + m (1 - z)(1 - c) over b^2
+        # (T b (z - c) + m (1 - z)(1 - c))/b^2
         numerator = [(T * b - m * (1 - c)) / b**2, (-T * b * c + m * (1 - c)) / b**2]
         assert oracles.worst(position[0], numerator) <= tol.TRANSFER.float64
         assert oracles.worst(position[1], [mpf(1), -(1 + c), c]) <= allowed
 
 
-def test_limits_without_damping_are_eqs_12_and_13():
+def test_undamped_transfer_functions_are_eqs_12_and_13():
     mass, period = 0.25, 1 / 512
     velocity, position = transfers(mass, 0.0, period)
-    # Powers of two: no rounding at all.
+    # All values are powers of two: no rounding errors.
     np.testing.assert_array_equal(velocity[0], [period / mass])
     np.testing.assert_array_equal(velocity[1], [1, -1])
     np.testing.assert_array_equal(position[0], [period**2 / (2 * mass)] * 2)

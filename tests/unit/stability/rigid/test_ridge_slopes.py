@@ -1,4 +1,6 @@
-"""Closed-form derivatives of the ridge against 60 digits, and through JAX's transformations."""
+"""Closed-form derivatives of the ridge against finite differences in 60 digits, directly and inside JAX
+transformations.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -12,25 +14,25 @@ from zwidth.numerics import evaluate
 from zwidth.stability.rigid.ridge import ridge_kernel, slopes_kernel
 
 
-def precise_plant(delta, f):
-    """a2, a1, a0 and gap from superposed position and velocity responses: a route of its own."""
+def plant_in_mpmath(delta, f):
+    """Return a2, a1, a0 and gap, independently, from superposed position and velocity responses."""
 
-    def held_for(t):
+    def respond_to_pulse(t):
         if delta == 0:
             return t * t / 2, t
         speed = -mp.expm1(-delta * t) / delta
         return (t - speed) / delta, speed
 
     c = mp.exp(-delta)
-    (x, v), (late, speed) = held_for(mp.mpf(1)), held_for(1 - f)
+    (x, v), (late, speed) = respond_to_pulse(mp.mpf(1)), respond_to_pulse(1 - f)
     a2, a1, a0 = late, v * speed - c * late + x - late, v * (v - speed) - c * (x - late)
     return a2, a1, a0, a2 - a1 + a0
 
 
-def precise_alpha(delta, d, guess):
-    """alpha_max by 60-digit Newton steps on the curve of the definitions."""
+def alpha_in_mpmath(delta, d, guess):
+    """Return alpha_max by root finding in 60 digits on the boundary curve."""
     n = mp.floor(d)
-    a2, a1, a0, _ = precise_plant(delta, d - n)
+    a2, a1, a0, _ = plant_in_mpmath(delta, d - n)
     c = mp.exp(-delta)
 
     def height(omega):
@@ -44,27 +46,29 @@ def precise_alpha(delta, d, guess):
 POINTS = [(0.0, 0.5), (0.1, 1.3), (0.1, 1.0), (3.0, 0.25), (20.0, 0.6), (0.7, 6.5), (50.0, 3.5)]
 
 
-def precise_derivatives(delta, d, omega):
-    """Gradient and Hessian from the right, as documented: four points each way leave an error of step^3 and less."""
+def derivatives_in_mpmath(delta, d, omega):
+    """Return gradient and Hessian, both from the right as documented, by one-sided differences of four points per
+    variable.
+    """
     step = mp.mpf(10) ** -9
     with mp.workdps(60):
         first, second = (mp.mpf(-11) / 6, 3, mp.mpf(-3) / 2, mp.mpf(1) / 3), (2, -5, 4, -1)
-        at = [[precise_alpha(delta + i * step, d + j * step, omega) for j in range(4)] for i in range(4)]
-        down, across = [at[i][0] for i in range(4)], at[0]
-        mixed = sum(first[i] * first[j] * at[i][j] for i in range(4) for j in range(4)) / step**2
+        values = [[alpha_in_mpmath(delta + i * step, d + j * step, omega) for j in range(4)] for i in range(4)]
+        down, across = [values[i][0] for i in range(4)], values[0]
+        mixed = sum(first[i] * first[j] * values[i][j] for i in range(4) for j in range(4)) / step**2
         gradient = [mp.fdot(first, line) / step for line in (down, across)]
         bends = [mp.fdot(second, line) / step**2 for line in (down, across)]
     return np.array(gradient, float), np.array([[bends[0], mixed], [mixed, bends[1]]], float)
 
 
-def test_gradient_and_hessian_against_60_digits(x64):
+def test_gradient_and_hessian_agree_with_60_digits(x64):
     def alpha(p):
         return zwidth.alpha_max(p[0], p[1]).alpha
 
     _, hessians = compile_bends(jax.grad(alpha))(POINTS)
     for k, (delta, d) in enumerate(POINTS):
         point = zwidth.alpha_max(delta, d)
-        gradient, hessian = precise_derivatives(delta, d, point.omega)
+        gradient, hessian = derivatives_in_mpmath(delta, d, point.omega)
         size = 1 + abs(float(point.alpha))
         by_hand = slopes_kernel(np.float64(delta), np.float64(d))
         np.testing.assert_allclose((by_hand.by_delta, by_hand.by_d), gradient, rtol=1e-13, atol=1e-14 * size)
@@ -78,8 +82,8 @@ def test_gradient_and_hessian_against_60_digits(x64):
         np.testing.assert_allclose(bend, hessian[0, 1], rtol=1e-10, atol=1e-11 * size)
 
 
-def test_a_start_is_close_everywhere():
-    """The last of three steps leaves rounding only if the one before left less than its root, over the whole domain."""
+def test_newton_converges_in_three_steps_everywhere():
+    """The status is OK only if the second of three steps was below the square root of the rounding error."""
     rng = np.random.default_rng(5)
     for low, high in ((0.0, 1.0), (1.0, 2.0), (2.0, 9.0), (9.0, 1e5)):
         d = rng.uniform(low, high, 20000) if high < 10 else 10 ** rng.uniform(1, 5, 20000)
@@ -93,22 +97,22 @@ def test_a_start_is_close_everywhere():
         assert np.isfinite(point.alpha).all()
 
 
-# Whole and broken delays, the corner of d = 0 on both sides of its take-over, its first and its last device.
+# Integer and fractional delays, both sides of the corner transition of d = 0, smallest and largest damping.
 HARD = [(0.0, 0.0), (1e-12, 0.0), (3.6593, 0.0), (3.6594, 0.0), (50.0, 0.0), (1e6, 0.0), (0.0, 1.0), (0.3, 1.0)]
 HARD += [(0.3, 1.5), (1e6, 0.37), (1e-9, 499.5), (2.0, 500.0), (1e6, 500.0), (30.0, 0.01), (-1.0, 1.0), (np.nan, 2.0)]
 
 
-def every_slope(function, delta, d):
-    """d (alpha, beta, omega) by delta and d of one device each."""
+def differentiate_all(function, delta, d):
+    """Return the derivatives of (alpha, beta, omega) by delta and d at every device."""
     sides = [
-        jax.jvp(lambda *at: function(*at)[:3], (delta, d), side)[1]
+        jax.jvp(lambda *args: function(*args)[:3], (delta, d), side)[1]
         for side in ((1.0 + 0 * d, 0 * d), (0 * d, 1.0 + 0 * d))
     ]
     return np.array(sides)
 
 
-def test_gradients_at_concrete_devices_are_those_that_are_compiled(x64):
-    """They are formed without the compiler: by complex steps in NumPy through the text that JAX differentiates."""
+def test_gradients_without_compiler_agree_with_compiled_ones(x64):
+    """Gradients at concrete values need no compiler: NumPy evaluates the same source code at complex steps."""
     rng = np.random.default_rng(5)
     delta, d = (
         np.concatenate([column, drawn])
@@ -117,26 +121,27 @@ def test_gradients_at_concrete_devices_are_those_that_are_compiled(x64):
         )
     )
     delta, d = jnp.asarray(delta), jnp.asarray(d)
-    concrete = every_slope(zwidth.alpha_max, delta, d)
-    compiled = every_slope(jax.jit(lambda *at: zwidth.alpha_max(*at)[:3]), delta, d)
+    concrete = differentiate_all(zwidth.alpha_max, delta, d)
+    compiled = differentiate_all(jax.jit(lambda *args: zwidth.alpha_max(*args)[:3]), delta, d)
     valid = (delta >= 0.0) & np.isfinite(delta)
     assert np.isfinite(concrete[..., valid]).all()
     assert np.isnan(concrete[..., ~valid]).all()
-    # Of a device's largest slope: where a damping has ceased to matter, its slopes are differences of equal terms.
-    # A slope of omega grows towards the corner as one over the distance, by which a rounded s is then too rough.
+    # Errors are relative to the largest derivative of a device, because derivatives by an irrelevant damping are
+    # differences of equal terms. Near the corner the derivative of omega grows inversely with the distance, which
+    # amplifies rounding errors.
     size = np.abs(compiled).max(axis=(0, 1))
     assert (np.abs(concrete - compiled) <= 1e-13 * size * np.maximum(1.0, size))[..., valid].all()
 
 
-def test_a_first_gradient_compiles_no_kernel(x64, monkeypatch):
+def test_first_gradient_compiles_no_kernel(x64, monkeypatch):
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
-        lambda event, duration_secs, **words: (
-            compiled.append(words.get("fun_name")) if "backend_compile" in event else None
+        lambda event, duration_secs, **arguments: (
+            compiled.append(arguments.get("fun_name")) if "backend_compile" in event else None
         )
     )
     try:
-        # As if no kernel had been compiled before; other tests keep theirs.
+        # Disable the cache of compiled kernels in this test only.
         monkeypatch.setattr(evaluate, "compile_traced", evaluate.compile_traced.__wrapped__)
         quick = jax.grad(lambda delta: zwidth.alpha_max(delta, 1.25).alpha)(0.3)
         assert not [name for name in compiled if "by_argument" in str(name) or "plain" in str(name)]

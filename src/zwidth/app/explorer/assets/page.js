@@ -37,7 +37,7 @@ function addRow(form, name, label, ...controls) {
 // Add the input field of a number; `change` converts the number to changed parameters.
 function addNumber(field, name, change = value => ({ [name]: value }), kind = "not a number") {
   const number = field.number = element("input", { type: "number", step: "any", id: name });
-  number.addEventListener("input", () => doubt(number.value !== String(field.shown)));
+  number.addEventListener("input", () => markStale(number.value !== String(field.shown)));
   number.addEventListener("keydown", event => { if (event.key === "Escape") send({}, true); });
   number.addEventListener("change", () => {
     moved = "";
@@ -119,18 +119,18 @@ function flush() {
   });
 }
 // Mark the results as stale while an input field differs from the computed scene.
-function doubt(is) {
+function markStale(is) {
   document.body.classList.toggle("stale", is);
   by("stale").hidden = !is;
 }
 function refuse(names, why) {
   by("error").textContent = why;
-  doubt(true);
+  markStale(true);
   for (const name of names) fields[name]?.number?.setAttribute("aria-invalid", true);
 }
 function accept() {
   by("error").textContent = "";
-  doubt(false);
+  markStale(false);
   for (const field of Object.values(fields)) field.number?.removeAttribute("aria-invalid");
 }
 function remember(link, number) {
