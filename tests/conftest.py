@@ -92,7 +92,7 @@ def _check_open_resources():
 
 @pytest.fixture
 def fitted_once():
-    """Fit each log and each list of walls only once per process."""
+    """Compute each fit, wall search and diagnosis of commands, studies and pages only once per process."""
     from fitted_once import fitting_once
 
     with fitting_once():

@@ -1,7 +1,9 @@
-"""Every public function with every argument type, in every JAX transformation and in both precisions.
+"""Every public function with every argument type, in JAX transformations and in both precisions.
 
 At most one argument is traced, or all; the others share one type. Values are integers, which every type
-represents exactly.
+represents exactly. Functions that convert their arguments by the same code share one representative, which is traced
+with every type in every transformation. All other functions are called directly with every type, and traced with the
+most common types, at shapes for which one compiled program serves all types.
 """
 
 from __future__ import annotations
@@ -39,6 +41,19 @@ TYPES = NUMBERS | ARRAYS
 CONVERSIONS = ("int", "float", "int32", "JAX float32", "list of int", "float64 array")
 # One scalar and one array: conversions in single precision follow the same paths, which saves compilations.
 SINGLE_CONVERSIONS = ("int", "float64 array")
+# One function per way of evaluation: quantities with units, a compiled kernel, a kernel with derivatives by NumPy, the
+# same in SI units, results with an axis of their own, conversion of complex numbers, methods of scenes.
+REPRESENTATIVES = (
+    "normalize",
+    "passivity_margin",
+    "alpha_max",
+    "max_stiffness",
+    "char_poly",
+    "count_poles",
+    "Scene.passivity_margin",
+)
+# Types of the arguments that are not traced, for all other functions.
+COMMON = ("int", "float", "float32", "float64", "list of int", "int array", "float64 array", "JAX float32 array")
 DIFFERENTIATED = ("grad", "jit(grad)", "hessian")
 ALL = "all"  # instead of an argument's name: all arguments are traced
 EVERY_CASE = [*CASES, *SCENE_CASES]
@@ -54,7 +69,33 @@ class Combination(NamedTuple):
 
 
 def combinations(case: Case) -> Iterator[Combination]:
-    """Yield all combinations that the contract covers for a function."""
+    """Yield the entries of a function: all of them for a representative, otherwise the common ones."""
+    yield from all_combinations(case) if case.name in REPRESENTATIVES else common_combinations(case)
+
+
+def common_combinations(case: Case) -> Iterator[Combination]:
+    """Yield direct calls with every type, traced calls with the common types, and the highest promised derivative."""
+    for x64 in (True, False):
+        for kind in TYPES:
+            yield Combination(kind, "direct", "", x64)
+    if case.refuses_tracing:
+        return
+    # Two walls each, also of scenes, whose parameters are single numbers: one program serves all types.
+    first, last = case.free[0], case.free[-1]
+    yield Combination("float64 array", "jit", ALL, True)
+    for kind in COMMON:
+        yield Combination(kind, "jit", first if kind in ARRAYS and last not in case.one_number else last, True)
+    yield Combination("float64 array", "jit", last, False)
+    if case.derivatives is None:
+        yield Combination("float64 array", "vmap", first, True)
+    elif not case.gradient_in:
+        yield Combination("int", "jit(grad)", first, True)
+        if case.derivatives == 2:
+            yield Combination("int", "hessian", first, True)
+
+
+def all_combinations(case: Case) -> Iterator[Combination]:
+    """Yield every type in every transformation that the contract promises."""
     for x64 in (True, False):
         for kind in TYPES:
             yield Combination(kind, "direct", "", x64)

@@ -19,7 +19,9 @@ and which derivatives it has. `scripts/refresh_contract.py` writes the page from
 - **Types of arguments.** `tests/contract/test_matrix.py` tests {combinations:,} combinations of types, in direct
   calls and inside `jit`, `vmap`, `grad`, `jit(grad)` and the second derivative, in float64 and float32. In each
   combination, at most one argument is traced. The other arguments are Python numbers, NumPy scalars, NumPy arrays of
-  integers or floats, 0-d arrays, lists or JAX arrays. The combinations also cover methods of a rigid `Scene`.
+  integers or floats, 0-d arrays, lists or JAX arrays. Functions that convert their arguments by the same code share
+  one representative with all combinations; the other functions have the most common ones. The combinations also
+  cover methods of a rigid `Scene`.
 - **Bad points.** An entry of an array is bad if it is NaN or infinite, or if it is negative although negative values
   are not allowed. The column "bad points" contains the result for a bad entry. If the function returns a status, the
   status of this entry is INVALID_INPUT. An entry outside the domain has the same result, with the status

@@ -1,4 +1,4 @@
-"""A cache for fits of logs and walls that commands, studies and reports repeat in one process, because a fit
+"""A cache for fits, wall searches and diagnoses that commands, studies and reports repeat in one process, because each
 takes seconds.
 """
 
@@ -11,33 +11,43 @@ from functools import wraps
 from typing import Any
 from unittest.mock import patch
 
+from zwidth.analysis import cautions, diagnosis, recommendation
 from zwidth.identification import columns, onset_fit
-from zwidth.identification.device_fit import DeviceFit
 
-_fitted: dict[tuple[str, bytes], DeviceFit] = {}
-
-
-def _once(fit: Callable[..., DeviceFit]) -> Callable[..., DeviceFit]:
-    """Cache a fit by its arguments; the results are immutable."""
-
-    @wraps(fit)
-    def fit_once(*arguments: Any, **options: Any) -> DeviceFit:
-        key = fit.__name__, pickle.dumps((arguments, sorted(options.items())))
-        if key not in _fitted:
-            _fitted[key] = fit(*arguments, **options)
-        return _fitted[key]
-
-    return fit_once
+_results: dict[tuple[str, bytes], Any] = {}
 
 
-_fit_log, _fit_buzz = _once(columns.fit_log), _once(onset_fit.fit_buzz)
+def _once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Cache a function by its arguments; the results are immutable."""
+
+    @wraps(function)
+    def compute_once(*arguments: Any, **options: Any) -> Any:
+        try:
+            key = function.__name__, pickle.dumps((arguments, sorted(options.items())))
+        except (pickle.PicklingError, TypeError, AttributeError):
+            return function(*arguments, **options)
+        if key not in _results:
+            _results[key] = function(*arguments, **options)
+        return _results[key]
+
+    return compute_once
+
+
+_fit_log, _fit_buzz, _diagnose = _once(columns.fit_log), _once(onset_fit.fit_buzz), _once(diagnosis.diagnose)
+_choose_wall = _once(recommendation.choose_wall)
 
 
 @contextmanager
 def fitting_once() -> Iterator[None]:
-    """Make commands and studies fit equal logs and walls only once.
+    """Make commands and studies fit equal logs and walls, choose equal walls and diagnose them only once.
 
-    `zwidth.fit_log` and any `fit_buzz` imported before are not cached.
+    `zwidth.fit_log` and any functions imported before are not cached.
     """
-    with patch.object(columns, "fit_log", _fit_log), patch.object(onset_fit, "fit_buzz", _fit_buzz):
+    with (
+        patch.object(columns, "fit_log", _fit_log),
+        patch.object(onset_fit, "fit_buzz", _fit_buzz),
+        patch.object(diagnosis, "diagnose", _diagnose),
+        patch.object(recommendation, "choose_wall", _choose_wall),
+        patch.object(cautions, "choose_wall", _choose_wall),
+    ):
         yield

@@ -147,8 +147,9 @@ def _as_ambient(name: str, value: ArrayLike, dtype: Any) -> Any:
             return as_float64(name, value).astype(dtype, copy=False)
     if value.dtype.kind == "c":
         raise InputError(f"{name}: got complex numbers; real numbers are needed")
-    # Convert only if the type differs, because outside jit JAX compiles a separate program for each operation.
-    return value if value.dtype == dtype else value.astype(dtype)
+    # Convert only if the type differs, because outside jit JAX compiles a separate program for each operation. Convert
+    # the weak type of a Python number as well, because JAX compiles a kernel again for each combination of weak types.
+    return value if value.dtype == dtype and not value.weak_type else value.astype(dtype)
 
 
 _warned = threading.Event()

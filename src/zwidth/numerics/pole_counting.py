@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,7 +91,7 @@ def count_poles(zeros: RootsLike, poles: RootsLike, gain: ArrayLike, lag: ArrayL
     if is_traced(*members):
         xp = namespace(*members)
         traced = [xp.asarray(value, dtype=_get_type(name)) for name, value in values.items()]
-        return _count(_align_coefficients(traced, xp), xp)
+        return _compile_count()(_align_coefficients(traced, xp))
     columns = _align_coefficients([_check_coefficients(name, value) for name, value in values.items()], np)
     shape = columns[2].shape
     size = math.prod(shape)
@@ -102,6 +103,14 @@ def count_poles(zeros: RootsLike, poles: RootsLike, gain: ArrayLike, lag: ArrayL
             counts[block] = _count([column[block] for column in columns], np)
     counts = counts.reshape(shape)
     return to_caller(counts, tuple(members))
+
+
+@cache
+def _compile_count() -> Any:
+    """Return `_count`, compiled by JAX as one program: outside jit, each of its 700 operations would be a program."""
+    import jax
+
+    return jax.jit(lambda columns: _count(columns, jax.numpy))
 
 
 def _iterate_members(value: ArrayLike) -> Iterator[Any]:

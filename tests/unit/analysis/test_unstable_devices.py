@@ -48,6 +48,8 @@ def test_max_stiffness_of_pendulums_matches_scipy_poles(seed):
             > 1.0
         )
         assert scene.islands() == []
+        if delay != (0, 1, 3)[seed % 3]:
+            continue  # recommend for one delay per seed, because recommendations take most of the time
         recommendation = scene.recommend()
         assert recommendation.status == Status.OK
         assert compute_radius(coefficients, delay, recommendation.stiffness, recommendation.virtual_damping) < 1.0

@@ -18,6 +18,7 @@ import zwidth
 from zwidth.app.verdict import spell_passivity
 from zwidth.cli.commands import cli
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
 DEVICE = ["--mass", "100 g", "--damping", "10", "--delay", "1 periods"]
 RATE = ["--rate", "1 kHz"]
 WALL = ["--stiffness", "3 kN/m", "--virtual-damping", "5"]

@@ -14,6 +14,7 @@ import zwidth
 from zwidth.cli import cli
 from zwidth.cli.logs import spell_safe_wall
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
 DEVICE = TrueDevice("one resonance", 0.1, 3.0, 3e-4, ((140.0, 0.02, 0.6),), 0.7e-3, 1e-3, 1e-5, 3.0)
 LOOP = ["--period", "1 ms", "--force", "3 N", "--resolution", "10 um", "--duration", "30 s"]
 

@@ -9,6 +9,7 @@ from click.testing import CliRunner
 import zwidth
 from zwidth.cli.commands import cli
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
 KNOB = [
     *("--mass", "60 g cm^2", "--damping", "0.02 mN m s/rad", "--rate", "1 kHz", "--delay", "0.7 periods"),
     *("--velocity-cutoff", "100 Hz", "--stiffness", "0.3 N m/rad", "--virtual-damping", "1.4 mN m s/rad"),

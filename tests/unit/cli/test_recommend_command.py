@@ -10,6 +10,7 @@ from click.testing import CliRunner
 import zwidth
 from zwidth.cli.commands import cli
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
 DEVICE = ["--mass", "100 g", "--damping", "10", "--rate", "1 kHz", "--delay", "1 ms"]
 SCENE = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
 

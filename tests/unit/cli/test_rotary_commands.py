@@ -11,6 +11,7 @@ from click.testing import CliRunner
 import zwidth
 from zwidth.cli.commands import cli
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
 DEVICE = ["--mass", "12 g cm^2", "--damping", "0.02mNms/rad", "--rate", "1 kHz", "--delay", "1 ms"]
 LINEAR_UNITS = re.compile(r"(N/m|N s/m|\bm?N\b(?! m)|\bk?g\b(?! ?[cm]+\^2))")
 COMMANDS = {

@@ -8,6 +8,7 @@ from click.testing import CliRunner
 import zwidth
 from zwidth.cli.commands import cli
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
 SCENE = """\
 version: 1
 name: knob
