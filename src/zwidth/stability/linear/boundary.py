@@ -420,7 +420,7 @@ class _LoopValues(NamedTuple):
             is_zero = self.common == 0
             divisor = np.where(is_zero, 1.0, self.common)
             ratio = np.where(is_zero, np.imag(slope) / self.common_slope, np.imag(value) / divisor)
-            # Where common is 0, the result is 0: the exact derivative at w = 0 and pi, where the ratio is even in the
+            # The result is 0 where common is 0: the exact derivative at w = 0 and pi, where the ratio is even in the
             # distance from w; at other angles it only affects the starting value of Newton's method.
             ratio_slope = (np.imag(slope) - ratio * self.common_slope) / divisor
             return _RowValues(ratio, ratio_slope, np.real(value), np.real(slope))
