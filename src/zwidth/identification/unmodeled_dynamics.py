@@ -341,6 +341,7 @@ def truncate_logs(fit: FittedModel) -> FittedModel:
     """Return a copy of the fit with the same theta and only the first `MAX_SAMPLES` positions of each log."""
     if max(log.position.size for log in fit.model.logs) <= MAX_SAMPLES:
         return fit
+    # Drop the alternatives, which only affect the covariance of theta, and estimate the noise from the shorter logs.
     part = replace(fit, model=fit.model.truncate(MAX_SAMPLES), alternatives=())
     part = replace(part, squares=float(part.residuals @ part.residuals))
     return replace(part, model=replace(part.model, noise=part.noise)) if fit.model.noise is not None else part
@@ -360,6 +361,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
     last = _filter_forces(fit, np.array([-np.inf]))[0]
     last_in_basis = basis.T @ last
     last_outside = last - basis @ last_in_basis
+    # Map coefficients in the basis to changes of theta: the pseudo-inverse of W J, divided by the scales of its columns.
     basis_to_theta = fit.inverse.matrix @ basis / fit.columns[1][:, None]
     batch_size = max(1, BATCH_SIZE // (2 * residuals.size))
     batches = []
@@ -371,6 +373,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
             filtered, (gain, last_gain) = _filter_forces(fit, poles), _expand_unit_modes(fit, poles)
             in_basis = basis.T @ filtered
             outside = filtered - basis @ in_basis
+            # A complex pole is absorbed if one of its two parts is.
             remaining = np.linalg.norm(outside, axis=1).min(0)
             is_absorbed = remaining <= ABSORBED_NORM * np.linalg.norm(filtered, axis=1).max(0)
             # Fit the residuals by the real and the imaginary part of each filtered force, by least squares.
