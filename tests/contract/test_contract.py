@@ -350,8 +350,8 @@ def test_decay_rate_and_its_derivative():
     assert slopes["value"]["alpha"] == pytest.approx(difference, rel=1e-7)
 
 
-@pytest.mark.parametrize(("name", "line"), [("row", "beta"), ("column", "alpha")])
-def test_derivatives_of_boundary_points_match_mpmath(name, line):
+@pytest.mark.parametrize("line", ["beta", "alpha"])
+def test_derivatives_of_boundary_points_match_mpmath(line):
     """Derivatives with respect to the given coordinate, delta and d, at integer d from the right, against
     secant roots in mpmath.
     """
@@ -360,7 +360,8 @@ def test_derivatives_of_boundary_points_match_mpmath(name, line):
     if line == "beta":
         points += [(0.3, 0.1, 1.0), (0.1, 0.7, 2.4), (0.5, 0.0, 0.0), (50.0, 0.1, 1.0)]
     names = (line, "delta", "d")
-    leaves, slopes = evaluate_case(f"boundary_point of a {name}", **dict(zip(names, np.transpose(points), strict=True)))
+    columns = dict(zip(names, np.transpose(points), strict=True))
+    leaves, slopes = evaluate_case(f"boundary_point at constant {line}", **columns)
 
     def exact(omega, number, delta, d):
         def offset(w):

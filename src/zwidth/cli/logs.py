@@ -69,7 +69,7 @@ _WALL = Parsed("WALL", _read_wall)
 _SOFTER = 50  # largest number of reductions of K to make the rounded wall stable
 
 
-# Options with the walls of the example in the help.
+# Options of the example that the help shows: two walls at the onset of instability.
 _BUZZING = "--buzz 'K=218N/m B=0 f=8.38Hz'", "--buzz 'K=2.53kN/m B=8 f=33.9Hz'"
 
 
@@ -287,7 +287,7 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
         share = float(made.expected.stiffness / made.limit.stiffness)
         result |= {"expected": _plain(made.expected), "limit": _plain(made.limit)}
         expected = format_wall(made.expected.stiffness, made.expected.virtual_damping, units)
-        lines += [format_row("expected safe wall", f"{expected}, {100 * share:.0f} % of the present K_max")]
+        lines += [format_row("expected safe wall", f"{expected}, {100 * share:.0f} % of the current K_max")]
     print_result(result, [*lines, format_row("wrote", str(out))], as_json)
 
 

@@ -40,6 +40,18 @@ def is_traced(*values: Any) -> bool:
     return kind is not None and any(isinstance(value, kind) for value in values)
 
 
+class _Jax:
+    """Module `jax`, imported when an attribute is first used."""
+
+    def __getattr__(self, name: str) -> Any:
+        import jax.numpy
+
+        return getattr(jax, name)
+
+
+lazy_jax: Any = _Jax()
+
+
 @contextmanager
 def compute_concretely() -> Iterator[None]:
     """Compute in float64 without tracing inside the context, even during a JAX transformation of other values."""

@@ -361,7 +361,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
     last = _filter_forces(fit, np.array([-np.inf]))[0]
     last_in_basis = basis.T @ last
     last_outside = last - basis @ last_in_basis
-    # Map coefficients in the basis to changes of theta: the pseudo-inverse of W J, divided by the scales of its columns.
+    # Map coefficients in the basis to changes of theta: the pseudo-inverse of W J, divided by its column scales.
     basis_to_theta = fit.inverse.matrix @ basis / fit.columns[1][:, None]
     batch_size = max(1, BATCH_SIZE // (2 * residuals.size))
     batches = []

@@ -192,7 +192,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     entries = _name_targets(required, factor, unit)
     handles = [style.line(words, style.DASHED, color=colors[target]) for target, words in entries]
     handles.append(
-        style.line("present value", "", color=style.BLACK, marker="s", markerfacecolor="white", markersize=5)
+        style.line("current value", "", color=style.BLACK, marker="s", markerfacecolor="white", markersize=5)
     )
     style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels

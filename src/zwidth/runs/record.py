@@ -133,7 +133,7 @@ class Record:
     def check_same(self, inputs: dict[str, dict[str, Any]]) -> None:
         """Raise `StoreError` if the run cannot be resumed, because other releases or other inputs produced it.
 
-        ``inputs`` contains the inputs of each study in the present configuration, by name of the study.
+        ``inputs`` contains the inputs of each study in the current configuration, by name of the study.
         """
         if not self.exists:
             return

@@ -97,7 +97,7 @@ OF_ENERGY = {"wall_work", "external_work", "damping_loss", "friction_loss", "ene
 
 
 def _draw(motion: Motion) -> str:
-    """Return a plot of position over time in text characters; "" unless the motion is single and recorded."""
+    """Return a plot of position over time in text characters; "" for a batch, and if no samples were recorded."""
     if motion.position is None or np.ndim(motion.position) != 1:
         return ""
     return draw_line(motion.time, motion.position, "position over time")

@@ -22,18 +22,16 @@ tested against this module. Source: Hulin, Preusche, Hirzinger 2006, eqs. (15), 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import lazy_loader
 import numpy as np
 
 from zwidth.core.types import Array, Coefficients, Reals, Roots
+from zwidth.core.xp import lazy_jax as jax
 from zwidth.core.xp import namespace
 from zwidth.numerics.held_mass import Plant, discretize_mass, split_delay
 from zwidth.numerics.polynomials import Affine, companion
 from zwidth.numerics.root_finding import bracket_root, polish_root
-
-jax: Any = lazy_loader.load("jax")  # imported on first use; NumPy computes the coefficients of few walls without it
 
 NEAR_PI = np.pi * (1.0 - 1e-4)  # largest omega of the curve; rounding errors grow as 1/(pi - omega)
 

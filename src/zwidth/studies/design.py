@@ -91,7 +91,7 @@ class DesignStudy(ComputedStudy):
     """Required ratio of the maximum stable stiffness to the required stiffness, 1 or more."""
 
     within: Ends | None = None
-    """Search range [low, high]. Default: 1/30 to 30 times the present value, with delays of at most 1,000 periods."""
+    """Search range [low, high]. Default: 1/30 to 30 times the current value, with delays of at most 1,000 periods."""
 
     num: Count = 61
     """Number of points of the curve in the figure."""

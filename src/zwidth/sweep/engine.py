@@ -261,7 +261,7 @@ def refuse_changes(where: Path, name: str, noun: str, old: Any, new: Any) -> Non
         name: Name of the study.
         noun: Noun for the results, "store" or "run".
         old: Recorded study, as JSON.
-        new: Study of the present configuration, as JSON.
+        new: Study of the current configuration, as JSON.
     """
     # Ignore the keys delay_model and delay_models of earlier releases if they have the value that is now the only one.
     ignored = ("delay_model", "held", None), ("delay_models", ["held"], None)

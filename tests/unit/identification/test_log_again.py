@@ -138,7 +138,7 @@ def test_log_with_gaps_is_fitted_as_several_logs():
     both = np.concatenate([each.modeled for each in separate.motions])
     np.testing.assert_allclose(motion.modeled[(motion.time < 0.1495) | (motion.time > 0.1905)], both, rtol=1e-9)
     note = dict(detail_fit(fit, "log"))["samples"]
-    assert note == "315 of 379 samples: those after each of 2 gaps depend on forces that were not logged"
+    assert note == "315 of 379 used: those after each of 2 gaps depend on forces that were not logged"
     with pytest.raises(InputError, match="21 samples of log 1 are missing, most of them after sample 169"):
         zwidth.respond(clock[is_kept], position[is_kept], force[is_kept])
 

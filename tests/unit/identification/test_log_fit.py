@@ -320,5 +320,5 @@ def test_long_log_is_truncated_and_reported(monkeypatch):
     assert (finite[0], finite.size) == (22, finite[-1] - 21)
     assert 400 <= finite.size < 500
     assert abs(fit.mass - 0.1) < 4 * fit.errors["mass"]
-    assert dict(detail_fit(fit, "a log"))["samples"].startswith(f"{finite.size} of 900 samples")
+    assert dict(detail_fit(fit, "a log"))["samples"].startswith(f"{finite.size} of 900 used")
     assert "samples" not in dict(detail_fit(zwidth.fit_log(PERIOD, position[:400], force[:400]), "a log"))

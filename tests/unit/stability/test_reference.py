@@ -77,7 +77,7 @@ def test_polynomial_is_that_of_the_paper():
         s, t = delta - 1.0 + c, 1.0 - c - delta * c
         device = np.polymul([1.0, -1.0], [1.0, -c] + [0.0] * (1 + d)) * delta**2
         expected = np.polyadd(device, np.polymul([s, t], [alpha + beta, -beta]))
-        coefficients = expand_loop(*map(np.asarray, (alpha, beta, delta, float(d))), find_degree(d))
+        coefficients = expand_loop(*map(np.asarray, (alpha, beta, delta, float(d))), degree=find_degree(d))
         np.testing.assert_allclose(coefficients, expected / delta**2, rtol=1e-12)
 
 
@@ -107,4 +107,4 @@ def test_boundary_points_separate_stable_from_unstable_walls(line, x64):
         # Scale beta + delta, which is positive on the boundary; beta itself may be 0.
         beta = (point.beta + delta) * factor - delta
         walls = (point.alpha * factor, point.beta) if line == "row" else (point.alpha, beta)
-        assert (zwidth.is_stable(*map(np.asarray, walls), delta, d) == expected).all()
+        assert (zwidth.is_stable(np.asarray(walls[0]), np.asarray(walls[1]), delta, d) == expected).all()

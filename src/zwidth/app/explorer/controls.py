@@ -136,7 +136,7 @@ class Controls:
 
     @property
     def sliders(self) -> dict[str, Slider]:
-        """The sliders of all parameters for this kind of device, linear or rotary, by path."""
+        """The sliders of all parameters of this kind of device (linear or rotary); keys such as "coupling.mass"."""
         return ROTARY_SLIDERS if self.rotary else SLIDERS
 
     def shown(self) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def quantity_status(**values: Array) -> Array:
 
 
 def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """Return a mask of the walls that are valid and in range, together with their device."""
+    """Return a mask that is True if all four values of a wall and its device are numbers in their ranges."""
     return is_valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
 
 

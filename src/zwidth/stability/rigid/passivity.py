@@ -133,7 +133,7 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
         return alpha / needed, beta / needed
 
     lower, upper = -0.49 * np.pi, 0.49 * np.pi
-    # The passive set is convex, so alpha has a single maximum over the direction.
+    # The passive set is convex, so its boundary, parameterized by the angle of (alpha, beta), has one maximum of alpha.
     with np.errstate(all="ignore"):
         for _ in range(SEARCH_ROUNDS):
             angles = np.linspace(lower, upper, 17)

@@ -181,10 +181,13 @@ def aberth_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Deg
     return z, radius, disjoint & converged
 
 
-def _replace_invalid(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> tuple[Reals, ...]:
+def _replace_invalid(
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree
+) -> tuple[Reals, Reals, Reals, Reals]:
     """Replace arguments out of range by valid numbers; the caller sets the results of these walls to NaN."""
     xp, ok = namespace(alpha, beta, delta, d), valid_wall(alpha, beta, delta, d)
-    return *(xp.where(ok, value, 0.0) for value in (alpha, beta, delta)), xp.where(ok, d, float(degree.n))
+    alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
+    return alpha, beta, delta, xp.where(ok, d, float(degree.n))
 
 
 def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:

@@ -61,7 +61,7 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
     c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
     phi_t, phi_f = phi_functions(delta * t), phi_functions(delta * f)
     chi_t, chi_f = _compute_chi(delta * t, phi_t.gap), _compute_chi(delta * f, phi_f.gap)
-    # No digits cancel in the sum below, because each term of a1 decreases with delta.
+    # The derivatives of all terms of a1 have the same sign, so no digits cancel in their sum below.
     a2 = -t * t * t * chi_t
     a1 = t * t * t * (phi_t.psi - chi_t) + f * f * f * chi_f
     a1 = -(
