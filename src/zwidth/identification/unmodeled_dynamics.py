@@ -2,27 +2,32 @@
 
 Model. The weighted residuals of a fit are ``e = r s + n``: s is the signature of one missing pole, r its size, and n
 noise of variance ``sigma^2``. The *signature* of a mode or lag is the part of its effect on the positions that no
-change of the fitted parameters ``theta`` (`identification.extended_model.Recordings`) reproduces. A mode of *mass
-ratio* r has the modal mass ``m/(r sqrt(1 - zeta^2))``, with the mass m of the device and the damping ratio zeta of the
-mode; r is negative if actuator and sensor are on opposite sides of a node. A *unit mode* has mass ratio 1. J are the
-derivatives of the positions with respect to theta, W the weights of the samples. Unless stated otherwise, times are in
-sampling
-periods and frequencies are relative to the sampling rate.
+change of the fitted parameters ``theta`` (`identification.extended_model.Recordings`) reproduces; theta begins with g =
+T^2/m, delta = b T/m and the delay, followed by the parameters of a lag and of modes. A mode of *mass ratio* r has the
+modal mass ``m/(r sqrt(1 - zeta^2))``, with the mass m of the device and the damping ratio zeta of the mode, so that
+sqrt(1 - zeta^2) cancels in its response; r is negative if actuator and sensor are on opposite sides of a node. A *unit
+mode* has mass ratio 1. J are the derivatives of the positions with respect to theta, W the weights of the samples.
+``sigma^2`` includes ``fit.excess``, the factor by which autocorrelation increases the variance of sums of residuals.
+Unless stated otherwise, times are in sampling periods and frequencies are relative to the sampling rate.
 
 The candidates are a bank of poles: a grid of frequencies for each of a few damping ratios, and real poles for actuator
 lags. No model with a candidate is fitted. A pole is *absorbed* if a change of ``theta`` reproduces nearly all of its
 effect. K_max is the maximum stiffness of a wall. The steps are explained in docs/theory/hidden.md:
 
 1. Score: the reduction of the sum of squares, in sigma^2, if the real and imaginary part of the force filtered by the
-   pole are added to the model (Rao 1948). It is a chi-square variable if no pole is missing.
+   pole are added to the model (Rao 1948). If no pole is missing, the score of one given pole is a chi-square variable
+   with 2 degrees of freedom for a complex pole, 1 for a real one.
 2. Detection: `detect_missing_pole` returns the pole of the highest score if it satisfies the Bayesian information
    criterion (BIC, Schwarz 1978) for white noise and for the autocorrelated errors of the encoder.
-3. Bound: if no pole is detected, |r| is at most ``(sqrt(score) + 4)/size``, with ``size = |s|/sigma`` of the unit mode.
-   `bound_response` computes the largest change of the response by such a mode, a radius that limits the safe walls.
+3. Bound: if no pole is detected, |r| is at most ``(sqrt(score) + 4 error)/size``, with ``size = |s|/sigma`` of the unit
+   mode and the local standard ``error``, at least 1. sqrt(score) is about |t| of step 4 or more, because the score fits
+   both amplitudes freely. `bound_response` computes the largest change of the response by such a mode, a radius that
+   limits the safe walls.
 4. Averaging: with ``t = s'e/(sigma^2 size)``, the likelihood ratio of a device with one more mode to one without it is
    ``exp(t r size - (r size)^2/2)``. Its mean over the prior is the posterior odds; `sample_resonances` draws modes from
    the posterior and computes K_max with each (Bayesian model averaging, Hoeting et al. 1999).
-5. Lags: `bound_lag` returns the longest first-order actuator lag that the data cannot distinguish from pure delay.
+5. Lags: `identification.unmodeled_lag.bound_lag` returns the longest first-order actuator lag that the data cannot
+   distinguish from pure delay.
 
 References:
     Rao 1948, Proc. Cambridge Philos. Soc. 44, 50-57 (score test). Schwarz 1978, Annals of Statistics 6, 461-464
@@ -100,7 +105,8 @@ class HiddenPole(NamedTuple):
 
     frequency: float  # natural frequency of the pole, relative to the sampling rate
     is_resonance: bool  # True for a complex pole (resonance), False for a real pole (actuator lag)
-    replaces_lag: bool = False  # True if the pole is an alternative to the actuator lag of the model and fits as well
+    # True if the pole is an alternative to the actuator lag and fits as well (set by `identification.model_selection`)
+    replaces_lag: bool = False
 
 
 class PoleBank(NamedTuple):
@@ -237,6 +243,7 @@ def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenR
     order = np.argsort(grid, -1)
     grid, response = (np.take_along_axis(each, order, -1) for each in (grid, np.concatenate(responses, -1)))
     velocity = scene.velocity.estimate(period).jet(circle_points(2.0 * np.pi * grid)).value
+    # Pass q and the velocity estimate per second, one row per sample; entry 0 belongs to the device without a mode.
     reference, *stiffness = GridLimits(-1.0 / response, velocity / period).find_stiffness_max()
     return HiddenResonances(odds, np.array(stiffness) / reference) if reference > 0 else None
 
@@ -273,12 +280,12 @@ def _draw_modes(bank: PoleBank) -> tuple[float, PoleBank, np.ndarray]:
 def _build_frequency_grid(scene: Scene, phase_step: float) -> np.ndarray:
     """Build a frequency grid, relative to the sampling rate, for the response of the fitted device.
 
-    The grid is logarithmic below the frequencies of the pole bank and has additional points around the resonances of
-    the device.
+    The grid is logarithmic below the frequencies of the pole bank, equidistant above their lowest one, and has
+    additional points around the resonances of the device.
 
     Args:
         scene: The scene of the fitted device.
-        phase_step: Largest phase change by the delay between neighboring frequencies, in rad.
+        phase_step: Largest phase change by the delay and one more period between neighboring frequencies, in rad.
     """
     count = 2.0 * np.pi * MAX_FREQUENCY * (1.0 + scene.d) / phase_step
     even = np.arange(1.0, count) * phase_step / (2.0 * np.pi * (1.0 + scene.d))
@@ -323,7 +330,7 @@ def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tup
 
     count, response = fit.model.parts.stop, evaluate(fit.theta)
     steps = np.abs(fit.theta[:count])
-    steps[1:3] = np.maximum(steps[1:3], 1e-3)  # use an absolute step, because damping and delay may be 0
+    steps[1:3] = np.maximum(steps[1:3], 1e-3)  # absolute, because only damping and delay may be 0
     steps *= DIFFERENCE_STEP
     units = np.eye(count, fit.theta.size)
     shifted = [evaluate(fit.theta + step * unit) for step, unit in zip(steps, units, strict=True)]
@@ -334,6 +341,7 @@ def truncate_logs(fit: FittedModel) -> FittedModel:
     """Return a copy of the fit with the same theta and only the first `MAX_SAMPLES` positions of each log."""
     if max(log.position.size for log in fit.model.logs) <= MAX_SAMPLES:
         return fit
+    # Drop the alternatives, which only affect the covariance of theta, and estimate the noise from the shorter logs.
     part = replace(fit, model=fit.model.truncate(MAX_SAMPLES), alternatives=())
     part = replace(part, squares=float(part.residuals @ part.residuals))
     return replace(part, model=replace(part.model, noise=part.noise)) if fit.model.noise is not None else part
@@ -353,6 +361,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
     last = _filter_forces(fit, np.array([-np.inf]))[0]
     last_in_basis = basis.T @ last
     last_outside = last - basis @ last_in_basis
+    # Map coefficients in the basis to changes of theta: the pseudo-inverse of W J, divided by its column scales.
     basis_to_theta = fit.inverse.matrix @ basis / fit.columns[1][:, None]
     batch_size = max(1, BATCH_SIZE // (2 * residuals.size))
     batches = []
@@ -364,6 +373,7 @@ def _score_poles(fit: FittedModel, basis: np.ndarray, residuals: np.ndarray, noi
             filtered, (gain, last_gain) = _filter_forces(fit, poles), _expand_unit_modes(fit, poles)
             in_basis = basis.T @ filtered
             outside = filtered - basis @ in_basis
+            # A complex pole is absorbed if one of its two parts is.
             remaining = np.linalg.norm(outside, axis=1).min(0)
             is_absorbed = remaining <= ABSORBED_NORM * np.linalg.norm(filtered, axis=1).max(0)
             # Fit the residuals by the real and the imaginary part of each filtered force, by least squares.

@@ -6,20 +6,17 @@ a0 of the device under zero-order hold (`numerics.held_mass`), the characteristi
 
     P(z) = z^(2+n) (z - 1)(z - c) + N(z) (alpha z + beta (z - 1)) = D(z) + alpha N1(z) + beta N2(z)
 
-For integer d, a0 = 0 and a factor z cancels; the result is polynomial (17) of the paper divided by -delta^2.
-
 1. *Grids.* The poles are the eigenvalues of the companion matrix of P. The loop is stable if the spectral radius, the
-   largest modulus of its poles, is below 1. `jax.vmap` maps one wall to arrays of walls.
-2. *Boundary points.* On the stability boundary a pole is on the unit circle: P(e^(j omega)) = 0. These are two real
-   equations for alpha, beta and omega. A third equation fixes alpha or beta. Bisection (jaxopt) brackets omega, and
-   Newton's method (optimistix) solves the three equations, with implicit derivatives.
+   largest modulus of its poles, is below 1. For integer d, a0 = 0, and a factor z of P cancels.
+2. *Boundary points.* On the stability boundary P(e^(j omega)) = 0: two real equations for alpha, beta and omega. A
+   third fixes alpha or beta. Bisection (jaxopt) yields omega, Newton's method (optimistix) then implicit derivatives.
 3. *Maximum stiffness.* The largest alpha subject to spectral radius 1: the third equation is the stationarity of the
    Lagrangian, Im(conj(dP/dbeta) dP/domega) = 0. For d < 1 the maximum may be the *corner*, a double pole at z = -1.
 
 The *curve* consists of the walls with a pole pair at e^(+-j omega). Its first part, up to alpha = 0 or the corner,
-bounds the stable walls: a line of constant beta crosses it once, a line of constant alpha once on each side of its
-maximum (docs/theory/one-lobe.md). All other methods of `zwidth.stability` compute the same results faster and are
-tested against this module. Source: Hulin, Preusche, Hirzinger 2006, eqs. (15), (17), (24), (25).
+bounds the stable walls: beta increases along it with omega, so a line of constant beta crosses it once, and a line of
+constant alpha once on each side of its maximum (docs/theory/one-lobe.md). The faster methods of `zwidth.stability` are
+tested against this module. Source: Hulin, Preusche, Hirzinger 2006, eqs. (15), (17) = -delta^2 P, (24), (25).
 """
 
 from __future__ import annotations
@@ -71,11 +68,8 @@ def expand_loop(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degre
 
 def compute_poles(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
     """Return the poles of walls, given by one-dimensional arrays, along a new last axis."""
-
-    def solve(alpha: Array, beta: Array, delta: Array, d: Array) -> Roots:
-        return jax.numpy.linalg.eigvals(companion(expand_loop(alpha, beta, delta, d, degree)))
-
-    return jax.vmap(solve)(alpha, beta, delta, d)
+    solve = jax.vmap(lambda *wall: jax.numpy.linalg.eigvals(companion(expand_loop(*wall, degree))))
+    return solve(alpha, beta, delta, d)
 
 
 def compute_radii(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Reals:
@@ -93,7 +87,7 @@ class Point(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """The discretized device and the integer part of its delay."""
+    """The discretized device, with em = 1 - c and gap = N(-1) = a2 - a1 + a0, and the integer part of its delay."""
 
     plant: Plant
     n: Array
@@ -106,7 +100,7 @@ def build_loop(delta: Array, d: Array) -> Loop:
 
 
 def divide_polynomial(omega: Array, loop: Loop) -> tuple[Array, Array]:
-    """Return q and w = z^(1/2) such that P(z) is proportional to ``alpha w + 2j beta Im w - q`` at z = e^(j omega)."""
+    """Return q and w = z^(1/2) such that P(z) = N(z) w (alpha w + 2j beta Im w - q) at z = e^(j omega)."""
     plant, w = loop.plant, jax.numpy.cos(0.5 * omega) + 1j * jax.numpy.sin(0.5 * omega)
     # Insert z - 1 = 2j w Im w and cos(omega) = 2 (Re w)^2 - 1, because the differences cancel near 0 and near pi.
     device = 2j * w.imag * (plant.em - 2.0 * w.imag**2 + 2j * w.imag * w.real)
@@ -140,18 +134,20 @@ def solve_point(condition: Callable[..., Array], start: Array, bracketed: Array,
 
     first = jax.numpy.stack([*wall, start]) / scales
     alpha, beta, omega = polish_root(evaluate, first, (loop, given), bracketed) * scales
+    # The start is exact up to rounding errors; after a larger change, the solution is another one.
     return Point(alpha, beta, omega, bracketed & (abs(omega - start) <= 1e-5 * start))
 
 
 def find_curve_end(loop: Loop, d: Array) -> Array:
     """Return the omega at which the first part of the curve ends with alpha = 0, or `NEAR_PI` at the corner."""
+    # Without a corner, i.e. always for d >= 0.5, the curve has alpha < 0 at omega = pi/(d + 0.5).
     limit = jax.numpy.minimum(NEAR_PI, np.pi / (d + 0.5))
     end, exists = bracket_root(lambda omega, loop: solve_wall(omega, loop)[0], 1e-6 * limit, limit, loop)
     return jax.numpy.where(exists, end, NEAR_PI)
 
 
 def find_line(loop: Loop) -> tuple[Array, Array, Array]:
-    """Return N(-1), the value of alpha + 2 beta of all walls with P(-1) = 0, and True if d < 1 and N(-1) > 0."""
+    """Return N(-1), alpha + 2 beta of all walls with P(-1) = 0, and True if d < 1 and N(-1) > 0; else, N(-1) -> 1."""
     exists = (loop.n == 0) & (loop.plant.gap > 0)
     gap = jax.numpy.where(exists, loop.plant.gap, 1.0)
     return gap, 2.0 * (1.0 + loop.plant.c) / gap, exists
@@ -159,11 +155,8 @@ def find_line(loop: Loop) -> tuple[Array, Array, Array]:
 
 def maximize_stiffness(delta: Array, d: Array) -> tuple[Point, Array]:
     """Return the solution of ``max alpha subject to spectral radius 1``, and True if it is the corner."""
-    loop = build_loop(delta, d)
-    end = find_curve_end(loop, d)
-
-    def differentiate_alpha(omega: Array, loop: Loop) -> Array:
-        return jax.grad(lambda omega: solve_wall(omega, loop)[0])(omega)
+    end = find_curve_end(loop := build_loop(delta, d), d)
+    differentiate_alpha = jax.grad(lambda omega, loop: solve_wall(omega, loop)[0])
 
     def stationarity(unknowns: Array, _: Array, polynomial: Callable[..., Array]) -> Array:
         by_beta, by_omega = jax.jacfwd(polynomial, argnums=(1, 2))(*unknowns)
@@ -171,7 +164,8 @@ def maximize_stiffness(delta: Array, d: Array) -> tuple[Point, Array]:
 
     start, bracketed = bracket_root(differentiate_alpha, 1e-6 * end, end, loop)
     smooth = solve_point(stationarity, start, bracketed, d, loop)
-    # The corner satisfies P(-1) = 0 and P'(-1) = 0, with N'(-1) = a1 - 2 a2.
+    # The corner satisfies P(-1) = 0 and P'(-1) = 0, with D'(-1) = -7 - 5 c and N'(-1) = a1 - 2 a2. It is the maximum
+    # if alpha increases up to the end of the curve, i.e. if no zero of the derivative is bracketed.
     (gap, line, exists), plant = find_line(loop), loop.plant
     beta = line - (7.0 + 5.0 * plant.c + (plant.a1 - 2.0 * plant.a2) * line) / gap
     is_corner = exists & (end >= NEAR_PI) & ~bracketed
@@ -189,9 +183,7 @@ def find_boundary_point(delta: Array, d: Array, given: Array, line: str) -> tupl
     end, top = jax.lax.stop_gradient((find_curve_end(loop, d), maximize_stiffness(delta, d)[0]))
     middle = jax.numpy.minimum(top.omega, end)
     lower, upper = middle if line == "upper" else 1e-9 * end, middle if line == "lower" else end
-    start, crosses = bracket_root(
-        lambda omega, *args: solve_wall(omega, args[0])[k] - args[1], lower, upper, loop, given
-    )
+    start, crosses = bracket_root(lambda w, *args: solve_wall(w, args[0])[k] - args[1], lower, upper, loop, given)
     point = solve_point(lambda unknowns, given, _: unknowns[k] - given, start, crosses, given, loop)
     value = point[1 - k]
     if line != "lower":

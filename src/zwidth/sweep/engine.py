@@ -1,6 +1,7 @@
 """Compute the sweeps of a run: create or repair their stores, then compute the missing chunks one by one.
 
-A *chunk* is one block of the grid of a sweep (`sweep.plan`), a *job* the computation of one chunk. Chunks are computed
+A *chunk* is one block of the grid of a sweep, described by a `Task` of its plan (`sweep.plan`); a *job* is the
+computation of one chunk of one store. Chunks are computed
 in this process, in worker processes (`sweep.jobs`) or on a cluster (`sweep.distributed`). Each sweep has one *store*,
 ``<study>.zarr`` in the folder of the run (`sweep.store`). A chunk is done once its status file is in the store;
 therefore an interrupted run can be resumed from the stores alone.
@@ -51,7 +52,7 @@ class SweepResult:
     computed: int = 0  # number of chunks computed by this run
     skipped: int = 0  # number of chunks computed by earlier runs
     total: int = 0  # number of all chunks of the sweep
-    repaired: tuple[str, ...] = ()  # names of damaged chunks, which are computed again, and of restored files
+    repaired: tuple[str, ...] = ()  # damaged chunks, which are computed again, with their faults; and restored files
     failed: dict[str, str] = field(default_factory=dict)  # error of each failed chunk, by name of the chunk
 
     @property
@@ -81,19 +82,20 @@ def compute_sweeps(
 ) -> Sweeps:
     """Compute the missing chunks of the stores ``<folder>/<study>.zarr``; create stores that do not exist.
 
-    The caller must hold the lock of the folder.
+    The caller must hold the lock of the folder, and must have called `check_stores`.
 
     Args:
         plans: The plan of each sweep.
         folder: Folder of the run.
         about: Attributes of the stores: name, description, config, and config_sha256 (of config.yaml).
-        workers: Number of worker processes; None to compute in this process.
+        workers: Number of worker processes; None to compute in this process. No effect with a scheduler.
         scheduler: Address of a dask.distributed scheduler; None to compute on this machine.
         progress: Function that is called after every chunk.
 
     Raises:
         InputError: The scheduler does not reply, or its workers have no access to the folder.
     """
+    # Import `perform` here, because tests replace it in `sweep.jobs`.
     from zwidth.sweep.jobs import perform
 
     with ExitStack() as stack:
@@ -106,6 +108,7 @@ def compute_sweeps(
         sweeps, stores, jobs = Sweeps({}), {}, []
         for plan in plans:
             store, repaired = _prepare_store(plan, folder, about)
+            # Use the plan that the store records, because its chunks may differ from those of a new plan.
             tasks = list(store.plan.tasks())
             missing = [Job(str(store.path), task) for task in tasks if not store.is_done(task)]
             skipped, total = len(tasks) - len(missing), len(tasks)
@@ -226,12 +229,13 @@ def _count_chunks(jobs: list[Job], stores: dict[str, Store], sweeps: Sweeps) -> 
     for path, task in jobs:
         store = stores[path]
         sweep = sweeps.results[store.study.name]
+        # Use `is_visible` instead of `is_done`, because a file system may report the files of other machines late.
         if store.is_visible(task):
             sweep.computed += 1
             # Discard the error of the job, because the chunk is done: another process has computed it, such as a worker
             # that was assumed dead.
             sweep.failed.pop(store.label(task), None)
-        elif not over:
+        elif not over:  # if the run ended early, chunks without an outcome are neither computed nor failed
             sweep.failed.setdefault(store.label(task), "reported as computed but missing from the store")
 
 
@@ -260,7 +264,9 @@ def refuse_changes(where: Path, name: str, noun: str, old: Any, new: Any) -> Non
         new: Study of the current configuration, as JSON.
     """
     # Ignore the keys delay_model and delay_models of earlier releases if they have the value that is now the only one.
-    changed = [each for each in list_differences(old, new) if each[1:] not in (("held", None), (["held"], None))]
+    ignored = ("delay_model", "held", None), ("delay_models", ["held"], None)
+    differences = list_differences(old, new)
+    changed = [(key, *values) for key, *values in differences if (key.rpartition(".")[2], *values) not in ignored]
     if changed:
         lines = [
             f"{where}: studies[{name}].{key}: the {noun} was created with {describe(before)}, the configuration has "
@@ -276,7 +282,8 @@ def refuse_changes(where: Path, name: str, noun: str, old: Any, new: Any) -> Non
 def refuse_versions(where: Path, old: dict[str, str]) -> None:
     """Raise `StoreError` if results were computed by other releases of zwidth or of the packages it computes with.
 
-    The reason is that no set of releases could reproduce results of mixed origin. ``where`` is the file that records
+    The reason is that no set of releases could reproduce results of mixed origin. The version of Python, which does not
+    compute the results, may differ. ``where`` is the file that records
     the releases ``old``, by package.
     """
     for key, now in list_versions().items():
@@ -303,7 +310,7 @@ def repair_store(store: Store, tasks: Iterable[Task]) -> list[str]:
 def remove_store(folder: Path, study: SweepStudy) -> None:
     """Delete the store of a sweep; keep any folder of the same name that is not a store.
 
-    `check_stores` raises an error for such a folder.
+    Such a folder makes the `check_stores` that follows raise an error.
     """
     path = store_path(folder, study)
     if path.is_dir() and not path.is_symlink():

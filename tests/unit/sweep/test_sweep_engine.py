@@ -224,6 +224,8 @@ def test_delay_models_of_earlier_releases_are_accepted_if_held(tmp_path):
     path, new = tmp_path / "a.zarr", {"kind": "sweep", "scene": {"d": 0.5}}
     refuse_changes(path, "a", "store", {**new, "delay_model": "held", "delay_models": ["held"]}, new)
     refuse_changes(path, "a", "store", {**new, "scene": {"d": 0.5, "delay_model": "held"}}, new)
+    with pytest.raises(StoreError, match=r"studies\[a\].label: the store was created with"):
+        refuse_changes(path, "a", "store", {**new, "label": "held"}, new)
     with pytest.raises(StoreError, match=r"studies\[a\].delay_models: the store was created with a list of 2 items"):
         refuse_changes(path, "a", "store", {**new, "delay_models": ["held", "fractional_power"]}, new)
 

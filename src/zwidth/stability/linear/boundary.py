@@ -2,11 +2,14 @@
 
 The boundary consists of the arcs and crossing lines of `stability.linear.curve`; a line of constant B crosses each of
 them at most once (docs/theory/scenes.md, V12). As alpha increases along the line, a pole leaves the unit circle where
-``Im(q' - beta F') > 0`` and enters it where this is negative (V11; q and F as in `stability.linear.roots`). Hence
+``Im(q' - beta F') > 0`` and enters it where this is negative (V11), with d/dw denoted by a prime. Here q = -1/G with
+the response G of the device, F is the velocity estimate, and the poles z satisfy ``alpha + beta F(z) = q(z)``
+(`stability.linear.roots`). A crossing line consists of the walls with a pole at an angle where F and q are real. Hence
 
     unstable poles(alpha, beta) = base + sum of +-2 (pairs) or +-1 (real poles) over the crossings below alpha
 
-where the same number ``base`` holds for all walls: as alpha -> -inf the poles approach the zeros of G (V13, V14).
+where ``base``, the number as alpha -> -inf, follows from the zeros of G, which poles approach (V13, V14). It is equal
+for all walls, except in a lossless loop (`find_lossless`): there it differs below and above the lossless damping.
 
 In the arrays of this module, a *row* belongs to a line of constant B, and a *column* to an arc or, after all arcs, to a
 crossing line. ``leaving`` is the net number of poles that leave the circle as alpha increases past a crossing.
@@ -41,7 +44,7 @@ from zwidth.stability.linear.roots import LoopRoots
 MAX_STEPS = 120
 CONVERGED_STEP = 1e-10  # relative to w; the error after it is of the order of its square
 
-# Relative changes of beta, tried in this order if rounding errors make the crossings of a line ambiguous (V15).
+# Relative changes of the given beta, tried in this order if rounding errors make crossings of a line ambiguous (V15).
 SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
 # Distance of an additional point of the curve from an end of an interval, at which the curve may be infinite, relative
 # to the distance of the nearest node from this end.
@@ -70,7 +73,7 @@ class Boundary:
     arcs: tuple[Arc, ...]
     lines: tuple[CrossingLine, ...]
     asymptotes: np.ndarray  # angles at which the curve runs to infinity
-    limits: dict[float, tuple[float, float]]  # angle -> limit of alpha and beta where V8 is 0/0; NaN if infinite
+    limits: dict[float, tuple[float, float]]  # angle -> limit of alpha and beta where Im q/Im F is 0/0; NaN if infinite
     lossless: float  # damping of a lossless loop (`find_lossless`); NaN for all other loops
 
     @classmethod
@@ -78,6 +81,7 @@ class Boundary:
         """Compute the stability boundary of a loop: its nodes, arcs and crossing lines."""
         w = place_nodes(loop)
         curve = evaluate_curve(loop, w)
+        # Find the angles with Im F = 0, where beta is infinite or 0/0. Im F may touch 0 at zeros on the circle.
         vertical = find_field_zeros(loop, w, curve.im_f, "im_f")
         touched = [p for p in list_circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
         vertical = np.union1d(vertical, touched)
@@ -90,9 +94,7 @@ class Boundary:
         limits |= {line.w: (line.q - line.curve_beta * line.f, line.curve_beta) for line in lines}
         lossless = find_lossless(loop, w, curve, limits[0.0][1])
         arcs = (
-            [build_level_arc(w, curve, lossless)]
-            if np.isfinite(lossless)
-            else cut_arcs(loop, w, curve, extrema, limits)
+            cut_arcs(loop, w, curve, extrema, limits) if np.isnan(lossless) else [build_level_arc(w, curve, lossless)]
         )
         return cls(loop, w, tuple(arcs), tuple(lines), asymptotes, limits, lossless)
 
@@ -109,11 +111,9 @@ class Boundary:
         w, alpha = self._solve_crossings(beta[row], column, k)
         shape = beta.size, len(self.arcs) + len(self.lines)
         out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape), consistent)
-        out.alpha[row, column], out.w[row, column] = alpha, w
-        out.leaving[row, column] = joined.leaving[column]
+        out.alpha[row, column], out.w[row, column], out.leaving[row, column] = alpha, w, joined.leaving[column]
         for column, line in enumerate(self.lines, len(self.arcs)):
-            out.alpha[:, column] = line.q - beta * line.f
-            out.w[:, column] = line.w
+            out.alpha[:, column], out.w[:, column] = line.q - beta * line.f, line.w
             out.leaving[:, column] = line.count_leaving(beta)
         return out
 
@@ -239,9 +239,8 @@ class Boundary:
             probes = a + PROBE_DISTANCE * (inner[0] - a), b - PROBE_DISTANCE * (b - inner[-1])
             inner = np.concatenate([probes[:1], inner, probes[1:]])
             pieces.append(np.concatenate([[a], inner, [b]]))
-            values.append(
-                np.concatenate([self.limits[a][:1], evaluate_curve(self.loop, inner).alpha, self.limits[b][:1]])
-            )
+            alpha = evaluate_curve(self.loop, inner).alpha
+            values.append(np.concatenate([self.limits[a][:1], alpha, self.limits[b][:1]]))
         return np.concatenate(pieces), np.concatenate(values)
 
     @property
@@ -259,21 +258,21 @@ class Boundary:
             The dampings, and for each line whether its crossings are consistent with the counts far below and above.
         """
         mismatch = self._count_mismatch(beta)
+        shifted = beta.copy() if mismatch.any() else beta
         for shift in SHIFTS:
             row = np.flatnonzero(mismatch)
             if not row.size:
                 break
-            beta = beta.copy()
-            beta[row] = beta[row] * (1.0 + shift)
-            mismatch[row] = self._count_mismatch(beta[row])
-        return beta, mismatch == 0
+            shifted[row] = beta[row] * (1.0 + shift)
+            mismatch[row] = self._count_mismatch(shifted[row])
+        return shifted, mismatch == 0
 
     def _count_mismatch(self, beta: np.ndarray) -> np.ndarray:
         """Return, for each line, the count below all crossings plus the sum of ``leaving`` minus the count above."""
         return self.count_below(beta) - self.count_above(beta) + self._sum_leaving(beta)
 
     def _sum_leaving(self, beta: np.ndarray, limit: float = np.inf) -> np.ndarray:
-        """Return the sum of min(``leaving``, ``limit``) over all crossings of each line of constant B."""
+        """Sum min(``leaving``, ``limit``) over all crossings of each line of constant B; limit 0: entering poles."""
         joined = self._joined
         total = joined.sum_crossed(np.minimum(joined.leaving, limit), beta)
         return total + sum(np.minimum(line.count_leaving(beta), limit) for line in self.lines)
@@ -363,7 +362,7 @@ class Boundary:
     def _far_outside(self, side: float, excess: float) -> int:
         """Return the number of poles outside the unit circle as |alpha| -> inf.
 
-        As many poles as the device has zeros approach these zeros; the remaining poles go to infinity.
+        As many poles as the device has zeros approach these zeros; the other poles go to infinity (z^lag: pole of G).
 
         Args:
             side: sign of alpha.
@@ -373,15 +372,15 @@ class Boundary:
         depth, on_circle = distances_inside(loop.zeros), are_on_circle(loop.zeros)
         leaving = 0
         for zero, order in zip(*np.unique(loop.zeros[on_circle], return_counts=True), strict=True):
-            # Near a zero at w0, G = c x^order (1 + e x) with x = w - w0; poles satisfy G = -1/alpha, and |z| > 1 if and
-            # only if Im x < 0 (V14).
+            # Near a zero at w0 (stored as 1 - z), G = c x^order (1 + e x) with x = w - w0. Poles satisfy G = -1/alpha,
+            # and |z| > 1 if and only if Im x < 0 (V14). The size of alpha only scales x; use alpha = +-1.
             points = circle_points(np.angle(1.0 - zero))
             rest = replace(loop, zeros=loop.zeros[loop.zeros != zero]).evaluate_response(points)
             power = -side / (rest.value * (1j * points.z) ** order)
             x = power ** (1.0 / order) * np.exp(2j * np.pi * np.arange(order) / order)
             if np.isfinite(self.lossless):
                 # In a lossless loop, alpha moves the pole along the circle. Only a difference of beta from the lossless
-                # damping moves the pole off the circle: x becomes x (1 - (beta - lossless) F/alpha).
+                # damping moves it off the circle: x becomes x (1 - (beta - lossless) F/(order alpha)).
                 leaving += int(np.sum(side * excess * loop.estimate.jet(points).value.imag * x.real > 0))
                 continue
             # If x is real, the pole leaves the zero along the circle. The imaginary part of the next term of its
@@ -421,9 +420,10 @@ class _LoopValues(NamedTuple):
             is_zero = self.common == 0
             divisor = np.where(is_zero, 1.0, self.common)
             ratio = np.where(is_zero, np.imag(slope) / self.common_slope, np.imag(value) / divisor)
-            return _RowValues(
-                ratio, (np.imag(slope) - ratio * self.common_slope) / divisor, np.real(value), np.real(slope)
-            )
+            # The result is 0 where common is 0: the exact derivative at w = 0 and pi, where the ratio is even in the
+            # distance from w; at other angles it only affects the starting value of Newton's method.
+            ratio_slope = (np.imag(slope) - ratio * self.common_slope) / divisor
+            return _RowValues(ratio, ratio_slope, np.real(value), np.real(slope))
 
 
 @np.errstate(all="ignore")

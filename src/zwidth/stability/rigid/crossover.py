@@ -7,16 +7,23 @@ the characteristic polynomial P = T + B and the open loop L = B/T with
     T = z^(n+1) (z - 1)(z - c)                device and delay, c = e^-delta
     B = M(z) ((alpha + beta) z - beta)        wall, M = a2 z + a1 + a0/z
 
-On the unit circle, z = e^(jw) with 0 < w <= pi, the code uses
+f = 0 gives a2 = phi2, a1 = psi and a0 = 0; for f > 0 see docs/theory/model.md. The fields p1, psi, p1_t and psi_t of
+the plant are phi1(delta), psi(delta), phi1((1 - f) delta) and psi((1 - f) delta). On the unit circle, z = e^(jw) with
+0 < w <= pi, the code uses
 
     y = sin^2(w/2)      u = 1 - cos w = 2 y      W = alpha + beta u + j beta sin w      V = |M|^2
     em = 1 - c          p1 = phi1 = em/delta     phi2 = (1 - phi1)/delta                psi = (phi1 - c)/delta
 
-and gap = a2 - a1 + a0. For alpha > 0, |L| decreases strictly with frequency (one-crossover.md, Theorem 1). So there is
-at most one gain crossover, and the phase of the loop at that frequency decides stability (Theorem 2).
+and gap = a2 - a1 + a0 = -M(-1). With W, B = z M W, so |B|^2 = V |W|^2; and |T|^2 = 2 u (em^2 + 2 c u). Each
+docstring states whether an expansion is in y or in u.
 
-A wall on the *boundary curve* (alpha_w, beta_w) has a pole at e^(jw). The *lobe*, the first part of this curve, bounds
-the stable set, together with the line of walls with a pole at z = -1 if the lobe ends on that line, in the *corner*.
+For alpha > 0, |L| decreases strictly with frequency (one-crossover.md, Theorem 1). So there is at most one gain
+crossover, and the phase of the loop at that frequency decides stability (Theorem 2). Without a gain crossover, |L| > 1
+up to w = pi, and the loop is unstable.
+
+A wall on the *boundary curve* (alpha_w, beta_w) has a pole at e^(jw). The *lobe*, the part of this curve from w = 0 to
+the first return to alpha_w = 0 or, for some d < 1, to w = pi, bounds the stable set. If the lobe ends at w = pi, in the
+*corner*, the line of walls with a pole at z = -1 bounds the stable set beyond it.
 
 The same source code runs in any *arithmetic*: NumPy and JAX arrays, float64 numbers with an error bound, and balls of
 python-flint. In the last two (`stability.rigid.certified`) a value represents a set of numbers, and a comparison is
@@ -58,8 +65,8 @@ from zwidth.numerics.held_mass import ANY, DelayClasses, DiscretePlant, discreti
 from zwidth.numerics.root_finding import attach_root_derivatives
 from zwidth.units.quantities import WALL_RANGE
 
-# Number of Newton steps for the cubic. The starting value is within 11 % of the root, and each step squares the
-# relative error: 0.11^16 < 5e-16.
+# Number of Newton steps for the cubic. The starting value, also where it is replaced by 1, is within 11 % of the root
+# (within 5 % in two million random cases), and each step squares the relative error: 0.11^16 < 5e-16.
 NEWTON_STEPS = 4
 
 
@@ -80,11 +87,11 @@ class DelayPhase(NamedTuple):
     sine: Any  # sin((n + 1/2) w)
     half_sine_squared: Any  # sin^2((n + 1/2) w/2)
     within: Any  # (n + 1/2) w <= pi: cosine and sine determine the phase lag uniquely
-    beyond: Any  # w >= pi/(n + 1): above the frequencies of the stability lobe, hence unstable
+    beyond: Any  # w >= pi/(n + 1): above the lobe, which ends below pi/(n + 1) for d >= 1; hence unstable
 
 
 # Type of functions that return the root u of the polynomial with the coefficients h0, h1, h2[, h3]
-# (`expand_gain_difference`), and whether it is provably the only root in (0, 2).
+# (`expand_gain_difference`), and whether it is certain that u is the gain crossover and lies in (0, 1].
 RootFinder = Callable[[tuple[Any, ...]], tuple[Any, Any]]
 # Type of functions of u and n that return the phase lag at the frequency of u.
 DelayPhaseFunction = Callable[[Any, Any], DelayPhase]
@@ -111,7 +118,10 @@ class LongDelayCurve(NamedTuple):
 
 
 def expand_short_delay_curve(plant: Any) -> ShortDelayCurve:
-    """Expand the boundary curve for d < 1 in powers of y, in any arithmetic."""
+    """Expand the boundary curve for d < 1 in powers of y, in any arithmetic.
+
+    The coefficients follow from B1 of boundary.md for n = 0, with sin w and cos w expressed by y.
+    """
     p1, em, a2, a1, a0, f = plant.p1, plant.em, plant.a2, plant.a1, plant.a0, plant.f
     t = 1.0 - f
     # No digits cancel, because all terms of ``total`` are nonnegative and the other coefficient is a single product.
@@ -126,6 +136,7 @@ def expand_long_delay_curve(plant: Any) -> LongDelayCurve:
     """Expand the terms of `LongDelayCurve` in powers of y, in any arithmetic; a0 is None for integer d."""
     p1, em, a2, a1, a0 = plant.p1, plant.em, plant.a2, plant.a1, plant.a0
     if a0 is None:
+        # For f = 0, the general formulas below simplify by phi1 = a2 + a1 and 1 - delta a2 = phi1.
         E = em * p1, (plant.gap - em * a2) * 2.0
         return LongDelayCurve(E, (p1 * p1,), (p1 * p1, a1 * a2 * -4.0), (p1 * plant.gap * -2.0,))
     total, difference, product = a2 + a0, a2 - a0, a2 * a0 * 4.0
@@ -146,7 +157,7 @@ def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]
     """
     p1_squared, cross, alpha_squared = plant.p1 * plant.p1, beta * (alpha + beta) * 2, alpha * alpha
     # With ``|W|^2 = alpha^2 + cross u``, compute ``bend = cross/2 - delta^2`` in factored form, to avoid cancellation
-    # near beta = delta.
+    # near beta = delta. The term ``2 phi1^2 bend`` contains the term -2 em^2 of |T|^2, because em = delta phi1.
     bend = (beta - plant.delta) * (beta + plant.delta) + alpha * beta
     # The expansion of V is phi1^2 - 2 m1 u + product u^2; for integer d, a0 = 0 and therefore product = 0.
     if plant.a0 is None:
@@ -160,20 +171,21 @@ def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]
 
 def decide_short_delay(alpha: Any, beta: Any, plant: Any) -> Verdict:
     """Decide stability for d < 1, alpha > 0 and beta > -delta, by comparing alpha with the boundary at this beta."""
-    # Require |L(-1)| < 1, because otherwise there is no gain crossover. On lines of constant beta that miss the lobe,
-    # this condition alone limits alpha.
+    # Require |L(-1)| < 1, because otherwise there is no gain crossover and the wall is unstable. On lines of constant
+    # beta that miss the lobe, this condition alone limits alpha. The sign of L(-1) is that of gap, so both signs occur.
     wall_at_nyquist, device_at_nyquist = plant.gap * (alpha + beta * 2.0), (plant.c + 1.0) * 2.0
     crosses = (wall_at_nyquist < device_at_nyquist) & (wall_at_nyquist > -device_at_nyquist)
     crosses_nowhere = (wall_at_nyquist > device_at_nyquist) | (wall_at_nyquist < -device_at_nyquist)
     b = beta + plant.delta
     if plant.a0 is None:
         # For d = 0, y can be eliminated: alpha_w = phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)), where p1 = phi1,
-        # a1 = psi, a2 = phi2 and b = beta + delta.
+        # a1 = psi, a2 = phi2 and b = beta + delta. Lines of constant beta that miss the lobe need no separate case,
+        # because the two conditions alpha < alpha_w and |L(-1)| < 1 are those of the Jury test for all beta.
         left, right = alpha * plant.a1 * (plant.p1 + plant.a2 * b), plant.p1 * b * (1.0 - plant.a1 * beta)
         return Verdict(crosses & (left < right), crosses_nowhere | (left > right))
     (u0, u1), modulus, stiffness = expand_short_delay_curve(plant)
     # The lobe has this beta where ``V b = y (u0 + u1 y)`` with b = beta + delta, that is, where ``quadratic y^2 -
-    # linear y + constant = 0``. Compute the first positive root y.
+    # linear y + constant = 0``. Compute the first positive root y, in the form of the quadratic formula that adds.
     constant, linear, quadratic = modulus[0] * b, u0 - b * modulus[1], b * modulus[2] - u1
     discriminant = linear * linear - constant * quadratic * 4.0
     y = constant * 2.0 / (linear + square_roots(discriminant)[0])
@@ -183,8 +195,8 @@ def decide_short_delay(alpha: Any, beta: Any, plant: Any) -> Verdict:
     meets_lobe = meets_curve & (y < 1.0)
     # A line of constant beta may miss the lobe. If the lobe ends in the corner (y = 1, alpha > 0), the walls on such a
     # line are stable up to the line of poles at z = -1. If the lobe ends earlier, at alpha = 0, none of them is stable.
-    # The lobe ends earlier if V alpha_w < 0 at y = 1, or if gap < 0, because the line of poles at z = -1 then lies
-    # below the stable set.
+    # The lobe ends earlier if V alpha_w < 0 at y = 1, or if gap < 0: then the walls with a pole at z = -1 have
+    # alpha + 2 beta < 0, and the lobe cannot reach their line (one-lobe.md, S17 and L15).
     stiffness_at_nyquist = stiffness[0] + stiffness[1] + stiffness[2]
     ends_at_nyquist = (stiffness_at_nyquist > 0) & (plant.gap > 0)
     ends_earlier = (stiffness_at_nyquist < 0) | (plant.gap < 0)
@@ -207,7 +219,8 @@ def decide_long_delay(
 ) -> Verdict:
     """Decide stability for d >= 1, alpha > 0 and beta > -delta, by comparing with the boundary at the gain crossover.
 
-    For alpha = 0, where one pole is at z = 1, the verdict applies to the other poles and requires beta > delta (S15b).
+    For alpha = 0, where one pole is at z = 1, the verdict applies to the other poles. There the caller must ensure
+    beta > delta, because |L| is beta/delta at w = 0 and the crossover exists only if this exceeds 1 (S15b).
 
     Args:
         alpha: Normalized stiffness of the wall.
@@ -241,11 +254,12 @@ def decide_long_delay(
     cross_product = projection * beta * sin_half * 2.0 - (sine_F - phase.cosine * E) * alpha
     damping_margin = (beta + plant.delta) * cos_half * horner(y, V_terms) - boundary_offset
     # The lobe ends where (n + 1) w + arg(E + j F) reaches pi, where E + j F = (z - c) conj M. Neither angle is
-    # negative. ``projection`` has the sign of the sine of their sum; the last condition excludes sums of 2 pi or more.
+    # negative, because arg(z - c) >= w >= arg M. ``projection`` has the sign of the sine of their sum. With (n + 1/2) w
+    # <= pi, the last condition excludes sums of 2 pi or more, which need both angles above pi/2.
     on_lobe = certain & phase.within & (projection > 0) & ((E > 0) | (cos_full > 0))
     # Both criteria have the same sign but different rounding errors: cross_product is accurate near the end of the
-    # lobe, where alpha decreases, and damping_margin next to beta = -delta. ``steep`` separates the two parts
-    # approximately. (``^ True`` negates arrays as well as Python's bool.)
+    # lobe, where alpha decreases to 0, and damping_margin next to beta = -delta. ``steep``, the condition
+    # Im W > alpha, separates the two parts approximately. (``^ True`` negates arrays as well as Python's bool.)
     steep = sin_half * cos_half * beta * 2.0 > alpha
     stable = on_lobe & ((steep & (cross_product > 0)) | ((steep ^ True) & (damping_margin > 0)))
     # If |B|^2 - |T|^2 is positive at u = 1, the crossover lies above w = pi/2 >= pi/(n + 1), or does not exist. The
@@ -266,7 +280,7 @@ def find_first_root(coefficients: tuple[Array, ...]) -> Array:
     """
     h0, h1, h2, *rest = coefficients
     xp = namespace(*coefficients)
-    # Start from the quadratic in which the cubic term h3 u^3 is replaced by (h3/2) u^2.
+    # Start from the quadratic in which the cubic term h3 u^3 is replaced by (h3/2) u^2, a compromise over (0, 1].
     negative_h2 = -(h2 + 0.5 * rest[0]) if rest else -h2
     discriminant_root = xp.sqrt(xp.maximum(h1 * h1 + 4.0 * negative_h2 * h0, 0.0))
     # Choose the form of the quadratic formula that adds terms of equal sign, to avoid cancellation.
@@ -277,7 +291,7 @@ def find_first_root(coefficients: tuple[Array, ...]) -> Array:
     if not rest:
         return root
     h3 = rest[0]
-    # If the start is outside (0, 1], the cubic term is not small; start from 1 instead.
+    # If the start is outside (0, 1], start from 1 instead: the root, if it is in (0, 1], is then near 1.
     root = xp.where((root > 0) & (root < 1.0), root, 1.0)
     # Unroll the Newton steps, because XLA then fuses all of them into a single loop over the points.
     for _ in range(NEWTON_STEPS):
@@ -288,7 +302,10 @@ def find_first_root(coefficients: tuple[Array, ...]) -> Array:
 
 
 def _find_crossover(gain_difference: tuple[Array, ...]) -> tuple[Array, Array]:
-    """Return the crossover u, and whether it lies in (0, 1]; for d >= 1 no wall with a larger u is stable."""
+    """Return the crossover u, and whether it lies in (0, 1]; for d >= 1 no wall with a larger u is stable.
+
+    A root in (0, 1] is the only one in (0, 2) by `expand_gain_difference`, so its uniqueness needs no check.
+    """
     u = find_first_root(gain_difference)
     return u, (sum(gain_difference[1:], gain_difference[0]) <= 0) & (u > 0) & (u <= 1.0)
 
@@ -298,11 +315,12 @@ def evaluate_phase(u: Array, n: Array) -> DelayPhase:
     xp = namespace(u, n)
     # Compute the sine of half the phase lag, because 1 - cos((n + 1/2) w) must keep its relative accuracy for low
     # crossover frequencies.
+    # ``w/2 = asin sqrt(u/2)``; ARCSINE approximates asin(s)/s in powers of 4 s^2 - 1 = 2 u - 1.
     half = xp.minimum((n + 0.5) * xp.sqrt(0.5 * u) * horner(2.0 * u - 1.0, ARCSINE), 0.5 * np.pi)
     square = half * half
     sine, cosine = half * horner(square, SINE), horner(square, COSINE)
-    # If the comparison is true, (n + 1/2) w <= pi; otherwise (n + 1) w >= pi, because u <= w^2/2
-    # (docs/theory/certified.md, C5).
+    # If the comparison is false, (n + 1) w >= pi, because u <= w^2/2. If it is true, (n + 1/2) w <= pi, because asin is
+    # nearly linear at these arguments and the factor (n + 1/2)/(n + 1) outweighs the rest (certified.md, C5).
     below_bound = u * (n + 1.0) * (n + 1.0) < 0.5 * np.pi * np.pi
     return DelayPhase(
         (cosine - sine) * (cosine + sine), 2.0 * sine * cosine, sine * sine, below_bound, below_bound ^ True
@@ -315,7 +333,7 @@ def find_gain_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tupl
     Args:
         alpha: Normalized stiffness.
         beta: Normalized damping.
-        plant: Device and delay; a0 must be an array, 0 for integer delays.
+        plant: Device and delay; a0 must be an array, 0 for integer delays, so that there are always four coefficients.
 
     Returns:
         The crossover w in rad per sample, in (0, pi], differentiable under JAX; and whether it exists. If it does not,

@@ -2,30 +2,30 @@
 
 In each cell, one or two *groups* of poles (one pole, or a pair near the real axis) are expanded in the wall's position
 (`stability.rigid.pole_cells`). One count (`stability.rigid.pole_count.count_poles_in_cell`) certifies for all walls of
-the cell that no other pole is larger. The proofs, C1 to C6, are in docs/theory/maps.md. Cells that fail are divided in
-four; walls of the smallest cells that fail are left *open*, and `stability.rigid.dominant_poles` computes them one by
-one. The *special* walls are those that are open or whose spectral radius is so close to 1 that its side of 1 is
-uncertain.
+the cell that no other pole is larger, by the argument principle. The proofs, C1 to C6, are in docs/theory/maps.md.
+Cells that fail, also because of other pairs, are divided in four; walls of the smallest cells that fail are left
+*open*, and `stability.rigid.dominant_poles` computes them one by one. The *special* walls are those that are open or
+whose spectral radius is so close to 1 that its side of 1 is uncertain.
 
 A grid has the axes device, row (beta) and column (alpha); a *position* is an index triple of these, of a cell or of a
 wall. Only a *window* of the grid, a range of rows and columns, is computed. xi and eta are the positions in alpha and
-beta relative to the center of the cell, from -1 to 1. A *log radius* is log |z| of a pole z.
+beta relative to the center of the cell, from -1 to 1. A *log radius* is log |z| of a pole z, a *decay rate* is -log |z|
+of the dominant pole. `AllowedErrors` converts the requested accuracy of radii to the largest error of log radii
+(``limit``); only if this accuracy is *coarse*, which excludes decay rates, may another pole be slightly larger. A field
+``order`` of a group is an index of `ORDERS`; it is ``len(ORDERS)`` if no circle encloses the group.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.polynomial.chebyshev import chebpts1, chebvander
 from numpy.polynomial.polynomial import polyvander
 
 from zwidth.stability.rigid.characteristic_function import halley_step
 from zwidth.stability.rigid.dominant_pole_search import list_starts
 from zwidth.stability.rigid.pole_cells import (
-    EXTRA_NODES,
     ORDERS,
     REAL_AXIS_WIDTH,
     ROUNDING,
@@ -33,11 +33,13 @@ from zwidth.stability.rigid.pole_cells import (
     AllowedErrors,
     Cells,
     Group,
+    compute_interpolation_weights,
     compute_larger,
     enclose_poles,
     expand_sums,
     find_stationary_point,
     is_larger_accurate,
+    list_chebyshev_nodes,
     select_cells,
 )
 from zwidth.stability.rigid.pole_count import LoopFactors, count_poles_in_cell, factor_loop
@@ -50,13 +52,14 @@ CELLS_PER_BATCH = 1 << 7  # number of cells whose series are computed at once
 WALLS_PER_WRITE = 1 << 16  # number of walls whose poles are evaluated and stored at once
 # Number of Halley steps from each starting point of the search for the two largest poles at the center of a cell.
 HALLEY_STEPS = 5
-# Distance in log z, relative to the distance between neighboring poles of a long delay. A sequence of Halley steps has
-# converged if its last step is shorter. Two sequences have found the same pole if their ends are closer together.
+# Distance in log z times n + 1; with a long delay, neighboring poles are about 2 pi/(n + 1) apart. Halley steps have
+# converged if the last step is shorter (expansions may start anywhere near the pole); closer ends are the same pole.
 SAME_POLE_DISTANCE = 1e-2
 # Largest number of walls along an axis for which powers and interpolation weights are cached.
 MAX_CACHED = 1 << 14
 # Circles on which poles are counted: distances in log |z| below the lower bound of the groups' poles, relative to the
-# distance between this bound and the poles at the center of the cell.
+# distance between this bound and the poles at the center of the cell. One success suffices (C5): a near
+# circle keeps close poles inside, a far one keeps its distance from the poles of the group.
 COUNT_CIRCLES = (0.3, 1.5, 6.0)
 
 
@@ -85,20 +88,6 @@ class Area(NamedTuple):
         return [self.alpha[alpha, column], self.beta[beta, row], self.delta[device], self.d[device]]
 
 
-@cache
-def _list_chebyshev_nodes(order: int) -> np.ndarray:
-    """Return the Chebyshev nodes for interpolating the exponential of a series of the given order."""
-    return chebpts1(order + EXTRA_NODES)
-
-
-def _compute_interpolation_weights(positions: np.ndarray, order: int) -> np.ndarray:
-    """Return the weights by which the values at the nodes are multiplied to interpolate at positions: (..., nodes)."""
-    nodes = _list_chebyshev_nodes(order)
-    polynomials = chebvander(nodes, nodes.size - 1).T * (2.0 / nodes.size)
-    polynomials[0] *= 0.5
-    return chebvander(positions, nodes.size - 1) @ polynomials
-
-
 class _AxisPieces:
     """The values along one axis of the grid, divided into pieces of one cell each: (devices, pieces)."""
 
@@ -108,6 +97,7 @@ class _AxisPieces:
             pieces = pieces.reshape(values.shape[0], -1, side)
             low, high = pieces.min(-1), pieces.max(-1)
             self.center = 0.5 * (low + high)
+            # Divide by a positive number, also if all values of a piece are equal.
             self.half = np.maximum(0.5 * (high - low), 1e-12 * np.abs(self.center) + 1e-200)
             self._positions = (pieces - self.center[..., None]) / self.half[..., None]
         self._tables: dict[Any, np.ndarray] = {}
@@ -122,12 +112,18 @@ class _AxisPieces:
 
 
 def pad_to_16(index: np.ndarray) -> np.ndarray:
-    """Pad an index array with its last entry to a multiple of 16, because NumPy may round a remainder differently."""
+    """Pad an index array with its last entry to a multiple of 16, so that results do not depend on the batch size.
+
+    NumPy's vectorized loops may round the last entries, which do not fill a vector, differently.
+    """
     return np.concatenate([index, np.repeat(index[-1:], -index.size % 16)])
 
 
 def _bound_on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``re - error`` and ``re + error``, limited so that both are on the same side of the unit circle as re."""
+    """Return ``re - error`` and ``re + error``, limited so that both are on the same side of the unit circle as re.
+
+    If re is closer to 0 than the limit, the bounds do not enclose it, and the certificate fails.
+    """
     gap = 2.0 * VERDICT_WIDTH
     return (
         np.where(re > 0, np.maximum(re - error, gap), re - error),
@@ -170,8 +166,7 @@ class _ResultArrays:
         sizes = [-(-part.stop // side) * side - start for (part, side), start in zip(windows, starts, strict=True)]
         shape, self.first = (area.d.size, *sizes), np.array([[0], *([start] for start in starts)])
         self.radius, self.rate = np.empty(shape), np.empty(shape if with_rate else (0, 0, 0))
-        # Positions of the special walls.
-        self.special: list[np.ndarray] = []
+        self.special: list[np.ndarray] = []  # positions of the special walls
 
     def cut_out(self, window: tuple[slice, slice]) -> GridPoles:
         """Return the results in the window."""
@@ -182,7 +177,8 @@ class _ResultArrays:
         radius, rate = (values[:, rows, columns] for values in (self.radius, self.rate))
         index = np.concatenate([np.empty((3, 0), int), *self.special], axis=1) - [[0], [rows.start], [columns.start]]
         is_inside = (index[1:] >= 0).all(0) & (index[1] < radius.shape[1]) & (index[2] < radius.shape[2])
-        # Remove duplicates, because walls for which two groups were compared may be listed twice.
+        # Remove duplicates, because walls for which two groups were compared may be listed twice. Walls of which only
+        # the smaller pole is close to the unit circle are listed needlessly.
         is_special = np.zeros(radius.shape, bool)
         is_special[tuple(index[:, is_inside])] = True
         return GridPoles(radius, rate, np.unravel_index(np.flatnonzero(is_special), radius.shape))
@@ -247,18 +243,18 @@ class _CellGrid:
                     re[0, index], positions[:, index], select_cells(cells, index), fractional
                 )
         enclosed = (single.order < len(ORDERS)) | certified
-        # Expand two poles: as two groups if the other may become dominant; as a pair if no circle encloses one alone.
+        # Expand two poles: as two groups if a circle encloses the first one, but the second one may be larger; as a
+        # pair if no circle encloses the first one alone.
         for mask, poles in ((enclosed & ~certified, 1), (~enclosed, 2)):
             index = pad_to_16(np.flatnonzero(mask))
             if not index.size:
                 continue
             part = select_cells(cells, index)
             if poles == 1:
-                groups = [
-                    select_cells(single, index),
-                    enclose_poles(1, re[1, index], im[1, index], part, fractional, self.errors),
-                ]
+                other = enclose_poles(1, re[1, index], im[1, index], part, fractional, self.errors)
+                groups = [select_cells(single, index), other]
             else:
+                # Use the real zero of A' between the two poles as the center.
                 center = find_stationary_point(re[0, index], im[0, index], part.loop, fractional)
                 groups = [enclose_poles(2, *center, part, fractional, self.errors)]
             certified[index] = self._certify(groups, positions[:, index], part, fractional)
@@ -266,7 +262,7 @@ class _CellGrid:
 
     def _evaluates_logarithms(self, k: int) -> bool:
         """Return whether series of the order ``ORDERS[k]`` are evaluated at each wall instead of interpolated."""
-        return self.errors.with_rate or min(self.sides) <= _list_chebyshev_nodes(ORDERS[k]).size
+        return self.errors.with_rate or min(self.sides) <= list_chebyshev_nodes(ORDERS[k]).size
 
     def _index_axes(self, positions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the indices of the cells on the alpha axis and on the beta axis, each as (device, piece)."""
@@ -294,7 +290,7 @@ class _CellGrid:
             circles.append(_bound_on_one_side(low, self.errors.reserve)[1])
             counts.append(0 * counts[0])
         loop, a, b = select_cells(cells, np.tile(index, len(circles)))
-        # Count the poles outside all circles in one call.
+        # Count the poles outside each circle, in one call.
         outside, certain = count_poles_in_cell(np.concatenate(circles), loop, (a, b), fractional)
         shape = len(circles), index.size
         certified = np.zeros(positions.shape[1], bool)
@@ -311,6 +307,7 @@ class _CellGrid:
         outside, certain = (part.reshape(2, -1) for part in count_poles_in_cell(circles, loop, (a, b), fractional))
         uniform = certain.all(0) & (outside[0] > 0) & (outside[1] == 0)
         values = np.exp(np.where(re > 0, *_bound_on_one_side(re, 0.0)))
+        # Store no rates, because coarse accuracy excludes them.
         self.radius[tuple((positions - self.first)[:, uniform])] = values[uniform, None, None]
         return uniform
 
@@ -332,9 +329,8 @@ class _CellGrid:
                 padded = pad_to_16(chosen)
                 batch = select_cells(group, padded)
                 with np.errstate(all="ignore"):
-                    self._write(
-                        positions[:, chosen], expand_sums(batch, select_cells(cells, padded), order), batch, k, merge
-                    )
+                    sums = expand_sums(batch, select_cells(cells, padded), order)
+                    self._write(positions[:, chosen], sums, batch, k, merge)
 
     def _write(self, positions: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
         """Store the poles of all walls of some cells; with ``merge``, only those larger than the stored ones."""
@@ -348,12 +344,13 @@ class _CellGrid:
             if self._evaluates_logarithms(k):
                 polynomials = [(logarithms, polyvander)]
             else:
-                powers = polyvander(_list_chebyshev_nodes(ORDERS[k]), ORDERS[k])
-                polynomials = [(np.exp(powers @ logarithms @ powers.T) - center, _compute_interpolation_weights)]
+                powers = polyvander(list_chebyshev_nodes(ORDERS[k]), ORDERS[k])
+                polynomials = [(np.exp(powers @ logarithms @ powers.T) - center, compute_interpolation_weights)]
             # Bound |log radius| from below by the magnitude of the constant term minus those of all other terms.
             sizes = np.abs(logarithms)
             least_log = np.maximum(2.0 * sizes[:, 0, 0] - sizes.sum((1, 2)), 0.0)
-            # Select the cells in which a wall may be special, i.e. too close to the unit circle or not accurate enough.
+            # Select the cells in which a wall may be special: too close to the unit circle or, with rates only, not
+            # accurate enough. Without rates, `limit` is the same for all smaller sizes for which an order is chosen.
             is_close = (least_log < 2.0 * self.errors.uncertain_width) | (log_error > self.errors.limit(least_log))
         else:
             polynomials, is_close = [(x, polyvander) for x in sums], np.ones(log_error.size, bool)
@@ -369,10 +366,9 @@ class _CellGrid:
             if len(sums) == 2:
                 values = self._select_larger(values, select_cells(group, part), k)
             elif self._evaluates_logarithms(k):
-                inaccurate = log_error[part][close_cells, None, None] > self.errors.limit(
-                    np.abs(values[0][close_cells])
-                )
-                values[0][close_cells] = np.where(inaccurate, np.nan, values[0][close_cells])
+                close = values[0][close_cells]
+                inaccurate = log_error[part][close_cells, None, None] > self.errors.limit(np.abs(close))
+                values[0][close_cells] = np.where(inaccurate, np.nan, close)
                 values = [np.exp(values[0]), -values[0]][: 1 + self.errors.with_rate]
             else:
                 values[0] += center[part]
@@ -383,7 +379,10 @@ class _CellGrid:
                 array[index] = choose(array[index], new) if merge else new
 
     def _select_larger(self, sums: list[np.ndarray], group: Group, k: int) -> list[np.ndarray]:
-        """Return the radius and rate of the larger of two poles from the sums over both; NaN if not accurate enough."""
+        """Return radius and rate of the larger of two poles; NaN if not accurate enough.
+
+        ``sums`` are the sums of u/U and (u/U)^2 over both poles, with the radius U = ``disk`` of the circle (C1).
+        """
         re, disk, error = (x[:, None, None] for x in (group.re, group.disk, group.error[k] + ROUNDING))
         values, discriminant = compute_larger(sums[0], sums[1], disk)
         values += re
@@ -411,12 +410,14 @@ class _CellGrid:
         return np.matmul(first, second, out=buffer[: positions.shape[1]])
 
     def mark_open(self, positions: np.ndarray) -> None:
-        """Set all walls of some cells to NaN, i.e. leave them open."""
+        """Set the radii and rates of all walls of some cells to NaN, i.e. leave the walls open."""
         self._note_special(positions, np.full((positions.shape[1], *self.sides), np.nan))
-        self.radius[tuple(positions - self.first)] = np.nan
+        for array in (self.radius, self.rate)[: 1 + self.errors.with_rate]:
+            array[tuple(positions - self.first)] = np.nan
 
     def _note_special(self, positions: np.ndarray, radius: np.ndarray) -> None:
         """Add the walls whose radius is NaN or so close to 1 that its side is uncertain to the special walls."""
+        # The width applies to log radii, which differ from radius - 1 by less than 1 % here.
         index = np.flatnonzero(~(np.abs(radius - 1.0) > 1.01 * self.errors.uncertain_width))
         cell, *offset = np.unravel_index(index, radius.shape)
         corner = (self.steps * (positions - self.first))[1:, cell]
@@ -430,12 +431,8 @@ def compute_grid_poles(area: Area, accuracy: float, with_rate: bool = False) -> 
     is_fractional = area.d != np.floor(area.d)
     results = _ResultArrays(area, sizes[0], with_rate)
     corners = [np.arange(w.start // side, -(-w.stop // side)) for w, side in zip(area.window, sizes[0], strict=True)]
-    open_cells = [
-        np.stack(
-            [part.reshape(-1) for part in np.meshgrid(np.flatnonzero(is_fractional == kind), *corners, indexing="ij")]
-        )
-        for kind in (False, True)
-    ]
+    devices = [np.flatnonzero(is_fractional == kind) for kind in (False, True)]
+    open_cells = [np.reshape(np.meshgrid(each, *corners, indexing="ij"), (3, -1)) for each in devices]
     with np.errstate(all="ignore"):
         for sides, larger in zip(sizes, (sizes[0], *sizes), strict=False):
             level = _CellGrid(area, sides, errors, results)

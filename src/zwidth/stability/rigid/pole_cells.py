@@ -20,6 +20,7 @@ from math import comb
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebpts1, chebvander
 
 from zwidth.stability.rigid.characteristic_function import make_complex
 from zwidth.stability.rigid.pole_count import LoopFactors
@@ -358,3 +359,17 @@ def is_larger_accurate(discriminant: np.ndarray, disk: Any, error: Any, limit: A
     return np.abs(discriminant) * remaining**2 >= np.where(
         discriminant_error <= remaining**2, -1.0, discriminant_error**2
     )
+
+
+@cache
+def list_chebyshev_nodes(order: int) -> np.ndarray:
+    """Return the Chebyshev nodes for interpolating the exponential of a series of the given order."""
+    return chebpts1(order + EXTRA_NODES)
+
+
+def compute_interpolation_weights(positions: np.ndarray, order: int) -> np.ndarray:
+    """Return the weights by which the values at the nodes are multiplied to interpolate at positions: (..., nodes)."""
+    nodes = list_chebyshev_nodes(order)
+    polynomials = chebvander(nodes, nodes.size - 1).T * (2.0 / nodes.size)
+    polynomials[0] *= 0.5
+    return chebvander(positions, nodes.size - 1) @ polynomials

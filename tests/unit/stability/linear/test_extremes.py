@@ -161,6 +161,18 @@ def test_walls_on_an_inconsistent_line_are_decided_by_poles(monkeypatch):
     np.testing.assert_array_equal(loop.is_stable(stiffness, damping), expected)
 
 
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_ambiguous_lines_are_shifted_upward_and_downward(monkeypatch, direction):
+    boundary, beta = scene(device(0.1), 1.3, WINDOW(5)).loop.boundary, np.array([0.5, 0.25])
+    # The first line is ambiguous up to a relative distance of 5e-14 on one side, and everywhere on the other side.
+    monkeypatch.setattr(
+        type(boundary), "_count_mismatch", lambda self, x: ((x > 0.3) & (direction * (x - 0.5) < 0.25e-13)).astype(int)
+    )
+    shifted, consistent = boundary.shift_ambiguous(beta)
+    assert consistent.all()
+    np.testing.assert_allclose(shifted / beta - 1.0, [direction * 1e-13, 0.0], rtol=0.01)
+
+
 @pytest.mark.parametrize("damping", [-0.5, 5.0, 20.0])
 def test_poles_where_eigenvalues_return_two_real_poles_for_a_pair(damping):
     # Near modes and an operator close to z = 1, the coefficients hardly determine the poles there.

@@ -76,6 +76,14 @@ def test_grid_satisfies_every_requested_accuracy(d, accuracy):
     assert (np.abs(log_radius[row, column] - exact.re) <= accuracy + exact.error).all()
 
 
+def test_rates_of_open_walls_are_nan():
+    alpha, beta = np.linspace(0.01, 60.0, 64), np.linspace(-5.0, 40.0, 64)
+    grid = compute_grid_poles(Area.whole(alpha[None], beta[None], np.array([60.0]), np.array([2.0])), 1e-10, True)
+    is_open = np.isnan(grid.radius)
+    assert is_open.any()
+    np.testing.assert_array_equal(np.isnan(grid.rate), is_open)
+
+
 def test_permuted_axis_gives_permuted_radii():
     rng = np.random.default_rng(4)
     alpha, beta = np.geomspace(1e-12, 1.0, 200), np.linspace(-0.05, 1.0, 200)
