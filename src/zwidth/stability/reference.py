@@ -68,7 +68,7 @@ def expand_loop(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degre
 
 def compute_poles(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
     """Return the poles of walls, given by one-dimensional arrays, along a new last axis."""
-    solve = jax.vmap(lambda *wall: jax.numpy.linalg.eigvals(companion(expand_loop(*wall, degree))))
+    solve = jax.vmap(lambda a, b, c, d: jax.numpy.linalg.eigvals(companion(expand_loop(a, b, c, d, degree))))
     return solve(alpha, beta, delta, d)
 
 
