@@ -80,8 +80,9 @@ def _list_margins(requirements: Requirements) -> dict[str, Requirements]:
     phase = max(DEFAULT_PHASE_MARGIN, requirements.phase_margin or 0.0)
     gain = max(DEFAULT_GAIN_MARGIN, requirements.gain_margin or 0.0)
     by_phase, by_gain = f"--phase-margin {phase:g}", f"--gain-margin {gain:g}"
-    tried = {by_phase: requirements._replace(phase_margin=phase)}
-    tried[f"{by_phase} {by_gain}"] = requirements._replace(phase_margin=phase, gain_margin=gain)
+    passive = " --passive" if requirements.passive else ""
+    tried = {by_phase + passive: requirements._replace(phase_margin=phase)}
+    tried[f"{by_phase} {by_gain}{passive}"] = requirements._replace(phase_margin=phase, gain_margin=gain)
     if requirements.passive:
         tried[f"{by_phase} without --passive"] = requirements._replace(phase_margin=phase, passive=False)
     defaults = Requirements.check(None, None, None, False, requirements.beyond_safe, requirements.grasps)

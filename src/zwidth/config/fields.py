@@ -101,6 +101,8 @@ _PYDANTIC_ERRORS = {
     "dict_type": ("it must be a mapping", "write 'key: value' lines, or {key: value}"),
 }
 
+# Keys that users may write for the keys of the models: words of rotary devices and of the command line.
+_OTHER_NAMES = {"inertia": "mass", "friction": "coulomb"}
 _REMOVED_KEYS = ("delay_model", "delay_models")  # keys that studies had in earlier releases
 
 
@@ -229,6 +231,8 @@ class Strict(BaseModel):
         if colon and key in cls.model_fields:
             return "unknown key", "a space follows the colon after a key", f"write '{key}: {value}'"
         allowed = f"{cls.noun} has the keys {quote_names(cls.model_fields)}"
+        if (standard := _OTHER_NAMES.get(name)) in cls.model_fields:
+            return "unknown key", allowed, f"use {standard!r}"
         return "unknown key", allowed, suggestion(name, cls.model_fields, "remove it")
 
     def find_faults(self) -> Iterable[LocatedProblem]:

@@ -124,7 +124,9 @@ class Study(Strict):
         """Raise a problem if the study would take parameters from a scene with parts, but ignore the parts."""
         taken = cls._list_absent(raw)
         if taken and not cls.takes_parts and scene.nonrigid_parts:
-            raise make_parts_error(cls.kind_name(), list_parts(scene), f"add {' and '.join(taken)} to the study")
+            raise make_parts_error(
+                cls.kind_name(), list_parts(scene), f"add {' and '.join(taken)} for a rigid mass without them"
+            )
 
     @classmethod
     def check_estimate(cls, raw: dict[str, Any], scene: AnyScene) -> None:

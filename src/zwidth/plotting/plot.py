@@ -68,7 +68,9 @@ def _with_house_style(function: Callable[Parameters, Result]) -> Callable[Parame
 
     @wraps(function)
     def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        owner = args[0] if args else next(iter(kwargs.values()), None)
+        owner: Any = args[0] if args else next(iter(kwargs.values()), None)
+        # The scenes of a mapping have the same units; `region` rejects others.
+        owner = next(iter(owner.values()), None) if isinstance(owner, Mapping) else owner
         with style.house_style(getattr(owner, "unit_system", None)):
             return function(*args, **kwargs)
 
@@ -133,11 +135,16 @@ def region(
         The Axes. Stable walls are shaded; the largest outline is solid, outlines of islands dashed, of holes dotted.
 
     Raises:
-        InputError: if a value is no scene, or ``passive`` is set and a scene has no passivity condition.
+        InputError: if a value is no scene, if both linear and rotary devices are given, or if ``passive`` is set and a
+            scene has no passivity condition.
     """
     scenes = scene if isinstance(scene, Mapping) else {"": scene}
     for each in scenes.values():
         check_scene(each)
+    if len({each.unit_system.rotary for each in scenes.values()}) > 1:
+        raise InputError(
+            "scene: got linear and rotary devices, whose stiffnesses have different units; draw them apart"
+        )
     outlines, walls = tabulate_sets(scenes)
     edges = [_trace_passive(each, label) for label, each in (scenes if passive else {}).items()]
     return draw_stable_set(stack([outlines, *edges]), walls, _choose_axes(ax), normalized=normalized)[0]

@@ -340,7 +340,7 @@ def figure_of(drawn: AnyAxes | Figure) -> Figure:
 
 
 def save(
-    drawn: AnyAxes | Figure, stem: Path, formats: Sequence[str] = ("png", "svg"), dpi: float | None = None
+    drawn: AnyAxes | Figure, stem: Path | str, formats: Sequence[str] = ("png", "svg"), dpi: float | None = None
 ) -> tuple[Path, ...]:
     """Write a figure to one file per format and return their paths; the same figure always has the same bytes.
 
@@ -350,7 +350,7 @@ def save(
         formats: File formats: "png", "svg" or "pdf".
         dpi: Resolution in dots per inch of PNG files, and of images within SVG and PDF files. Default: 180 for PNG.
     """
-    figure = figure_of(drawn)
+    figure, stem = figure_of(drawn), Path(stem)
     files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)
     engine = figure.get_layout_engine()
     with house_style():

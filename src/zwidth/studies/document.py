@@ -168,7 +168,11 @@ class Config(Strict, noun="a configuration"):
             "name": "name: my_run",
             "studies": "studies: [{kind: boundary, name: first, delta: 0, d: 0}]",
         }
-        return "every configuration has version, name and studies", f"add {examples[name]!r}"
+        remedy = f"add {examples[name]!r}"
+        if name == "studies":
+            for_scene = "'studies: [{kind: recommend, name: wall}]'"
+            remedy = f"add {for_scene} for the scene of the file, or without one {examples[name]!r}"
+        return "every configuration has version, name and studies", remedy
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:

@@ -38,7 +38,7 @@ def test_text_lists_the_wall_its_margins_and_improvements():
 def test_wall_with_small_margins_has_a_caution():
     text = " ".join(recommend("--passive").stdout.split())
     assert "CAUTION phase margin 0.89 deg, gain margin 1.04, delay margin" in text
-    assert "rings for 470 ms; use recommend --phase-margin 30: K = 3.979 kN/m, B = 7.75" in text
+    assert "rings for 470 ms; use recommend --phase-margin 30 --passive: K = 3.979 kN/m, B = 7.75" in text
     assert "N s/m (costs 52 % of the stiffness)" in text
     assert "limited by passivity; CAUTION: small margins device" in text
     assert "requirements (not checked in the reference grasps):" in text

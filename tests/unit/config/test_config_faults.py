@@ -145,7 +145,7 @@ FAULTS = {
     "scene_without_value": [("4:8: scene.mass: got nothing", "add one or remove the key")],
     "studies_empty": [("3:10: studies: got an empty list", "fill the list")],
     "studies_mapping": [("4:3: studies: got a mapping of 2 keys", "write '- ' before each of them")],
-    "studies_missing": [("1:1: studies: missing", "add 'studies: [{kind: boundary, name: first")],
+    "studies_missing": [("1:1: studies: missing", "add 'studies: [{kind: recommend, name: wall")],
     "studies_nothing": [("3:9: studies: got nothing", "add one or remove the key")],
     "study_names_twice": [("9:11: studies[1].name: got 'r' twice, here and at [0]", "rename one")],
     "study_null": [("8:4: studies[1]: got nothing", "write '- kind: boundary' and its fields, or")],
@@ -286,3 +286,12 @@ def test_values_are_shown_in_one_printable_line(tmp_path):
     for line in str(load_invalid(path)).split("\n"):
         assert line.isprintable()
         assert len(line) < len(str(path)) + 250
+
+
+@pytest.mark.parametrize(("word", "key"), [("inertia: 3 g cm^2", "mass"), ("friction: 1 mN m", "coulomb")])
+def test_words_of_rotary_devices_and_commands_name_the_key(tmp_path, word, key):
+    file = tmp_path / "knob.yaml"
+    scene = f"{{mass: 35 g cm^2, rate: 1 kHz, {word}}}"
+    file.write_text(f"version: 1\nname: knob\nscene: {scene}\nstudies: [{{kind: recommend, name: wall}}]\n", "utf-8")
+    with pytest.raises(ConfigFileError, match=f"unknown key; .*; use '{key}'"):
+        load_config(file)

@@ -290,3 +290,15 @@ def test_tables_of_rotary_devices_are_drawn_in_rotary_units(tmp_path, unpainted)
     assert zwidth.run({"version": 1, "name": "moves", "scene": scene, "studies": [linear]}, out=tmp_path / "linear").ok
     labels = [ax.get_ylabel() for ax in plotting.draw_step(pandas.read_csv(tmp_path / "linear" / "step.csv"))]
     assert not any("rad" in label for label in labels)
+
+
+def test_several_rotary_scenes_have_rotary_units_and_mixed_scenes_are_rejected(tmp_path):
+    timing = zwidth.Timing(rate="2 kHz", delay="1.5 periods")
+    knob = zwidth.Scene(zwidth.Device("35 g cm^2", "0.4 mN m s/rad"), timing, velocity=zwidth.LowPass("80 Hz"))
+    ax = plot.region({"2 kHz": knob, "4 kHz": knob.replace(rate="4 kHz")})
+    assert "N m/rad" in ax.get_xlabel()
+    assert "N m s/rad" in ax.get_ylabel()
+    files = plotting.save(ax, str(tmp_path / "walls"))
+    assert [file.name for file in files] == ["walls.png", "walls.svg"]
+    with pytest.raises(zwidth.InputError, match="linear and rotary devices"):
+        plot.region({"knob": knob, "mass": RIGID})
