@@ -112,7 +112,7 @@ def _advise(
 
 
 def judge_grasps(scene: Any) -> dict[str, bool]:
-    """Return a dictionary that maps each reference grasp to True if the wall of the scene is stable in this grasp.
+    """Return the stability of the wall of a scene in each reference grasp, as a dictionary of Booleans by grasp.
 
     If the scene has an operator, the entry "released" is the stability without the operator.
     """

@@ -49,6 +49,6 @@ def find_group(flag: str) -> str:
 
 
 def show_example(command: str, *more: str) -> dict[str, Any]:
-    """Return keyword arguments of ``cli.command`` for a command whose help has grouped options and an example."""
+    """Return the keyword arguments with which ``cli.command`` creates a command with grouped options and an example."""
     example = "\b\nExample:\n" + " \\\n    ".join((f"  zwidth {command}", *more))
     return {"cls": GroupedCommand, "epilog": example}

@@ -262,7 +262,7 @@ def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
 
 
 def is_normalized(raw: dict[str, Any]) -> bool:
-    """Return whether a mapping is normalized, by the first of its keys that belongs to only one of the two kinds."""
+    """Return whether a mapping is normalized: its first key that is allowed in only one of the two forms decides."""
     decisive = [key for key in raw if key in PHYSICAL_KEYS | NORMALIZED_KEYS]
     return bool(decisive) and decisive[0] in NORMALIZED_KEYS
 

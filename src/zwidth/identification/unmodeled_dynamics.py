@@ -206,7 +206,7 @@ def bound_response(fit: FittedModel, scene: Scene, bank: PoleBank) -> MeasuredDe
     response, derivatives = _evaluate_response(fit, scene.timing.period, grid)
     deviation = np.zeros(grid.size)
     for poles in banks:
-        # Subtract the change of the response that the bias of theta causes, because an undetected mode biases the fit.
+        # An undetected mode also biases the fitted theta. Subtract the change of the response that this bias causes.
         bias = poles.absorbed[:, : fit.model.parts.stop] @ derivatives.T
         change = _evaluate_unit_modes(fit, grid, poles.frequency[:, None], poles.ratio[:, None]) - bias
         deviation = np.maximum(deviation, np.max(np.abs(change) * poles.bound_mass_ratios()[:, None], 0))
@@ -235,7 +235,7 @@ def sample_resonances(fit: FittedModel, scene: Scene, bank: PoleBank) -> HiddenR
     responses, period = [], scene.timing.period
     for grid in (common, local):
         response, derivatives = _evaluate_response(fit, period, grid)
-        # Subtract the change of the response that the bias of theta causes, because an undetected mode biases the fit.
+        # An undetected mode also biases the fitted theta. Subtract the change of the response that this bias causes.
         bias = (derivatives @ modes.absorbed[:, : fit.model.parts.stop, None])[..., 0]
         change = _evaluate_unit_modes(fit, grid, frequency, damping_ratio) - bias
         responses.append(response + mass_ratio[:, None] * change)

@@ -81,7 +81,7 @@ def _make_slider(parameter: Parameter, system: UnitSystem) -> Slider:
 
 # Units of the page that differ from SI units, each with the number of these units per SI unit.
 _SHOWN = {"kg": ("g", 1e3), "s": ("ms", 1e3)}
-# Units of the page for rotary devices, by the SI unit of linear devices.
+# Unit of a rotary device on the page and the number of these units per SI unit, for each SI unit of linear devices.
 _ROTARY_UNITS = {"kg": ("g cm^2", 1e7), "N s/m": ("mN m s/rad", 1e3), "N/m": ("N m/rad", 1.0)}
 # Typical ratio of a rotary to a linear parameter in SI units, for a mass at a radius of about 3 cm; by the SI unit of
 # linear devices.

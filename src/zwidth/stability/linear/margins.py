@@ -108,7 +108,7 @@ class OpenLoop(NamedTuple):
         # Add the angle pi, because L is always real there.
         w = np.append(self._find_zeros(phase_sine, stop=-1), np.pi)
         L = self.evaluate(w)
-        # Exclude zeros of L, at which the phase jumps, because no change of the gain puts a pole at these points.
+        # Exclude zeros of L, where the phase jumps: for no gain is L = -1 at these points, so no pole can lie there.
         return w[(L.value.real < 0) & (np.abs(L.value) > ZERO_OF_L * w * np.abs(L.slope))]
 
     def _find_zeros(

@@ -158,7 +158,7 @@ class StableSet:
         return rows, meetings
 
     def _refine_meetings(self, rows: _Rows, meetings: _Meetings, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Locate meetings more accurately, and place new lines of constant B close to both sides of each.
+        """Locate meetings more accurately, and return lines of constant B just below and just above each meeting.
 
         Args:
             rows: stable intervals on all lines so far.
@@ -167,7 +167,7 @@ class StableSet:
             Dampings of further lines near these meetings, and the located corners as in `_pair_ends`.
         """
         b, columns, beta = self.boundary, meetings.columns[left], rows.beta
-        # Add a gap below the first and above the last line of constant B, because a meeting may lie beyond them.
+        # Add a gap below the lowest and above the highest line of constant B, because meetings may lie there, too.
         size = np.ptp(beta[np.isfinite(rows.alpha).any(1)]) + np.spacing(np.abs(beta).max())
         low, high = np.concatenate([[beta[0] - size], beta, [beta[-1] + size]])[
             meetings.gap[left] + np.array([[0], [1]])

@@ -42,7 +42,7 @@ ERROR_FACTORS = 10.0 ** np.arange(12)
 MAX_ERROR = 0.1  # largest relative error of a radius that is certified
 # Largest float64 below 1: radius of stable walls whose computed radius rounds to 1.
 BELOW_ONE = 1.0 - 2.0**-53
-# Rounding error of a computed radius. For alpha = 0, a radius that exceeds 1 by less is set to exactly 1.
+# Bound of the rounding error of a computed radius. For alpha = 0, a radius below 1 plus this bound is set to 1.
 RADIUS_ROUNDING = 1e-13
 # Largest certified relative error of a decay rate; with a larger error the rate is NaN.
 MAX_RATE_ERROR = 1e-3

@@ -54,7 +54,7 @@ def _find_magnitude_range(name: str) -> tuple[float, float]:
 
 
 def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
-    """Return ``value`` as float64; raise `InputError` for a scalar out of range. Traced values stay unchecked."""
+    """Convert a value to float64, or raise `InputError` for a scalar out of range; return a traced value unchanged."""
     if is_traced(value):
         return value
     number = as_float64(name, value)
