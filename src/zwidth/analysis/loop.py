@@ -30,7 +30,7 @@ from zwidth.model.circle_functions import circle_points
 from zwidth.model.mechanism import AnyChain, build_chain
 from zwidth.model.parameter_paths import AnyScene, list_parameters, replace_parameters
 from zwidth.numerics.evaluate import as_float64, check_scalars, evaluate
-from zwidth.numerics.held_mass import classify_delays
+from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.linear.boundary import Boundary
 from zwidth.stability.linear.curve import evaluate_curve
 from zwidth.stability.linear.discretization import find_roots

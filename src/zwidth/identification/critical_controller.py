@@ -27,7 +27,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.model.circle_functions import CirclePoints, Jet
-from zwidth.numerics.held_mass import Plant, discretize_mass, split_delay
+from zwidth.plant.rigid_mass import Plant, discretize_mass, split_delay
 from zwidth.stability.rigid.ridge import plant_slopes
 
 # Least |zeta^2 - 1| of a pole pair with damping ratio zeta. Pairs that are closer to a double pole are moved apart,
@@ -42,7 +42,7 @@ _TIMES = 3  # number of refinements
 class CriticalController:
     """The critical controller ``q = -1/G`` of a batch of devices, whose parameters broadcast with the frequencies.
 
-    A rigid device has ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``, with the coefficients of `numerics.held_mass`.
+    A rigid device has ``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)``, with the coefficients of `plant.rigid_mass`.
 
     Args:
         delta: damping b T/m.

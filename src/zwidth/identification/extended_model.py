@@ -25,7 +25,7 @@ from zwidth.identification.critical_controller import expand_partial_fractions
 from zwidth.identification.device_estimate import DimensionlessDevice
 from zwidth.identification.friction_model import ModelResponse, Recording, recur
 from zwidth.identification.quantization_noise import MeasurementNoise
-from zwidth.numerics.held_mass import phi_functions
+from zwidth.plant.rigid_mass import phi_functions
 
 # Step of central differences: absolute for the pole of a filter, relative for the parameters; for delta at least this
 # value, because delta may be 0.

@@ -27,7 +27,7 @@ from zwidth.model.circle_functions import CirclePoints, circle_points, power_jet
 from zwidth.model.linear_plant import System
 from zwidth.model.mechanism import AnyChain, Chain, is_zero
 from zwidth.model.state_space import StateSpace, connect_in_series, realize_estimate
-from zwidth.numerics.held_mass import Plant, discretize_mass, factor_numerator
+from zwidth.plant.rigid_mass import Plant, discretize_mass, factor_numerator
 from zwidth.stability.linear.roots import LoopRoots, compute_aberth_step
 from zwidth.stability.linear.sampled_zeros import find_sampled_zeros
 
