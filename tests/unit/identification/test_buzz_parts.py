@@ -10,10 +10,10 @@ from measured_devices import OTHERS, PERIOD, OtherDevice, TrueDevice
 
 import zwidth
 from zwidth.core.status import Status
-from zwidth.identification.critical_controller import CriticalController
 from zwidth.identification.device_estimate import DimensionlessDevice, differentiate, name_parameters
 from zwidth.identification.onset_model import Onsets
 from zwidth.model.circle_functions import circle_points
+from zwidth.plant.sampled_plant import sample_parts
 
 VELOCITY = zwidth.BackwardDifference()
 KINDS = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 2)]
@@ -39,13 +39,11 @@ def differ(function, theta):
 def test_critical_controller_matches_the_sampled_device(lag, modes):
     device = describe_device(lag, modes)
     points = circle_points(np.array([1e-3, 0.05, 0.3, 0.72, 1.9, 3.0]))
-    controller, expected = (
-        CriticalController(*device[1:]),
-        device.to_scene(PERIOD, VELOCITY).loop.roots.evaluate_controller(points),
-    )
-    np.testing.assert_allclose(controller.evaluate(points), expected.value, rtol=1e-12)
+    roots = device.to_scene(PERIOD, VELOCITY).loop.roots
+    plant, expected = sample_parts(*device[1:]), roots.evaluate_controller(points)
+    np.testing.assert_allclose(plant.controller(points), expected.value, rtol=1e-12)
     if not lag + modes:
-        np.testing.assert_allclose(controller.evaluate_rigid(points).slope, expected.slope, rtol=1e-12)
+        np.testing.assert_allclose(plant.rigid_controller(points).slope, expected.slope, rtol=1e-12)
 
 
 @pytest.mark.parametrize("lag, modes", KINDS)
