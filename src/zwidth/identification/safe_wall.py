@@ -29,8 +29,7 @@ from zwidth.model.mechanism import Body, Chain, Resonance
 from zwidth.model.state_space import StateSpace, connect_in_series, realize_estimate
 from zwidth.model.velocity import BackwardDifference, Estimate
 from zwidth.plant.sampled_plant import sample_parts
-from zwidth.plant.sampled_states import SampledStates
-from zwidth.plant.transition import compute_transition
+from zwidth.plant.sampled_states import SampledStates, sample_states
 from zwidth.stability.rigid.normalization import device_status
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import SI_RANGE
@@ -274,17 +273,12 @@ def _are_stable(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtua
         A mask of the devices on which all these walls are stable.
     """
     estimate, devices = fit.velocity.estimate(fit.period), fit.normalize(drawn)
-    A, B, _ = (np.moveaxis(part, -1, 0) for part in _build_chain(devices, estimate).realize())
-    n_delay, f = np.floor(devices.d).astype(int), realize_estimate(estimate)
-    rate = np.concatenate([A, B[..., None]], -1)
-    whole, late = (compute_transition(rate, time).change for time in (1.0, n_delay + 1.0 - devices.d))
-    parts = whole[..., :-1], whole[..., -1], late[..., -1]
+    states, f = sample_states(_build_chain(devices, estimate)), realize_estimate(estimate)
     stable = np.zeros(len(drawn), bool)
     # Group the devices by the integer delay, because only closed loops of the same order form a batch.
-    for n in np.unique(n_delay):
-        group = n_delay == n
-        psi, full, late = (part[group] for part in parts)
-        plant = SampledStates(psi, full, late, n).realize()
+    for n in np.unique(states.n_delay):
+        group = states.n_delay == n
+        plant = SampledStates._make((*(part[group] for part in states[:3]), n)).realize()
         alpha, beta = (
             wall / devices.mass[group, None, None] for wall in (stiffness * fit.period**2, virtual_damping * fit.period)
         )
@@ -303,4 +297,4 @@ def _build_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
     lag = 1.0 / devices.lag[0] if devices.lag else None
     if len(devices.lag) == 2:
         lag = Resonance(lag, devices.lag[1], devices.lag[0] ** 2)
-    return Chain((Body(1.0, devices.delta, 0.0),), (), modes, lag, 0, devices.d, 0, estimate)
+    return Chain((Body(1.0, devices.delta, 0.0),), (), modes, lag, 0, devices.d, np.floor(devices.d), estimate)

@@ -14,7 +14,7 @@ rest:
 
 ``q = -1/G`` is the *critical controller*: a wall with stiffness K and damping B has a closed-loop pole at a point z of
 the unit circle if and only if ``K + B F(z)/T = q(z)``, with the velocity estimate F. All functions accept NumPy and JAX
-arrays. Parameters of many devices broadcast with the points z; lists of poles are stacked along a first axis.
+arrays. Parameters of many devices are arrays that broadcast with the points z.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class SampledPlant(NamedTuple):
     """The sampled plant as the sum of a rigid mass and of first-order parts."""
 
     rigid: Plant  # zero-order-hold discretization of the rigid mass, with the fractional delay
-    poles: Any  # p of the other parts, shape (parts, ...)
-    residues: Any  # r of the other parts, shape (parts, ...)
+    poles: Sequence[Any]  # p of the other parts, numbers or arrays
+    residues: Sequence[Any]  # r of the other parts
     n_delay: Any  # integer delay n
     fraction: Any  # fractional delay f
 
@@ -62,12 +62,11 @@ class SampledPlant(NamedTuple):
 
     def parts_response(self, points: CirclePoints) -> Array:
         """Return the part of G that the poles other than those of the rigid mass contribute."""
-        if not len(self.poles):
-            return 0.0 * points.z
-        xp = namespace(self.poles, points.w)
-        late, full = integrate_pole(self.poles, 1.0 - self.fraction), integrate_pole(self.poles, 1.0)
-        each = (points.z_minus_1 * late + full) / (points.z_minus_1 - xp.expm1(self.poles))
-        return (self.residues * each).sum(0) * power_jet(points, -self.n_delay - 1.0).value
+        total, xp = 0.0 * points.z, namespace(points.w, *self.poles)
+        for pole, residue in zip(self.poles, self.residues, strict=True):
+            late, full = integrate_pole(pole, 1.0 - self.fraction), integrate_pole(pole, 1.0)
+            total = total + residue * (points.z_minus_1 * late + full) / (points.z_minus_1 - xp.expm1(pole))
+        return total * power_jet(points, -self.n_delay - 1.0).value
 
 
 def evaluate_numerator(plant: Plant, points: CirclePoints) -> Any:
@@ -93,13 +92,7 @@ def sample_parts(delta: Any, d: Any, lag: Sequence[Any] = (), modes: Sequence[Se
     """
     xp = namespace(delta, d, *lag, *(value for mode in modes for value in mode))
     n, fraction = split_delay(xp.asarray(d, float))
-    poles, residues = (_stack(part, xp) for part in expand_partial_fractions(delta, lag, modes))
-    return SampledPlant(discretize_mass(delta, fraction), poles, residues, n, fraction)
-
-
-def _stack(values: Sequence[Any], xp: Any) -> Any:
-    """Stack complex arrays, which broadcast with each other, along a new first axis."""
-    return xp.stack(xp.broadcast_arrays(*(value + xp.zeros(1, complex) for value in values))) if values else ()
+    return SampledPlant(discretize_mass(delta, fraction), *expand_partial_fractions(delta, lag, modes), n, fraction)
 
 
 def expand_partial_fractions(delta: Any, lag: Any, modes: Any) -> tuple[list[Any], list[Any]]:

@@ -88,8 +88,11 @@ def sample_chain(chain: AnyChain) -> SampledPlant | SampledStates:
 
 
 def sample_states(chain: AnyChain) -> SampledStates:
-    """Return the sampled plant of a chain in state space."""
+    """Return the sampled plant of a chain in state space; parameters of many chains along a last axis yield a batch."""
     A, B, _ = chain.realize()
+    if A.ndim > 2:
+        xp = namespace(A)
+        A, B = xp.moveaxis(A, -1, 0), xp.moveaxis(B, -1, 0)
     psi, full = integrate_chain(chain, A, B, 1.0)
     fraction = chain.d - chain.n_delay
     late = None if is_zero(fraction) else integrate_chain(chain, A, B, 1.0 - fraction)[1]

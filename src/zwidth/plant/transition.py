@@ -40,7 +40,7 @@ def compute_transition(rate: Any, time: Any, drain: Any = None) -> Transition:
     # compile time of derivatives is proportional to its length: with JAX's own exponential, derivatives of
     # `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to compile.
     xp = namespace(rate, time)
-    n, time = rate.shape[-2], xp.asarray(time)[..., None, None]
+    n, time = rate.shape[-2], time[..., None, None] if xp.ndim(time) else time
     norm = stop_gradient(xp.abs(rate[..., :n] * time).sum(-2, keepdims=True).max(-1, keepdims=True), xp)
     doublings = xp.ceil(xp.log2(xp.maximum(2.0 * norm, 1.0)))
     start = time / 2.0**doublings
@@ -58,9 +58,9 @@ def compute_transition(rate: Any, time: Any, drain: Any = None) -> Transition:
             loss = xp.where(k < doublings, 2.0 * loss + moved, loss)
         return k + 1.0, xp.where(k < doublings, 2.0 * change + change[..., :n] @ change, change), loss
 
-    identity = xp.eye(n, dtype=rate.dtype)
+    identity = xp.broadcast_to(xp.eye(n, dtype=rate.dtype), small[..., :n].shape)
     zero = 0.0 * xp.max(doublings)
-    _, phi1 = iterate(TERMS, add, (zero + TERMS + 1.0, xp.broadcast_to(identity, small[..., :n].shape)), xp)
+    _, phi1 = iterate(TERMS, add, (zero + TERMS + 1.0, identity), xp)
     state = zero, phi1 @ small, None if drain is None else _integrate_power(rate, start, drain)
     done = iterate(MAX_DOUBLINGS, double, state, xp, lambda old, new: bool((new[0] >= doublings).all()))
     return Transition(*done[1:])
