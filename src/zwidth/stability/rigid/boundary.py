@@ -25,8 +25,8 @@ from zwidth.core.types import Array, ArrayLike, Vertices
 from zwidth.core.xp import materialize, namespace, nan_with_nan_derivatives, stop_gradient, tree_map
 from zwidth.model.checks import check_integer
 from zwidth.numerics.evaluate import as_number, check_scalars, evaluate
-from zwidth.numerics.held_mass import DelayClasses, classify_delays, discretize_mass, is_valid_device, split_delay
 from zwidth.numerics.root_finding import attach_root_derivatives, integrate
+from zwidth.plant.rigid_mass import DelayClasses, classify_delays, discretize_mass, is_valid_device, split_delay
 from zwidth.stability.rigid.curve import (
     build_lobe,
     compute_corner_line,

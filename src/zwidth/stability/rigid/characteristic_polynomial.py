@@ -25,7 +25,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import namespace, nan_unless
-from zwidth.numerics.held_mass import DiscretePlant, discretize_mass, factor_numerator, split_delay
+from zwidth.plant.rigid_mass import DiscretePlant, discretize_mass, factor_numerator, split_delay
 from zwidth.stability.rigid.normalization import valid_wall
 
 

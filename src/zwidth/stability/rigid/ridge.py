@@ -22,7 +22,7 @@ from zwidth.core.status import RidgeKind, Status
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import differentiate_along, epsilon, horner, materialize, namespace, nan_unless
 from zwidth.numerics.evaluate import evaluate
-from zwidth.numerics.held_mass import (
+from zwidth.plant.rigid_mass import (
     ANY,
     GAP,
     DelayClasses,
@@ -56,7 +56,7 @@ def _compute_chi(x: Array, gap: Array) -> Array:
 
 
 def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
-    """Return the derivatives of `numerics.held_mass.discretize_mass` in delta and in the fraction of the delay."""
+    """Return the derivatives of `plant.rigid_mass.discretize_mass` in delta and in the fraction of the delay."""
     f, t = fraction, 1.0 - fraction
     c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
     phi_t, phi_f = phi_functions(delta * t), phi_functions(delta * f)
@@ -100,7 +100,7 @@ def differentiable_ridge(plant: Plant, n: Array, start: Start, kind: DelayClasse
 
 @cache
 def _jax_plant() -> Any:
-    """Return `numerics.held_mass.discretize_mass` as a JAX function with derivatives in closed form."""
+    """Return `plant.rigid_mass.discretize_mass` as a JAX function with derivatives in closed form."""
     import jax
 
     function = jax.custom_jvp(lambda delta, fraction: discretize_mass(delta, fraction))
