@@ -19,7 +19,14 @@ import numpy as np
 from zwidth.analysis.recommendation import Recommendation
 from zwidth.core.status import Status
 from zwidth.identification.device_fit import AlternativeDevice, DeviceFit
-from zwidth.identification.safe_scene import advise_record, describe_status, limit_walls, round_parameter, round_period
+from zwidth.identification.safe_scene import (
+    RECORD_AGAIN,
+    advise_record,
+    describe_status,
+    limit_walls,
+    round_parameter,
+    round_period,
+)
 from zwidth.model.parameter_paths import spell_estimate
 from zwidth.units.formatting import plain, with_unit
 from zwidth.units.quantities import FIELDS
@@ -72,7 +79,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
     recommended = fit.recommended
     rows = [("NO WALL", recommended.reason)]
     if fit.is_unreliable:
-        rows = [("NO WALL", "resolve the warnings first, then record again")]
+        rows = [("NO WALL", RECORD_AGAIN)]
     elif recommended.status == Status.OK:
         limit = recommended.scene.safe_limit
         cause = limit.reason.partition("; ")[0] if limit is not None and recommended.is_at_safe_limit else ""
