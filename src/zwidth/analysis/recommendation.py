@@ -170,7 +170,7 @@ class Recommendation:
     def grasps(self) -> dict[str, bool]:
         """Dictionary that maps each of `zwidth.reference_grasps` to True if the wall is stable in this grasp.
 
-        It is empty unless the device is a `Device`. The grasps hold a rotary device at radii of 10 to 100 mm. If the
+        It is empty unless the device is a `Device`. The grasps hold a rotary device 10 to 100 mm from its axis. If the
         scene has an operator, the entry "released" is the stability without the operator.
         """
         return {} if self.status != Status.OK else judge_grasps(self.scene)
@@ -252,7 +252,7 @@ class Recommendation:
         labels = {name: stable for name, stable in self.grasps.items() if name != "released"}
         if not labels:
             return ""
-        radii = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if self.unit_system.rotary else ""
+        radii = f", held {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm from the axis" if self.unit_system.rotary else ""
         stable = sum(labels.values())
         count = "all six" if stable == len(labels) else f"{stable} of {len(labels)}"
         return f"stable in {count} reference grasps{radii}"
