@@ -142,13 +142,14 @@ class Recommendation:
         """Improvements of the device that allow a stiffer wall under the same requirements, the largest gain first.
 
         The improvements are those of `zwidth.limits_of`. The stiffness of each entry is that of the wall recommended
-        for the improved device, accurate to about 0.2 %. The list is empty if the safe limit is active, because then
-        only a new measurement allows a stiffer wall.
+        for the improved device, accurate to about 0.2 %. Twice the rate at a constant delay is included even if it
+        gains nothing. The list is empty if the safe limit is active, because then only a new measurement allows a
+        stiffer wall.
         """
         if self.status != Status.OK or self.is_at_safe_limit:
             return []
         steps = compute_gains(self.scene.replace(wall=NoWall()), self.stiffness, self._choose_again)
-        return [step for step in steps if step.gain > 1.0]
+        return [step for step in steps if step.gain > 1.0 or (step.name == "period" and step.note and step.gain > 0)]
 
     def _choose_again(self, improved: SceneOptima) -> float:
         """Return the K recommended for an improved device under the same requirements; NaN if none is recommended."""

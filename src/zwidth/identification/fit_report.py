@@ -28,7 +28,7 @@ from zwidth.identification.safe_scene import (
     round_period,
 )
 from zwidth.model.parameter_paths import spell_estimate
-from zwidth.units.formatting import plain, with_unit
+from zwidth.units.formatting import plain, round_conservatively, with_unit
 from zwidth.units.quantities import FIELDS
 from zwidth.units.unit_system import UnitSystem
 
@@ -226,7 +226,10 @@ def format_alternative(alternative: AlternativeDevice, system: UnitSystem) -> st
 
 def _format(fit: DeviceFit, name: str) -> str:
     """Format a value of a fit with its unit, and with as many digits as its confidence interval requires."""
-    return format_value(name, fit.value_of(name), fit.unit_system, _count_digits(fit, name))
+    value, digits = fit.value_of(name), _count_digits(fit, name)
+    # Round K_max down, as all commands do, because it is a limit.
+    value = round_conservatively(value, "below", digits) if name == "stiffness_max" else value
+    return format_value(name, value, fit.unit_system, digits)
 
 
 def _format_interval(fit: DeviceFit, name: str) -> str:
