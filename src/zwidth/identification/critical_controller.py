@@ -27,8 +27,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.model.circle_functions import CirclePoints, Jet
-from zwidth.numerics.held_mass import Plant, discretize_mass, split_delay
-from zwidth.stability.rigid.ridge import plant_slopes
+from zwidth.numerics.held_mass import Plant, differentiate_mass, discretize_mass, split_delay
 
 # Least |zeta^2 - 1| of a pole pair with damping ratio zeta. Pairs that are closer to a double pole are moved apart,
 # because partial fractions require distinct poles.
@@ -101,7 +100,7 @@ class CriticalController:
         Returns:
             The derivatives with respect to delta and to d.
         """
-        by_delta, by_fraction = plant_slopes(self.delta, self.fraction)
+        by_delta, by_fraction = differentiate_mass(self.delta, self.fraction)
         numerator = _evaluate_numerator(self.plant, points)
         return (
             q * (by_delta.em / (points.z_minus_1 + self.plant.em) - _evaluate_numerator(by_delta, points) / numerator),
