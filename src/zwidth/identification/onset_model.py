@@ -22,8 +22,8 @@ import numpy as np
 from zwidth.identification.device_estimate import DimensionlessDevice
 from zwidth.model.circle_functions import CirclePoints, circle_points
 from zwidth.model.velocity import Estimate, Velocity
+from zwidth.plant.rigid_mass import differentiate_mass
 from zwidth.plant.sampled_plant import SampledPlant, evaluate_numerator, sample_parts
-from zwidth.stability.rigid.ridge import plant_slopes
 from zwidth.units.unit_system import LINEAR, UnitSystem
 
 # Constants of the Newton iteration, which solves the imaginary part of the equation for w, in rad per sample.
@@ -134,7 +134,7 @@ def _differentiate_controller(
         points: points of the unit circle.
         q: value of q at these points.
     """
-    by_delta, by_fraction = plant_slopes(delta, plant.fraction)
+    by_delta, by_fraction = differentiate_mass(delta, plant.fraction)
     numerator = evaluate_numerator(plant.rigid, points)
     return (
         q * (by_delta.em / (points.z_minus_1 + plant.rigid.em) - evaluate_numerator(by_delta, points) / numerator),
