@@ -3,7 +3,8 @@
 The system ``x' = A x + B u`` in controllable canonical form is discretized by a matrix exponential, and the
 Faddeev-LeVerrier algorithm computes the numerator of its transfer function (docs/theory/scenes.md, V4 and V22). The
 precision is doubled until two successive results agree, because float64 does not resolve slow zeros next to the aliases
-of fast poles. Zeros are returned as offsets 1 - z.
+of fast poles: for random systems of up to 12 states, eigenvalues in float64 caused relative errors of the response of
+up to 5e-9. Zeros are returned as offsets 1 - z.
 """
 
 from __future__ import annotations
