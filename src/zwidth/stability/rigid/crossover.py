@@ -54,8 +54,8 @@ from zwidth.core.xp import (
     stop_gradient,
     within,
 )
-from zwidth.numerics.held_mass import ANY, DelayClasses, DiscretePlant, discretize_plant
 from zwidth.numerics.root_finding import attach_root_derivatives
+from zwidth.plant.rigid_mass import ANY, DelayClasses, DiscretePlant, discretize_plant
 from zwidth.stability.rigid.boundary_curve import (
     compute_squared_modulus,
     expand_curve_with_offset,

@@ -19,7 +19,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import iterate, materialize, namespace, stop_gradient
-from zwidth.numerics.held_mass import DelayClasses, DiscretePlant, discretize_plant
+from zwidth.plant.rigid_mass import DelayClasses, DiscretePlant, discretize_plant
 from zwidth.stability.rigid.boundary_curve import (
     CurvePoint,
     evaluate_curve,

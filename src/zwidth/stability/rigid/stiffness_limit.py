@@ -16,7 +16,7 @@ import numpy as np
 from zwidth.core.types import Array
 from zwidth.core.xp import SINE, horner, iterate, materialize, namespace, nan_beyond
 from zwidth.numerics.evaluate import FEW, Route, evaluate_columns
-from zwidth.numerics.held_mass import DiscretePlant, discretize_plant
+from zwidth.plant.rigid_mass import DiscretePlant, discretize_plant
 from zwidth.stability.rigid.boundary_curve import (
     Curve,
     CurveTerms,
