@@ -206,7 +206,7 @@ def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]
 
 
 def evaluate_at_nyquist(alpha: Any, beta: Any, plant: Any) -> tuple[Any, Any]:
-    """Return -B and T at z = -1, both divided by ``(-1)^(n+1)``, in any arithmetic, for the coefficients of W."""
+    """Return B at z = -1, and T there divided by ``(-1)^(n+1)``, in any arithmetic, for the coefficients of W."""
     return plant.gap * (alpha + beta * 2.0), (plant.c + 1.0) * 2.0
 
 
