@@ -21,7 +21,7 @@ import numpy as np
 from methods.clock import time_calls
 from zwidth.core import xp
 from zwidth.numerics import blocks, evaluate
-from zwidth.numerics.held_mass import ANY
+from zwidth.plant.rigid_mass import ANY
 from zwidth.stability.rigid import crossover, ridge, ridge_newton
 from zwidth.stability.rigid.dominant import pole_count as circle
 from zwidth.stability.rigid.dominant import search as radius

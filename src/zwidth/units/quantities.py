@@ -368,8 +368,8 @@ _OUTPUTS = (
         r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", source="spectral_radius",
     ),
     Output(
-        "pole_angle", "angle of the dominant pole, from 0 to pi", r"\omega T", "sequential", units="rad", with_parts=True,
-        source="spectral_radius", label="angle of the dominant pole",
+        "pole_angle", "angle of the dominant pole, from 0 to pi", r"\omega T", "sequential", units="rad",
+        with_parts=True, source="spectral_radius", label="angle of the dominant pole",
     ),
     Output(
         "frequency", "frequency of the dominant pole; 0 if the response does not oscillate", "f", "sequential",

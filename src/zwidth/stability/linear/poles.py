@@ -24,8 +24,8 @@ from zwidth.core.xp import within
 from zwidth.model.circle_functions import Jet
 from zwidth.model.velocity import Estimate
 from zwidth.numerics.pole_counting import count_poles
-from zwidth.numerics.polynomials import abs2, companion
-from zwidth.stability.linear.roots import LoopRoots, affine_polynomial, compute_aberth_step, factor_open_loop
+from zwidth.numerics.polynomials import abs2, companion, compute_aberth_step
+from zwidth.stability.linear.roots import LoopRoots, affine_polynomial, factor_open_loop
 from zwidth.units.quantities import MOST_POLES, WALL_RANGE
 
 # Aberth's method
@@ -241,7 +241,7 @@ def compute_dominant_poles(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray)
         return log, np.array(angles)
     zeta = compute_poles_minus_one(loop, alpha, beta)
     dominant = np.take_along_axis(zeta, log_modulus(zeta).argmax(-1)[:, None], -1)[:, 0]
-    return log_modulus(dominant), np.abs(np.arctan2(dominant.imag, 1.0 + dominant.real))
+    return log_modulus(dominant), np.arctan2(np.abs(np.imag(dominant)), 1.0 + np.real(dominant))
 
 
 def _find_angle(loop: LoopRoots, alpha: float, beta: float, log_radius: float) -> float:
@@ -262,8 +262,9 @@ def _find_angle(loop: LoopRoots, alpha: float, beta: float, log_radius: float) -
         P = evaluate_polynomial(loop, np.float64(alpha), np.float64(beta), zeta)
         misfit = np.where(np.abs(P.value) < 1e-10 * P.size, np.abs(log_modulus(zeta) - log_radius), np.inf)
     k = np.argmin(np.where(np.isnan(misfit), np.inf, misfit))
-    zeta = zeta[k].real + 0j if abs(zeta[k].imag) <= REAL_TOLERANCE * abs(zeta[k]) else zeta[k]
-    return float(abs(np.arctan2(zeta.imag, 1.0 + zeta.real))) if misfit[k] < ON_CIRCLE else np.nan
+    re, im = np.real(zeta)[k], np.abs(np.imag(zeta)[k])
+    im = 0.0 if im <= REAL_TOLERANCE * np.abs(re) else im
+    return float(np.arctan2(im, 1.0 + re)) if misfit[k] < ON_CIRCLE else np.nan
 
 
 def agree_with_verdict(log: np.ndarray, stable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 All other modules of `stability.rigid` take P from this module; only `stability.reference` evaluates P independently. A
 wall has the normalized stiffness alpha and damping beta, its device the normalized damping delta, and the delay is d =
-n + f periods (n integer, 0 <= f < 1). With the discretized device (`numerics.held_mass`),
+n + f periods (n integer, 0 <= f < 1). With the discretized device (`plant.rigid_mass`),
 
     P = T + B
     T = z^(1+n) (z - 1)(z - c)         device and delay, c = e^-delta
@@ -25,7 +25,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import namespace, nan_unless
-from zwidth.numerics.held_mass import DiscretePlant, discretize_mass, factor_numerator, split_delay
+from zwidth.plant.rigid_mass import DiscretePlant, discretize_mass, factor_numerator, split_delay
 from zwidth.stability.rigid.normalization import valid_wall
 
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import apply_each, expand_along, materialize, namespace, stop_gradient
-from zwidth.numerics.held_mass import DiscretePlant
 from zwidth.numerics.root_finding import attach_root_derivatives, newton
+from zwidth.plant.rigid_mass import DiscretePlant
 from zwidth.stability.rigid.characteristic_polynomial import differentiate_open_loop, evaluate_on_unit_circle
 from zwidth.stability.rigid.crossover import find_gain_crossover
 

@@ -19,7 +19,7 @@ import numpy as np
 from zwidth.core.status import Status
 from zwidth.numerics.blocks import map_blocks
 from zwidth.numerics.evaluate import BLOCK, FEW, Route, compile_columns
-from zwidth.numerics.held_mass import classify_delays
+from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.rigid.broadcasting import Points, fold
 from zwidth.stability.rigid.characteristic_polynomial import factor_loop
 from zwidth.stability.rigid.crossover import stable_kernel

@@ -15,7 +15,7 @@ from zwidth.core.status import Status
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced, namespace
 from zwidth.numerics.evaluate import broadcast, broadcast_traced, check_scalars, evaluate, to_caller
-from zwidth.numerics.held_mass import classify_delays
+from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.results import DominantPole
 from zwidth.stability.rigid.broadcasting import NAMES
 from zwidth.stability.rigid.dominant.arrays import ACCURACY, find_poles
