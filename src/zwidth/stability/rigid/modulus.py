@@ -12,8 +12,8 @@ Both bound the range of frequencies in which the minimum can lie:
 - Within one turn of the phase on either side of the gain crossover there is a frequency at which L is real and
   negative. Its distance is ``||L| - 1|``, and all frequencies beyond it are farther from -1.
 
-So at most two turns of the phase have to be searched, whatever the delay: the distance is sampled, and the lowest
-samples are refined by Newton's method.
+So at most two turns of the phase have to be searched, whatever the delay. They are searched by `stability.open_loop`,
+as for every linear loop.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import apply_each, expand_along, materialize, namespace, stop_gradient
+from zwidth.model.circle_functions import Jet
 from zwidth.numerics.held_mass import DiscretePlant
-from zwidth.numerics.root_finding import attach_root_derivatives, newton
+from zwidth.numerics.root_finding import attach_root_derivatives
+from zwidth.stability.open_loop import find_nearest_angle
 from zwidth.stability.rigid.crossover import find_gain_crossover
 
 
@@ -72,48 +74,38 @@ SAMPLES_WEIGHT = 8
 SAMPLES_PER_TURN = 48
 SAMPLES_BELOW = 32
 SAMPLES_ABOVE = 48
-# Number of local minima that are refined, the lowest ones first.
-MAX_DIPS = 5
-# Number of Newton steps from each of these minima.
-NEWTON_STEPS = 8
 
 
-def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Array:
-    """Return ``|1 + L|^2`` at w in (0, pi]: ``L = -W M Z e^(-j (n + 1/2) w)/(2 |Z|^2 sin(w/2))``."""
-    xp = namespace(w, alpha)
-    delay_phase = (2.0 * plant.whole + 1.0) * (0.5 * w)
-    sine, _, u, s, (wall_re, wall_im), (m_re, m_im) = _evaluate_factors(w, alpha, beta, plant)
+def _multiply_factors(w: Array, plant: DiscretePlant, factors: tuple[Any, ...]) -> tuple[Array, Array]:
+    """Return real and imaginary part of ``L = -W M Z e^(-j (n + 1/2) w)/(2 |Z|^2 sin(w/2))`` at w in (0, pi]."""
+    sine, _, u, s, (wall_re, wall_im), (m_re, m_im) = factors
+    xp, delay_phase = namespace(sine), (2.0 * plant.whole + 1.0) * (0.5 * w)
     re, im = wall_re * m_re - wall_im * m_im, wall_re * m_im + wall_im * m_re
     em_minus_u = plant.em - u
     re, im = re * s - im * em_minus_u, re * em_minus_u + im * s
-    cos_delay, sin_delay = xp.cos(delay_phase), xp.sin(delay_phase)
+    cosine, sine_of_delay = xp.cos(delay_phase), xp.sin(delay_phase)
     denominator = 2.0 * sine * (plant.em * plant.em + 2.0 * plant.c * u)
-    minus_re_loop, im_part = (
-        (re * cos_delay + im * sin_delay) / denominator,
-        (im * cos_delay - re * sin_delay) / denominator,
-    )
-    return (1.0 - minus_re_loop) ** 2 + im_part * im_part
+    return -(re * cosine + im * sine_of_delay) / denominator, (re * sine_of_delay - im * cosine) / denominator
 
 
-def _differentiate_distance(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
-    """Return half the first and half the second derivative of |1 + L|^2 in w, from the derivatives of log L."""
-    xp = namespace(w, alpha)
-    n_plus_half, c = plant.whole + 0.5, xp.cos(w)
-    sine, cosine, u, s, wall, m = _evaluate_factors(w, alpha, beta, plant)
-    z, delay = c + 1j * s, xp.cos(n_plus_half * w) - 1j * xp.sin(n_plus_half * w)
-    wall, m, wall_slope = wall[0] + 1j * wall[1], m[0] + 1j * m[1], beta * (s + 1j * c)
-    total, difference = plant.a2 + plant.a0, plant.a2 - plant.a0
-    # The derivative of conj_Z, the conjugate of Z, with respect to w is z.
-    conj_Z = s + 1j * (u - plant.em)
-    wall_rate, m_rate, pole_rate = wall_slope / wall, (1j * difference * c - total * s) / m, z / conj_Z
-    rate = wall_rate + m_rate - pole_rate - 1j * n_plus_half - 0.5 * cosine / sine
-    curvature = beta * xp.conj(z) / wall - wall_rate**2 - (total * c + 1j * difference * s) / m - m_rate**2
-    curvature = curvature - 1j * pole_rate + pole_rate**2 + 0.25 / (sine * sine)
-    loop = -wall * m * delay / (2.0 * sine * conj_Z)
-    slope, conj_distance = rate * loop, xp.conj(1.0 + loop)
-    return xp.real(conj_distance * slope), xp.abs(slope) ** 2 + xp.real(
-        conj_distance * (curvature + rate * rate) * loop
-    )
+def differentiate_open_loop(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Jet:
+    """Return L and its derivative in w, from the derivative of log L."""
+    factors = _evaluate_factors(w, alpha, beta, plant)
+    sine, cosine, u, s, wall, m = factors
+    c, total, difference = 1.0 - u, plant.a2 + plant.a0, plant.a2 - plant.a0
+    # The derivative of the conjugate of Z with respect to w is z.
+    rate = beta * (s + 1j * c) / (wall[0] + 1j * wall[1])
+    rate = rate + (1j * difference * c - total * s) / (m[0] + 1j * m[1])
+    rate = rate - (c + 1j * s) / (s + 1j * (u - plant.em)) - 1j * (plant.whole + 0.5)
+    re, im = _multiply_factors(w, plant, factors)
+    L = re + 1j * im
+    return Jet(L, (rate - 0.5 * cosine / sine) * L)
+
+
+def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Array:
+    """Return ``|1 + L|^2`` at w in (0, pi]."""
+    re, im = _multiply_factors(w, plant, _evaluate_factors(w, alpha, beta, plant))
+    return (1.0 + re) ** 2 + im * im
 
 
 def find_modulus_margin(alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
@@ -121,17 +113,15 @@ def find_modulus_margin(alpha: Array, beta: Array, plant: DiscretePlant) -> tupl
     xp = namespace(alpha, plant.c)
     wall = alpha, beta, plant
 
+    def slope(w: Array, *wall: Any) -> Array:
+        """Return half the derivative of ``|1 + L|^2`` in w."""
+        loop = differentiate_open_loop(w, *wall)
+        return xp.real(xp.conj(1.0 + loop.value) * loop.slope)
+
     def is_dip(w: Array, curvature: Array, _: Array) -> Array:
         return (w < np.pi) & (curvature > 0)
 
-    lowest = _find_lowest(*stop_gradient(wall, xp), xp)
-    w = attach_root_derivatives(
-        lambda *point: _differentiate_distance(*point)[0],
-        lowest,
-        is_dip,
-        *wall,
-        slope=lambda *point: _differentiate_distance(*point)[1],
-    )
+    w = attach_root_derivatives(slope, _find_lowest(*stop_gradient(wall, xp), xp), is_dip, *wall)
     return xp.sqrt(xp.maximum(compute_squared_distance(w, *wall), 0.0)), w
 
 
@@ -167,26 +157,4 @@ def _find_lowest(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> Ar
         center[..., None] * (high / center)[..., None] ** list_fractions(SAMPLES_ABOVE),
     ]
     grid = xp.sort(xp.concatenate(grid, axis=-1), axis=-1)
-    values = compute_squared_distance(grid, *wall)
-    infinity = xp.full_like(values[..., :1], np.inf)
-    previous, following = (
-        xp.concatenate([infinity, values[..., :-1]], -1),
-        xp.concatenate([values[..., 1:], infinity], -1),
-    )
-    # If two samples coincide, count them as one minimum. Because the minimum may lie to the right of the second one,
-    # search between the second neighbors on both sides.
-    dips = xp.where((values < previous) & (values <= following), values, np.inf)
-    best = xp.argpartition(dips, MAX_DIPS - 1, axis=-1)[..., :MAX_DIPS]
-
-    def take_neighbor(steps: int) -> Array:
-        return xp.take_along_axis(grid, xp.clip(best + steps, 0, grid.shape[-1] - 1), axis=-1)
-
-    middle = take_neighbor(0)
-    refined = newton(
-        lambda w: _differentiate_distance(w, *wall), take_neighbor(-2), take_neighbor(2), middle, NEWTON_STEPS
-    )[0]
-    # Compare each refined minimum with the sample from which the refinement started, because the minimum may be an end
-    # of the range.
-    candidates = xp.concatenate([refined, middle], axis=-1)
-    lowest = xp.argmin(compute_squared_distance(candidates, *wall), axis=-1)[..., None]
-    return xp.take_along_axis(candidates, lowest, axis=-1)[..., 0]
+    return find_nearest_angle(lambda w: differentiate_open_loop(w, *wall), grid, compute_squared_distance(grid, *wall))
