@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from zwidth.analysis.base import WallSI, wrap_methods
+from zwidth.analysis.coupling import is_safe_for_every_world, max_safe_coupling
 from zwidth.analysis.recommendation import SceneAdvice
 from zwidth.core.types import ArrayLike
 from zwidth.core.xp import is_traced, namespace
@@ -77,6 +78,8 @@ class Scene(SceneAdvice):
             for piece in self.loop.outlines()
         )
 
+    is_safe_for_every_world = is_safe_for_every_world
+    max_safe_coupling = max_safe_coupling
     simulate = simulate
     """Method that calls `zwidth.simulate` with this scene and all other arguments."""
 

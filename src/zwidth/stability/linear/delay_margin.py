@@ -12,7 +12,7 @@ The plant of the chain, discretized for any delay d = n + f (n integer, 0 <= f <
 
     G = z^-(n+1) C (z - e^A)^-1 ((z - 1) Gamma(1 - f) + Gamma(1))
 
-with the state Gamma(t) after a unit force held for time t (`stability.linear.discretization`).
+with the state Gamma(t) after a unit force held for time t (`plant.sampled_states`).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from zwidth.model.circle_functions import Jet, are_on_circle, circle_points, dis
 from zwidth.model.mechanism import AnyChain
 from zwidth.model.velocity import Estimate
 from zwidth.numerics.root_finding import find_zeros_in_brackets
+from zwidth.plant.sampled_states import integrate_chain
 from zwidth.stability.linear.curve import place_nodes
-from zwidth.stability.linear.discretization import compute_transition, find_roots
-from zwidth.stability.linear.roots import POLE_AT_ONE, LoopRoots
+from zwidth.stability.linear.roots import POLE_AT_ONE, LoopRoots, find_roots
 from zwidth.stability.open_loop import OpenLoop, find_gain_crossovers
 
 # Delays at which the gain crossovers are computed.
@@ -172,13 +172,13 @@ class DelayedPlant:
 
     def __init__(self, chain: AnyChain) -> None:
         """Discretize the chain."""
-        self.A, self.B, _ = chain.realize()
-        self.psi, self.full = compute_transition(self.A, self.B, 1.0)
+        self.chain, (self.A, self.B, _) = chain, chain.realize()
+        self.psi, self.full = integrate_chain(chain, self.A, self.B, 1.0)
 
     def evaluate(self, w: np.ndarray, delay: np.ndarray) -> tuple[Jet, np.ndarray]:
         """Return G with its derivative in w, and its derivative in the delay, for angles and delays of one shape."""
         points, n = circle_points(w), np.floor(delay)
-        psi, late = compute_transition(self.A, self.B, (1.0 - (delay - n))[:, None, None])
+        psi, late = integrate_chain(self.chain, self.A, self.B, 1.0 - (delay - n))
         zeta, size = points.z_minus_1[:, None], self.B.size
         inverse = np.linalg.inv(zeta[..., None] * np.eye(size) - self.psi)
         row = inverse[:, :1] @ np.stack([zeta * late + self.full, late, zeta * (self.B + (psi @ self.B))], -1)

@@ -4,7 +4,7 @@ The open loop is ``L = G (alpha + beta F)`` with the plant G and the velocity es
 Its crossovers and its distance from -1 are computed by `stability.open_loop`, for many walls at once, at nodes that all
 walls share: those of `stability.linear.curve`, which resolve G and F, and further nodes that resolve the controller
 ``alpha + beta F`` and low gain crossovers. A *chain* is the plant of a scene with its delay
-(`stability.linear.discretization`).
+(`plant.sampled_states`).
 """
 
 from __future__ import annotations
