@@ -33,7 +33,7 @@ from zwidth.numerics.evaluate import as_float64, check_scalars, evaluate
 from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.linear.boundary import Boundary
 from zwidth.stability.linear.curve import evaluate_curve
-from zwidth.stability.linear.margins import compute_margins, open_loop_response
+from zwidth.stability.linear.margins import compute_margins, evaluate_walls
 from zwidth.stability.linear.passivity import PassivityCondition, compute_passivity_margins
 from zwidth.stability.linear.poles import (
     agree_with_verdict,
@@ -292,7 +292,7 @@ class LinearLoop:
 
     def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> Array:
         """Return the open loop ``L = (alpha + beta F) G`` at angles w; F is the velocity estimate, G the plant."""
-        return open_loop_response(self.roots, alpha, beta, circle_points(w)).value
+        return evaluate_walls(self.roots, alpha, beta, circle_points(w)).value
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
         """Return the stability margins of walls, with times in periods and frequencies in rad per period.

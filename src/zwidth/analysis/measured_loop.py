@@ -23,9 +23,9 @@ from zwidth.core.status import Method, RidgeKind, Status
 from zwidth.core.types import Array
 from zwidth.model.mechanism import AnyChain
 from zwidth.numerics.root_finding import minimize_golden_section
-from zwidth.stability.linear.margins import select_gain_margin, select_phase_margin
 from zwidth.stability.linear.regions import Outline
 from zwidth.stability.linear.rows import Island, arrange_by_line
+from zwidth.stability.open_loop import select_gain_margin, select_phase_margin
 from zwidth.stability.results import Margins, RidgePoint, Stability
 from zwidth.stability.rigid.verdict import StabilityMethod
 
