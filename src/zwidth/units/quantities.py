@@ -368,7 +368,7 @@ _OUTPUTS = (
         r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", source="spectral_radius",
     ),
     Output(
-        "pole_angle", "angle of the dominant pole, from 0 to pi", r"\omega T", "sequential", units="rad",
+        "pole_angle", "angle of the dominant pole, from 0 to pi", r"\omega T", "sequential", units="rad/period",
         with_parts=True, source="spectral_radius", label="angle of the dominant pole",
     ),
     Output(

@@ -114,7 +114,7 @@ studies:
         (tmp_path / f"{name}.yaml").write_text(text)
         assert zwidth.run(tmp_path / f"{name}.yaml", out=tmp_path / name).ok
         data = open_dataset(tmp_path / name).load()
-        assert data.pole_angle.attrs["units"] == "rad"
+        assert data.pole_angle.attrs["units"] == "rad/period"
         assert data.frequency.attrs["units"] == "Hz"
         assert (data.status == Status.OK).all()
         velocity = {"velocity": zwidth.LowPass(cutoff=100)} if parts else {}
