@@ -25,6 +25,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import namespace, nan_unless
+from zwidth.model.circle_functions import Jet
 from zwidth.plant.rigid_mass import DiscretePlant, discretize_mass, factor_numerator, split_delay
 from zwidth.stability.rigid.normalization import valid_wall
 
@@ -168,20 +169,19 @@ def evaluate_on_unit_circle(w: Array, alpha: Array, beta: Array, plant: Discrete
     )
 
 
-def differentiate_open_loop(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array, Array]:
-    """Return L at z = e^(j w), and the first and second derivative of log L in w."""
+def differentiate_open_loop(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Jet:
+    """Return L at z = e^(j w), and its derivative in w from that of log L."""
     xp, wall_beta = namespace(w, alpha), expand_wall(alpha, beta).beta
     point, n_plus_half = evaluate_on_unit_circle(w, alpha, beta, plant), plant.whole + 0.5
     W, M, Z = (re + 1j * im for re, im in (point.W, point.M, point.Z))
-    z, conj_Z, half_tangent = xp.cos(w) + 1j * point.sin_w, xp.conj(Z), 0.5 * point.cosine / point.sine
+    z, conj_Z = xp.cos(w) + 1j * point.sin_w, xp.conj(Z)
     # The derivatives of W/z = alpha + beta (1 - conj z) and of M follow from those of z and conj z, j z and -j conj z;
     # the derivative of conj Z is z.
-    W1, M1, Z1 = 1j * wall_beta * xp.conj(z) / W, 1j * (plant.a2 * z - plant.a0 * xp.conj(z)) / M, z / conj_Z
-    rate = W1 + M1 - Z1 - 1j * n_plus_half - half_tangent
-    second = wall_beta * xp.conj(z) / W - W1**2 - (plant.a2 * z + plant.a0 * xp.conj(z)) / M - M1**2
-    second = second - 1j * Z1 + Z1**2 + 0.25 / (point.sine * point.sine)
+    rate = 1j * wall_beta * xp.conj(z) / W + 1j * (plant.a2 * z - plant.a0 * xp.conj(z)) / M - z / conj_Z
+    rate = rate - 1j * n_plus_half - 0.5 * point.cosine / point.sine
     delay = xp.cos(n_plus_half * w) - 1j * xp.sin(n_plus_half * w)
-    return -W * M * delay / (2.0 * point.sine * conj_Z), rate, second
+    L = -W * M * delay / (2.0 * point.sine * conj_Z)
+    return Jet(L, rate * L)
 
 
 def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]:
