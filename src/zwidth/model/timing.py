@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -34,7 +35,7 @@ class Timing(Part):
     rate: Any = None
     # Delay in periods if the user gave it in periods, otherwise None. This number is stored, because the quotient of
     # delay and period in seconds may have a rounding error.
-    _periods: ClassVar[float | None] = None
+    _periods: ClassVar[Any] = None
 
     def __post_init__(self) -> None:
         if (self.period is None) == (self.rate is None):
@@ -53,6 +54,27 @@ class Timing(Part):
         """Return the expression that creates this timing, with the delay in its original unit, seconds or periods."""
         text = super().__repr__()
         return text if self._periods is None else text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
+
+    def flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
+        # The delay is a child in the unit in which it stays constant if the period changes.
+        return (("period", self.period), ("delay", self._periods if self.in_periods else self.delay)), self.in_periods
+
+    @classmethod
+    def unflatten(cls, structure: Any, children: Any) -> Any:
+        timing, (period, delay) = object.__new__(cls), children
+        values = {"period": period, "delay": delay, "rate": None}
+        if structure:
+            # JAX also passes objects that are not numbers; a delay in seconds does not exist for these.
+            with suppress(TypeError):
+                values["delay"] = delay * period
+            values["_periods"] = delay
+        for name, value in values.items():
+            object.__setattr__(timing, name, value)
+        return timing
+
+    def rebuild(self) -> Self:
+        delay = f"{float(self._periods)!r} periods" if self._periods is not None else self.delay
+        return type(self)(period=self.period, delay=delay)
 
     @property
     def in_periods(self) -> bool:
@@ -75,5 +97,5 @@ class Timing(Part):
     def d(self) -> Any:
         """The delay in periods; an exact integer if it differs from one only by rounding errors."""
         if self._periods is not None:
-            return np.float64(self._periods)
+            return self._periods if is_jax(self._periods) else np.float64(self._periods)
         return to_periods(*(value if is_jax(value) else np.float64(value) for value in (self.delay, self.period)))

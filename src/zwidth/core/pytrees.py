@@ -1,0 +1,100 @@
+"""Registration of classes as nodes of JAX pytrees, without importing JAX.
+
+A class of this package becomes a *pytree* node: JAX flattens an object into its *leaves*, which it can trace, batch and
+differentiate, and into its *structure*, which is constant. JAX has to be told about a class before it flattens an
+object of this class, but importing zwidth must not import JAX, which takes 0.4 s. If JAX is loaded, `register` therefore
+registers a class at once, otherwise as soon as the program imports JAX.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any, Protocol
+
+_waiting: list[type[Node]] = []  # classes that JAX does not know yet
+
+
+class Node(Protocol):
+    """A class whose objects can be flattened for JAX."""
+
+    def flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
+        """Return the children of the object with their names, and its structure, which is hashable."""
+        ...
+
+    @classmethod
+    def unflatten(cls, structure: Any, children: Any) -> Any:
+        """Return an object from its structure and its children, without checks, because children may be tracers."""
+        ...
+
+
+class HiddenText(tuple[Any, ...]):
+    """Values that a pytree carries along with its structure: all of them compare equal, and JAX compiles once."""
+
+    __slots__ = ()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, HiddenText)
+
+    def __ne__(self, other: object) -> bool:
+        return not isinstance(other, HiddenText)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+def register(kind: type[Node]) -> None:
+    """Register a class as a node of JAX pytrees, at once if JAX is loaded, otherwise when it is imported."""
+    _waiting.append(kind)
+    register_waiting()
+
+
+def register_waiting() -> None:
+    """Register all waiting classes if JAX is loaded."""
+    # ``vars`` does not load the module, unlike ``getattr``, if it is a lazy module (importlib.util.LazyLoader).
+    if not _waiting or "tree_util" not in vars(sys.modules.get("jax", sys)):
+        return
+    from jax.tree_util import GetAttrKey, register_pytree_with_keys
+
+    while _waiting:
+        kind = _waiting.pop()
+
+        def flatten_with_keys(node: Node) -> tuple[list[tuple[Any, Any]], Any]:
+            children, structure = node.flatten()
+            return [(GetAttrKey(name), child) for name, child in children], structure
+
+        def flatten(node: Node) -> tuple[tuple[Any, ...], Any]:
+            children, structure = node.flatten()
+            return tuple([child for _, child in children]), structure
+
+        register_pytree_with_keys(kind, flatten_with_keys, kind.unflatten, flatten)
+
+
+class _Watcher:
+    """A finder of modules (`sys.meta_path`) that registers the waiting classes after the import of JAX."""
+
+    def find_spec(self, name: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        """Return the specification of the module `jax` by the other finders; None for other modules."""
+        if name != "jax":
+            return None
+        others = (finder for finder in sys.meta_path if finder is not self)
+        specs = (finder.find_spec(name, path, target) for finder in others)
+        spec = next((spec for spec in specs if spec is not None), None)
+        loader = None if spec is None else spec.loader
+        if loader is None:
+            return spec
+        execute = loader.exec_module
+
+        def execute_and_register(module: ModuleType) -> None:
+            execute(module)
+            if self in sys.meta_path:
+                sys.meta_path.remove(self)
+            register_waiting()
+
+        loader.exec_module = execute_and_register
+        return spec
+
+
+if "jax" not in sys.modules:
+    sys.meta_path.insert(0, _Watcher())
