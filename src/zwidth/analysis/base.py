@@ -112,9 +112,23 @@ class SceneParts(Part):
     @cached_property
     def loop(self) -> LinearLoop:
         """Normalized loop of the scene, in the fastest implementation that supports its parts."""
+        for name, value in list_parameters(self).items():
+            if np.ndim(value):
+                raise InputError(f"{name}: got an array of shape {np.shape(value)}; map over scenes with jax.vmap")
         if isinstance(self.device, MeasuredDevice):
             return MeasuredLoop(self)
+        if self.nonrigid_parts and self.traced_path is not None:
+            return self.traced_loop
         return LinearLoop(make_plain(self)) if self.nonrigid_parts else RigidLoop(self)
+
+    @cached_property
+    def traced_loop(self) -> LinearLoop:
+        """Loop for values that JAX traces, if the scene has no closed form."""
+        if isinstance(self.device, MeasuredDevice):
+            raise InputError("device: got a measured response inside jit, vmap or grad; use a model of the device")
+        from zwidth.analysis.traced_loop import TracedLoop
+
+        return TracedLoop(self)
 
     def check_parts(self) -> None:
         """Raise `InputError` for an invalid combination of parts, such as a cutoff above the Nyquist frequency."""
@@ -268,6 +282,10 @@ def wrap_function(
     return checked
 
 
+# Methods that are compiled as a whole if JAX traces the scene.
+COMPILED = ("boundary", "is_passive", "margins", "max_stiffness", "passivity_margin", "required", "sensitivities", "spectral_radius")
+
+
 def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Collection[str]) -> None:
     """Wrap the public methods of a scene class, except those named in ``but``, so that their results print with units.
 
@@ -285,8 +303,15 @@ def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], trace
 
     @wraps(method)
     def wrapped(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        if not traceable and (scene.traced_path is not None or is_traced(*args, *kwargs.values())):
-            refuse_traced(method.__name__, scene, inspect.signature(method).bind(scene, *args, **kwargs).arguments)
+        if scene.traced_path is not None or is_traced(*args, *kwargs.values()):
+            arguments = inspect.signature(method).bind(scene, *args, **kwargs).arguments
+            if not traceable:
+                refuse_traced(method.__name__, scene, arguments)
+            if method.__name__ in COMPILED and scene.traced_path is not None and scene.nonrigid_parts:
+                from zwidth.analysis.traced_loop import run_compiled
+
+                _, *rest = arguments.items()
+                return with_units(run_compiled(method, scene, dict(rest)), scene.unit_system)
         return with_units(method(scene, *args, **kwargs), scene.unit_system)
 
     return wrapped

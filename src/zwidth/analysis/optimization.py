@@ -27,7 +27,7 @@ from zwidth.model.checks import read_texts
 from zwidth.model.wall import resolve_wall
 from zwidth.numerics.root_finding import find_global_minimum
 from zwidth.stability.linear.margins import OpenLoop
-from zwidth.stability.linear.ridge import SceneSensitivities
+from zwidth.stability.linear.derivatives import SceneSensitivities
 from zwidth.units.display import compact_repr
 from zwidth.units.parsing import to_float
 from zwidth.units.quantities import FIELDS, WALL

@@ -58,9 +58,8 @@ class Scene(SceneAdvice):
             ``stiffness`` in N/m and ``virtual_damping`` in N s/m; NaN for other frequencies.
         """
         w = (omega if is_traced(omega) else as_float64("omega", omega)) * self.timing.period
-        self._check_traceable(w, *self.units)
         inside, units = (w > 0) & (w < np.pi), self.units
-        alpha, beta = self.loop.critical_walls(namespace(w).where(inside, w, 1.0))
+        alpha, beta = self._loop_for(w).critical_walls(namespace(w).where(inside, w, 1.0))
         walls = alpha * units.stiffness, beta * units.virtual_damping
         return WallSI(*(namespace(inside, part).where(inside, part, np.nan)[()] for part in walls))
 

@@ -9,22 +9,24 @@ registers a class at once, otherwise as soon as the program imports JAX.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any, Protocol
 
-_waiting: list[type[Node]] = []  # classes that JAX does not know yet
+_nodes: set[type] = set()  # registered classes
+_waiting: list[type[Node]] = []  # those of them that JAX does not know yet
 
 
 class Node(Protocol):
     """A class whose objects can be flattened for JAX."""
 
-    def flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
+    def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
         """Return the children of the object with their names, and its structure, which is hashable."""
         ...
 
     @classmethod
-    def unflatten(cls, structure: Any, children: Any) -> Any:
+    def _unflatten(cls, structure: Any, children: Any) -> Any:
         """Return an object from its structure and its children, without checks, because children may be tracers."""
         ...
 
@@ -46,8 +48,32 @@ class HiddenText(tuple[Any, ...]):
 
 def register(kind: type[Node]) -> None:
     """Register a class as a node of JAX pytrees, at once if JAX is loaded, otherwise when it is imported."""
+    _nodes.add(kind)
     _waiting.append(kind)
     register_waiting()
+
+
+def is_node(value: object) -> bool:
+    """Return whether the class of an object is registered."""
+    return type(value) in _nodes
+
+
+def list_leaves(tree: Any) -> list[Any]:
+    """Return the leaves of an object of a registered class, or of a tuple of such objects, in the order of JAX."""
+    if not (is_node(tree) or isinstance(tree, tuple)):
+        return [tree]
+    children = tree if isinstance(tree, tuple) else [child for _, child in tree._flatten()[0]]
+    return [leaf for child in children for leaf in list_leaves(child)]
+
+
+def replace_leaves(tree: Any, leaves: Iterator[Any]) -> Any:
+    """Return a copy of an object with other leaves, without checks."""
+    if isinstance(tree, tuple):
+        return tuple([replace_leaves(each, leaves) for each in tree])
+    if not is_node(tree):
+        return next(leaves)
+    children, structure = tree._flatten()
+    return type(tree)._unflatten(structure, [replace_leaves(child, leaves) for _, child in children])
 
 
 def register_waiting() -> None:
@@ -61,14 +87,14 @@ def register_waiting() -> None:
         kind = _waiting.pop()
 
         def flatten_with_keys(node: Node) -> tuple[list[tuple[Any, Any]], Any]:
-            children, structure = node.flatten()
+            children, structure = node._flatten()
             return [(GetAttrKey(name), child) for name, child in children], structure
 
         def flatten(node: Node) -> tuple[tuple[Any, ...], Any]:
-            children, structure = node.flatten()
+            children, structure = node._flatten()
             return tuple([child for _, child in children]), structure
 
-        register_pytree_with_keys(kind, flatten_with_keys, kind.unflatten, flatten)
+        register_pytree_with_keys(kind, flatten_with_keys, kind._unflatten, flatten)
 
 
 class _Watcher:

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, ParamSpec, Self, TypeVar
 import numpy as np
 
 from zwidth.core.errors import InputError, UnusableValueError, check_choice
-from zwidth.core.pytrees import HiddenText, register, register_waiting
+from zwidth.core.pytrees import HiddenText, is_node, register, register_waiting
 from zwidth.core.types import Array
 from zwidth.core.xp import is_jax, is_traced, namespace, stop_gradient
 from zwidth.units.display import with_units
@@ -160,7 +160,7 @@ class Part:
 
     _owner: ClassVar[str] = ""  # first part of the dotted paths of the fields, as in "coupling.mass"
     _texts: ClassVar[tuple[str, ...]] = ()  # fields with texts for people, which do not count as structure
-    _child_names: tuple[str, ...] | None = None  # set by `unflatten`, because its children may be any objects
+    _child_names: tuple[str, ...] | None = None  # set by `_unflatten`, because its children may be any objects
 
     def __init_subclass__(cls) -> None:
         """Register the class as a node of JAX pytrees."""
@@ -187,7 +187,7 @@ class Part:
                     value = check_number(path, value, self.unit_system[quantity.unit], allowed)
                 object.__setattr__(self, item.name, value)
 
-    def flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
+    def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
         """Return the children of the part for JAX with their names, and its constant structure."""
         values = {item.name: getattr(self, item.name) for item in fields(self) if item.init}  # pyright: ignore[reportArgumentType]
         names = self._child_names
@@ -204,10 +204,10 @@ class Part:
         """Return whether a field is a child in the sense of JAX: a number that is not an integer, a part, or parts."""
         if isinstance(value, tuple):
             return all(isinstance(each, Part) for each in value)
-        return isinstance(value, float | np.floating | np.ndarray | Part) or hasattr(value, "flatten") or is_jax(value)
+        return isinstance(value, float | np.floating | np.ndarray) or is_node(value) or is_jax(value)
 
     @classmethod
-    def unflatten(cls, structure: Any, children: Any) -> Any:
+    def _unflatten(cls, structure: Any, children: Any) -> Any:
         """Return a part from its structure and its children, which JAX may have replaced by any objects."""
         if isinstance(structure, Part):
             return structure
@@ -222,7 +222,7 @@ class Part:
             object.__setattr__(part, name, value)
         return part
 
-    def rebuild(self) -> Self:
+    def _rebuild(self) -> Self:
         """Return the part with all numbers converted to floats and checked again, as JAX does not check them."""
         part = type(self)(**{item.name: _rebuild(getattr(self, item.name)) for item in fields(self) if item.init})  # pyright: ignore[reportArgumentType]
         if self.unit_system is SYSTEMS[True]:
@@ -250,7 +250,7 @@ def _rebuild(value: Any) -> Any:
     """Return a checked copy of a part or of a tuple of parts; return other values unchanged."""
     if isinstance(value, tuple):
         return tuple(map(_rebuild, value))
-    return value.rebuild() if isinstance(value, Part) else value
+    return value._rebuild() if isinstance(value, Part) else value
 
 
 def _flatten(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:

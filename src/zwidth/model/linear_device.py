@@ -57,12 +57,12 @@ class ResponseDevice:
         """Register the class as a node of JAX pytrees."""
         register(cls)
 
-    def flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
+    def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
         """Return no children and the device itself as its structure, because its exact coefficients are constant."""
         return (), self
 
     @classmethod
-    def unflatten(cls, structure: Any, children: Any) -> Any:
+    def _unflatten(cls, structure: Any, children: Any) -> Any:
         """Return the device, which is its own structure."""
         return structure
 

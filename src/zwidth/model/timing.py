@@ -55,12 +55,12 @@ class Timing(Part):
         text = super().__repr__()
         return text if self._periods is None else text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
 
-    def flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
+    def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
         # The delay is a child in the unit in which it stays constant if the period changes.
         return (("period", self.period), ("delay", self._periods if self.in_periods else self.delay)), self.in_periods
 
     @classmethod
-    def unflatten(cls, structure: Any, children: Any) -> Any:
+    def _unflatten(cls, structure: Any, children: Any) -> Any:
         timing, (period, delay) = object.__new__(cls), children
         values = {"period": period, "delay": delay, "rate": None}
         if structure:
@@ -72,7 +72,7 @@ class Timing(Part):
             object.__setattr__(timing, name, value)
         return timing
 
-    def rebuild(self) -> Self:
+    def _rebuild(self) -> Self:
         delay = f"{float(self._periods)!r} periods" if self._periods is not None else self.delay
         return type(self)(period=self.period, delay=delay)
 

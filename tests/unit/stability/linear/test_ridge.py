@@ -17,7 +17,8 @@ from zwidth import Actuator, Butterworth, Coupling, Device, LowPass, Operator, S
 from zwidth.core.errors import InputError, TracedDelayError
 from zwidth.core.status import RidgeKind
 from zwidth.stability.linear.curve import evaluate_curve
-from zwidth.stability.linear.ridge import Condition, RidgeSolution, find_ridge, list_ridge_parameters
+from zwidth.stability.linear.derivatives import list_ridge_parameters
+from zwidth.stability.linear.ridge import Condition, RidgeSolution, find_ridge
 
 # Mass 0.1 kg, period and delay 1 ms: K_max in kN/m at b = 0 and b = 10 N s/m, from a grid search with polynomial roots,
 # with a step of 10 N/m.
