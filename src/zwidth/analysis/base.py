@@ -121,14 +121,10 @@ class SceneParts(Part):
             return self.traced_loop
         return LinearLoop(make_plain(self)) if self.nonrigid_parts else RigidLoop(self)
 
-    @cached_property
-    def traced_loop(self) -> LinearLoop:
-        """Loop for values that JAX traces, if the scene has no closed form."""
-        if isinstance(self.device, MeasuredDevice):
-            raise InputError("device: got a measured response inside jit, vmap or grad; use a model of the device")
-        from zwidth.analysis.traced_loop import TracedLoop
-
-        return TracedLoop(self)
+    @property
+    def traced_loop(self) -> Any:
+        """Loop for values that JAX traces, which `zwidth.Scene` defines because it requires JAX."""
+        raise NotImplementedError
 
     def check_parts(self) -> None:
         """Raise `InputError` for an invalid combination of parts, such as a cutoff above the Nyquist frequency."""
@@ -282,8 +278,18 @@ def wrap_function(
     return checked
 
 
-# Methods that are compiled as a whole if JAX traces the scene.
-COMPILED = ("boundary", "is_passive", "margins", "max_stiffness", "passivity_margin", "required", "sensitivities", "spectral_radius")
+# Methods that are compiled as a whole if JAX traces a scene without closed form. Outside of the caller's own jit, JAX
+# would otherwise compile each operation of the method on its own, which takes ten times as long.
+COMPILED = (
+    "boundary",
+    "is_passive",
+    "margins",
+    "max_stiffness",
+    "passivity_margin",
+    "required",
+    "sensitivities",
+    "spectral_radius",
+)
 
 
 def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Collection[str]) -> None:
@@ -308,10 +314,8 @@ def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], trace
             if not traceable:
                 refuse_traced(method.__name__, scene, arguments)
             if method.__name__ in COMPILED and scene.traced_path is not None and scene.nonrigid_parts:
-                from zwidth.analysis.traced_loop import run_compiled
-
                 _, *rest = arguments.items()
-                return with_units(run_compiled(method, scene, dict(rest)), scene.unit_system)
+                return with_units(scene.traced_loop.run_compiled(method, dict(rest)), scene.unit_system)
         return with_units(method(scene, *args, **kwargs), scene.unit_system)
 
     return wrapped

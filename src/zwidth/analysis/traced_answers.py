@@ -13,13 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.analysis.optimization import SIDES
+from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError
-from zwidth.core.pytrees import list_leaves
+from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import RidgeKind, Status
 from zwidth.model.circle_functions import circle_points
-from zwidth.numerics.taylor import Implicit, Taylor
-from zwidth.stability.linear.derivatives import LoopTerms, differentiate, differentiate_ridge, split
+from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, seed
+from zwidth.stability.linear.derivatives import LoopTerms, differentiate, differentiate_ridge, index_parameters, split
 from zwidth.stability.linear.margins import change_delay, open_loop_response
+from zwidth.stability.linear.passivity import PassivityCondition
 from zwidth.stability.linear.poles import compute_poles_minus_one, log_modulus
 
 # Largest |1 + L| at which an angle counts as that of the pole on the unit circle after the delay margin is added.
@@ -40,8 +43,9 @@ def fill_rows(results: Derivatives, point: int, rows: Sequence[int], parts: Impl
             result[point, row] = factor * part[k] if part is not None else np.nan
 
 
-def find_stiffest(scene: Any, points: np.ndarray, order: int, negative: bool) -> Derivatives:
+def find_stiffest(scene: Any, points: np.ndarray, order: int, negative_damping: bool | None) -> Derivatives:
     """Return alpha, beta, omega, kind and status of the stiffest wall."""
+    negative = allows_negative(scene, negative_damping)
     top = scene.loop.stiffest(negative)
     results = no_derivatives(np.array([[*top]], float), len(list_leaves(scene)), order)
     for result in results[1:]:
@@ -197,11 +201,133 @@ def _find_delayed_angle(scene: Any, wall: list[float], delay: float) -> float | 
     return float(w[best[0]]) if distance[best[0]] <= POLE_TOLERANCE else None
 
 
+NODES_PER_PERIOD = 32  # angles per period of delay and window, among which the largest required damping is sought
+NEWTON_STEPS = 2  # for the angle; the search before has half of the digits
+MARGIN_TOLERANCE = (
+    1e-9  # relative difference of the margin at this angle and its value, above which derivatives are NaN
+)
+
+
 def find_passivity_margin(scene: Any, points: np.ndarray, order: int) -> Derivatives:
     """Return the passivity margin, normalized."""
     margin = np.asarray(scene.loop.passivity_margin(*points.T), float).reshape(-1, 1)
-    results = no_derivatives(margin, len(list_leaves(scene)) + 2, order, np.nan)
+    size = len(list_leaves(scene)) + 2
+    results = no_derivatives(margin, size, order, np.nan)
+    for k in np.flatnonzero(np.isfinite(margin[:, 0])) if order else ():
+        w = _find_worst_angle(scene, *points[k].tolist())
+        value = _evaluate_passivity(scene, points[k], w)
+        for _ in range(NEWTON_STEPS):
+            slope, curvature = value.first[-1], value.second[-1, -1]
+            if 0.0 < w < np.pi and curvature > 0.0:
+                w = float(np.clip(w - slope / curvature, 0.0, np.pi))
+                value = _evaluate_passivity(scene, points[k], w)
+        if not abs(value.v - margin[k, 0]) <= MARGIN_TOLERANCE * (abs(value.v) + abs(points[k]).sum()):
+            continue
+        # The margin is a minimum over w, so its first derivatives are those at constant w (envelope theorem).
+        results[1][k, 0] = value.first[:size]
+        if order > 1:
+            mixed, curvature = value.second[:size, -1], value.second[-1, -1]
+            inverse = 1.0 / curvature if 0.0 < w < np.pi and curvature > 0.0 else 0.0
+            results[2][k, 0] = value.second[:size, :size] - inverse * np.outer(mixed, mixed)
     return results
+
+
+def _find_worst_angle(scene: Any, alpha: float, beta: float) -> float:
+    """Return the angle at which a passive wall requires the largest damping, with half of the digits."""
+    from scipy.optimize import minimize_scalar
+
+    estimate = scene.velocity.estimate(scene.timing.period)
+    condition = PassivityCondition.derive(estimate, scene.d)
+    stiffness = max(alpha + beta * condition.spring, 0.0)
+
+    def require_damping(w: Any) -> Any:
+        return condition.require_damping(stiffness, beta, np.asarray(w))
+
+    w = np.linspace(0.0, np.pi, 513 + NODES_PER_PERIOD * (condition.integer_delay + estimate.degree))
+    needed = require_damping(w)
+    k = int(np.argmax(needed))
+    if k in (0, w.size - 1):
+        return float(w[k])
+    bounds = w[k - 1], w[k + 1]
+    return float(
+        minimize_scalar(lambda x: -require_damping(x), bounds=bounds, method="bounded", options={"xatol": 1e-12}).x
+    )
+
+
+def _evaluate_passivity(scene: Any, wall: np.ndarray, w: float) -> Taylor:
+    """Return the passivity margin by the condition at one angle, in terms of leaves, alpha, beta and the angle.
+
+    The formulas are those of `stability.linear.passivity`.
+    """
+    leaves = list_leaves(scene)
+    variables = seed([*leaves, *wall.tolist(), w], 2)
+    alpha, beta, angle = variables[len(leaves) :]
+    terms = LoopTerms(scene, variables, scene.integer_delay)
+    n, f, one = scene.integer_delay, terms.d - scene.integer_delay, terms.one
+    (spring, rate), lam = terms.estimate(one * 0j), angle * 1j
+    velocity = terms.estimate(lam)[0] - spring
+    quotient = velocity / lam.expm1() if w else rate
+    kernel = (angle * (n + 0.5)).sin() / (angle * 0.5).sin() if w else one * (2.0 * n + 1.0)
+    stiffness = (alpha + beta * spring).real
+    controller = stiffness + beta * velocity
+    a = (beta * (lam * -n).exp() * quotient).real * 2.0 - stiffness * kernel
+    a = a - f * (controller * (lam * -(n + 1)).exp()).real * 2.0
+    square = controller.real * controller.real + controller.imag * controller.imag
+    needed = ((a * a + f * (1.0 - f) * square * 4.0).sqrt() - a) / 4.0
+    device = terms.varied.device
+    margin = device.damping * terms.varied.timing.period / terms.varied.mass - needed
+    return stiffness if stiffness.v < min(0.0, margin.v) else margin
+
+
+def find_required(scene: Any, points: np.ndarray, order: int, parameter: str, *options: Any) -> Derivatives:
+    """Return the required value of a parameter, its side, both ends of the range, and a status."""
+    within, negative = options
+    count = len(list_leaves(scene))
+    results = no_derivatives(np.full((len(points), 5), np.nan), count + 1, order)
+    for k, stiffness in enumerate(points[:, 0].tolist()):
+        needed = scene.required(parameter, stiffness, within=within, negative_damping=negative)
+        side = SIDES.index(needed.sufficient_side)
+        results[0][k] = needed.value, side, *needed.range, needed.status
+        for result in results[1:]:
+            result[k, 0] = np.nan
+        if order and needed.status == Status.OK and needed.crossings:
+            fill_rows(
+                results, k, [0], _differentiate_required(scene, parameter, needed.value, stiffness, order, negative)
+            )
+    return results
+
+
+def _differentiate_required(
+    scene: Any, parameter: str, value: float, stiffness: float, order: int, negative: bool | None
+) -> Implicit:
+    """Return the derivatives of a required value in the leaves of a scene and in the required stiffness."""
+    path, x = ("period", 1.0 / value) if parameter == "rate" else (parameter, value)
+    changed = scene.replace(**{path: x})
+    count, index = len(list_leaves(scene)), index_parameters(changed)[path]
+    top = find_stiffest(changed, np.zeros((1, 0)), order, negative)
+    leaves = seed(list_leaves(changed), order)
+    varied = replace_leaves(changed, iter(leaves))
+    alpha = Taylor(top[0][0, 0], top[1][0, 0], top[2][0, 0] if order > 1 else None)
+    K = alpha * varied.mass / varied.timing.period / varied.timing.period
+
+    def move(part: np.ndarray) -> np.ndarray:
+        """Add the stiffness as a parameter, and move the derivatives in the required parameter to the unknown."""
+        moved = np.zeros(tuple(size + 2 for size in part.shape))
+        moved[tuple(slice(count) for _ in part.shape)] = part
+        for axis in range(part.ndim):
+            moved = np.moveaxis(moved, axis, 0)
+            moved[-1], moved[index] = moved[index].copy(), 0.0
+            moved = np.moveaxis(moved, 0, axis)
+        return moved
+
+    equation = Taylor(K.v - stiffness, move(K.first), None if K.second is None else move(K.second))
+    equation.first[count] = -1.0
+    result = differentiate_implicitly([equation])
+    if parameter != "rate":
+        return result
+    # The rate is the reciprocal of the period.
+    period = Taylor(x, result.first[0], None if result.second is None else result.second[0]).reciprocal()
+    return Implicit(period.first[None], None if period.second is None else period.second[None])
 
 
 ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {
@@ -211,6 +337,7 @@ ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {
     "critical_walls": (find_boundary, 2),
     "margins": (find_margins, 7),
     "passivity_margin": (find_passivity_margin, 1),
+    "required": (find_required, 5),
 }
 """Functions that compute answers, with the numbers of their results, by method of `zwidth.analysis.loop`."""
 
@@ -218,4 +345,5 @@ ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {
 INVALID = {
     "stiffest": [np.nan, np.nan, np.nan, RidgeKind.NONE, Status.INVALID_INPUT],
     "labels": [0.0],
+    "required": [np.nan, SIDES.index("nowhere"), np.nan, np.nan, Status.INVALID_INPUT],
 }

@@ -17,11 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth.analysis.loop import LinearLoop
-from zwidth.analysis.traced_answers import ANSWERS, INVALID, no_derivatives
+from zwidth.analysis.traced_answers import ANSWERS, INVALID
 from zwidth.core.errors import InputError, ZwidthError
+from zwidth.core.status import Status
 from zwidth.core.types import Array
 from zwidth.numerics.evaluate import broadcast_traced
 from zwidth.numerics.host_function import call_host
+from zwidth.stability.linear.derivatives import SceneSensitivities, list_ridge_parameters
 from zwidth.stability.results import Margins, RidgePoint
 
 KEPT_SCENES = 32  # scenes whose loops are kept, because values and derivatives are computed by several calls
@@ -90,20 +92,6 @@ def _ask(question: Question, leaves: Sequence[Any], arguments: Sequence[Any]) ->
     return [column.reshape(shape) for column in results.T]
 
 
-def run_compiled(method: Callable[..., Any], scene: Any, arguments: Mapping[str, Any]) -> Any:
-    """Call a method of a traced scene as one compiled program.
-
-    Outside of the caller's own jit, JAX would otherwise compile each operation of the method on its own.
-    """
-    numbers = {name: value for name, value in arguments.items() if isinstance(value, jax.Array | np.ndarray)}
-    constants = tuple((name, value) for name, value in arguments.items() if name not in numbers)
-    try:
-        hash(constants)
-    except TypeError:
-        return method(scene, **arguments)
-    return _compile(method)(constants, scene, numbers)
-
-
 @cache
 def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
     """Return a compiled function of constant arguments, scene and further arguments of a method."""
@@ -120,6 +108,12 @@ class TracedLoop(LinearLoop):
 
     traceable = True
 
+    @property
+    def chain(self) -> Any:
+        raise InputError(
+            "scene: got values traced by JAX; this question needs plain numbers, outside jit, vmap and grad"
+        )
+
     def labels(self, alpha: Array, beta: Array) -> Array:
         return ask(self.scene, "labels", alpha, beta)[0] > 0.5
 
@@ -130,8 +124,9 @@ class TracedLoop(LinearLoop):
         alpha, beta = ask(self.scene, "critical_walls", w)
         return alpha, beta
 
-    def stiffest(self, negative: bool) -> RidgePoint:
-        alpha, beta, omega, kind, status = ask(self.scene, "stiffest", options=(negative,))
+    def trace_stiffest(self, negative_damping: bool | None) -> RidgePoint:
+        """Return the stiffest stable wall; ``negative_damping`` as for `zwidth.Scene.max_stiffness`."""
+        alpha, beta, omega, kind, status = ask(self.scene, "stiffest", options=(negative_damping,))
         return RidgePoint(alpha, beta, omega, kind.astype(jnp.int32), status.astype(jnp.int32))
 
     def margins(self, alpha: Array, beta: Array, wanted: Container[str] = Margins._fields) -> Margins:
@@ -141,4 +136,40 @@ class TracedLoop(LinearLoop):
         return ask(self.scene, "passivity_margin", alpha, beta)[0]
 
     def poles(self, alpha: Array, beta: Array) -> Any:
-        raise InputError("poles: got a value traced by JAX, allowed only for a rigid device with the backward difference")
+        raise InputError(
+            "poles: got a value traced by JAX, allowed only for a rigid device with the backward difference"
+        )
+
+    def trace_sensitivities(self, negative_damping: bool | None) -> SceneSensitivities:
+        """Return K_max and its derivatives by dotted path; see `zwidth.Scene.sensitivities`."""
+        timing = self.scene.timing
+
+        def maximum(scene: Any) -> tuple[Any, Any]:
+            wall = scene.max_stiffness(negative_damping=negative_damping)
+            return wall.stiffness, wall.status
+
+        (stiffness, status), slopes = jax.value_and_grad(maximum, has_aux=True)(self.scene)
+        values = slopes.parameters()
+        if timing.in_periods:
+            values["delay"] = slopes.timing.span.value / timing.period
+        per = {path: values[path] for path in list_ridge_parameters(self.scene)}
+        is_missing = jnp.isnan(sum(per.values(), stiffness)) & (status == Status.OK)
+        return SceneSensitivities(stiffness, per, jnp.where(is_missing, int(Status.NOT_CONVERGED), status))
+
+    def trace_required(
+        self, parameter: str, stiffness: Any, within: tuple[Any, ...] | None, negative_damping: bool | None
+    ) -> tuple[Any, ...]:
+        """Return the fields of the result of `zwidth.Scene.required`, without the crossings."""
+        options = (parameter, within, negative_damping)
+        value, side, low, high, status = ask(self.scene, "required", stiffness, options=options)
+        return value, side.astype(jnp.int32), (), (low, high), status.astype(jnp.int32)
+
+    def run_compiled(self, method: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+        """Call a method of the scene as one compiled program, whose arguments are the scene and all arrays."""
+        numbers = {name: value for name, value in arguments.items() if isinstance(value, jax.Array | np.ndarray)}
+        constants = tuple((name, value) for name, value in arguments.items() if name not in numbers)
+        try:
+            hash(constants)
+        except TypeError:
+            return method(self.scene, **arguments)
+        return _compile(method)(constants, self.scene, numbers)

@@ -304,13 +304,13 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     samples. They are excluded for a device given as a whole system: its true damping is unknown, so a wall with B < 0
     would cancel modeled damping that may not exist.
     """
-    if negative_damping is None and isinstance(scene.device, ResponseDevice):
-        return False
-    if negative_damping is None:
-        estimate = scene.velocity.estimate(scene.timing.period)
-        return estimate.is_difference and bool(is_traced(estimate.gain) or estimate.gain > 0)
-    if not isinstance(negative_damping, bool | np.bool_):
+    if negative_damping is not None and not isinstance(negative_damping, bool | np.bool_):
         raise InputError(f"negative_damping: got {negative_damping!r}; pass True, False or None")
+    if negative_damping is None and not isinstance(scene.device, ResponseDevice):
+        if not scene.nonrigid_parts:
+            return True
+        estimate = scene.velocity.estimate(scene.timing.period)
+        return bool(estimate.is_difference and estimate.gain > 0)
     return bool(negative_damping)
 
 

@@ -1,9 +1,9 @@
 """Registration of classes as nodes of JAX pytrees, without importing JAX.
 
-A class of this package becomes a *pytree* node: JAX flattens an object into its *leaves*, which it can trace, batch and
-differentiate, and into its *structure*, which is constant. JAX has to be told about a class before it flattens an
-object of this class, but importing zwidth must not import JAX, which takes 0.4 s. If JAX is loaded, `register` therefore
-registers a class at once, otherwise as soon as the program imports JAX.
+JAX flattens an object of a registered class, a *node* of a *pytree*, into its *leaves*, which it can trace, batch and
+differentiate, and into its constant *structure*. A class must be registered before JAX flattens an object of it, but
+importing zwidth must not import JAX, which takes 0.4 s. `register` therefore registers a class at once if JAX is
+loaded, otherwise as soon as the program imports JAX.
 """
 
 from __future__ import annotations

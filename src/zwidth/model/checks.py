@@ -58,7 +58,7 @@ class Span(NamedTuple):
         return float(to_periods(np.float64(self.value), np.float64(period)))
 
     def __str__(self) -> str:
-        return f"{short(self.value)} {self.unit}"
+        return f"{self.value if is_jax(self.value) else short(self.value)} {self.unit}"
 
 
 def read_span(value: Any, allowed: Range) -> Span:

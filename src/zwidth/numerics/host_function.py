@@ -1,8 +1,8 @@
 """Functions that NumPy computes with their derivatives, for use inside JAX transformations.
 
-`call_host` evaluates such a function by a callback of JAX, alone or for a whole batch under `jax.vmap`. JAX takes its
-first and second derivatives from the function itself, as matrices, so that nothing of it is compiled: a program contains
-only the callback and products with the derivatives. Third derivatives are NaN.
+`call_host` evaluates such a function by a callback of JAX, for a whole batch at once under `jax.vmap`. The function
+also returns its first and second derivatives, as matrices. A compiled program therefore contains only the callback and
+products with these matrices, and is compiled fast. Third derivatives are NaN.
 """
 
 from __future__ import annotations

@@ -95,33 +95,33 @@ class Taylor:
         return not self < other
 
     def reciprocal(self) -> Taylor:
-        """Return 1/x."""
+        """Return the reciprocal."""
         inverse = 1.0 / self.v
         return self.chain(inverse, -(inverse**2), 2.0 * inverse**3)
 
     # NumPy calls these methods for its functions of the same names.
     def exp(self) -> Taylor:
-        """Return e^x."""
+        """Return the exponential."""
         v = np.exp(self.v)
         return self.chain(v, v, v)
 
     def expm1(self) -> Taylor:
-        """Return e^x - 1."""
+        """Return the exponential minus 1."""
         v = np.exp(self.v)
         return self.chain(np.expm1(self.v), v, v)
 
     def tan(self) -> Taylor:
-        """Return tan(x)."""
+        """Return the tangent."""
         v = np.tan(self.v)
         return self.chain(v, 1.0 + v * v, 2.0 * v * (1.0 + v * v))
 
     def sin(self) -> Taylor:
-        """Return sin(x)."""
+        """Return the sine."""
         v = np.sin(self.v)
         return self.chain(v, np.cos(self.v), -v)
 
     def sqrt(self) -> Taylor:
-        """Return the square root of x."""
+        """Return the square root."""
         v = np.sqrt(self.v)
         return self.chain(v, 0.5 / v, -0.25 / v**3)
 
@@ -144,7 +144,9 @@ def seed(values: Sequence[float], order: int) -> list[Taylor]:
     """Return variables with the given values, as zero-dimensional arrays with derivatives up to ``order``, 1 or 2."""
     count = len(values)
     units = np.eye(count)
-    return [Taylor(np.float64(v), units[k], np.zeros((count, count)) if order > 1 else None) for k, v in enumerate(values)]
+    return [
+        Taylor(np.float64(v), units[k], np.zeros((count, count)) if order > 1 else None) for k, v in enumerate(values)
+    ]
 
 
 def stack(entries: Any, like: Taylor) -> Taylor:

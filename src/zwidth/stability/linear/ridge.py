@@ -8,8 +8,10 @@ coincide, or, if only beta >= 0 is allowed, a crossing on the line beta = 0. It 
     second    the same at w2; or alpha is stationary along the curve of the first condition; or beta = 0
 
 As a parameter changes, the same conditions remain active, so their implicit derivatives are those of alpha (V21;
-`stability.linear.derivatives`). In arrays of crossings, a *row* belongs to a line of constant B and a *column* to an arc or crossing line, as in
-`stability.linear.boundary`. A *main* piece of the stable set is one that is connected to K = 0
+`stability.linear.derivatives`). In arrays of crossings, a *row* belongs to a line of constant B and a *column* to an
+arc or crossing line, as in `stability.linear.boundary`.
+
+A *main* piece of the stable set is one that is connected to K = 0
 (`stability.linear.regions`).
 """
 
