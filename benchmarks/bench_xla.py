@@ -21,7 +21,7 @@ import numpy as np
 from methods.clock import time_calls
 from zwidth.core import xp
 from zwidth.numerics import blocks, evaluate
-from zwidth.numerics.held_mass import ANY
+from zwidth.plant.rigid_mass import ANY
 from zwidth.stability.rigid import characteristic_function as pole_step
 from zwidth.stability.rigid import crossover, ridge, ridge_newton
 from zwidth.stability.rigid import dominant_pole_search as radius

@@ -50,6 +50,8 @@ from .model.actuator import Actuator as Actuator
 from .model.device import Coupling as Coupling
 from .model.device import Device as Device
 from .model.grasps import reference_grasps as reference_grasps
+from .model.joint_space import from_mass_matrix as from_mass_matrix
+from .model.joint_space import from_mujoco as from_mujoco
 from .model.linear_device import LinearDevice as LinearDevice
 from .model.measured_device import MeasuredDevice as MeasuredDevice
 from .model.mode import Mode as Mode

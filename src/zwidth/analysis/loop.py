@@ -31,18 +31,17 @@ from zwidth.model.circle_functions import circle_points
 from zwidth.model.mechanism import AnyChain, build_chain
 from zwidth.model.parameter_paths import AnyScene, list_parameters
 from zwidth.numerics.evaluate import as_float64, check_scalars, evaluate
-from zwidth.numerics.held_mass import classify_delays
+from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.linear.boundary import Boundary
 from zwidth.stability.linear.curve import evaluate_curve
 from zwidth.stability.linear.derivatives import SceneSensitivities, compute_sensitivities
-from zwidth.stability.linear.discretization import find_roots
 from zwidth.stability.linear.margins import compute_margins, open_loop_response
 from zwidth.stability.linear.passivity import PassivityCondition, compute_passivity_margins
 from zwidth.stability.linear.poles import compute_poles_minus_one, is_marginal, log_modulus
 from zwidth.stability.linear.poles import spectral_radius as linear_radius
 from zwidth.stability.linear.regions import Outline, StableSet
 from zwidth.stability.linear.ridge import RidgeSolution, find_ridge
-from zwidth.stability.linear.roots import LoopRoots
+from zwidth.stability.linear.roots import LoopRoots, find_roots
 from zwidth.stability.linear.rows import Island, find_stable_dampings, find_stable_intervals, label_walls
 from zwidth.stability.results import Margins, RidgePoint, Stability
 from zwidth.stability.rigid.boundary import boundary, boundary_point, stable_region

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.analysis.base import WallSI, wrap_methods
+from zwidth.analysis.coupling import is_safe_for_every_world, max_safe_coupling
 from zwidth.analysis.recommendation import SceneAdvice
 from zwidth.core.errors import InputError
 from zwidth.core.types import ArrayLike
@@ -90,6 +91,8 @@ class Scene(SceneAdvice):
             for piece in self.loop.outlines()
         )
 
+    is_safe_for_every_world = is_safe_for_every_world
+    max_safe_coupling = max_safe_coupling
     simulate = simulate
     """Method that calls `zwidth.simulate` with this scene and all other arguments."""
 

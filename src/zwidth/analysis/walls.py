@@ -23,7 +23,8 @@ from zwidth.model.linear_device import ResponseDevice
 from zwidth.model.state_space import StateSpace
 from zwidth.model.wall import resolve_wall
 from zwidth.numerics.evaluate import are_numbers, as_float64, broadcast_traced, join_shapes
-from zwidth.stability.linear.discretization import realize_closed_loop, realize_device, realize_open_loop
+from zwidth.plant.sampled_states import sample_states
+from zwidth.stability.linear.closed_loop import realize_closed_loop, realize_open_loop
 from zwidth.stability.linear.passivity import find_unsupported_reason
 from zwidth.stability.linear.rows import Island
 from zwidth.stability.results import Margins, Stability
@@ -328,7 +329,7 @@ def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, a
     loop = build(chain, *read_single_wall(alpha, beta))
     force = mass / period**2
     device = np.array(chain.state_units(1.0 / period, force))
-    n_delayed = realize_device(chain).A.shape[0] - device.size
+    n_delayed = int(sample_states(chain).lag)
     n_filter = loop.A.shape[0] - device.size - n_delayed
     # Units of the states in their order: states of the velocity estimate, states of the device, delayed forces.
     scale = np.concatenate([np.ones(n_filter), device, np.full(n_delayed, force)])

@@ -139,7 +139,7 @@ def find_roots(polynomial: Polynomial, offsets: bool = False) -> np.ndarray:
     for times, factor in enumerate(_split_by_multiplicity(rest), start=1):
         while len(factor) > 1 and factor[-1] == 0:
             factor, roots = factor[:-1], [*roots, *[0j] * times]
-        roots += [root for root in _simple_roots(factor) for _ in range(times)]
+        roots += [root for root in find_simple_roots(factor) for _ in range(times)]
     return np.array(roots, complex)
 
 
@@ -161,7 +161,7 @@ def _split_by_multiplicity(polynomial: Polynomial) -> list[Polynomial]:
     return factors
 
 
-def _simple_roots(polynomial: Polynomial) -> list[complex]:
+def find_simple_roots(polynomial: Polynomial) -> list[complex]:
     """Return the roots of a square-free polynomial that has no root at 0."""
     if len(polynomial) < 2:
         return []

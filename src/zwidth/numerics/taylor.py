@@ -187,7 +187,7 @@ def solve(matrix: Taylor, right: Taylor) -> Taylor:
 
 def flow(A: Taylor, B: Taylor, time: Taylor) -> tuple[Taylor, Taylor]:
     """Return ``e^(A t) - 1`` and the state after a unit force held for time t from rest, of ``x' = A x + B u``."""
-    # As in `stability.linear.discretization.compute_transition`: a series for a short time, which is then doubled.
+    # As in `plant.transition.compute_transition`: a series for a short time, which is then doubled.
     size = len(A.v)
     norm = float(np.abs(A.v * time.v).sum(0).max())
     doublings = int(np.ceil(np.log2(max(2.0 * norm, 1.0))))

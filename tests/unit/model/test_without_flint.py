@@ -13,7 +13,7 @@ from mpmath import mp
 
 import zwidth
 from zwidth.model.exact_polynomials import find_common_factor, find_roots, multiply, trim
-from zwidth.stability.linear.sampled_zeros import find_sampled_zeros
+from zwidth.plant.sampled_zeros import find_sampled_zeros
 
 PROGRAM = """
 import sys

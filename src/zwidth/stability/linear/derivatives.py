@@ -3,7 +3,7 @@
 An answer u, such as the stiffest wall or a margin, solves equations ``F(p, u) = 0`` in the numbers p of the scene. They
 are formulated here in Taylor arithmetic (`zwidth.numerics.taylor`), evaluated at the solution, and differentiated by
 the implicit function theorem. With ``z = e^lambda``, the velocity estimate F, the critical controller ``q = -1/G``, and
-the matrices of the discretized device (`stability.linear.discretization`; delay d = n + f),
+the matrices of the discretized device (`plant.sampled_states`; delay d = n + f),
 
     q = -e^((n + 1) lambda)/x_1,   (z - 1 - Psi) x = (z - 1) Gamma(1 - f) + Gamma(1)
 

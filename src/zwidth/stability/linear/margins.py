@@ -10,7 +10,7 @@ the phase ``p = arg(-L)``, a pole is therefore on the unit circle after m more p
 pi. Therefore loops with delays within one period suffice for all longer delays: if m passes an integer between two of
 them, Newton's method solves for the delay, with the exact loop of each iterate. A real pole reaches z = -1 where
 ``|L(-1)|`` passes 1. Counts of the unstable poles below and above must confirm the smallest of these delays. A *chain*
-is the plant of a scene with its delay (`stability.linear.discretization`).
+is the plant of a scene with its delay (`plant.sampled_states`).
 """
 
 from __future__ import annotations
@@ -29,9 +29,8 @@ from zwidth.model.mechanism import AnyChain
 from zwidth.numerics.root_finding import find_zeros_between
 from zwidth.stability.linear.boundary import Boundary
 from zwidth.stability.linear.curve import place_nodes
-from zwidth.stability.linear.discretization import find_roots
 from zwidth.stability.linear.poles import compute_log_radius
-from zwidth.stability.linear.roots import LoopRoots
+from zwidth.stability.linear.roots import LoopRoots, find_roots
 from zwidth.stability.linear.rows import label_walls
 from zwidth.stability.results import Margins
 from zwidth.units.quantities import WALL_RANGE

@@ -24,8 +24,8 @@ from zwidth.core.xp import within
 from zwidth.model.circle_functions import Jet
 from zwidth.model.velocity import Estimate
 from zwidth.numerics.pole_counting import count_poles
-from zwidth.numerics.polynomials import abs2, companion
-from zwidth.stability.linear.roots import LoopRoots, affine_polynomial, compute_aberth_step, factor_open_loop
+from zwidth.numerics.polynomials import abs2, companion, compute_aberth_step
+from zwidth.stability.linear.roots import LoopRoots, affine_polynomial, factor_open_loop
 from zwidth.units.quantities import MOST_POLES, WALL_RANGE
 
 # Aberth's method

@@ -25,8 +25,8 @@ from zwidth.core.types import Array, ArrayLike, Vertices
 from zwidth.core.xp import materialize, namespace, nan_with_nan_derivatives, stop_gradient, tree_map
 from zwidth.model.checks import check_integer
 from zwidth.numerics.evaluate import as_number, check_scalars, evaluate
-from zwidth.numerics.held_mass import DelayClasses, classify_delays, discretize_mass, is_valid_device, split_delay
 from zwidth.numerics.root_finding import attach_root_derivatives, integrate
+from zwidth.plant.rigid_mass import DelayClasses, classify_delays, discretize_mass, is_valid_device, split_delay
 from zwidth.stability.rigid.curve import (
     build_lobe,
     compute_corner_line,
@@ -339,17 +339,18 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     """Compute the area of the stable set: the integral of alpha db along the lobe and, beyond a corner, a triangle."""
     xp = namespace(delta, d)
     curve = build_lobe(delta, d, kind)
-    end = stop_gradient(curve.end, xp)
+    # Without a corner, alpha is 0 at the end of the lobe.
+    end = attach_root_derivatives(
+        lambda x, curve: evaluate_lobe(x, curve).alpha,
+        curve.end,
+        lambda *_: True,
+        curve,
+        slope=lambda x, curve: xp.where(curve.to_corner, xp.inf, evaluate_lobe(x, curve).d_alpha),
+    )
     # If the lobe ends in the corner, add the triangle below the line alpha + 2 beta = const, on which the outline
     # continues to alpha = 0.
     point = evaluate_lobe(end, curve)
     corner_alpha = xp.where(curve.to_corner, point.alpha, 0.0)
-    if xp is not np:
-        # Without a corner, alpha is 0 at the end of the lobe. Add one Newton step for this end, because second
-        # derivatives of the area depend on the derivative of the end.
-        end = end - xp.where(
-            curve.to_corner, 0.0, point.alpha / stop_gradient(xp.where(curve.to_corner, 1.0, point.d_alpha), xp)
-        )
     # Add an axis for the quadrature nodes.
     expanded = tree_map(lambda value: None if value is None else value[..., None], curve)
 

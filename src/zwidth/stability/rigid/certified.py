@@ -31,8 +31,8 @@ from zwidth.core.types import Array
 from zwidth.core.xp import horner, materialize, namespace, nan_beyond, square_roots
 from zwidth.numerics.balls import BITS, available
 from zwidth.numerics.evaluate import evaluate_columns
-from zwidth.numerics.held_mass import DelayClasses, DiscretePlant, PhiFunctions, classify_delays, discretize_mass
-from zwidth.numerics.held_mass import discretize_plant as discretize
+from zwidth.plant.rigid_mass import DelayClasses, DiscretePlant, PhiFunctions, classify_delays, discretize_mass
+from zwidth.plant.rigid_mass import discretize_plant as discretize
 from zwidth.stability.rigid.broadcasting import Points
 from zwidth.stability.rigid.crossover import (
     DelayPhase,

@@ -1,13 +1,13 @@
 """Evaluate the characteristic polynomial P and its derivatives at a point, and take Newton or Halley steps to a pole.
 
-The polynomial is evaluated in factored form (`stability.rigid.pole_count.LoopFactors`),
+The polynomial is evaluated in factored form (`stability.rigid.characteristic_polynomial.evaluate_factors`),
 
-    P = z^p A + D      p = 1 + n      A = (z - 1)(z - c)      D = (a2 z + h)(s z - beta)
+    P = z^p A + N W
 
-For fractional delays both terms have one more factor: z^p becomes z^(p+1), and D is multiplied by z + q. At
-``z = e^(re + j im)`` all terms are computed from z - 1, so that poles near 1 keep their relative accuracy. P is
-divided by the larger of |z^p| and 1, so that nothing overflows for large n. As a function of log z, P is close to an
-exponential; for such functions Halley's method converges from distant starting points, and cubically near the pole.
+with p = 1 + n; for fractional delays p = 2 + n, and the values are those of z P. At ``z = e^(re + j im)`` all terms are
+computed from z - 1, so that poles near 1 keep their relative accuracy. P is divided by the larger of |z^p| and 1, so
+that nothing overflows for large n. As a function of log z, P is close to an exponential; for such functions Halley's
+method converges from distant starting points, and cubically near the pole.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from zwidth.core.types import Array
 from zwidth.core.xp import COSINE, SINE, epsilon, horner, materialize, namespace
 from zwidth.numerics.polynomials import abs2
-from zwidth.stability.rigid.pole_count import LoopFactors
+from zwidth.stability.rigid.characteristic_polynomial import LoopFactors, bound_wall_part, evaluate_factors
 
 # Bound on the rounding error of P, in rounding units of the sum of the moduli of its terms. The rounding error of the
 # angle p im is added separately.
@@ -124,26 +124,22 @@ def evaluate_polynomial(re: Array, im: Array, loop: LoopFactors, fractional: boo
     if number is Pair:
         z_minus_1, delay = _store_pair(z_minus_1, re), _store_pair(delay, re)
     z = z_minus_1 + 1.0
-    device, device_slope = z_minus_1 * (z_minus_1 + loop.em), z * (z_minus_1 * 2.0 + loop.em)
-    numerator = (z * loop.a2 + loop.h) * wall_scale
-    numerator_slope, wall_factor, wall_slope = z * (loop.a2 * wall_scale), z_minus_1 * loop.s + loop.alpha, z * loop.s
-    d = numerator * wall_factor
-    d1 = numerator_slope * wall_factor + numerator * wall_slope
-    d2 = d1 + numerator_slope * wall_slope * 2.0
-    abs_z_minus_1 = xp.abs(z_minus_1.real) + xp.abs(z_minus_1.imag)
-    wall_size = wall_scale * (loop.h + loop.a2 * r) * (xp.abs(loop.alpha) + xp.abs(loop.s) * abs_z_minus_1)
+    A, dA, N, dN, ddN, W = evaluate_factors(z, z_minus_1, loop, fractional)
+    N, dN, device_slope, z_squared = N * wall_scale, dN * wall_scale, z * dA, z * z
+    d, d1, bend = N * W, (W * dN + N * loop.s) * z, dN * (2.0 * loop.s)
     if fractional:
-        z_plus_q = z + loop.q
-        d, d1, d2 = d * z_plus_q, d1 * z_plus_q + d * z, d2 * z_plus_q + (d1 * 2.0 + d) * z
-        wall_size = wall_size * (r + loop.q)
-    t1 = delay * (device * power + device_slope)
-    t2 = delay * ((device * power + device_slope * 2.0) * power + device_slope + z * z * 2.0)
+        bend = W * (ddN * wall_scale) + bend
+    d2 = z_squared * bend + d1
+    abs_z_minus_1 = xp.abs(z_minus_1.real) + xp.abs(z_minus_1.imag)
+    wall_size = wall_scale * bound_wall_part(r, abs_z_minus_1, loop, fractional)
+    t1 = delay * (A * power + device_slope)
+    t2 = delay * ((A * power + device_slope * 2.0) * power + device_slope + z_squared * 2.0)
     angle_rounding = power * (xp.abs(re) + xp.abs(im))
     rounding = (
         device_scale * abs_z_minus_1 * (abs_z_minus_1 + loop.em) * (FACTOR_ROUNDING + angle_rounding)
         + FACTOR_ROUNDING * wall_size
     )
-    values = delay * device + d, t1 + d1, t2 + d2
+    values = delay * A + d, t1 + d1, t2 + d2
     # Convert single results to NumPy's complex type, because Python's complex numbers raise an error on division by
     # zero.
     return PolynomialValue(

@@ -1,7 +1,7 @@
 """Decide the stability of rigid virtual walls in closed form, by a Nyquist test at the single gain crossover.
 
 The inputs are the normalized stiffness alpha and damping beta of the wall, the normalized physical damping delta of the
-device, and its delay of d = n + f periods (n integer, 0 <= f < 1). The discretized plant (`numerics.held_mass`) yields
+device, and its delay of d = n + f periods (n integer, 0 <= f < 1). The discretized plant (`plant.rigid_mass`) yields
 the characteristic polynomial P = T + B and the open loop L = B/T with
 
     T = z^(n+1) (z - 1)(z - c)                device and delay, c = e^-delta
@@ -61,8 +61,8 @@ from zwidth.core.xp import (
     stop_gradient,
     within,
 )
-from zwidth.numerics.held_mass import ANY, DelayClasses, DiscretePlant, discretize_plant
 from zwidth.numerics.root_finding import attach_root_derivatives
+from zwidth.plant.rigid_mass import ANY, DelayClasses, DiscretePlant, discretize_plant
 from zwidth.units.quantities import WALL_RANGE
 
 # Number of Newton steps for the cubic. The starting value, also where it is replaced by 1, is within 11 % of the root

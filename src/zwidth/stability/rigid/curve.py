@@ -20,7 +20,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import horner, iterate, materialize, namespace, stop_gradient
-from zwidth.numerics.held_mass import DelayClasses, DiscretePlant, discretize_plant
+from zwidth.plant.rigid_mass import DelayClasses, DiscretePlant, discretize_plant
 from zwidth.stability.rigid.crossover import expand_short_delay_curve
 from zwidth.stability.rigid.ridge_newton import guess_start, solve_ridge
 from zwidth.stability.rigid.stiffness_limit import (

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyvander
 
 from zwidth.stability.rigid.characteristic_function import halley_step
+from zwidth.stability.rigid.characteristic_polynomial import LoopFactors, factor_loop
 from zwidth.stability.rigid.dominant_pole_search import list_starts
 from zwidth.stability.rigid.pole_cells import (
     ORDERS,
@@ -42,7 +43,7 @@ from zwidth.stability.rigid.pole_cells import (
     list_chebyshev_nodes,
     select_cells,
 )
-from zwidth.stability.rigid.pole_count import LoopFactors, count_poles_in_cell, factor_loop
+from zwidth.stability.rigid.pole_count import count_poles_in_cell
 
 # Sides of the cells of a square grid, in walls. Cells of other grids have as many walls and the grid's proportions.
 CELL_SIDES = (128, 64, 32, 16, 8)

@@ -9,10 +9,10 @@ Certificate: let r be the modulus of the result and tol the tolerance. A count (
 all poles lie inside ``|z| = r (1 + tol)``, and a pole lies within tol of the result. Then the spectral radius is r to
 within tol. If this fails, more starting points are tried, and finally the radius is bisected by counts.
 
-As in `stability.rigid.pole_count`, P = T + B with T = z^(1+n) (z - 1)(z - c) and B = M(z) W(z), W = s z - beta; a
-*crossover* is a point with |T| = |B| on a circle. All positions are logarithms: a pole is ``e^(re + j im)`` with 0 <=
-im <= pi. There are two implementations: NumPy functions, which `stability.rigid.dominant_poles` applies to walls
-without a certificate, and one program for JAX transformations (`traced_kernel`).
+P = T + B has the factors of `stability.rigid.characteristic_polynomial`; a *crossover* is a point with |T| = |B| on a
+circle. All positions are logarithms: a pole is ``e^(re + j im)`` with 0 <= im <= pi. There are two implementations:
+NumPy functions, which `stability.rigid.dominant_poles` applies to walls without a certificate, and one program for JAX
+transformations (`traced_kernel`).
 """
 
 from __future__ import annotations
@@ -41,8 +41,15 @@ from zwidth.stability.rigid.characteristic_function import (
     newton_step,
     shift_pole,
 )
+from zwidth.stability.rigid.characteristic_polynomial import (
+    LoopFactors,
+    bound_wall_part,
+    expand_at_one,
+    expand_on_circle,
+    factor_loop,
+)
 from zwidth.stability.rigid.normalization import valid_wall
-from zwidth.stability.rigid.pole_count import LoopFactors, count_poles, factor_loop
+from zwidth.stability.rigid.pole_count import count_poles
 
 # Numbers of Halley steps.
 STEPS_ON_BOTH = 2  # from both starting points
@@ -96,7 +103,7 @@ class DominantPoles(NamedTuple):
 def _bound_log_radius(loop: LoopFactors) -> Array:
     """Return the logarithm of a radius above the moduli of all poles: |T| > |B| on every larger circle."""
     xp = namespace(loop.alpha)
-    wall_bound = (loop.a2 + loop.h) * (1.0 + loop.q) * (xp.abs(loop.alpha) + 2.0 * xp.abs(loop.beta))
+    wall_bound = bound_wall_part(1.0, 2.0, loop, True)
     bound_root = xp.sqrt(wall_bound)
     # For r > 1 use |T| >= r^(1+n) (r - 1)^2 and |B| <= wall_bound r^2.
     bound = xp.log1p(xp.where(loop.n_plus_1 > 1, bound_root, bound_root + wall_bound))
@@ -107,15 +114,7 @@ def _bound_log_radius(loop: LoopFactors) -> Array:
 def approximate_slow_pole(loop: LoopFactors) -> tuple[Array, Array]:
     """Approximate the larger pole near 1, from the Taylor polynomial of P of second order in z - 1."""
     xp = namespace(loop.alpha)
-    alpha, s, n_plus_1 = loop.alpha, loop.s, loop.n_plus_1
-    numerator_at_1, numerator_slope = (loop.a2 + loop.h) * (1.0 + loop.q), loop.a2 - loop.h * loop.q
-    constant = numerator_at_1 * alpha
-    linear = loop.em + numerator_at_1 * s + (numerator_slope - n_plus_1 * numerator_at_1) * alpha
-    quadratic = (
-        1.0
-        + (numerator_slope - n_plus_1 * numerator_at_1) * s
-        + (0.5 * n_plus_1 * (n_plus_1 + 1.0) * numerator_at_1 - n_plus_1 * numerator_slope) * alpha
-    )
+    constant, linear, quadratic = expand_at_one(loop)
     quadratic = xp.where(quadratic > 0.1, quadratic, 1.0)
     discriminant = linear * linear - 4.0 * quadratic * constant
     discriminant_root = xp.sqrt(xp.abs(discriminant))
@@ -141,15 +140,13 @@ def approximate_first_pair(loop: LoopFactors, fractional: bool) -> tuple[Array, 
     # pair is then about twice as large.
     im = xp.where((loop.alpha < -loop.beta * im) & (loop.n_plus_1 > 1), 2.0 * im, im)
     x = xp.sin(0.5 * im) ** 2
-    device_factors = [(1.0 - zero) * (1.0 - zero) + 4.0 * zero * x for zero in (1.0, loop.c)]
-    numerator = (loop.a2 + loop.h) ** 2 - 4.0 * loop.a2 * loop.h * x
-    wall_factor = loop.alpha * loop.alpha + 4.0 * loop.s * loop.beta * x
     n_plus_1 = loop.n_plus_1
+    z_minus_1, z_minus_c, W, numerator, late = (
+        value * value + slope * x for value, slope in expand_on_circle(1.0, 0.0, loop)
+    )
     if fractional:
-        numerator, n_plus_1 = numerator * ((1.0 + loop.q) ** 2 - 4.0 * loop.q * x), n_plus_1 + 1.0
-    return xp.maximum(
-        0.5 * xp.log(numerator * wall_factor / (device_factors[0] * device_factors[1])) / n_plus_1, -1.0
-    ), im
+        numerator, n_plus_1 = numerator * late, n_plus_1 + 1.0
+    return xp.maximum(0.5 * xp.log(numerator * W / (z_minus_1 * z_minus_c)) / n_plus_1, -1.0), im
 
 
 def approximate_larger_pole(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:

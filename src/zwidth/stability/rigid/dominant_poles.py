@@ -19,8 +19,9 @@ import numpy as np
 from zwidth.core.status import Status
 from zwidth.numerics.blocks import map_blocks
 from zwidth.numerics.evaluate import BLOCK, FEW, Route, compile_columns
-from zwidth.numerics.held_mass import classify_delays
+from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.rigid.broadcasting import Points, fold
+from zwidth.stability.rigid.characteristic_polynomial import factor_loop
 from zwidth.stability.rigid.crossover import stable_kernel
 from zwidth.stability.rigid.dominant_pole_grid import Area, compute_grid_poles, pad_to_16
 from zwidth.stability.rigid.dominant_pole_search import (
@@ -34,7 +35,7 @@ from zwidth.stability.rigid.dominant_pole_search import (
 )
 from zwidth.stability.rigid.normalization import wall_status
 from zwidth.stability.rigid.pole_cells import VERDICT_WIDTH
-from zwidth.stability.rigid.pole_count import count_poles, factor_loop
+from zwidth.stability.rigid.pole_count import count_poles
 
 # If a count is uncertain because of rounding errors, it is repeated with error bounds that are larger than the required
 # accuracy by these factors, up to `MAX_ERROR`.

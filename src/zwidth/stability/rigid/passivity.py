@@ -13,8 +13,8 @@ import numpy as np
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced, namespace, nan_with_nan_derivatives, stop_gradient
 from zwidth.numerics.evaluate import as_number, check_scalars, evaluate, to_caller
-from zwidth.numerics.held_mass import ANY, DelayClasses, classify_delays, is_valid_device
 from zwidth.numerics.root_finding import integrate
+from zwidth.plant.rigid_mass import ANY, DelayClasses, classify_delays, is_valid_device
 from zwidth.stability.rigid.broadcasting import NAMES
 from zwidth.stability.rigid.normalization import valid_wall
 from zwidth.stability.rigid.required_damping import compute_needed_damping, find_directions

@@ -4,13 +4,13 @@ A cell is a rectangle of walls, ``|alpha - alpha0| <= a``, ``|beta - beta0| <= b
 u), alpha = alpha0 + a xi and beta = beta0 + b eta, the poles of the walls solve
 
     A(u) = tau(u)      A = Q(z) - alpha0 - beta0 f(z)      tau = a xi + b eta f(z)
-    f = 1 - 1/z        Q = -z^n (z - 1)(z - c)/M(z)        M = (a2 z + h)(1 + q/z)
+    f = 1 - 1/z        Q = -T/(z M)
 
-with c and M of the device and the integer delay n as in `stability.rigid.pole_count` (docs/theory/maps.md). A *group*
-is one pole, or two poles close to the real axis that may meet there. Two poles that meet are not analytic in xi and
-eta, but their sums are. The coefficients of these sums are integrals along a circle ``|u| = U`` around the group (C1).
-The circle is chosen such that ``|A| > R |tau|`` on it for all walls (C2); powers of 1/R bound the truncation error,
-relative to a bound G (C3). A pole is e^(re + j im); ``log |z|`` = re is called its log radius.
+with the factors T and M of P (`stability.rigid.characteristic_polynomial`; docs/theory/maps.md). A *group* is one pole,
+or two poles close to the real axis that may meet there. Two poles that meet are not analytic in xi and eta, but their
+sums are. The coefficients of these sums are integrals along a circle ``|u| = U`` around the group (C1). The circle is
+chosen such that ``|A| > R |tau|`` on it for all walls (C2); powers of 1/R bound the truncation error, relative to a
+bound G (C3). A pole is e^(re + j im); ``log |z|`` = re is called its log radius.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebpts1, chebvander
 
 from zwidth.stability.rigid.characteristic_function import make_complex
-from zwidth.stability.rigid.pole_count import LoopFactors
+from zwidth.stability.rigid.characteristic_polynomial import LoopFactors, TaylorSeries, expand_taylor, expand_wall
 
 # Orders of the series in xi and eta that are tried; each group uses the lowest order that is accurate enough.
 ORDERS = (2, 4, 8, 12, 20)
@@ -110,7 +110,6 @@ class Group(NamedTuple):
     im: np.ndarray
     a: Any  # complex coefficients of A in u (terms, cells)
     f: Any  # f at the center
-    w: Any  # 1/z at the center
     disk: np.ndarray  # radius U of the circle, in u
     low: np.ndarray  # lower bound of log |z| of the group's poles for all walls of the cell
     error: np.ndarray  # truncation error for each order, relative to the bound G of C3 (orders, cells)
@@ -142,45 +141,14 @@ def select_cells(tree: Any, index: Any) -> Any:
     return tree[..., index] if isinstance(tree, np.ndarray) else tree
 
 
-def _expand_taylor(re: np.ndarray, im: np.ndarray, loop: LoopFactors, fractional: bool, terms: int) -> tuple[Any, ...]:
-    """Return the Taylor coefficients of A in u around centers, and f, 1/z and the moduli of A's factors there."""
+def _expand_taylor(re: np.ndarray, im: np.ndarray, loop: LoopFactors, fractional: bool, terms: int) -> TaylorSeries:
+    """Return the Taylor series of A in u around centers."""
     expm1_re, sine = np.expm1(re), np.sin(0.5 * im)
     r = 1.0 + expm1_re
     z_minus_1 = make_complex(expm1_re - 2.0 * r * sine * sine, 2.0 * r * sine * np.cos(0.5 * im))
-    z, z_minus_c = z_minus_1 + 1.0, z_minus_1 + loop.em
-    w, inverse_numerator = 1.0 / z, 1.0 / (loop.a2 * z + loop.h)
-    # Multiply the series in u of the factors of Q = -z^n (z - 1)(z - c)/((a2 z + h)(1 + q/z)), one after the other.
     n, modulus = loop.n_plus_1 - 1.0, np.exp((loop.n_plus_1 - 1.0) * re)
-    q0, rho = (
-        -make_complex(modulus * np.cos(n * im), modulus * np.sin(n * im)) * inverse_numerator,
-        loop.a2 * z * inverse_numerator,
-    )
-    z_over_z_plus_q = z / (z + loop.q)
-    if fractional:
-        q0 *= z_over_z_plus_q
-    f, orders = z_minus_1 * w, np.arange(terms)[:, None]
-    power = np.ones((terms + 1, re.size))
-    np.cumprod((n - orders) / (orders + 1.0), axis=0, out=power[1:])
-    a = z_minus_1 * z_minus_c * q0 * power
-    a[1:] += z * (z_minus_1 + z_minus_c) * q0 * power[:-1]
-    a[2:] += z * z * q0 * power[:-2]
-    if fractional:
-        _divide_series(a, rho)
-        a[1:] += a[:-1].copy()
-        _divide_series(a, z_over_z_plus_q)
-    else:
-        _divide_series(a, rho)
-    a[0] -= f * loop.beta + loop.alpha
-    a[1:] += (-1.0) ** (orders + 1.0) * (w * loop.beta)
-    return a, f, w, [np.abs(part) for part in (z_minus_1, z_minus_c, q0, rho, z_over_z_plus_q)]
-
-
-def _divide_series(a: np.ndarray, x: Any) -> None:
-    """Divide power series in u by 1 + x u in place, as 1/(1 + x u) = (1 - x u)(1 + x^2 u^2)(1 + x^4 u^4) ..."""
-    power, x = 1, -x
-    while power < len(a):
-        a[power:] += x * a[:-power]
-        power, x = 2 * power, x * x
+    z_to_n = make_complex(modulus * np.cos(n * im), modulus * np.sin(n * im))
+    return expand_taylor(z_minus_1, z_to_n, loop, fractional, terms)
 
 
 def find_stationary_point(
@@ -194,7 +162,7 @@ def find_stationary_point(
     )
     max_step = 0.5 / loop.n_plus_1
     for _ in range(NEWTON_STEPS):
-        _, slope, curvature = _expand_taylor(re, im, loop, fractional, 2)[0].real
+        _, slope, curvature = _expand_taylor(re, im, loop, fractional, 2).terms.real
         re = re + np.log1p(np.clip(-0.5 * slope / curvature, -max_step, max_step))
     return re, im
 
@@ -216,8 +184,8 @@ def enclose_poles(
         The groups. Those that no circle encloses have infinite errors and no order.
     """
     loop, points, orders = cells.loop, POINTS_PER_POLE * poles, np.arange(N_TERMS + 1)
-    a, f, w, (abs_z_minus_1, abs_z_minus_c, abs_q0, rho, abs_late) = _expand_taylor(re, im, loop, fractional, N_TERMS)
-    r, abs_f, abs_w, sizes = np.exp(re), np.abs(f), np.abs(w), np.abs(a)
+    a, f, (abs_z_minus_1, abs_z_minus_c, abs_q0, rho, abs_late) = _expand_taylor(re, im, loop, fractional, N_TERMS)
+    r, abs_f, sizes, abs_w = np.exp(re), np.abs(f), np.abs(a), np.exp(-re)
     limit = 1.0 / np.maximum(1.0, np.maximum(rho, abs_late) if fractional else rho)
     largest = np.minimum(2.0 / loop.n_plus_1, 0.4 * limit)
     disk = largest * CIRCLE_RADII[:, None]
@@ -281,7 +249,7 @@ def enclose_poles(
         farthest = np.where((ratio > 1.02) & (reach < 0.98), np.log1p(-reach) * disk / (1.0 - disk), -np.inf)
     else:
         farthest = np.where(ratio > 1.02, np.log1p(-disk), -np.inf)
-    group = Group(poles, re, im, a, f, w, disk[chosen], re + farthest.max(0), error, best)
+    group = Group(poles, re, im, a, f, disk[chosen], re + farthest.max(0), error, best)
     least = np.maximum(np.abs(re) - (re - group.low), MIN_LOG_RADIUS)
     allowed = errors.limit(least) * (1.0 if poles == 1 else PAIR_FACTOR)
     return group._replace(order=(~(group.log_error <= allowed)).sum(0))
@@ -327,8 +295,10 @@ def expand_sums(group: Group, cells: Cells, order: int) -> list[np.ndarray]:
     coefficients = (group.a * group.disk ** powers[:, None]).T
     inverse = 1.0 / np.fft.ifft(coefficients, count, norm="forward")[:, : points.size]
     log_derivative = np.fft.ifft(coefficients * powers, count, norm="forward")[:, : points.size] * inverse
-    powers_xi = _compute_powers(np.conj(cells.a[:, None] * inverse), order + 1).transpose(0, 2, 1)
-    powers_eta = cells.b[:, None] * inverse * (group.f[:, None] + group.w[:, None] * (u / (1.0 + u)))
+    change = expand_wall(cells.a[:, None], cells.b[:, None])
+    powers_xi = _compute_powers(np.conj(change.alpha * inverse), order + 1).transpose(0, 2, 1)
+    # Insert f = 1 - 1/z at z = z0 (1 + u), with 1/z0 = 1 - f(z0).
+    powers_eta = change.beta * inverse * (group.f[:, None] + (1.0 - group.f[:, None]) * (u / (1.0 + u)))
     orders, sums = np.arange(order + 1), []
     binomials = np.where(orders[:, None] + orders <= order, BINOMIAL_WEIGHTS[: order + 1, : order + 1], 0.0)
     for k in range(1, poles + 1):

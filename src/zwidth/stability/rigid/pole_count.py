@@ -1,12 +1,8 @@
 """Count the poles outside a circle |z| = r by the argument principle, from the gain crossovers on that circle.
 
-P = T + B as in `stability.rigid.crossover`, with c = e^-delta, s = alpha + beta and the delay d = n + f:
-
-    T = z^(1+n) (z - 1)(z - c)    device and delay
-    B = M(z) W(z)                 wall,  W = s z - beta,  M = (a2 z + h)(1 + q/z) with real zeros <= 0
-
-A *crossover* is a point of the circle with |T| = |B|. On ``z = r e^(j w)``, 0 < w < pi, with x = sin^2(w/2), a factor
-z - a with real a satisfies ``|z - a|^2 = (r - a)^2 + 4 r a x``, and its imaginary part does not change sign. Therefore
+P = T + B with the factors of `stability.rigid.characteristic_polynomial`; the zeros of M are real and not positive. A
+*crossover* is a point of the circle with |T| = |B|. On ``z = r e^(j w)``, 0 < w < pi, the squared modulus of each
+factor is linear in x = sin^2(w/2), and its imaginary part does not change sign. Therefore
 
 - |T|^2 - |B|^2 is a quadratic in x for integer delays and a cubic for fractional ones; its zeros are the crossovers;
 - the principal values of all arguments are continuous in w, so that no phase has to be unwrapped.
@@ -24,10 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.core.types import Array
-from zwidth.core.xp import angle, apply_each, epsilon, invert_haversine, iterate, namespace, nan_unless
-from zwidth.numerics.held_mass import discretize_mass, factor_numerator, split_delay
+from zwidth.core.xp import angle, apply_each, epsilon, invert_haversine, iterate, namespace
+from zwidth.stability.rigid.characteristic_polynomial import CircleFactors, LoopFactors, expand_on_circle
 from zwidth.stability.rigid.crossover import find_first_root
-from zwidth.stability.rigid.normalization import valid_wall
 
 # Largest number of steps of the bracketed iteration for a zero of the cubic |T|^2 - |B|^2.
 CUBIC_STEPS = 6
@@ -37,33 +32,6 @@ WIDENING = 1.0 + 1e-12
 # four equal pieces, and the phase change is bounded on each piece. The positions are those of the ends of the pieces
 # (even indices) and of their midpoints (odd indices), from 0 to 1 in the interval.
 PIECE_POINTS = np.arange(9)[:, None, None] / 8.0
-
-
-class LoopFactors(NamedTuple):
-    """The factors of P for each loop; all NaN for a loop with an argument out of range."""
-
-    alpha: Array
-    beta: Array
-    s: Array  # alpha + beta
-    n_plus_1: Array  # n + 1, the exponent of z in T
-    d_plus_1: Array  # d + 1
-    c: Array
-    em: Array  # 1 - c
-    a2: Array
-    h: Array  # -h/a2 is the larger zero of M
-    q: Array  # -q is the smaller zero of M; 0 for integer delays
-
-
-def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> LoopFactors:
-    """Return the factors of P; ``fractional`` is True if any delay is fractional."""
-    xp = namespace(alpha, beta, delta, d)
-    valid = valid_wall(alpha, beta, delta, d)
-    delta, d = xp.where(valid, delta, 1.0), xp.where(valid, d, 0.0)
-    n, f = split_delay(d)
-    plant = discretize_mass(delta, f if fractional else None)
-    h, q = factor_numerator(plant) if fractional else (plant.a1, 0.0 * plant.a1)
-    alpha, beta, s = nan_unless(valid, alpha, beta, alpha + beta)
-    return LoopFactors(alpha, beta, s, n + 1.0, d + 1.0, plant.c, plant.em, plant.a2, h, q)
 
 
 class _Circle(NamedTuple):
@@ -77,6 +45,7 @@ class _Circle(NamedTuple):
     r_minus_c: Array
     wall: Array  # s r - beta
     numerator: Array  # a2 r + h
+    factors: CircleFactors
     h: tuple[Array, Array, Array, Array]  # |T|^2 - |B|^2, lowest power of x first
     at_start: tuple[Array, Array]  # |T| and |B| at x = 0, i.e. z = r
     at_end: tuple[Array, Array]  # |T| and |B| at x = 1, i.e. z = -r
@@ -99,28 +68,28 @@ class _Circle(NamedTuple):
 def _evaluate_on_circle(log_r: Array, loop: LoopFactors, fractional: bool, xp: Any) -> _Circle:
     """Evaluate the factors of T and B, and |T|^2 - |B|^2, on the circle |z| = e^log_r."""
     r, r_minus_1 = xp.exp(log_r), xp.expm1(log_r)
-    r_minus_c, wall, numerator = r_minus_1 + loop.em, loop.alpha * r + loop.beta * r_minus_1, loop.a2 * r + loop.h
+    factors = expand_on_circle(r, r_minus_1, loop)
+    (r_minus_c, c1), (wall, w1), (numerator, m1), (one_plus_ratio, g1) = factors[1:]
     power = loop.n_plus_1 * log_r
     smaller = xp.exp(-xp.abs(power))
     # Divide T and B by the larger of r^(1+n) and 1 to avoid overflow.
     device_scale, wall_scale = xp.where(power < 0, smaller, 1.0), xp.where(power < 0, 1.0, smaller)
-    t0, t1 = device_scale * r_minus_1 * (device_scale * r_minus_1), 4.0 * r * device_scale * device_scale
-    c0, c1 = r_minus_c * r_minus_c, 4.0 * r * loop.c
-    w0, w1 = wall * wall, 4.0 * r * loop.s * loop.beta
-    m0, m1 = wall_scale * numerator * (wall_scale * numerator), -4.0 * r * loop.a2 * loop.h * wall_scale * wall_scale
+    t0, t1 = device_scale * r_minus_1 * (device_scale * r_minus_1), factors.z_minus_1[1] * device_scale * device_scale
+    c0, w0 = r_minus_c * r_minus_c, wall * wall
+    m0, m1 = wall_scale * numerator * (wall_scale * numerator), m1 * wall_scale * wall_scale
     b0, b1, b2, b3 = m0 * w0, m0 * w1 + m1 * w0, m1 * w1, 0.0 * m0
-    one_plus_ratio, one_minus_ratio = 1.0, 1.0
+    one_minus_ratio = 1.0 - loop.q / r if fractional else 1.0
     if fractional:
-        ratio = loop.q / r
-        one_plus_ratio, one_minus_ratio = 1.0 + ratio, 1.0 - ratio
-        g0, g1 = one_plus_ratio * one_plus_ratio, -4.0 * ratio
+        g0 = one_plus_ratio * one_plus_ratio
         b0, b1, b2, b3 = b0 * g0, b1 * g0 + b0 * g1, b2 * g0 + b1 * g1, b2 * g1
         m0 = m0 * g0
     at_start = device_scale * xp.abs(r_minus_1 * r_minus_c), wall_scale * xp.abs(numerator * one_plus_ratio * wall)
     wall_at_end = (loop.h - loop.a2 * r) * one_minus_ratio * (wall + 2.0 * loop.beta)
     at_end = device_scale * (1.0 + r) * (loop.c + r), wall_scale * xp.abs(wall_at_end)
     h = (t0 * c0 - b0, t0 * c1 + t1 * c0 - b1, t1 * c1 - b2, -b3)
-    return _Circle(r, r_minus_1, r_minus_c, wall, numerator, h, at_start, at_end, (t0, t1, c0, c1, m0, w0, xp.abs(w1)))
+    return _Circle(
+        r, r_minus_1, r_minus_c, wall, numerator, factors, h, at_start, at_end, (t0, t1, c0, c1, m0, w0, xp.abs(w1))
+    )
 
 
 def _find_quadratic_zeros(h0: Array, h1: Array, h2: Array, xp: Any) -> list[Array]:
@@ -317,15 +286,15 @@ def count_poles_in_cell(
     r, abs_r_minus_1, power = circle.r, np.abs(circle.r_minus_1), loop.n_plus_1 * log_r
     # Bound the changes of three quantities over the walls of the cell: W = alpha z + beta (z - 1) at x = 0, and the
     # coefficients w0 and w1 of |W|^2 = w0 + w1 x.
-    wall_change, w1 = a * r + b * abs_r_minus_1, 4.0 * r * loop.s * loop.beta
+    (_, w1), (_, m1), (one_plus_ratio, g1) = circle.factors[2:]
+    wall_change = a * r + b * abs_r_minus_1
     e0 = (2.0 * np.abs(circle.wall) * wall_change + wall_change * wall_change) * WIDENING + 1e-14 * circle.wall**2
     e1 = 4.0 * r * (np.abs(loop.s) * b + (np.abs(loop.beta) + b) * (a + b)) * WIDENING + 1e-14 * np.abs(w1)
     wall_scale = np.where(power < 0, 1.0, np.exp(-np.abs(power)))
-    m0, m1 = (wall_scale * circle.numerator) ** 2, -4.0 * r * loop.a2 * loop.h * wall_scale * wall_scale
-    changes = [m0 * e0, m0 * e1 + m1 * e0, m1 * e1, 0.0 * m0]
+    m0, m1_scaled = (wall_scale * circle.numerator) ** 2, m1 * wall_scale * wall_scale
+    changes = [m0 * e0, m0 * e1 + m1_scaled * e0, m1_scaled * e1, 0.0 * m0]
     if fractional:
-        ratio = loop.q / r
-        g0, g1 = (1.0 + ratio) ** 2, -4.0 * ratio
+        g0 = one_plus_ratio**2
         changes = [
             changes[0] * g0,
             changes[1] * g0 + changes[0] * g1,
@@ -359,9 +328,13 @@ def count_poles_in_cell(
     # Bound the derivative of arg(z - a), the real part of z/(z - a) = 1 + a/(z - a), on each piece, by evaluating it at
     # that end of the piece at which |z - a| is smallest.
     least_wall = np.sqrt(np.maximum(circle.wall**2 + np.minimum(w1 * first, w1 * second), 0.0))
-    rate = loop.n_plus_1 + 1.0 / np.sqrt(abs_r_minus_1**2 + 4.0 * r * first) + np.abs(loop.beta) / least_wall
-    rate = rate + loop.c / np.sqrt(circle.r_minus_c**2 + 4.0 * r * loop.c * first)
-    rate = rate + loop.h / np.sqrt(np.maximum(circle.numerator**2 - 4.0 * r * loop.a2 * loop.h * second, 0.0))
+    rate = (
+        loop.n_plus_1
+        + 1.0 / np.sqrt(abs_r_minus_1**2 + circle.factors.z_minus_1[1] * first)
+        + np.abs(loop.beta) / least_wall
+    )
+    rate = rate + loop.c / np.sqrt(circle.r_minus_c**2 + circle.factors.z_minus_c[1] * first)
+    rate = rate + loop.h / np.sqrt(np.maximum(circle.numerator**2 + m1 * second, 0.0))
     if fractional:
         rate = rate + loop.q / np.sqrt(np.maximum((r + loop.q) ** 2 - 4.0 * r * loop.q * second, 0.0))
     relative_change = (a * r + b * np.sqrt(abs_r_minus_1**2 + 4.0 * r * second)) / least_wall

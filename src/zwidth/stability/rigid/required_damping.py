@@ -22,8 +22,8 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import ARCSINE, COSINE, SINE, epsilon, horner, namespace, stop_gradient
-from zwidth.numerics.held_mass import ANY, DelayClasses, split_delay
 from zwidth.numerics.root_finding import newton
+from zwidth.plant.rigid_mass import ANY, DelayClasses, split_delay
 
 # Number of Newton steps to the peak; the error of the starting value is a few percent.
 PEAK_STEPS = 3

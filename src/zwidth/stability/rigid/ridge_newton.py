@@ -22,7 +22,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import ARCSINE, COSINE, SINE, epsilon, horner, iterate, materialize, namespace, stop_gradient
-from zwidth.numerics.held_mass import ANY, DelayClasses, DiscretePlant, Plant
+from zwidth.plant.rigid_mass import ANY, DelayClasses, DiscretePlant, Plant
 
 
 class Curve(NamedTuple):

@@ -14,7 +14,7 @@ from zwidth.core.errors import InputError, check_choice
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced, namespace
 from zwidth.numerics.evaluate import broadcast, check_scalars, evaluate, to_caller
-from zwidth.numerics.held_mass import classify_delays
+from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.rigid.broadcasting import NAMES
 from zwidth.stability.rigid.dominant_pole_search import traced_kernel
 from zwidth.stability.rigid.dominant_poles import ACCURACY, find_poles

@@ -20,8 +20,8 @@ import numpy as np
 from zwidth.core.types import Array, Samples
 from zwidth.model.checks import check_integer
 from zwidth.numerics.evaluate import as_number
-from zwidth.numerics.held_mass import phi_functions
 from zwidth.numerics.root_finding import bisect
+from zwidth.plant.rigid_mass import phi_functions
 from zwidth.stability.rigid.broadcasting import find_degree
 from zwidth.stability.rigid.crossover import stable_kernel
 from zwidth.stability.rigid.dominant_poles import find_dominant_pole

@@ -22,7 +22,7 @@ import numpy as np
 from zwidth.core.types import Array
 from zwidth.core.xp import COSINE, SINE, horner, iterate, namespace, nan_beyond
 from zwidth.numerics.evaluate import FEW, Route, evaluate_columns
-from zwidth.numerics.held_mass import DiscretePlant, discretize_plant
+from zwidth.plant.rigid_mass import DiscretePlant, discretize_plant
 from zwidth.stability.rigid.broadcasting import Points, group_by_value
 from zwidth.stability.rigid.crossover import expand_long_delay_curve, expand_short_delay_curve
 from zwidth.units.quantities import WALL_RANGE

@@ -10,7 +10,7 @@ from certified_labels import certified_stable
 from mpmath import mp
 
 import oracles
-from zwidth.numerics.held_mass import classify_delays, phi_functions
+from zwidth.plant.rigid_mass import classify_delays, phi_functions
 from zwidth.stability.rigid import certified
 from zwidth.stability.rigid.certified import (
     CROSSOVER_WIDTH,

@@ -6,7 +6,7 @@ from mpmath import mp
 
 import oracles
 from zwidth.stability.rigid.characteristic_function import newton_step
-from zwidth.stability.rigid.pole_count import factor_loop
+from zwidth.stability.rigid.characteristic_polynomial import factor_loop
 
 
 def walls(d, count=12):

@@ -12,8 +12,8 @@ import pytest
 import oracles
 import zwidth
 from zwidth.stability.rigid.characteristic_function import halley_step
+from zwidth.stability.rigid.characteristic_polynomial import factor_loop
 from zwidth.stability.rigid.dominant_pole_search import approximate_first_pair, approximate_slow_pole
-from zwidth.stability.rigid.pole_count import factor_loop
 
 REFERENCE = Path(__file__).resolve().parents[3] / "reference"
 NAMES = ("alpha", "beta", "delta", "d")

@@ -20,6 +20,7 @@ less than two bits.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from math import factorial
 from typing import Any, NamedTuple
 
@@ -118,6 +119,51 @@ def discretize_mass(
         - f * f * (phi_f.gap + delta * t * phi_t.phi1 * phi_f.psi)
     )
     return Plant(phi.c, delta * phi.phi1, a2, a1, a0, gap)
+
+
+def differentiate_mass(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
+    """Return the derivatives of `discretize_mass` in delta and in the fraction f of the delay, in closed form.
+
+    The derivative of N(1) in f is exactly 0. That of automatic differentiation is a rounding error, with which the
+    derivatives of the maximum stiffness in d would have errors 80 times as large at d = 500.
+    """
+    f, t = fraction, 1.0 - fraction
+    c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
+    phi_t, phi_f = phi_functions(delta * t), phi_functions(delta * f)
+    chi_t, chi_f = _compute_chi(delta * t, phi_t.gap), _compute_chi(delta * f, phi_f.gap)
+    # The derivatives of all terms of a1 have the same sign, so no digits cancel in their sum below.
+    a2 = -t * t * t * chi_t
+    a1 = t * t * t * (phi_t.psi - chi_t) + f * f * f * chi_f
+    a1 = -(
+        a1 + t * f * (e_t * (t * phi_f.phi1 + f * phi_f.psi) + t * phi_t.psi * phi_f.phi1 + f * phi_t.phi1 * phi_f.psi)
+    )
+    a0 = -e_t * f * f * (t * phi_f.psi + f * (phi_f.psi - chi_f))
+    slow, fast = t * phi_t.phi1, e_t * f * phi_f.phi1
+    zero = 0.0 * c
+    return Plant(-c, c, a2, a1, a0, a2 - a1 + a0), Plant(zero, zero, -slow, slow - fast, fast, 2.0 * (fast - slow))
+
+
+@cache
+def get_differentiable_mass() -> Callable[[Array, Array], Plant]:
+    """Return `discretize_mass` as a JAX function whose derivatives are those of `differentiate_mass`."""
+    import jax
+
+    function = jax.custom_jvp(lambda delta, fraction: discretize_mass(delta, fraction))
+
+    @function.defjvp
+    def rule(primals: tuple, tangents: tuple) -> tuple[Plant, Plant]:
+        (by_delta, by_f), (d_delta, d_f) = differentiate_mass(*primals), tangents
+        return function(*primals), Plant(*(a * d_delta + b * d_f for a, b in zip(by_delta, by_f, strict=True)))
+
+    return function
+
+
+def _compute_chi(x: Array, gap: Array) -> Array:
+    """Return chi = ``gap/x = -phi2'``, with the limit 1/6 at x = 0. The derivative of psi is ``chi - psi``."""
+    xp = namespace(x)
+    is_small = x < SERIES_BELOW
+    half = xp.where(is_small, 0.5 * x, 0.0)
+    return xp.where(is_small, xp.exp(-half) * horner(half * half, GAP), gap / xp.where(is_small, 1.0, x))
 
 
 def factor_numerator(plant: Plant) -> tuple[Array, Array]:
