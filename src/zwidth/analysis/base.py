@@ -23,6 +23,7 @@ import numpy as np
 from zwidth.analysis.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.analysis.measured_loop import MeasuredLoop
 from zwidth.core.errors import InputError
+from zwidth.core.pytrees import list_leaves
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced
 from zwidth.model.checks import Part, check_kind
@@ -112,16 +113,16 @@ class SceneParts(Part):
     @cached_property
     def loop(self) -> LinearLoop:
         """Normalized loop of the scene, in the fastest implementation that supports its parts."""
-        for name, value in list_parameters(self).items():
-            if np.ndim(value):
-                raise InputError(f"{name}: got an array of shape {np.shape(value)}; map over scenes with jax.vmap")
+        shape = next((np.shape(leaf) for leaf in list_leaves(self) if np.ndim(leaf)), ())
+        if shape:
+            raise InputError(f"scene: got numbers of shape {shape}; map over scenes with jax.vmap")
         if isinstance(self.device, MeasuredDevice):
             return MeasuredLoop(self)
         if self.nonrigid_parts and self.traced_path is not None:
             return self.traced_loop
         return LinearLoop(make_plain(self)) if self.nonrigid_parts else RigidLoop(self)
 
-    @property
+    @cached_property
     def traced_loop(self) -> Any:
         """Loop for values that JAX traces, which `zwidth.Scene` defines because it requires JAX."""
         raise NotImplementedError

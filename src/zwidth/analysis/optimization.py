@@ -329,7 +329,8 @@ class SceneOptima(SceneAnalysis):
         if self.traced_path is not None or is_traced(stiffness):
             stiffness = read_texts("stiffness", stiffness, self.unit_system["N/m"])
             if within is not None:
-                within = tuple(to_float(end) for end in read_texts("within", within, ""))
+                low, high = read_texts("within", within, "")
+                within = to_float(low), to_float(high)
             return RequiredValue(*self.traced_loop.trace_required(parameter, stiffness, within, negative_damping))
         stiffness = _read_stiffness(stiffness, self.unit_system["N/m"])
         now = _get_present_value(self, parameter)

@@ -25,8 +25,10 @@ from zwidth.stability.linear.margins import change_delay, open_loop_response
 from zwidth.stability.linear.passivity import PassivityCondition
 from zwidth.stability.linear.poles import compute_poles_minus_one, log_modulus
 
-# Largest |1 + L| at which an angle counts as that of the pole on the unit circle after the delay margin is added.
-POLE_TOLERANCE = 1e-6
+# Search for the angle of the pole on the unit circle after the delay margin is added.
+POLE_TOLERANCE = 1e-9  # largest |1 + L| at this angle; the delay margin has a relative error of about 1e-12
+ANGLE_STEPS = 12  # Newton steps
+N_ANGLES = 8  # starting angles
 
 Derivatives = list[np.ndarray]  # values, first and second derivatives of one point or of several
 
@@ -36,7 +38,7 @@ def no_derivatives(values: np.ndarray, arguments: int, order: int, fill: float =
     return [values, *(np.full((*values.shape, *[arguments] * k), fill) for k in range(1, order + 1))]
 
 
-def fill_rows(results: Derivatives, point: int, rows: Sequence[int], parts: Implicit, factor: float = 1.0) -> None:
+def fill_rows(results: Derivatives, point: Any, rows: Sequence[int], parts: Implicit, factor: float = 1.0) -> None:
     """Insert the derivatives of unknowns into the rows of the results of one point, multiplied by a factor."""
     for result, part in zip(results[1:], parts, strict=False):
         for k, row in enumerate(rows):
@@ -186,19 +188,18 @@ def _meet_distance(terms: LoopTerms, alpha: Taylor, beta: Taylor, distance: Tayl
 
 def _find_delayed_angle(scene: Any, wall: list[float], delay: float) -> float | None:
     """Return the angle of the pole that reaches the unit circle if the delay margin is added to the delay."""
-    chain = scene.loop.chain
+    chain, (alpha, beta) = scene.loop.chain, wall
     loop, w = change_delay(chain, float(chain.d) + delay), np.append(scene.loop.boundary.w, np.pi)
-    with np.errstate(all="ignore"):
-        for _ in range(8):
-            L = open_loop_response(loop, *wall, circle_points(w))
-            distance = np.abs(1.0 + L.value)
-            best = np.argsort(np.where(np.isnan(distance), np.inf, distance))[:8]
-            if distance[best[0]] < POLE_TOLERANCE**2:
-                break
-            w, value, slope = w[best], L.value[best], L.slope[best]
-            step = np.where(w < np.pi, ((1.0 + value) / slope).real, 0.0)
-            w = np.concatenate([w, np.clip(w - step, 0.0, np.pi)])
-    return float(w[best[0]]) if distance[best[0]] <= POLE_TOLERANCE else None
+    for _ in range(ANGLE_STEPS):
+        L = open_loop_response(loop, alpha, beta, circle_points(w))
+        distance = np.abs(1.0 + L.value)
+        best = np.argsort(np.where(np.isnan(distance), np.inf, distance))[:N_ANGLES]
+        if distance[best[0]] <= POLE_TOLERANCE:
+            return float(w[best[0]])
+        # Newton steps from the angles at which L is closest to -1; keep these angles as well.
+        w, step = w[best], ((1.0 + L.value[best]) / L.slope[best]).real
+        w = np.concatenate([w, np.clip(np.where(w < np.pi, w - step, w), 0.0, np.pi)])
+    return None
 
 
 NODES_PER_PERIOD = 32  # angles per period of delay and window, among which the largest required damping is sought

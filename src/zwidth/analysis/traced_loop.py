@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache, partial
+from functools import cache, cached_property, lru_cache, partial
 from typing import Any
 
 import jax
@@ -21,6 +21,7 @@ from zwidth.analysis.traced_answers import ANSWERS, INVALID
 from zwidth.core.errors import InputError, ZwidthError
 from zwidth.core.status import Status
 from zwidth.core.types import Array
+from zwidth.model.mechanism import AnyChain
 from zwidth.numerics.evaluate import broadcast_traced
 from zwidth.numerics.host_function import call_host
 from zwidth.stability.linear.derivatives import SceneSensitivities, list_ridge_parameters
@@ -108,8 +109,8 @@ class TracedLoop(LinearLoop):
 
     traceable = True
 
-    @property
-    def chain(self) -> Any:
+    @cached_property
+    def chain(self) -> AnyChain:
         raise InputError(
             "scene: got values traced by JAX; this question needs plain numbers, outside jit, vmap and grad"
         )

@@ -89,7 +89,7 @@ def test_traced_scene_drops_texts_and_can_be_printed():
 
 def test_scene_of_arrays_asks_for_vmap():
     many = jax.tree.map(lambda x: np.full(3, x), SCENES["rigid"])
-    with pytest.raises(InputError, match=r"mass: got an array of shape \(3,\); map over scenes with jax.vmap"):
+    with pytest.raises(InputError, match=r"scene: got numbers of shape \(3,\); map over scenes with jax.vmap"):
         many.max_stiffness()
 
 

@@ -173,19 +173,18 @@ def differentiate(
         terms = LoopTerms(scene, variables, n, added)
         return differentiate_implicitly(list(equations(terms, variables[len(leaves) :])))
 
+    index, size = index_parameters(scene), len(leaves) + len(parameters)
+    is_sampled = getattr(scene.device, "dt", None) is not None
+    has_kink = not is_sampled and hasattr(scene.device, "system") and n == scene.d > 0 and added_delay is None
     with np.errstate(all="ignore"):
         try:
             result = compute(n)
-            index = index_parameters(scene)
-            sampled = getattr(scene.device, "dt", None) is not None
-            if not sampled and hasattr(scene.device, "system") and n == scene.d > 0 and added_delay is None:
+            if has_kink:
                 # Without inertia, the answer has a kink at integer delays. A longer period shortens the delay.
                 _replace_derivatives(result, compute(n - 1), index["period"])
         except (ArithmeticError, np.linalg.LinAlgError):
-            size = len(leaves) + len(parameters)
-            result = Implicit(*(np.full((len(unknowns), *[size] * k), np.nan) for k in (1, 2)))
-            sampled = False
-    if sampled:
+            return Implicit(*(np.full((len(unknowns), *[size] * k), np.nan) for k in (1, 2)))
+    if is_sampled:
         # A sampled device is valid for one period and one delay only.
         for path in ("period", "delay"):
             _replace_derivatives(result, None, index[path])
