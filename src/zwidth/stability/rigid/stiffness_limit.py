@@ -101,7 +101,7 @@ def build_long_lobe(plant: DiscretePlant) -> LongLobe:
     curve, n, em = expand_curve_with_offset(plant), plant.whole, plant.em
     xp, D = namespace(plant.delta), n + 1.0
     end = _find_lobe_end(curve, n, em / (plant.p1 + plant.f * em), n + plant.f)
-    wave = evaluate_wave(end, n)
+    wave = evaluate_wave(end, n, low=True)
     terms, end_angle = evaluate_curve(wave, curve), wave.half_omega
     end_b = terms.b / terms.V
     # Approximate the lobe by ``sqrt(b/end_b) = sin(start_angle w/2/end_angle)/sin(start_angle)``, where w/2 = end_angle
@@ -133,7 +133,7 @@ def _find_lobe_end(curve: Curve, n: Array, start_ratio: Array, d: Array) -> Arra
     limit = xp.sin(xp.minimum(0.5 * np.pi / (d + 0.5), 0.5 * np.pi))
 
     def step(s: Array) -> Array:
-        wave = evaluate_wave(s, n)
+        wave = evaluate_wave(s, n, low=True)
         E, H, _, dE, dH, _ = evaluate_polynomials(wave, curve)
         y, q, sin_squared = wave.y, wave.q, 4.0 * wave.y * wave.q
         # The product of sine and cosine of the phase approximates its difference from pi, divided by sin w; take a
@@ -148,7 +148,7 @@ def _find_lobe_end(curve: Curve, n: Array, start_ratio: Array, d: Array) -> Arra
 
     # Use a loop, which compiles five times faster than unrolled steps. It runs more slowly, but only once per device.
     start = 0.5 * np.pi / D * (1.0 + 0.7 * start_ratio / (start_ratio + 1.0 / D))
-    return iterate(END_STEPS, step, xp.sin(0.5 * start), xp)
+    return iterate(END_STEPS, step, xp.sin(0.5 * start), xp, lambda old, new: bool(np.all(old == new)))
 
 
 def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
@@ -169,9 +169,9 @@ def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
     angle = end_angle * (_approximate_arcsine(r * start_sine) / start_angle + start_correction * r * (1.0 - share))
     s = xp.minimum(angle * horner(angle * angle, SINE[:8]), end)
     for _ in range(ROW_STEPS):
-        terms = evaluate_curve(evaluate_wave(s, n), curve)
+        terms = evaluate_curve(evaluate_wave(s, n, low=True), curve)
         s = xp.clip(s - _compute_newton_step(target_b, terms) / s, 0.0, end)
-    terms = evaluate_curve(evaluate_wave(s, n), curve)
+    terms = evaluate_curve(evaluate_wave(s, n, low=True), curve)
     # Add the effect of the last Newton step to alpha V and V, to first order.
     step = _compute_newton_step(target_b, terms)
     limit = (terms.alpha - 2.0 * step * terms.d_alpha) / (terms.V - 2.0 * step * terms.dV)
