@@ -306,10 +306,14 @@ def _compute_walls(
         labels = scene.loop.decide(alpha.T, beta.T, "auto", (stiffness.T, virtual_damping.T))
         results["stable"], status = np.asarray(labels.stable).T, np.asarray(labels.status).T
     unknown = np.zeros(status.shape, bool)
-    if RADIUS_OUTPUTS & set(outputs):
+    wanted = RADIUS_OUTPUTS & set(outputs)
+    if wanted - {"spectral_radius"}:
         pole = scene.dominant_pole(stiffness, virtual_damping)
         results |= {"spectral_radius": pole.radius, "pole_angle": pole.angle, "frequency": pole.frequency}
-        unknown |= np.logical_or.reduce([np.isnan(results[name]) for name in RADIUS_OUTPUTS & set(outputs)])
+    elif wanted:
+        results["spectral_radius"] = np.asarray(scene.spectral_radius(stiffness, virtual_damping))
+    for name in wanted:
+        unknown |= np.isnan(results[name])
     if "passive" in outputs:
         margin = np.asarray(scene.passivity_margin(stiffness, virtual_damping))
         results["passive"] = margin > 0

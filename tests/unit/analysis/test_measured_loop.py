@@ -185,6 +185,7 @@ def test_gain_margin_above_the_highest_frequency_is_finite(last):
 FUNCTIONS = {
     "poles": lambda scene: scene.poles(1e3, 1.0),
     "radius": lambda scene: scene.spectral_radius(1e3, 1.0),
+    "dominant pole": lambda scene: scene.dominant_pole(1e3, 1.0),
     "certificate": lambda scene: scene.decide_stability(1e3, 1.0, method="certified"),
     "passivity": lambda scene: scene.is_passive(1e3, 1.0),
     "sensitivities": lambda scene: scene.sensitivities(),

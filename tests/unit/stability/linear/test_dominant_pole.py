@@ -1,7 +1,9 @@
 """Dominant poles of linear loops against all poles and simulated oscillations."""
 
+import jax
 import numpy as np
 import pytest
+from compiling import QUICKLY
 
 import zwidth
 from zwidth.core.status import Status
@@ -44,6 +46,12 @@ def test_rigid_scene_and_walls_as_typed_by_a_user():
     assert pole.frequency == pytest.approx(float(expected.angle) / (2 * np.pi * 1e-3), rel=1e-12)
     assert scene.replace(wall=zwidth.VirtualWall(10_000, 20)).dominant_pole() == pole
     assert scene.dominant_pole([1, 1e70], 1).status.tolist() == [Status.OK, Status.OUT_OF_RANGE]
+
+
+def test_rigid_scene_inside_jit(x64):
+    scene = zwidth.Scene(DEVICE, zwidth.Timing(1e-3, 1e-3))
+    frequency = jax.jit(lambda K: scene.dominant_pole(K, 20).frequency, compiler_options=QUICKLY)(10e3)
+    assert frequency == pytest.approx(float(scene.dominant_pole(10e3, 20).frequency), rel=1e-9)
 
 
 def test_frequency_is_that_of_the_assessment():

@@ -212,18 +212,8 @@ def quick_kernel(
     return certify_pole(*find_candidate(loop, fractional), tolerance, loop, fractional, fractional)
 
 
-# The following NumPy functions certify the walls that `quick_kernel` leaves without a certificate; ``loop`` contains
-# only these.
-
-
-def _certify_largest(
-    starts: tuple[np.ndarray, np.ndarray], steps: int, tolerance: float, loop: LoopFactors, fractional: bool
-) -> DominantPoles:
-    """Certify the largest of the poles to which starting points lead, by a count with any number of crossovers."""
-    re, im = iterate(steps, lambda point: halley_step(*point, loop, fractional), starts, np)
-    converged = newton_step(re, im, loop, fractional).radius < CONVERGED_RADIUS
-    best = np.where(converged, re, -np.inf).argmax(0), np.arange(re.shape[1])
-    return certify_pole(re[best], im[best], tolerance, loop, fractional, False)
+# The following functions certify the walls that `quick_kernel` leaves without a certificate; ``loop`` contains only
+# these.
 
 
 def bound_radius(poles: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
@@ -245,8 +235,12 @@ def list_starts(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np.nda
 
 
 def certify_starts(_: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
-    """Certify the largest of the poles to which all four starting points lead."""
-    return _certify_largest(list_starts(loop, fractional), STEPS_ON_ALL, tolerance, loop, fractional)
+    """Certify the largest of the poles to which four starting points lead, counting any number of crossovers."""
+    starts = list_starts(loop, fractional)
+    re, im = iterate(STEPS_ON_ALL, lambda point: halley_step(*point, loop, fractional), starts, np)
+    converged = newton_step(re, im, loop, fractional).radius < CONVERGED_RADIUS
+    best = np.where(converged, re, -np.inf).argmax(0), np.arange(re.shape[1])
+    return certify_pole(re[best], im[best], tolerance, loop, fractional, False)
 
 
 def find_by_bisection(loop: LoopFactors, fractional: bool) -> tuple[Array, Array, Array]:
