@@ -314,7 +314,7 @@ class SceneAnalysis(SceneParts):
         the exact discretization of every fractional delay, and is NaN if counts of poles below and above it do not
         confirm it. If no factor, phase or delay moves a pole onto the unit circle, the first three margins are infinite
         for a stable wall, and 0, NaN and 0 for an unstable one. Walls out of range are NaN. A rigid scene uses
-        `zwidth.margins`; otherwise a wall takes some milliseconds, and its delay margin about 0.1 s.
+        `zwidth.margins`. Otherwise a single wall takes about 0.1 s, and many walls in one call a few milliseconds each.
         """
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
