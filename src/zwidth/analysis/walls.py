@@ -9,7 +9,7 @@ results back. K and B are the stiffness and damping of the wall, F(z) is the vel
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -45,6 +45,17 @@ Wall: TypeAlias = float | str | None
 )
 class SceneMargins(Margins):
     """Gain, phase, delay and modulus margin of walls, with the delay margin in s and the frequencies in Hz."""
+
+
+@compact_repr(decay_rate="1/s", angle="rad", frequency="Hz")
+class ScenePole(NamedTuple):
+    """Dominant pole of the closed loop with a wall; arrays for several walls."""
+
+    radius: Array  # magnitude of the pole, the spectral radius
+    angle: Array  # angle of the pole in rad per period, from 0 to pi
+    decay_rate: Array  # decay rate in 1/s
+    frequency: Array  # frequency in Hz, ``angle/(2 pi T)``; 0 if the response does not oscillate
+    status: Array  # code of `Status`
 
 
 class SceneAnalysis(SceneParts):
@@ -95,6 +106,24 @@ class SceneAnalysis(SceneParts):
         """
         walls = self._broadcast_walls(stiffness, virtual_damping)
         return self._loop_for(*walls).radius(*walls)
+
+    def dominant_pole(self, stiffness: Walls = None, virtual_damping: Walls = None) -> ScenePole:
+        """Return the dominant pole of the closed loop with each wall, i.e. the pole of largest magnitude.
+
+        After faster components have decayed, the response oscillates with ``frequency`` in Hz and decays with
+        ``decay_rate`` in 1/s. The radius and the method are those of `spectral_radius`; if several poles have the same
+        magnitude, the angle is that of any of them. Values that cannot be computed are NaN, with a ``status`` that is
+        not 0.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> print(f"{scene.dominant_pole(5000, 10).frequency:.1f} Hz")
+            37.3 Hz
+        """
+        radius, angle, rate, status = self.loop.dominant_poles(*self._broadcast_walls(stiffness, virtual_damping))
+        period = self.timing.period
+        return ScenePole(radius, angle, rate / period, angle / (2.0 * np.pi * period), status)
 
     def islands(self, *, negative_damping: bool | None = None) -> list[Island]:
         """Return the islands: the pieces of the stable set that are not connected to K = 0 by paths of stable walls.

@@ -31,6 +31,7 @@ from zwidth.units.quantities import ANY, POSITIVE
 
 TIME_CONSTANTS = 8.0  # default length of a simulation, in time constants of the linear loop
 FEWEST_PERIODS = 300  # shortest default length of a simulation, in sampling periods
+MOVING = 0.02  # deviation from the final position, relative to the range of positions, that a figure must show
 MOST_PERIODS = 20_000  # longest default length of a simulation, in sampling periods
 DEFAULT_DEPTH = 1e-3  # m or rad; default depth from which the device is released, if no encoder is given
 DEFAULT_STEPS = 50  # default depth in encoder steps, if an encoder is given
@@ -144,12 +145,27 @@ def simulate(
     lines += [format_row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
     lines += [format_row("CAUTION", text) for text in _list_cautions(scene)]
     if figure is not None:
-        from zwidth.plotting import plot
-
-        lines.append(save_figure(plot.motion(motion).figure, figure))
+        lines.append(save_figure(_draw_motion(motion), figure))
     result = {name: getattr(motion, name) for name in OF_WHOLE if name not in ("outcome", "status")}
     result = {name: value.item() for name, value in result.items()} | {"outcome": MotionKind(int(motion.outcome)).name}
     printing.print_result(result | {"ending": ending, "periods": periods, "diagnosis": cause.as_dict()}, lines, as_json)
+
+
+def _draw_motion(motion: Any) -> Any:
+    """Return a figure of a motion over time; the time axis ends at three times the time in which it comes to rest."""
+    import numpy as np
+
+    from zwidth.plotting import plot
+    from zwidth.simulation.result import MotionKind
+
+    ax = plot.motion(motion)
+    moving = abs(motion.position - motion.position[-1]) > MOVING * np.ptp(motion.position)
+    if int(motion.outcome) == MotionKind.REST and moving.any():
+        settled = motion.time[np.flatnonzero(moving)[-1] + 1]
+        # Convert to the unit of the axis, which may be ms, by the second sample.
+        unit = ax.lines[0].get_xdata()[1] / motion.time[1]
+        ax.set_xlim(0.0, min(3.0 * settled * unit, ax.get_xlim()[1]))
+    return ax.figure
 
 
 def _choose_start(

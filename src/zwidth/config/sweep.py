@@ -245,10 +245,9 @@ class SweepStudy(_Parts, Study):
     accuracy: Annotated[float, Quantity(allowed=Range(1e-12, 0.1))] = 1e-9
     """Certified relative error of the spectral radius.
 
-    On a grid of walls (stiffness along one axis, virtual damping along another), a larger value is faster, because one
-    Taylor expansion and one pole count certify a whole cell of walls. Single walls are accurate to nearly all digits
-    for every value. If the certification fails, mostly close to double poles, the status is NOT_CONVERGED; the value
-    is then present if an error of at most 0.1 is certified, otherwise NaN.
+    A larger value saves next to no time. Most radii are accurate to nearly all digits for every value. If the
+    certification fails, mostly close to double poles, the status is NOT_CONVERGED; the value is then present if an
+    error of at most 0.1 is certified, otherwise NaN.
     """
 
     @classmethod

@@ -7,10 +7,10 @@ Gamma(t), the state after a unit force held for time t from rest, the response f
 
     G(z) = C (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1)) / z^(n+1),   d = n + f
 
-with the integer delay n and the fractional delay f; for f = 0 it is ``C (zeta - Psi)^-1 Gamma(1) / z^n``. In state
-space, with the forces u of earlier samples and Gamma of the command,
+with the integer delay n and the fractional delay f; for f = 0 it is ``C (zeta - Psi)^-1 Gamma(1) / z^n``. The state x
+follows from the forces u of earlier samples:
 
-    x+ = e^A x + Gamma(1 - f) u_(k-n) + (Gamma(1) - Gamma(1 - f)) u_(k-n-1)
+    x_(k+1) = e^A x_k + Gamma(1 - f) u_(k-n) + (Gamma(1) - Gamma(1 - f)) u_(k-n-1)
 
 A *chain* (`model.mechanism`) is a row of masses, springs and dampers; a *system* (`model.linear_plant`) is any linear
 device. A *sampled* system is given in discrete time already.

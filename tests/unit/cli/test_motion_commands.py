@@ -8,6 +8,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
+from zwidth.cli.motions import _draw_motion
 
 pytestmark = pytest.mark.usefixtures("fitted_once")
 KNOB = [
@@ -81,6 +82,16 @@ def test_diagnosis_is_not_that_of_the_simulated_hit():
     )
     assert "leaves the wall after 1 contact, comes to rest outside" in printed
     assert "in contact LIMIT CYCLE: 5.7 µm at 120 Hz" in printed
+
+
+def test_time_axis_ends_after_the_motion():
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(rate=1000, delay=1e-3))
+    figure = _draw_motion(scene.simulate(8008, 33.45, start_position=1e-3, periods=300))
+    (ax,) = figure.axes
+    assert ax.get_xlabel().endswith("in ms")
+    assert 30 < ax.get_xlim()[1] < 100
+    figure = _draw_motion(scene.simulate(25e3, 33.45, start_position=1e-3, periods=50))
+    assert figure.axes[0].get_xlim()[1] == pytest.approx(49)
 
 
 def test_hit_under_a_constant_force():

@@ -70,14 +70,14 @@ def test_many_plants_on_shared_points_equal_single_plants(lag, modes):
 
 
 def test_plants_compute_with_jax_arrays(x64):
-    delta, d, *parts = describe_parts(2, 1)
+    delta, d, lag, modes = describe_parts(2, 1)
     points = circle_points(jnp.asarray(POINTS.w))
 
     def evaluate(delta, d):
-        plant = sample_parts(delta, d, *parts)
+        plant = sample_parts(delta, d, lag, modes)
         return jnp.stack([plant.controller(points), plant.response(points)])
 
-    expected = np.stack([(plant := sample_parts(delta, d, *parts)).controller(POINTS), plant.response(POINTS)])
+    expected = np.stack([(plant := sample_parts(delta, d, lag, modes)).controller(POINTS), plant.response(POINTS)])
     step = 1e-5
     values, many = jax.jit(evaluate), jax.jit(jax.vmap(evaluate))
     np.testing.assert_allclose(values(delta, d), expected, rtol=1e-12)
@@ -99,11 +99,11 @@ def test_states_of_many_chains_equal_those_of_each_chain():
     realized = many.realize()
     for k, one in enumerate(zip(delta, rate, d, strict=True)):
         states = sample_states(build_chain(*one))
-        single = SampledStates(*(part[k] for part in many[:3]), many.n_delay)
+        single = SampledStates._make((*(part[k] for part in many[:3]), 1))
         np.testing.assert_allclose(single.controller(POINTS), states.controller(POINTS), rtol=1e-12)
         np.testing.assert_allclose(single.realize().A, realized.A[k], rtol=0)
     # The leading axes of the matrices broadcast with the points.
-    columns = SampledStates(*(part[:, None] for part in many[:3]), many.n_delay)
+    columns = SampledStates._make((*(part[:, None] for part in many[:3]), 1))
     assert columns.controller(POINTS).shape == (3, 7)
 
 

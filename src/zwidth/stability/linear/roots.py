@@ -26,6 +26,7 @@ from zwidth.plant.factored_plant import FactoredPlant, factor_chain
 
 # Coefficients below this fraction of the largest one are regarded as rounding errors of 0.
 NEGLIGIBLE_COEFFICIENT = 1e-12
+POLE_AT_ONE = 1e-13  # distance from z = 1 below which a pole counts as a pole at z = 1
 
 
 @dataclass(frozen=True)
