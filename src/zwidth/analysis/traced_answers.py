@@ -240,10 +240,10 @@ def _find_worst_angle(scene: Any, alpha: float, beta: float) -> float:
 
     estimate = scene.velocity.estimate(scene.timing.period)
     condition = PassivityCondition.derive(estimate, scene.d)
-    stiffness = max(alpha + beta * condition.spring, 0.0)
+    wall = np.array(max(alpha + beta * condition.spring, 0.0)), np.array(beta)
 
     def require_damping(w: Any) -> Any:
-        return condition.require_damping(stiffness, beta, np.asarray(w))
+        return condition.require_damping(*wall, np.asarray(w))
 
     w = np.linspace(0.0, np.pi, 513 + NODES_PER_PERIOD * (condition.integer_delay + estimate.degree))
     needed = require_damping(w)
