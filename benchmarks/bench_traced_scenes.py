@@ -4,12 +4,11 @@
     python benchmarks/bench_traced_scenes.py [--write benchmarks/results/traced_scenes.md]
 
 Each row is measured in a process of its own, so that the first call includes all compilations. The first compilation
-of an empty program is not included.
+of an empty program is not included. Times are CPU times of all threads, which hardly depend on the load of the machine.
 """
 
 from __future__ import annotations
 
-import os
 import platform
 import subprocess
 import sys
@@ -45,15 +44,15 @@ def numbers(k):
     return jax.block_until_ready(jax.tree.map(lambda x: x * factors, scene))
 scenes, times = [numbers(k) for k in range(6)], []
 for each in scenes:
-    start = time.perf_counter()
+    start = time.process_time()
     jax.block_until_ready(function(each))
-    times.append(time.perf_counter() - start)
+    times.append(time.process_time() - start)
 print(times[0], min(times[1:]))
 """
 
 
 def measure(scene: str, function: str) -> tuple[float, float]:
-    """Return the times in s of the first call, and of the fastest call with other numbers."""
+    """Return the CPU times in s of the first call, and of the fastest call with other numbers."""
     program = PROGRAM.format(scene=scene, function=function, many="vmap" in function)
     output = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
     first, later = map(float, output.split())
@@ -67,8 +66,8 @@ def measure_all() -> str:
         "",
         "The command `benchmarks/bench_traced_scenes.py --write` writes this table: the maximum stiffness of a scene",
         "with all its numbers traced, in float64, each row in a process of its own. The first call includes all",
-        f"compilations. Measured with JAX {jax.__version__} and Python {platform.python_version()} on",
-        f"{os.cpu_count()} CPU cores at a load average of {os.getloadavg()[0]:.1f}.",
+        "compilations. Times are CPU times of all threads, which hardly depend on other programs; the run time on an",
+        f"idle machine is at most as long. JAX {jax.__version__}, Python {platform.python_version()}.",
         "",
         "| scene | transformation | first call | other numbers |",
         "|---|---|--:|--:|",

@@ -20,8 +20,9 @@ from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import RidgeKind, Status
 from zwidth.model.circle_functions import circle_points
 from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, seed
+from zwidth.stability.linear.delay_margin import change_delay
 from zwidth.stability.linear.derivatives import LoopTerms, differentiate, differentiate_ridge, index_parameters, split
-from zwidth.stability.linear.margins import change_delay, open_loop_response
+from zwidth.stability.linear.margins import evaluate_walls
 from zwidth.stability.linear.passivity import PassivityCondition
 from zwidth.stability.linear.poles import compute_poles_minus_one, log_modulus
 
@@ -191,7 +192,7 @@ def _find_delayed_angle(scene: Any, wall: list[float], delay: float) -> float | 
     chain, (alpha, beta) = scene.loop.chain, wall
     loop, w = change_delay(chain, float(chain.d) + delay), np.append(scene.loop.boundary.w, np.pi)
     for _ in range(ANGLE_STEPS):
-        L = open_loop_response(loop, alpha, beta, circle_points(w))
+        L = evaluate_walls(loop, alpha, beta, circle_points(w))
         distance = np.abs(1.0 + L.value)
         best = np.argsort(np.where(np.isnan(distance), np.inf, distance))[:N_ANGLES]
         if distance[best[0]] <= POLE_TOLERANCE:
@@ -239,10 +240,10 @@ def _find_worst_angle(scene: Any, alpha: float, beta: float) -> float:
 
     estimate = scene.velocity.estimate(scene.timing.period)
     condition = PassivityCondition.derive(estimate, scene.d)
-    stiffness = max(alpha + beta * condition.spring, 0.0)
+    wall = np.array(max(alpha + beta * condition.spring, 0.0)), np.array(beta)
 
     def require_damping(w: Any) -> Any:
-        return condition.require_damping(stiffness, beta, np.asarray(w))
+        return condition.require_damping(*wall, np.asarray(w))
 
     w = np.linspace(0.0, np.pi, 513 + NODES_PER_PERIOD * (condition.integer_delay + estimate.degree))
     needed = require_damping(w)

@@ -5,8 +5,9 @@ The *coded period* is the sampling period that the constants of an estimate were
 another period T, the program divides position differences by the wrong time, and its cut-off frequency is shifted;
 `Estimate` includes these errors.
 
-Estimates are evaluated with floats, JAX arrays, and balls of python-flint (``flint.arb``). Zeros and poles are stored
-as offsets ``1 - root``, which are accurate for roots near z = 1.
+Estimates are evaluated with floats, balls of python-flint (``flint.arb``), and Taylor objects, whose derivatives are
+exact (`zwidth.numerics.taylor`). Zeros and poles are stored as offsets ``1 - root``, which are accurate for roots near
+z = 1.
 """
 
 from __future__ import annotations
