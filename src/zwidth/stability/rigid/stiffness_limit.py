@@ -15,16 +15,18 @@ The curve is used in its form with half angles (docs/theory/boundary.md, B1). b 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.core.types import Array
-from zwidth.core.xp import COSINE, SINE, horner, iterate, namespace, nan_beyond
-from zwidth.numerics.evaluate import FEW, Route, evaluate_columns
-from zwidth.numerics.held_mass import DiscretePlant, discretize_plant
-from zwidth.stability.rigid.broadcasting import Points, group_by_value
-from zwidth.stability.rigid.crossover import expand_long_delay_curve, expand_short_delay_curve
+from zwidth.core.types import Array, ArrayLike
+from zwidth.core.xp import COSINE, SINE, horner, iterate, materialize, namespace, nan_beyond, within
+from zwidth.numerics.evaluate import FEW, Route, compile_kernel, convert_for_jax, evaluate_columns, precision
+from zwidth.numerics.held_mass import DelayClasses, DiscretePlant, discretize_plant
+from zwidth.stability.rigid.broadcasting import MIN_DENSE_SIZE, Points, group_by_value
+from zwidth.stability.rigid.crossover import expand_long_delay_curve, expand_short_delay_curve, stable_kernel
 from zwidth.units.quantities import WALL_RANGE
 
 # Numbers of Newton steps, each of which doubles the number of correct digits.
@@ -294,6 +296,8 @@ def _compute_newton_step(target_b: Array, terms: LobeTerms) -> Array:
 # For smaller grids it is faster to compare each point with its limit.
 MIN_PATTERN_SIZE = 1 << 16
 MIN_PATTERN_ROWS = 8
+# Smallest number of walls per line of constant beta with which JAX computes the limits of the lines.
+MIN_ROW_LENGTH = 32
 
 
 def label_grid(points: Points) -> np.ndarray:
@@ -302,6 +306,47 @@ def label_grid(points: Points) -> np.ndarray:
     # lobe, an error of 1e-15 of the largest limit.
     alpha, beta = nan_beyond(WALL_RANGE, points.alpha, points.beta)
     return _compare_with_limits(alpha, row_limits(beta, points.delta, points.d))
+
+
+def label_jax_arrays(arguments: Mapping[str, ArrayLike], kind: DelayClasses) -> Array:
+    """Return whether each wall is stable, in code compiled by JAX; as `label_grid` does if the shapes form a grid.
+
+    Args:
+        arguments: alpha, beta, delta and d by name, some of them JAX arrays; they broadcast.
+        kind: classes of the delays.
+    """
+    values = arguments.values()
+    with precision(values):
+        arrays = convert_for_jax(arguments)
+        shape, rows = (np.broadcast_shapes(*map(np.shape, parts)) for parts in (arrays, arrays[1:]))
+        if np.prod(shape) >= MIN_DENSE_SIZE and MIN_ROW_LENGTH * np.prod(rows) <= np.prod(shape):
+            return _compile_labels(kind)(*arrays)
+        return compile_kernel(stable_kernel, (kind,))(*arrays)
+
+
+@cache
+def _compile_labels(kind: DelayClasses) -> Callable[..., Array]:
+    """Return a function, compiled by JAX, that compares alpha with the limit of its line of constant beta."""
+    import jax
+    import jax.numpy as jnp
+
+    @jax.jit
+    def label(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+        rank = max(map(jnp.ndim, (alpha, beta, delta, d)))
+        alpha, beta, delta, d = (
+            jnp.reshape(x, (1,) * (rank - jnp.ndim(x)) + jnp.shape(x)) for x in (alpha, beta, delta, d)
+        )
+        limits = [
+            compute(beta, *jnp.broadcast_arrays(delta, d))
+            for compute, occurs in ((_short_limit, kind.short), (_long_limit, kind.long))
+            if occurs
+        ]
+        limit = jnp.where(d < 1.0, *limits) if len(limits) > 1 else limits[0]
+        # Without `materialize`, XLA repeats the last Newton step at each point of the grid.
+        limit = materialize(jnp.where(within(beta, WALL_RANGE), limit, 0.0), beta)
+        return (alpha > 0.0) & (alpha < limit) & within(alpha, WALL_RANGE)
+
+    return label
 
 
 def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, route: Route = "auto") -> np.ndarray:
