@@ -26,7 +26,7 @@ from zwidth.core.xp import is_jax, is_traced
 from zwidth.model.checks import read_texts
 from zwidth.model.wall import resolve_wall
 from zwidth.numerics.root_finding import find_global_minimum
-from zwidth.stability.linear.margins import OpenLoop
+from zwidth.stability.linear.margins import find_modulus_margins, tabulate
 from zwidth.stability.linear.ridge import SceneSensitivities
 from zwidth.units.display import compact_repr
 from zwidth.units.parsing import to_float
@@ -409,12 +409,12 @@ class SceneOptima(SceneAnalysis):
             """Return the spectral radius of walls with this stiffness."""
             return self.spectral_radius(stiffness, beta * units.virtual_damping)
 
-        @np.vectorize
-        def margin(beta: float) -> float:
-            """Return the modulus margin of a wall with this stiffness."""
-            loop = self.loop
-            wall = OpenLoop.tabulate(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
-            return wall.find_least_distance()[0]
+        def margin(beta: Any) -> np.ndarray:
+            """Return the modulus margin of walls with this stiffness."""
+            loop, beta = self.loop, np.asarray(beta)
+            alpha = np.full(beta.size, stiffness / units.stiffness)
+            walls = tabulate(loop.roots, alpha, beta.reshape(-1), loop.boundary.w)
+            return find_modulus_margins(walls)[0].reshape(beta.shape)
 
         cost: Callable[[Any], np.ndarray] = radius if goal == "fast" else lambda beta: -margin(beta)
         intervals = find_connected_dampings(self, stiffness, negative_damping)

@@ -22,7 +22,7 @@ from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import namespace
 from zwidth.model.checks import accept_units
 from zwidth.numerics.evaluate import check_scalars, compile_kernel, evaluate
-from zwidth.numerics.held_mass import DelayClasses, classify_delays
+from zwidth.plant.rigid_mass import DelayClasses, classify_delays
 from zwidth.stability.rigid.normalization import Normalized, normalize, quantity_status
 from zwidth.stability.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slopes
 from zwidth.units.display import compact_repr

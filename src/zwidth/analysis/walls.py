@@ -9,7 +9,7 @@ results back. K and B are the stiffness and damping of the wall, F(z) is the vel
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from zwidth.model.linear_device import ResponseDevice
 from zwidth.model.state_space import StateSpace
 from zwidth.model.wall import resolve_wall
 from zwidth.numerics.evaluate import are_numbers, as_float64, broadcast_traced, join_shapes
-from zwidth.stability.linear.discretization import realize_closed_loop, realize_device, realize_open_loop
+from zwidth.plant.sampled_states import sample_states
+from zwidth.stability.linear.closed_loop import realize_closed_loop, realize_open_loop
 from zwidth.stability.linear.passivity import find_unsupported_reason
 from zwidth.stability.linear.rows import Island
 from zwidth.stability.results import Margins, Stability
@@ -43,6 +44,17 @@ Wall: TypeAlias = float | str | None
 )
 class SceneMargins(Margins):
     """Gain, phase, delay and modulus margin of walls, with the delay margin in s and the frequencies in Hz."""
+
+
+@compact_repr(decay_rate="1/s", angle="rad", frequency="Hz")
+class ScenePole(NamedTuple):
+    """Dominant pole of the closed loop with a wall; arrays for several walls."""
+
+    radius: Array  # magnitude of the pole, the spectral radius
+    angle: Array  # angle of the pole in rad per period, from 0 to pi
+    decay_rate: Array  # decay rate in 1/s
+    frequency: Array  # frequency in Hz, ``angle/(2 pi T)``; 0 if the response does not oscillate
+    status: Array  # code of `Status`
 
 
 class SceneAnalysis(SceneParts):
@@ -96,6 +108,24 @@ class SceneAnalysis(SceneParts):
         poles inside circles, with a run time that does not increase with the delay.
         """
         return self.loop.radius(*self._broadcast_walls(stiffness, virtual_damping))
+
+    def dominant_pole(self, stiffness: Walls = None, virtual_damping: Walls = None) -> ScenePole:
+        """Return the dominant pole of the closed loop with each wall, i.e. the pole of largest magnitude.
+
+        After faster components have decayed, the response oscillates with ``frequency`` in Hz and decays with
+        ``decay_rate`` in 1/s. The radius and the method are those of `spectral_radius`; if several poles have the same
+        magnitude, the angle is that of any of them. Values that cannot be computed are NaN, with a ``status`` that is
+        not 0.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> print(f"{scene.dominant_pole(5000, 10).frequency:.1f} Hz")
+            37.3 Hz
+        """
+        radius, angle, rate, status = self.loop.dominant_poles(*self._broadcast_walls(stiffness, virtual_damping))
+        period = self.timing.period
+        return ScenePole(radius, angle, rate / period, angle / (2.0 * np.pi * period), status)
 
     def islands(self, *, negative_damping: bool | None = None) -> list[Island]:
         """Return the islands: the pieces of the stable set that are not connected to K = 0 by paths of stable walls.
@@ -331,7 +361,7 @@ def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, a
     loop = build(chain, *read_single_wall(alpha, beta))
     force = mass / period**2
     device = np.array(chain.state_units(1.0 / period, force))
-    n_delayed = realize_device(chain).A.shape[0] - device.size
+    n_delayed = int(sample_states(chain).lag)
     n_filter = loop.A.shape[0] - device.size - n_delayed
     # Units of the states in their order: states of the velocity estimate, states of the device, delayed forces.
     scale = np.concatenate([np.ones(n_filter), device, np.full(n_delayed, force)])

@@ -27,9 +27,9 @@ from zwidth.core.status import RidgeKind, Status
 from zwidth.core.types import Array
 from zwidth.model.circle_functions import CirclePoints, circle_points, power_jet
 from zwidth.model.mechanism import build_chain
+from zwidth.plant.sampled_states import integrate_chain
 from zwidth.stability.linear.boundary import Boundary
 from zwidth.stability.linear.curve import evaluate_curve
-from zwidth.stability.linear.discretization import compute_chain_transition
 from zwidth.stability.linear.regions import StableSet
 from zwidth.stability.linear.roots import LoopRoots
 from zwidth.stability.linear.rows import find_stable_intervals
@@ -356,8 +356,8 @@ def _differentiate_controller(
     A, B = (value + 1j * COMPLEX_STEP * d for value, d in zip(chain.realize(), (d_A, d_B), strict=False))
     fraction = chain.d - n + 1j * COMPLEX_STEP * d_delay
     steps = (
-        *compute_chain_transition(chain, A, B, 1.0),
-        compute_chain_transition(chain, A, B, 1.0 - fraction)[1],
+        *integrate_chain(chain, A, B, 1.0),
+        integrate_chain(chain, A, B, 1.0 - fraction)[1],
     )
     (psi, full, late), (d_psi, d_full, d_late) = (
         [f(x) for x in steps] for f in (np.real, lambda x: x.imag / COMPLEX_STEP)

@@ -28,7 +28,7 @@ from zwidth.model.parameter_paths import replace_parameters
 from zwidth.model.wall import VirtualWall
 from zwidth.numerics.evaluate import broadcast_traced
 from zwidth.numerics.root_finding import polish_root
-from zwidth.stability.linear.discretization import discretize_chain, evaluate_controller
+from zwidth.plant.sampled_states import sample_chain
 from zwidth.stability.linear.ridge import Condition, list_ridge_parameters
 from zwidth.stability.results import RidgePoint
 
@@ -148,7 +148,7 @@ def _solve_conditions(
         "poles": jnp.asarray(estimate.poles, complex_dtype),
     }
     begin = start / scales
-    args = (jax.tree.map(jnp.asarray, discretize_chain(chain)), traced, start, conditions, scales)
+    args = (jax.tree.map(jnp.asarray, sample_chain(chain)), traced, start, conditions, scales)
     end = polish_root(partial(_residual, chain), begin, args, exists)
     # Return whether the solution is close to the start, because Newton's method may converge to a different solution.
     # Only half of the digits must agree, because a double root is not more accurate.
@@ -170,7 +170,8 @@ def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
 
     def evaluate_r(w: Array) -> tuple[Array, Array]:
         """Return the pair (r/|q|, F) at the angle w, with ``r = alpha + beta F - q``."""
-        q, f = evaluate_controller(chain, w, discretized), estimate.jet(circle_points(w)).value
+        points = circle_points(w)
+        q, f = discretized.controller(points), estimate.jet(points).value
         size = jax.lax.stop_gradient(jnp.abs(q))
         return (alpha + beta * f - q) / jnp.where(size > 0, size, 1.0), f
 

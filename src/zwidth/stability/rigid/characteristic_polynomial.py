@@ -2,7 +2,7 @@
 
 All other modules of `stability.rigid` take P from this module; only `stability.reference` evaluates P independently. A
 wall has the normalized stiffness alpha and damping beta, its device the normalized damping delta, and the delay is d =
-n + f periods (n integer, 0 <= f < 1). With the discretized device (`numerics.held_mass`),
+n + f periods (n integer, 0 <= f < 1). With the discretized device (`plant.rigid_mass`),
 
     P = T + B
     T = z^(1+n) (z - 1)(z - c)         device and delay, c = e^-delta
@@ -25,7 +25,8 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import namespace, nan_unless
-from zwidth.numerics.held_mass import DiscretePlant, discretize_mass, factor_numerator, split_delay
+from zwidth.model.circle_functions import Jet
+from zwidth.plant.rigid_mass import DiscretePlant, discretize_mass, factor_numerator, split_delay
 from zwidth.stability.rigid.normalization import valid_wall
 
 
@@ -168,20 +169,60 @@ def evaluate_on_unit_circle(w: Array, alpha: Array, beta: Array, plant: Discrete
     )
 
 
-def differentiate_open_loop(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array, Array]:
-    """Return L at z = e^(j w), and the first and second derivative of log L in w."""
+def differentiate_open_loop(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Jet:
+    """Return L at z = e^(j w), and its derivative in w from that of log L."""
     xp, wall_beta = namespace(w, alpha), expand_wall(alpha, beta).beta
     point, n_plus_half = evaluate_on_unit_circle(w, alpha, beta, plant), plant.whole + 0.5
     W, M, Z = (re + 1j * im for re, im in (point.W, point.M, point.Z))
-    z, conj_Z, half_tangent = xp.cos(w) + 1j * point.sin_w, xp.conj(Z), 0.5 * point.cosine / point.sine
+    z, conj_Z = xp.cos(w) + 1j * point.sin_w, xp.conj(Z)
     # The derivatives of W/z = alpha + beta (1 - conj z) and of M follow from those of z and conj z, j z and -j conj z;
     # the derivative of conj Z is z.
-    W1, M1, Z1 = 1j * wall_beta * xp.conj(z) / W, 1j * (plant.a2 * z - plant.a0 * xp.conj(z)) / M, z / conj_Z
-    rate = W1 + M1 - Z1 - 1j * n_plus_half - half_tangent
-    second = wall_beta * xp.conj(z) / W - W1**2 - (plant.a2 * z + plant.a0 * xp.conj(z)) / M - M1**2
-    second = second - 1j * Z1 + Z1**2 + 0.25 / (point.sine * point.sine)
+    rate = 1j * wall_beta * xp.conj(z) / W + 1j * (plant.a2 * z - plant.a0 * xp.conj(z)) / M - z / conj_Z
+    rate = rate - 1j * n_plus_half - 0.5 * point.cosine / point.sine
     delay = xp.cos(n_plus_half * w) - 1j * xp.sin(n_plus_half * w)
-    return -W * M * delay / (2.0 * point.sine * conj_Z), rate, second
+    L = -W * M * delay / (2.0 * point.sine * conj_Z)
+    return Jet(L, rate * L)
+
+
+def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]:
+    """Expand |B|^2 - |T|^2 on the unit circle in powers of u = 1 - cos w, in any arithmetic.
+
+    Here alpha and beta are the coefficients of W; |B|^2 = |M|^2 |W|^2, |T|^2 = 2 u (em^2 + 2 c u) and em = 1 - c.
+    There are three coefficients if a0 is None, i.e. for integer d, otherwise four. For alpha > 0 the polynomial is
+    positive at u = 0 and has at most one root in (0, 2), the gain crossover, above which it is negative.
+    """
+    p1_squared, cross, alpha_squared = plant.p1 * plant.p1, beta * (alpha + beta) * 2, alpha * alpha
+    # With ``|W|^2 = alpha^2 + cross u``, compute ``bend = cross/2 - delta^2`` in factored form, to avoid cancellation
+    # near beta = delta. The term ``2 phi1^2 bend`` contains the term -2 em^2 of |T|^2, because em = delta phi1.
+    bend = (beta - plant.delta) * (beta + plant.delta) + alpha * beta
+    # The expansion of V is phi1^2 - 2 m1 u + product u^2; for integer d, a0 = 0 and therefore product = 0.
+    if plant.a0 is None:
+        m1 = plant.a1 * plant.a2
+        return p1_squared * alpha_squared, (p1_squared * bend - m1 * alpha_squared) * 2, m1 * cross * -2 - plant.c * 4
+    product = plant.a2 * plant.a0 * 4
+    m1 = plant.a1 * (plant.a2 + plant.a0) + product
+    h2 = product * alpha_squared - m1 * cross * 2 - plant.c * 4
+    return p1_squared * alpha_squared, (p1_squared * bend - m1 * alpha_squared) * 2, h2, product * cross
+
+
+def evaluate_at_nyquist(alpha: Any, beta: Any, plant: Any) -> tuple[Any, Any]:
+    """Return B at z = -1, and T there divided by ``(-1)^(n+1)``, in any arithmetic, for the coefficients of W."""
+    return plant.gap * (alpha + beta * 2.0), (plant.c + 1.0) * 2.0
+
+
+def expand_gain_difference_at_nyquist(alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, ...]:
+    """Expand |T|^2 - |B|^2 on the unit circle in powers of v = 1 + cos w, for the coefficients of W."""
+    wall, device = evaluate_at_nyquist(alpha, beta, plant)
+    W_nyquist, sigma, mu = alpha + 2.0 * beta, plant.a2 + plant.a0, plant.a2 - plant.a0
+    W_squared, cross, product = W_nyquist * W_nyquist, 2.0 * beta * (alpha + beta), 4.0 * plant.a2 * plant.a0
+    # The expansions are gap^2 + g1 v + product v^2 for |M|^2, and W_squared - cross v for |W|^2.
+    g1 = 2.0 * (mu * mu - plant.gap * sigma)
+    return (
+        (device - wall) * (device + wall),
+        plant.gap * plant.gap * cross - g1 * W_squared - 2.0 * (plant.em * plant.em + 8.0 * plant.c),
+        4.0 * plant.c - product * W_squared + g1 * cross,
+        product * cross,
+    )
 
 
 def expand_at_one(loop: LoopFactors) -> tuple[Array, Array, Array]:

@@ -9,8 +9,8 @@ the range of frequencies in which the minimum can lie:
 - Within one turn of the phase on either side of the gain crossover there is a frequency at which L is real and
   negative. Its distance is ``||L| - 1|``, and all frequencies beyond it are farther from -1.
 
-So at most two turns of the phase have to be searched, whatever the delay: the distance is sampled, and the lowest
-samples are refined by Newton's method.
+So at most two turns of the phase have to be sampled, whatever the delay. `stability.open_loop` refines the lowest
+samples, as for every linear loop.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import apply_each, expand_along, materialize, namespace, stop_gradient
-from zwidth.numerics.held_mass import DiscretePlant
-from zwidth.numerics.root_finding import attach_root_derivatives, newton
+from zwidth.numerics.root_finding import attach_root_derivatives
+from zwidth.plant.rigid_mass import DiscretePlant
+from zwidth.stability.open_loop import find_nearest_angle
 from zwidth.stability.rigid.characteristic_polynomial import differentiate_open_loop, evaluate_on_unit_circle
 from zwidth.stability.rigid.crossover import find_gain_crossover
 
@@ -60,10 +61,6 @@ SAMPLES_WEIGHT = 8
 SAMPLES_PER_TURN = 48
 SAMPLES_BELOW = 32
 SAMPLES_ABOVE = 48
-# Number of local minima that are refined, the lowest ones first.
-MAX_DIPS = 5
-# Number of Newton steps from each of these minima.
-NEWTON_STEPS = 8
 
 
 def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Array:
@@ -82,32 +79,20 @@ def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: Discret
     return (1.0 - minus_re_loop) ** 2 + im_part * im_part
 
 
-def _differentiate_distance(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
-    """Return half the first and half the second derivative of |1 + L|^2 in w, from the derivatives of log L."""
-    xp = namespace(w, alpha)
-    loop, rate, curvature = differentiate_open_loop(w, alpha, beta, plant)
-    slope, conj_distance = rate * loop, xp.conj(1.0 + loop)
-    return xp.real(conj_distance * slope), xp.abs(slope) ** 2 + xp.real(
-        conj_distance * (curvature + rate * rate) * loop
-    )
-
-
 def find_modulus_margin(alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
     """Return the least ``|1 + L|`` over (0, pi] and its frequency w, for alpha > 0, elementwise."""
     xp = namespace(alpha, plant.c)
     wall = alpha, beta, plant
 
+    def slope(w: Array, *wall: Any) -> Array:
+        """Return half the derivative of ``|1 + L|^2`` in w."""
+        loop = differentiate_open_loop(w, *wall)
+        return xp.real(xp.conj(1.0 + loop.value) * loop.slope)
+
     def is_dip(w: Array, curvature: Array, _: Array) -> Array:
         return (w < np.pi) & (curvature > 0)
 
-    lowest = _find_lowest(*stop_gradient(wall, xp), xp)
-    w = attach_root_derivatives(
-        lambda *point: _differentiate_distance(*point)[0],
-        lowest,
-        is_dip,
-        *wall,
-        slope=lambda *point: _differentiate_distance(*point)[1],
-    )
+    w = attach_root_derivatives(slope, _find_lowest(*stop_gradient(wall, xp), xp), is_dip, *wall)
     return xp.sqrt(xp.maximum(compute_squared_distance(w, *wall), 0.0)), w
 
 
@@ -143,26 +128,4 @@ def _find_lowest(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> Ar
         center[..., None] * (high / center)[..., None] ** list_fractions(SAMPLES_ABOVE),
     ]
     grid = xp.sort(xp.concatenate(grid, axis=-1), axis=-1)
-    values = compute_squared_distance(grid, *wall)
-    infinity = xp.full_like(values[..., :1], np.inf)
-    previous, following = (
-        xp.concatenate([infinity, values[..., :-1]], -1),
-        xp.concatenate([values[..., 1:], infinity], -1),
-    )
-    # If two samples coincide, count them as one minimum. Because the minimum may lie to the right of the second one,
-    # search between the second neighbors on both sides.
-    dips = xp.where((values < previous) & (values <= following), values, np.inf)
-    best = xp.argpartition(dips, MAX_DIPS - 1, axis=-1)[..., :MAX_DIPS]
-
-    def take_neighbor(steps: int) -> Array:
-        return xp.take_along_axis(grid, xp.clip(best + steps, 0, grid.shape[-1] - 1), axis=-1)
-
-    middle = take_neighbor(0)
-    refined = newton(
-        lambda w: _differentiate_distance(w, *wall), take_neighbor(-2), take_neighbor(2), middle, NEWTON_STEPS
-    )[0]
-    # Compare each refined minimum with the sample from which the refinement started, because the minimum may be an end
-    # of the range.
-    candidates = xp.concatenate([refined, middle], axis=-1)
-    lowest = xp.argmin(compute_squared_distance(candidates, *wall), axis=-1)[..., None]
-    return xp.take_along_axis(candidates, lowest, axis=-1)[..., 0]
+    return find_nearest_angle(lambda w: differentiate_open_loop(w, *wall), grid, compute_squared_distance(grid, *wall))

@@ -39,11 +39,11 @@ from zwidth.core.xp import (
     nan_with_nan_derivatives,
 )
 from zwidth.numerics.blocks import map_blocks
+from zwidth.numerics.complex_pairs import Pair, make_complex
 from zwidth.numerics.evaluate import CACHED_KERNELS, as_float64, precision, to_caller
 from zwidth.numerics.polynomials import abs2, companion
 from zwidth.stability.reference import Degree, compute_poles, expand_loop
 from zwidth.stability.rigid.broadcasting import count_uncompiled_points, find_degree, map_by_degree
-from zwidth.stability.rigid.characteristic_function import Pair, make_complex
 from zwidth.stability.rigid.characteristic_polynomial import (
     LoopFactors,
     bound_wall_part,

@@ -22,7 +22,8 @@ from zwidth.core.status import RidgeKind, Status
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import differentiate_along, epsilon, materialize, namespace, nan_unless
 from zwidth.numerics.evaluate import evaluate
-from zwidth.numerics.held_mass import (
+from zwidth.numerics.root_finding import attach_root_derivatives
+from zwidth.plant.rigid_mass import (
     ANY,
     DelayClasses,
     Plant,
@@ -33,7 +34,6 @@ from zwidth.numerics.held_mass import (
     is_valid_device,
     split_delay,
 )
-from zwidth.numerics.root_finding import attach_root_derivatives
 from zwidth.stability.results import RidgePoint
 from zwidth.stability.rigid.normalization import device_status
 from zwidth.stability.rigid.ridge_newton import (

@@ -11,11 +11,11 @@ import pytest
 
 import oracles
 import zwidth
-from zwidth.stability.rigid.characteristic_function import halley_step
 from zwidth.stability.rigid.characteristic_polynomial import factor_loop
-from zwidth.stability.rigid.dominant_pole_search import approximate_first_pair, approximate_slow_pole
+from zwidth.stability.rigid.dominant.search import approximate_first_pair, approximate_slow_pole
+from zwidth.stability.rigid.dominant.steps import halley_step
 
-REFERENCE = Path(__file__).resolve().parents[3] / "reference"
+REFERENCE = Path(__file__).resolve().parents[4] / "reference"
 NAMES = ("alpha", "beta", "delta", "d")
 # Hard cases: rates formerly returned as 0 or -5e-16; a double pole near 1; beta = -delta; a slow pole and a pair of
 # equal modulus.

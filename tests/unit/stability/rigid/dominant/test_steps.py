@@ -5,8 +5,8 @@ import pytest
 from mpmath import mp
 
 import oracles
-from zwidth.stability.rigid.characteristic_function import newton_step
 from zwidth.stability.rigid.characteristic_polynomial import factor_loop
+from zwidth.stability.rigid.dominant.steps import newton_step
 
 
 def walls(d, count=12):

@@ -3,25 +3,23 @@
 The system ``x' = A x + B u`` in controllable canonical form is discretized by a matrix exponential, and the
 Faddeev-LeVerrier algorithm computes the numerator of its transfer function (docs/theory/scenes.md, V4 and V22). The
 precision is doubled until two successive results agree, because float64 does not resolve slow zeros next to the aliases
-of fast poles. Zeros are returned as offsets 1 - z.
+of fast poles: for random systems of up to 12 states, eigenvalues in float64 caused relative errors of the response of
+up to 5e-9. Zeros are returned as offsets 1 - z.
 """
 
 from __future__ import annotations
 
 from decimal import Context, Decimal, getcontext, localcontext
 from fractions import Fraction
-from math import comb
 from typing import Any
 
 import numpy as np
 
 from zwidth.core.errors import InputError
-from zwidth.model.exact_polynomials import DIGITS, EXPONENT, Complex, Polynomial, iterate_roots, magnitude
+from zwidth.model.exact_polynomials import DIGITS, EXPONENT, Polynomial, find_simple_roots, shift, trim
 from zwidth.model.linear_device import LinearDevice
 
-# Largest relative difference between the results of two precisions that counts as agreement: a tenth of the resolution
-# of float64.
-PRECISION_TOLERANCE = 1e-17
+PRECISION_TOLERANCE = 4e-16  # relative difference of the float64 results of two precisions that counts as agreement
 # With n decimal digits, leading coefficients below 10^(-2n/NEGLIGIBLE_DIGITS) of the largest one are regarded as
 # rounding errors of 0.
 NEGLIGIBLE_DIGITS = 3
@@ -38,71 +36,47 @@ def find_sampled_zeros(device: LinearDevice, period: float, fraction: float) -> 
     Raises:
         InputError: if the results of no two precisions agree.
     """
-    previous: tuple[Decimal, list[Any]] | None = None
+    previous: tuple[float, np.ndarray] = np.nan, np.zeros(0)
     for digits in DIGITS:
         with localcontext(Context(prec=digits, Emax=EXPONENT, Emin=-EXPONENT)):
-            result = _compute_zeros(device, period, fraction, digits)
-            if result is not None and previous is not None and _agree(previous, result):
-                return float(result[0]), np.array([complex(*map(float, zero)) for zero in result[1]], complex)
-            previous = result
+            numerator = trim(map(Fraction, _expand_response(device, period, fraction, digits)))
+        if not numerator:
+            continue
+        # One zero is at exactly z = 1 if the system has a zero at s = 0, i.e. no static response to a constant force.
+        has_zero_at_one = device.system.numerator[-1] == 0
+        offsets = shift(numerator)[:-1] if has_zero_at_one else shift(numerator)
+        result = float(numerator[0]), np.array(find_simple_roots(offsets) + [0.0] * has_zero_at_one, complex)
+        if _agree(previous, result):
+            return result
+        previous = result
     raise InputError(
         "device: zeros of the sampled response cannot be computed to float64 accuracy; remove modes of tiny response"
     )
 
 
-def _agree(one: tuple[Decimal, list[Any]], other: tuple[Decimal, list[Any]]) -> bool:
+def _agree(one: tuple[float, np.ndarray], other: tuple[float, np.ndarray]) -> bool:
     """Return whether gains and zeros from computations in two precisions differ by at most `PRECISION_TOLERANCE`."""
     (gain, zeros), (gain2, zeros2) = one, other
-    if len(zeros) != len(zeros2) or abs(gain - gain2) > Decimal(PRECISION_TOLERANCE) * abs(gain2):
+    if zeros.size != zeros2.size or not abs(gain - gain2) <= PRECISION_TOLERANCE * abs(gain2):
         return False
-    left = list(zeros)
-    for zero in zeros2:
-        distances = [magnitude(Complex(each.real - zero.real, each.imag - zero.imag)) for each in left]
-        nearest = min(range(len(left)), key=distances.__getitem__)
-        if distances[nearest] > Decimal(PRECISION_TOLERANCE) * magnitude(zero):
-            return False
-        del left[nearest]
-    return True
+    nearest = np.abs(zeros - zeros2[:, None]).min(1, initial=np.inf)
+    return bool(np.all(nearest <= PRECISION_TOLERANCE * np.abs(zeros2)))
 
 
-def _compute_zeros(device: LinearDevice, period: float, fraction: float, digits: int) -> Any:
-    """Return leading coefficient and zeros, computed with ``digits`` digits; None if all coefficients round to 0."""
+def _expand_response(device: LinearDevice, period: float, fraction: float, digits: int) -> list[Any]:
+    """Return the numerator of the sampled response, highest power first, in the precision of the decimal context."""
     denominator, numerator = (_as_decimals(part) for part in (device.system.denominator, device.system.numerator))
-    rest = 1 - Decimal(fraction)
     transition, full, output = _discretize(denominator, numerator, Decimal(period))
+    response = _expand_numerator(transition, full, output)
     if fraction:
-        newer = _discretize(denominator, numerator, Decimal(period) * rest)[1]
-        parts = (
-            [*_expand_numerator(transition, newer, output), Decimal(0)],
-            [Decimal(0), *_expand_numerator(transition, full - newer, output)],
-        )
-        response = [a + b for a, b in zip(*parts, strict=True)]
-    else:
-        response = _expand_numerator(transition, full, output)
+        # The newer force contributes z N(newer), the older one N(full - newer), and N is linear.
+        newer = _discretize(denominator, numerator, Decimal(period) * (1 - Decimal(fraction)))[1]
+        late = _expand_numerator(transition, newer, output)
+        response = [a + b - c for a, b, c in zip([*late, 0], [0, *response], [0, *late], strict=True)]
     largest = max(map(abs, response))
     while response and abs(response[0]) <= largest * Decimal(10) ** (-digits // NEGLIGIBLE_DIGITS * 2):
         response = response[1:]
-    if not response:
-        return None
-    # Substitute z = 1 - x, so that the roots x are the offsets of the zeros.
-    order = len(response) - 1
-    shifted = [
-        (-1) ** power * sum(response[order - k] * comb(k, power) for k in range(power, order + 1))
-        for power in range(order, -1, -1)
-    ]
-    # Set one zero to exactly z = 1 if the system has a zero at s = 0, i.e. no static response to a constant force.
-    has_zero_at_one = device.system.numerator[-1] == 0
-    if has_zero_at_one:
-        shifted = shifted[:-1]
-    zeros, _ = iterate_roots(shifted) if len(shifted) > 1 else ([], [])
-    # Make conjugate pairs exact, and drop imaginary parts that are rounding errors.
-    tolerance = Decimal(10) ** (-digits // 3)
-    pairs = [zero for zero in zeros if zero.imag > tolerance * magnitude(zero)]
-    flat = [Complex(zero.real, Decimal(0)) for zero in zeros if abs(zero.imag) <= tolerance * magnitude(zero)]
-    result = [*pairs, *(Complex(zero.real, -zero.imag) for zero in pairs), *flat]
-    if has_zero_at_one:
-        result.append(Complex(Decimal(0), Decimal(0)))
-    return response[0], result
+    return response
 
 
 def _as_decimals(polynomial: Polynomial) -> list[Decimal]:

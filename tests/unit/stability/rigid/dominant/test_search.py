@@ -19,10 +19,10 @@ import oracles
 import zwidth
 from zwidth.core.errors import InputError
 from zwidth.core.status import Status
-from zwidth.stability.rigid.dominant_pole_search import quick_kernel
-from zwidth.stability.rigid.dominant_poles import compute_dominant_poles
+from zwidth.stability.rigid.dominant.arrays import compute_dominant_poles
+from zwidth.stability.rigid.dominant.search import quick_kernel
 
-LABELS = Path(__file__).resolve().parents[3] / "reference" / "labels.npz"
+LABELS = Path(__file__).resolve().parents[4] / "reference" / "labels.npz"
 ACCURACIES = [1e-9, 1e-12]
 
 

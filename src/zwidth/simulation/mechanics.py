@@ -1,11 +1,9 @@
-"""Compute the exact motion of mechanisms over given times, and the energy dissipated by their dampers.
+"""Build the matrices of mechanisms: the equations of motion, energies, and the power that their dampers dissipate.
 
 A *mechanism* is the linear model ``x' = rate @ (x, u)`` of the bodies, links, modes and actuator of a scene, with the
-state x and constant forces u. Over a time t the state changes by ``change @ z``, and the dampers dissipate the energy
-``z @ loss @ z``, with ``z = (x, u)`` (docs/theory/simulation.md, T1 and T6). Both matrices are computed by a Taylor
-series for the time t/2^k and k doublings (scaling and squaring), for all times and mechanisms at once. With an actuator
-or modes, u consists of the command and of the external force on the first body, otherwise of their sum. Units are the
-sampling period and the mass of the first body. n is the length of x.
+state x and constant forces u (docs/theory/simulation.md, T1 and T6). With an actuator or modes, u consists of the
+command and of the external force on the first body, otherwise of their sum. Units are the sampling period and the mass
+of the first body. n is the length of x, and ``z = (x, u)``. `plant.transition` integrates the equations.
 """
 
 from __future__ import annotations
@@ -19,18 +17,6 @@ import numpy as np
 from zwidth.core.errors import InputError
 from zwidth.model.linear_plant import System
 from zwidth.model.mechanism import Resonance, express_body_position
-
-# Number of terms of the Taylor series. For a matrix norm of 1/2 the truncation error is below 1e-18 in ``change`` and
-# below 5e-14 in ``loss``.
-TERMS = 15
-DIGITS = 53  # number of binary digits of a float64 time below 2 periods: 1, 1/2, ... 2^-52
-
-
-class Flow(NamedTuple):
-    """Matrices of the change of state and of the dissipated energy over given times; the leading axes are the times."""
-
-    change: np.ndarray  # change of state per z, (..., n, n + forces)
-    loss: np.ndarray  # quadratic form in z of the energy dissipated by dampers, (..., n + forces, n + forces)
 
 
 class Mechanics(NamedTuple):
@@ -118,33 +104,3 @@ def _build_system(systems: Sequence[Any]) -> Mechanics:
 def _stack(parts: Sequence[Any]) -> Any:
     """Return one named tuple whose fields are the stacked fields of the given named tuples."""
     return type(parts[0])(*(np.array(column, float) for column in zip(*parts, strict=True)))
-
-
-def flow(rate: np.ndarray, drain: np.ndarray, times: np.ndarray) -> Flow:
-    """Return the matrices of the change of state and of the dissipated energy of ``x' = rate @ (x, u)``.
-
-    Args:
-        rate: matrices of shape (scenes, n, n + forces).
-        drain: matrices of the power dissipated by the dampers, of shape (scenes, n + forces, n + forces).
-        times: times of shape (scenes, ...), in sampling periods.
-    """
-    count, size = rate.shape[-2:]
-    inner = (rate.shape[0], *(1,) * (times.ndim - 1), size, size)
-    whole = np.concatenate([rate, np.zeros((rate.shape[0], size - count, size))], 1).reshape(inner)
-    norm = float(np.abs(whole).sum(-1).max() * np.max(times, initial=0.0))
-    doublings = max(0, int(np.ceil(np.log2(max(2.0 * norm, 1.0)))))
-    small = times[..., None, None] / 2.0**doublings
-    power = np.broadcast_to(np.eye(size), (*times.shape, size, size))
-    drained = small * drain.reshape(inner)
-    step, lost = np.zeros(power.shape), np.zeros(power.shape)
-    for k in range(1, TERMS + 1):
-        power = power @ whole * (small / k)
-        step = step + power
-        lost = lost + drained
-        drained = (whole.mT @ drained + drained @ whole) * (small / (k + 1))
-    for _ in range(doublings):
-        moved = step.mT @ lost
-        lost = 2.0 * lost + moved + moved.mT + moved @ step
-        # Double e^A - 1 instead of e^A, because adding 1 would lose the last digits of slow motions.
-        step = 2.0 * step + step @ step
-    return Flow(step[..., :count, :], lost)

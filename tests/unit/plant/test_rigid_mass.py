@@ -8,7 +8,7 @@ import tolerances as tol
 from mpmath import mp, mpf
 
 import oracles
-from zwidth.numerics.held_mass import discretize_mass, phi_functions, split_delay
+from zwidth.plant.rigid_mass import discretize_mass, phi_functions, split_delay
 
 FRACTIONS = [0.0, 1e-300, 1e-16, 1e-8, 0.125, 0.25, 0.37, 0.5, 0.75, 0.9, 1 - 2.0**-30, 1 - 2.0**-53]
 DAMPINGS = [0.0, 1e-300, 1e-16, 1e-8, 1e-3, 0.1, 1.0, 2.31, 2.5, 3.0, 8.0, 30.0, 700.0, 1e4, 1e6]

@@ -1,12 +1,12 @@
 """Compute the dominant pole of each wall of an array, certified: spectral radii and decay rates.
 
 The dominant pole e^(re + j im) is the pole of largest modulus. e^re is the spectral radius, -re the decay rate per
-period. A result is certified by counting the poles outside a circle (`stability.rigid.pole_count`).
+period. A result is certified by counting the poles outside a circle (`stability.rigid.dominant.pole_count`).
 
 The walls are given by *columns*: one-dimensional arrays of alpha, beta, delta and d. Most walls are computed by one
-compiled kernel (`stability.rigid.dominant_pole_search`). Walls that it does not certify are computed again by slower
-methods in NumPy. On grids of alpha and beta, Taylor series serve whole *cells* of neighboring walls
-(`stability.rigid.dominant_pole_grid`); walls that these leave open are computed one by one.
+compiled kernel (`stability.rigid.dominant.search`). Walls that it does not certify are computed again by slower methods
+in NumPy. On grids of alpha and beta, Taylor series serve whole *cells* of neighboring walls
+(`stability.rigid.dominant.grid`); walls that these leave open are computed one by one.
 """
 
 from __future__ import annotations
@@ -19,23 +19,22 @@ import numpy as np
 from zwidth.core.status import Status
 from zwidth.numerics.blocks import map_blocks
 from zwidth.numerics.evaluate import BLOCK, FEW, Route, compile_columns
-from zwidth.numerics.held_mass import classify_delays
+from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.rigid.broadcasting import Points, fold
 from zwidth.stability.rigid.characteristic_polynomial import factor_loop
 from zwidth.stability.rigid.crossover import stable_kernel
-from zwidth.stability.rigid.dominant_pole_grid import Area, compute_grid_poles, pad_to_16
-from zwidth.stability.rigid.dominant_pole_search import (
+from zwidth.stability.rigid.dominant.grid import Area, compute_grid_poles, pad_to_16
+from zwidth.stability.rigid.dominant.pole_count import count_poles
+from zwidth.stability.rigid.dominant.search import (
     DominantPoles,
     bisect_radius,
     bound_radius,
     certification_width,
-    certify_again,
     certify_starts,
     quick_kernel,
+    round_to_real,
 )
 from zwidth.stability.rigid.normalization import wall_status
-from zwidth.stability.rigid.pole_cells import VERDICT_WIDTH
-from zwidth.stability.rigid.pole_count import count_poles
 
 # If a count is uncertain because of rounding errors, it is repeated with error bounds that are larger than the required
 # accuracy by these factors, up to `MAX_ERROR`.
@@ -47,6 +46,11 @@ BELOW_ONE = 1.0 - 2.0**-53
 RADIUS_ROUNDING = 1e-13
 # Largest certified relative error of a decay rate; with a larger error the rate is NaN.
 MAX_RATE_ERROR = 1e-3
+# Value of |log radius| below which the closed-form verdict, instead of the computed radius, decides on which side of
+# the unit circle a pole is. Within 1e-10 of the stability boundary, one in ten computed radii is on the wrong side.
+VERDICT_WIDTH = 1e-7
+# Upper limit of the error of the |log radius| of a grid that is added to `VERDICT_WIDTH`.
+MAX_UNCERTAIN_WIDTH = 1e-5
 # Value of |sin(im)| below which a pole is counted as real, i.e. without a conjugate.
 REAL_AXIS_WIDTH = 1e-6
 # Smallest number of walls per device with which a grid is computed by cells; for fewer walls, computing them one by one
@@ -54,6 +58,8 @@ REAL_AXIS_WIDTH = 1e-6
 SMALLEST_MAP = 1 << 11
 # Number of walls per batch in NumPy. Smaller batches take longer per wall.
 BATCH_SIZE = 1 << 13
+# The same for open walls, whose arrays have four rows: NumPy rounds complex products in arrays of 256 KB differently.
+OPEN_BATCH_SIZE = 1 << 11
 # Largest number of walls that are computed one by one without testing whether they form a grid.
 FEW_FOR_CELLS = 1 << 13
 # Number of walls per compiled batch. All large batches have this size, so that they share one compiled program.
@@ -61,7 +67,7 @@ PIECE = BLOCK >> 3
 
 # Default of the largest relative error of radii and rates.
 ACCURACY = 1e-9
-NO_RATE = np.empty(0)  # placeholder for rates that are not requested
+NOT_REQUESTED = np.empty(0)  # placeholder for results that are not requested
 
 
 def compute_dominant_poles(columns: list[np.ndarray], accuracy: float, route: Route = "auto") -> DominantPoles:
@@ -113,9 +119,9 @@ def _certify_open_walls(
     open_walls = np.flatnonzero(~poles.certified)
     # Skip invalid walls, which cannot be certified.
     open_walls = open_walls[np.asarray(wall_status(*(column[open_walls] for column in columns))) == Status.OK]
-    larger_errors = accuracy * ERROR_FACTORS
-    attempts = [(method, accuracy) for method in (certify_again, certify_starts, bound_radius, bisect_radius)]
-    attempts += [(bound_radius, error) for error in larger_errors[larger_errors <= MAX_ERROR].tolist()]
+    errors = accuracy * ERROR_FACTORS
+    attempts = [(certify_starts, accuracy), (bisect_radius, accuracy)]
+    attempts += [(bound_radius, error) for error in errors[errors <= MAX_ERROR].tolist()]
     for method, tolerance in attempts:
         if not open_walls.size:
             break
@@ -130,15 +136,17 @@ def _certify_open_walls(
                 column[batch[is_finite]] = leaf[: batch.size][is_finite]
             return batch[~attempted.certified[: batch.size]]
 
-        open_walls = np.concatenate(_map_in_batches(attempt, [open_walls]))
+        open_walls = np.concatenate(_map_in_batches(attempt, [open_walls], OPEN_BATCH_SIZE))
     return poles
 
 
-def _map_in_batches(function: Callable[[list[np.ndarray]], Any], columns: list[np.ndarray]) -> list[Any]:
+def _map_in_batches(
+    function: Callable[[list[np.ndarray]], Any], columns: list[np.ndarray], size: int = BATCH_SIZE
+) -> list[Any]:
     """Apply a function to batches of walls, one after another, because a second thread would not save time."""
-    starts = range(0, max(columns[0].size, 1), BATCH_SIZE)
+    starts = range(0, max(columns[0].size, 1), size)
     with np.errstate(all="ignore"):
-        return [function([column[start : start + BATCH_SIZE] for column in columns]) for start in starts]
+        return [function([column[start : start + size] for column in columns]) for start in starts]
 
 
 def arrange_as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
@@ -169,64 +177,65 @@ def arrange_as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, .
 
 
 class WallPoles(NamedTuple):
-    """Spectral radii of walls, and their decay rates if requested."""
+    """Spectral radii of walls, with the decay rate and the angle of the dominant pole if requested."""
 
     radius: np.ndarray  # NaN without a certified error bound
     certified: np.ndarray  # True if the requested accuracy is certified
     rate: np.ndarray  # NaN if fewer than three digits are certified
+    angle: np.ndarray  # in [0, pi]; NaN if only the radius is certified
 
     def map(self, function: Callable[[np.ndarray], np.ndarray]) -> WallPoles:
         """Return the results with a function applied to each array, e.g. to change the layout."""
-        return WallPoles(*(leaf if leaf is NO_RATE else function(leaf) for leaf in self))
+        return WallPoles(*(leaf if leaf is NOT_REQUESTED else function(leaf) for leaf in self))
 
 
-def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPoles:
+def area_poles(area: Area, accuracy: float, with_rate: bool = False, with_angle: bool = False) -> WallPoles:
     """Compute the dominant poles of a grid by Taylor series in cells of walls; walls where these fail, one by one.
 
     Nothing is compiled, and the result of a wall does not depend on the window of the grid.
     """
-    followed = compute_grid_poles(area, accuracy, with_rate)
-    (radius, rate, special), certified = followed, np.ones(followed.radius.shape, bool)
-    columns, is_missing = area.walls(np.stack(special)), np.isnan(radius[special])
-    near_one, missing_walls = (tuple(axis_index[mask] for axis_index in special) for mask in (~is_missing, is_missing))
-    radius[near_one] = _place_by_verdict(radius[near_one], [column[~is_missing] for column in columns])
-    if missing_walls[0].size:
-        single_poles = list_poles([column[is_missing] for column in columns], accuracy, with_rate, "numpy")
-        for array, leaf in zip((radius, certified, rate), single_poles, strict=True):
+    radius, re, *im = compute_grid_poles(area, accuracy, with_angle)
+    rate, angle = -re if with_rate else NOT_REQUESTED, im[0] if with_angle else NOT_REQUESTED
+    width = VERDICT_WIDTH + min(accuracy, MAX_UNCERTAIN_WIDTH)
+    special = np.unravel_index(np.flatnonzero(~(np.abs(re) > width)), re.shape)
+    is_open, columns = np.isnan(re[special]), area.walls(special)
+    poles = WallPoles(radius, np.ones(re.shape, bool), rate, angle)
+    near_one, open_walls = (tuple(index[mask] for index in special) for mask in (~is_open, is_open))
+    poles.radius[near_one] = _place_by_verdict(poles.radius[near_one], [column[~is_open] for column in columns])
+    if open_walls[0].size:
+        single_poles = list_poles([column[is_open] for column in columns], accuracy, with_rate, with_angle, "numpy")
+        for array, leaf in zip(poles, single_poles, strict=True):
             if array.size:
-                array[missing_walls] = leaf
-    return WallPoles(radius, certified, rate if with_rate else NO_RATE)
+                array[open_walls] = leaf
+    return poles
 
 
-def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = False, route: Route = "auto") -> WallPoles:
+def list_poles(
+    columns: list[np.ndarray],
+    accuracy: float,
+    with_rate: bool = False,
+    with_angle: bool = False,
+    route: Route = "auto",
+) -> WallPoles:
     """Compute the dominant poles of columns of equal length one by one; the columns may include invalid walls."""
     size = columns[0].size
     if route != "auto":
         columns = [column[pad_to_16(np.arange(size))] for column in columns]
-    return _find_listed(columns, accuracy, with_rate, route)[0].map(lambda leaf: leaf[:size])
-
-
-def find_dominant_pole(wall: tuple[float, float, float, float]) -> tuple[float, float, float]:
-    """Return the spectral radius of one wall, its decay rate and the angle of its dominant pole."""
-    results, dominant = _find_listed([np.array([value]) for value in wall], ACCURACY, True, "auto")
-    return float(results.radius[0]), float(results.rate[0]), abs(float(dominant.im[0]))
-
-
-def _find_listed(
-    columns: list[np.ndarray], accuracy: float, with_rate: bool, route: Route
-) -> tuple[WallPoles, DominantPoles]:
-    """Return the radii of walls given as columns (1-D arrays) and, if requested, the rates; and the dominant poles."""
     dominant = compute_dominant_poles(columns, accuracy, route)
-    rate = compute_rates(dominant, columns, accuracy) if with_rate else NO_RATE
-    radius = np.exp(np.where(np.isinf(dominant.error), np.nan, dominant.re))
-    near_one = np.flatnonzero(
-        np.abs(dominant.re) <= np.maximum(VERDICT_WIDTH, np.where(np.isinf(dominant.error), 0.0, dominant.error))
-    )
+    re, error = dominant.re, dominant.error
+    rate = compute_rates(dominant, columns, accuracy) if with_rate else NOT_REQUESTED
+    radius = np.exp(np.where(dominant.certified, re, np.nan))
+    near_one = np.flatnonzero(np.abs(re) <= np.maximum(VERDICT_WIDTH, np.where(dominant.certified, error, 0.0)))
     radius[near_one] = _place_by_verdict(radius[near_one], [column[near_one] for column in columns])
-    return WallPoles(radius, dominant.error <= accuracy, rate), dominant
+    angle = NOT_REQUESTED
+    if with_angle:
+        angle = np.where(dominant.certified & np.isfinite(dominant.pole_error), round_to_real(dominant), np.nan)
+    return WallPoles(radius, error <= accuracy, rate, angle).map(lambda leaf: leaf[:size])
 
 
-def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = False) -> WallPoles:
+def find_poles(
+    arrays: list[np.ndarray], accuracy: float, with_rate: bool = False, with_angle: bool = False
+) -> WallPoles:
     """Compute the dominant poles of arrays of equal shape, by cells if the arrays form a grid."""
     shape = arrays[0].shape
     # Add a first axis of length 1, because a line of walls has only one axis.
@@ -235,14 +244,14 @@ def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = Fals
     )
     if arranged is None:
         columns = [array.reshape(-1) for array in arrays]
-        return list_poles(columns, accuracy, with_rate).map(lambda leaf: leaf.reshape(shape))
+        return list_poles(columns, accuracy, with_rate, with_angle).map(lambda leaf: leaf.reshape(shape))
     area, order, area_shape = arranged
 
     def restore_layout(leaf: np.ndarray) -> np.ndarray:
         leaf = leaf.reshape(area_shape).transpose(np.argsort(order))[0]
         return leaf if leaf.shape == shape else np.broadcast_to(leaf, shape).copy()
 
-    return area_poles(area, accuracy, with_rate).map(restore_layout)
+    return area_poles(area, accuracy, with_rate, with_angle).map(restore_layout)
 
 
 def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: float) -> np.ndarray:

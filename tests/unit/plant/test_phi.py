@@ -8,7 +8,7 @@ import tolerances as tol
 from compiling import QUICKLY
 from mpmath import hyp1f1, mp, mpf
 
-from zwidth.numerics.held_mass import phi_functions
+from zwidth.plant.rigid_mass import phi_functions
 
 SMALL = [0.0, 5e-324, 1e-300, *(10.0**k for k in range(-16, 0))]
 AROUND_THE_SWITCH = [2.4, np.nextafter(2.5, 0), 2.5, np.nextafter(2.5, 3), 2.6]

@@ -1,7 +1,7 @@
-"""Return the spectral radius and the decay rate of arrays of walls, from their dominant poles.
+"""Return the dominant pole of arrays of walls: its modulus (the spectral radius), angle and decay rate.
 
-The dominant pole is the pole with the largest modulus. `stability.rigid.dominant_poles` computes and certifies it. With
-method "companion", `stability.rigid.poles` computes all poles instead. This module has the public functions.
+The dominant pole is the pole with the largest modulus. `stability.rigid.dominant.arrays` computes and certifies it.
+With method "companion", `stability.rigid.poles` computes all poles instead. This module has the public functions.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from zwidth.core.errors import InputError, check_choice
+from zwidth.core.status import Status
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced, namespace
-from zwidth.numerics.evaluate import broadcast, check_scalars, evaluate, to_caller
-from zwidth.numerics.held_mass import classify_delays
+from zwidth.numerics.evaluate import broadcast, broadcast_traced, check_scalars, evaluate, to_caller
+from zwidth.plant.rigid_mass import classify_delays
+from zwidth.stability.results import DominantPole
 from zwidth.stability.rigid.broadcasting import NAMES
-from zwidth.stability.rigid.dominant_pole_search import traced_kernel
-from zwidth.stability.rigid.dominant_poles import ACCURACY, find_poles
+from zwidth.stability.rigid.dominant.arrays import ACCURACY, find_poles
+from zwidth.stability.rigid.dominant.search import traced_kernel
+from zwidth.stability.rigid.normalization import status_of_results, wall_status
 from zwidth.stability.rigid.poles import radius_by_companion
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
@@ -50,9 +53,8 @@ def spectral_radius(
             a circle, at a cost independent of d; "companion" computes all poles.
         accuracy: largest relative error, 1e-9 by default, at least 1e-12. If two poles nearly coincide, the radius is
             ill-conditioned: rounding errors of the coefficients then change it by up to 1e-8, whatever the accuracy
-            (2.8e-9 was observed near a double pole at z = -1). On large grids (alpha along one axis, beta along the
-            other) and lines, a larger value saves time, mostly at long delays, and errors come close to it at some
-            points; single walls are more accurate than required. Has no effect on "companion".
+            (2.8e-9 was observed near a double pole at z = -1). A larger value saves next to no time. Has no effect on
+            "companion".
 
     Returns:
         Array of the broadcast shape: below 1 if and only if `zwidth.is_stable` returns True. NaN for a point out of
@@ -67,7 +69,7 @@ def spectral_radius(
         Direct calls compute in float64; grids and up to 262,144 other walls are computed without JAX. Inside `jit` the
         function computes in JAX's default float type, d may be traced, and a radius within rounding error of 1 may be
         on either side of 1. On grids, one Taylor series with a certified bound serves a cell of walls
-        (`stability.rigid.dominant_pole_grid`). Derivatives are those of the dominant pole, up to the second order; NaN
+        (`stability.rigid.dominant.grid`). Derivatives are those of the dominant pole, up to the second order; NaN
         if this pole is a multiple one. Near a k-fold pole the error of the radius is about 1e-16^(1/k), whatever the
         accuracy. If the radius is within 1e-16 of 1, use `decay_rate`.
 
@@ -86,7 +88,7 @@ def spectral_radius(
     if method == "companion":
         return radius_by_companion(*values)
     if is_traced(*values):
-        log_radius = evaluate(traced_kernel, arguments, classify_delays(d).fractional)
+        log_radius, _ = evaluate(traced_kernel, arguments, classify_delays(d).fractional)
         return namespace(log_radius).exp(log_radius)
     return to_caller(find_poles(broadcast(arguments), required).radius, values)
 
@@ -130,8 +132,58 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
     if is_traced(*values):
-        return -evaluate(traced_kernel, arguments, classify_delays(d).fractional)
+        return -evaluate(traced_kernel, arguments, classify_delays(d).fractional)[0]
     return to_caller(find_poles(broadcast(arguments), ACCURACY, with_rate=True).rate, values)
+
+
+def dominant_pole(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> DominantPole:
+    """Return the dominant pole of the loop, i.e. the pole ``z = radius e^(j angle)`` with the largest modulus.
+
+    After faster components have decayed, the response oscillates with the angular frequency ``angle`` in rad per
+    sampling period; with the period T this is the frequency ``angle/(2 pi T)`` in Hz.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, integer or fractional. All four broadcast.
+
+    Returns:
+        Named tuple of arrays of the broadcast shape: ``radius``, see `zwidth.spectral_radius`; ``angle`` in rad, from 0
+        to pi, 0 for a positive real pole and pi for a negative real one; ``decay_rate`` per period, see
+        `zwidth.decay_rate`; ``status``, see `zwidth.Status`. A value that is not certified is NaN, with a status that
+        is not 0.
+
+    Raises:
+        InputError: an argument is no real number or a scalar out of range, or shapes do not broadcast.
+
+    Numerics:
+        As for `zwidth.spectral_radius`. The angle is that of a pole whose modulus is certified to be the spectral
+        radius within 1e-9; its error is at most 1e-9, near a k-fold pole about 1e-16^(1/k). If the moduli of several
+        poles agree within 1e-9, the angle is that of any of them. Inside `jit`, values have the ambient precision.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (17).
+
+    Example:
+        >>> import zwidth
+        >>> pole = zwidth.dominant_pole(0.5, 0.5, 0.1, 1)
+        >>> print(f"{pole.radius:.6f} {pole.angle:.6f}")
+        1.207346 0.694368
+    """
+    values = (alpha, beta, delta, d)
+    arguments = dict(zip(NAMES, values, strict=True))
+    check_scalars(arguments)
+    if is_traced(*values):
+        re, im = evaluate(traced_kernel, arguments, classify_delays(d).fractional)
+        xp, status = namespace(re), wall_status(*broadcast_traced(arguments))
+        status = xp.where((status == Status.OK) & xp.isnan(re), int(Status.NOT_CONVERGED), status)
+        return DominantPole(xp.exp(re), im, -re, status)
+    arrays = broadcast(arguments)
+    radius, certified, rate, angle = find_poles(arrays, ACCURACY, with_rate=True, with_angle=True)
+    status = status_of_results(radius.shape, (radius, rate, angle), tuple(arrays[:2]), tuple(arrays[2:]))
+    status = np.where((status == Status.OK) & ~certified, Status.NOT_CONVERGED, status).astype(np.int32)
+    return to_caller(DominantPole(radius, angle, rate, status), values)
 
 
 def _check_accuracy(method: str, accuracy: float | None) -> float:
