@@ -250,9 +250,9 @@ def _compile_labels(kind: DelayClasses) -> Callable[..., Array]:
             if occurs
         ]
         limit = jnp.where(d < 1.0, *limits) if len(limits) > 1 else limits[0]
-        # Without `materialize`, XLA repeats the last Newton step at each point of the grid.
+        # Without `materialize`, XLA would repeat the last Newton step and the tests of the range at each point.
         limit = materialize(jnp.where(within(beta, WALL_RANGE), limit, 0.0), beta)
-        return (alpha > 0.0) & (alpha < limit) & within(alpha, WALL_RANGE)
+        return materialize(jnp.where((alpha > 0.0) & within(alpha, WALL_RANGE), alpha, jnp.inf), alpha) < limit
 
     return label
 
