@@ -9,14 +9,16 @@ and all other notation is that of `stability.rigid.boundary_curve`.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.core.types import Array
-from zwidth.core.xp import SINE, horner, iterate, materialize, namespace, nan_beyond
-from zwidth.numerics.evaluate import FEW, Route, evaluate_columns
-from zwidth.plant.rigid_mass import DiscretePlant, discretize_plant
+from zwidth.core.types import Array, ArrayLike
+from zwidth.core.xp import SINE, horner, iterate, materialize, namespace, nan_beyond, within
+from zwidth.numerics.evaluate import FEW, Route, compile_kernel, convert_for_jax, evaluate_columns, precision
+from zwidth.plant.rigid_mass import DelayClasses, DiscretePlant, discretize_plant
 from zwidth.stability.rigid.boundary_curve import (
     Curve,
     CurveTerms,
@@ -26,8 +28,9 @@ from zwidth.stability.rigid.boundary_curve import (
     expand_curve_with_offset,
     expand_short_delay_curve,
 )
-from zwidth.stability.rigid.broadcasting import Points, group_by_value
+from zwidth.stability.rigid.broadcasting import MIN_DENSE_SIZE, Points, group_by_value
 from zwidth.stability.rigid.characteristic_polynomial import expand_wall
+from zwidth.stability.rigid.crossover import stable_kernel
 from zwidth.units.quantities import WALL_RANGE
 
 # Numbers of Newton steps, each of which doubles the number of correct digits.
@@ -201,6 +204,8 @@ def _compute_newton_step(target_b: Array, terms: CurveTerms) -> Array:
 # For smaller grids it is faster to compare each point with its limit.
 MIN_PATTERN_SIZE = 1 << 16
 MIN_PATTERN_ROWS = 8
+# Smallest number of walls per line of constant beta with which JAX computes the limits of the lines.
+MIN_ROW_LENGTH = 32
 
 
 def label_grid(points: Points) -> np.ndarray:
@@ -209,6 +214,47 @@ def label_grid(points: Points) -> np.ndarray:
     # lobe, an error of 1e-15 of the largest limit.
     alpha, beta = nan_beyond(WALL_RANGE, points.alpha, points.beta)
     return _compare_with_limits(alpha, row_limits(beta, points.delta, points.d))
+
+
+def label_jax_arrays(arguments: Mapping[str, ArrayLike], kind: DelayClasses) -> Array:
+    """Return whether each wall is stable, in code compiled by JAX; as `label_grid` does if the shapes form a grid.
+
+    Args:
+        arguments: alpha, beta, delta and d by name, some of them JAX arrays; they broadcast.
+        kind: classes of the delays.
+    """
+    values = arguments.values()
+    with precision(values):
+        arrays = convert_for_jax(arguments)
+        shape, rows = (np.broadcast_shapes(*map(np.shape, parts)) for parts in (arrays, arrays[1:]))
+        if np.prod(shape) >= MIN_DENSE_SIZE and MIN_ROW_LENGTH * np.prod(rows) <= np.prod(shape):
+            return _compile_labels(kind)(*arrays)
+        return compile_kernel(stable_kernel, (kind,))(*arrays)
+
+
+@cache
+def _compile_labels(kind: DelayClasses) -> Callable[..., Array]:
+    """Return a function, compiled by JAX, that compares alpha with the limit of its line of constant beta."""
+    import jax
+    import jax.numpy as jnp
+
+    @jax.jit
+    def label(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+        rank = max(map(jnp.ndim, (alpha, beta, delta, d)))
+        alpha, beta, delta, d = (
+            jnp.reshape(x, (1,) * (rank - jnp.ndim(x)) + jnp.shape(x)) for x in (alpha, beta, delta, d)
+        )
+        limits = [
+            compute(beta, *jnp.broadcast_arrays(delta, d))
+            for compute, occurs in ((_short_limit, kind.short), (_long_limit, kind.long))
+            if occurs
+        ]
+        limit = jnp.where(d < 1.0, *limits) if len(limits) > 1 else limits[0]
+        # Without `materialize`, XLA would repeat the last Newton step and the tests of the range at each point.
+        limit = materialize(jnp.where(within(beta, WALL_RANGE), limit, 0.0), beta)
+        return materialize(jnp.where((alpha > 0.0) & within(alpha, WALL_RANGE), alpha, jnp.inf), alpha) < limit
+
+    return label
 
 
 def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, route: Route = "auto") -> np.ndarray:
