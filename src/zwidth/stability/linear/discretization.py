@@ -46,16 +46,24 @@ MAX_DOUBLINGS = 36  # 2^36 exceeds twice the largest rate that `Chain.check` all
 
 
 def compute_transition(A: Any, B: Any, time: Any) -> tuple[Any, Any]:
-    """Return ``e^(A t) - 1`` and Gamma(t), the state after a unit force held for time t from rest."""
+    """Return ``e^(A t) - 1`` and Gamma(t), the state after a unit force held for time t from rest.
+
+    Args:
+        A: state matrices, shape (..., n, n).
+        B: input vectors, shape (..., n).
+        time: times t, a number or an array that broadcasts with the leading axes.
+    """
     # Evaluate the series for the time divided by a power of 2, then double the time repeatedly: y(2 t) = y(t) (2 +
     # y(t)) for y = e^(A t) - 1, and similarly Gamma. This keeps the relative accuracy of slow and of strongly damped
     # modes. Write the evaluation as two program loops, because these make the program short, and the compile time of
     # derivatives is proportional to its length: with JAX's own exponential, derivatives of `zwidth.Scene.max_stiffness`
     # took 1.2 to 1.7 times as long to compile.
     xp = namespace(A)
-    norm = stop_gradient(xp.abs(A * time).sum(0).max(), xp)
+    time = xp.asarray(time)[..., None, None]
+    norm = stop_gradient(xp.abs(A * time).sum(-2, keepdims=True).max(-1, keepdims=True), xp)
     doublings = xp.ceil(xp.log2(xp.maximum(2.0 * norm, 1.0)))
-    small, identity = A * (time / 2.0**doublings), xp.eye(A.shape[0], dtype=A.dtype)
+    start = time / 2.0**doublings
+    small, identity = A * start, xp.eye(A.shape[-1], dtype=A.dtype)
 
     def add(state: tuple[Any, Any]) -> tuple[Any, Any]:
         k, total = state
@@ -63,12 +71,13 @@ def compute_transition(A: Any, B: Any, time: Any) -> tuple[Any, Any]:
 
     def double(state: tuple[Any, Any]) -> tuple[Any, Any]:
         k, both = state
-        return k + 1.0, xp.where(k < doublings, 2.0 * both + both[:, :-1] @ both, both)
+        return k + 1.0, xp.where(k < doublings, 2.0 * both + both[..., :-1] @ both, both)
 
-    _, phi1 = iterate(SERIES_TERMS, add, (doublings * 0.0 + SERIES_TERMS + 1.0, identity), xp)
-    both = phi1 @ xp.concatenate([small, B[:, None] * (time / 2.0**doublings)], 1)
-    both = iterate(MAX_DOUBLINGS, double, (doublings * 0.0, both), xp, lambda old, new: bool(new[0] >= doublings))[1]
-    return both[:, :-1], both[:, -1]
+    zero = doublings * 0.0
+    _, phi1 = iterate(SERIES_TERMS, add, (zero + SERIES_TERMS + 1.0, identity + 0.0 * small), xp)
+    both = phi1 @ xp.concatenate([small, B[..., None] * start], -1)
+    both = iterate(MAX_DOUBLINGS, double, (zero, both), xp, lambda old, new: bool((new[0] >= doublings).all()))[1]
+    return both[..., :-1], both[..., -1]
 
 
 def compute_chain_transition(chain: AnyChain, A: Any, B: Any, time: Any) -> tuple[Any, Any]:
