@@ -1,10 +1,10 @@
 """Stability and stiffness limits of many variants of a scene, for tolerances and uncertain devices.
 
 A *variant* is the scene with other values of some parameters. `Variants` evaluates the variants of any scene at once,
-by counts of poles along lines of walls (`zwidth.stability.linear.batch`), and each variant whose result these counts do
-not confirm by itself. `RigidVariants` evaluates variants of a rigid mass with the backward difference by closed forms on
-arrays. Results have one entry per variant. K and B are the stiffness and damping of a wall in SI units; ``rate`` is
-m/T, ``delta = b T/m``, and d is the delay in periods T, with the mass m and damping b of the device.
+by counts of poles along lines of walls (`zwidth.stability.linear.batch_lines`), and each variant whose result these
+counts do not confirm by itself. `RigidVariants` evaluates variants of a rigid mass with the backward difference by
+closed forms on arrays. Results have one entry per variant. K and B are the stiffness and damping of a wall in SI
+units; ``rate`` is m/T, ``delta = b T/m``, and d is the delay in periods T, with the mass m and damping b of the device.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.velocity import ESTIMATES, FOAW
 from zwidth.numerics.evaluate import FEW
-from zwidth.stability.linear.batch import count_outside, find_stiffness_limits, sample
+from zwidth.stability.linear.batch_devices import compare_responses, map_loops
+from zwidth.stability.linear.batch_lines import count_outside, find_stiffness_limits
 from zwidth.stability.linear.batch_ridge import find_stiffest
-from zwidth.stability.linear.loop_batch import compare_responses, map_loops
+from zwidth.stability.linear.loop_batch import sample
 from zwidth.stability.linear.rows import are_connected
 from zwidth.stability.results import RidgePoint
 from zwidth.stability.rigid.boundary import boundary_point

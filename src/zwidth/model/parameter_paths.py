@@ -170,7 +170,7 @@ def spell_part(part: Any, *, every: bool = False) -> dict[str, Any]:
 
 
 def fill_parameters(scene: AnyScene, values: dict[str, Any]) -> AnyScene:
-    """Return a copy of a scene with arrays as parameters, by dotted path, without checks; only `build_chain` accepts it.
+    """Return a copy of a scene with arrays as parameters, without checks; only `build_chain` accepts such a scene.
 
     Args:
         scene: the scene.

@@ -6,41 +6,36 @@ a relative distance `MARGIN`,
 
     the ray to the wall          has no crossing below it, so this wall is stable and connected to K = 0
     the line of constant K above has no stable wall, so no piece connected to K = 0 extends above it
-    the line beta = 0            has no stable wall above it, if that line has one with beta < 0 and only beta >= 0 is allowed
+    the line beta = 0            has no stable wall above it; needed if only beta >= 0 is allowed and the line of
+                                 constant K has a stable wall with beta < 0
 
-Any wall for which this holds is within `MARGIN` of the stiffest one, so no other constraint can be binding below it.
-Names and shapes are those of `stability.linear.batch`.
+A wall for which this holds is within `MARGIN` of the stiffest one, so no other constraint can be binding below it.
+Symbols and shapes are those of `stability.linear.batch_lines`.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from zwidth.core.status import RidgeKind
 from zwidth.core.types import Array
 from zwidth.core.xp import iterate, namespace
-from zwidth.stability.linear.batch import (
+from zwidth.stability.linear.batch_lines import (
     MOST_CROSSINGS,
     Crossings,
-    Form,
     Line,
-    LoopBatch,
-    Sampled,
-    Sizes,
-    Values,
     combine,
     count_far,
     count_outside,
     cross_end,
-    evaluate,
     find_crossings,
     list_cells,
-    sample,
     sort_crossings,
     tabulate,
 )
+from zwidth.stability.linear.loop_batch import Form, LoopBatch, Sampled, Sizes, Values, evaluate, sample
 
 MARGIN = 4e-10  # relative distance in alpha of the walls that confirm a maximum
 LOG_RANGE = (-9.0, 2.0)  # log10 alpha of the first bracket of the maximum
@@ -57,9 +52,6 @@ THINNEST = 1e-4  # width of an interval of beta in the bisection, relative to it
 LARGEST_BETA = 50.0  # of a stable interval; crossings near zeros of F on the unit circle are farther away
 LEAST = -2  # marks the end of an interval at beta = 0, in place of the index of a node
 CLEAR = 1e-12  # smallest distance between two crossings in t, relative to t, at which their order is certain
-
-
-DEBUG = []
 
 
 class Stiffest(NamedTuple):
@@ -119,7 +111,7 @@ def find_stiffest(form: Form, loop: LoopBatch, sizes: Sizes, negative: bool) -> 
 def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> Crossings:
     """Return the crossings of a line of constant K per loop, interpolated linearly between nodes.
 
-    ``on_axis`` is the alpha at which the curve crosses the line beta = 0 in each step between nodes; NaN if it does not.
+    ``on_axis`` is the alpha at which the curve crosses the line beta = 0 in each step between nodes; NaN without one.
     """
     xp, n = namespace(loops.w), alpha.size
     k = loops.parts[1] + alpha * loops.parts[2]
@@ -143,6 +135,7 @@ def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> Crossing
     columns = (
         (t, np.inf, end),
         (xp.where(after > before, 2.0, -2.0), 0.0, xp.sign(end_slope)),
+        (loops.w[cells.cell, cells.loop], np.nan, xp.full((n,), np.pi)),
         (cells.cell, -1, xp.full((n,), -1)),
     )
     tables = (xp.concatenate([tabulate(cells, values, fill), last[None]]) for values, fill, last in columns)
@@ -204,7 +197,7 @@ def _solve(loops: Sampled, axis: Crossings, alpha: Array, left: Array, right: Ar
     clipped = left == LEAST
     # If the interval ends at beta = 0, a smooth maximum may lie in the step in which the curve crosses this line.
     undamped = xp.argmin(xp.abs(xp.log(xp.where(axis.t > 0, axis.t, np.inf) / alpha)), 0)[None]
-    undamped, crossed = (xp.take_along_axis(part, undamped, 0)[0] for part in (axis.t, axis.cell))
+    undamped, rest, crossed = (xp.take_along_axis(part, undamped, 0)[0] for part in (axis.t, axis.w, axis.cell))
     first = xp.where(clipped, crossed, xp.minimum(left, right))
     second = xp.where(clipped, crossed, xp.maximum(left, right))
     close = (first >= 0) & (second - first <= CLOSE_CELLS)
@@ -237,7 +230,9 @@ def _solve(loops: Sampled, axis: Crossings, alpha: Array, left: Array, right: Ar
     corner = iterate(NEWTON_STEPS, step, tuple(starts), xp, lambda old, new: bool(np.all(old[0] == new[0])))
     meeting = _trace(evaluate(form, loop, corner[0]))
     # Two crossings in distant steps bound a corner or, where nodes are dense, a smooth maximum: take the nearer one.
-    distance = [xp.where(ok, xp.abs(xp.log(one.alpha / alpha)), np.inf) for one, ok in ((top, converged), (meeting, ~clipped))]
+    distance = [
+        xp.where(ok, xp.abs(xp.log(one.alpha / alpha)), np.inf) for one, ok in ((top, converged), (meeting, ~clipped))
+    ]
     smooth = xp.where(close | clipped, distance[0] < 0.1, ~(distance[0] > distance[1]))
     smooth = smooth & converged & (first >= 0) & (~clipped | ((top.beta > 0) & (top.alpha > undamped)))
     kinds = [smooth, clipped, ~clipped & (second >= 0)]
@@ -246,8 +241,8 @@ def _solve(loops: Sampled, axis: Crossings, alpha: Array, left: Array, right: Ar
         for choices in (
             [top.alpha, undamped, meeting.alpha],
             [top.beta, 0.0 * undamped, meeting.beta],
-            [peak, xp.full_like(peak, np.nan), corner[0]],
-            [peak, xp.full_like(peak, np.nan), xp.where(pair, corner[1], np.pi)],
+            [peak, rest, corner[0]],
+            [peak, rest, xp.where(pair, corner[1], np.pi)],
         )
     ]
     codes = [int(kind) for kind in (RidgeKind.SMOOTH, RidgeKind.NO_DAMPING, RidgeKind.CORNER)]
@@ -257,7 +252,7 @@ def _solve(loops: Sampled, axis: Crossings, alpha: Array, left: Array, right: Ar
 def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]]) -> tuple[Array, Array]:
     """Return the angle in a bracket at which alpha has a maximum along the curve, and whether the search converged.
 
-    The Illinois method keeps a bracket; it is replaced by bisection if a step does not halve the bracket twice.
+    The brackets are tried in order of their width. The Illinois method keeps a bracket of the maximum.
     """
     xp = namespace(loop.gain)
 
@@ -265,7 +260,7 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
         return _trace(evaluate(form, loop, w)).alpha_slope
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        low, high, first, last, x, side, move = state
+        low, high, first, last, x, side, _ = state
         value = slope(x)
         before = value > 0
         last = xp.where(before, xp.where(side > 0, 0.5 * last, last), value)
@@ -312,8 +307,6 @@ def _confirm(loops: Sampled, axis: Crossings, start: Array, found: tuple[Array, 
     # The order of two crossings must be certain.
     clear = xp.all(level.t[1:] - level.t[:-1] > CLEAR * xp.abs(level.t[1:]), 0, where=xp.isfinite(level.t[1:]))
     doubtful = axis.doubtful | level.doubtful | ray.doubtful
-    import zwidth.stability.linear.batch_ridge as me
-    me.DEBUG.append(np.stack([loops.resolved, np.isfinite(alpha), ~axis.doubtful, ~level.doubtful, ~ray.doubtful, is_known, (axis_counts[-1] == far), xp.all(counts>=0,0), clear, bounded, connected]))
     return loops.resolved & ~doubtful & consistent & clear & bounded & connected & (alpha > 0)
 
 

@@ -1,230 +1,215 @@
-"""Discretize many devices of one structure at once, for the counts of `stability.linear.batch`.
+"""Evaluate many linear loops of one form at angles on the unit circle, with the same source code for NumPy and JAX.
 
-The devices are given by one chain (`model.mechanism`) whose parameters are arrays with one value per loop, along the
-last axis. With ``zeta = z - 1`` and ``Psi = e^A - 1``, the poles of G are eigenvalues of Psi, and its zeros those of a
-similar matrix. Numerator and denominator are polynomials in zeta, lowest power first, expanded from these roots, because
-all roots in the left half-plane of zeta yield positive terms. The values of G are compared with those of the matrices.
+All loops of a batch have the same *form*: orders, integer delay and window. The last axis of every array belongs to the
+loops, the first one to coefficients, roots or angles. The *nodes* are the angles at which a batch is evaluated; each
+loop has its own. q = -1/G is the critical controller and F the velocity estimate (`stability.linear.roots`). Roots are
+stored as offsets 1 - z, and polynomials by their coefficients in zeta = z - 1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import namespace
-from zwidth.model.circle_functions import circle_points
-from zwidth.model.linear_plant import System
-from zwidth.model.mechanism import AnyChain, Chain, build_chain, is_zero
-from zwidth.model.parameter_paths import Parts, fill_parameters
-from zwidth.numerics.held_mass import discretize_mass, factor_numerator
-from zwidth.numerics.threads import run_in_threads
-from zwidth.stability.linear.batch import LANES, Form, LoopBatch, Sizes, count_nodes, evaluate
-from zwidth.stability.linear.discretization import DiscreteChain, compute_transition
+from zwidth.model.circle_functions import CirclePoints, Jet, circle_points, distances_inside
+from zwidth.model.velocity import Estimate
 
-# Angles in rad per sample at which G by polynomials is compared with G by matrices, and the largest relative difference.
-TEST_ANGLES = (1e-2, 1e-1, 0.5, 2.0)
-RESPONSE_TOLERANCE = 1e-10
+# Nodes, as angles w in rad. They are geometrically spaced towards w = 0 and w = pi, equidistant between these ranges,
+# and condensed near zeros of G and poles of F that are close to the unit circle, where q or F changes fast.
+SPLIT = 0.3  # width of the two ranges with geometric spacing
+FIRST_NODE = 1e-3  # first node, relative to the distance of the nearest root from z = 1
+LAST_NODE = 1e-4  # pi - w of the last node, as in `stability.linear.curve.place_nodes`
+LOW_RATIO, HIGH_RATIO = 0.2, 0.25  # steps in log w near 0, and in log(pi - w) near pi
+STEP, PHASE_STEP = 0.08, 0.4  # largest step between these ranges, and of the phase of z^lag
+BUCKET = 32  # the numbers of nodes in the ranges are multiples of this, so that many loops share a shape
+NEAR_CIRCLE = 0.25  # distance from the circle of a root with its own nodes, relative to its angle (at most 1 rad)
+CLUSTER_NODES = 31  # nodes around one root
+CLUSTER_REACH = 0.15  # largest distance of these nodes from the root
+CLOSEST = 1e-7  # their smallest spacing
+# Largest sum of step/distance over all zeros of G and poles of F at which a step between nodes counts as resolved.
+RESOLUTION = 1.5
+INSIDE = 1e-10  # smallest distance inside the unit circle, relative to the distance from z = 1, of a decaying pole
 
 
-class _Plant(NamedTuple):
-    """G of each loop, with the fields of `LoopBatch`."""
+class Form(NamedTuple):
+    """The structure that all loops of a batch share."""
 
-    numerator: Array
+    lag: int  # of G: integer delay plus 1 for a fractional delay
+    window: int  # of the velocity estimate, as in `Estimate`
+    estimate_lag: int
+
+    @property
+    def phase_rate(self) -> float:
+        """Bound on the derivative of the phases of the powers of z in q and F, in rad per rad."""
+        return self.lag + self.window + abs(self.estimate_lag) + 1.0
+
+
+class LoopBatch(NamedTuple):
+    """Loops without their walls: ``G = numerator/(denominator z^lag)``, polynomials in z - 1, lowest power first."""
+
+    numerator: Array  # shape (coefficients, loops)
     denominator: Array
-    plant_zeros: Array
-    plant_poles: Array
-    integrators: Array
+    gain: Array  # of F, shape (loops,)
+    zeros: Array  # offsets 1 - z of the zeros of F, shape (zeros, loops)
+    poles: Array  # offsets of the poles of F
+    plant_zeros: Array  # offsets of the zeros of G
+    plant_poles: Array  # offsets of the poles of G, those at z = 1 first
+    integrators: Array  # number of poles of G at z = 1
+
+    def take(self, index: Array) -> LoopBatch:
+        """Return the loops with the given indices."""
+        return LoopBatch(*(leaf[..., index] for leaf in self))
 
 
-class DeviceBatch(NamedTuple):
-    """Loops of one structure, and the discretized devices whose first axis is that of the loops; None if rigid."""
+class Values(NamedTuple):
+    """q, F and their derivatives at angles w."""
+
+    q: Array
+    q_slope: Array
+    f: Array
+    f_slope: Array
+
+
+def evaluate(form: Form, loop: LoopBatch, w: Array) -> Values:
+    """Return q and F and their derivatives in w at angles of shape (..., loops)."""
+    xp, points = namespace(w), circle_points(w)
+    top, top_slope = _horner(loop.numerator, points.z_minus_1)
+    bottom, bottom_slope = _horner(loop.denominator, points.z_minus_1)
+    power = xp.where(w >= np.pi, (-1.0) ** form.lag + 0j, xp.exp(1j * form.lag * w))
+    ratio = bottom / top
+    slope = -power * (1j * points.z * (bottom_slope - ratio * top_slope) / top + 1j * form.lag * ratio)
+    f = Estimate(form.window, loop.gain, form.estimate_lag).jet(points)
+    for offset in loop.zeros:
+        f = f.times(_subtract_root(points, offset))
+    for offset in loop.poles:
+        f = f.over(_subtract_root(points, offset))
+    return Values(-power * ratio, slope, f.value, f.slope)
+
+
+def _subtract_root(points: CirclePoints, offset: Array) -> Jet:
+    """Return z - root and its derivative in w, without cancellation for roots near z = 1 or z = -1."""
+    xp = namespace(points.w)
+    value, left = points.z_minus_1 + offset, offset.real > 1.0
+    if xp is not np or left.any():
+        # Roots near z = -1 need z + 1, which is accurate there (V16).
+        value = xp.where(left, points.z_plus_1 + (offset - 2.0), value)
+    return Jet(value, 1j * points.z)
+
+
+def _horner(coefficients: Array, x: Array) -> tuple[Array, Array]:
+    """Return a polynomial and its derivative at x; the coefficients are given from the lowest power up."""
+    value, slope = coefficients[-1] + 0.0 * x, 0.0 * x
+    for coefficient in coefficients[-2::-1]:
+        value, slope = value * x + coefficient, slope * x + value
+    return value, slope
+
+
+class Sizes(NamedTuple):
+    """Numbers of nodes, which determine the shapes of all arrays."""
+
+    low: int  # near w = 0
+    high: int  # near pi
+    clusters: int  # roots with their own nodes
+    density: int = 1  # factor of all numbers of nodes
+
+
+def count_nodes(form: Form, loop: LoopBatch) -> np.ndarray:
+    """Return the `Sizes` of each loop of a NumPy batch, shape (3, loops).
+
+    Loops of equal sizes can be computed together. The sizes of a loop do not depend on the other loops, so its results
+    do not depend on them either.
+    """
+    first, last = _find_ends(form, loop)
+    counts = np.log(SPLIT / np.stack([first, last])) / np.array([[LOW_RATIO], [HIGH_RATIO]])
+    return np.concatenate([BUCKET * np.ceil(counts / BUCKET), _find_near(loop)[2].sum(0)[None]]).astype(int)
+
+
+def _find_ends(form: Form, loop: LoopBatch) -> tuple[Array, Array]:
+    """Return the first node, and the distance of the last node from pi."""
+    xp = namespace(loop.gain)
+    roots = xp.concatenate([loop.plant_zeros, loop.plant_poles, loop.zeros, loop.poles])
+    ends = []
+    for offset in (0.0, 2.0):
+        distance = xp.abs(roots - offset)
+        nearest = xp.min(xp.where(distance > 1e-13, distance, np.inf), 0)
+        ends.append(xp.minimum(nearest, 1.0 / form.phase_rate))
+    return FIRST_NODE * ends[0], LAST_NODE * ends[1] ** (2.0 / 3.0)
+
+
+def _find_near(loop: LoopBatch) -> tuple[Array, Array, Array]:
+    """Return angle, distance from the circle, and nearness of the zeros of G and poles of F in the upper half-plane."""
+    xp = namespace(loop.gain)
+    roots = xp.concatenate([loop.plant_zeros, loop.poles])
+    angle, distance = xp.angle(1.0 - roots), xp.abs(distances_inside(roots))
+    near = (angle > 1e-9) & (angle < np.pi - 1e-9) & (distance < NEAR_CIRCLE * xp.minimum(angle, 1.0))
+    return angle, distance, near
+
+
+def place_nodes(form: Form, loop: LoopBatch, sizes: Sizes) -> Array:
+    """Return the angles of the nodes, ascending, shape (nodes, loops)."""
+    xp = namespace(loop.gain)
+    first, last = _find_ends(form, loop)
+    counts = sizes.density * sizes.low, sizes.density * sizes.high
+    low, high = (xp.asarray(np.linspace(0.0, 1.0, count)[:, None]) for count in counts)
+    inner = sizes.density * int(np.ceil((np.pi - 2.0 * SPLIT) / min(STEP, PHASE_STEP / form.phase_rate))) + 1
+    middle = xp.asarray(np.linspace(SPLIT, np.pi - SPLIT, inner)[1:-1, None])
+    parts = [first * (SPLIT / first) ** low, middle + 0.0 * first, np.pi - SPLIT * (last / SPLIT) ** high]
+    if not sizes.clusters:
+        return xp.concatenate(parts)
+    angle, distance, near = _find_near(loop)
+    order = xp.argsort(xp.where(near, distance, np.inf), 0)[: sizes.clusters]
+    cluster = xp.asarray(np.linspace(-1.0, 1.0, sizes.density * CLUSTER_NODES)[:, None])
+    for row in order:
+        radius, center = (xp.take_along_axis(part, row[None], 0)[0] for part in (distance, angle))
+        radius = xp.maximum(radius, CLOSEST)
+        offset = radius * xp.sinh(xp.arcsinh(CLUSTER_REACH / radius) * cluster)
+        parts.append(xp.clip(center + offset, first, np.pi - last))
+    return xp.sort(xp.concatenate(parts), 0)
+
+
+class Sampled(NamedTuple):
+    """Loops with the values at their nodes from which k of every line follows (V23)."""
 
     form: Form
     loop: LoopBatch
-    states: DiscreteChain | None
+    w: Array
+    parts: tuple[Array, Array, Array]  # Im q, Im(q conj F), Im F
+    slopes: tuple[Array, Array, Array]  # their derivatives in w
+    levels: tuple[Array, Array]  # Re(q conj F)/|F|^2 and Re F/|F|^2, of which t on a line of constant K consists
+    ends: Values  # at z = -1
+    resolved: Array  # of each loop: whether the nodes resolve q and F
+
+    def count_start(self, k_first: Array) -> Array:
+        """Return the number of poles outside the circle for the softest walls of a ray, from k at the first node."""
+        # For t -> 0 the other poles are inside. One pole at z = 1 enters the circle, or two of them form a pair close
+        # to z = 1: both are outside if k is positive at small angles (V23).
+        xp = namespace(k_first)
+        return xp.where(k_first < 0, 0.0, self.loop.integrators)
 
 
-def build_loops(chain: AnyChain, size: int) -> DeviceBatch:
-    """Return the loops of a chain whose parameters are numbers or arrays of shape (size,)."""
-    f, fraction = chain.estimate, chain.d - chain.n_delay
-    form, states = Form(chain.n_delay + 1, f.window, f.lag), None
-    if isinstance(chain, Chain) and chain.rigid:
-        plant = _discretize_rigid(chain.bodies[0].damping, fraction, size)
-    else:
-        A, B = _stack_states(chain, size)
-        states = _discretize(A, B, fraction, chain.sampled)
-        plant = _factor(chain, states)
-    roots = (part[:, None] if np.ndim(part) < 2 else part for part in (f.zeros, f.poles))
-    xp = namespace(plant.numerator, f.gain)
-    estimate = [xp.broadcast_to(xp.asarray(f.gain), (size,)), *(xp.broadcast_to(r, (r.shape[0], size)) for r in roots)]
-    loop = LoopBatch(*plant[:2], *estimate, *plant[2:])
-    if states is not None:
-        # Make the gain of a loop NaN, and thereby all its results, if rounding errors spoil its polynomials.
-        exact = xp.all(xp.stack([compare_responses(form, loop, states, w) for w in TEST_ANGLES]), 0)
-        loop = loop._replace(gain=xp.where(exact, loop.gain, np.nan))
-    return DeviceBatch(form, loop, states)
+def sample(form: Form, loop: LoopBatch, sizes: Sizes) -> Sampled:
+    """Evaluate loops at their nodes."""
+    xp, w = namespace(loop.gain), place_nodes(form, loop, sizes)
+    values = evaluate(form, loop, w)
+    parts, slopes = split_values(values)
+    size = values.f.real**2 + values.f.imag**2
+    levels = (values.q.real * values.f.real + values.q.imag * values.f.imag) / size, values.f.real / size
+    points = circle_points(w)
+    crowding = form.phase_rate + sum(1.0 / xp.abs(points.z_minus_1 + root) for root in (*loop.plant_zeros, *loop.poles))
+    crowding = xp.minimum(crowding[1:], crowding[:-1]) * (w[1:] - w[:-1])
+    decaying = distances_inside(loop.plant_poles) > INSIDE * xp.abs(loop.plant_poles)
+    decaying = decaying | (xp.arange(loop.plant_poles.shape[0])[:, None] < loop.integrators)
+    resolved = xp.all(crowding < RESOLUTION, 0) & xp.all(decaying, 0) & (loop.integrators <= 2)
+    ends = evaluate(form, loop, np.pi + 0.0 * loop.gain)
+    return Sampled(form, loop, w, parts, slopes, levels, ends, resolved)
 
 
-def compare_responses(form: Form, loop: LoopBatch, states: DiscreteChain, w: Any) -> Array:
-    """Return whether q by the polynomials agrees with q by the matrices at an angle, or at one angle per loop."""
-    xp = namespace(loop.gain)
-    w = w + 0.0 * loop.numerator[0]
-    points = circle_points(xp.where(xp.isfinite(w), w, 0.5))
-    zeta = points.z_minus_1[:, None]
-    matrix = zeta[..., None] * xp.eye(states.full.shape[-1]) - states.psi
-    state = xp.linalg.solve(matrix, (zeta * states.late + states.full)[..., None])
-    q = -xp.exp(1j * form.lag * points.w) / state[:, 0, 0]
-    return xp.abs(evaluate(form, loop, points.w).q / q - 1.0) < RESPONSE_TOLERANCE
-
-
-def _discretize_rigid(damping: Any, fraction: Any, size: int) -> _Plant:
-    """Return G of rigid masses in closed form."""
-    xp = namespace(damping, fraction)
-    delta = xp.broadcast_to(xp.asarray(damping), (size,)) + 0.0
-    plant = discretize_mass(delta, xp.broadcast_to(xp.asarray(fraction), (size,)) + 0.0)
-    h, q = factor_numerator(plant)
-    one = xp.ones_like(delta)
-    return _Plant(
-        xp.stack([plant.a2 + plant.a1 + plant.a0, 2.0 * plant.a2 + plant.a1, plant.a2]),
-        xp.stack([0.0 * one, plant.em, one]),
-        xp.stack([one + h / plant.a2, one + q]) + 0j,
-        xp.stack([0.0 * one, plant.em]) + 0j,
-        xp.where(delta > 0, 1.0, 2.0),
-    )
-
-
-def _stack_states(chain: AnyChain, size: int) -> tuple[Array, Array]:
-    """Return the state matrices, shape (size, n, n), and input vectors, shape (size, n), of a chain."""
-    if not isinstance(chain, System):
-        A, B, _ = chain.realize()
-        xp = namespace(A)
-        A, B = (xp.broadcast_to(part[..., None] if part.ndim == axes else part, (*part.shape[:axes], size)) for part, axes in ((A, 2), (B, 1)))
-        return xp.moveaxis(A, -1, 0) + 0.0, xp.moveaxis(B, -1, 0) + 0.0
-    # The matrices of a linear system do not depend on the period; only their units do.
-    A, B, _ = System(chain.device, 1.0, 1.0, chain.d, chain.n_delay, chain.estimate).realize()
-    xp = namespace(chain.period, chain.mass)
-    period = xp.broadcast_to(xp.asarray(chain.period), (size,))[:, None]
-    if chain.sampled:
-        return A + 0.0 * period[..., None], B * (chain.mass / period**2)
-    return A * period[..., None], B * (chain.mass / period)
-
-
-def _discretize(A: Array, B: Array, fraction: Any, sampled: bool) -> DiscreteChain:
-    """Return the discretized devices; without a fractional delay, ``late`` is ``full``."""
-    xp = namespace(A, fraction)
-    if sampled:
-        return DiscreteChain(A - xp.eye(A.shape[-1]), B, B)
-    psi, full = compute_transition(A, B, 1.0)
-    return DiscreteChain(psi, full, full if is_zero(fraction) else compute_transition(A, B, 1.0 - fraction)[1])
-
-
-def _factor(chain: AnyChain, states: DiscreteChain) -> _Plant:
-    """Return G of discretized devices as polynomials, and its zeros and poles."""
-    psi, full, late = states
-    xp = namespace(psi)
-    zeros = -xp.linalg.eigvals(_realize_zeros(states)).T + 0j
-    offsets, integrators = _find_poles(chain, psi)
-    return _Plant(late[:, 0] * _expand(zeros), _expand(offsets), zeros, offsets, integrators)
-
-
-def _realize_zeros(states: DiscreteChain) -> Array:
-    """Return matrices whose eigenvalues are the zeros of G in zeta.
-
-    G is 0 if a force u with ``(zeta - Psi) x = (zeta late + full) u`` leaves the position, the first entry of x, at 0.
-    With y = x - late u, without its first entry, this is an eigenvalue problem of (y, u).
-    """
-    xp = namespace(states.psi)
-    psi, full, late = states
-    inner, row = psi[:, 1:, 1:], psi[:, :1, 1:]
-    column = inner @ late[:, 1:, None] + full[:, 1:, None]
-    last = xp.concatenate([row, row @ late[:, 1:, None] + full[:, :1, None]], -1) / -late[:, :1, None]
-    matrix = xp.concatenate([xp.concatenate([inner, column], -1), last], -2)
-    return xp.where(xp.isfinite(matrix), matrix, 0.0)
-
-
-def _expand(offsets: Array) -> Array:
-    """Return the coefficients of ``prod(zeta + offset)``, lowest power first."""
-    xp = namespace(offsets)
-    one, zero = xp.ones_like(offsets[:1]), xp.zeros_like(offsets[:1])
-    product = one
-    for offset in offsets:
-        product = xp.concatenate([zero, product]) + offset * xp.concatenate([product, zero])
-    return product.real
-
-
-def _find_poles(chain: AnyChain, psi: Array) -> tuple[Array, Array]:
-    """Return the offsets of all poles of G, and the number of those at z = 1, which are first."""
-    xp, size = namespace(psi), psi.shape[0]
-    if isinstance(chain, System):
-        device = chain.device
-        exact = device.offsets[1] if chain.sampled else -device.poles
-        exact = exact[np.argsort(np.abs(exact))][:, None]
-        offsets = exact + 0.0 * psi[:, 0, 0] if chain.sampled else -xp.expm1(-exact * xp.asarray(chain.period))
-        return xp.broadcast_to(offsets, (exact.size, size)), xp.full((size,), float(np.sum(exact == 0)))
-    offsets = -xp.linalg.eigvals(xp.where(xp.isfinite(psi), psi, 0.0)).T + 0j
-    if not all(is_zero(body.stiffness) for body in chain.bodies):
-        return offsets, xp.zeros(size)
-    # One pole is at z = 1, and a second one if no damper connects the device to ground.
-    offsets = xp.take_along_axis(offsets, xp.argsort(xp.abs(offsets), 0), 0)
-    damping = sum(body.damping for body in chain.bodies) + xp.zeros(size)
-    count = xp.where(damping > 0, 1.0, 2.0)
-    return xp.where(xp.arange(offsets.shape[0])[:, None] < count, 0.0, offsets), count
-
-
-BLOCK_SIZE = 1 << 9  # loops per call; their arrays fit in the cache
-LONGEST_DELAY = 64  # in periods; longer delays need so many nodes that a batch saves no time
-
-
-def map_loops(
-    scene: Parts, values: dict[str, np.ndarray], d: np.ndarray, function: Callable[..., tuple[np.ndarray, ...]]
-) -> list[np.ndarray]:
-    """Apply a function to the loops of many scenes of one structure, in blocks of loops with equally many nodes.
-
-    The results for a scene do not depend on the other scenes, bit for bit.
-
-    Args:
-        scene: a scene of this structure, whose other parameters all scenes share.
-        values: parameters by dotted path, arrays of shape (scenes,).
-        d: delays in periods, shape (scenes,).
-        function: maps form, loops, `Sizes`, discretized devices, and the indices of the scenes to arrays, whose last
-            axis is that of the loops.
-
-    Returns:
-        The arrays of the function for all scenes; 0 or False for delays above `LONGEST_DELAY`.
-    """
-    whole, tasks = np.floor(d), []
-    for n in np.unique(whole[whole <= LONGEST_DELAY]).astype(int).tolist():
-        index = _pad(np.flatnonzero(whole == n))
-        filled = fill_parameters(scene, {path: column[index] for path, column in values.items()})
-        fraction = d[index] if np.any(d[index] != n) else np.float64(n)
-        batch = build_loops(build_chain(filled, (fraction, n)), index.size)
-        sizes, group = np.unique(count_nodes(batch.form, batch.loop), axis=1, return_inverse=True)
-        for k, column in enumerate(sizes.T.tolist()):
-            members = np.flatnonzero(group.reshape(-1) == k)
-            tasks += [
-                (batch, Sizes(*column), index, members[start : start + BLOCK_SIZE])
-                for start in range(0, members.size, BLOCK_SIZE)
-            ]
-
-    def run(task: tuple[DeviceBatch, Sizes, np.ndarray, np.ndarray]) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        batch, sizes, index, members = task
-        padded = _pad(members)
-        states = batch.states and DiscreteChain(*(part[padded] for part in batch.states))
-        with np.errstate(all="ignore"):
-            results = function(batch.form, batch.loop.take(padded), sizes, states, index[padded])
-        return index[members], tuple(part[..., : members.size] for part in results)
-
-    whole_results: list[np.ndarray] = []
-    for index, results in run_in_threads(run, tasks):
-        whole_results = whole_results or [np.zeros((*part.shape[:-1], d.size), part.dtype) for part in results]
-        for to, part in zip(whole_results, results, strict=True):
-            to[..., index] = part
-    return whole_results
-
-
-def _pad(index: np.ndarray) -> np.ndarray:
-    """Return indices, padded with the last one to a multiple of `LANES`."""
-    return np.pad(index, (0, -index.size % LANES), mode="edge")
+def split_values(values: Values) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
+    """Return Im q, Im(q conj F) and Im F, and their derivatives in w."""
+    q, q_slope, f, f_slope = values
+    cross = q.imag * f.real - q.real * f.imag
+    cross_slope = q_slope.imag * f.real - q_slope.real * f.imag + q.imag * f_slope.real - q.real * f_slope.imag
+    return (q.imag + 0.0, cross, f.imag + 0.0), (q_slope.imag + 0.0, cross_slope, f_slope.imag + 0.0)

@@ -1,7 +1,6 @@
 """Count the unstable poles along lines of walls for many loops at once, with the same source code for NumPy and JAX.
 
-All loops have the same *form*: orders, integer delay and window. The last axis of every array belongs to the loops, the
-first one to coefficients, angles (*nodes*) or crossings. A *line* consists of the walls
+A *line* consists of the walls
 
     alpha = a0 + a1 t        beta = b0 + b1 t
 
@@ -10,10 +9,10 @@ line has a pole at ``z = e^(jw)`` if and only if (docs/theory/scenes.md, V23)
 
     k(w) = Im((q - c0) conj c1) = 0      t = Re((q - c0) conj c1)/|c1|^2      c0 = a0 + b0 F,  c1 = a1 + b1 F
 
-with the critical controller q = -1/G and the velocity estimate F. A pole pair leaves the unit circle as t increases if
-k increases with w at the crossing, and enters it if k decreases. So the number of poles outside the circle follows from
-the sign changes of k between nodes. A result is *doubtful* if the nodes do not resolve k; the caller then has to use
-`stability.linear.boundary`, which adapts its nodes to each loop.
+A pole pair leaves the unit circle as t increases if k increases with w at the crossing, and enters it if k decreases.
+So the number of poles outside the circle follows from the sign changes of k between nodes. A result is *doubtful* if
+the nodes do not resolve k; the caller then has to use `stability.linear.boundary`, whose nodes are adapted to one loop.
+Symbols, nodes and shapes are those of `stability.linear.loop_batch`.
 """
 
 from __future__ import annotations
@@ -24,25 +23,9 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import iterate, namespace
-from zwidth.model.circle_functions import CirclePoints, Jet, circle_points, distances_inside
-from zwidth.model.velocity import Estimate
+from zwidth.model.circle_functions import distances_inside
+from zwidth.stability.linear.loop_batch import Sampled, Values, evaluate, split_values
 
-# Nodes, as angles w. They are geometrically spaced towards w = 0 and w = pi, equidistant between these ranges, and
-# condensed near zeros of G and poles of F that are close to the unit circle, where q or F changes fast.
-SPLIT = 0.3  # width in rad of the two ranges with geometric spacing
-FIRST_NODE = 1e-3  # first node, relative to the distance of the nearest root from z = 1
-LAST_NODE = 1e-4  # pi - w of the last node, as in `stability.linear.curve.place_nodes`
-LOW_RATIO, HIGH_RATIO = 0.2, 0.25  # steps in log w near 0 and in log(pi - w) near pi
-STEP, PHASE_STEP = 0.08, 0.4  # largest step between these ranges in rad, and of the phase of z^lag in rad
-BUCKET = 32  # the numbers of nodes in the ranges are multiples of this, so that many loops share a shape
-NEAR_CIRCLE = 0.25  # distance from the circle of a root with its own nodes, relative to its angle (at most 1 rad)
-CLUSTER_NODES = 31  # around one root
-CLUSTER_REACH = 0.15  # rad
-CLOSEST = 1e-7  # smallest spacing of these nodes in rad
-# Largest sum of step/distance over all zeros of G and poles of F at which a step between nodes counts as resolved.
-RESOLUTION = 1.5
-
-# Crossings
 MOST_CROSSINGS = 12  # changes of sign of k from node to node per line; a line with more is doubtful
 MOST_TURNS = 3  # steps per line in which k may turn; a line with more is doubtful
 TURN_STEPS = 10  # steps for the extremum of k
@@ -51,49 +34,7 @@ STEPS = 10  # largest number of Newton steps for the angle of a crossing
 CONVERGED_STEP = 1e-13  # relative to w
 LARGEST_STEP = 1e-9  # the last step of a crossing that is not doubtful, relative to w
 LANES = 16  # lists of crossings are padded to a multiple of this, because NumPy rounds differently in a remainder
-
-# Poles of the loop without a wall
-INSIDE = 1e-10  # smallest distance inside the unit circle, relative to the distance from z = 1, of a decaying pole
 ON_CIRCLE = 1e-6  # distance from the circle below which the poles near a zero of G for large |alpha| are not counted
-
-
-class Form(NamedTuple):
-    """The structure that all loops of a batch share."""
-
-    lag: int  # of G: integer delay plus 1 for a fractional delay
-    window: int  # of the velocity estimate, as in `Estimate`
-    estimate_lag: int
-
-    @property
-    def phase_rate(self) -> float:
-        """Bound on the derivative of the phases of the powers of z in q and F, in rad per rad."""
-        return self.lag + self.window + abs(self.estimate_lag) + 1.0
-
-
-class LoopBatch(NamedTuple):
-    """Loops without their walls: ``G = numerator/(denominator z^lag)``, polynomials in z - 1, lowest power first."""
-
-    numerator: Array  # shape (coefficients, loops)
-    denominator: Array
-    gain: Array  # of F, shape (loops,)
-    zeros: Array  # offsets 1 - z of the zeros of F, shape (zeros, loops)
-    poles: Array  # offsets of the poles of F
-    plant_zeros: Array  # offsets of the zeros of G
-    plant_poles: Array  # offsets of the poles of G, those at z = 1 first
-    integrators: Array  # number of poles of G at z = 1
-
-    def take(self, index: Array) -> LoopBatch:
-        """Return the loops with the given indices."""
-        return LoopBatch(*(leaf[..., index] for leaf in self))
-
-
-class Values(NamedTuple):
-    """q, F and their derivatives at angles w."""
-
-    q: Array
-    q_slope: Array
-    f: Array
-    f_slope: Array
 
 
 class Line(NamedTuple):
@@ -105,151 +46,13 @@ class Line(NamedTuple):
     b1: Any = 0.0
 
 
-def evaluate(form: Form, loop: LoopBatch, w: Array) -> Values:
-    """Return q and F and their derivatives in w at angles of shape (..., loops)."""
-    xp, points = namespace(w), circle_points(w)
-    top, top_slope = _horner(loop.numerator, points.z_minus_1)
-    bottom, bottom_slope = _horner(loop.denominator, points.z_minus_1)
-    power = xp.where(w >= np.pi, (-1.0) ** form.lag + 0j, xp.exp(1j * form.lag * w))
-    ratio = bottom / top
-    slope = -power * (1j * points.z * (bottom_slope - ratio * top_slope) / top + 1j * form.lag * ratio)
-    f = Estimate(form.window, loop.gain, form.estimate_lag).jet(points)
-    for offset in loop.zeros:
-        f = f.times(_subtract_root(points, offset))
-    for offset in loop.poles:
-        f = f.over(_subtract_root(points, offset))
-    return Values(-power * ratio, slope, f.value, f.slope)
-
-
-def _subtract_root(points: CirclePoints, offset: Array) -> Jet:
-    """Return z - root and its derivative in w, without cancellation for roots near z = 1 or z = -1."""
-    xp = namespace(points.w)
-    # Roots near z = -1 need z + 1, which is accurate there (V16).
-    left = offset.real > 1.0
-    value = xp.where(left, points.z_plus_1 + (offset - 2.0), points.z_minus_1 + offset) if bool(np.any(left)) else points.z_minus_1 + offset
-    return Jet(value, 1j * points.z)
-
-
-def _horner(coefficients: Array, x: Array) -> tuple[Array, Array]:
-    """Return a polynomial and its derivative at x; the coefficients are given from the lowest power up."""
-    value, slope = coefficients[-1] + 0.0 * x, 0.0 * x
-    for coefficient in coefficients[-2::-1]:
-        value, slope = value * x + coefficient, slope * x + value
-    return value, slope
-
-
-class Sizes(NamedTuple):
-    """Numbers of nodes, which determine the shapes of all arrays."""
-
-    low: int  # near w = 0
-    high: int  # near pi
-    clusters: int  # roots with their own nodes
-    density: int = 1  # factor of all numbers of nodes
-
-
-def count_nodes(form: Form, loop: LoopBatch) -> np.ndarray:
-    """Return the `Sizes` of each loop of a NumPy batch, shape (3, loops); loops of equal sizes can be computed together.
-
-    The sizes of a loop do not depend on the other loops, so its results do not depend on them either.
-    """
-    first, last = _find_ends(form, loop)
-    counts = np.log(SPLIT / np.stack([first, last])) / np.array([[LOW_RATIO], [HIGH_RATIO]])
-    return np.concatenate([BUCKET * np.ceil(counts / BUCKET), _find_near(loop)[2].sum(0)[None]]).astype(int)
-
-
-def _find_ends(form: Form, loop: LoopBatch) -> tuple[Array, Array]:
-    """Return the first node, and the distance of the last node from pi."""
-    xp = namespace(loop.gain)
-    roots = xp.concatenate([loop.plant_zeros, loop.plant_poles, loop.zeros, loop.poles])
-    ends = []
-    for offset in (0.0, 2.0):
-        distance = xp.abs(roots - offset)
-        nearest = xp.min(xp.where(distance > 1e-13, distance, np.inf), 0)
-        ends.append(xp.minimum(nearest, 1.0 / form.phase_rate))
-    return FIRST_NODE * ends[0], LAST_NODE * ends[1] ** (2.0 / 3.0)
-
-
-def _find_near(loop: LoopBatch) -> tuple[Array, Array, Array]:
-    """Return angle, distance from the circle, and nearness of the zeros of G and poles of F in the upper half-plane."""
-    xp = namespace(loop.gain)
-    roots = xp.concatenate([loop.plant_zeros, loop.poles])
-    angle, distance = xp.angle(1.0 - roots), xp.abs(distances_inside(roots))
-    near = (angle > 1e-9) & (angle < np.pi - 1e-9) & (distance < NEAR_CIRCLE * xp.minimum(angle, 1.0))
-    return angle, distance, near
-
-
-def place_nodes(form: Form, loop: LoopBatch, sizes: Sizes) -> Array:
-    """Return the angles of the nodes, ascending, shape (nodes, loops)."""
-    xp = namespace(loop.gain)
-    first, last = _find_ends(form, loop)
-    counts = sizes.density * sizes.low, sizes.density * sizes.high
-    low, high = (xp.asarray(np.linspace(0.0, 1.0, count)[:, None]) for count in counts)
-    inner = sizes.density * int(np.ceil((np.pi - 2.0 * SPLIT) / min(STEP, PHASE_STEP / form.phase_rate))) + 1
-    middle = xp.asarray(np.linspace(SPLIT, np.pi - SPLIT, inner)[1:-1, None])
-    parts = [first * (SPLIT / first) ** low, middle + 0.0 * first, np.pi - SPLIT * (last / SPLIT) ** high]
-    if not sizes.clusters:
-        return xp.concatenate(parts)
-    angle, distance, near = _find_near(loop)
-    order = xp.argsort(xp.where(near, distance, np.inf), 0)[: sizes.clusters]
-    cluster = xp.asarray(np.linspace(-1.0, 1.0, sizes.density * CLUSTER_NODES)[:, None])
-    for row in order:
-        radius, center = (xp.take_along_axis(part, row[None], 0)[0] for part in (distance, angle))
-        radius = xp.maximum(radius, CLOSEST)
-        offset = radius * xp.sinh(xp.arcsinh(CLUSTER_REACH / radius) * cluster)
-        parts.append(xp.clip(center + offset, first, np.pi - last))
-    return xp.sort(xp.concatenate(parts), 0)
-
-
-class Sampled(NamedTuple):
-    """Loops with the values at their nodes from which k of every line follows (V23)."""
-
-    form: Form
-    loop: LoopBatch
-    w: Array
-    parts: tuple[Array, Array, Array]  # Im q, Im(q conj F), Im F
-    slopes: tuple[Array, Array, Array]  # their derivatives in w
-    levels: tuple[Array, Array]  # Re(q conj F)/|F|^2 and Re F/|F|^2, of which t on a line of constant K consists
-    ends: Values  # at z = -1
-    resolved: Array  # of each loop: whether the nodes resolve q and F
-
-    def count_start(self, k_first: Array) -> Array:
-        """Return the number of poles outside the circle for the softest walls of a ray, from k at the first node."""
-        # For t -> 0 the other poles are inside. One pole at z = 1 enters the circle, or two of them form a pair close
-        # to z = 1: both are outside if k is positive at small angles (V23).
-        xp = namespace(k_first)
-        return xp.where(k_first < 0, 0.0, self.loop.integrators)
-
-
-def sample(form: Form, loop: LoopBatch, sizes: Sizes) -> Sampled:
-    """Evaluate loops at their nodes."""
-    xp, w = namespace(loop.gain), place_nodes(form, loop, sizes)
-    values = evaluate(form, loop, w)
-    parts, slopes = _split(values)
-    size = values.f.real**2 + values.f.imag**2
-    levels = (values.q.real * values.f.real + values.q.imag * values.f.imag) / size, values.f.real / size
-    points = circle_points(w)
-    crowding = form.phase_rate + sum(1.0 / xp.abs(points.z_minus_1 + root) for root in (*loop.plant_zeros, *loop.poles))
-    crowding = xp.minimum(crowding[1:], crowding[:-1]) * (w[1:] - w[:-1])
-    decaying = distances_inside(loop.plant_poles) > INSIDE * xp.abs(loop.plant_poles)
-    decaying = decaying | (xp.arange(loop.plant_poles.shape[0])[:, None] < loop.integrators)
-    resolved = xp.all(crowding < RESOLUTION, 0) & xp.all(decaying, 0) & (loop.integrators <= 2)
-    ends = evaluate(form, loop, np.pi + 0.0 * loop.gain)
-    return Sampled(form, loop, w, parts, slopes, levels, ends, resolved)
-
-
-def _split(values: Values) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
-    """Return Im q, Im(q conj F) and Im F, and their derivatives in w."""
-    q, q_slope, f, f_slope = values
-    cross = q.imag * f.real - q.real * f.imag
-    cross_slope = q_slope.imag * f.real - q_slope.real * f.imag + q.imag * f_slope.real - q.real * f_slope.imag
-    return (q.imag + 0.0, cross, f.imag + 0.0), (q_slope.imag + 0.0, cross_slope, f_slope.imag + 0.0)
-
-
 def combine(line: Line, parts: tuple[Array, Array, Array]) -> Array:
     """Return k of a line, or its derivative, from the parts of `_split`."""
     a0, b0, a1, b1 = line
     weights = a1, b1, a0 * b1 - b0 * a1
-    return sum(weight * part for weight, part in zip(weights, parts, strict=True) if not isinstance(weight, float) or weight)
+    return sum(
+        weight * part for weight, part in zip(weights, parts, strict=True) if not isinstance(weight, float) or weight
+    )
 
 
 def find_position(line: Line, values: Values) -> Array:
@@ -303,6 +106,7 @@ class Crossings(NamedTuple):
 
     t: Array  # shape (crossings, loops); infinite for unused entries
     leaving: Array  # net number of poles that leave the circle as t increases
+    w: Array  # angle of the poles on the circle; only the node before it if interpolated
     cell: Array  # index of the node before the crossing, -1 for the pole at z = -1
     doubtful: Array  # shape (loops,)
 
@@ -324,12 +128,12 @@ class Crossings(NamedTuple):
         return start + xp.sum(xp.where((self.t > 0) & (self.t < t), self.leaving, 0.0), 0)
 
 
-def sort_crossings(t: Array, leaving: Array, cell: Array, doubtful: Array) -> Crossings:
+def sort_crossings(t: Array, leaving: Array, w: Array, cell: Array, doubtful: Array) -> Crossings:
     """Return crossings in ascending order of t."""
     xp = namespace(t)
     t = xp.where(xp.isnan(t), np.inf, t)
     order = xp.argsort(t, 0)
-    return Crossings(*(xp.take_along_axis(part, order, 0) for part in (t, leaving, cell)), doubtful)
+    return Crossings(*(xp.take_along_axis(part, order, 0) for part in (t, leaving, w, cell)), doubtful)
 
 
 def find_crossings(loops: Sampled, line: Line) -> Crossings:
@@ -363,7 +167,7 @@ def find_crossings(loops: Sampled, line: Line) -> Crossings:
 
     def refine(state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, x, move = state
-        parts, slopes = _split(evaluate(loops.form, part, x))
+        parts, slopes = split_values(evaluate(loops.form, part, x))
         value = combine(each, parts)
         passed = (value > 0) == rising
         low, high = xp.where(passed, low, x), xp.where(passed, x, high)
@@ -380,15 +184,16 @@ def find_crossings(loops: Sampled, line: Line) -> Crossings:
     leaving = xp.where(crosses, xp.where(rising, 2.0, -2.0), 0.0)
     poor = crosses & (move > LARGEST_STEP * crossing)
     columns = [
-        _tabulate_lists(lists, values, fill) for values, fill in ((t, np.inf), (leaving, 0.0), (index[0], -1), (poor, False))
+        _tabulate_lists(lists, values, fill)
+        for values, fill in ((t, np.inf), (leaving, 0.0), (crossing, np.nan), (index[0], -1), (poor, False))
     ]
     # Add the pole at z = -1. Between the last node and z = -1, k must not change its sign.
     end, end_slope = cross_end(loops, line)
     turned = (end_slope != 0) & ((k[-1] > 0) != (end_slope < 0))
-    doubtful = unclear | cells.crowded | turns.crowded | xp.any(columns[3], 0) | turned
+    doubtful = unclear | cells.crowded | turns.crowded | xp.any(columns[4], 0) | turned
     doubtful = doubtful | xp.any(~xp.isfinite(k), 0)
-    last_row = end[None], xp.sign(end_slope)[None], xp.full((1, n), -1)
-    return sort_crossings(*(xp.concatenate(both) for both in zip(columns, last_row)), doubtful)
+    last_row = end[None], xp.sign(end_slope)[None], xp.full((1, n), np.pi), xp.full((1, n), -1)
+    return sort_crossings(*(xp.concatenate(both) for both in zip(columns, last_row, strict=False)), doubtful)
 
 
 def _take_line(line: Line, index: Array, n: int) -> Line:
@@ -413,7 +218,7 @@ def _find_turns(loops: Sampled, line: Line, turns: Cells, k: Array, slope: Array
 
     def bisect(state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, first, last, x, side = state
-        value = combine(each, _split(evaluate(loops.form, part, x))[1])
+        value = combine(each, split_values(evaluate(loops.form, part, x))[1])
         before = (value > 0) == (first > 0)
         # The Illinois method
         new_first = xp.where(before, value, xp.where(side < 0, 0.5 * first, first))
@@ -427,9 +232,12 @@ def _find_turns(loops: Sampled, line: Line, turns: Cells, k: Array, slope: Array
     first, last = slope[turns.cell, turns.loop], slope[turns.cell + 1, turns.loop]
     begin = low, high, first, last, 0.5 * (low + high), 0.0 * low
     x = iterate(TURN_STEPS, bisect, begin, xp)[4]
-    parts = _split(evaluate(loops.form, part, x))[0]
+    parts = split_values(evaluate(loops.form, part, x))[0]
     value, node = combine(each, parts), k[turns.cell, turns.loop]
-    size = sum(abs(weight * term) for weight, term in zip((each.a1, each.b1, each.a0 * each.b1 - each.b0 * each.a1), parts, strict=True))
+    size = sum(
+        abs(weight * term)
+        for weight, term in zip((each.a1, each.b1, each.a0 * each.b1 - each.b0 * each.a1), parts, strict=True)
+    )
     unclear = xp.any(tabulate(turns, xp.abs(value) <= TURN_TOLERANCE * size, False), 0)
     return (xp.where(turns.valid, x, low), xp.where(turns.valid, value, node)), unclear
 
@@ -438,7 +246,7 @@ def cross_end(loops: Sampled, line: Line) -> tuple[Array, Array]:
     """Return t of the wall with a pole at z = -1, infinite if there is none, and the derivative of k there."""
     xp = namespace(loops.w)
     t = find_position(line, loops.ends)
-    return xp.where(xp.isfinite(t), t, np.inf), combine(line, _split(loops.ends)[1])
+    return xp.where(xp.isfinite(t), t, np.inf), combine(line, split_values(loops.ends)[1])
 
 
 def count_far(loops: Sampled) -> tuple[Array, Array]:
@@ -460,9 +268,9 @@ def count_outside(loops: Sampled, alpha: Array, beta: Array) -> tuple[Array, Arr
 
 
 def find_stiffness_limits(loops: Sampled, beta: Array) -> tuple[Array, Array]:
-    """Return the upper end of the stable interval of alpha from K = 0 on at one beta per loop, and whether it is doubtful.
+    """Return the upper end of the stable interval of alpha that starts at K = 0, and whether the end is doubtful.
 
-    The end is 0 if the softest walls with this beta are unstable.
+    The lines are those of one beta per loop. The end is 0 if the softest walls with this beta are unstable.
     """
     xp = namespace(loops.w)
     row = find_crossings(loops, Line(b0=beta, a1=1.0))
