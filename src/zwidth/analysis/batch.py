@@ -21,6 +21,7 @@ from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError, describe_choice
 from zwidth.core.status import RidgeKind
 from zwidth.core.types import ArrayLike
+from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.parameter_paths import find_parts
 from zwidth.numerics.evaluate import as_float64, join_shapes
 from zwidth.stability.results import RidgePoint
@@ -90,13 +91,14 @@ def stiffest_walls(
     for k, scene in enumerate(members):
         check_scene(scene, "stiffest_walls")
         groups.setdefault((_describe_structure(scene), allows_negative(scene, negative_damping)), []).append(k)
-    table = np.full((4, len(members)), np.nan)
+    table = np.full((3, len(members)), np.nan)
     kind, status = np.full(len(members), int(RidgeKind.NONE), np.int32), np.zeros(len(members), np.int32)
     searched = np.ones(len(members), bool)
     for (_, negative), index in groups.items():
         walls = _solve_group([members[k] for k in index], negative)
-        table[:3, index], kind[index], status[index], searched[index] = walls[:3], *walls[3:]
-    return StiffestWalls(*table[:3], kind, status, searched)
+        table[:, index], kind[index], status[index] = walls[:3], walls.kind, walls.status
+        searched[index] = walls.searched
+    return StiffestWalls._make([*table, kind, status, searched])
 
 
 def _vary_scene(scene: SceneOptima, parameters: Mapping[str, ArrayLike], negative: bool | None) -> StiffestWalls:
@@ -146,11 +148,13 @@ def _convert(variants: Variants, point: RidgePoint, searched: np.ndarray) -> Sti
     with np.errstate(all="ignore"):
         rate = mass / period
         numbers = point.alpha * rate / period, point.beta * rate, point.omega / (2.0 * math.pi * period)
-    return StiffestWalls(*numbers, point.kind.astype(np.int32), point.status.astype(np.int32), searched)
+    return StiffestWalls._make([*numbers, point.kind.astype(np.int32), point.status.astype(np.int32), searched])
 
 
 def _describe_structure(scene: SceneOptima) -> tuple[Any, ...]:
     """Return a hashable description of a scene without its continuous parameters."""
+    if isinstance(scene.device, MeasuredDevice):
+        return (id(scene),)
     parts = {"device": scene.device, **find_parts(scene)}
     described: list[Any] = []
     for name, part in parts.items():

@@ -91,11 +91,10 @@ class Variants:
             for name, column in values.items():
                 key = f"mode.{name.rpartition('.')[2]}" if name.startswith("modes.") else name
                 usable &= np.isfinite(column) & (FIELDS[key].allowed.holds(column) if key in FIELDS else False)
-            every = {path: values.get(path, value) for path, value in nominal.items()}
+            every: dict[str, Any] = {path: values.get(path, value) for path, value in nominal.items()}
             cutoff = every.get("velocity.cutoff", 0.0) * every.get("velocity.coded_period", period)
             usable &= cutoff < 0.5
             usable &= every.get("operator.mass", 1.0) > 0 if "operator.coupling_stiffness" in nominal else True
-            usable &= every.get("modes.0.mass", 1.0) != 0
         hand = scene.operator
         rigid = hand is not None and hand.rigid and scene.device.coupling is None
         mass = every.get("mass", float(scene.mass)) + (every["operator.mass"] if rigid else 0.0)
@@ -129,11 +128,12 @@ class Variants:
             def label(form, loop, sizes, states, index) -> tuple[np.ndarray, ...]:
                 rate = mass[selected[index]] / period[selected[index]]
                 loops = sample(form, loop, sizes)
-                return count_outside(loops, stiffness * period[selected[index]] / rate, damping / rate)
+                outside, doubtful = count_outside(loops, stiffness * period[selected[index]] / rate, damping / rate)
+                return outside, np.asarray(doubtful)
 
             outside, doubtful = self._map(label, selected)
             stable[selected], left[selected] = outside == 0, doubtful
-        for k in np.flatnonzero(left):
+        for k in np.flatnonzero(left).tolist():
             stable[k] = bool(self.build(k).is_stable(stiffness, damping))
         return stable
 
@@ -153,11 +153,11 @@ class Variants:
                 loops = sample(form, loop, sizes)
                 ends = [find_stiffness_limits(loops, B / rate) for B in damping.tolist()]
                 alpha, doubtful = (np.stack(part) for part in zip(*ends, strict=True))
-                return alpha * rate / period[selected[index]], doubtful.any(0)
+                return alpha * rate / period[selected[index]], np.asarray(doubtful.any(0))
 
             found, doubtful = self._map(limit, selected)
             limits[selected], left[selected] = found.T, doubtful
-        for k in np.flatnonzero(left):
+        for k in np.flatnonzero(left).tolist():
             limits[k] = self._find_limits(self.build(k), damping)
         return limits
 
@@ -187,8 +187,9 @@ class Variants:
             def solve(form, loop, sizes, states, index, density=density) -> tuple[np.ndarray, ...]:
                 found = find_stiffest(form, loop, sizes._replace(density=density), negative)
                 confirmed = found.confirmed
-                for w in () if states is None else found.angles:
-                    confirmed = confirmed & compare_responses(form, loop, states, w)
+                if states is not None:
+                    for w in found.angles:
+                        confirmed = confirmed & compare_responses(form, loop, states, w)
                 return (*found[:3], found.kind, confirmed)
 
             *found, kinds, confirmed = self._map(solve, selected)
@@ -196,11 +197,11 @@ class Variants:
             for column, part in zip(columns, found, strict=True):
                 column[done] = part[confirmed]
             kind[done], left[done] = kinds[confirmed], False
-        for k in np.flatnonzero(left):
+        for k in np.flatnonzero(left).tolist():
             *numbers, kind[k], status[k] = self._search_ridge(k, negative)
             for column, number in zip(columns, numbers, strict=True):
                 column[k] = number
-        return BatchRidge(RidgePoint(*columns, kind, status), left)
+        return BatchRidge(RidgePoint._make([*columns, kind, status]), left)
 
     def _search_ridge(self, k: int, negative: bool) -> tuple[float, ...]:
         """Return the stiffest wall of one variant by a search of its own."""

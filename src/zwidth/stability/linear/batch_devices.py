@@ -63,7 +63,7 @@ def build_loops(chain: AnyChain, size: int) -> DeviceBatch:
     roots = (part[:, None] if np.ndim(part) < 2 else part for part in (f.zeros, f.poles))
     xp = namespace(plant.numerator, f.gain)
     estimate = [xp.broadcast_to(xp.asarray(f.gain), (size,)), *(xp.broadcast_to(r, (r.shape[0], size)) for r in roots)]
-    loop = LoopBatch(*plant[:2], *estimate, *plant[2:])
+    loop = LoopBatch._make([*plant[:2], *estimate, *plant[2:]])
     if states is not None:
         # Make the gain of a loop NaN, and thereby all its results, if rounding errors spoil its polynomials.
         exact = xp.all(xp.stack([compare_responses(form, loop, states, w) for w in TEST_ANGLES]), 0)
@@ -130,6 +130,7 @@ def _discretize(A: Array, B: Array, fraction: Any, sampled: bool) -> DiscreteCha
 def _factor(chain: AnyChain, states: DiscreteChain) -> _Plant:
     """Return G of discretized devices as polynomials, and its zeros and poles."""
     psi, late = states.psi, states.late
+    assert late is not None, "`_discretize` sets it"
     xp = namespace(psi)
     zeros = -xp.linalg.eigvals(_realize_zeros(states)).T + 0j
     offsets, integrators = _find_poles(chain, psi)
@@ -144,6 +145,7 @@ def _realize_zeros(states: DiscreteChain) -> Array:
     """
     xp = namespace(states.psi)
     psi, full, late = states
+    assert late is not None, "`_discretize` sets it"
     inner, row = psi[:, 1:, 1:], psi[:, :1, 1:]
     column = inner @ late[:, 1:, None] + full[:, 1:, None]
     last = xp.concatenate([row, row @ late[:, 1:, None] + full[:, :1, None]], -1) / -late[:, :1, None]
@@ -181,7 +183,7 @@ def _find_poles(chain: AnyChain, psi: Array) -> tuple[Array, Array]:
 
 
 BLOCK_SIZE = 1 << 9  # loops per call; their arrays fit in the cache
-LONGEST_DELAY = 64  # in periods; longer delays need so many nodes that a batch saves no time
+LONGEST_DELAY = 24  # in periods; longer delays need so many nodes that a batch saves little time
 
 
 def map_loops(
@@ -218,7 +220,7 @@ def map_loops(
     def run(task: tuple[DeviceBatch, Sizes, np.ndarray, np.ndarray]) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
         batch, sizes, index, members = task
         padded = _pad(members)
-        states = batch.states and DiscreteChain(*(part[padded] for part in batch.states))
+        states = batch.states and DiscreteChain(*(np.asarray(part)[padded] for part in batch.states))
         with np.errstate(all="ignore"):
             results = function(batch.form, batch.loop.take(padded), sizes, states, index[padded])
         return index[members], tuple(part[..., : members.size] for part in results)

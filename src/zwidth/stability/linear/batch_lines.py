@@ -26,7 +26,7 @@ from zwidth.core.xp import iterate, namespace
 from zwidth.model.circle_functions import distances_inside
 from zwidth.stability.linear.loop_batch import Sampled, Values, evaluate, split_values
 
-MOST_CROSSINGS = 12  # changes of sign of k from node to node per line; a line with more is doubtful
+MOST_CROSSINGS = 12  # changes of sign of k from node to node per line without delay; a line with more is doubtful
 MOST_TURNS = 3  # steps per line in which k may turn; a line with more is doubtful
 TURN_STEPS = 10  # steps for the extremum of k
 TURN_TOLERANCE = 1e-12  # |k| at an extremum, relative to its terms, below which its sign is unclear
@@ -34,7 +34,7 @@ STEPS = 10  # largest number of Newton steps for the angle of a crossing
 CONVERGED_STEP = 1e-13  # relative to w
 LARGEST_STEP = 1e-9  # the last step of a crossing that is not doubtful, relative to w
 LANES = 16  # lists of crossings are padded to a multiple of this, because NumPy rounds differently in a remainder
-ON_CIRCLE = 1e-6  # distance from the circle below which the poles near a zero of G for large |alpha| are not counted
+ON_CIRCLE = 1e-6  # distance of a zero of G from the circle below which it is not counted as inside or outside
 
 
 class Line(NamedTuple):
@@ -83,12 +83,19 @@ def list_cells(selected: Array, most: int) -> Cells:
         crowded = np.bincount(loop, minlength=n) > most
         padding = (0, -cell.size % LANES)
         columns = (np.pad(part, padding) for part in (cell, loop, slot, slot < most))
-        return Cells(*columns, crowded, most)
+        return Cells._make([*columns, crowded, most])
     first = xp.sort(xp.where(selected, xp.arange(count)[:, None], count), 0)[:most]
     slot, loop = xp.meshgrid(xp.arange(most), xp.arange(n), indexing="ij")
     valid = first < count
     columns = (part.reshape(-1) for part in (xp.where(valid, first, 0), loop, slot, valid))
-    return Cells(*columns, xp.sum(selected, 0) > most, most)
+    return Cells._make([*columns, xp.sum(selected, 0) > most, most])
+
+
+def list_changes(loops: Sampled, positive: Array) -> Cells:
+    """List the steps between nodes over which k changes its sign, from the signs of k at the nodes."""
+    # Each period of delay turns q by one revolution and adds up to two crossings.
+    most = MOST_CROSSINGS + 2 * (loops.form.lag + loops.form.window)
+    return list_cells(positive[1:] != positive[:-1], most)
 
 
 def tabulate(cells: Cells, values: Array, fill: float) -> Array:
@@ -133,7 +140,7 @@ def sort_crossings(t: Array, leaving: Array, w: Array, cell: Array, doubtful: Ar
     xp = namespace(t)
     t = xp.where(xp.isnan(t), np.inf, t)
     order = xp.argsort(t, 0)
-    return Crossings(*(xp.take_along_axis(part, order, 0) for part in (t, leaving, w, cell)), doubtful)
+    return Crossings._make([*(xp.take_along_axis(part, order, 0) for part in (t, leaving, w, cell)), doubtful])
 
 
 def find_crossings(loops: Sampled, line: Line) -> Crossings:
@@ -141,7 +148,7 @@ def find_crossings(loops: Sampled, line: Line) -> Crossings:
     xp, w, n = namespace(loops.w), loops.w, loops.w.shape[1]
     k, slope = combine(line, loops.parts), combine(line, loops.slopes)
     positive = k > 0
-    cells = list_cells(positive[1:] != positive[:-1], MOST_CROSSINGS)
+    cells = list_changes(loops, positive)
     # If k turns back between two nodes of equal sign, it may have two zeros between them. Its tangents at both nodes
     # bound k if k is convex (or concave) there.
     sign = xp.where(positive[:-1], 1.0, -1.0)
@@ -176,7 +183,12 @@ def find_crossings(loops: Sampled, line: Line) -> Crossings:
         done = move <= CONVERGED_STEP * x
         return low, high, xp.where(done, x, new), xp.where(done, move, xp.abs(new - x))
 
-    start = low - first * (high - low) / xp.where(first == last, 1.0, last - first)
+    # Start from the secant, or on both sides of a turn from the parabola with its vertex there.
+    share = first / xp.where(first == last, 1.0, first - last)
+    near, far = xp.sqrt(xp.maximum(share, 0.0)), 1.0 - xp.sqrt(xp.maximum(1.0 - share, 0.0))
+    splits = cells.cell.size, cells.cell.size + turns.cell.size
+    share = xp.concatenate([share[: splits[0]], far[splits[0] : splits[1]], near[splits[1] :]])
+    start = low + share * (high - low)
     state = iterate(STEPS, refine, (low, high, start, high - low), xp, lambda old, new: bool(np.all(old[2] == new[2])))
     crossing, move = state[2:]
     crosses = (first > 0) != (last > 0)
@@ -189,11 +201,12 @@ def find_crossings(loops: Sampled, line: Line) -> Crossings:
     ]
     # Add the pole at z = -1. Between the last node and z = -1, k must not change its sign.
     end, end_slope = cross_end(loops, line)
-    turned = (end_slope != 0) & ((k[-1] > 0) != (end_slope < 0))
+    turned = (end_slope != 0) & xp.isfinite(end_slope) & ((k[-1] > 0) != (end_slope < 0))
     doubtful = unclear | cells.crowded | turns.crowded | xp.any(columns[4], 0) | turned
     doubtful = doubtful | xp.any(~xp.isfinite(k), 0)
     last_row = end[None], xp.sign(end_slope)[None], xp.full((1, n), np.pi), xp.full((1, n), -1)
-    return sort_crossings(*(xp.concatenate(both) for both in zip(columns, last_row, strict=False)), doubtful)
+    t, leaving, angle, cell = (xp.concatenate(both) for both in zip(columns[:4], last_row, strict=True))
+    return sort_crossings(t, leaving, angle, cell, doubtful)
 
 
 def _take_line(line: Line, index: Array, n: int) -> Line:
@@ -250,12 +263,13 @@ def cross_end(loops: Sampled, line: Line) -> tuple[Array, Array]:
 
 
 def count_far(loops: Sampled) -> tuple[Array, Array]:
-    """Return the number of poles outside the circle for alpha -> inf, and whether it is known."""
-    # As many poles as G has zeros approach these zeros, the others go to infinity (V14).
+    """Return the least and the largest possible number of poles outside the circle for alpha -> inf."""
+    # As many poles as G has zeros approach these zeros, the others go to infinity (V14). A pole near a zero on the
+    # circle may be inside or outside.
     xp, loop = namespace(loops.w), loops.loop
     depth = distances_inside(loop.plant_zeros)
     excess = loops.form.lag + loop.denominator.shape[0] - 1 - loop.plant_zeros.shape[0]
-    return excess + xp.sum(depth < 0, 0), xp.all(xp.abs(depth) > ON_CIRCLE, 0)
+    return excess + xp.sum(depth < -ON_CIRCLE, 0), excess + xp.sum(depth <= ON_CIRCLE, 0)
 
 
 def count_outside(loops: Sampled, alpha: Array, beta: Array) -> tuple[Array, Array]:

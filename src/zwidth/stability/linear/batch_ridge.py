@@ -23,7 +23,6 @@ from zwidth.core.status import RidgeKind
 from zwidth.core.types import Array
 from zwidth.core.xp import iterate, namespace
 from zwidth.stability.linear.batch_lines import (
-    MOST_CROSSINGS,
     Crossings,
     Line,
     combine,
@@ -31,7 +30,7 @@ from zwidth.stability.linear.batch_lines import (
     count_outside,
     cross_end,
     find_crossings,
-    list_cells,
+    list_changes,
     sort_crossings,
     tabulate,
 )
@@ -86,11 +85,7 @@ def find_stiffest(form: Form, loop: LoopBatch, sizes: Sizes, negative: bool) -> 
     xp, n = namespace(loops.w), loop.gain.size
     axis, start = find_crossings(loops, Line(a1=1.0)), loops.count_start(loops.parts[0][0])
     least = -np.inf if negative else 0.0
-    on_axis = sum(
-        xp.where((xp.arange(loops.w.shape[0] - 1)[:, None] == cell) & xp.isfinite(t), t, 0.0)
-        for t, cell in zip(axis.t, axis.cell, strict=True)
-    )
-    on_axis = xp.where(on_axis == 0, np.nan, on_axis)
+    on_axis = _place_axis(axis, loops.w)
 
     def halve(state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, left, right = state
@@ -108,6 +103,22 @@ def find_stiffest(form: Form, loop: LoopBatch, sizes: Sizes, negative: bool) -> 
     return Stiffest(alpha, beta, omega, kind, confirmed, angles)
 
 
+def _place_axis(axis: Crossings, w: Array) -> Array:
+    """Return the alpha at which the curve crosses beta = 0 in each step between nodes, shape (nodes, loops).
+
+    NaN marks a step without such a crossing.
+    """
+    xp, (nodes, n) = namespace(w), w.shape
+    # Collect all entries without a step in the last row, which belongs to no step.
+    row = xp.where(xp.isfinite(axis.t) & (axis.cell >= 0), axis.cell, nodes - 1)
+    index = row, xp.broadcast_to(xp.arange(n), row.shape)
+    table = xp.full((nodes, n), np.nan)
+    if xp is not np:
+        return table.at[index].set(axis.t)
+    table[index] = axis.t
+    return table
+
+
 def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> Crossings:
     """Return the crossings of a line of constant K per loop, interpolated linearly between nodes.
 
@@ -116,7 +127,7 @@ def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> Crossing
     xp, n = namespace(loops.w), alpha.size
     k = loops.parts[1] + alpha * loops.parts[2]
     positive = k > 0
-    cells = list_cells(positive[1:] != positive[:-1], MOST_CROSSINGS)
+    cells = list_changes(loops, positive)
     before, after = (k[cells.cell + offset, cells.loop] for offset in (0, 1))
     share, level = before / (before - after), alpha[cells.loop]
     ends = [
@@ -138,8 +149,8 @@ def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> Crossing
         (loops.w[cells.cell, cells.loop], np.nan, xp.full((n,), np.pi)),
         (cells.cell, -1, xp.full((n,), -1)),
     )
-    tables = (xp.concatenate([tabulate(cells, values, fill), last[None]]) for values, fill, last in columns)
-    return sort_crossings(*tables, cells.crowded)
+    t, leaving, w, cell = (xp.concatenate([tabulate(cells, each, fill), last[None]]) for each, fill, last in columns)
+    return sort_crossings(t, leaving, w, cell, cells.crowded)
 
 
 def _find_interval(
@@ -302,12 +313,12 @@ def _confirm(loops: Sampled, axis: Crossings, start: Array, found: tuple[Array, 
     connected = (first == 0) & ~xp.any((ray.t > 0) & (ray.t < 1.0 - MARGIN), 0)
     if accurate:
         connected = connected | _are_connected(loops, axis, start, alpha, beta)
-    far, is_known = count_far(loops)
-    consistent = is_known & (axis_counts[-1] == far) & xp.all(counts >= 0, 0)
+    far = count_far(loops)
+    consistent = (axis_counts[-1] >= far[0]) & (axis_counts[-1] <= far[1]) & xp.all(counts >= 0, 0)
     # The order of two crossings must be certain.
     clear = xp.all(level.t[1:] - level.t[:-1] > CLEAR * xp.abs(level.t[1:]), 0, where=xp.isfinite(level.t[1:]))
-    doubtful = axis.doubtful | level.doubtful | ray.doubtful
-    return loops.resolved & ~doubtful & consistent & clear & bounded & connected & (alpha > 0)
+    certain = ~axis.doubtful & ~level.doubtful & ~ray.doubtful
+    return loops.resolved & certain & consistent & clear & bounded & connected & (alpha > 0)
 
 
 def _are_connected(loops: Sampled, axis: Crossings, start: Array, alpha: Array, beta: Array) -> Array:

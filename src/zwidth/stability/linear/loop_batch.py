@@ -29,8 +29,9 @@ NEAR_CIRCLE = 0.25  # distance from the circle of a root with its own nodes, rel
 CLUSTER_NODES = 31  # nodes around one root
 CLUSTER_REACH = 0.15  # largest distance of these nodes from the root
 CLOSEST = 1e-7  # their smallest spacing
-# Largest sum of step/distance over all zeros of G and poles of F at which a step between nodes counts as resolved.
-RESOLUTION = 1.5
+# Largest sum of step/distance over all zeros of G and poles of F at which a step between nodes counts as resolved. It is
+# below 2, the sum of a root in the middle of the step.
+RESOLUTION = 1.9
 INSIDE = 1e-10  # smallest distance inside the unit circle, relative to the distance from z = 1, of a decaying pole
 
 
@@ -198,8 +199,10 @@ def sample(form: Form, loop: LoopBatch, sizes: Sizes) -> Sampled:
     size = values.f.real**2 + values.f.imag**2
     levels = (values.q.real * values.f.real + values.q.imag * values.f.imag) / size, values.f.real / size
     points = circle_points(w)
-    crowding = form.phase_rate + sum(1.0 / xp.abs(points.z_minus_1 + root) for root in (*loop.plant_zeros, *loop.poles))
-    crowding = xp.minimum(crowding[1:], crowding[:-1]) * (w[1:] - w[:-1])
+    crowding = form.phase_rate + 0.0 * w
+    for root in (*loop.plant_zeros, *loop.poles):
+        crowding = crowding + 1.0 / xp.abs(points.z_minus_1 + root)
+    crowding = xp.maximum(crowding[1:], crowding[:-1]) * (w[1:] - w[:-1])
     decaying = distances_inside(loop.plant_poles) > INSIDE * xp.abs(loop.plant_poles)
     decaying = decaying | (xp.arange(loop.plant_poles.shape[0])[:, None] < loop.integrators)
     resolved = xp.all(crowding < RESOLUTION, 0) & xp.all(decaying, 0) & (loop.integrators <= 2)
