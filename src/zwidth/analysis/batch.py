@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from zwidth.analysis.ensemble import Variants
 from zwidth.analysis.optimization import SceneOptima
 from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError, describe_choice
-from zwidth.core.status import RidgeKind
+from zwidth.core.status import RidgeKind, Status
 from zwidth.core.types import ArrayLike
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.parameter_paths import find_parts
@@ -87,13 +88,18 @@ def stiffest_walls(
     if parameters is not None:
         raise InputError("parameters: allowed only together with one scene; pass a zwidth.Scene as the first argument")
     members = list(scenes)
+    table = np.full((3, len(members)), np.nan)
+    kind = np.full(len(members), int(RidgeKind.NONE), np.int32)
+    status = np.full(len(members), int(Status.INVALID_INPUT), np.int32)
+    searched = np.ones(len(members), bool)
     groups: dict[Any, list[int]] = {}
     for k, scene in enumerate(members):
         check_scene(scene, "stiffest_walls")
-        groups.setdefault((_describe_structure(scene), allows_negative(scene, negative_damping)), []).append(k)
-    table = np.full((3, len(members)), np.nan)
-    kind, status = np.full(len(members), int(RidgeKind.NONE), np.int32), np.zeros(len(members), np.int32)
-    searched = np.ones(len(members), bool)
+        if negative_damping is not None:
+            allows_negative(scene, negative_damping)
+        # Leave out an invalid scene, such as one with a cutoff above the Nyquist frequency.
+        with suppress(InputError):
+            groups.setdefault((_describe_structure(scene), allows_negative(scene, negative_damping)), []).append(k)
     for (_, negative), index in groups.items():
         walls = _solve_group([members[k] for k in index], negative)
         table[:, index], kind[index], status[index] = walls[:3], walls.kind, walls.status

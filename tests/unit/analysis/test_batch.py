@@ -118,6 +118,12 @@ def test_rate_and_delay_in_periods_are_understood():
     np.testing.assert_allclose(walls.stiffness, expected, rtol=1e-9)
 
 
+def test_an_invalid_scene_does_not_affect_the_others():
+    scene = SCENES["low-pass"]
+    walls = stiffest_walls([scene, scene.replace(**{"velocity.cutoff": 900})])
+    np.testing.assert_array_equal(walls.status, [Status.OK, Status.INVALID_INPUT])
+
+
 def test_an_empty_list_and_a_single_scene_are_allowed():
     assert stiffest_walls([]).stiffness.shape == (0,)
     assert stiffest_walls(SCENES["low-pass"]).stiffness.shape == ()

@@ -22,7 +22,7 @@ from zwidth.model.mechanism import AnyChain, Chain, build_chain, is_zero
 from zwidth.model.parameter_paths import Parts, fill_parameters
 from zwidth.numerics.held_mass import discretize_mass, factor_numerator
 from zwidth.numerics.threads import run_in_threads
-from zwidth.stability.linear.batch_lines import LANES
+from zwidth.stability.linear.batch_lines import VECTOR_SIZE
 from zwidth.stability.linear.discretization import DiscreteChain, compute_transition
 from zwidth.stability.linear.loop_batch import Form, LoopBatch, Sizes, count_nodes, evaluate
 
@@ -234,5 +234,5 @@ def map_loops(
 
 
 def _pad(index: np.ndarray) -> np.ndarray:
-    """Return indices, padded with the last one to a multiple of `LANES`."""
-    return np.pad(index, (0, -index.size % LANES), mode="edge")
+    """Return indices, padded with the last one to a multiple of `VECTOR_SIZE`."""
+    return np.pad(index, (0, -index.size % VECTOR_SIZE), mode="edge")

@@ -33,7 +33,7 @@ TURN_TOLERANCE = 1e-12  # |k| at an extremum, relative to its terms, below which
 STEPS = 10  # largest number of Newton steps for the angle of a crossing
 CONVERGED_STEP = 1e-13  # relative to w
 LARGEST_STEP = 1e-9  # the last step of a crossing that is not doubtful, relative to w
-LANES = 16  # lists of crossings are padded to a multiple of this, because NumPy rounds differently in a remainder
+VECTOR_SIZE = 16  # lists of crossings are padded to a multiple of this, because NumPy rounds differently in a remainder
 ON_CIRCLE = 1e-6  # distance of a zero of G from the circle below which it is not counted as inside or outside
 
 
@@ -81,7 +81,7 @@ def list_cells(selected: Array, most: int) -> Cells:
         cell, loop = np.nonzero(selected)
         slot = np.cumsum(selected, 0, dtype=np.int32)[cell, loop] - 1
         crowded = np.bincount(loop, minlength=n) > most
-        padding = (0, -cell.size % LANES)
+        padding = (0, -cell.size % VECTOR_SIZE)
         columns = (np.pad(part, padding) for part in (cell, loop, slot, slot < most))
         return Cells._make([*columns, crowded, most])
     first = xp.sort(xp.where(selected, xp.arange(count)[:, None], count), 0)[:most]

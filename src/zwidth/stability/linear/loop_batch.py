@@ -29,8 +29,8 @@ NEAR_CIRCLE = 0.25  # distance from the circle of a root with its own nodes, rel
 CLUSTER_NODES = 31  # nodes around one root
 CLUSTER_REACH = 0.15  # largest distance of these nodes from the root
 CLOSEST = 1e-7  # their smallest spacing
-# Largest sum of step/distance over all zeros of G and poles of F at which a step between nodes counts as resolved. It is
-# below 2, the sum of a root in the middle of the step.
+# Largest sum of step/distance over all zeros of G and poles of F at which a step between nodes counts as resolved. It
+# is below 2, the ratio for a root in the middle of the step.
 RESOLUTION = 1.9
 INSIDE = 1e-10  # smallest distance inside the unit circle, relative to the distance from z = 1, of a decaying pole
 
