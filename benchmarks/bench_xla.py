@@ -21,11 +21,11 @@ import numpy as np
 from methods.clock import time_calls
 from zwidth.core import xp
 from zwidth.numerics import blocks, evaluate
-from zwidth.numerics.held_mass import ANY
-from zwidth.stability.rigid import characteristic_function as pole_step
+from zwidth.plant.rigid_mass import ANY
 from zwidth.stability.rigid import crossover, ridge, ridge_newton
-from zwidth.stability.rigid import dominant_pole_search as radius
-from zwidth.stability.rigid import pole_count as circle
+from zwidth.stability.rigid.dominant import pole_count as circle
+from zwidth.stability.rigid.dominant import search as radius
+from zwidth.stability.rigid.dominant import steps as pole_step
 
 Make = Callable[[], Callable[..., Any]]
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Generate the tables of the reference pages: commands, configuration files, units and status codes.
+"""Generate the tables of pages: commands, configuration files, outputs of sweeps, units and status codes.
 
     scripts/reference_pages.py NAME      prints one of them
 
@@ -21,6 +21,7 @@ from zwidth.cli import cli
 from zwidth.cli.help import GROUPS, OWN, find_group
 from zwidth.core.status import Status
 from zwidth.units.parsing import COUNTS, DIMENSIONS, PERIOD_WORDS
+from zwidth.units.quantities import OUTPUTS
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_NAMES = 8  # allowed values that a table lists; the description of the key names a longer set
@@ -164,6 +165,20 @@ def _describe_value(value: dict[str, Any], models: dict[str, Any]) -> str:
     return ", ".join([{"string": "text", "boolean": "true or false", "object": "mapping"}.get(kind, kind), *ends])
 
 
+def list_outputs() -> str:
+    """Return a table of the outputs of sweeps: names, units, meanings, and whether devices with parts have them."""
+    lines = ["| output | one value per | unit | for devices with parts | meaning |", "|---|---|---|---|---|"]
+    for output in OUTPUTS.values():
+        unit = "true or false" if output.dtype == "bool" else "code" if output.dtype == "uint8" else output.units
+        unit = unit.replace("1/period", "1 per period") if unit != "1" else ""
+        if output.physical_units:
+            unit += f"; in SI quantities {output.physical_units}"
+        parts = "yes" if output.with_parts else "no"
+        only = "; only in SI quantities" if output.physical_only else ""
+        lines.append(f"| `{output.name}` | {output.family} | {unit} | {parts} | {_escape(output.long_name)}{only} |")
+    return "\n".join(lines)
+
+
 def list_units() -> str:
     """Return a table of the dimensions with their usual units and an example of each."""
     lines = ["| dimension | usual units | example |", "|---|---|---|"]
@@ -207,6 +222,7 @@ def _indent(text: str) -> str:
 TABLES = {
     "commands": list_commands,
     "configuration": list_configuration,
+    "outputs": list_outputs,
     "units": list_units,
     "statuses": list_statuses,
 }

@@ -103,9 +103,10 @@ def fitted_once():
 def early_compiler(monkeypatch):
     """Use compiled kernels from 2048 points on, to test them with small batches."""
     from zwidth.numerics import evaluate
-    from zwidth.stability.rigid import broadcasting, dominant_poles, stiffness_limit
+    from zwidth.stability.rigid import broadcasting, stiffness_limit
+    from zwidth.stability.rigid.dominant import arrays
 
-    for module in (evaluate, broadcasting, dominant_poles, stiffness_limit):
+    for module in (evaluate, broadcasting, arrays, stiffness_limit):
         monkeypatch.setattr(module, "FEW", 1 << 11)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from zwidth.core.status import Status
 from zwidth.stability.rigid import certified
 from zwidth.stability.rigid.boundary import boundary, sample_lobe
-from zwidth.stability.rigid.dominant_poles import compute_dominant_poles
+from zwidth.stability.rigid.dominant.arrays import compute_dominant_poles
 from zwidth.stability.rigid.ridge import alpha_max
 from zwidth.stability.rigid.verdict import decide_stability
 

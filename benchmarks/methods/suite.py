@@ -15,10 +15,10 @@ from methods.baselines import available
 from methods.clock import time_calls
 from methods.problems import Walls
 from zwidth.stability.rigid import certified
+from zwidth.stability.rigid.dominant.spectral_radius import spectral_radius
 from zwidth.stability.rigid.passivity import is_passive, passivity_margin
 from zwidth.stability.rigid.poles import poles
 from zwidth.stability.rigid.ridge import RidgeMethod, alpha_max
-from zwidth.stability.rigid.spectral_radius import spectral_radius
 from zwidth.stability.rigid.verdict import StabilityMethod, decide_stability, is_stable
 
 # Minimum total time in s and minimum number of repetitions of a measurement.

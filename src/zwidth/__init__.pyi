@@ -52,6 +52,8 @@ from .model.actuator import Actuator as Actuator
 from .model.device import Coupling as Coupling
 from .model.device import Device as Device
 from .model.grasps import reference_grasps as reference_grasps
+from .model.joint_space import from_mass_matrix as from_mass_matrix
+from .model.joint_space import from_mujoco as from_mujoco
 from .model.linear_device import LinearDevice as LinearDevice
 from .model.measured_device import MeasuredDevice as MeasuredDevice
 from .model.mode import Mode as Mode
@@ -72,6 +74,7 @@ from .runs import run as run
 from .simulation.result import Motion as Motion
 from .simulation.result import MotionKind as MotionKind
 from .simulation.simulate import simulate as simulate
+from .stability.results import DominantPole as DominantPole
 from .stability.results import Margins as Margins
 from .stability.results import RidgePoint as RidgePoint
 from .stability.rigid.boundary import BoundaryPoint as BoundaryPoint
@@ -80,6 +83,9 @@ from .stability.rigid.boundary import boundary as boundary
 from .stability.rigid.boundary import boundary_point as boundary_point
 from .stability.rigid.boundary import stable_area as stable_area
 from .stability.rigid.boundary import stable_region as stable_region
+from .stability.rigid.dominant.spectral_radius import decay_rate as decay_rate
+from .stability.rigid.dominant.spectral_radius import dominant_pole as dominant_pole
+from .stability.rigid.dominant.spectral_radius import spectral_radius as spectral_radius
 from .stability.rigid.margins import margins as margins
 from .stability.rigid.normalization import denormalize as denormalize
 from .stability.rigid.normalization import normalize as normalize
@@ -90,8 +96,6 @@ from .stability.rigid.poles import char_poly as char_poly
 from .stability.rigid.poles import poles as poles
 from .stability.rigid.ridge import alpha_max as alpha_max
 from .stability.rigid.ridge import stiffness_slope as stiffness_slope
-from .stability.rigid.spectral_radius import decay_rate as decay_rate
-from .stability.rigid.spectral_radius import spectral_radius as spectral_radius
 from .stability.rigid.step_response import StepResponse as StepResponse
 from .stability.rigid.step_response import step_response as step_response
 from .stability.rigid.verdict import decide_stability as decide_stability

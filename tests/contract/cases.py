@@ -137,6 +137,7 @@ CASES = [
     make_wall_case(zwidth.poles, concrete=("d",), extra_axes=1, derivatives=1, domain=f"{WALLS}, at most 4,000 poles"),
     make_wall_case(zwidth.spectral_radius, single=1e-5),
     make_wall_case(zwidth.decay_rate),
+    make_wall_case(zwidth.dominant_pole),
     make_wall_case(zwidth.is_stable, derivatives=None, value="False"),
     make_wall_case(zwidth.decide_stability, derivatives=None, value="False, with a status", refuses_tracing=True),
     make_wall_case(zwidth.is_passive, derivatives=None, value="False"),

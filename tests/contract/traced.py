@@ -40,7 +40,7 @@ def read_concrete(case):
 
 
 # Cases of one kernel are compiled together, which compiles their common part once.
-FAMILIES = [("spectral_radius", "decay_rate"), ("passivity_margin", "is_passive")]
+FAMILIES = [("spectral_radius", "decay_rate", "dominant_pole"), ("passivity_margin", "is_passive")]
 
 
 def find_family(name):

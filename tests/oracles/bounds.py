@@ -7,7 +7,7 @@ import numpy as np
 from zwidth.core.status import Status
 from zwidth.numerics.evaluate import broadcast
 from zwidth.stability.rigid.broadcasting import NAMES
-from zwidth.stability.rigid.dominant_poles import compute_dominant_poles, find_poles
+from zwidth.stability.rigid.dominant.arrays import compute_dominant_poles, find_poles
 from zwidth.stability.rigid.normalization import wall_status
 
 
@@ -26,7 +26,7 @@ def bound_radius(alpha, beta, delta, d, *, accuracy=1e-9) -> Radius:
     """
     arrays = broadcast(dict(zip(NAMES, (alpha, beta, delta, d), strict=True)))
     shape, arrays = arrays[0].shape, [np.atleast_1d(array) for array in arrays]
-    radius, certified, _ = find_poles(arrays, accuracy)
+    radius, certified, *_ = find_poles(arrays, accuracy)
     log_error, status = np.full(radius.shape, accuracy), np.asarray(wall_status(*arrays))
     # Uncertified points: compute the error bound pointwise, also for points of a grid.
     open_points = [array[~certified] for array in arrays]

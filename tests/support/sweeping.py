@@ -42,7 +42,7 @@ def study(name="map", axes=None, outputs=("stable",), **fields):
 
 WALLS = (
     *("stable", "spectral_radius", "margin", "decay_rate", "settling_time", "passive", "passivity_margin"),
-    *("gain_margin", "phase_margin", "delay_margin", "modulus_margin"),
+    *("pole_angle", "gain_margin", "phase_margin", "delay_margin", "modulus_margin"),
 )
 DEVICES = ("alpha_max", "beta_at_max", "kind")
 FEW = {"alpha": [0.0, 0.1, 0.5], "beta": [-0.05, 0.1, 0.4, 0.9], "delta": [0.0, 0.3], "d": [0, 0.5, 2]}
@@ -57,7 +57,7 @@ def make_full_config():
     return make_config(
         study("map", FEW, (*WALLS, *DEVICES)),
         study("proved", FEW, ("spectral_radius", "settling_time"), accuracy=1e-11),
-        study("si", IN_SI, (*WALLS, "stiffness_max", "virtual_damping_at_max")),
+        study("si", IN_SI, (*WALLS, "frequency", "stiffness_max", "virtual_damping_at_max")),
     )
 
 

@@ -11,7 +11,14 @@ from collections.abc import Callable
 from typing import Any
 
 from zwidth.analysis.assessment import Assessment, assess, round_margin
-from zwidth.analysis.wall_search import COARSE, DEFAULT_GAIN_MARGIN, DEFAULT_PHASE_MARGIN, Requirements, choose_wall
+from zwidth.analysis.wall_search import (
+    COARSE,
+    DEFAULT_GAIN_MARGIN,
+    DEFAULT_PHASE_MARGIN,
+    Requirements,
+    WallChoice,
+    choose_wall,
+)
 from zwidth.core.status import Status
 from zwidth.model.device import Device
 from zwidth.model.grasps import list_grasps
@@ -104,11 +111,43 @@ def _advise(
         scene = recommendation.scene
         wall = choose_wall(scene, requirements, recommendation.stiffest, recommendation.stiffness, COARSE)
         if wall.status == Status.OK and accepts(scene.replace(stiffness=wall.stiffness, virtual_damping=wall.damping)):
-            ratio = wall.stiffness / recommendation.stiffness
-            cost = f"costs {max(100.0 * (1.0 - ratio), 0.1):.2g} % of the stiffness"
-            cost = cost if ratio <= 1.0 else f"{plain(ratio, 3)} times the stiffness"
-            return f"use recommend {words}: {format_wall(wall.stiffness, wall.damping, scene.unit_system)} ({cost})"
+            return f"use recommend {words}: {_spell_change(recommendation, wall)}"
     return otherwise
+
+
+def _spell_change(recommendation: Any, wall: WallChoice) -> str:
+    """Return a text with another wall and its loss or gain of stiffness, relative to the recommended wall."""
+    ratio = wall.stiffness / recommendation.stiffness
+    percent = max(100.0 * (1.0 - ratio), 0.1)
+    cost = f"costs {percent:.{2 if percent < 99.0 else 3}g} % of the stiffness"
+    cost = cost if ratio <= 1.0 else f"{plain(ratio, 3)} times the stiffness"
+    return f"{format_wall(wall.stiffness, wall.damping, recommendation.scene.unit_system)} ({cost})"
+
+
+def price_passivity(recommendation: Any) -> str:
+    """Return a text with the passive wall under the same requirements, its options and its loss of stiffness.
+
+    It is "" if the recommended wall is passive, or if passivity cannot be determined. The wall is accurate to about
+    0.2 %.
+    """
+    scene, requirements = recommendation.scene, recommendation.requirements
+    if recommendation.verdict is None or recommendation.verdict.passive is not False:
+        return ""
+    wall = choose_wall(
+        scene, requirements._replace(passive=True), recommendation.stiffest, recommendation.stiffness, COARSE
+    )
+    if wall.status != Status.OK:
+        return "no passive wall satisfies the same requirements"
+    # List all requirements, because --passive replaces the defaults.
+    options = {
+        "--stiffness-fraction": requirements.stiffness_fraction and f"{100.0 * requirements.stiffness_fraction:.4g}%",
+        "--gain-margin": requirements.gain_margin and f"{requirements.gain_margin:g}",
+        "--phase-margin": requirements.phase_margin and f"{requirements.phase_margin:g}",
+        "--grasps": requirements.grasps if requirements.grasps != "none" else None,
+    }
+    listed = " ".join(f"{name} {value}" for name, value in options.items() if value)
+    listed += " --beyond-safe" if requirements.beyond_safe else ""
+    return f"a passive wall has {_spell_change(recommendation, wall)}: recommend --passive {listed}".rstrip()
 
 
 def judge_grasps(scene: Any) -> dict[str, bool]:

@@ -33,7 +33,8 @@ FEWEST_PERIODS = 2000  # length of the shortest simulation, in sampling periods
 MOST_PERIODS = 200_000  # length of the longest simulation, in sampling periods; limits the run time
 SETTLED = 2.0  # time constants that must be simulated before a motion may count as sustained
 CONFIRMED = "simulated at these and larger changes: check the value that you choose with diagnose"
-UNSEARCHED = f"zwidth diagnose searches for changes (delay of at most {LONG_DELAY:g} periods)"
+UNSEARCHED = f"zwidth diagnose searches for a remedy, unless the delay is longer than {LONG_DELAY:g} periods"
+SMALL = 0.1  # encoder steps; a limit cycle of smaller amplitude is printed without a caution
 WITHOUT_MARGINS = "these are limits of stability, without margins: for a wall to set, use recommend"
 FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in proportion to its steps"
 
@@ -87,6 +88,11 @@ class Diagnosis:
             return "LIMIT CYCLE" if math.isfinite(self.amplitude) else "UNBOUNDED"
         return {"none": "AT REST", "instability": "UNSTABLE"}.get(self.cause, "UNDECIDED")
 
+    @property
+    def is_small(self) -> bool:
+        """True for a limit cycle caused by the encoder whose amplitude is below a tenth of an encoder step."""
+        return self.cause == "quantization" and self.amplitude < SMALL * self.hardware.resolution
+
     def explain(self) -> str:
         """Return the cause of the oscillation as a sentence, with its amplitude and frequency."""
         units = self.unit_system
@@ -99,12 +105,13 @@ class Diagnosis:
             else "the linear loop is marginal (poles on the unit circle)"
         )
         if self.cause == "instability":
-            limited = f"; the simulation reaches {swing}" if 0 < self.amplitude < math.inf else ""
-            stuck = "; friction holds small displacements" if self.amplitude == 0 else ""
-            return f"the linear loop is unstable at {with_unit(self.frequency, 'Hz', 3)}{limited}{stuck}"
+            simulated = f"reaches {swing}" if math.isfinite(self.amplitude) else "grows without bound"
+            simulated = simulated if self.amplitude else "comes to rest, because friction holds small displacements"
+            return f"the linear loop is unstable at {with_unit(self.frequency, 'Hz', 3)}; the simulation {simulated}"
         if self.cause == "quantization":
             step = with_unit(self.hardware.resolution, units["m"], 3)
-            return f"{swing}, caused by the encoder's steps of {step}; {linear}"
+            small = ", less than a tenth of a step" if self.is_small else ""
+            return f"{swing}, caused by the encoder's steps of {step}{small}; {linear}"
         if self.cause == "saturation":
             limits = (
                 [with_unit(self.hardware.max_force, units["N"], 3)] if math.isfinite(self.hardware.max_force) else []

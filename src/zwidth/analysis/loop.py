@@ -23,40 +23,40 @@ import numpy as np
 
 from zwidth.analysis.ensemble import RIGID_PARAMETERS, RigidVariants, Variants
 from zwidth.core.errors import ZwidthError
+from zwidth.core.pytrees import list_leaves
 from zwidth.core.status import Method, RidgeKind, Status
 from zwidth.core.types import Array
 from zwidth.core.xp import is_jax, is_traced, namespace, nan_beyond
 from zwidth.model.circle_functions import circle_points
 from zwidth.model.mechanism import AnyChain, build_chain
-from zwidth.model.parameter_paths import AnyScene, list_parameters, replace_parameters
+from zwidth.model.parameter_paths import AnyScene, list_parameters
 from zwidth.numerics.evaluate import as_float64, check_scalars, evaluate
-from zwidth.numerics.held_mass import classify_delays
+from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.linear.boundary import Boundary
 from zwidth.stability.linear.curve import evaluate_curve
-from zwidth.stability.linear.discretization import find_roots
-from zwidth.stability.linear.margins import compute_margins, open_loop_response
+from zwidth.stability.linear.derivatives import SceneSensitivities, compute_sensitivities
+from zwidth.stability.linear.margins import compute_margins, evaluate_walls
 from zwidth.stability.linear.passivity import PassivityCondition, compute_passivity_margins
-from zwidth.stability.linear.poles import compute_poles_minus_one, is_marginal, log_modulus
+from zwidth.stability.linear.poles import (
+    agree_with_verdict,
+    compute_dominant_poles,
+    compute_poles_minus_one,
+    is_marginal,
+    log_modulus,
+)
 from zwidth.stability.linear.poles import spectral_radius as linear_radius
 from zwidth.stability.linear.regions import Outline, StableSet
-from zwidth.stability.linear.ridge import (
-    RidgeSolution,
-    SceneSensitivities,
-    compute_sensitivities,
-    differentiate_stiffness,
-    find_ridge,
-)
-from zwidth.stability.linear.roots import LoopRoots
+from zwidth.stability.linear.ridge import RidgeSolution, find_ridge
+from zwidth.stability.linear.roots import LoopRoots, find_roots
 from zwidth.stability.linear.rows import Island, find_stable_dampings, find_stable_intervals, label_walls
-from zwidth.stability.results import Margins, RidgePoint, Stability
+from zwidth.stability.results import DominantPole, Margins, RidgePoint, Stability
 from zwidth.stability.rigid.boundary import boundary, boundary_point, stable_region
-from zwidth.stability.rigid.dominant_poles import find_dominant_pole
+from zwidth.stability.rigid.dominant.spectral_radius import dominant_pole, spectral_radius
 from zwidth.stability.rigid.margins import margins, margins_kernel
 from zwidth.stability.rigid.normalization import wall_status
 from zwidth.stability.rigid.passivity import passivity_margin
 from zwidth.stability.rigid.poles import poles
 from zwidth.stability.rigid.ridge import alpha_max, slopes_kernel, stiffness_slopes
-from zwidth.stability.rigid.spectral_radius import spectral_radius
 from zwidth.stability.rigid.verdict import StabilityMethod, decide_stability, is_stable
 from zwidth.units.quantities import WALL_RANGE
 
@@ -65,8 +65,8 @@ from zwidth.units.quantities import WALL_RANGE
 ON_CIRCLE = 1e-7
 
 
-class DominantPole(NamedTuple):
-    """Dominant pole (pole of largest magnitude) of the closed loop with one wall."""
+class DominantMode(NamedTuple):
+    """Dominant pole (pole of largest magnitude) of the closed loop with one wall, also on the unit circle."""
 
     marginal: bool  # poles on the unit circle, none outside: one at z = 1, or all poles of an undamped plant
     radius: float  # spectral radius
@@ -175,17 +175,29 @@ class LinearLoop:
         radius = linear_radius(self.roots, alpha.reshape(-1), beta.reshape(-1), stable)
         return radius.reshape(alpha.shape)[()]
 
-    def find_dominant(self, alpha: float, beta: float) -> DominantPole:
+    def dominant_poles(self, alpha: np.ndarray, beta: np.ndarray) -> DominantPole:
+        """Return the dominant pole of each wall, with times in periods; NaN for invalid walls."""
+        # Pass zeros for delta and d as in `decide`.
+        status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
+        alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
+        stable = label_walls(self.boundary, alpha, beta).reshape(-1)
+        log, angle = compute_dominant_poles(self.roots, alpha.reshape(-1), beta.reshape(-1))
+        radius, log = agree_with_verdict(log, stable)
+        radius, log, angle = (leaf.reshape(alpha.shape) for leaf in (radius, log, angle))
+        failed = (status == Status.OK) & np.isnan(radius + angle)
+        return DominantPole(radius, angle, -log, np.where(failed, np.int32(Status.NOT_CONVERGED), status))
+
+    def find_dominant(self, alpha: float, beta: float) -> DominantMode:
         """Return the dominant pole of the closed loop with one wall."""
         if is_marginal(self.roots, alpha, beta):
-            return DominantPole(True, 1.0, 0.0, 0.0)
+            return DominantMode(True, 1.0, 0.0, 0.0)
         wall = np.array([alpha]), np.array([beta])
         zeta = compute_poles_minus_one(self.roots, *wall)[0]
         dominant = zeta[np.argmax(log_modulus(zeta))]
         angle = abs(np.arctan2(dominant.imag, 1.0 + dominant.real))
         if self.boundary.are_lossless(wall[1])[0] and log_modulus(dominant) <= ON_CIRCLE:
-            return DominantPole(True, 1.0, 0.0, float(angle))
-        return DominantPole(False, float(self.radius(*wall)[0]), -float(log_modulus(dominant)), float(angle))
+            return DominantMode(True, 1.0, 0.0, float(angle))
+        return DominantMode(False, float(self.radius(*wall)[0]), -float(log_modulus(dominant)), float(angle))
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
         """Return the stable intervals of alpha for each beta, shape (n, intervals, 2), padded with NaN."""
@@ -246,10 +258,6 @@ class LinearLoop:
 
     def stiffest(self, negative: bool) -> RidgePoint:
         """Return the stiffest stable wall connected to K = 0; ``negative`` allows beta < 0."""
-        if is_traced(*list_parameters(self.scene).values()):
-            from zwidth.stability.linear.traced_ridge import trace_stiffest
-
-            return trace_stiffest(self.scene, negative)
         ridge, status = self.ridge(negative)
         if ridge is None:
             nan = np.float64(math.nan)
@@ -276,7 +284,7 @@ class LinearLoop:
 
     def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> Array:
         """Return the open loop ``L = (alpha + beta F) G`` at angles w; F is the velocity estimate, G the plant."""
-        return open_loop_response(self.roots, alpha, beta, circle_points(w)).value
+        return evaluate_walls(self.roots, alpha, beta, circle_points(w)).value
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
         """Return the stability margins of walls, with times in periods and frequencies in rad per period.
@@ -325,12 +333,16 @@ class RigidLoop(LinearLoop):
     def radius(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         return spectral_radius(alpha, beta, self.scene.delta, self.scene.d)
 
-    def find_dominant(self, alpha: float, beta: float) -> DominantPole:
-        with np.errstate(all="ignore"):
-            dominant = find_dominant_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
+    def dominant_poles(self, alpha: np.ndarray, beta: np.ndarray) -> DominantPole:
+        return dominant_pole(alpha, beta, self.scene.delta, self.scene.d)
+
+    def find_dominant(self, alpha: float, beta: float) -> DominantMode:
+        poles = self.dominant_poles(np.array([alpha]), np.array([beta]))
+        radius, angle, rate = (float(leaf[0]) for leaf in poles[:3])
         # A wall with K = 0 has a pole at z = 1. If walls with slightly larger K are stable, it has no pole outside the
         # unit circle, i.e. it is marginal.
-        return DominantPole(alpha == 0 and bool(self.find_stable_alpha(np.array([beta])).size), *dominant)
+        marginal = alpha == 0 and bool(self.find_stable_alpha(np.array([beta])).size)
+        return DominantMode(marginal, radius, rate, angle)
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
         end = np.asarray(boundary_point(self.scene.delta, self.scene.d, beta=beta).alpha)
@@ -392,10 +404,8 @@ class RigidLoop(LinearLoop):
 
 
 def make_plain(scene: AnyScene) -> AnyScene:
-    """Return a copy of the scene in which JAX numbers are converted to floats, unless JAX traces them."""
-    numbers = list_parameters(scene).items()
-    floats = {path: float(value) for path, value in numbers if is_jax(value) and not is_traced(value)}
-    return replace_parameters(scene, floats) if floats else scene
+    """Return a scene in which JAX numbers are converted to floats and checked."""
+    return scene._rebuild() if any(map(is_jax, list_leaves(scene))) else scene
 
 
 def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None:
@@ -418,9 +428,6 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
         # Differentiate the active constraints of the stiffest wall implicitly, because the derivative of K_max with
         # respect to the stiffness of the operator has no closed form.
-        ridge = scene.loop.ridge(negative)[0]
-        per["operator.stiffness"] = (
-            math.nan if ridge is None else differentiate_stiffness(scene, ridge, "operator.stiffness")
-        )
+        per["operator.stiffness"] = compute_sensitivities(scene, *scene.loop.ridge(negative)).per["operator.stiffness"]
     per = {path: float(derivative) for path, derivative in per.items()}
     return SceneSensitivities(np.float64(stiffness), per, slopes.point.status)

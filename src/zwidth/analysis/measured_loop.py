@@ -16,16 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.analysis.loop import DominantPole, LinearLoop
+from zwidth.analysis.loop import DominantMode, LinearLoop
 from zwidth.analysis.measured_curve import DecidedIntervals, DecidedWalls, ResponseCurve
 from zwidth.core.errors import InputError
 from zwidth.core.status import Method, RidgeKind, Status
 from zwidth.core.types import Array
 from zwidth.model.mechanism import AnyChain
 from zwidth.numerics.root_finding import minimize_golden_section
-from zwidth.stability.linear.margins import select_gain_margin, select_phase_margin
 from zwidth.stability.linear.regions import Outline
 from zwidth.stability.linear.rows import Island, arrange_by_line
+from zwidth.stability.open_loop import select_gain_margin, select_phase_margin
 from zwidth.stability.results import Margins, RidgePoint, Stability
 from zwidth.stability.rigid.verdict import StabilityMethod
 
@@ -108,9 +108,9 @@ class MeasuredLoop(LinearLoop):
         shape, used = alpha.shape, np.full(alpha.shape, Method.CROSSOVER, np.int32)
         return Stability(stable.reshape(shape)[()], status.reshape(shape)[()], used[()])
 
-    def find_dominant(self, alpha: float, beta: float) -> DominantPole:
+    def find_dominant(self, alpha: float, beta: float) -> DominantMode:
         """Return a dominant pole with NaN in all numbers, because a measured response does not determine the poles."""
-        return DominantPole(False, np.nan, np.nan, np.nan)
+        return DominantMode(False, np.nan, np.nan, np.nan)
 
     def find_stable_alpha(self, beta: np.ndarray) -> np.ndarray:
         """Return the intervals of stable alpha for each beta, shape (n, intervals, 2), padded with NaN."""

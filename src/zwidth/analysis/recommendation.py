@@ -142,13 +142,14 @@ class Recommendation:
         """Improvements of the device that allow a stiffer wall under the same requirements, the largest gain first.
 
         The improvements are those of `zwidth.limits_of`. The stiffness of each entry is that of the wall recommended
-        for the improved device, accurate to about 0.2 %. The list is empty if the safe limit is active, because then
-        only a new measurement allows a stiffer wall.
+        for the improved device, accurate to about 0.2 %. Twice the rate at a constant delay is included even if it
+        gains nothing. The list is empty if the safe limit is active, because then only a new measurement allows a
+        stiffer wall.
         """
         if self.status != Status.OK or self.is_at_safe_limit:
             return []
         steps = compute_gains(self.scene.replace(wall=NoWall()), self.stiffness, self._choose_again)
-        return [step for step in steps if step.gain > 1.0]
+        return [step for step in steps if step.gain > 1.0 or (step.name == "period" and step.note and step.gain > 0)]
 
     def _choose_again(self, improved: SceneOptima) -> float:
         """Return the K recommended for an improved device under the same requirements; NaN if none is recommended."""
@@ -170,7 +171,7 @@ class Recommendation:
     def grasps(self) -> dict[str, bool]:
         """Dictionary that maps each of `zwidth.reference_grasps` to True if the wall is stable in this grasp.
 
-        It is empty unless the device is a `Device`. The grasps hold a rotary device at radii of 10 to 100 mm. If the
+        It is empty unless the device is a `Device`. The grasps hold a rotary device 10 to 100 mm from its axis. If the
         scene has an operator, the entry "released" is the stability without the operator.
         """
         return {} if self.status != Status.OK else judge_grasps(self.scene)
@@ -252,7 +253,7 @@ class Recommendation:
         labels = {name: stable for name, stable in self.grasps.items() if name != "released"}
         if not labels:
             return ""
-        radii = f" at radii of {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm" if self.unit_system.rotary else ""
+        radii = f", held {1e3 * RADII[0]:g} to {1e3 * RADII[-1]:g} mm from the axis" if self.unit_system.rotary else ""
         stable = sum(labels.values())
         count = "all six" if stable == len(labels) else f"{stable} of {len(labels)}"
         return f"stable in {count} reference grasps{radii}"

@@ -22,7 +22,7 @@ from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import namespace
 from zwidth.model.checks import accept_units
 from zwidth.numerics.evaluate import check_scalars, compile_traced, evaluate
-from zwidth.numerics.held_mass import DelayClasses, classify_delays
+from zwidth.plant.rigid_mass import DelayClasses, classify_delays
 from zwidth.stability.rigid.normalization import Normalized, normalize, quantity_status
 from zwidth.stability.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slopes
 from zwidth.units.display import compact_repr
@@ -63,22 +63,12 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
     """
     device = normalize_device(mass=mass, damping=damping, period=period, delay=delay)
     arguments = {"mass": mass, "period": period, "delta": device.delta, "d": device.d}
-    return evaluate(max_stiffness_kernel, arguments, classify_delays(device.d), slopes=differentiate_max_stiffness)
+    return evaluate(max_stiffness_kernel, arguments, classify_delays(device.d))
 
 
 def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
     """Compute K_max in N/m; ``kind`` states which delays d contains: below 1, from 1 on, or fractional ones."""
     return ridge_kernel(delta, d, kind).alpha * (mass / period) / period
-
-
-def differentiate_max_stiffness(
-    mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses
-) -> tuple[Array, tuple[Array, ...]]:
-    """Return K_max in N/m, and a tuple of its partial derivatives with respect to mass, period, delta and d."""
-    slopes = slopes_kernel(delta, d, kind)
-    scale = (mass / period) / period
-    value = slopes.point.alpha * scale
-    return value, (value / mass, -2.0 * value / period, slopes.by_delta * scale, slopes.by_d * scale)
 
 
 @compact_repr(

@@ -9,11 +9,12 @@ results back. K and B are the stiffness and damping of the wall, F(z) is the vel
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from zwidth.analysis.base import SceneParts
+from zwidth.analysis.loop import LinearLoop
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced, namespace
@@ -22,7 +23,8 @@ from zwidth.model.linear_device import ResponseDevice
 from zwidth.model.state_space import StateSpace
 from zwidth.model.wall import resolve_wall
 from zwidth.numerics.evaluate import are_numbers, as_float64, broadcast_traced, join_shapes
-from zwidth.stability.linear.discretization import realize_closed_loop, realize_device, realize_open_loop
+from zwidth.plant.sampled_states import sample_states
+from zwidth.stability.linear.closed_loop import realize_closed_loop, realize_open_loop
 from zwidth.stability.linear.passivity import find_unsupported_reason
 from zwidth.stability.linear.rows import Island
 from zwidth.stability.results import Margins, Stability
@@ -43,6 +45,17 @@ Wall: TypeAlias = float | str | None
 )
 class SceneMargins(Margins):
     """Gain, phase, delay and modulus margin of walls, with the delay margin in s and the frequencies in Hz."""
+
+
+@compact_repr(decay_rate="1/s", angle="rad", frequency="Hz")
+class ScenePole(NamedTuple):
+    """Dominant pole of the closed loop with a wall; arrays for several walls."""
+
+    radius: Array  # magnitude of the pole, the spectral radius
+    angle: Array  # angle of the pole in rad per period, from 0 to pi
+    decay_rate: Array  # decay rate in 1/s
+    frequency: Array  # frequency in Hz, ``angle/(2 pi T)``; 0 if the response does not oscillate
+    status: Array  # code of `Status`
 
 
 class SceneAnalysis(SceneParts):
@@ -68,16 +81,11 @@ class SceneAnalysis(SceneParts):
     def _broadcast_walls(self, stiffness: Walls, virtual_damping: Walls) -> Sequence[Array]:
         """Convert K in N/m and B in N s/m to arrays alpha and beta of a common shape."""
         walls = self.normalize_walls(stiffness, virtual_damping)
-        self._check_traceable(*walls)
         return namespace(*walls).broadcast_arrays(*walls)
 
-    def _check_traceable(self, *values: Any) -> None:
-        """Raise `InputError` if JAX traces a parameter or a wall, and the loop of the scene does not support this."""
-        if is_traced(*values) and not self.loop.traceable:
-            raise InputError(
-                f"{self.traced_path or 'stiffness, virtual_damping'}: got a value traced by JAX, allowed only for a "
-                "rigid device with the backward difference; pass plain numbers, outside jit, vmap and grad"
-            )
+    def _loop_for(self, *values: Any) -> LinearLoop:
+        """Return the loop of the scene, or the one for walls that JAX traces."""
+        return self.traced_loop if is_traced(*values) and not self.loop.traceable else self.loop
 
     def poles(self, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
         """Return all poles of the closed loop, along a new last axis in no particular order.
@@ -86,7 +94,8 @@ class SceneAnalysis(SceneParts):
         factored polynomial, expanded around z = 1. The error is about 1e-15 times the condition number for a simple
         pole and 1e-16^(1/k) for a k-fold one. The run time per wall is O(degree^3).
         """
-        return self.loop.poles(*self._broadcast_walls(stiffness, virtual_damping))
+        walls = self._broadcast_walls(stiffness, virtual_damping)
+        return self._loop_for(*walls).poles(*walls)
 
     def spectral_radius(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """Return the largest magnitude of the closed-loop poles of each wall.
@@ -95,7 +104,26 @@ class SceneAnalysis(SceneParts):
         by a measured response. If the loop has at most 150 poles, all are computed; otherwise the method counts the
         poles inside circles, with a run time that does not increase with the delay.
         """
-        return self.loop.radius(*self._broadcast_walls(stiffness, virtual_damping))
+        walls = self._broadcast_walls(stiffness, virtual_damping)
+        return self._loop_for(*walls).radius(*walls)
+
+    def dominant_pole(self, stiffness: Walls = None, virtual_damping: Walls = None) -> ScenePole:
+        """Return the dominant pole of the closed loop with each wall, i.e. the pole of largest magnitude.
+
+        After faster components have decayed, the response oscillates with ``frequency`` in Hz and decays with
+        ``decay_rate`` in 1/s. The radius and the method are those of `spectral_radius`; if several poles have the same
+        magnitude, the angle is that of any of them. Values that cannot be computed are NaN, with a ``status`` that is
+        not 0.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> print(f"{scene.dominant_pole(5000, 10).frequency:.1f} Hz")
+            37.3 Hz
+        """
+        radius, angle, rate, status = self.loop.dominant_poles(*self._broadcast_walls(stiffness, virtual_damping))
+        period = self.timing.period
+        return ScenePole(radius, angle, rate / period, angle / (2.0 * np.pi * period), status)
 
     def islands(self, *, negative_damping: bool | None = None) -> list[Island]:
         """Return the islands: the pieces of the stable set that are not connected to K = 0 by paths of stable walls.
@@ -182,8 +210,7 @@ class SceneAnalysis(SceneParts):
         if method != "auto":
             return self.decide_stability(stiffness, virtual_damping, method=method).stable
         walls = self.normalize_walls(stiffness, virtual_damping)
-        self._check_traceable(*walls)
-        return self.loop.labels(*walls)
+        return self._loop_for(*walls).labels(*walls)
 
     def stable_stiffness(self, virtual_damping: ArrayLike | None = None) -> np.ndarray:
         """Return all intervals of the stiffness K in which the walls with a given damping B are stable.
@@ -270,7 +297,7 @@ class SceneAnalysis(SceneParts):
         if obstacle := find_unsupported_reason(**vars(self.device)):
             raise InputError(f"passivity {obstacle}")
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
-        return self.loop.passivity_margin(alpha, beta) * self.units.virtual_damping
+        return self._loop_for(alpha, beta).passivity_margin(alpha, beta) * self.units.virtual_damping
 
     def is_passive(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """Return whether walls are passive (positive `passivity_margin`), i.e. stable with every passive operator."""
@@ -291,7 +318,7 @@ class SceneAnalysis(SceneParts):
         """
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
-        margins = SceneMargins._make(self.loop.margins(alpha, beta))
+        margins = SceneMargins._make(self._loop_for(alpha, beta).margins(alpha, beta))
         return margins._replace(
             delay_margin=margins.delay_margin * self.timing.period,
             phase_crossover=margins.phase_crossover * hertz,
@@ -307,13 +334,13 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     samples. They are excluded for a device given as a whole system: its true damping is unknown, so a wall with B < 0
     would cancel modeled damping that may not exist.
     """
-    if negative_damping is None and isinstance(scene.device, ResponseDevice):
-        return False
-    if negative_damping is None:
-        estimate = scene.velocity.estimate(scene.timing.period)
-        return estimate.is_difference and bool(is_traced(estimate.gain) or estimate.gain > 0)
-    if not isinstance(negative_damping, bool | np.bool_):
+    if negative_damping is not None and not isinstance(negative_damping, bool | np.bool_):
         raise InputError(f"negative_damping: got {negative_damping!r}; pass True, False or None")
+    if negative_damping is None and not isinstance(scene.device, ResponseDevice):
+        if not scene.nonrigid_parts:
+            return True
+        estimate = scene.velocity.estimate(scene.timing.period)
+        return bool(estimate.is_difference and estimate.gain > 0)
     return bool(negative_damping)
 
 
@@ -331,7 +358,7 @@ def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, a
     loop = build(chain, *read_single_wall(alpha, beta))
     force = mass / period**2
     device = np.array(chain.state_units(1.0 / period, force))
-    n_delayed = realize_device(chain).A.shape[0] - device.size
+    n_delayed = int(sample_states(chain).lag)
     n_filter = loop.A.shape[0] - device.size - n_delayed
     # Units of the states in their order: states of the velocity estimate, states of the device, delayed forces.
     scale = np.concatenate([np.ones(n_filter), device, np.full(n_delayed, force)])

@@ -175,18 +175,22 @@ def list_limit_cautions(scene: Scene) -> list[str]:
     return [f"this wall exceeds the safe limit: the real device may be unstable. {limit.describe(scene.unit_system)}"]
 
 
+def _has_alarm(diagnosis: Diagnosis) -> bool:
+    """Return whether a diagnosis deserves a caution: the device oscillates, and not only by a small limit cycle."""
+    return diagnosis.cause != "none" and not diagnosis.is_small
+
+
 def spell_diagnosis(diagnosis: Diagnosis | None) -> list[tuple[str, str]]:
-    """Return pairs of label and text: the result of a diagnosis and, if the device oscillates, its remedies."""
+    """Return pairs of label and text: the result of a diagnosis and, for an oscillation that is not small, remedies."""
     if diagnosis is None:
         return []
-    advice = diagnosis.advise()
-    label = "simulated" if diagnosis.cause == "none" else "CAUTION"
+    label, advice = ("CAUTION", diagnosis.advise()) if _has_alarm(diagnosis) else ("simulated", "")
     return [(label, f"{diagnosis.word}: {diagnosis.explain()}"), *([("", f"to stop it: {advice}")] if advice else [])]
 
 
 def spell_alarm(diagnosis: Diagnosis | None, *alarms: str) -> str:
     """Return the end of a headline, "; CAUTION: ..." with a diagnosed oscillation and ``alarms``; "" without any."""
-    oscillation = [] if diagnosis is None or diagnosis.cause == "none" else [diagnosis.word.lower()]
+    oscillation = [diagnosis.word.lower()] if diagnosis is not None and _has_alarm(diagnosis) else []
     words = [*oscillation, *filter(None, alarms)]
     return f"; CAUTION: {', '.join(words)}" if words else ""
 

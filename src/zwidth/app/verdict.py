@@ -12,7 +12,7 @@ from math import isfinite, isnan
 from typing import TYPE_CHECKING
 
 from zwidth.analysis.assessment import round_margin
-from zwidth.analysis.cautions import find_thin
+from zwidth.analysis.cautions import find_thin, price_passivity
 from zwidth.analysis.stabilization import stabilize
 from zwidth.app.printing import (
     format_diagnosis,
@@ -227,7 +227,13 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
 
 def format_gains(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:
     """Return the lines of a table of improvements of a device and the factors by which they raise K_max."""
-    shown = [limit for limit in limits if isfinite(limit.gain) and (verbose or limit.gain > NOTEWORTHY)]
+    # Always show the rate with a constant delay in seconds, because twice the rate then often gains much less than with
+    # a constant delay in periods, which is the first entry.
+    shown = [
+        limit
+        for limit in limits
+        if isfinite(limit.gain) and (verbose or limit.gain > NOTEWORTHY or (limit.name == "period" and limit.note))
+    ]
     if not shown:
         return []
     width, rows = max(len(limit.label) for limit in shown), []
@@ -266,13 +272,15 @@ def format_recommendation(
             *format_decay(verdict),
             format_line("room", _spell_room(verdict, verdict.stable_damping)),
         ]
+    passive = spell_passivity(scene, verdict) if verbose else recommendation.spell_passive()
+    passive = "; ".join(filter(None, (passive, price_passivity(recommendation))))
     lines = [
         format_line("SET", f"{recommendation.spell_wall()}; {recommendation.spell_limit()}{alarm}"),
         *device,
         *margins,
         *([format_line("grasps", hands)] if (hands := recommendation.spell_hands()) else []),
         *format_diagnosis(diagnosis),
-        format_line("passive", spell_passivity(scene, verdict) if verbose else recommendation.spell_passive()),
+        format_line("passive", passive),
         *omission_lines,
         *(format_line("CAUTION", caution) for caution in recommendation.cautions),
     ]

@@ -229,7 +229,7 @@ def _complete(context: click.Context, parameter: click.Parameter, begun: str) ->
 
 
 @cli.command()
-@click.argument("name", required=False, shell_complete=_complete)
+@click.argument("names", nargs=-1, metavar="[NAME]", shell_complete=_complete)
 @click.option(
     "--example",
     metavar="EXAMPLE",
@@ -237,12 +237,17 @@ def _complete(context: click.Context, parameter: click.Parameter, begun: str) ->
     help="Example to copy.  [default: NAME if it is an example, else quickstart]",
 )
 @click.option("--list", "listing", is_flag=True, help="List the examples.")
-def init(name: str | None, example: str | None, listing: bool) -> None:
+def init(names: tuple[str, ...], example: str | None, listing: bool) -> None:
     """Write an example configuration NAME.yaml to run and edit.
 
     The command never replaces an existing file. If NAME is omitted, the file has the name of the example.
     """
     examples = find_examples()
+    if len(names) > 1:
+        first, second = names[:2]
+        hint = f"; write zwidth init {second} --example {first}" if first in examples else ""
+        raise click.UsageError(f"got {len(names)} names, {first!r} and {second!r}, but one NAME is allowed{hint}")
+    name = names[0] if names else None
     if listing:
         width = max(map(len, examples))
         for each, path in examples.items():

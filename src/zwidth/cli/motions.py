@@ -31,10 +31,10 @@ from zwidth.units.quantities import ANY, POSITIVE
 
 TIME_CONSTANTS = 8.0  # default length of a simulation, in time constants of the linear loop
 FEWEST_PERIODS = 300  # shortest default length of a simulation, in sampling periods
+MOVING = 0.02  # deviation from the final position, relative to the range of positions, that a figure must show
 MOST_PERIODS = 20_000  # longest default length of a simulation, in sampling periods
 DEFAULT_DEPTH = 1e-3  # m or rad; default depth from which the device is released, if no encoder is given
 DEFAULT_STEPS = 50  # default depth in encoder steps, if an encoder is given
-APPROACH = 2.0  # sampling periods of motion before contact in a simulated hit
 
 _WALL = "--stiffness '10 kN/m' --virtual-damping '40 N s/m'"
 _LIMITS = "--resolution '20 um' --friction '50 mN'"
@@ -56,17 +56,34 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
     diagnosis = find_cause(scene, **hardware)
     remedy = diagnosis.advise()
     lines = [format_row(diagnosis.word, diagnosis.explain()), *([format_row("to stop it", remedy)] if remedy else [])]
-    cautions = [*printing.list_limit_cautions(scene), *printing.list_omission_cautions(scene, find_omitted())]
+    thin = _list_thin_margins(scene)
     lines += [format_row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
-    lines += [format_row("CAUTION", text) for text in cautions]
-    printing.print_result(diagnosis.as_dict(), lines, as_json)
+    lines += [format_row("CAUTION", text) for text in (*thin, *_list_cautions(scene))]
+    printing.print_result(diagnosis.as_dict() | {"cautions": thin}, lines, as_json)
+
+
+def _list_thin_margins(scene: Any) -> list[str]:
+    """Return a list with a caution on the small margins of a stable wall; empty if all margins are large enough."""
+    from zwidth.analysis.assessment import assess
+    from zwidth.analysis.cautions import find_thin
+
+    verdict = assess(scene)
+    thin = find_thin(verdict, scene.timing.period) if verdict.stable else []
+    return [f"{', '.join(thin)}: see zwidth recommend for a wall with larger margins"] if thin else []
+
+
+def _list_cautions(scene: Any) -> list[str]:
+    """Return the cautions on the safe limit and on values that the user has not given."""
+    return [*printing.list_limit_cautions(scene), *printing.list_omission_cautions(scene, find_omitted())]
 
 
 @cli.command(**show_example("simulate --hit '0.1 m/s'", _WALL, OF_SCENE))
 @scene_options(wall=True)
-@click.option("--hit", type=quantity_type("m/s", POSITIVE), help="Speed of a hit on the wall from outside, in m/s.")
+@click.option("--hit", type=quantity_type("m/s", POSITIVE), help="Speed with which the device enters the wall, in m/s.")
 @click.option(
-    "--external-force", type=quantity_type("N", ANY), help="Constant external force, in N, positive into the wall."
+    "--external-force",
+    type=quantity_type("N", ANY),
+    help="Constant external force, in N, positive into the wall; also together with --hit or --hold.",
 )
 @click.option(
     "--hold", type=quantity_type("m", ANY), help="Depth in the wall at which the device is released at rest, in m."
@@ -91,8 +108,10 @@ def simulate(
 ) -> None:
     """Simulate a hit on a wall, a constant external force, or the release of the device from inside the wall.
 
-    In a hit the wall is unilateral; otherwise it is bilateral. Without --hit, --external-force and --hold the device is
-    released at a depth of 1 mm (1 mrad if rotary), or of 50 encoder steps if --resolution is given. The options
+    A hit starts at the surface of the wall, at a sample, with the given speed; the wall is then unilateral and
+    otherwise bilateral. Without --hit, --external-force and --hold the device is released at a depth of 1 mm (1 mrad if
+    rotary), or of 50 encoder steps if --resolution is given. The row "in contact" states what zwidth diagnose finds for
+    a device that stays in the wall, which may differ from the simulated motion. The options
     --stiffness, --mass (or --device) and --rate (or --period) are required. Parameters that are not given as options
     are taken from SCENE.yaml (or from the folder of a run).
     """
@@ -106,37 +125,47 @@ def simulate(
     cause, ending = find_cause(scene, **hardware, remedies=False), describe_ending(motion)
     units = scene.unit_system
     load = "torque" if units.rotary else "force"
-    start = [
-        f"hit at {with_unit(hit, units['m/s'], 3)}" if hit is not None else "",
-        f"external {load} {with_unit(options['external_force'], units['N'], 3)}"
-        if options.get("external_force")
-        else "",
-        f"released at a depth of {with_unit(options['start_position'], units['m'], 3)}"
-        if hit is None and options.get("start_position")
-        else "",
-    ]
+    start = [f"hits the wall at {with_unit(hit, units['m/s'], 3)}"] if hit is not None else []
+    if hit is None and (depth := options.get("start_position")):
+        start.append(f"released at a depth of {with_unit(depth, units['m'], 3)}")
+    if push := options.get("external_force"):
+        start.append(f"external {load} {with_unit(push, units['N'], 3)}")
     force = max(abs(float(motion.command.min())), abs(float(motion.command.max())))
     depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}, "
     depth += f"{load} up to {with_unit(force, units['N'], 3)}; "
     # Omit the largest depth and force of a growing motion, because they grow with the simulated time.
     depth = "" if int(motion.outcome) == MotionKind.GROWING else depth
     lines = [
-        format_row("start", ", ".join(filter(None, start)) or "at rest"),
+        format_row("start", ", ".join(start) or "at rest"),
         format_row("motion", depth + ending),
-        format_row(cause.word, cause.explain()),
+        format_row("in contact", f"{cause.word}: {cause.explain()}"),
     ]
     if cause.cause not in ("none", "undecided"):
         lines.append(format_row("remedies", "zwidth diagnose, with the same options"))
-    cautions = [*printing.list_limit_cautions(scene), *printing.list_omission_cautions(scene, find_omitted())]
     lines += [format_row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
-    lines += [format_row("CAUTION", text) for text in cautions]
+    lines += [format_row("CAUTION", text) for text in _list_cautions(scene)]
     if figure is not None:
-        from zwidth.plotting import plot
-
-        lines.append(save_figure(plot.motion(motion).figure, figure))
+        lines.append(save_figure(_draw_motion(motion), figure))
     result = {name: getattr(motion, name) for name in OF_WHOLE if name not in ("outcome", "status")}
     result = {name: value.item() for name, value in result.items()} | {"outcome": MotionKind(int(motion.outcome)).name}
     printing.print_result(result | {"ending": ending, "periods": periods, "diagnosis": cause.as_dict()}, lines, as_json)
+
+
+def _draw_motion(motion: Any) -> Any:
+    """Return a figure of a motion over time; the time axis ends at three times the time in which it comes to rest."""
+    import numpy as np
+
+    from zwidth.plotting import plot
+    from zwidth.simulation.result import MotionKind
+
+    ax = plot.motion(motion)
+    moving = abs(motion.position - motion.position[-1]) > MOVING * np.ptp(motion.position)
+    if int(motion.outcome) == MotionKind.REST and moving.any():
+        settled = motion.time[np.flatnonzero(moving)[-1] + 1]
+        # Convert to the unit of the axis, which may be ms, by the second sample.
+        unit = ax.lines[0].get_xdata()[1] / motion.time[1]
+        ax.set_xlim(0.0, min(3.0 * settled * unit, ax.get_xlim()[1]))
+    return ax.figure
 
 
 def _choose_start(
@@ -148,13 +177,7 @@ def _choose_start(
             "--hold: given together with --hit; give only one of them, because a hit starts outside the wall"
         )
     if hit is not None:
-        before = -APPROACH * hit * scene.timing.period
-        return {
-            "start_position": before,
-            "start_velocity": hit,
-            "external_force": external_force or 0.0,
-            "contact": "unilateral",
-        }
+        return {"start_velocity": hit, "external_force": external_force or 0.0, "contact": "unilateral"}
     if hold is None and external_force is None:
         depth = DEFAULT_STEPS * hardware["resolution"] if "resolution" in hardware else DEFAULT_DEPTH
         if isinstance(scene.device, LinearDevice):

@@ -28,7 +28,7 @@ from zwidth.model.parameter_paths import PARTS, find_parts, spell_part
 from zwidth.model.timing import Timing
 from zwidth.model.velocity import ESTIMATES, name_estimate
 from zwidth.model.wall import NoWall, VirtualWall
-from zwidth.units.parsing import DIMENSIONS, detect_kind, read_quantity, read_share
+from zwidth.units.parsing import DIMENSIONS, detect_kind, looks_like_number, read_quantity, read_share
 from zwidth.units.plausibility import list_implausible
 from zwidth.units.quantities import ANY, CHOICES, HARDWARE, OF_PARTS, PARAMETERS, Range
 from zwidth.units.unit_system import SYSTEMS, UnitSystem
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 # Keys under which data are stored in the click context of a command.
 _WITH_KIND = "zwidth.with_kind"  # options whose units determine the kind of device, linear or rotary
 _HARDWARE = "zwidth.hardware"  # encoder, friction and motor of the scene file
+LONG_DELAY = 0.5  # s; the largest plausible delay. A longer one requires a unit
 BOTH_PERIODS = "--period and --rate are both given; give only one of them"
 Command: TypeAlias = Callable[..., Any]
 
@@ -105,6 +106,17 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
     return Parsed("quantity", read)
 
 
+def _read_delay(text: str) -> Any:
+    """Return a delay as a `Span`; refuse a long one without a unit, because it is probably meant in periods or ms."""
+    if looks_like_number(text) and float(text) >= LONG_DELAY:
+        number = text.strip()
+        raise ValueError(
+            f"got {text!r}, i.e. {number} s; write '{number} periods' or '{number} ms', or '{number} s' if it is meant "
+            "in seconds"
+        )
+    return quantity_type("s", PARAMETERS["delay"].allowed, periods=True).read(text)
+
+
 SHARE = Parsed("SHARE", read_share, "write a share, such as 2% or 0.02")
 
 
@@ -144,7 +156,8 @@ def _add_option(command: Command, path: str) -> Command:
         parameter = PARAMETERS[path]
         # Skip the range check of parameters of parts, because the constructors of the parts check them.
         allowed = ANY if path in OF_PARTS else parameter.allowed
-        kind = click.INT if parameter.whole else quantity_type(parameter.unit, allowed, periods=path == "delay")
+        kind = click.INT if parameter.whole else quantity_type(parameter.unit, allowed)
+        kind = Parsed("quantity", _read_delay) if path == "delay" else kind
         unit, note = (
             "" if parameter.unit == "1" else f", in {parameter.unit}",
             f"; {parameter.note}" if parameter.note else "",

@@ -7,12 +7,13 @@ device and the timing unless the axes contain them.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import MISSING, fields, replace
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, GetPydanticSchema, ValidationError, WrapValidator, create_model
+from pydantic import BeforeValidator, Field, GetPydanticSchema, ValidationError, WrapValidator, create_model
 from pydantic_core import PydanticCustomError
 
 from zwidth.analysis.scene import Scene
@@ -36,6 +37,7 @@ from zwidth.model.parameter_paths import PARTS
 from zwidth.model.timing import Timing
 from zwidth.model.velocity import BackwardDifference
 from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.units.formatting import describe
 from zwidth.units.quantities import (
     MAX_DELAY_PERIODS,
     NORMALIZED,
@@ -184,7 +186,27 @@ def _find_mixed_kinds(keys: list[str], subject: str) -> Iterable[LocatedProblem]
     yield from find_second_period(keys)
 
 
-OutputName = Annotated[str, GetPydanticSchema(lambda _, handler: handler.generate_schema(Literal[tuple(OUTPUTS)]))]
+# Outputs by the letters of their symbols in figures and in printed results, such as "kmax".
+_BY_SYMBOL = {
+    letters: output.name
+    for output in OUTPUTS.values()
+    if (letters := re.sub(r"[\W_]", "", output.symbol).lower()) not in ("", *PARAMETERS)
+}
+
+
+def _name_symbol(value: Any) -> Any:
+    """Return the name of an output unchanged; raise a problem with the name if the value is a symbol, such as K_max."""
+    name = _BY_SYMBOL.get(value.replace("_", "").lower()) if isinstance(value, str) and value not in OUTPUTS else None
+    if name is not None:
+        raise problem(f"got {describe(value)}", "outputs are written by name, not by symbol", f"write {name}")
+    return value
+
+
+OutputName = Annotated[
+    str,
+    GetPydanticSchema(lambda _, handler: handler.generate_schema(Literal[tuple(OUTPUTS)])),
+    BeforeValidator(_name_symbol),
+]
 
 
 _SCENE = "that of the scene"
@@ -223,10 +245,9 @@ class SweepStudy(_Parts, Study):
     accuracy: Annotated[float, Quantity(allowed=Range(1e-12, 0.1))] = 1e-9
     """Certified relative error of the spectral radius.
 
-    On a grid of walls (stiffness along one axis, virtual damping along another), a larger value is faster, because one
-    Taylor expansion and one pole count certify a whole cell of walls. Single walls are accurate to nearly all digits
-    for every value. If the certification fails, mostly close to double poles, the status is NOT_CONVERGED; the value
-    is then present if an error of at most 0.1 is certified, otherwise NaN.
+    A larger value saves next to no time. Most radii are accurate to nearly all digits for every value. If the
+    certification fails, mostly close to double poles, the status is NOT_CONVERGED; the value is then present if an
+    error of at most 0.1 is certified, otherwise NaN.
     """
 
     @classmethod

@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.identification.critical_controller import expand_partial_fractions
 from zwidth.identification.device_estimate import DimensionlessDevice
 from zwidth.identification.friction_model import ModelResponse, Recording, recur
 from zwidth.identification.quantization_noise import MeasurementNoise
-from zwidth.numerics.held_mass import phi_functions
+from zwidth.plant.rigid_mass import phi_functions
+from zwidth.plant.sampled_plant import expand_partial_fractions, integrate_pole
 
 # Step of central differences: absolute for the pole of a filter, relative for the parameters; for delta at least this
 # value, because delta may be 0.
@@ -281,8 +281,7 @@ def _filter_force(log: Recording, pole: complex, d: float) -> ModelResponse:
     # Within a period the delayed force changes once. Compute the gains from the forces before and after this change to
     # E_p at the next sample, at the pole p and, for the derivative with respect to p, at p plus and minus a step.
     near = pole + _STEP * np.array([[0.0], [1.0], [-1.0]])
-    near = np.where(near == 0, 1e-300, near)
-    gains = np.expm1(np.array([1.0 - f, f]) * near) / near * np.exp([0.0, 1.0 - f] * near)
+    gains = integrate_pole(near, np.array([1.0 - f, f])) * np.exp([0.0, 1.0 - f] * near)
     decay = np.exp(pole)
     states = recur(decay, gains[0] @ log.recent_forces)
 

@@ -19,9 +19,16 @@ import numpy as np
 from zwidth.analysis.recommendation import Recommendation
 from zwidth.core.status import Status
 from zwidth.identification.device_fit import AlternativeDevice, DeviceFit
-from zwidth.identification.safe_scene import advise_record, describe_status, limit_walls, round_parameter, round_period
+from zwidth.identification.safe_scene import (
+    RECORD_AGAIN,
+    advise_record,
+    describe_status,
+    limit_walls,
+    round_parameter,
+    round_period,
+)
 from zwidth.model.parameter_paths import spell_estimate
-from zwidth.units.formatting import plain, with_unit
+from zwidth.units.formatting import plain, round_conservatively, with_unit
 from zwidth.units.quantities import FIELDS
 from zwidth.units.unit_system import UnitSystem
 
@@ -72,7 +79,7 @@ def summarize_fit(fit: DeviceFit, checks: Iterable[tuple[str, str]] = ()) -> lis
     recommended = fit.recommended
     rows = [("NO WALL", recommended.reason)]
     if fit.is_unreliable:
-        rows = [("NO WALL", "resolve the warnings first, then record again")]
+        rows = [("NO WALL", RECORD_AGAIN)]
     elif recommended.status == Status.OK:
         limit = recommended.scene.safe_limit
         cause = limit.reason.partition("; ")[0] if limit is not None and recommended.is_at_safe_limit else ""
@@ -219,7 +226,10 @@ def format_alternative(alternative: AlternativeDevice, system: UnitSystem) -> st
 
 def _format(fit: DeviceFit, name: str) -> str:
     """Format a value of a fit with its unit, and with as many digits as its confidence interval requires."""
-    return format_value(name, fit.value_of(name), fit.unit_system, _count_digits(fit, name))
+    value, digits = fit.value_of(name), _count_digits(fit, name)
+    # Round K_max down, as all commands do, because it is a limit.
+    value = round_conservatively(value, "below", digits) if name == "stiffness_max" else value
+    return format_value(name, value, fit.unit_system, digits)
 
 
 def _format_interval(fit: DeviceFit, name: str) -> str:

@@ -10,7 +10,7 @@ fractional part f of the delay. The period therefore has two *parts* of duration
 
 Within a part the velocity approaches a/delta exponentially, so it reaches 0 at most once. At this *stop* the mass
 sticks if ``|g F + o| <= c``; otherwise it reverses. The time of the stop follows from a logarithm. Before and after it
-the velocity and position have a closed form in the phi-functions of `zwidth.numerics.held_mass`. The derivatives with
+the velocity and position have a closed form in the phi-functions of `zwidth.plant.rigid_mass`. The derivatives with
 respect to the parameters are exact, too: a change dv of the velocity near the stop shifts its time by -dv/a.
 
 Stops are computed one after another in Python; all other steps are vectorized, and linear recursions are solved by
@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.numerics.held_mass import PhiFunctions, phi_functions
+from zwidth.plant.rigid_mass import PhiFunctions, phi_functions
 
 # Columns of the derivatives that `Recording.move` computes: index of each parameter.
 G = 0  # reciprocal mass g = T^2/m

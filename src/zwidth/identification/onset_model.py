@@ -19,10 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.identification.critical_controller import CriticalController
 from zwidth.identification.device_estimate import DimensionlessDevice
-from zwidth.model.circle_functions import circle_points
+from zwidth.model.circle_functions import CirclePoints, circle_points
 from zwidth.model.velocity import Estimate, Velocity
+from zwidth.plant.rigid_mass import differentiate_mass
+from zwidth.plant.sampled_plant import SampledPlant, evaluate_numerator, sample_parts
 from zwidth.units.unit_system import LINEAR, UnitSystem
 
 # Constants of the Newton iteration, which solves the imaginary part of the equation for w, in rad per sample.
@@ -68,11 +69,11 @@ class Onsets:
 
         The frequency w of each wall is computed by Newton's method from the measured frequency.
         """
-        mass, controller, estimate, w = np.exp(theta[0]), CriticalController(*theta[1:3]), self._estimate, self.w
+        mass, plant, estimate, w = np.exp(theta[0]), sample_parts(*theta[1:3]), self._estimate, self.w
         step = np.full(w.shape, np.inf)
         for _ in range(STEPS):
             points = circle_points(w)
-            f, q = estimate.jet(points), controller.evaluate_rigid(points)
+            f, q = estimate.jet(points), plant.rigid_controller(points)
             residual, slope = (
                 (self.scaled_damping * f.value - mass * q.value).imag,
                 (self.scaled_damping * f.slope - mass * q.slope).imag,
@@ -84,13 +85,13 @@ class Onsets:
             if not np.any(np.abs(step) > CONVERGED * w):
                 break
         points = circle_points(w)
-        f, q = estimate.jet(points), controller.evaluate_rigid(points)
+        f, q = estimate.jet(points), plant.rigid_controller(points)
         kappa = (mass * q.value - self.scaled_damping * f.value).real
 
         def differentiate() -> np.ndarray:
             # Differentiating kappa + B T F = m q gives d kappa + (B T F' - m q') dw = d(m q), with d(m q) at fixed w.
             # The imaginary part of this equation determines dw, and the real part d kappa.
-            moved = mass * np.stack([q.value, *controller.differentiate(points, q.value)], -1)
+            moved = mass * np.stack([q.value, *_differentiate_controller(plant, theta[1], points, q.value)], -1)
             by_w = (self.scaled_damping * f.slope - mass * q.slope)[:, None]
             dw = moved.imag / by_w.imag
             return np.stack([(moved.real - by_w.real * dw) / kappa[:, None], dw / w[:, None]], 1)
@@ -111,7 +112,7 @@ class Onsets:
 
         delays = np.linspace(0.0, longest, max(8, int(np.ceil(longest * self.w.max() / 0.1))) + 1)
         points = circle_points(self.w)
-        q = CriticalController(deltas[:, None, None], delays[:, None]).evaluate_rigid(points).value
+        q = sample_parts(deltas[:, None, None], delays[:, None]).controller(points)
         errors = np.log((self.kappa + self.scaled_damping * self._estimate.jet(points).value) / q)
         # At fixed delta and d, the cost is quadratic in ln m, so that the optimal ln m is the mean of the real parts of
         # the logarithms.
@@ -120,3 +121,22 @@ class Onsets:
         lowest = np.argwhere(cost == minimum_filter(cost, 3, mode="constant", cval=np.inf))
         minima = sorted(lowest.tolist(), key=lambda index: cost[tuple(index)])[:count]
         return [np.array([log_mass[i, j], deltas[i], delays[j]]) for i, j in minima]
+
+
+def _differentiate_controller(
+    plant: SampledPlant, delta: float, points: CirclePoints, q: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of q of a rigid mass with respect to the damping delta and the delay d.
+
+    Args:
+        plant: the sampled rigid mass.
+        delta: its damping b T/m.
+        points: points of the unit circle.
+        q: value of q at these points.
+    """
+    by_delta, by_fraction = differentiate_mass(delta, plant.fraction)
+    numerator = evaluate_numerator(plant.rigid, points)
+    return (
+        q * (by_delta.em / (points.z_minus_1 + plant.rigid.em) - evaluate_numerator(by_delta, points) / numerator),
+        -q * evaluate_numerator(by_fraction, points) / numerator,
+    )

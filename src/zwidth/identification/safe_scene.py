@@ -69,6 +69,9 @@ def describe_status(fit: DeviceFit) -> str:
     return "" if status == Status.OK else _STATUS_TEXTS.get(status, status.message)
 
 
+RECORD_AGAIN = "the fit has warnings: record again as they advise"  # reason for no wall, if it is unreliable
+
+
 def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
     """Compute the safe limit of the walls of a fit: a wall with the reason for its limit and the warnings.
 
@@ -78,7 +81,7 @@ def limit_walls(fit: DeviceFit, *, rigid: bool = False) -> SafeLimit:
     """
     if fit.is_unreliable:
         text = describe_status(fit)
-        return SafeLimit(0.0, reason=text or "resolve the warnings first", warnings=fit.warnings)
+        return SafeLimit(0.0, reason=text or RECORD_AGAIN, warnings=fit.warnings)
     wall = fit.safe_wall(rigid=rigid)
     if wall.status != Status.OK or not wall.stiffness > 0:
         return SafeLimit(0.0, reason="the fitted parameters are too uncertain for any wall; record longer")

@@ -8,7 +8,7 @@ proportion* (reliability) is the proportion of devices on which the wall must be
   intervals (docs/theory/one-lobe.md). The search bisects K; for each K, the ends of the stable intervals of B determine
   the B that is stable on most devices.
 - For rigid devices with a velocity filter, the stability limits are computed on a grid of frequencies
-  (`zwidth.identification.critical_controller`). The eigenvalues of the closed loop confirm the wall on every device.
+  (`zwidth.identification.grid_limits`). The eigenvalues of the closed loop confirm the wall on every device.
 - For devices with a lag or resonances, and for undetected resonances, the wall must be stable for all responses within
   the radius of the fitted response (docs/theory/measured.md).
 """
@@ -22,14 +22,14 @@ import numpy as np
 from zwidth.analysis.ensemble import RigidVariants
 from zwidth.analysis.tolerances import compute_stiffness_quantile
 from zwidth.core.status import Status
-from zwidth.identification.critical_controller import CriticalController, GridLimits, find_highest
 from zwidth.identification.device_estimate import DeviceEstimate, DimensionlessDevice
+from zwidth.identification.grid_limits import GridLimits, find_highest
 from zwidth.model.circle_functions import circle_points
 from zwidth.model.mechanism import Body, Chain, Resonance
 from zwidth.model.state_space import StateSpace, connect_in_series, realize_estimate
 from zwidth.model.velocity import BackwardDifference, Estimate
-from zwidth.simulation.flow import flow
-from zwidth.stability.linear.discretization import DiscreteChain, add_input_delay
+from zwidth.plant.sampled_plant import sample_parts
+from zwidth.plant.sampled_states import SampledStates, sample_states
 from zwidth.stability.rigid.normalization import device_status
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import SI_RANGE
@@ -221,8 +221,8 @@ class _SearchedDevices:
         points = circle_points(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
         with np.errstate(all="ignore"):
             velocity = scene.velocity.estimate(period).jet(points).value[None] / period
-            controller = CriticalController(*fit.normalize(drawn[..., None])[1:3])
-            critical = controller.evaluate_rigid(points).value * (rate / period)[:, None]
+            plant = sample_parts(*fit.normalize(drawn[..., None])[1:3])
+            critical = plant.controller(points) * (rate / period)[:, None]
             # Set the imaginary parts at z = -1 to 0, because they are only rounding errors.
             critical[:, -1], velocity[:, -1] = np.real(critical[:, -1]), np.real(velocity[:, -1])
             self.limits = GridLimits(critical, velocity)
@@ -273,17 +273,12 @@ def _are_stable(fit: DeviceEstimate, drawn: np.ndarray, stiffness: float, virtua
         A mask of the devices on which all these walls are stable.
     """
     estimate, devices = fit.velocity.estimate(fit.period), fit.normalize(drawn)
-    A, B, _ = (np.moveaxis(part, -1, 0) for part in _build_chain(devices, estimate).realize())
-    n_delay, f = np.floor(devices.d).astype(int), realize_estimate(estimate)
-    rate, size = np.concatenate([A, B[..., None]], -1), B.shape[-1]
-    times = np.stack([np.ones_like(devices.d), n_delay + 1.0 - devices.d], -1)
-    moved = flow(rate, np.zeros((len(A), size + 1, size + 1)), times).change
-    parts = moved[:, 0, :, :size], moved[:, 0, :, size], moved[:, 1, :, size]
+    states, f = sample_states(_build_chain(devices, estimate)), realize_estimate(estimate)
     stable = np.zeros(len(drawn), bool)
     # Group the devices by the integer delay, because only closed loops of the same order form a batch.
-    for n in np.unique(n_delay):
-        group = n_delay == n
-        plant = add_input_delay(DiscreteChain(*(part[group] for part in parts)), int(n))
+    for n in np.unique(states.n_delay):
+        group = states.n_delay == n
+        plant = SampledStates._make((*(part[group] for part in states[:3]), n)).realize()
         alpha, beta = (
             wall / devices.mass[group, None, None] for wall in (stiffness * fit.period**2, virtual_damping * fit.period)
         )
@@ -302,4 +297,4 @@ def _build_chain(devices: DimensionlessDevice, estimate: Estimate) -> Chain:
     lag = 1.0 / devices.lag[0] if devices.lag else None
     if len(devices.lag) == 2:
         lag = Resonance(lag, devices.lag[1], devices.lag[0] ** 2)
-    return Chain((Body(1.0, devices.delta, 0.0),), (), modes, lag, 0, devices.d, 0, estimate)
+    return Chain((Body(1.0, devices.delta, 0.0),), (), modes, lag, 0, devices.d, np.floor(devices.d), estimate)

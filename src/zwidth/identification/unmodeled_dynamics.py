@@ -46,11 +46,12 @@ import numpy as np
 
 from zwidth.analysis.measured_curve import LEAST_DAMPING_RATIO
 from zwidth.analysis.scene import Scene
-from zwidth.identification.critical_controller import CriticalController, GridLimits
 from zwidth.identification.friction_model import recur
+from zwidth.identification.grid_limits import GridLimits
 from zwidth.identification.output_error import FittedModel
 from zwidth.model.circle_functions import circle_points
 from zwidth.model.measured_device import MeasuredDevice
+from zwidth.plant.sampled_plant import sample_parts
 
 # Grid of candidate poles (the bank). Frequencies are relative to the sampling rate.
 MIN_FREQUENCY = 0.005  # lowest natural frequency in the bank
@@ -308,7 +309,7 @@ def _evaluate_unit_modes(fit: FittedModel, grid: np.ndarray, frequency: np.ndarr
         ratio: Damping ratios of the modes; broadcasts with ``grid``.
     """
     (g, delta, d), mode = fit.theta[:3], (2.0 * np.pi * frequency, ratio, np.sqrt(1.0 - ratio**2))
-    return g * CriticalController(delta, d, (), [mode]).evaluate_parts(circle_points(2.0 * np.pi * grid))
+    return g * sample_parts(delta, d, (), [mode]).parts_response(circle_points(2.0 * np.pi * grid))
 
 
 def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -325,8 +326,8 @@ def _evaluate_response(fit: FittedModel, period: float, grid: np.ndarray) -> tup
     points = circle_points(2.0 * np.pi * grid.ravel())
 
     def evaluate(theta: np.ndarray) -> np.ndarray:
-        controller = CriticalController(*fit.model.normalize(theta, period)[1:])
-        return (-theta[0] / controller.evaluate(points)).reshape(grid.shape)
+        plant = sample_parts(*fit.model.normalize(theta, period)[1:])
+        return (theta[0] * plant.response(points)).reshape(grid.shape)
 
     count, response = fit.model.parts.stop, evaluate(fit.theta)
     steps = np.abs(fit.theta[:count])

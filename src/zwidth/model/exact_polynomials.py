@@ -23,6 +23,9 @@ from zwidth.core.errors import InputError
 Polynomial: TypeAlias = tuple[Fraction, ...]
 """Exact coefficients, highest power first, without leading zeros; empty for the zero polynomial."""
 
+# NumPy's polynomial functions are exact for fractions, which its type annotations exclude.
+numpy: Any = np
+
 # Working precisions in decimal digits, tried in this order: 50, 100, .., 1600.
 DIGITS = tuple(50 << k for k in range(6))
 STEPS = 400  # largest number of Aberth steps; about 10 suffice, starting from the eigenvalues of the companion matrix
@@ -46,35 +49,22 @@ def trim(coefficients: Any) -> Polynomial:
 
 def multiply(one: Polynomial, other: Polynomial) -> Polynomial:
     """Return the product of two polynomials."""
-    product = [Fraction(0)] * (len(one) + len(other) - 1)
-    for i, a in enumerate(one):
-        for j, b in enumerate(other):
-            product[i + j] += a * b
-    return trim(product)
+    return trim(numpy.polymul(one, other))
 
 
 def subtract(one: Polynomial, other: Polynomial) -> Polynomial:
     """Return the difference of two polynomials."""
-    size = max(len(one), len(other))
-    padded = ((Fraction(0),) * (size - len(part)) + part for part in (one, other))
-    return trim([a - b for a, b in zip(*padded, strict=True)])
+    return trim(numpy.polysub(one, other))
 
 
 def differentiate(polynomial: Polynomial) -> Polynomial:
     """Return the derivative of a polynomial."""
-    size = len(polynomial) - 1
-    return trim([value * (size - k) for k, value in enumerate(polynomial[:-1])])
+    return trim(numpy.polyder(polynomial))
 
 
 def shift(polynomial: Polynomial) -> Polynomial:
     """Return the coefficients of the polynomial p(1 - x), given those of p(x)."""
-    # Horner's scheme (synthetic division) yields p(1 + x); reverse the sign of odd powers afterwards.
-    values = list(polynomial)
-    for k in range(1, len(values)):
-        for j in range(1, len(values) - k + 1):
-            values[j] += values[j - 1]
-    size = len(values) - 1
-    return trim([-value if (size - k) % 2 else value for k, value in enumerate(values)])
+    return trim(numpy.polyval(polynomial, np.poly1d([-1, 1])).coeffs)
 
 
 def divide(top: Polynomial, bottom: Polynomial) -> tuple[Polynomial, Polynomial]:
@@ -139,7 +129,7 @@ def find_roots(polynomial: Polynomial, offsets: bool = False) -> np.ndarray:
     for times, factor in enumerate(_split_by_multiplicity(rest), start=1):
         while len(factor) > 1 and factor[-1] == 0:
             factor, roots = factor[:-1], [*roots, *[0j] * times]
-        roots += [root for root in _simple_roots(factor) for _ in range(times)]
+        roots += [root for root in find_simple_roots(factor) for _ in range(times)]
     return np.array(roots, complex)
 
 
@@ -161,7 +151,7 @@ def _split_by_multiplicity(polynomial: Polynomial) -> list[Polynomial]:
     return factors
 
 
-def _simple_roots(polynomial: Polynomial) -> list[complex]:
+def find_simple_roots(polynomial: Polynomial) -> list[complex]:
     """Return the roots of a square-free polynomial that has no root at 0."""
     if len(polynomial) < 2:
         return []

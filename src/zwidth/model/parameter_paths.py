@@ -8,7 +8,7 @@ parameter of another part begins with the name of the part: ``velocity.cutoff``,
 from __future__ import annotations
 
 from dataclasses import MISSING, fields, replace
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,7 @@ class Parts(Protocol):
     def velocity(self) -> Velocity: ...
     @property
     def operator(self) -> Operator | None: ...
+    def _rebuild(self) -> Self: ...
 
 
 AnyScene = TypeVar("AnyScene", bound=Parts)

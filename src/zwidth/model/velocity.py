@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from zwidth.core.errors import InputError
-from zwidth.core.xp import is_jax, namespace
+from zwidth.core.xp import is_jax, is_traced, namespace
 from zwidth.model.checks import Part
 from zwidth.model.circle_functions import CirclePoints, Jet, power_jet, product_jet
 from zwidth.model.filter_sections import (
@@ -340,6 +340,9 @@ def is_plain(velocity: Velocity, period: Any) -> bool:
     """Return whether an estimate is the backward difference, divided by the loop's period, with all fields None."""
     if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
         return False
+    if is_traced(period):
+        # A user's estimate may accept only floats.
+        return type(velocity).estimate is BackwardDifference.estimate
     estimate = velocity.estimate(period)
     return estimate.window == 1 and estimate.is_difference and isinstance(estimate.gain, float) and estimate.gain == 1.0
 

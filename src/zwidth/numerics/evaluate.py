@@ -180,9 +180,6 @@ def _stack_level() -> int:
 # NumPy and JAX may differ in the last digit.
 Route: TypeAlias = Literal["auto", "numpy", "jax"]
 
-# Type of a function that computes, in NumPy, the values of a kernel and their derivatives in each argument.
-Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
-
 # Largest number of points that NumPy evaluates. NumPy takes some tenths of a second for so many points, a compilation
 # takes seconds. With ten times as many points a compilation saves time, because compiled calls are two to five times as
 # fast.
@@ -197,7 +194,6 @@ def evaluate(
     *static: Any,
     weight: int = 1,
     route: Route = "auto",
-    slopes: Slopes | None = None,
 ) -> Any:
     """Evaluate a kernel for arguments that broadcast, by NumPy or JAX.
 
@@ -207,7 +203,6 @@ def evaluate(
         *static: further arguments of the kernel, which are constants at compilation.
         weight: time and memory of a point relative to a simple kernel; larger for kernels that sample each point.
         route: evaluation by NumPy or JAX.
-        slopes: derivatives of the kernel in NumPy, so that gradients of few points need no compilation.
 
     Returns:
         The results, with the broadcast shape and the array type of the arguments.
@@ -224,7 +219,7 @@ def evaluate(
                 result = kernel(*numbers, *static)
             return result if isinstance(result, np.generic) else tree_map(_plain, result)
     if is_traced(*values):
-        return compile_traced(kernel, static, slopes)(*broadcast_traced(arguments))
+        return compile_traced(kernel, static)(*broadcast_traced(arguments))
     arrays = broadcast(arguments)
     shape = arrays[0].shape
     flat = evaluate_columns(kernel, [array.reshape(-1) for array in arrays], *static, weight=weight, route=route)
@@ -262,15 +257,12 @@ def _plain(leaf: Any) -> Any:
 
 
 @cache
-def compile_traced(
-    kernel: Callable[..., Any], static: tuple[Any, ...], slopes: Slopes | None = None
-) -> Callable[..., Any]:
+def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
     """Return a kernel compiled for traced values, with a rule that computes its derivatives elementwise.
 
     Args:
         kernel: function of arrays and ``static``.
         static: further arguments of the kernel, which are constants at compilation.
-        slopes: derivatives of the kernel in NumPy; if given, gradients of few points outside jit need no compilation.
     """
     # Define the derivatives by a rule, because the result at a point depends only on the arguments at this point: its
     # tangent is a sum of one product per argument. Without the rule, `jax.grad` outside `jit` would compile a program
@@ -320,16 +312,7 @@ def compile_traced(
         active = tuple(not isinstance(tangent, jax.custom_derivatives.SymbolicZero) for tangent in tangents)
         if not any(active):
             return function(*primals), tree_map(_no_change, function(*primals))
-        if slopes is None or is_traced(*primals) or np.size(primals[0]) > FEW:
-            value, sides = sloped(active)(*primals)
-        else:
-            with np.errstate(all="ignore"):
-                value, sides = slopes(*(np.asarray(primal, np.float64) for primal in primals), *static)
-            value, *sides = (
-                tree_map(partial(_as_precise, argument=primals[0]), leaves)
-                for leaves in (value, *(by for by, moves in zip(sides, active, strict=True) if moves))
-            )
-            sides = tree_map(lambda *leaves: leaves, *sides)
+        value, sides = sloped(active)(*primals)
         moving = [tangent for tangent, moves in zip(tangents, active, strict=True) if moves]
 
         def change(leaf: Any, by: Any) -> Any:
@@ -344,15 +327,6 @@ def compile_traced(
 
     function.defjvp(rule, symbolic_zeros=True)
     return function
-
-
-def _as_precise(leaf: Any, argument: Any) -> Any:
-    """Convert a NumPy result to a JAX array; real numbers take the precision of the argument."""
-    import jax
-
-    # Convert the precision with NumPy, because JAX would compile a program for the conversion.
-    kind = argument.dtype if np.issubdtype(leaf.dtype, np.inexact) else leaf.dtype
-    return jax.numpy.asarray(np.asarray(leaf, kind))
 
 
 def _no_change(leaf: Any) -> Any:

@@ -1,8 +1,10 @@
-"""Polynomials, represented by their coefficients (highest power first), and their companion matrices."""
+"""Polynomials by their coefficients (highest power first), their companion matrices, and Aberth's iteration."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from zwidth.core.types import Array, Coefficients, Matrices
 from zwidth.core.xp import namespace
@@ -37,3 +39,19 @@ def companion(monic: Coefficients) -> Matrices:
 def abs2(x: Any) -> Array:
     """Return the squared magnitude ``|x|^2`` of real or complex numbers, without a square root."""
     return x.real * x.real + x.imag * x.imag
+
+
+def compute_aberth_step(roots: Array, rate: Array) -> Array:
+    """Return Aberth's steps for approximations of all roots of a polynomial P, along the last axis.
+
+    The step is Newton's, corrected for the other roots, so that no two approximations converge to the same root.
+
+    Args:
+        roots: approximations.
+        rate: ``P'/P`` at the approximations.
+
+    Returns:
+        The steps, to be subtracted.
+    """
+    differences = np.where(np.eye(roots.shape[-1], dtype=bool), np.inf, roots[..., :, None] - roots[..., None, :])
+    return 1.0 / (rate - (1.0 / differences).sum(-1))

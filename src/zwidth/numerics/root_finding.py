@@ -246,13 +246,26 @@ def find_zeros_between(function: Function, nodes: np.ndarray, values: np.ndarray
     Returns:
         The zeros, shape (zeros,).
     """
-    if not k.size:
-        return nodes[k]
-    low, high, first, last = nodes[k], nodes[k + 1], values[k], values[k + 1]
+    return find_zeros_in_brackets(function, nodes[k], nodes[k + 1], values[k], values[k + 1])
+
+
+def find_zeros_in_brackets(function: Function, low: Array, high: Array, at_low: Array, at_high: Array) -> Array:
+    """Find the zero of a function in each bracket whose ends have values of opposite sign, by false position.
+
+    Args:
+        function: the function.
+        low: lower ends of the brackets, positive.
+        high: upper ends. A bracket of width 0 returns its end.
+        at_low: values at ``low``.
+        at_high: values at ``high``.
+    """
+    if not low.size:
+        return low
+    xp = namespace(low, at_low)
     with np.errstate(all="ignore"):
-        sizes = np.abs(first) + np.abs(last)
-        scale = np.where(first > 0, 1.0, -1.0) / np.where(sizes > 0, sizes, 1.0)
-        ends = low, high, first * scale, last * scale
+        size = xp.abs(at_low) + xp.abs(at_high)
+        scale = xp.where(at_low > 0, 1.0, -1.0) / xp.where(size > 0, size, 1.0)
+        ends = low, high, at_low * scale, at_high * scale
         return false_position(lambda x: function(x) * scale, *ends, MAX_BETWEEN_STEPS, BETWEEN_WIDTH * high)
 
 

@@ -194,6 +194,9 @@ def recommendation(
     interval = np.array([verdict.virtual_damping_lower, verdict.virtual_damping_upper])
     look = {"color": style.GRAY, "linewidth": 1.0, "label": "virtual_damping_interval"}
     panels[0].plot([K * spring] * 2, interval * damper, **look)
+    shown = panels[0].get_legend()
+    handles = [*(shown.legend_handles if shown else ()), style.line("stable $B$ at this $K$", width=1.0)]
+    style.legend(panels, handles, outside=False, loc="upper right")
     if response is None and has_model:
         # Simulate one and a half times the decay time of the dominant pole, within MIN_PERIODS and MAX_PERIODS.
         periods = int(

@@ -39,6 +39,8 @@ MARKS: dict[str, dict[str, Any]] = {
 }
 _LETTER_WIDTH = 4.4  # mean width of a letter of the text next to a mark, in points
 _FRAME_MARGIN = 0.8  # width of a panel outside the frame of its axes, in inches
+_MARGINS = 1.08  # width of the stiffness axis without text, relative to the largest stiffness
+_WIDEST_TEXT = 0.45  # largest width of a text to the right of the stiffest wall, relative to the panel
 # Line style of each kind of outline.
 _DASHES = {"outline": style.SOLID, "island": style.DASHED, "hole": style.DOTTED, "passive": style.DASH_DOTTED}
 
@@ -83,8 +85,7 @@ def mark_wall(
     *,
     kind: str,
     text: str = "",
-    right: bool = False,
-    room: float = np.inf,
+    rooms: tuple[float, float] = (np.inf, 0.0),
     **look: Any,
 ) -> None:
     """Mark a wall in a panel.
@@ -95,21 +96,37 @@ def mark_wall(
         label: Label of the mark for legends.
         kind: Kind of the mark, a key of `MARKS`.
         text: Text next to the mark.
-        right: Write the text to the right of the mark instead of the left.
-        room: Width available to the left of the mark, in points. A wider text is written above the mark, beginning at
-            the vertical axis.
+        rooms: Widths available to the left and to the right of the mark, in points. The text is written to the left
+            if it fits there, otherwise to the right, otherwise above the mark, beginning at the vertical axis.
         look: Properties of the mark that replace those of its kind.
     """
     look = {"linestyle": "", "color": style.BLACK, "zorder": 5, "clip_on": False, **MARKS[kind], **look}
     ax.plot(*wall, label=label, **look)
     if text:
-        place: Any = {"xytext": (6 if right else -8, 0), "ha": "left" if right else "right", "va": "center"}
-        if room < _LETTER_WIDTH * max(map(len, text.split("\n"))) + 8:
+        needed = _measure_width(text)
+        place: Any = {"xytext": (-8, 0), "ha": "right", "va": "center"}
+        if rooms[0] < needed <= rooms[1]:
+            place = {"xytext": (6, 0), "ha": "left", "va": "center"}
+        elif rooms[0] < needed:
             # Write the text above the mark, starting at the vertical axis. Give the text a white background, because
             # lines may cross the text there.
             background = {"facecolor": "white", "alpha": 0.7, "linewidth": 0.0, "pad": 1.0}
-            place = {"xytext": (4 - room, 6), "ha": "left", "va": "bottom", "bbox": background}
+            place = {"xytext": (4 - rooms[0], 6), "ha": "left", "va": "bottom", "bbox": background}
         ax.annotate(text, wall, textcoords="offset points", fontsize=8, zorder=6, **place)
+
+
+def _estimate_width(ax: Axes) -> float:
+    """Return the width of the frame of an Axes in points; with a layout engine, the one expected after the layout."""
+    figure, spec = style.figure_of(ax), ax.get_subplotspec()
+    width = figure.get_figwidth() * ax.get_position().width
+    if figure.get_layout_engine() is not None:
+        width = figure.get_figwidth() / (spec.get_gridspec().ncols if spec else 1) - _FRAME_MARGIN
+    return 72.0 * width
+
+
+def _measure_width(text: str) -> float:
+    """Return the approximate width of a text next to a mark, with its distance from the mark, in points."""
+    return _LETTER_WIDTH * max(len(line.replace("$", "")) for line in text.split("\n")) + 8.0
 
 
 def draw_zeros(ax: Axes) -> None:
@@ -270,12 +287,10 @@ def draw_stable_set(
     pieces = set()
     for label, color in colors.items() if "label" in outlines else ():
         pieces |= _draw_pieces(ax, select(outlines, label=label), names, color, factors, 0.5 / (1 + len(labels)))
-    rows, spec = select(walls), ax.get_subplotspec()
-    width = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
-    # Extend the stiffness axis for the text to the right of the stiffest wall, by a larger fraction if the panel is
-    # narrow, because the width of the text does not shrink with the panel.
-    right_margin, most = 0.28 * max(1.0, 5.6 / width), max(rows[names[0]], default=np.nan) * factors[0]
+    rows, right_margin = select(walls), 0.0
     rows = {"digits": np.full(len(rows["wall"]), 4), **rows}
+    most = max(rows[names[0]], default=np.nan) * factors[0]
+    width = _estimate_width(ax)
     for kind, label, digits, *wall in zip(*(rows[name] for name in ("wall", "label", "digits", *names)), strict=True):
         # Round K down, because the wall with the printed K must be stable.
         read = round_conservatively(wall[0], "below", digits), wall[1]
@@ -286,16 +301,21 @@ def draw_stable_set(
             f"${symbol}$ = {f'{value:.{digits}g}' if normalized else with_unit(value, style.units()[unit], digits)}"
             for symbol, value, unit in symbols
         ]
-        text = "\n".join([kind, *numbers]) if alone and np.isfinite(wall[0]) else ""
+        text = "\n".join([kind.replace(" (", "\n("), *numbers]) if alone and np.isfinite(wall[0]) else ""
         look = {"color": style.BLACK} if alone else {"color": colors[label]}
         look |= {"marker": markers[label]} if which == "stiffest" else {}
-        room = (
-            np.inf if which == "stiffest" else 72.0 * (width - _FRAME_MARGIN) * wall[0] / ((1.0 + right_margin) * most)
-        )
-        mark_wall(ax, wall, kind, kind=which, text=text, right=kind == "stiffest", room=room, **look)
+        scale = width / (_MARGINS * (1.0 + right_margin) * most)
+        rooms = scale * wall[0], scale * (most - wall[0])
+        if which == "stiffest" and text:
+            # Extend the stiffness axis for a text to the right of the stiffest wall. In a narrow panel, write the text
+            # to the left, because the extended axis would leave little room for the curves.
+            share = _measure_width(text) / width
+            right_margin = share / (1.0 - share) if share < _WIDEST_TEXT else 0.0
+            rooms = (0.0, np.inf) if right_margin else (np.inf, 0.0)
+        mark_wall(ax, wall, kind, kind=which, text=text, rooms=rooms, **look)
     name_axes(ax, *units)
     ax.margins(0.04)
-    if alone and np.isfinite(rows[names[0]]).any():
+    if right_margin:
         low, high = ax.get_xlim()
         ax.set_xlim(low, high + right_margin * (high - low))
     handles: list[Any] = []

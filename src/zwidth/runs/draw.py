@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.core.errors import InputError, StoreError
-from zwidth.model.checks import check_number
+from zwidth.core.errors import InputError, StoreError, UnusableValueError
+from zwidth.model.checks import check_number, read_span
 from zwidth.plotting.curves import draw_curves, draw_outlines, find_family
 from zwidth.plotting.grid import choose_axes
 from zwidth.plotting.plane import Edges, draw_plane
@@ -192,6 +192,21 @@ def _format_value(value: float, unit: str) -> str:
     return f"{short(value)} {unit}".removesuffix(" 1")
 
 
+def _count_periods(data: xarray.Dataset, dim: str, value: str) -> float:
+    """Return the number of sampling periods of a text with a unit, such as "1 ms" or "1 periods".
+
+    Raise `InputError` if the text is in seconds and the sweep has several sampling periods.
+    """
+    try:
+        span = read_span(value, ANY)
+    except UnusableValueError as error:
+        raise InputError(f"at: {dim}: {error}") from None
+    period = data.attrs["study"]["axes"].get("period")
+    if span.unit == "s" and not isinstance(period, float):
+        raise InputError(f"at: {dim}: got {value!r}; write a number of sampling periods, because the period varies")
+    return span.periods(period)
+
+
 def _find_nearest(data: xarray.Dataset, dim: str, value: float | str) -> tuple[int, bool]:
     """Return the index of the value of the sweep nearest to the requested one, and whether the two are equal.
 
@@ -206,10 +221,13 @@ def _find_nearest(data: xarray.Dataset, dim: str, value: float | str) -> tuple[i
     try:
         wanted = float(value)
     except ValueError:
-        if unit in ("1", "sampling periods"):
-            remedy = f"write a number in {unit}".removesuffix(" in 1")
-            raise InputError(f"at: {dim}: got {value!r}; {remedy}") from None
-        wanted = check_number(f"at: {dim}", value, unit, ANY)
+        if unit == "1":
+            raise InputError(f"at: {dim}: got {value!r}; write a number") from None
+        wanted = (
+            _count_periods(data, dim, str(value))
+            if unit == "sampling periods"
+            else check_number(f"at: {dim}", value, unit, ANY)
+        )
     if not np.isfinite(wanted):
         raise InputError(f"at: {dim}: got {value!r}; write a finite number")
     values = np.asarray(data[dim].values, dtype=float)

@@ -19,7 +19,7 @@ from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import Parts, replace_parameters
 from zwidth.model.velocity import FOAW, BackwardDifference
 from zwidth.numerics.threads import run_in_threads
-from zwidth.simulation.flow import build_mechanics
+from zwidth.simulation.mechanics import build_mechanics
 from zwidth.simulation.parameters import (
     ExternalInputs,
     Motor,
@@ -27,7 +27,7 @@ from zwidth.simulation.parameters import (
     Parameters,
     Settings,
     build_estimators,
-    build_flows,
+    build_transitions,
     cut_period,
     round_up,
     spread_scenes,
@@ -177,7 +177,7 @@ def build_batch(
             numbers["static"] * force,
         ),
         estimator=build_estimators(estimates, which),
-        **build_flows(build_mechanics(chains), np.moveaxis(durations, -1, 0), which, options),
+        **build_transitions(build_mechanics(chains), np.moveaxis(durations, -1, 0), which, options),
     )
     instants = durations = None
     if options.jitter:

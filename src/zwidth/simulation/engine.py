@@ -21,7 +21,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import filter_options
-from zwidth.simulation.flow import Flow
+from zwidth.plant.transition import Transition
 from zwidth.simulation.parameters import ExternalInputs, Options, Parameters, Settings
 from zwidth.simulation.propagation import BodyState, advance, dot, propagate_with_friction, read, times
 
@@ -213,7 +213,8 @@ def propagate(
     """
     zero, direct = 0.0 * body.x[0], params.rate.shape[1] == params.rate.shape[0] + 1
     forces = jnp.stack([force + external_force + zero] if direct else [force + zero, external_force + zero])
-    step = None if options.jitter else Flow(*(read(read(part, indices[0], 1), indices[1], 1) for part in params.pieces))
+    selected = (read(read(part, indices[0], 1), indices[1], 1) for part in params.pieces)
+    step = None if options.jitter else Transition(*selected)
     rubbed = zero
     if options.friction:
         after, lost, rubbed = propagate_with_friction(params, body, forces, time, step)

@@ -2,13 +2,13 @@
 
 Units are the sampling period, the mass that the force of the wall acts on, and m. A last axis of length 1 broadcasts
 over the batch. A period is divided into equal *substeps*, and a substep into *pieces* with constant force. n is the
-length of the state x of the bodies (`simulation.flow`). The first body *slips*, or friction *holds* it. FOAW is the
-adaptive velocity estimate of Janabi-Sharifi et al. 2000. T1 to T7 are steps of docs/theory/simulation.md.
+length of the state x of the bodies (`simulation.mechanics`). The first body *slips*, or friction *holds* it. FOAW is
+the adaptive velocity estimate of Janabi-Sharifi et al. 2000. T1 to T7 are steps of docs/theory/simulation.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
 
@@ -18,11 +18,13 @@ from zwidth.core.errors import InputError
 from zwidth.core.types import Array
 from zwidth.model.state_space import realize_estimate
 from zwidth.model.velocity import FOAW
-from zwidth.simulation.flow import DIGITS, Flow, Mechanics, flow
+from zwidth.plant.transition import Transition, compute_transition
+from zwidth.simulation.mechanics import Mechanics
 
 # Longest step with friction, as the angle in rad by which the fastest oscillation advances. A longer step could contain
 # two events, i.e. changes between slipping and holding (T5).
 LONGEST_ANGLE = 0.25
+DIGITS = 53  # number of binary digits of a float64 time below 2 periods: 1, 1/2, ... 2^-52
 MOST_STEPS = 256  # largest number of steps per period with friction, to limit the run time
 
 
@@ -118,10 +120,10 @@ class Parameters(NamedTuple):
     durations: Array  # durations of the pieces without jitter, (substeps, pieces, batch)
     # Matrices of the motion over each piece, for a first body that slips and, with friction, for one that is held; the
     # axes are (1 or 2, substeps, pieces, ..., batch).
-    pieces: Flow
+    pieces: Transition
     # Matrices of the motion over each binary digit of time, for a first body that slips and, with friction, for one
     # that is held; the axes are (1 or 2, DIGITS, ..., batch).
-    digits: Flow
+    digits: Transition
     longest: Array  # longest step with friction, in periods
 
 
@@ -208,7 +210,7 @@ def find_longest_steps(machine: Mechanics) -> np.ndarray:
     return steps
 
 
-def build_flows(machine: Mechanics, durations: np.ndarray, which: np.ndarray, options: Options) -> dict[str, Any]:
+def build_transitions(machine: Mechanics, durations: np.ndarray, which: np.ndarray, options: Options) -> dict[str, Any]:
     """Return the matrices of the mechanisms and of their motion over given times, keyed by the fields of `Parameters`.
 
     Args:
@@ -219,13 +221,18 @@ def build_flows(machine: Mechanics, durations: np.ndarray, which: np.ndarray, op
     """
     ways = (machine.rate, machine.held) if options.friction else (machine.rate,)
 
-    def stack(flows: Iterable[Flow]) -> Flow:
-        return Flow(*(np.stack(column) for column in zip(*(spread_scenes(each, which) for each in flows), strict=True)))
+    def integrate(times: np.ndarray) -> Transition:
+        """Return the motion over times of shape (scenes, ...), for each way, with the batch as the last axis."""
+        inner = (len(times), *(1,) * (times.ndim - 1))
+        drain = machine.drain.reshape(*inner, *machine.drain.shape[1:])
+        motions = (compute_transition(way.reshape(*inner, *way.shape[1:]), times, drain) for way in ways)
+        spread = (spread_scenes(motion, which) for motion in motions)
+        return Transition(*(np.stack(column) for column in zip(*spread, strict=True)))
 
-    digits = Flow(*(np.zeros((1, 1, 1, 1, 1)) for _ in Flow._fields))
+    digits = Transition(*(np.zeros((1, 1, 1, 1, 1)) for _ in Transition._fields))
     if options.friction or options.jitter:
         times = np.broadcast_to(0.5 ** np.arange(DIGITS), (len(machine.rate), DIGITS))
-        digits = stack(flow(way, machine.drain, times) for way in ways)
+        digits = integrate(times)
     longest = find_longest_steps(machine) if options.friction else np.array([2.0])
     return {
         "rate": spread_scenes(machine.rate, which),
@@ -233,7 +240,7 @@ def build_flows(machine: Mechanics, durations: np.ndarray, which: np.ndarray, op
         "motion": machine.motion[..., None],
         "energy": spread_scenes(machine.energy, which),
         "durations": spread_scenes(durations, which),
-        "pieces": stack(flow(way, machine.drain, durations) for way in ways),
+        "pieces": integrate(durations),
         "digits": digits,
         "longest": spread_scenes(longest, which),
     }

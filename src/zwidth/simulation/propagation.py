@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth.core.types import Array
-from zwidth.simulation.flow import DIGITS, Flow
-from zwidth.simulation.parameters import Parameters
+from zwidth.plant.transition import Transition
+from zwidth.simulation.parameters import DIGITS, Parameters
 
 MOST_EVENTS = 512  # largest number of steps per piece, nearly all to an event; beyond it the state is set to NaN
 LAST_DIGIT = 0.5 ** (DIGITS - 1)  # shortest step, in sampling periods
@@ -53,7 +53,7 @@ def dot(row: Array, vector: Array) -> Array:
 
 
 def advance(
-    digits: Flow,
+    digits: Transition,
     held: Array,
     x: Array,
     forces: Array,
@@ -66,7 +66,7 @@ def advance(
     This bisects to the instant at which the condition becomes false, or propagates up to ``limit`` if it stays true.
 
     Args:
-        digits: flows over the binary digits of time, while the first body slips and while it is held.
+        digits: transitions over the binary digits of time, while the first body slips and while it is held.
         held: mask of the batch entries whose first body is held.
         x: state of the bodies.
         forces: constant forces.
@@ -210,7 +210,7 @@ class _Joint(NamedTuple):
             state.events + moving,
         )
 
-    def glide(self, state: _Slide, whole: Flow) -> _Slide:
+    def glide(self, state: _Slide, whole: Transition) -> _Slide:
         """Propagate the batch entries without an event over their whole piece, in one step by precomputed matrices."""
         x, slip = state.body
 
@@ -230,12 +230,12 @@ class _Joint(NamedTuple):
         )
         return self.account(state, calm, BodyState(far, slip), 0.0 * state.left, lost)
 
-    def step(self, state: _Slide, digits: Flow, which: Array | None) -> _Slide:
+    def step(self, state: _Slide, digits: Transition, which: Array | None) -> _Slide:
         """Propagate all batch entries to their next event, or by the longest step if it contains no event.
 
         Args:
             state: intermediate state before the step.
-            digits: flows over the binary digits of time.
+            digits: transitions over the binary digits of time.
             which: indices in the batch of the entries of ``state``; all if None.
         """
         x, slip = state.body
@@ -276,7 +276,7 @@ class _Joint(NamedTuple):
 
 
 def propagate_with_friction(
-    params: Parameters, body: BodyState, forces: Array, duration: Array, whole: Flow | None
+    params: Parameters, body: BodyState, forces: Array, duration: Array, whole: Transition | None
 ) -> tuple[BodyState, Array, Array]:
     """Propagate the bodies over one piece with constant forces and dry friction, from event to event.
 
@@ -285,8 +285,8 @@ def propagate_with_friction(
         body: state at the start of the piece.
         forces: constant forces; friction is added to the last one.
         duration: duration of the piece, in sampling periods.
-        whole: flows over the whole piece, while the first body slips and while it is held; None with jitter, because
-            the durations then vary from period to period.
+        whole: transitions over the whole piece, while the first body slips and while it is held; None with jitter,
+            because the durations then vary from period to period.
 
     Returns:
         State at the end, energy dissipated by the dampers, and energy dissipated by friction.

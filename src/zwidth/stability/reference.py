@@ -2,7 +2,7 @@
 
 A device with normalized damping delta = b T/m renders a wall with stiffness alpha = K T^2/m and damping beta = B T/m
 after a delay of d = n + f periods (n integer, 0 <= f < 1). With c = e^-delta and the numerator N(z) = a2 z^2 + a1 z +
-a0 of the device under zero-order hold (`numerics.held_mass`), the characteristic polynomial is
+a0 of the device under zero-order hold (`plant.rigid_mass`), the characteristic polynomial is
 
     P(z) = z^(2+n) (z - 1)(z - c) + N(z) (alpha z + beta (z - 1)) = D(z) + alpha N1(z) + beta N2(z)
 
@@ -29,9 +29,9 @@ import numpy as np
 from zwidth.core.types import Array, Coefficients, Reals, Roots
 from zwidth.core.xp import lazy_jax as jax
 from zwidth.core.xp import namespace
-from zwidth.numerics.held_mass import Plant, discretize_mass, split_delay
 from zwidth.numerics.polynomials import Affine, companion
 from zwidth.numerics.root_finding import bracket_root, polish_root
+from zwidth.plant.rigid_mass import Plant, discretize_mass, split_delay
 
 NEAR_PI = np.pi * (1.0 - 1e-4)  # largest omega of the curve; rounding errors grow as 1/(pi - omega)
 

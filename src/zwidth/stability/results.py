@@ -36,6 +36,16 @@ class Margins(NamedTuple):
     modulus_frequency: Array  # frequency of the modulus margin; wms in python-control
 
 
+@compact_repr(angle="rad")
+class DominantPole(NamedTuple):
+    """Dominant pole (pole of largest magnitude) of the closed loop with a wall; arrays for several walls."""
+
+    radius: Array  # magnitude of the pole, the spectral radius
+    angle: Array  # angle of the pole in rad per period, from 0 to pi; 0 if the response does not oscillate
+    decay_rate: Array  # -ln(radius) per period
+    status: Array  # code of `Status`
+
+
 @compact_repr(method=Method)
 class Stability(NamedTuple):
     """Stability of walls, with the status and the deciding method of each wall; all arrays have the same shape."""

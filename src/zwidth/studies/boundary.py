@@ -29,9 +29,9 @@ from zwidth.model.timing import Timing
 from zwidth.plotting.stable_set import Outlines, tabulate_sets
 from zwidth.plotting.table import stack
 from zwidth.stability.rigid.boundary import Piece, boundary_point, stable_region
+from zwidth.stability.rigid.dominant.spectral_radius import spectral_radius
 from zwidth.stability.rigid.normalization import status_of_results
 from zwidth.stability.rigid.passivity import is_passive
-from zwidth.stability.rigid.spectral_radius import spectral_radius
 from zwidth.stability.rigid.verdict import is_stable
 from zwidth.studies.outcome import (
     ComputedStudy,

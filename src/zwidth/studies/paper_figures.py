@@ -23,8 +23,8 @@ import numpy as np
 from zwidth import plotting
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
-from zwidth.numerics.held_mass import Plant, discretize_mass
 from zwidth.numerics.root_finding import bisect, newton
+from zwidth.plant.rigid_mass import Plant, discretize_mass
 from zwidth.plotting.table import stack
 from zwidth.stability.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.stability.rigid.ridge_newton import (

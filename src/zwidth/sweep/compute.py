@@ -24,8 +24,8 @@ import numpy as np
 from zwidth.core.status import Status
 from zwidth.numerics.blocks import map_blocks
 from zwidth.numerics.evaluate import Route
-from zwidth.stability.rigid.dominant_pole_grid import Area
-from zwidth.stability.rigid.dominant_poles import area_poles, list_poles
+from zwidth.stability.rigid.dominant.arrays import WallPoles, area_poles, list_poles
+from zwidth.stability.rigid.dominant.grid import Area
 from zwidth.stability.rigid.margins import margins_kernel
 from zwidth.stability.rigid.normalization import status_of_results
 from zwidth.stability.rigid.passivity import compute_margins
@@ -47,7 +47,7 @@ MAX_EXPANDED = 1 << 20  # largest number of points whose parameters are expanded
 # JAX and compiling the kernel.
 MAX_NUMPY = 1 << 20
 # Smallest number of walls per device for which the dominant poles are computed by power series over cells of the grid
-# (`stability.rigid.dominant_pole_grid`). For fewer walls they are computed one by one.
+# (`stability.rigid.dominant.grid`). For fewer walls they are computed one by one.
 MIN_GRID_WALLS = 1 << 8
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
@@ -97,19 +97,17 @@ def _compute_walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> d
     values: dict[str, np.ndarray] = {}
     not_certified, period = False, block.period[:, None, None]
     if RADIUS_OUTPUTS & set(outputs):
+        with_angle = bool({"pole_angle", "frequency"} & set(outputs))
         if block.all_alpha.shape[1] * block.all_beta.shape[1] >= MIN_GRID_WALLS:
             area = Area(block.all_alpha, block.all_beta, block.delta, block.d, (block.betas, block.alphas))
-            poles = area_poles(area, accuracy, with_rate=True)
-            radius, certified, rate = (leaf.transpose(0, 2, 1) for leaf in poles)
+            poles = area_poles(area, accuracy, True, with_angle).map(lambda leaf: leaf.transpose(0, 2, 1))
         else:
-            listed = partial(
-                list_poles,
-                accuracy=accuracy,
-                with_rate=True,
-                route=_choose_route(block.lines * block.all_alpha.shape[1]),
-            )
-            radius, certified, rate = _apply_to_walls(listed, block, shape, leaves=3)
-        values["spectral_radius"], not_certified = radius, certified == 0
+            route = _choose_route(block.lines * block.all_alpha.shape[1])
+            listed = partial(list_poles, accuracy=accuracy, with_rate=True, with_angle=True, route=route)
+            poles = WallPoles(*_apply_to_walls(listed, block, shape, leaves=4))
+        values["spectral_radius"], not_certified, rate = poles.radius, poles.certified == 0, poles.rate
+        if with_angle:
+            values |= {"pole_angle": poles.angle, "frequency": poles.angle / (2.0 * np.pi * period)}
         # Compute these outputs from the logarithmic decay rate and not from the spectral radius, which rounds to 1 for
         # slow decay.
         values |= {"decay_rate": rate / period, "margin": -np.expm1(-rate), "settling_time": decay_time(rate) * period}

@@ -33,7 +33,7 @@ from zwidth.sweep.files import is_fatal, read_or_empty
 from zwidth.sweep.grid import SceneBlock
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store
-from zwidth.units.quantities import OUTPUTS, STATUS_OF, Family
+from zwidth.units.quantities import OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 # Function that computes and writes one chunk, given the path of the store, the family and the index of the chunk. It is
 # `perform`, or a failing replacement in tests.
@@ -321,9 +321,10 @@ def _compute_walls(
         labels = scene.loop.decide(alpha.T, beta.T, "auto", (stiffness.T, virtual_damping.T))
         results["stable"], status = np.asarray(labels.stable).T, np.asarray(labels.status).T
     unknown = np.zeros(status.shape, bool)
-    if "spectral_radius" in outputs:
-        results["spectral_radius"] = radius = np.asarray(scene.spectral_radius(stiffness, virtual_damping))
-        unknown |= np.isnan(radius)
+    if RADIUS_OUTPUTS & set(outputs):
+        pole = scene.dominant_pole(stiffness, virtual_damping)
+        results |= {"spectral_radius": pole.radius, "pole_angle": pole.angle, "frequency": pole.frequency}
+        unknown |= np.logical_or.reduce([np.isnan(results[name]) for name in RADIUS_OUTPUTS & set(outputs)])
     if "passive" in outputs:
         margin = np.asarray(scene.passivity_margin(stiffness, virtual_damping))
         results["passive"] = margin > 0

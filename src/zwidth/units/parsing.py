@@ -62,8 +62,14 @@ class Dimension:
         return None if size is None else size.exponents
 
     def measure(self, unit: str) -> UnitSize | None:
-        """Return the conversion factor of a unit to SI as a `UnitSize`; None for a unit of another dimension."""
-        return measure_unit(unit, self.exponents) if self.exponents and unit else None
+        """Return the conversion factor of a unit to SI as a `UnitSize`; None for a unit of another dimension.
+
+        An angular damping may omit the angle, as in the "mN m s" of data sheets of motors.
+        """
+        if not self.exponents or not unit:
+            return None
+        size = measure_unit(unit, self.exponents)
+        return measure_unit(unit, _WITHOUT_ANGLE) if size is None and self is ANGULAR_DAMPING else size
 
     def in_base(self, mantissa: str, exponent: int, unit: str) -> float | None:
         """Convert the quantity ``mantissa * 10**exponent`` with a unit to the base unit; None for another dimension."""
@@ -84,9 +90,11 @@ LENGTH = Dimension("m, cm, mm, um, µm, nm", "10 um")
 ANGLE = Dimension("rad, mrad, deg, °, rev, turn, turns", "0.1 deg")
 TORQUE = Dimension("N m, mN m, uN m, µN m, kN m, N mm, mN mm, N cm", "50 mN m")
 ANGULAR_STIFFNESS = Dimension("N m/rad, mN m/rad, uN m/rad, µN m/rad, kN m/rad, N m/deg, mN m/deg", "0.5 N m/rad")
-ANGULAR_DAMPING = Dimension("N m s/rad, mN m s/rad, uN m s/rad, µN m s/rad, N m s/deg, mN m s/deg", "2 mN m s/rad")
+ANGULAR_DAMPING = Dimension(
+    "N m s/rad, mN m s/rad, uN m s/rad, µN m s/rad, N m s/deg, mN m s/deg, mN m s, mN m/rpm", "2 mN m s/rad"
+)
 INERTIA = Dimension("kg m^2, g m^2, kg cm^2, kg mm^2, g cm^2, g mm^2, mg mm^2", "12 g cm^2")
-ANGULAR_SPEED = Dimension("rad/s, mrad/s, deg/s", "0.1 rad/s")
+ANGULAR_SPEED = Dimension("rad/s, mrad/s, deg/s, rpm", "0.1 rad/s")
 TORQUE_RATE = Dimension("N m/s, mN m/s", "0.5 N m/s")
 SPEED = Dimension("m/s, cm/s, mm/s, um/s", "1 mm/s")
 FORCE_RATE = Dimension("N/s, kN/s, N/ms", "500 N/s")
@@ -104,6 +112,8 @@ PERIOD_WORDS = ("periods", "period")
 """Accepted units of a time that is given as a number of sampling periods."""
 COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
 """Accepted units of encoder positions in counts; multiplication by the encoder resolution converts these to SI."""
+
+_LINES = ("ppr", "lines", "line", "pulses", "pulses/rev", "lines/rev")  # units of encoders before counting
 
 
 def find_other(dimension: Dimension) -> Dimension | None:
@@ -181,10 +191,11 @@ def _canonical(unit: str) -> str:
     return re.sub(r"N[\s*·⋅.]*(?=[scm])", "N ", unit)
 
 
+_WITHOUT_ANGLE: Exponents = (1, 2, -1, 0)  # exponents of kg, m, s and rad of an angular damping without its angle
 # Kind of device (True: rotary, False: linear) to which a unit belongs, by the unit's exponents of kg, m, s and rad.
 _KIND_OF_EXPONENTS = {
     DIMENSIONS[base].exponents: kind == 1 for pair in UNIT_PAIRS for kind, base in enumerate(pair) if base in DIMENSIONS
-}
+} | {_WITHOUT_ANGLE: True}
 
 
 def _drop_separators(text: str, *, strict: bool = True) -> str:
@@ -245,8 +256,7 @@ def _read_counts(mantissa: str, unit: str) -> tuple[float, Dimension] | None:
     number = float(mantissa)
     if unit.lower() in ("bit", "bits", "-bit") and 1 <= number <= 64 and number.is_integer():
         return 2.0 * math.pi / 2.0**number, ANGLE
-    if unit.lower() == "cpr":
-        unit = "counts/rev"
+    unit = "counts/rev" if unit.lower() == "cpr" else re.sub(r"\s+per\s+", "/", unit)
     name, per, base = (part.strip() for part in unit.partition("/"))
     if name.lower() not in COUNTS or not per or not number > 0:
         return None
@@ -290,6 +300,9 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
             if step[1] is not dimension:
                 _refuse_kind(got, dimension, "write the encoder step as a length, or as '50 counts/mm'")
             return step[0], dimension.base
+        if unit.lower() in _LINES:
+            remedy = f"write '{4.0 * float(number):.15g} counts/rev' if the counter counts all four edges of a line"
+            raise UnusableValueError(got, "an encoder step is needed", remedy)
     if dimension is RATIO:
         raise UnusableValueError(got, allowed, remedy)
     other = find_other(dimension)

@@ -368,6 +368,15 @@ _OUTPUTS = (
         r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", source="spectral_radius",
     ),
     Output(
+        "pole_angle", "angle of the dominant pole, from 0 to pi", r"\omega T", "sequential", units="rad",
+        with_parts=True, source="spectral_radius", label="angle of the dominant pole",
+    ),
+    Output(
+        "frequency", "frequency of the dominant pole; 0 if the response does not oscillate", "f", "sequential",
+        units="Hz", physical_only=True, with_parts=True, source="spectral_radius",
+        label="frequency of the dominant pole",
+    ),
+    Output(
         "gain_margin", "common factor of stiffness and damping at the limit of stability; below 1 for an unstable wall",
         "g_m", "logarithmic", rates=(2e5, 0.0),
     ),

@@ -49,6 +49,7 @@ _SYMBOLS: dict[str, tuple[int, float, Exponents, str]] = {
     "N": (0, 1.0, _FORCE, "nuμmckM"),
     "Hz": (0, 1.0, _PER_TIME, "mkM"),
     "rad": (0, 1.0, _ANGLE, "uμmk"),
+    **dict.fromkeys(("rpm", "RPM"), (0, math.pi / 30, (0, 0, -1, 1), "k")),
     "sec": (0, 1.0, _TIME, "nuμm"),
     "in": (0, 0.0254, _LENGTH, ""),
     "ft": (0, 0.3048, _LENGTH, ""),
@@ -60,7 +61,10 @@ _SYMBOLS: dict[str, tuple[int, float, Exponents, str]] = {
     "lbf": (0, 4.4482216152605, _FORCE, ""),
     "ozf": (0, 0.27801385095378125, _FORCE, ""),
     **dict.fromkeys(("seconds", "second"), (0, 1.0, _TIME, "")),
-    **dict.fromkeys(("deg", "°", "degree", "degrees"), (0, math.pi / 180, _ANGLE, "")),
+    "deg": (0, math.pi / 180, _ANGLE, "m"),
+    **dict.fromkeys(("°", "degree", "degrees"), (0, math.pi / 180, _ANGLE, "")),
+    "arcmin": (0, math.pi / 10_800, _ANGLE, ""),
+    "arcsec": (0, math.pi / 648_000, _ANGLE, ""),
     **dict.fromkeys(("rev", "turn", "turns", "revolution", "revolutions"), (0, 2 * math.pi, _ANGLE, "")),
 }
 # Conversion factors and exponents of all symbols, without prefix and with each allowed prefix.
@@ -75,6 +79,8 @@ _GRAVITY = 9.80665  # standard gravity, m/s^2
 _WEIGHT = re.compile(r"(?<![A-Za-z])(kg|g|lb|oz)(?![A-Za-z])|^(kg|g)(?=[cm]?m)")
 # Pattern of symbols with an exponent, as in "m^2", "m**2" or "m2".
 _POWER = re.compile(r"(.*?)(?:\^|\*\*)?(-?[1-4])?", re.DOTALL)
+# Other spellings of rpm. "min" alone is no symbol, because it would make units of headers such as "angle_min".
+_PER_MINUTE = re.compile(r"(?:rev|r|U|1)/min|min\^?-1")
 # Pattern of a denominator that is itself a quotient, as in "N m/(rad/s)".
 _DIVIDED_RATE = re.compile(r"/\(([^()/]+)/([^()/]+)\)")
 
@@ -127,6 +133,7 @@ def _read_weights(text: str, exponents: Exponents) -> UnitSize | None:
 def _read(text: str) -> list[UnitSize]:
     """Return a `UnitSize` for each interpretation of a unit, at most 64, in the order of their number of symbols."""
     text = re.sub(r"\s*/\s*", "/", text.strip())
+    text = _PER_MINUTE.sub("rpm", text)
     # Replace "N m/(rad/s)" by "N m s/rad".
     if inverse := _DIVIDED_RATE.search(text):
         text = f"{text[: inverse.start()]} {inverse[2]}/{inverse[1]}{text[inverse.end() :]}"

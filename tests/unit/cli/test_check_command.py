@@ -228,11 +228,11 @@ def test_rate_and_period_are_equivalent():
             "--resolution is 2000 rad, .* write counts as --resolution '2000 counts/rev'",
         ),
         (
-            ["--mass", "1", *RATE, "--delay", "20"],
+            ["--mass", "1", *RATE, "--delay", "20 s"],
             "--delay is 20 s, .* did you mean --delay '20 ms' or --delay '20 periods'?",
         ),
         (
-            ["--mass", "1", *RATE, "--delay", "1"],
+            ["--mass", "1", *RATE, "--delay", "1 s"],
             "--delay is 1 s, .* did you mean --delay '1 ms' or --delay '1 periods'?",
         ),
         (
@@ -246,6 +246,15 @@ def test_implausible_values_have_a_warning(arguments, warning):
     assert re.search("^(STABLE|UNSTABLE|MARGINAL) ", result.output, re.MULTILINE)
     (line,) = list_warnings(result)
     assert re.fullmatch(f"zwidth: {warning.replace('?', '[?]')}", line)
+
+
+@pytest.mark.parametrize("command", ["check", "recommend", "ridge", "simulate", "diagnose", "design"])
+def test_long_delay_without_unit_is_refused(command):
+    wall = [] if command in ("recommend", "ridge") else ["--stiffness", "100"]
+    result = CliRunner().invoke(cli, [command, *wall, *DEVICE, *RATE, "--delay", "1.5"])
+    assert result.exit_code != 0
+    assert "got '1.5', i.e. 1.5 s; write '1.5 periods' or '1.5 ms', or '1.5 s'" in result.output + str(result.exception)
+    assert run("check", *WALL, *DEVICE, *RATE, "--delay", "1.5periods").exit_code == 0
 
 
 def test_only_implausible_stiffness_has_a_warning():

@@ -186,7 +186,7 @@ def test_failed_fit_prints_its_warning_first():
     arguments = [str(CONFIGS / "fit_log.csv"), "--resolution", "0.03mm", "--max-delay", "1 ms"]
     first, *others = run(*arguments, code=1).splitlines()
     assert not any(line.startswith("SET ") for line in others)
-    assert first == "NO WALL    resolve the warnings first, then record again"
+    assert first == "NO WALL    the fit has warnings: record again as they advise"
     assert "WARNING    the delay is at the end of the search range, 1.000 ms; give a longer max_delay" in others
     text = run(*arguments, "--yaml")
     assert 'reason: "the delay is at the end of the search range"' in text

@@ -95,7 +95,7 @@ def test_wall_above_the_safe_limit_requires_an_option_and_warns(tmp_path):
     assert "exceeds" not in printed
     # The encoder is that of the file; remedies are searched by diagnose only.
     assert "LIMIT CYCLE" in printed
-    assert "to stop it: zwidth diagnose searches for changes" in printed
+    assert "to stop it: zwidth diagnose searches for a remedy" in printed
     program = run("recommend", file, *fraction, "--beyond-safe", "--code", "c")
     assert "WARNING: this wall exceeds the safe limit" in program
 
@@ -104,7 +104,7 @@ def test_warnings_prevent_a_wall_in_every_command(tmp_path):
     true, force, position = record_hidden_mode()
     log = write_log(tmp_path, true, force, 1e4 * position)
     lines = run("fit", *log, code=1).splitlines()
-    assert lines[0] == "NO WALL    resolve the warnings first, then record again"
+    assert lines[0] == "NO WALL    the fit has warnings: record again as they advise"
     assert any(line.startswith("WARNING ") for line in lines)
     file, out = tmp_path / "fitted.yaml", tmp_path / "run"
     file.write_text(run("fit", *log, "--yaml"), encoding="utf-8")

@@ -81,6 +81,13 @@ def test_invalid_names_raise(arguments, message, folder):
     assert list(folder.iterdir()) == []
 
 
+def test_two_names_are_refused_with_the_right_call(folder):
+    result = CliRunner().invoke(cli, ["init", "amplifier", "mine"])
+    assert result.exit_code != 0
+    assert "zwidth init mine --example amplifier" in result.output + str(result.exception)
+    assert list(folder.iterdir()) == []
+
+
 def test_list_describes_each_example():
     lines = run("--list")
     assert [line.split()[0] for line in lines if not line.startswith(" ")] == EXAMPLES

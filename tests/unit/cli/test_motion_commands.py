@@ -8,6 +8,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
+from zwidth.cli.motions import _draw_motion
 
 pytestmark = pytest.mark.usefixtures("fitted_once")
 KNOB = [
@@ -58,16 +59,59 @@ def test_stable_wall_without_encoder_comes_to_rest():
 def test_hit_agrees_with_simulate(tmp_path):
     file = tmp_path / "hit.png"
     printed = run("simulate", *HANDLE, *SOFT, "--hit", "0.1 m/s", "--figure", str(file))
-    assert "hit at 100 mm/s" in printed
+    assert "hits the wall at 100 mm/s" in printed
     assert "leaves the wall after 1 contact" in printed
     assert file.read_bytes().startswith(b"\x89PNG")
     output = parse("simulate", *HANDLE, *SOFT, "--hit", "0.1 m/s")
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(rate=1000, delay=1e-3))
-    motion = scene.simulate(
-        8008, 33.45, start_position=-2e-4, start_velocity=0.1, contact="unilateral", periods=output["periods"]
-    )
+    motion = scene.simulate(8008, 33.45, start_velocity=0.1, contact="unilateral", periods=output["periods"])
     assert output["penetration"] == pytest.approx(motion.penetration, rel=1e-12)
     assert output["bounces"] == motion.bounces
+
+
+@pytest.mark.parametrize("speed", ["20 mm/s", "0.5 mm/s"])
+def test_friction_does_not_stop_a_hit_before_the_wall(speed):
+    printed = run("simulate", *HANDLE, *SOFT, "--hit", speed, "--friction", "1 N")
+    assert "comes to rest within" in printed
+    assert "never meets the wall" not in printed
+
+
+def test_diagnosis_is_not_that_of_the_simulated_hit():
+    printed = " ".join(
+        run("simulate", *HANDLE, *SOFT, "--hit", "0.1", "--resolution", "20um", "--friction", "50mN").split()
+    )
+    assert "leaves the wall after 1 contact, comes to rest outside" in printed
+    assert "in contact LIMIT CYCLE: 5.7 µm at 120 Hz" in printed
+
+
+def test_time_axis_ends_after_the_motion():
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(rate=1000, delay=1e-3))
+    figure = _draw_motion(scene.simulate(8008, 33.45, start_position=1e-3, periods=300))
+    (ax,) = figure.axes
+    assert ax.get_xlabel().endswith("in ms")
+    assert 30 < ax.get_xlim()[1] < 100
+    figure = _draw_motion(scene.simulate(25e3, 33.45, start_position=1e-3, periods=50))
+    assert figure.axes[0].get_xlim()[1] == pytest.approx(49)
+
+
+def test_hit_under_a_constant_force():
+    printed = run("simulate", *HANDLE, *SOFT, "--hit", "0.1 m/s", "--external-force", "2 N")
+    assert "hits the wall at 100 mm/s, external force 2.00 N" in printed
+
+
+def test_diagnose_warns_of_small_margins():
+    wall = "--stiffness", "19.8 kN/m", "--virtual-damping", "42"
+    assert "phase margin 0.12 deg, gain margin 1.00" in " ".join(run("diagnose", *HANDLE, *wall).split("CAUTION")[1:])
+    assert parse("diagnose", *HANDLE, *wall)["cautions"]
+    assert "CAUTION" not in run("diagnose", *HANDLE, *SOFT)
+
+
+def test_diagnosis_of_an_unstable_wall_states_the_simulated_motion():
+    wall = *STIFF, "--virtual-damping", "42", "--max-force", "5 N"
+    assert "the simulation grows without bound" in run("diagnose", *HANDLE, *STIFF)
+    assert "the simulation reaches 210 µm at 83 Hz" in run("diagnose", *HANDLE, *wall)
+    stuck = " ".join(run("diagnose", *HANDLE, *wall, "--friction", "50 N").split())
+    assert "the simulation comes to rest, because friction holds small displacements" in stuck
 
 
 def test_push_and_release():
@@ -93,7 +137,7 @@ def test_scene_file(tmp_path):
         f"version: 1\nname: knob\nscene: {scene}\nstudies: [{{kind: simulate, name: s}}]\n", encoding="utf-8"
     )
     printed = run("simulate", str(file), "--hit", "1 rad/s", "--duration", "0.2 s")
-    assert "hit at 1.00 rad/s" in printed
+    assert "hits the wall at 1.00 rad/s" in printed
     assert run("diagnose", str(file)).startswith("AT REST ")
 
 

@@ -1,6 +1,7 @@
 """`zwidth recommend`: text, JSON, figure and code, against Scene.recommend."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -42,6 +43,27 @@ def test_wall_with_small_margins_has_a_caution():
     assert "N s/m (costs 52 % of the stiffness)" in text
     assert "limited by passivity; CAUTION: small margins device" in text
     assert "requirements (not checked in the reference grasps):" in text
+
+
+def test_passive_wall_and_its_loss_of_stiffness():
+    text = " ".join(recommend("--phase-margin", "30").stdout.split())
+    assert "passive no; a passive wall has K = 3.9" in text
+    assert "(costs 50 % of the stiffness): recommend --passive --phase-margin 30 To gain" in text
+    text = " ".join(recommend("--damping", "0").stdout.split())
+    assert "passive no; no passive wall satisfies the same requirements" in text
+
+
+def test_options_of_the_passive_wall_recommend_it():
+    text = " ".join(recommend().stdout.split())
+    wall, options = re.search(r"a passive wall has (K = [\d.]+) .*?: recommend (--passive .*? soft) ", text).groups()
+    again = json.loads(recommend(*options.split(), "--json").stdout)["recommended"]
+    assert again["passive"]
+    assert again["stiffness"] == pytest.approx(1e3 * float(wall.removeprefix("K = ")), rel=5e-3)
+
+
+def test_rate_without_gain_is_shown():
+    text = " ".join(recommend("--damping", "0.1", "--delay", "300 ms", "--stiffness-fraction", "50%").stdout.split())
+    assert "(x 1.00; the delay stays 300.0 ms)" in text
 
 
 def test_wall_stable_in_every_grasp():

@@ -39,6 +39,25 @@ def test_every_command_prints_rotary_units(command):
     assert not LINEAR_UNITS.search(as_json), as_json
 
 
+def test_units_of_data_sheets_of_motors_and_encoders():
+    wall = "--mass", "60 gcm^2", "--rate", "1kHz", "--stiffness", "0.1 N m/rad"
+    texts = [
+        run("simulate", *wall, "--damping", damping, "--virtual-damping", B, "--hit", "60 rpm", "--resolution", encoder)
+        for damping, B, encoder in (
+            ("0.02 mN m s", "0.5 mN*m*s", "4096 cpr"),
+            ("0.02 mN m s/rad", "0.5 mN m s/rad", "4096 counts per rev"),
+        )
+    ]
+    assert texts[0] == texts[1]
+    assert "hits the wall at 6.28 rad/s" in texts[0]
+
+
+def test_lines_of_an_encoder_are_refused_with_the_number_of_counts():
+    result = CliRunner().invoke(cli, ["excite", "--rate", "1 kHz", "--force", "20 mN m", "--resolution", "512 PPR"])
+    assert result.exit_code != 0
+    assert "'2048 counts/rev'" in result.output + str(result.exception)
+
+
 def test_ridge_agrees_with_python():
     output = json.loads(run("ridge", *DEVICE, "--json"))
     scene = zwidth.Scene(zwidth.Device(12e-7, 2e-5, rotary=True), zwidth.Timing(1e-3, 1e-3))

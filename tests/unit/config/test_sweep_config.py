@@ -105,6 +105,8 @@ PHYSICAL = "stiffness: 1, mass: 1, rate: 1 kHz, "
         (NORMALIZED, ", outputs: [alpha_max]", "axes.alpha", "changes no output"),
         ("delta: 1, d: 1", ", outputs: [stiffness_max]", "outputs[0]", "SI units"),
         (NORMALIZED, ", outputs: [stabel]", "outputs[0]", "did you mean 'stable'?"),  # codespell:ignore
+        ("mass: [0.05, 0.1], damping: 10, rate: 1e3", ", outputs: [K_max]", "outputs[0]", "write stiffness_max"),
+        (NORMALIZED, ", outputs: [rho]", "outputs[0]", "write spectral_radius"),
         (NORMALIZED, ", accuracy: 0", "accuracy", "at least"),
         (NORMALIZED, ", accuracy: 1e-13", "accuracy", "at least 1e-12"),
         (NORMALIZED, ", accuracy: tight", "accuracy", "one number"),

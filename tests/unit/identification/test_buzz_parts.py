@@ -10,10 +10,8 @@ from measured_devices import OTHERS, PERIOD, OtherDevice, TrueDevice
 
 import zwidth
 from zwidth.core.status import Status
-from zwidth.identification.critical_controller import CriticalController
 from zwidth.identification.device_estimate import DimensionlessDevice, differentiate, name_parameters
 from zwidth.identification.onset_model import Onsets
-from zwidth.model.circle_functions import circle_points
 
 VELOCITY = zwidth.BackwardDifference()
 KINDS = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 2)]
@@ -33,19 +31,6 @@ def differ(function, theta):
     """Return the derivatives along a last axis, by central differences."""
     steps = 1e-6 * np.eye(theta.size)
     return np.stack([(function(theta + step) - function(theta - step)) / 2e-6 for step in steps], -1)
-
-
-@pytest.mark.parametrize("lag, modes", KINDS)
-def test_critical_controller_matches_the_sampled_device(lag, modes):
-    device = describe_device(lag, modes)
-    points = circle_points(np.array([1e-3, 0.05, 0.3, 0.72, 1.9, 3.0]))
-    controller, expected = (
-        CriticalController(*device[1:]),
-        device.to_scene(PERIOD, VELOCITY).loop.roots.evaluate_controller(points),
-    )
-    np.testing.assert_allclose(controller.evaluate(points), expected.value, rtol=1e-12)
-    if not lag + modes:
-        np.testing.assert_allclose(controller.evaluate_rigid(points).slope, expected.slope, rtol=1e-12)
 
 
 @pytest.mark.parametrize("lag, modes", KINDS)

@@ -11,9 +11,9 @@ from measured_devices import PERIOD, TrueDevice
 
 import zwidth
 from zwidth.core.status import Status
-from zwidth.identification.critical_controller import GridLimits
 from zwidth.identification.extended_model import Recordings
 from zwidth.identification.friction_model import Recording
+from zwidth.identification.grid_limits import GridLimits
 from zwidth.identification.model_selection import choose_structure
 from zwidth.identification.output_error import fit_model
 from zwidth.identification.unmodeled_dynamics import HiddenResonances, sample_resonances

@@ -302,7 +302,7 @@ def test_no_wall_is_recommended_while_warnings_remain(period, scale, word):
     assert word in fit.recommended.reason
     summary = dict(summarize_fit(fit))
     assert "SET" not in summary
-    assert "resolve the warnings first" in summary["NO WALL"]
+    assert "record again as they advise" in summary["NO WALL"]
     assert word in summary["WARNING"]
     assert "safe limit" not in dict(detail_fit(fit, "a log"))
     text = "\n".join(write_scene(fit, "a log"))

@@ -94,6 +94,23 @@ def test_recommendation_is_drawn_with_its_response():
     assert single_axes is plt.gca()
 
 
+@pytest.mark.parametrize("size", [(6.4, 4.8), (4.0, 3.0), (2.6, 2.4)])
+def test_text_of_the_stiffest_wall_is_inside_the_frame(size):
+    knob = zwidth.Scene(zwidth.Device("60 g cm^2", "0.02 mN m s"), TIMING)
+    for scene in (RIGID, knob):
+        figure, ax = plt.subplots(figsize=size)
+        plot.region(scene, ax)
+        (text,) = ax.texts
+        frame, box = ax.get_window_extent(), text.get_window_extent(figure.canvas.get_renderer())
+        assert frame.x0 <= box.x0, size
+        assert box.x1 <= frame.x1, size
+
+
+def test_gray_line_of_a_recommendation_is_explained():
+    walls, _ = plot.recommendation(RIGID.recommend(stiffness_fraction=0.5))
+    assert [text.get_text() for text in walls.get_legend().get_texts()] == ["passive", "stable $B$ at this $K$"]
+
+
 def test_integer_parameter_is_drawn_as_points():
     ax = plot.ridge(RIGID.replace(velocity=zwidth.WindowedDifference(1)), "velocity.samples", [1, 2, 3, 4])
     (points,) = ax.lines

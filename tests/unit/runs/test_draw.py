@@ -210,7 +210,8 @@ def test_missing_points_are_blank_and_in_the_legend(tmp_path):
         ({"mu": 1}, "at: no sweep in .* varies 'mu'; choose from .*d, delta"),
         ({"delta": "x"}, "at: delta: got 'x'; write a number$"),
         ({"rate": "2 ms"}, "at: rate: got '2 ms'; the units allowed are Hz, kHz, MHz"),
-        ({"delay": "1 ms"}, "at: delay: got '1 ms'; write a number in sampling periods"),
+        ({"delay": "1 ms"}, "at: delay: got '1 ms'; write a number of sampling periods, because the period varies"),
+        ({"delay": "1 kg"}, "at: delay: got '1 kg'; the units allowed are s, ms"),
         ({"delta": "nan"}, "at: delta: got 'nan'; write a finite number"),
         ({"device": "x"}, "at: no device 'x' in the sweep; choose from light, heavy"),
     ],
@@ -219,6 +220,21 @@ def test_invalid_slices_raise(folder, tmp_path, at, message):
     with pytest.raises(InputError, match=message):
         draw_stores(folder, tmp_path / "no", selection=at)
     assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize("delay", ["1 ms", "1ms", "1 periods", "1", 1])
+def test_delay_in_periods_is_selected_with_any_unit(tmp_path, delay):
+    axes = {
+        "mass": 0.1,
+        "damping": 10,
+        "period": "1 ms",
+        "delay": ["0 periods", "1 periods"],
+        "stiffness": {"linear": {"start": 100, "stop": 20e3, "num": 7}},
+        "virtual_damping": {"linear": {"start": 0, "stop": 80, "num": 7}},
+    }
+    run_sweeps(make_config(study(axes=axes)), tmp_path)
+    data = open_dataset(tmp_path)
+    assert draw._find_nearest(data.reset_coords(drop=True), "delay", delay) == (1, True)
 
 
 def test_folder_without_stores_raises(tmp_path, capsys):

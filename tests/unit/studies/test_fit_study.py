@@ -147,7 +147,7 @@ def test_failed_fit_reports_its_warnings_first(monkeypatch):
     monkeypatch.chdir(ROOT / "configs")
     outcome = make_study(log={"csv": "fit_log.csv", "resolution": "0.03 mm"}, max_delay="1 ms").compute(None, True)
     assert outcome.table["status"].tolist() == ["UNREACHABLE"]
-    assert outcome.answer[1] == "NO WALL: resolve the warnings first, then record again"
+    assert outcome.answer[1] == "NO WALL: the fit has warnings: record again as they advise"
     assert "WARNING: the delay is at the end of the search range, 1.000 ms; give a longer max_delay" in outcome.answer
 
 

@@ -72,7 +72,7 @@ def test_maximum_stiffness_is_on_the_boundary(folder):
 
 def test_radii_and_passivity_agree_with_single_scenes(tmp_path):
     walls = {"stiffness": [500.0, 5000.0], "virtual_damping": [0.0, 5.0, 60.0]}
-    outputs = ("stable", "spectral_radius", "passive")
+    outputs = ("stable", "spectral_radius", "pole_angle", "frequency", "passive")
     config = make_config(study("s", {**DEVICE, "velocity.cutoff": [30, 100], **walls}, outputs, **FILTER))
     assert zwidth.run(config, out=tmp_path).ok
     data = open_dataset(tmp_path).load()
@@ -83,9 +83,51 @@ def test_radii_and_passivity_agree_with_single_scenes(tmp_path):
             selected, scene = data.sel(damping=damping, velocity_cutoff=cutoff), scene_of(cutoff, damping)
             grid = np.meshgrid(*walls.values(), indexing="ij")
             np.testing.assert_array_equal(selected.passive, scene.is_passive(*grid))
-            exact = np.abs(scene.poles(*grid)).max(-1)
-            np.testing.assert_allclose(selected.spectral_radius, exact, rtol=1e-9)
+            z = scene.poles(*grid)
+            np.testing.assert_allclose(selected.spectral_radius, np.abs(z).max(-1), rtol=1e-9)
+            dominant = np.take_along_axis(z, np.abs(z).argmax(-1)[..., None], -1)[..., 0]
+            np.testing.assert_allclose(selected.pole_angle, np.abs(np.angle(dominant)), atol=1e-9)
+            np.testing.assert_allclose(selected.frequency, selected.pole_angle / (2e-3 * np.pi), rtol=1e-12)
     assert 0 < data.passive.mean() < 1
+
+
+@pytest.mark.parametrize("parts", ["", "velocity: {kind: low_pass, cutoff: 100 Hz}"])
+def test_frequency_of_the_dominant_pole_from_a_yaml_file(parts, tmp_path):
+    """As a user types it: integers, units, and few or many walls."""
+    for name, stiffness in (("few", "[0, 1000, 20 kN/m]"), ("many", "{linear: {start: 0, stop: 20000, num: 90}}")):
+        text = f"""
+version: 1
+name: dominant
+studies:
+  - kind: sweep
+    name: {name}
+    outputs: [pole_angle, frequency, spectral_radius]
+    {parts}
+    axes:
+      mass: 100 g
+      damping: 10
+      rate: 1 kHz
+      delay: [0 ms, 1.5 ms]
+      stiffness: {stiffness}
+      virtual_damping: [0, 5, 40]
+"""
+        (tmp_path / f"{name}.yaml").write_text(text)
+        assert zwidth.run(tmp_path / f"{name}.yaml", out=tmp_path / name).ok
+        data = open_dataset(tmp_path / name).load()
+        assert data.pole_angle.attrs["units"] == "rad"
+        assert data.frequency.attrs["units"] == "Hz"
+        assert (data.status == Status.OK).all()
+        velocity = {"velocity": zwidth.LowPass(cutoff=100)} if parts else {}
+        for delay in (0, 1.5e-3):
+            scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, delay), **velocity)
+            selected = data.sel(delay=delay)
+            K, B = np.meshgrid(selected.stiffness, selected.virtual_damping, indexing="ij")
+            angle = np.abs(np.angle(scene.poles(K, B)))
+            # The angle must be that of a pole with the largest modulus.
+            dominant = np.abs(np.abs(scene.poles(K, B)) - selected.spectral_radius.values[..., None]) < 1e-6
+            error = np.where(dominant, np.abs(angle - selected.pole_angle.values[..., None]), np.inf).min(-1)
+            assert error.max() < 1e-6
+            np.testing.assert_allclose(selected.frequency, selected.pole_angle / (2e-3 * np.pi), rtol=1e-12)
 
 
 def test_names_in_stores_csv_and_netcdf_have_no_dots(folder, tmp_path):

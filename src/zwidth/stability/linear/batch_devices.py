@@ -20,16 +20,17 @@ from zwidth.model.circle_functions import circle_points
 from zwidth.model.linear_plant import System
 from zwidth.model.mechanism import AnyChain, Chain, build_chain, is_zero
 from zwidth.model.parameter_paths import Parts, fill_parameters
-from zwidth.numerics.held_mass import discretize_mass, factor_numerator
 from zwidth.numerics.threads import run_in_threads
+from zwidth.plant.rigid_mass import discretize_mass, factor_numerator
+from zwidth.plant.sampled_states import SampledStates, integrate_chain
 from zwidth.stability.linear.batch_lines import VECTOR_SIZE
-from zwidth.stability.linear.discretization import DiscreteChain, compute_transition
 from zwidth.stability.linear.loop_batch import Form, LoopBatch, Sizes, count_nodes, evaluate
 
 # Angles in rad per sample at which the values of q by polynomials and by matrices are compared, and their largest
 # relative difference.
 TEST_ANGLES = (1e-2, 1e-1, 0.5, 2.0)
 RESPONSE_TOLERANCE = 1e-10
+LARGEST_RATE = 1e6  # of the entries of A, squares of frequencies in rad per period
 
 
 class _Plant(NamedTuple):
@@ -47,40 +48,38 @@ class DeviceBatch(NamedTuple):
 
     form: Form
     loop: LoopBatch
-    states: DiscreteChain | None
+    states: SampledStates | None
 
 
 def build_loops(chain: AnyChain, size: int) -> DeviceBatch:
     """Return the loops of a chain whose parameters are numbers or arrays of shape (size,)."""
     f, fraction = chain.estimate, chain.d - chain.n_delay
-    form, states = Form(chain.n_delay + 1, f.window, f.lag), None
+    form, states, A = Form(chain.n_delay + 1, f.window, f.lag), None, np.zeros((size, 1, 1))
     if isinstance(chain, Chain) and chain.rigid:
         plant = _discretize_rigid(chain.bodies[0].damping, fraction, size)
     else:
         A, B = _stack_states(chain, size)
-        states = _discretize(A, B, fraction, chain.sampled)
+        states = _sample(A, B, chain)
         plant = _factor(chain, states)
     roots = (part[:, None] if np.ndim(part) < 2 else part for part in (f.zeros, f.poles))
     xp = namespace(plant.numerator, f.gain)
     estimate = [xp.broadcast_to(xp.asarray(f.gain), (size,)), *(xp.broadcast_to(r, (r.shape[0], size)) for r in roots)]
     loop = LoopBatch._make([*plant[:2], *estimate, *plant[2:]])
     if states is not None:
-        # Make the gain of a loop NaN, and thereby all its results, if rounding errors spoil its polynomials.
+        # Make the gain of a loop NaN, and thereby all its results, if rounding errors spoil its polynomials, or if a
+        # part is so fast that a scene may refuse it.
         exact = xp.all(xp.stack([compare_responses(form, loop, states, w) for w in TEST_ANGLES]), 0)
-        loop = loop._replace(gain=xp.where(exact, loop.gain, np.nan))
+        slow = xp.max(xp.abs(A), (1, 2)) < LARGEST_RATE
+        loop = loop._replace(gain=xp.where(exact & slow, loop.gain, np.nan))
     return DeviceBatch(form, loop, states)
 
 
-def compare_responses(form: Form, loop: LoopBatch, states: DiscreteChain, w: Any) -> Array:
+def compare_responses(form: Form, loop: LoopBatch, states: SampledStates, w: Any) -> Array:
     """Return whether q by the polynomials agrees with q by the matrices at an angle, or at one angle per loop."""
     xp = namespace(loop.gain)
     w = w + 0.0 * loop.numerator[0]
     points = circle_points(xp.where(xp.isfinite(w), w, 0.5))
-    zeta = points.z_minus_1[:, None]
-    matrix = zeta[..., None] * xp.eye(states.full.shape[-1]) - states.psi
-    state = xp.linalg.solve(matrix, (zeta * states.late + states.full)[..., None])
-    q = -xp.exp(1j * form.lag * points.w) / state[:, 0, 0]
-    return xp.abs(evaluate(form, loop, points.w).q / q - 1.0) < RESPONSE_TOLERANCE
+    return xp.abs(evaluate(form, loop, points.w).q / states.controller(points) - 1.0) < RESPONSE_TOLERANCE
 
 
 def _discretize_rigid(damping: Any, fraction: Any, size: int) -> _Plant:
@@ -113,39 +112,34 @@ def _stack_states(chain: AnyChain, size: int) -> tuple[Array, Array]:
     A, B, _ = System(chain.device, 1.0, 1.0, chain.d, chain.n_delay, chain.estimate).realize()
     xp = namespace(chain.period, chain.mass)
     period = xp.broadcast_to(xp.asarray(chain.period), (size,))[:, None]
-    if chain.sampled:
-        return A + 0.0 * period[..., None], B * (chain.mass / period**2)
     return A * period[..., None], B * (chain.mass / period)
 
 
-def _discretize(A: Array, B: Array, fraction: Any, sampled: bool) -> DiscreteChain:
-    """Return the discretized devices; without a fractional delay, ``late`` is ``full``."""
-    xp = namespace(A, fraction)
-    if sampled:
-        return DiscreteChain(A - xp.eye(A.shape[-1]), B, B)
-    psi, full = compute_transition(A, B, 1.0)
-    return DiscreteChain(psi, full, full if is_zero(fraction) else compute_transition(A, B, 1.0 - fraction)[1])
+def _sample(A: Array, B: Array, chain: AnyChain) -> SampledStates:
+    """Return the sampled plants; without a fractional delay, ``late`` is ``full``, which adds a zero at z = 0."""
+    fraction = chain.d - chain.n_delay
+    psi, full = integrate_chain(chain, A, B, 1.0)
+    late = full if is_zero(fraction) else integrate_chain(chain, A, B, 1.0 - fraction)[1]
+    return SampledStates(psi, full, late, chain.n_delay)
 
 
-def _factor(chain: AnyChain, states: DiscreteChain) -> _Plant:
+def _factor(chain: AnyChain, states: SampledStates) -> _Plant:
     """Return G of discretized devices as polynomials, and its zeros and poles."""
     psi, late = states.psi, states.late
-    assert late is not None, "`_discretize` sets it"
     xp = namespace(psi)
     zeros = -xp.linalg.eigvals(_realize_zeros(states)).T + 0j
     offsets, integrators = _find_poles(chain, psi)
     return _Plant(late[:, 0] * _expand(zeros), _expand(offsets), zeros, offsets, integrators)
 
 
-def _realize_zeros(states: DiscreteChain) -> Array:
+def _realize_zeros(states: SampledStates) -> Array:
     """Return matrices whose eigenvalues are the zeros of G in zeta.
 
     G is 0 if a force u with ``(zeta - Psi) x = (zeta late + full) u`` leaves the position, the first entry of x, at 0.
     With y = x - late u, without its first entry, this is an eigenvalue problem of (y, u).
     """
     xp = namespace(states.psi)
-    psi, full, late = states
-    assert late is not None, "`_discretize` sets it"
+    psi, full, late, _ = states
     inner, row = psi[:, 1:, 1:], psi[:, :1, 1:]
     column = inner @ late[:, 1:, None] + full[:, 1:, None]
     last = xp.concatenate([row, row @ late[:, 1:, None] + full[:, :1, None]], -1) / -late[:, :1, None]
@@ -168,10 +162,9 @@ def _find_poles(chain: AnyChain, psi: Array) -> tuple[Array, Array]:
     xp, size = namespace(psi), psi.shape[0]
     if isinstance(chain, System):
         device = chain.device
-        exact = device.offsets[1] if chain.sampled else -device.poles
-        exact = exact[np.argsort(np.abs(exact))][:, None]
-        offsets = exact + 0.0 * psi[:, 0, 0] if chain.sampled else -xp.expm1(-exact * xp.asarray(chain.period))
-        return xp.broadcast_to(offsets, (exact.size, size)), xp.full((size,), float(np.sum(exact == 0)))
+        poles = device.poles[np.argsort(np.abs(device.poles))][:, None]
+        offsets = xp.broadcast_to(-xp.expm1(poles * xp.asarray(chain.period)), (poles.size, size))
+        return offsets, xp.full((size,), float(np.sum(poles == 0)))
     offsets = -xp.linalg.eigvals(xp.where(xp.isfinite(psi), psi, 0.0)).T + 0j
     if not all(is_zero(body.stiffness) for body in chain.bodies):
         return offsets, xp.zeros(size)
@@ -220,7 +213,7 @@ def map_loops(
     def run(task: tuple[DeviceBatch, Sizes, np.ndarray, np.ndarray]) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
         batch, sizes, index, members = task
         padded = _pad(members)
-        states = batch.states and DiscreteChain(*(np.asarray(part)[padded] for part in batch.states))
+        states = batch.states and SampledStates(*(part[padded] for part in batch.states[:3]), batch.form.lag - 1)
         with np.errstate(all="ignore"):
             results = function(batch.form, batch.loop.take(padded), sizes, states, index[padded])
         return index[members], tuple(part[..., : members.size] for part in results)

@@ -46,7 +46,7 @@ SECANT_STEPS = 14
 CONVERGED_PEAK = 1e-7
 CONVERGED_STEP = 1e-13  # relative to w
 # Levels of alpha on the path from a maximum to K = 0, relative to it.
-LEVELS = (0.99, 0.95, 0.85, 0.7, 0.55, 0.4, 0.25, 0.12, 0.05, 0.01)
+LEVELS = (0.96, 0.8, 0.55, 0.3, 0.1, 0.02)
 THINNEST = 1e-4  # width of an interval of beta in the bisection, relative to its upper end; thinner ones may be false
 LARGEST_BETA = 50.0  # of a stable interval; crossings near zeros of F on the unit circle are farther away
 LEAST = -2  # marks the end of an interval at beta = 0, in place of the index of a node

@@ -23,6 +23,8 @@ import numpy as np
 from zwidth.core.types import Array
 from zwidth.model.circle_functions import circle_points
 from zwidth.model.velocity import Estimate
+from zwidth.numerics.polynomials import abs2
+from zwidth.stability.passivity import limit_margin, solve_larger_root
 
 # Settings of the search for the maximum of N.
 N_NODES = 129  # initial angles
@@ -31,6 +33,7 @@ N_PARTS = 16  # parts into which an interval is divided
 MAX_ROUNDS = 20  # largest number of rounds in which the undecided intervals are divided
 SHARES = np.arange(1, N_PARTS)[:, None] / N_PARTS  # inner points of a divided interval, relative to its width
 CERTIFIED_ERROR = 1e-13  # largest relative error of the maximum
+BATCH_WALLS = 64  # walls per batch, which limits the number of intervals in memory
 
 
 # Fields of a device for which no passivity condition is available, each with a description, a reason and a remedy.
@@ -114,20 +117,17 @@ class PassivityCondition:
             value = value * (mean * np.exp(-0.5j * (n + 1) * w))
         return value
 
-    def require_damping(self, alpha: float, beta: float, w: np.ndarray) -> np.ndarray:
+    def require_damping(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return the required damping N at angles in [0, pi]; ``alpha`` >= 0 includes the stiffness ``beta F(1)``."""
         n, f = self.integer_delay, self.fractional_delay
         s = np.sin(0.5 * w)
         kernel = np.where(s == 0, 2.0 * n + 1.0, np.sin((n + 0.5) * w) / np.where(s == 0, 1.0, s))
         damper = beta * self._evaluate_quotient(w)
         wall: Array = alpha + damper * circle_points(w).z_minus_1
-        a = -alpha * kernel + 2.0 * (np.exp(-1j * n * w) * damper).real
-        if f == 0:
-            return np.maximum(-0.5 * a, 0.0)
-        a = a - 2.0 * f * (np.exp(-1j * (n + 1) * w) * wall).real
-        return 0.25 * (-a + np.sqrt(a * a + 4.0 * f * (1.0 - f) * np.abs(wall) ** 2))
+        a = -alpha * kernel + 2.0 * (np.exp(-1j * n * w) * damper - f * np.exp(-1j * (n + 1) * w) * wall).real
+        return solve_larger_root(-0.5 * a, f * (1.0 - f) * abs2(wall), np)[0]
 
-    def bound_curvature(self, alpha: float, beta: float, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    def bound_curvature(self, alpha: np.ndarray, beta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Return a bound of ``|M''|`` on each interval of angles [low, high]."""
         n, f = self.integer_delay, self.fractional_delay
         difference = _bound_difference(low, high, 0.0)
@@ -182,33 +182,47 @@ def _bound_difference(low: np.ndarray, high: np.ndarray, offset: complex) -> tup
     return np.abs(circle_points(middle).z_minus_1 + offset) + 0.5 * (high - low), one, one
 
 
-def find_needed_damping(condition: PassivityCondition, alpha: float, beta: float) -> float:
-    """Return the maximum of N over all frequencies with a relative error below 1e-13; NaN for non-finite input."""
-    if not (np.isfinite(alpha) and np.isfinite(beta)):
-        return np.nan
-    stiffness = max(alpha + beta * condition.spring, 0.0)
+def find_needed_damping(condition: PassivityCondition, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+    """Return the maximum of N over all frequencies for each wall, with a relative error below 1e-13.
+
+    Args:
+        condition: the condition for velocity estimate and delay.
+        alpha: normalized stiffness, shape (walls,).
+        beta: normalized damping, shape (walls,).
+
+    Returns:
+        Array of shape (walls,); NaN for non-finite input.
+    """
+    stiffness = np.maximum(alpha + beta * condition.spring, 0.0)
     w = np.concatenate([[0.0], np.geomspace(1e-6, 1e-2, 24), np.linspace(1e-2, np.pi, N_NODES)[1:]])
-    values = condition.require_damping(stiffness, beta, w)
-    # Store the two ends of each interval of angles, and the required damping at each end, along the first axis.
-    ends, needs = np.stack([w[:-1], w[1:]]), np.stack([values[:-1], values[1:]])
-    best, upper = float(values.max()), values
-    for _ in range(MAX_ROUNDS):
-        upper = needs.max(0) + condition.bound_curvature(stiffness, beta, *ends) * np.diff(ends, axis=0)[0] ** 2 / 8.0
-        undecided = upper > best + CERTIFIED_ERROR * (abs(best) + 1e-300)
+    values = condition.require_damping(stiffness[:, None], beta[:, None], w)
+    best = values.max(-1)
+    # Store all undecided intervals of angles of all walls side by side: the index of the wall, the two ends, the
+    # required damping at each end, and an upper bound of the required damping.
+    wall = np.repeat(np.arange(alpha.size), w.size - 1)
+    low, high = (np.tile(end, alpha.size) for end in (w[:-1], w[1:]))
+    at_low, at_high = values[:, :-1].reshape(-1), values[:, 1:].reshape(-1)
+    curvature = condition.bound_curvature(stiffness[:, None], beta[:, None], w[:-1], w[1:]).reshape(-1)
+    for round_ in range(MAX_ROUNDS + 1):
+        upper = np.maximum(at_low, at_high) + curvature * (high - low) ** 2 / 8.0
+        undecided = upper > (best + CERTIFIED_ERROR * (np.abs(best) + 1e-300))[wall]
+        # Return the upper bound, a conservative result, for walls with too many undecided intervals, because their N is
+        # almost flat.
+        count = np.bincount(wall[undecided], minlength=alpha.size)
+        is_flat = (count > MAX_INTERVALS) | ((round_ == MAX_ROUNDS) & (count > 0))
+        np.maximum.at(best, wall[undecided & is_flat[wall]], upper[undecided & is_flat[wall]])
+        undecided &= ~is_flat[wall]
         if not undecided.any():
-            return best
-        if undecided.sum() > MAX_INTERVALS:
-            # Stop and return the upper bound, a conservative result: N is so flat that too many intervals remain
-            # undecided.
             break
-        (low, high), needs = ends[:, undecided], needs[:, undecided]
+        wall, low, high, at_low, at_high = (part[undecided] for part in (wall, low, high, at_low, at_high))
         angles = low + (high - low) * SHARES
-        inner = condition.require_damping(stiffness, beta, angles.ravel())
-        best = max(best, float(inner.max()))
-        angles = np.concatenate([[low], angles, [high]])
-        values = np.concatenate([needs[:1], inner.reshape(N_PARTS - 1, -1), needs[1:]])
-        ends, needs = (np.stack([part[:-1].ravel(), part[1:].ravel()]) for part in (angles, values))
-    return float(upper.max())
+        inner = condition.require_damping(stiffness[wall], beta[wall], angles)
+        np.maximum.at(best, wall, inner.max(0))
+        angles, values = np.concatenate([[low], angles, [high]]), np.concatenate([[at_low], inner, [at_high]])
+        wall = np.tile(wall, N_PARTS)
+        low, high, at_low, at_high = (part.reshape(-1) for part in (angles[:-1], angles[1:], values[:-1], values[1:]))
+        curvature = condition.bound_curvature(stiffness[wall], beta[wall], low, high)
+    return np.where(np.isfinite(alpha + beta), best, np.nan)
 
 
 def compute_passivity_margins(
@@ -216,17 +230,16 @@ def compute_passivity_margins(
 ) -> np.ndarray:
     """Return the passivity margins of walls: delta minus the required damping.
 
-    The margin of a wall with negative stiffness is at most its stiffness, because such a wall supplies unlimited
-    energy, which the condition at w > 0 does not detect.
-
     Args:
         condition: the condition for velocity estimate and delay.
         alpha: normalized stiffness, any shape.
         beta: normalized damping, the same shape.
         delta: normalized physical damping.
     """
-    pairs = zip(alpha.ravel().tolist(), beta.ravel().tolist(), strict=True)
-    needed = [find_needed_damping(condition, *wall) for wall in pairs]
-    margin = delta - np.array(needed).reshape(alpha.shape)
-    stiffness = alpha + beta * condition.spring
-    return np.where(stiffness < 0, np.minimum(margin, stiffness), margin)
+    walls = alpha.reshape(-1), beta.reshape(-1)
+    needed = np.zeros(alpha.size)
+    for start in range(0, alpha.size, BATCH_WALLS):
+        part = slice(start, start + BATCH_WALLS)
+        with np.errstate(invalid="ignore"):
+            needed[part] = find_needed_damping(condition, walls[0][part], walls[1][part])
+    return limit_margin(delta - needed.reshape(alpha.shape), alpha + beta * condition.spring)

@@ -24,8 +24,8 @@ from zwidth.core.xp import within
 from zwidth.model.circle_functions import Jet
 from zwidth.model.velocity import Estimate
 from zwidth.numerics.pole_counting import count_poles
-from zwidth.numerics.polynomials import abs2, companion
-from zwidth.stability.linear.roots import LoopRoots, affine_polynomial, compute_aberth_step, factor_open_loop
+from zwidth.numerics.polynomials import abs2, companion, compute_aberth_step
+from zwidth.stability.linear.roots import LoopRoots, affine_polynomial, factor_open_loop
 from zwidth.units.quantities import MOST_POLES, WALL_RANGE
 
 # Aberth's method
@@ -215,6 +215,12 @@ MAX_ROUNDS = 24
 BRACKET_WIDTH = 4e-16  # target width, relative to max(1, |log radius|)
 MAX_BRACKET_WIDTH = 1e-6  # a wider final bracket, caused by inconclusive counts, means NaN
 
+# Search for the dominant pole on the circle whose radius is the spectral radius.
+POINTS_PER_POLE = 8  # points on the half circle per pole at which P is evaluated
+MAX_STARTS = 16  # points from which Newton's method starts
+NEWTON_STEPS = 12
+ON_CIRCLE = 1e-6  # largest difference of log|z| from the log radius; bounded by `MAX_BRACKET_WIDTH`
+
 # Largest |log radius| at which the radius may contradict the verdict on stability. For a larger contradiction the
 # result is NaN, because either the radius or the verdict may be wrong.
 VERDICT_TOLERANCE = 1e-7
@@ -227,25 +233,61 @@ def compute_log_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray) -> 
     return np.array([_bracket_log_radius(loop, a, b) for a, b in zip(alpha.tolist(), beta.tolist(), strict=True)])
 
 
-def spectral_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, stable: np.ndarray) -> np.ndarray:
-    """Return the spectral radius ``max|z|`` of each wall, which is below 1 if and only if ``stable`` is True.
+def compute_dominant_poles(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``log|z|`` and the angle in rad, from 0 to pi, of the dominant pole of each wall; NaN if not computed."""
+    if loop.order > MAX_COMPUTED_POLES and loop.estimate.window <= MAX_COUNTED_WINDOW:
+        log = compute_log_radius(loop, alpha, beta)
+        angles = [_find_angle(loop, *wall) for wall in zip(alpha.tolist(), beta.tolist(), log.tolist(), strict=True)]
+        return log, np.array(angles)
+    zeta = compute_poles_minus_one(loop, alpha, beta)
+    dominant = np.take_along_axis(zeta, log_modulus(zeta).argmax(-1)[:, None], -1)[:, 0]
+    return log_modulus(dominant), np.arctan2(np.abs(np.imag(dominant)), 1.0 + np.real(dominant))
+
+
+def _find_angle(loop: LoopRoots, alpha: float, beta: float, log_radius: float) -> float:
+    """Return the angle of the pole with a known log radius by Newton's method; NaN if it does not converge."""
+    if not np.isfinite(log_radius):
+        return np.nan
+    angles = np.linspace(0.0, np.pi, POINTS_PER_POLE * loop.order)
+    zeta = np.expm1(log_radius + 1j * angles)
+    with np.errstate(all="ignore"):
+        P = evaluate_polynomial(loop, np.float64(alpha), np.float64(beta), zeta)
+        distance = np.abs(P.value / P.slope)
+        inner = np.pad(distance, 1, constant_values=np.inf)
+        minima = np.flatnonzero((distance <= inner[:-2]) & (distance <= inner[2:]))
+        zeta = zeta[minima[np.argsort(distance[minima])[:MAX_STARTS]]]
+        for _ in range(NEWTON_STEPS):
+            P = evaluate_polynomial(loop, np.float64(alpha), np.float64(beta), zeta)
+            zeta = zeta - P.value / P.slope
+        P = evaluate_polynomial(loop, np.float64(alpha), np.float64(beta), zeta)
+        misfit = np.where(np.abs(P.value) < 1e-10 * P.size, np.abs(log_modulus(zeta) - log_radius), np.inf)
+    k = np.argmin(np.where(np.isnan(misfit), np.inf, misfit))
+    re, im = np.real(zeta)[k], np.abs(np.imag(zeta)[k])
+    im = 0.0 if im <= REAL_TOLERANCE * np.abs(re) else im
+    return float(np.arctan2(im, 1.0 + re)) if misfit[k] < ON_CIRCLE else np.nan
+
+
+def agree_with_verdict(log: np.ndarray, stable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the spectral radius of each wall, below 1 if and only if ``stable`` is True, and its logarithm.
 
     Within rounding errors of the stability boundary the computed radius may contradict the verdict; it is then 1, or
     the next smaller float64 for a stable wall.
 
     Args:
-        loop: the loop without a wall.
-        alpha: normalized stiffness, shape (walls,).
-        beta: normalized damping, shape (walls,).
+        log: computed log radius, shape (walls,).
         stable: verdict on each wall, shape (walls,).
 
     Returns:
-        Array of shape (walls,); NaN for a contradiction larger than `VERDICT_TOLERANCE`.
+        Arrays of shape (walls,); NaN for a contradiction larger than `VERDICT_TOLERANCE`.
     """
-    log = compute_log_radius(loop, alpha, beta)
     log = np.where((log < 0) != stable, np.where(np.abs(log) < VERDICT_TOLERANCE, 0.0, np.nan), log)
     radius = np.exp(log)
-    return np.where(stable, np.minimum(radius, np.nextafter(1.0, 0.0)), radius)
+    return np.where(stable, np.minimum(radius, np.nextafter(1.0, 0.0)), radius), log
+
+
+def spectral_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, stable: np.ndarray) -> np.ndarray:
+    """Return the spectral radius ``max|z|`` of each wall, in agreement with its verdict (`agree_with_verdict`)."""
+    return agree_with_verdict(compute_log_radius(loop, alpha, beta), stable)[0]
 
 
 def _bracket_log_radius(loop: LoopRoots, alpha: float, beta: float) -> float:

@@ -18,42 +18,22 @@ from math import gcd
 
 import numpy as np
 
-from zwidth.core.types import Array
-from zwidth.model.circle_functions import (
-    CirclePoints,
-    Jet,
-    are_on_circle,
-    circle_points,
-    distances_inside,
-    power_jet,
-    product_jet,
-)
+from zwidth.model.circle_functions import are_on_circle, circle_points, distances_inside
+from zwidth.model.mechanism import AnyChain
 from zwidth.model.velocity import Estimate
 from zwidth.numerics.polynomials import Affine
+from zwidth.plant.factored_plant import FactoredPlant, factor_chain
 
 # Coefficients below this fraction of the largest one are regarded as rounding errors of 0.
 NEGLIGIBLE_COEFFICIENT = 1e-12
+POLE_AT_ONE = 1e-13  # distance from z = 1 below which a pole counts as a pole at z = 1
 
 
 @dataclass(frozen=True)
-class LoopRoots:
-    """The loop without a wall: ``G(z) = gain prod(z - zeros)/(z^lag prod(z - poles))`` and the velocity estimate F."""
+class LoopRoots(FactoredPlant):
+    """The loop without a wall: the sampled plant G and the velocity estimate F."""
 
-    gain: float
-    lag: int
-    zeros: Array
-    poles: Array
     estimate: Estimate
-
-    def evaluate_controller(self, points: CirclePoints) -> Jet:
-        """Return the critical controller ``q = -1/G`` and its derivative in w at points of the unit circle."""
-        quotient = product_jet(points, self.poles, -1.0).over(product_jet(points, self.zeros, self.gain))
-        return quotient.times(power_jet(points, self.lag))
-
-    def evaluate_response(self, points: CirclePoints) -> Jet:
-        """Return the response G and its derivative in w at points of the unit circle."""
-        quotient = product_jet(points, self.zeros, self.gain).over(product_jet(points, self.poles, 1.0))
-        return quotient.times(power_jet(points, -self.lag))
 
     @property
     def order(self) -> int:
@@ -117,20 +97,9 @@ class LoopRoots:
         return by_roots + self.lag + self.estimate.window + abs(self.estimate.lag) + 1.0
 
 
-def compute_aberth_step(roots: Array, rate: Array) -> Array:
-    """Return Aberth's steps for approximations of all roots of P, along the last axis.
-
-    The step is Newton's, corrected for the other roots, so that no two approximations converge to the same root.
-
-    Args:
-        roots: approximations.
-        rate: ``P'/P`` at the approximations.
-
-    Returns:
-        The steps, to be subtracted.
-    """
-    differences = np.where(np.eye(roots.shape[-1], dtype=bool), np.inf, roots[..., :, None] - roots[..., None, :])
-    return 1.0 / (rate - (1.0 / differences).sum(-1))
+def find_roots(chain: AnyChain) -> LoopRoots:
+    """Return the zeros, poles and gain of the loop of a chain, without a wall."""
+    return LoopRoots(**vars(factor_chain(chain)), estimate=chain.estimate)
 
 
 def _expand(*offsets: np.ndarray) -> np.ndarray:

@@ -8,8 +8,7 @@ region of the (alpha, beta) plane. Its outline consists of
   meets in the *corner*;
 - the line alpha = 0, on which a pole is at z = 1 (docs/theory/boundary.md, docs/theory/one-lobe.md).
 
-The *ridge* is the point of the lobe with the largest alpha. The code parameterizes the lobe by x
-(`stability.rigid.curve`).
+The *ridge* is the point of the lobe with the largest alpha. A point of the lobe is given by s = sin(omega/2).
 """
 
 from __future__ import annotations
@@ -25,19 +24,22 @@ from zwidth.core.types import Array, ArrayLike, Vertices
 from zwidth.core.xp import materialize, namespace, nan_with_nan_derivatives, stop_gradient, tree_map
 from zwidth.model.checks import check_integer
 from zwidth.numerics.evaluate import as_number, check_scalars, evaluate
-from zwidth.numerics.held_mass import DelayClasses, classify_delays, discretize_mass, is_valid_device, split_delay
 from zwidth.numerics.root_finding import attach_root_derivatives, integrate
+from zwidth.plant.rigid_mass import DelayClasses, classify_delays, discretize_mass, is_valid_device, split_delay
+from zwidth.stability.rigid.boundary_curve import evaluate_wall, evaluate_wave_at, expand_curve
+from zwidth.stability.rigid.characteristic_polynomial import expand_wall, recover_wall
 from zwidth.stability.rigid.curve import (
     build_lobe,
-    compute_corner_line,
+    compute_damping,
     compute_frequency,
+    compute_offset,
     evaluate_lobe,
     find_column_end,
+    find_on_corner_line,
     find_peak,
     find_row_end,
 )
 from zwidth.stability.rigid.normalization import wall_status
-from zwidth.stability.rigid.ridge_newton import evaluate_wall, evaluate_wave_at, expand_curve
 from zwidth.units.display import compact_repr
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
@@ -183,11 +185,11 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
     frozen_curve, frozen_number = stop_gradient((curve, number), xp)
     if is_row:
         limit = materialize(find_row_end(frozen_number, frozen_curve), delta)
-        x, on_lobe, exists = limit.x, limit.meets_lobe, (limit.meets_lobe | limit.beyond) & (limit.alpha > 0)
-        x = attach_root_derivatives(
-            lambda x, curve, b: evaluate_lobe(x, curve).b - b, x, lambda *_: True, curve, number + delta
+        s, on_lobe, exists = limit.s, limit.meets_lobe, (limit.meets_lobe | limit.beyond) & (limit.alpha > 0)
+        s = attach_root_derivatives(
+            lambda s, curve, b: evaluate_lobe(s, curve).b - b, s, lambda *_: True, curve, compute_offset(number, curve)
         )
-        point = evaluate_lobe(x, curve)
+        point = evaluate_lobe(s, curve)
         # Return exactly the limit of alpha that `zwidth.is_stable` compares with, but take the derivatives from the
         # point of the lobe, because the limit has been computed without derivatives.
         alpha = (
@@ -198,22 +200,20 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
         top = find_peak(frozen_curve, kind)
         exists = (frozen_number > 0) & (frozen_number < top.alpha)
         target = xp.where(exists, frozen_number, 0.5 * top.alpha)
-        x, on_line = materialize(find_column_end(target, top, frozen_curve, line == "upper"), delta)
+        s, on_line = materialize(find_column_end(target, top, frozen_curve, line == "upper"), delta)
         on_lobe = ~on_line
-        x = attach_root_derivatives(
-            lambda x, curve, alpha: evaluate_lobe(x, curve).alpha - alpha, x, lambda *_: True, curve, number
+        s = attach_root_derivatives(
+            lambda s, curve, alpha: evaluate_lobe(s, curve).alpha - alpha, s, lambda *_: True, curve, number
         )
-        point = evaluate_lobe(x, curve)
-        # Do not refine x by a further Newton step, because near the ridge the step would be a quotient of rounding
+        point = evaluate_lobe(s, curve)
+        # Do not refine s by a further Newton step, because near the ridge the step would be a quotient of rounding
         # errors.
-        alpha, beta = number, point.b - delta
-    omega = compute_frequency(x, curve)
+        alpha, beta = number, compute_damping(point.b, curve)
+    omega = compute_frequency(s)
     if curve.short_curve is not None and line != "lower":
-        # If the point is not on the lobe, it is on the line of walls with a pole at z = -1, where alpha + 2 beta is
-        # constant.
-        line_value = compute_corner_line(curve) - (2.0 * number if is_row else number)
-        alpha = xp.where(on_lobe, alpha, line_value) if is_row else alpha
-        beta = beta if is_row else xp.where(on_lobe, beta, 0.5 * line_value)
+        # If the point is not on the lobe, it is on the line of walls with a pole at z = -1.
+        alpha_on_line, beta_on_line = find_on_corner_line(number, curve, is_row)
+        alpha, beta = xp.where(on_lobe, alpha, alpha_on_line), xp.where(on_lobe, beta, beta_on_line)
         omega = xp.where(on_lobe, omega, np.pi)
     status = xp.where(exists, int(Status.OK), int(Status.NO_BOUNDARY))
     status = xp.where(input_status == int(Status.OK), status, input_status)
@@ -254,8 +254,7 @@ def sample_lobe(delta: float, d: float, *, points: int = 400) -> tuple[Vertices,
     kind = classify_delays(d)
     with np.errstate(all="ignore"):
         curve = build_lobe(np.float64(device["delta"]), np.float64(device["d"]), kind)
-        top = find_peak(curve, kind).x
-        first, last = (float(compute_frequency(x, curve)) for x in (top, curve.end))
+        first, last = (float(compute_frequency(s)) for s in (find_peak(curve, kind).s, curve.end))
     # Space the points more closely at both ends and at the ridge, where the curvature is largest.
     half_grid = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, points // 2)))
     omega = (
@@ -297,7 +296,7 @@ def stable_region(delta: float, d: float, *, points: int = 400) -> StableRegion:
     if omega[-1] == np.pi and alpha[-1] > 0:
         # Add the straight part of the outline, from the corner along alpha + 2 beta = const to alpha = 0.
         omega, piece = np.append(omega, np.pi), np.append(piece, Piece.MINUS_ONE)
-        beta = np.append(beta, beta[-1] + 0.5 * alpha[-1])
+        beta = np.append(beta, recover_wall(0.0, sum(expand_wall(0.5 * alpha[-1], beta[-1])[:2]))[1])
         alpha = np.append(alpha, 0.0)
     alpha[-1] = 0.0
     return StableRegion(alpha, beta, omega, piece)
@@ -339,22 +338,23 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     """Compute the area of the stable set: the integral of alpha db along the lobe and, beyond a corner, a triangle."""
     xp = namespace(delta, d)
     curve = build_lobe(delta, d, kind)
-    end = stop_gradient(curve.end, xp)
+    # Without a corner, alpha is 0 at the end of the lobe.
+    end = attach_root_derivatives(
+        lambda x, curve: evaluate_lobe(x, curve).alpha,
+        curve.end,
+        lambda *_: True,
+        curve,
+        slope=lambda x, curve: xp.where(curve.to_corner, xp.inf, evaluate_lobe(x, curve).d_alpha),
+    )
     # If the lobe ends in the corner, add the triangle below the line alpha + 2 beta = const, on which the outline
     # continues to alpha = 0.
     point = evaluate_lobe(end, curve)
     corner_alpha = xp.where(curve.to_corner, point.alpha, 0.0)
-    if xp is not np:
-        # Without a corner, alpha is 0 at the end of the lobe. Add one Newton step for this end, because second
-        # derivatives of the area depend on the derivative of the end.
-        end = end - xp.where(
-            curve.to_corner, 0.0, point.alpha / stop_gradient(xp.where(curve.to_corner, 1.0, point.d_alpha), xp)
-        )
     # Add an axis for the quadrature nodes.
     expanded = tree_map(lambda value: None if value is None else value[..., None], curve)
 
-    def integrand(x: Array) -> Array:
-        point = evaluate_lobe(x, expanded)
+    def integrand(s: Array) -> Array:
+        point = evaluate_lobe(s, expanded)
         return point.alpha * point.d_b
 
     under_lobe = integrate(integrand, (0.0 * end, end), (LOBE_NODES,))

@@ -31,9 +31,10 @@ from zwidth.core.types import Array
 from zwidth.core.xp import horner, materialize, namespace, nan_beyond, square_roots
 from zwidth.numerics.balls import BITS, available
 from zwidth.numerics.evaluate import evaluate_columns
-from zwidth.numerics.held_mass import DelayClasses, DiscretePlant, PhiFunctions, classify_delays, discretize_mass
-from zwidth.numerics.held_mass import discretize_plant as discretize
+from zwidth.plant.rigid_mass import DelayClasses, DiscretePlant, PhiFunctions, classify_delays, discretize_mass
+from zwidth.plant.rigid_mass import discretize_plant as discretize
 from zwidth.stability.rigid.broadcasting import Points
+from zwidth.stability.rigid.characteristic_polynomial import expand_wall
 from zwidth.stability.rigid.crossover import (
     DelayPhase,
     Verdict,
@@ -122,7 +123,7 @@ class Sized:
 def compute_wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
     """Return UNSTABLE, STABLE, OPEN or EDGE for each wall, elementwise."""
     xp, plant = namespace(alpha, beta, delta), size_device(delta, d, kind)
-    wall, verdicts = (Sized(alpha), Sized(beta)), []
+    wall, verdicts = expand_wall(Sized(alpha), Sized(beta))[:2], []
     if kind.short:
         verdicts.append(decide_short_delay(*wall, plant))
     if kind.long:
@@ -132,7 +133,7 @@ def compute_wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: 
     # one-crossover.md). For alpha > 0 no wall with beta <= -delta is stable (L16 of one-lobe.md). For alpha < 0 all
     # walls are unstable: P(1) = phi1 alpha < 0, so a real pole is above 1.
     b, edge = wall[1] + plant.delta, alpha == 0
-    valid = (edge & (beta > delta)) | ((alpha > 0) & (b > 0))
+    valid = (edge & (wall[1].value > delta)) | ((alpha > 0) & (b > 0))
     code = xp.where(stable & valid, xp.where(edge, EDGE, STABLE), OPEN)
     code = xp.where((unstable & valid) | (alpha < 0) | ((alpha > 0) & (b < 0)), UNSTABLE, code)
     return code.astype(xp.uint8)
@@ -203,7 +204,7 @@ def _decide_rest(
     # Do not test walls with beta <= -delta: they are not stable. For alpha = 0, P(1) = 0 and P'(1) = phi1 (delta +
     # beta) <= 0, so a further pole is at or above z = 1; for alpha > 0, the stable set lies above beta = -delta (L16 of
     # one-lobe.md).
-    open_walls = np.flatnonzero(in_range & ~edge & (beta > -delta))
+    open_walls = np.flatnonzero(in_range & ~edge & (expand_wall(alpha, beta).beta > -delta))
     status[open_walls] = Status.UNDECIDED
     if open_walls.size and available():
         walls = zip(*(column[open_walls].tolist() for column in (alpha, beta, delta, d)), strict=True)
@@ -226,7 +227,7 @@ def compute_verdict(alpha: float, beta: float, delta: float, d: float, bits: int
     import flint
 
     with flint.ctx.workprec(bits):
-        plant, wall = device(delta, d, bits), (flint.arb(alpha), flint.arb(beta))
+        plant, wall = device(delta, d, bits), expand_wall(flint.arb(alpha), flint.arb(beta))[:2]
         return (
             decide_short_delay(*wall, plant)
             if d < 1

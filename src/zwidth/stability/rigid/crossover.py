@@ -1,21 +1,14 @@
 """Decide the stability of rigid virtual walls in closed form, by a Nyquist test at the single gain crossover.
 
 The inputs are the normalized stiffness alpha and damping beta of the wall, the normalized physical damping delta of the
-device, and its delay of d = n + f periods (n integer, 0 <= f < 1). The discretized plant (`numerics.held_mass`) yields
-the characteristic polynomial P = T + B and the open loop L = B/T with
+device, and its delay of d = n + f periods (n integer, 0 <= f < 1). The characteristic polynomial P = T + B and the open
+loop L = B/T have the factors of `stability.rigid.characteristic_polynomial`. For f = 0, a2 = phi2, a1 = psi and a0 = 0;
+for f > 0 see docs/theory/model.md. On the unit circle, z = e^(jw) with 0 < w <= pi, the code uses
 
-    T = z^(n+1) (z - 1)(z - c)                device and delay, c = e^-delta
-    B = M(z) ((alpha + beta) z - beta)        wall, M = a2 z + a1 + a0/z
+    y = sin^2(w/2)      u = 1 - cos w = 2 y      V = |M|^2
+    em = 1 - c          p1 = phi1 = em/delta     phi2 = (1 - phi1)/delta      psi = (phi1 - c)/delta
 
-f = 0 gives a2 = phi2, a1 = psi and a0 = 0; for f > 0 see docs/theory/model.md. The fields p1, psi, p1_t and psi_t of
-the plant are phi1(delta), psi(delta), phi1((1 - f) delta) and psi((1 - f) delta). On the unit circle, z = e^(jw) with
-0 < w <= pi, the code uses
-
-    y = sin^2(w/2)      u = 1 - cos w = 2 y      W = alpha + beta u + j beta sin w      V = |M|^2
-    em = 1 - c          p1 = phi1 = em/delta     phi2 = (1 - phi1)/delta                psi = (phi1 - c)/delta
-
-and gap = a2 - a1 + a0 = -M(-1). With W, B = z M W, so |B|^2 = V |W|^2; and |T|^2 = 2 u (em^2 + 2 c u). Each
-docstring states whether an expansion is in y or in u.
+and gap = N(-1) = a2 - a1 + a0. Each docstring states whether an expansion is in y or in u.
 
 For alpha > 0, |L| decreases strictly with frequency (one-crossover.md, Theorem 1). So there is at most one gain
 crossover, and the phase of the loop at that frequency decides stability (Theorem 2). Without a gain crossover, |L| > 1
@@ -61,8 +54,19 @@ from zwidth.core.xp import (
     stop_gradient,
     within,
 )
-from zwidth.numerics.held_mass import ANY, DelayClasses, DiscretePlant, discretize_plant
 from zwidth.numerics.root_finding import attach_root_derivatives
+from zwidth.plant.rigid_mass import ANY, DelayClasses, DiscretePlant, discretize_plant
+from zwidth.stability.rigid.boundary_curve import (
+    compute_squared_modulus,
+    expand_curve_with_offset,
+    expand_short_delay_curve,
+)
+from zwidth.stability.rigid.characteristic_polynomial import (
+    evaluate_at_nyquist,
+    expand_gain_difference,
+    expand_gain_difference_at_nyquist,
+    expand_wall,
+)
 from zwidth.units.quantities import WALL_RANGE
 
 # Number of Newton steps for the cubic. The starting value, also where it is replaced by 1, is within 11 % of the root
@@ -97,83 +101,11 @@ RootFinder = Callable[[tuple[Any, ...]], tuple[Any, Any]]
 DelayPhaseFunction = Callable[[Any, Any], DelayPhase]
 
 
-class ShortDelayCurve(NamedTuple):
-    """The boundary curve (alpha_w, beta_w) for d < 1, as polynomials in y with the lowest power first."""
-
-    damping: tuple[Any, Any]  # V (beta_w + delta)/y
-    modulus: tuple[Any, Any, Any]  # V = |M|^2
-    stiffness: tuple[Any, Any, Any]  # V alpha_w/(4 y)
-
-
-class LongDelayCurve(NamedTuple):
-    """The terms E and H of ``(z - c) conj M = E + j H sin w``, and V, as polynomials in y with the lowest power first.
-
-    These terms determine the boundary curve for d >= 1 (boundary.md, B1). They do not depend on n.
-    """
-
-    E: tuple[Any, ...]
-    H: tuple[Any, ...]
-    V: tuple[Any, ...]  # |M|^2
-    excess: tuple[Any, ...]  # (delta V - E)/y, from which beta_w + delta is computed without cancellation
-
-
-def expand_short_delay_curve(plant: Any) -> ShortDelayCurve:
-    """Expand the boundary curve for d < 1 in powers of y, in any arithmetic.
-
-    The coefficients follow from B1 of boundary.md for n = 0, with sin w and cos w expressed by y.
-    """
-    p1, em, a2, a1, a0, f = plant.p1, plant.em, plant.a2, plant.a1, plant.a0, plant.f
-    t = 1.0 - f
-    # No digits cancel, because all terms of ``total`` are nonnegative and the other coefficient is a single product.
-    total = f * (f * em + p1) + t * (f * plant.p1_t + t * plant.psi_t) + a0
-    damping = p1 * total * 4.0, a0 * (f + t * plant.p1_t) * -16.0
-    modulus = p1 * p1, (a1 * (a2 + a0) + a2 * a0 * 4.0) * -4.0, a2 * a0 * 16.0
-    stiffness = p1 * (em + f * em + p1), (a1 + a0 * 3.0 + a0 * em) * -4.0, a0 * 16.0
-    return ShortDelayCurve(damping, modulus, stiffness)
-
-
-def expand_long_delay_curve(plant: Any) -> LongDelayCurve:
-    """Expand the terms of `LongDelayCurve` in powers of y, in any arithmetic; a0 is None for integer d."""
-    p1, em, a2, a1, a0 = plant.p1, plant.em, plant.a2, plant.a1, plant.a0
-    if a0 is None:
-        # For f = 0, the general formulas below simplify by phi1 = a2 + a1 and 1 - delta a2 = phi1.
-        E = em * p1, (plant.gap - em * a2) * 2.0
-        return LongDelayCurve(E, (p1 * p1,), (p1 * p1, a1 * a2 * -4.0), (p1 * plant.gap * -2.0,))
-    total, difference, product = a2 + a0, a2 - a0, a2 * a0 * 4.0
-    E = em * p1, (p1 + total * em - difference * 2.0) * -2.0, a0 * 8.0
-    H = p1 * (p1 + plant.f * em), a0 * -4.0
-    V = p1 * p1, (a1 * total + product) * -4.0, product * 4.0
-    # Expand (delta V - E)/y: the constant terms of delta V - E cancel exactly, because em = delta phi1.
-    excess0 = p1 * 2.0 - difference * 4.0 + plant.delta * (total * (total - a1) - product * 2.0) * 2.0
-    excess1 = a0 * (1.0 - plant.delta * a2 * 2.0) * -8.0
-    return LongDelayCurve(E, H, V, (excess0, excess1))
-
-
-def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]:
-    """Expand |B|^2 - |T|^2 in powers of u, in any arithmetic.
-
-    There are three coefficients if a0 is None, i.e. for integer d, otherwise four. For alpha > 0 the polynomial is
-    positive at u = 0 and has at most one root in (0, 2), the gain crossover, above which it is negative.
-    """
-    p1_squared, cross, alpha_squared = plant.p1 * plant.p1, beta * (alpha + beta) * 2, alpha * alpha
-    # With ``|W|^2 = alpha^2 + cross u``, compute ``bend = cross/2 - delta^2`` in factored form, to avoid cancellation
-    # near beta = delta. The term ``2 phi1^2 bend`` contains the term -2 em^2 of |T|^2, because em = delta phi1.
-    bend = (beta - plant.delta) * (beta + plant.delta) + alpha * beta
-    # The expansion of V is phi1^2 - 2 m1 u + product u^2; for integer d, a0 = 0 and therefore product = 0.
-    if plant.a0 is None:
-        m1 = plant.a1 * plant.a2
-        return p1_squared * alpha_squared, (p1_squared * bend - m1 * alpha_squared) * 2, m1 * cross * -2 - plant.c * 4
-    product = plant.a2 * plant.a0 * 4
-    m1 = plant.a1 * (plant.a2 + plant.a0) + product
-    h2 = product * alpha_squared - m1 * cross * 2 - plant.c * 4
-    return p1_squared * alpha_squared, (p1_squared * bend - m1 * alpha_squared) * 2, h2, product * cross
-
-
 def decide_short_delay(alpha: Any, beta: Any, plant: Any) -> Verdict:
     """Decide stability for d < 1, alpha > 0 and beta > -delta, by comparing alpha with the boundary at this beta."""
     # Require |L(-1)| < 1, because otherwise there is no gain crossover and the wall is unstable. On lines of constant
     # beta that miss the lobe, this condition alone limits alpha. The sign of L(-1) is that of gap, so both signs occur.
-    wall_at_nyquist, device_at_nyquist = plant.gap * (alpha + beta * 2.0), (plant.c + 1.0) * 2.0
+    wall_at_nyquist, device_at_nyquist = evaluate_at_nyquist(alpha, beta, plant)
     crosses = (wall_at_nyquist < device_at_nyquist) & (wall_at_nyquist > -device_at_nyquist)
     crosses_nowhere = (wall_at_nyquist > device_at_nyquist) | (wall_at_nyquist < -device_at_nyquist)
     b = beta + plant.delta
@@ -238,9 +170,9 @@ def decide_long_delay(
     y = u * 0.5
     sin_half, cos_half = square_roots(y, 1.0 - y)  # of w/2
     phase = evaluate_phase(u, n)
-    E_terms, H_terms, V_terms, excess = expand_long_delay_curve(plant)
+    curve = expand_curve_with_offset(plant)
     # Evaluate E and F = H sin w, the real and imaginary part of (z - c) conj M.
-    E, F = horner(y, E_terms), sin_half * cos_half * horner(y, H_terms) * 2.0
+    E, F = horner(y, curve.E), sin_half * cos_half * horner(y, curve.H) * 2.0
     cos_full = phase.cosine * cos_half - phase.sine * sin_half  # cos((n + 1) w)
     # Compute the boundary point, multiplied by V cos(w/2) > 0 (boundary.md, B1, second form):
     #   alpha_w -> 2 sin(w/2) projection
@@ -249,10 +181,10 @@ def decide_long_delay(
     projection = (phase.sine * cos_half + phase.cosine * sin_half) * E + cos_full * F
     sine_F = phase.sine * F
     cosine_drop = phase.half_sine_squared * 2.0 - y / (cos_half + 1.0)  # cos(w/2) - cos((n + 1/2) w)
-    boundary_offset = cos_half * y * horner(y, excess) + E * cosine_drop + sine_F
+    boundary_offset = cos_half * y * horner(y, curve.excess) + E * cosine_drop + sine_F
     # Evaluate the equivalent criteria beta alpha_w - alpha beta_w > 0 and beta - beta_w > 0, multiplied by V cos(w/2).
     cross_product = projection * beta * sin_half * 2.0 - (sine_F - phase.cosine * E) * alpha
-    damping_margin = (beta + plant.delta) * cos_half * horner(y, V_terms) - boundary_offset
+    damping_margin = (beta + plant.delta) * cos_half * compute_squared_modulus(y, 1.0 - y, curve) - boundary_offset
     # The lobe ends where (n + 1) w + arg(E + j F) reaches pi, where E + j F = (z - c) conj M. Neither angle is
     # negative, because arg(z - c) >= w >= arg M. ``projection`` has the sign of the sine of their sum. With (n + 1/2) w
     # <= pi, the last condition excludes sums of 2 pi or more, which need both angles above pi/2.
@@ -342,19 +274,11 @@ def find_gain_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tupl
     # Solve for the smaller of u = 1 - cos w and v = 1 + cos w, because computing it as 2 minus the other one would lose
     # its relative accuracy.
     xp = namespace(alpha, plant.delta)
+    alpha, beta, _ = expand_wall(alpha, beta)
     in_u = expand_gain_difference(alpha, beta, plant)
-    # Expand |T|^2 - |B|^2 in powers of v. It is positive at v = 0, i.e. at z = -1, if the crossover exists.
-    device_at_nyquist, W_nyquist = 2.0 * (1.0 + plant.c), alpha + 2.0 * beta
-    wall_at_nyquist, difference = plant.gap * W_nyquist, plant.a2 - plant.a0
-    W_squared, cross, product = W_nyquist * W_nyquist, 2.0 * beta * (alpha + beta), 4.0 * plant.a2 * plant.a0
-    # The expansion of V is gap^2 + g1 v + product v^2.
-    g1 = 2.0 * (difference * difference - plant.gap * (plant.a2 + plant.a0))
-    in_v = (
-        (device_at_nyquist - wall_at_nyquist) * (device_at_nyquist + wall_at_nyquist),
-        plant.gap * plant.gap * cross - g1 * W_squared - 2.0 * (plant.em * plant.em + 8.0 * plant.c),
-        4.0 * plant.c - product * W_squared + g1 * cross,
-        in_u[3],
-    )
+    # The expansion in v is positive at v = 0, i.e. at z = -1, if the crossover exists.
+    in_v = expand_gain_difference_at_nyquist(alpha, beta, plant)
+    wall_at_nyquist, device_at_nyquist = evaluate_at_nyquist(alpha, beta, plant)
     # If the polynomial in u is positive at u = 1, the crossover can only lie above w = pi/2; solve for v there.
     above_half = sum(in_u[1:], in_u[0]) > 0
     coefficients = tuple(xp.where(above_half, *pair) for pair in zip(in_v, in_u, strict=True))
@@ -376,6 +300,7 @@ def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Delay
 
 def decide_in_floats(alpha: Array, beta: Array, plant: DiscretePlant, kind: DelayClasses) -> Array:
     """Return whether each wall is stable on a discretized plant, elementwise, in floating point."""
+    alpha, beta, _ = expand_wall(alpha, beta)
     integer_plant = plant._replace(a0=None)
     if not kind.fractional:
         plant = integer_plant

@@ -28,8 +28,8 @@ from zwidth.core.xp import (
     stop_gradient,
 )
 from zwidth.numerics.evaluate import evaluate
-from zwidth.numerics.held_mass import ANY, DiscretePlant, discretize_plant, split_delay
 from zwidth.numerics.root_finding import attach_root_derivatives, false_position, minimize_golden_section
+from zwidth.plant.rigid_mass import ANY, DiscretePlant, discretize_plant, split_delay
 from zwidth.stability.results import Margins
 from zwidth.stability.rigid.crossover import decide_in_floats, expand_short_delay_curve
 from zwidth.stability.rigid.modulus import (

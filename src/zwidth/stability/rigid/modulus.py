@@ -1,19 +1,16 @@
 """Find the modulus margin of the rigid loop: the least distance ``|1 + L|`` of its Nyquist curve from -1.
 
-L = B/T is the open loop of `stability.rigid.crossover`. With the wall (alpha, beta), the delay d = n + f, u = 1 - cos
-w, s = sin w, c = e^-delta, em = 1 - c and z = e^(j w), its factors at the frequency w are
-
-    W = alpha + beta u + j beta s      M = a2 z + a1 + a0/z      Z = s + j (em - u)
-
-Its gain |L| decreases strictly with frequency (docs/theory/one-crossover.md, Theorem 1), and ``|1 + L| >= ||L| - 1|``.
-Both bound the range of frequencies in which the minimum can lie:
+L = B/T is the open loop of `stability.rigid.characteristic_polynomial`, with the factors W, M and Z at the frequency w
+(`UnitCircleFactors`), c = e^-delta and em = 1 - c, for the wall (alpha, beta) and the delay d = n + f. Its gain |L|
+decreases strictly with frequency (docs/theory/one-crossover.md, Theorem 1), and ``|1 + L| >= ||L| - 1|``. Both bound
+the range of frequencies in which the minimum can lie:
 
 - If the distance is r at one frequency, the minimum lies where ``1 - r <= |L| <= 1 + r``.
 - Within one turn of the phase on either side of the gain crossover there is a frequency at which L is real and
   negative. Its distance is ``||L| - 1|``, and all frequencies beyond it are farther from -1.
 
-So at most two turns of the phase have to be searched, whatever the delay: the distance is sampled, and the lowest
-samples are refined by Newton's method.
+So at most two turns of the phase have to be sampled, whatever the delay. `stability.open_loop` refines the lowest
+samples, as for every linear loop.
 """
 
 from __future__ import annotations
@@ -24,8 +21,10 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import apply_each, expand_along, materialize, namespace, stop_gradient
-from zwidth.numerics.held_mass import DiscretePlant
-from zwidth.numerics.root_finding import attach_root_derivatives, newton
+from zwidth.numerics.root_finding import attach_root_derivatives
+from zwidth.plant.rigid_mass import DiscretePlant
+from zwidth.stability.open_loop import find_nearest_angle
+from zwidth.stability.rigid.characteristic_polynomial import differentiate_open_loop, evaluate_on_unit_circle
 from zwidth.stability.rigid.crossover import find_gain_crossover
 
 
@@ -34,26 +33,16 @@ def evaluate_gain_and_phase(w: Array, alpha: Array, beta: Array, plant: Discrete
 
     With the factors W, M and Z of L,
 
-        |L|^2 = |W|^2 |M|^2 / (2 u (em^2 + 2 c u))
+        |L|^2 = |W|^2 |M|^2 / (2 u |Z|^2)      u = 1 - cos w
         phase = arg W + arg M + arg Z - (n + 1/2) w = pi + arg L
 
     The principal values of these arguments are continuous in w, so the phase needs no unwrapping.
     """
     xp = namespace(w, alpha)
-    _, _, u, s, (wall_re, wall_im), (m_re, m_im) = _evaluate_factors(w, alpha, beta, plant)
-    numerator = (wall_re * wall_re + wall_im * wall_im) * (m_re * m_re + m_im * m_im)
-    gain = xp.sqrt(numerator / (2.0 * u * (plant.em * plant.em + 2.0 * plant.c * u)))
-    phase = xp.arctan2(wall_im, wall_re) + xp.arctan2(m_im, m_re) + xp.arctan2(plant.em - u, s)
+    _, _, u, _, W, M, Z, abs2_Z = evaluate_on_unit_circle(w, alpha, beta, plant)
+    gain = xp.sqrt((W[0] * W[0] + W[1] * W[1]) * (M[0] * M[0] + M[1] * M[1]) / (2.0 * u * abs2_Z))
+    phase = xp.arctan2(W[1], W[0]) + xp.arctan2(M[1], M[0]) + xp.arctan2(Z[1], Z[0])
     return gain, phase - (plant.whole + 0.5) * w
-
-
-def _evaluate_factors(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Any, ...]:
-    """Return sin(w/2), cos(w/2), u, s, and the real and imaginary parts of W and of M."""
-    xp = namespace(w, alpha)
-    sine, cosine = xp.sin(0.5 * w), xp.cos(0.5 * w)
-    u, s = 2.0 * sine * sine, 2.0 * sine * cosine
-    m_re = 2.0 * (plant.a2 + plant.a0) * cosine * cosine - plant.gap
-    return sine, cosine, u, s, (alpha + beta * u, beta * s), (m_re, (plant.a2 - plant.a0) * s)
 
 
 def evaluate_at_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array, Array]:
@@ -72,22 +61,17 @@ SAMPLES_WEIGHT = 8
 SAMPLES_PER_TURN = 48
 SAMPLES_BELOW = 32
 SAMPLES_ABOVE = 48
-# Number of local minima that are refined, the lowest ones first.
-MAX_DIPS = 5
-# Number of Newton steps from each of these minima.
-NEWTON_STEPS = 8
 
 
 def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Array:
-    """Return ``|1 + L|^2`` at w in (0, pi]: ``L = -W M Z e^(-j (n + 1/2) w)/(2 |Z|^2 sin(w/2))``."""
+    """Return ``|1 + L|^2`` at w in (0, pi]."""
     xp = namespace(w, alpha)
     delay_phase = (2.0 * plant.whole + 1.0) * (0.5 * w)
-    sine, _, u, s, (wall_re, wall_im), (m_re, m_im) = _evaluate_factors(w, alpha, beta, plant)
-    re, im = wall_re * m_re - wall_im * m_im, wall_re * m_im + wall_im * m_re
-    em_minus_u = plant.em - u
-    re, im = re * s - im * em_minus_u, re * em_minus_u + im * s
+    sine, _, _, _, W, M, Z, abs2_Z = evaluate_on_unit_circle(w, alpha, beta, plant)
+    re, im = W[0] * M[0] - W[1] * M[1], W[0] * M[1] + W[1] * M[0]
+    re, im = re * Z[0] - im * Z[1], re * Z[1] + im * Z[0]
     cos_delay, sin_delay = xp.cos(delay_phase), xp.sin(delay_phase)
-    denominator = 2.0 * sine * (plant.em * plant.em + 2.0 * plant.c * u)
+    denominator = 2.0 * sine * abs2_Z
     minus_re_loop, im_part = (
         (re * cos_delay + im * sin_delay) / denominator,
         (im * cos_delay - re * sin_delay) / denominator,
@@ -95,43 +79,20 @@ def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: Discret
     return (1.0 - minus_re_loop) ** 2 + im_part * im_part
 
 
-def _differentiate_distance(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
-    """Return half the first and half the second derivative of |1 + L|^2 in w, from the derivatives of log L."""
-    xp = namespace(w, alpha)
-    n_plus_half, c = plant.whole + 0.5, xp.cos(w)
-    sine, cosine, u, s, wall, m = _evaluate_factors(w, alpha, beta, plant)
-    z, delay = c + 1j * s, xp.cos(n_plus_half * w) - 1j * xp.sin(n_plus_half * w)
-    wall, m, wall_slope = wall[0] + 1j * wall[1], m[0] + 1j * m[1], beta * (s + 1j * c)
-    total, difference = plant.a2 + plant.a0, plant.a2 - plant.a0
-    # The derivative of conj_Z, the conjugate of Z, with respect to w is z.
-    conj_Z = s + 1j * (u - plant.em)
-    wall_rate, m_rate, pole_rate = wall_slope / wall, (1j * difference * c - total * s) / m, z / conj_Z
-    rate = wall_rate + m_rate - pole_rate - 1j * n_plus_half - 0.5 * cosine / sine
-    curvature = beta * xp.conj(z) / wall - wall_rate**2 - (total * c + 1j * difference * s) / m - m_rate**2
-    curvature = curvature - 1j * pole_rate + pole_rate**2 + 0.25 / (sine * sine)
-    loop = -wall * m * delay / (2.0 * sine * conj_Z)
-    slope, conj_distance = rate * loop, xp.conj(1.0 + loop)
-    return xp.real(conj_distance * slope), xp.abs(slope) ** 2 + xp.real(
-        conj_distance * (curvature + rate * rate) * loop
-    )
-
-
 def find_modulus_margin(alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, Array]:
     """Return the least ``|1 + L|`` over (0, pi] and its frequency w, for alpha > 0, elementwise."""
     xp = namespace(alpha, plant.c)
     wall = alpha, beta, plant
 
+    def slope(w: Array, *wall: Any) -> Array:
+        """Return half the derivative of ``|1 + L|^2`` in w."""
+        loop = differentiate_open_loop(w, *wall)
+        return xp.real(xp.conj(1.0 + loop.value) * loop.slope)
+
     def is_dip(w: Array, curvature: Array, _: Array) -> Array:
         return (w < np.pi) & (curvature > 0)
 
-    lowest = _find_lowest(*stop_gradient(wall, xp), xp)
-    w = attach_root_derivatives(
-        lambda *point: _differentiate_distance(*point)[0],
-        lowest,
-        is_dip,
-        *wall,
-        slope=lambda *point: _differentiate_distance(*point)[1],
-    )
+    w = attach_root_derivatives(slope, _find_lowest(*stop_gradient(wall, xp), xp), is_dip, *wall)
     return xp.sqrt(xp.maximum(compute_squared_distance(w, *wall), 0.0)), w
 
 
@@ -167,26 +128,4 @@ def _find_lowest(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> Ar
         center[..., None] * (high / center)[..., None] ** list_fractions(SAMPLES_ABOVE),
     ]
     grid = xp.sort(xp.concatenate(grid, axis=-1), axis=-1)
-    values = compute_squared_distance(grid, *wall)
-    infinity = xp.full_like(values[..., :1], np.inf)
-    previous, following = (
-        xp.concatenate([infinity, values[..., :-1]], -1),
-        xp.concatenate([values[..., 1:], infinity], -1),
-    )
-    # If two samples coincide, count them as one minimum. Because the minimum may lie to the right of the second one,
-    # search between the second neighbors on both sides.
-    dips = xp.where((values < previous) & (values <= following), values, np.inf)
-    best = xp.argpartition(dips, MAX_DIPS - 1, axis=-1)[..., :MAX_DIPS]
-
-    def take_neighbor(steps: int) -> Array:
-        return xp.take_along_axis(grid, xp.clip(best + steps, 0, grid.shape[-1] - 1), axis=-1)
-
-    middle = take_neighbor(0)
-    refined = newton(
-        lambda w: _differentiate_distance(w, *wall), take_neighbor(-2), take_neighbor(2), middle, NEWTON_STEPS
-    )[0]
-    # Compare each refined minimum with the sample from which the refinement started, because the minimum may be an end
-    # of the range.
-    candidates = xp.concatenate([refined, middle], axis=-1)
-    lowest = xp.argmin(compute_squared_distance(candidates, *wall), axis=-1)[..., None]
-    return xp.take_along_axis(candidates, lowest, axis=-1)[..., 0]
+    return find_nearest_angle(lambda w: differentiate_open_loop(w, *wall), grid, compute_squared_distance(grid, *wall))

@@ -21,7 +21,7 @@ from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_jax, is_traced, namespace, nan_unless, within
 from zwidth.model.checks import accept_units, to_periods
 from zwidth.numerics.evaluate import as_float64, evaluate, join_shapes
-from zwidth.numerics.held_mass import is_valid_device
+from zwidth.plant.rigid_mass import is_valid_device
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import PARAMETERS, SI_RANGE, SIZES, WALL_RANGE
 

@@ -13,14 +13,13 @@ import numpy as np
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced, namespace, nan_with_nan_derivatives, stop_gradient
 from zwidth.numerics.evaluate import as_number, check_scalars, evaluate, to_caller
-from zwidth.numerics.held_mass import ANY, DelayClasses, classify_delays, is_valid_device
 from zwidth.numerics.root_finding import integrate
+from zwidth.plant.rigid_mass import ANY, DelayClasses, classify_delays, is_valid_device
+from zwidth.stability.passivity import limit_margin
 from zwidth.stability.rigid.broadcasting import NAMES
 from zwidth.stability.rigid.normalization import valid_wall
 from zwidth.stability.rigid.required_damping import compute_needed_damping, find_directions
 
-# Terms of the Chebyshev series; the last one is below 1e-16 for every delay.
-N_TERMS = 30
 # Rounds of the search in `passive_stiffness_slope`; each narrows the bracket of the direction by a factor of 8.
 SEARCH_ROUNDS = 17
 NO_DELAY = DelayClasses(True, False, False)
@@ -34,13 +33,7 @@ def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Dela
     safe_alpha = xp.where(valid & (alpha >= 0), alpha, 0.0)
     safe_beta, safe_d = xp.where(valid, beta, 0.0), xp.where(valid, d, 0.0)
     margin = delta - compute_needed_damping(safe_alpha, safe_beta, safe_d, kind)
-    return _limit_margin(margin, alpha) + nan_with_nan_derivatives(valid, alpha, beta, delta, d)
-
-
-def _limit_margin(margin: Array, alpha: Array) -> Array:
-    """Limit the margin to alpha for negative stiffness, which supplies unbounded energy even if the condition holds."""
-    xp = namespace(margin, alpha)
-    return xp.where(alpha < 0, xp.minimum(margin, alpha), margin)
+    return limit_margin(margin, alpha) + nan_with_nan_derivatives(valid, alpha, beta, delta, d)
 
 
 def compute_margins(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:

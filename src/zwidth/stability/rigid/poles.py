@@ -1,7 +1,7 @@
 """Compute all closed-loop poles: by eigenvalues, or by Aberth's iteration for many walls at once.
 
 The eigenvalues are those of the companion matrix of the characteristic polynomial P (`stability.reference`). Newton's
-method on the factors of P (`stability.rigid.pole_count.LoopFactors`) then refines them.
+method on the factors of P (`stability.rigid.characteristic_polynomial`) then refines them.
 
 Aberth's iteration (Ehrlich 1967, Aberth 1973) updates all approximations z_i of a wall together. With P monic of
 degree N, q_i the product of z_i - z_j over all j != i, and q_i' its derivative in z_i, one step subtracts
@@ -30,13 +30,18 @@ from zwidth.core.status import Status
 from zwidth.core.types import Array, ArrayLike, Coefficients, Radii, RadiiFirst, Reals, Roots, RootsFirst
 from zwidth.core.xp import epsilon, is_traced, iterate, materialize, namespace, nan_with_nan_derivatives
 from zwidth.numerics.blocks import map_blocks
+from zwidth.numerics.complex_pairs import Pair, make_complex
 from zwidth.numerics.evaluate import as_float64, to_caller
 from zwidth.numerics.polynomials import abs2, companion
 from zwidth.stability.reference import Degree, compute_poles, expand_loop
 from zwidth.stability.rigid.broadcasting import count_uncompiled_points, find_degree, map_by_degree
-from zwidth.stability.rigid.characteristic_function import Pair, make_complex
+from zwidth.stability.rigid.characteristic_polynomial import (
+    LoopFactors,
+    bound_wall_part,
+    evaluate_factors,
+    factor_loop,
+)
 from zwidth.stability.rigid.normalization import valid_wall, wall_status
-from zwidth.stability.rigid.pole_count import LoopFactors, factor_loop
 from zwidth.units.quantities import LONGEST_DELAY, MOST_POLES
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
@@ -75,20 +80,9 @@ def _raise_to_power(z: Pair, power: int) -> Pair:
 def _evaluate(z: Pair, loop: LoopFactors, degree: Degree) -> tuple[Pair, Pair]:
     """Return P(z) and P'(z)."""
     power = degree.poles - 2
-    z_minus_1, z_minus_c = z + -1.0, z + -loop.c
-    low_power, quadratic, z_times_slope = (
-        _raise_to_power(z, power - 1),
-        z_minus_1 * z_minus_c,
-        z * (z_minus_1 + z_minus_c),
-    )
-    numerator, numerator_slope = z * loop.a2 + loop.h, loop.a2
-    if degree.fractional:
-        z_plus_q = z + loop.q
-        numerator, numerator_slope = numerator * z_plus_q, z_plus_q * loop.a2 + numerator
-    wall = Pair(loop.alpha * z.real + loop.beta * z_minus_1.real, loop.s * z.imag)
-    return low_power * z * quadratic + numerator * wall, low_power * (
-        quadratic * power + z_times_slope
-    ) + wall * numerator_slope + numerator * loop.s
+    A, dA, N, dN, _, W = evaluate_factors(z, z + -1.0, loop, degree.fractional)
+    low_power = _raise_to_power(z, power - 1)
+    return low_power * z * A + N * W, low_power * (A * power + z * dA) + W * dN + N * loop.s
 
 
 def _bound_rounding(z: Pair, loop: LoopFactors, degree: Degree, unit: float) -> Array:
@@ -97,10 +91,7 @@ def _bound_rounding(z: Pair, loop: LoopFactors, degree: Degree, unit: float) -> 
     # Use |Re| + |Im| as an upper bound of the modulus, because it neither overflows nor underflows.
     abs_z, abs_z_minus_1, abs_z_minus_c = (xp.abs(z.real - zero) + xp.abs(z.imag) for zero in (0.0, 1.0, loop.c))
     device_part = abs_z**power * abs_z_minus_1 * ((3.0 * power + 8.0) * abs_z_minus_c + 2.0 * loop.c)
-    numerator = (loop.a2 * abs_z + loop.h) * (abs_z + loop.q if degree.fractional else 1.0)
-    return unit * (
-        device_part + NUMERATOR_ROUNDING * numerator * (xp.abs(loop.alpha) * abs_z + xp.abs(loop.beta) * abs_z_minus_1)
-    )
+    return unit * (device_part + NUMERATOR_ROUNDING * bound_wall_part(abs_z, abs_z_minus_1, loop, degree.fractional))
 
 
 def _split(z: Array) -> Pair:

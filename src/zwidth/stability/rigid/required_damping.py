@@ -22,8 +22,9 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.core.xp import ARCSINE, COSINE, SINE, epsilon, horner, namespace, stop_gradient
-from zwidth.numerics.held_mass import ANY, DelayClasses, split_delay
 from zwidth.numerics.root_finding import newton
+from zwidth.plant.rigid_mass import ANY, DelayClasses, split_delay
+from zwidth.stability.passivity import solve_larger_root
 
 # Number of Newton steps to the peak; the error of the starting value is a few percent.
 PEAK_STEPS = 3
@@ -53,14 +54,6 @@ def compute_delay_terms(d: Array) -> DelayTerms:
     """Return f, k and kappa of a delay d >= 0."""
     n, f = split_delay(d)
     return DelayTerms(f, n + 1.0, 4.0 * f * (1.0 - f))
-
-
-def solve_larger_root(A: Array, S: Array, xp: Any) -> tuple[Array, Array]:
-    """Return the larger root N of ``N^2 - A N - S/4 = 0``, and 2 N - A, with finite derivatives at A = S = 0."""
-    discriminant = A * A + S
-    root = xp.where(discriminant > 0, xp.sqrt(xp.where(discriminant > 0, discriminant, 1.0)), 0.0)
-    difference = root - A
-    return xp.where(A > 0, 0.5 * (root + A), 0.5 * S / xp.where(difference > 0, difference, 1.0)), root
 
 
 def _evaluate_at_zero(a: Array, beta: Array, delay: DelayTerms) -> tuple[Array, Array, Array]:

@@ -2,9 +2,9 @@
 
 The point of maximum stiffness is the *ridge* (docs/theory/boundary.md, B2): a smooth maximum of alpha on the stability
 lobe, or the *corner*, a wall with a double pole at z = -1. It is given by s = sin(omega/2), with its frequency omega.
-`stability.rigid.ridge_newton` solves the optimality condition T(s) = 0. The derivatives of the ridge follow from T, in
-closed form for NumPy and by a custom rule for JAX. For strong damping, alpha_max is proportional to delta;
-`stiffness_slope` returns the factor, the paper's eq. (22).
+`stability.rigid.ridge_newton` solves the optimality condition T(s) = 0. The derivatives of s follow from T by the
+implicit function theorem, those of alpha by the envelope theorem, because alpha is stationary in s. For strong damping,
+alpha_max is proportional to delta; `stiffness_slope` returns the factor, the paper's eq. (22).
 
 The delay is d = n + f. The plant has the numerator N(z) = a2 z^2 + a1 z + a0 and the pole c = e^-delta; a0, a1 and a2
 consist of phi1(x) = (1 - e^-x)/x, phi2 = (1 - phi1)/x, psi = (phi1 - e^-x)/x and gap = phi2 - psi.
@@ -20,17 +20,18 @@ import numpy as np
 from zwidth.core.errors import check_choice
 from zwidth.core.status import RidgeKind, Status
 from zwidth.core.types import Array, ArrayLike
-from zwidth.core.xp import differentiate_along, epsilon, horner, materialize, namespace, nan_unless
+from zwidth.core.xp import differentiate_along, epsilon, materialize, namespace, nan_unless
 from zwidth.numerics.evaluate import evaluate
-from zwidth.numerics.held_mass import (
+from zwidth.numerics.root_finding import attach_root_derivatives
+from zwidth.plant.rigid_mass import (
     ANY,
-    GAP,
     DelayClasses,
     Plant,
     classify_delays,
+    differentiate_mass,
     discretize_mass,
+    get_differentiable_mass,
     is_valid_device,
-    phi_functions,
     split_delay,
 )
 from zwidth.stability.results import RidgePoint
@@ -47,92 +48,47 @@ from zwidth.stability.rigid.ridge_newton import (
 )
 
 
-def _compute_chi(x: Array, gap: Array) -> Array:
-    """Return chi = ``gap/x = -phi2'``, with the limit 1/6 at x = 0. The derivative of psi is ``chi - psi``."""
-    xp = namespace(x)
-    is_small = x < 2.5
-    half = xp.where(is_small, 0.5 * x, 0.0)
-    return xp.where(is_small, xp.exp(-half) * horner(half * half, GAP), gap / xp.where(is_small, 1.0, x))
-
-
-def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
-    """Return the derivatives of `numerics.held_mass.discretize_mass` in delta and in the fraction of the delay."""
-    f, t = fraction, 1.0 - fraction
-    c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
-    phi_t, phi_f = phi_functions(delta * t), phi_functions(delta * f)
-    chi_t, chi_f = _compute_chi(delta * t, phi_t.gap), _compute_chi(delta * f, phi_f.gap)
-    # The derivatives of all terms of a1 have the same sign, so no digits cancel in their sum below.
-    a2 = -t * t * t * chi_t
-    a1 = t * t * t * (phi_t.psi - chi_t) + f * f * f * chi_f
-    a1 = -(
-        a1 + t * f * (e_t * (t * phi_f.phi1 + f * phi_f.psi) + t * phi_t.psi * phi_f.phi1 + f * phi_t.phi1 * phi_f.psi)
-    )
-    a0 = -e_t * f * f * (t * phi_f.psi + f * (phi_f.psi - chi_f))
-    slow, fast = t * phi_t.phi1, e_t * f * phi_f.phi1
-    zero = 0.0 * c
-    return Plant(-c, c, a2, a1, a0, a2 - a1 + a0), Plant(zero, zero, -slow, slow - fast, fast, 2.0 * (fast - slow))
-
-
-def recompute_ridge(s: Array, plant: Plant, n: Array, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
-    """Recompute alpha, beta, omega and s at a ridge with correct derivatives in ``plant`` and n."""
-    # Take one step of Newton's method from the solution, because the derivative of this step is that of the solution. A
-    # corner stays at s = 1. Compute alpha with a fixed s, because its derivative in s is 0 at a maximum.
-    xp = namespace(s, plant.a2, n)
-    undelayed, curve, is_corner = not kind.long, expand_curve(plant), s >= 1.0
-    s_inside = xp.where(is_corner, 0.5, s)
-    T, T1 = evaluate_stationarity(s_inside, curve, n, undelayed)
-    s_inside = xp.where(is_corner, 0.5, s_inside - T / xp.where(is_corner, 1.0, T1))
-    s_moved = xp.where(is_corner, 1.0, s_inside)
-    # Compute omega from s by arctan and not by the series in `evaluate_wave`, whose derivative has fewer digits.
-    omega = xp.where(is_corner, np.pi, 2.0 * xp.arctan(s_inside / xp.sqrt((1.0 - s_inside) * (1.0 + s_inside))))
-    alpha, beta = (evaluate_wall(evaluate_wave(s_value, n, undelayed), curve) for s_value in (s, s_moved))
-    return alpha[0], beta[1], omega, s_moved
-
-
 def differentiable_ridge(plant: Plant, n: Array, start: Start, kind: DelayClasses) -> Ridge:
-    """Return the ridge of one plant with a delay of n periods.
-
-    For JAX arrays, the derivatives in ``plant`` and n are those of `recompute_ridge`, which are exact to any order.
-    """
+    """Return the ridge of one plant with a delay of n periods; for JAX, with exact derivatives in ``plant`` and n."""
     ridge = solve_ridge if namespace(plant.a2, n) is np else _jax_ridge()
     return ridge(plant, n, start, kind)
 
 
 @cache
-def _jax_plant() -> Any:
-    """Return `numerics.held_mass.discretize_mass` as a JAX function with derivatives in closed form."""
-    import jax
-
-    function = jax.custom_jvp(lambda delta, fraction: discretize_mass(delta, fraction))
-
-    @function.defjvp
-    def rule(primals: tuple, tangents: tuple) -> tuple[Plant, Plant]:
-        (by_delta, by_f), (d_delta, d_f) = plant_slopes(*primals), tangents
-        plant_tangent = (a * d_delta + b * d_f for a, b in zip(by_delta, by_f, strict=True))
-        return function(*primals), Plant(*plant_tangent)
-
-    return function
-
-
-@cache
 def _jax_ridge() -> Any:
-    """Return a JAX function that solves for the ridge, with a custom rule for its derivatives in plant and n."""
+    """Return `solve_ridge` as a JAX function whose derivatives in the plant and in n are exact to any order."""
     import jax
 
     function = jax.custom_jvp(solve_ridge, nondiff_argnums=(3,))
 
     def rule(kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
-        # Call the function with this rule again, so that s has exact derivatives and derivatives of every order are
-        # exact.
+        # Call the function with this rule again, because derivatives of higher order require those of s.
         ridge = function(*primals, kind)
-
-        def moving(plant: Plant, n: Array) -> Ridge:
-            return Ridge(*recompute_ridge(ridge.s, plant, n, kind), ridge.last)
-
-        return ridge, jax.jvp(moving, primals[:2], tangents[:2])[1]
+        return ridge, jax.jvp(lambda plant, n: _vary_ridge(ridge, plant, n, kind), primals[:2], tangents[:2])[1]
 
     function.defjvp(rule)
     return function
+
+
+def _vary_ridge(ridge: Ridge, plant: Plant, n: Array, kind: DelayClasses) -> Ridge:
+    """Return a ridge that was computed before, as a function of ``plant`` and n, for JAX to differentiate."""
+    xp, undelayed, curve = namespace(ridge.s), not kind.long, expand_curve(plant)
+    is_corner = ridge.s >= 1.0
+    # s is the root of T, except at a corner, which stays at s = 1.
+    s = attach_root_derivatives(
+        lambda s, curve, n: evaluate_stationarity(s, curve, n, undelayed)[0],
+        xp.where(is_corner, 0.5, ridge.s),
+        lambda _, rate, __: rate != 0.0,
+        *(curve, n),
+        slope=lambda s, curve, n: evaluate_stationarity(s, curve, n, undelayed)[1],
+    )
+    # Compute omega from s by arctan and not by the series in `evaluate_wave`, whose derivative has fewer digits.
+    omega = xp.where(is_corner, np.pi, 2.0 * xp.arctan(s / xp.sqrt((1.0 - s) * (1.0 + s))))
+    s = xp.where(is_corner, 1.0, s)
+    # Compute alpha at the computed s: its derivatives are those at constant s, because alpha is stationary (envelope
+    # theorem).
+    alpha, beta = (evaluate_wall(evaluate_wave(value, n, undelayed), curve) for value in (ridge.s, s))
+    return Ridge(alpha[0], beta[1], omega, s, ridge.last)
 
 
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
@@ -157,10 +113,10 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
 
     Numerics:
         alpha to about 1e-15 relative, because at a maximum the error of alpha is of second order in that of omega. JAX
-        can trace the function in delta and d and differentiate it twice. The first derivatives of alpha are continuous,
-        also at the transition to the corner (d = 0: delta = 3.65936162742...) and at integer d > 0. The second
-        derivatives of alpha and the first ones of beta and omega jump there; at integer d they are those from the
-        right. For strong damping the second derivative in delta decreases as delta^-3. Its rounding error is 1e-15
+        can trace the function in delta and d and differentiate it to any order. The first derivatives of alpha are
+        continuous, also at the transition to the corner (d = 0: delta = 3.65936162742...) and at integer d > 0. The
+        second derivatives of alpha and the first ones of beta and omega jump there; at integer d they are those from
+        the right. For strong damping the second derivative in delta decreases as delta^-3. Its rounding error is 1e-15
         (d = 0) to 1e-12 (d = 500) times alpha/delta^2, so none of its digits is reliable at delta = 1e6.
 
         Float64 when called directly. Inside a transformation, also `jax.grad`, JAX's default precision applies: float32
@@ -182,31 +138,12 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
         from zwidth.stability.rigid.exact_points import kkt_kernel
 
         return RidgePoint(*evaluate(kkt_kernel, arguments, route="jax"))
-    return evaluate(ridge_kernel, arguments, classify_delays(d), slopes=differentiate_point)
+    return evaluate(ridge_kernel, arguments, classify_delays(d))
 
 
 def ridge_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgePoint:
     """Compute the point of maximum stiffness elementwise, for the classes of delays ``kind``."""
     return _make_point(*_solve_point(delta, d, kind)[:2])
-
-
-def differentiate_point(
-    delta: Array, d: Array, kind: DelayClasses = ANY
-) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
-    """Return the point of maximum stiffness and its derivatives in delta and in d, elementwise."""
-    ridge, status, plant, n, (delta, f) = _solve_point(delta, d, kind)
-    point, has_converged = _make_point(ridge, status), converged(ridge)
-
-    def differentiate(change: Plant) -> RidgePoint:
-        derivatives = differentiate_along(
-            lambda plant: recompute_ridge(ridge.s, plant, n, kind), (plant,), (change,), np
-        )
-        return point._replace(
-            **dict(zip(RidgePoint._fields, nan_unless(has_converged, *derivatives[:3]), strict=False))
-        )
-
-    by_delta, by_f = plant_slopes(delta, f)
-    return point, (differentiate(by_delta), differentiate(by_f))
 
 
 class RidgeSlopes(NamedTuple):
@@ -225,7 +162,7 @@ def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlop
     def differentiate(change: Plant) -> Array:
         return differentiate_along(lambda plant: evaluate_wall(wave, expand_curve(plant))[0], (plant,), (change,), xp)
 
-    slopes = map(differentiate, materialize(plant_slopes(delta, f), ridge.s))
+    slopes = map(differentiate, materialize(differentiate_mass(delta, f), ridge.s))
     by_delta, by_d = nan_unless(converged(ridge), *slopes)
     return RidgeSlopes(_make_point(ridge, status), by_delta, by_d)
 
@@ -251,7 +188,7 @@ def _solve_point(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Arr
     n, f = split_delay(d)
     start = guess_start(delta, d, f, kind)
     if kind.fractional:
-        plant = discretize_mass(delta, f) if namespace(delta, f) is np else _jax_plant()(delta, f)
+        plant = (discretize_mass if namespace(delta, f) is np else get_differentiable_mass())(delta, f)
     else:
         plant = discretize_mass(delta)
     ridge = materialize(differentiable_ridge(plant, n, start, kind), delta)

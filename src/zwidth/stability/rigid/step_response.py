@@ -20,11 +20,11 @@ import numpy as np
 from zwidth.core.types import Array, Samples
 from zwidth.model.checks import check_integer
 from zwidth.numerics.evaluate import as_number
-from zwidth.numerics.held_mass import phi_functions
 from zwidth.numerics.root_finding import bisect
+from zwidth.plant.rigid_mass import phi_functions
 from zwidth.stability.rigid.broadcasting import find_degree
 from zwidth.stability.rigid.crossover import stable_kernel
-from zwidth.stability.rigid.dominant_poles import find_dominant_pole
+from zwidth.stability.rigid.dominant.arrays import ACCURACY, find_poles
 from zwidth.units.display import compact_repr
 
 SETTLING_BAND = 0.02  # relative deviation from the final position that counts as settled, as in control textbooks
@@ -66,7 +66,8 @@ def settling_time(alpha: float, beta: float, delta: float, d: float) -> float:
     wall = alpha, beta, delta, d
     with np.errstate(all="ignore"):
         stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
-        rate = find_dominant_pole(wall)[1] if stable else math.nan
+        walls = [np.array([value]) for value in wall]
+        rate = float(find_poles(walls, ACCURACY, with_rate=True).rate[0]) if stable else math.nan
     periods = 2.0 * (d + 2.0 - math.log(SETTLING_BAND) / rate) if rate > 0 else math.inf
     while periods < MOST_PERIODS:
         last = _find_last_outside(wall, math.ceil(periods))

@@ -3,14 +3,8 @@
 For each (beta, delta, d), d = n + f, the stable walls are ``0 < alpha < limit`` (docs/theory/one-lobe.md, Theorem C).
 The *limit* is the point with this beta on the *lobe*, the first part of the boundary curve, or a point of the line of
 walls with a pole at z = -1, which cuts the lobe off in the *corner*. All walls with one (beta, delta, d) form a *line
-of constant beta*, also called row.
-
-A wall on the boundary curve has a pole at z = e^(j w). With M = N(z)/z of the discretized plant and its pole c,
-
-    E + j H sin w = (z - c) conj(M)      V = |M|^2      y = sin^2(w/2)      k = n + 1/2      b = beta + delta
-
-The curve is used in its form with half angles (docs/theory/boundary.md, B1). b vanishes like w^2 at w = 0. Therefore
-``V b = delta V - cos(k w)/cos(w/2) E + ...`` is rearranged such that nothing cancels, for every delta.
+of constant beta*, also called row. A point of the curve is given by s = sin(w/2) for its frequency w; b = beta + delta,
+and all other notation is that of `stability.rigid.boundary_curve`.
 """
 
 from __future__ import annotations
@@ -20,11 +14,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.core.types import Array
-from zwidth.core.xp import COSINE, SINE, horner, iterate, namespace, nan_beyond
+from zwidth.core.xp import SINE, horner, iterate, materialize, namespace, nan_beyond
 from zwidth.numerics.evaluate import FEW, Route, evaluate_columns
-from zwidth.numerics.held_mass import DiscretePlant, discretize_plant
+from zwidth.plant.rigid_mass import DiscretePlant, discretize_plant
+from zwidth.stability.rigid.boundary_curve import (
+    Curve,
+    CurveTerms,
+    evaluate_curve,
+    evaluate_polynomials,
+    evaluate_wave,
+    expand_curve_with_offset,
+    expand_short_delay_curve,
+)
 from zwidth.stability.rigid.broadcasting import Points, group_by_value
-from zwidth.stability.rigid.crossover import expand_long_delay_curve, expand_short_delay_curve
+from zwidth.stability.rigid.characteristic_polynomial import expand_wall
 from zwidth.units.quantities import WALL_RANGE
 
 # Numbers of Newton steps, each of which doubles the number of correct digits.
@@ -36,33 +39,19 @@ ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
 
 
 class LongLobe(NamedTuple):
-    """The boundary curve of a device with d >= 1, in powers of y = sin^2(w/2), and starts of Newton's method."""
+    """The boundary curve of a device with d >= 1, the end of its lobe, and starts of Newton's method."""
 
     delta: Array
-    k: Array  # n + 1/2
-    E0: Array  # E = E0 + E1 y + E2 y^2
-    E1: Array
-    E2: Array
-    H0: Array  # H = H0 + H1 y
-    H1: Array
-    V0: Array  # V = V0 + V1 y + V2 y^2
-    V1: Array
-    V2: Array
-    excess1: Array  # delta V - E = excess1 y + excess2 y^2
-    excess2: Array
-    end: Any = None  # w at the end of the lobe
-    end_b: Any = None  # b at the end of the lobe
-    # Newton's method for w at a given b starts from the solution of ``sqrt(b/end_b) = sin(start_angle
-    # w/end)/start_sine``, plus a correction. At the end of the lobe, w = end and b = end_b.
-    start_angle: Any = None
-    start_sine: Any = None
-    start_correction: Any = None
-
-
-def _compute_sine_and_cosine(x: Array) -> tuple[Array, Array]:
-    """Return sine and cosine for 0 <= x <= pi/4 by their series."""
-    square = x * x
-    return x * horner(square, SINE[:8]), horner(square, COSINE[:9])
+    n: Array
+    curve: Curve
+    end: Array  # s at the end of the lobe
+    end_angle: Array  # w/2 at the end of the lobe
+    end_b: Array  # b at the end of the lobe
+    # Newton's method for s at a given b starts from the solution of ``sqrt(b/end_b) = sin(start_angle
+    # w/2/end_angle)/start_sine``, plus a correction.
+    start_angle: Array
+    start_sine: Array
+    start_correction: Array
 
 
 def find_on_short_lobe(b: Array, curve: Any) -> tuple[Array, Array]:
@@ -81,6 +70,7 @@ def limit_short_delay(beta: Array, plant: DiscretePlant) -> Array:
     """
     p1, psi, minus_one_coefficient = plant.p1, plant.psi, plant.minus_one_coefficient
     xp = namespace(beta, plant.delta)
+    beta = expand_wall(0.0, beta).beta
     b = beta + plant.delta
     # Compute the limit for d = 0, phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)), with phi1, phi2 and psi of the plant.
     integer_limit = p1 * b * (1.0 - psi * beta) / (psi * (p1 + plant.p2 * b))
@@ -106,163 +96,86 @@ def _mask_limit(limit: Array, b: Array) -> Array:
     return xp.where(xp.isfinite(b), xp.where((b > 0) & (limit > 0), limit, 0.0), xp.nan)
 
 
-def expand_long_lobe(plant: DiscretePlant) -> LongLobe:
-    """Expand E, H and V of one device in powers of y; the end of the lobe and the starting values stay None."""
-    E, H, V, excess = expand_long_delay_curve(plant)
-    return LongLobe(plant.delta, plant.whole + 0.5, *E, *H, *V, *excess)
-
-
 def build_long_lobe(plant: DiscretePlant) -> LongLobe:
-    """Expand E, H and V of one device in powers of y; find the end of its lobe and starts of Newton's method."""
-    lobe = expand_long_lobe(plant)
-    em, p1, n, f = plant.em, plant.p1, plant.whole, plant.f
-    xp = namespace(lobe.delta)
-    end = _find_lobe_end(lobe, em / (p1 + f * em), n + f)
-    numerator, d_numerator, denominator, d_denominator = evaluate_offset(LobeTerms(end, lobe))
-    end_b = numerator / denominator
-    # Approximate the lobe by ``sqrt(b/end_b) = sin(start_angle w/end)/sin(start_angle)``, where w = end and b = end_b
-    # at the end of the lobe. This curve has the right derivative at w = end, where strong damping makes the lobe nearly
-    # flat; `start_correction` corrects the derivative at w = 0. The error is at most 0.4 %. The relative derivative at
-    # the end is start_angle/tan(start_angle); a rational function inverts it.
-    flat = xp.clip(1.0 - 0.5 * end * (d_numerator / numerator - d_denominator / denominator), 0.0, 1.0)
+    """Return the boundary curve of one device, the end of its lobe, and starts of Newton's method."""
+    curve, n, em = expand_curve_with_offset(plant), plant.whole, plant.em
+    xp, D = namespace(plant.delta), n + 1.0
+    end = _find_lobe_end(curve, n, em / (plant.p1 + plant.f * em), n + plant.f)
+    wave = evaluate_wave(end, n)
+    terms, end_angle = evaluate_curve(wave, curve), wave.half_omega
+    end_b = terms.b / terms.V
+    # Approximate the lobe by ``sqrt(b/end_b) = sin(start_angle w/2/end_angle)/sin(start_angle)``, where w/2 = end_angle
+    # and b = end_b at the end of the lobe. This curve has the right derivative there, where strong damping makes the
+    # lobe nearly flat; `start_correction` corrects the derivative at w = 0. The error is at most 0.4 %. The relative
+    # derivative at the end is start_angle/tan(start_angle); a rational function inverts it. ds/dw is cos(w/2)/2.
+    slope = end_angle * end * xp.sqrt(wave.q) * (terms.d_b / terms.b - terms.dV / terms.V)
+    flat = xp.clip(1.0 - slope, 0.0, 1.0)
     start_angle = xp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
     start_sine = xp.sin(start_angle)
     # Replace start_angle by the approximate arcsine that also computes the start, so that the start is exact at the end
     # of the lobe. For strong damping and long delays db/dw vanishes there, and each Newton step would only halve an
     # error.
     start_angle = _approximate_arcsine(start_sine)
-    d_b = (0.25 * lobe.excess1 + 0.5 * lobe.E0 * (lobe.k * lobe.k - 0.25) + lobe.k * lobe.H0) / lobe.V0
-    start_correction = xp.sqrt(end_b / d_b) / end - start_sine / start_angle
-    # Stack the fields into one array, so that XLA computes them once per device and not once per line of constant beta.
-    return LongLobe(*xp.stack([*lobe[:-5], end, end_b, start_angle, start_sine, start_correction]))
-
-
-class LobeTerms:
-    """E, H, V, and sines and cosines of w/2 (s, c) and k w (sin_k, cos_k) at one w; the prefix d denotes d/dw."""
-
-    def __init__(self, omega: Array, lobe: LongLobe):
-        _, k, E0, E1, E2, H0, H1, V0, V1, V2, excess1, excess2, *_ = lobe
-        self.k = k
-        s4, c4 = _compute_sine_and_cosine(0.25 * omega)
-        sk4, ck4 = _compute_sine_and_cosine(0.25 * k * omega)
-        # Compute sines of half angles first, because differences of cosines computed from them keep their relative
-        # accuracy for small w.
-        s_half = 2.0 * sk4 * ck4
-        self.s, self.c = 2.0 * s4 * c4, 1.0 - 2.0 * s4 * s4
-        self.sin_k = 2.0 * s_half * (1.0 - 2.0 * sk4 * sk4)
-        self.cos_k = 1.0 - 2.0 * s_half * s_half
-        # cos(w/2) - cos(k w)
-        self.cosine_drop = 2.0 * (s_half * s_half - s4 * s4)
-        y = self.s * self.s
-        self.E, self.H, self.V = E0 + y * (E1 + y * E2), H0 + y * H1, V0 + y * (V1 + y * V2)
-        # Compute the derivatives with respect to w, where dy/dw = sin(w/2) cos(w/2).
-        dy = self.s * self.c
-        self.dE, self.dH, self.dV = dy * (E1 + 2.0 * y * E2), dy * H1, dy * (V1 + 2.0 * y * V2)
-        self.excess, self.d_excess = y * (excess1 + y * excess2), dy * (excess1 + 2.0 * y * excess2)
-
-
-def evaluate_offset(terms: LobeTerms) -> tuple[Array, Array, Array, Array]:
-    """Return numerator and denominator of b on the boundary curve, each with its derivative in w.
-
-    Both are accurate relative to b.
-
-    Args:
-        terms: Terms of one frequency.
-
-    Returns:
-        Numerator, its derivative, denominator, its derivative.
-    """
-    k, s, c = terms.k, terms.s, terms.c
-    numerator = c * terms.excess + terms.E * terms.cosine_drop + s * c * 2.0 * terms.sin_k * terms.H
-    d_numerator = (
-        c * terms.d_excess
-        - 0.5 * s * terms.excess
-        + terms.dE * terms.cosine_drop
-        + terms.E * (k * terms.sin_k - 0.5 * s)
-    )
-    d_numerator += (
-        terms.H * (terms.sin_k * (1.0 - 2.0 * s * s) + 2.0 * k * s * c * terms.cos_k)
-        + 2.0 * s * c * terms.sin_k * terms.dH
-    )
-    return numerator, d_numerator, c * terms.V, c * terms.dV - 0.5 * s * terms.V
-
-
-class AlphaTerms(NamedTuple):
-    """The numerator of alpha on the boundary curve, and the terms from which alpha and its derivative are computed."""
-
-    projection: Array  # sin((n + 1) w) E + cos((n + 1) w) F, proportional to alpha
-    quadrature: Array  # cos((n + 1) w) E - sin((n + 1) w) F
-    d_projection: Array  # derivative of the projection in w
-    F: Array  # H sin w
-    dF: Array
-
-
-def evaluate_alpha_terms(terms: LobeTerms) -> AlphaTerms:
-    """Evaluate the numerator of alpha on the boundary curve, and its derivative, at one frequency w."""
-    # (n + 1) w = k w + w/2
-    n_plus_1 = terms.k + 0.5
-    sine = terms.sin_k * terms.c + terms.cos_k * terms.s
-    cosine = terms.cos_k * terms.c - terms.sin_k * terms.s
-    sin_w, cos_w = 2.0 * terms.s * terms.c, 1.0 - 2.0 * terms.s * terms.s
-    F, dF = sin_w * terms.H, cos_w * terms.H + sin_w * terms.dH
-    quadrature = cosine * terms.E - sine * F
-    return AlphaTerms(
-        sine * terms.E + cosine * F, quadrature, n_plus_1 * quadrature + sine * terms.dE + cosine * dF, F, dF
+    # At w = 0, b is b_rate (w/2)^2.
+    b_rate = (curve.excess[0] + 2.0 * n * D * curve.E[0] + (4.0 * n + 2.0) * curve.H[0]) / curve.at_one**2
+    start_correction = xp.sqrt(end_b / b_rate) / end_angle - start_sine / start_angle
+    # Materialize, so that XLA computes the lobe once per device and not once per line of constant beta.
+    return materialize(
+        LongLobe(plant.delta, n, curve, end, end_angle, end_b, start_angle, start_sine, start_correction), plant.delta
     )
 
 
-def _find_lobe_end(lobe: LongLobe, start_ratio: Array, d: Array) -> Array:
-    """Return the first w > 0 at which alpha is 0: the phase of ``e^(j (n+1) w) (E + j H sin w)`` reaches pi there."""
+def _find_lobe_end(curve: Curve, n: Array, start_ratio: Array, d: Array) -> Array:
+    """Return the first s > 0 at which alpha is 0: the phase of ``e^(j D w) (E + j H sin w)`` reaches pi there."""
     # Solve for the w with the phase pi by Newton's method, because the phase is nearly linear in w. ``start_ratio``,
-    # which is E/H at w = 0, determines the start between pi/(2 (n+1)), for an undamped device, and pi/(n+1).
-    n_plus_1 = lobe.k + 0.5
-    xp = namespace(n_plus_1)
-    limit = np.pi / (d + 0.5)
+    # which is E/H at w = 0, determines the start between pi/(2 D), for an undamped device, and pi/D.
+    xp, D = namespace(n), n + 1.0
+    limit = xp.sin(xp.minimum(0.5 * np.pi / (d + 0.5), 0.5 * np.pi))
 
-    def step(omega: Array) -> Array:
-        terms = LobeTerms(omega, lobe)
-        alpha_terms = evaluate_alpha_terms(terms)
-        size = terms.E * terms.E + alpha_terms.F * alpha_terms.F
-        # If the phase differs from pi by less than pi/2, approximate the difference by the product of its sine and
-        # cosine; otherwise take a limited step.
-        remaining = xp.where(alpha_terms.quadrature < 0, alpha_terms.projection * alpha_terms.quadrature, -0.2 * size)
-        return xp.minimum(
-            omega - remaining / (n_plus_1 * size + (terms.E * alpha_terms.dF - alpha_terms.F * terms.dE)), limit
-        )
+    def step(s: Array) -> Array:
+        wave = evaluate_wave(s, n)
+        E, H, _, dE, dH, _ = evaluate_polynomials(wave, curve)
+        y, q, sin_squared = wave.y, wave.q, 4.0 * wave.y * wave.q
+        # The product of sine and cosine of the phase approximates its difference from pi, divided by sin w; take a
+        # limited step if the difference exceeds pi/2.
+        size = E * E + sin_squared * H * H
+        cosine = wave.kappa * E - sin_squared * wave.tau * H
+        per_sine = 1.0 / xp.sqrt(sin_squared)
+        remaining = xp.where(cosine < 0, (wave.tau * E + wave.kappa * H) * cosine, -0.2 * size * per_sine)
+        # Multiply the step in w by ds/dw = cos(w/2)/2.
+        rate = D * size + E * ((q - y) * H + 2.0 * y * q * dH) - 2.0 * y * q * H * dE
+        return xp.minimum(s - s * q * remaining / rate, limit)
 
     # Use a loop, which compiles five times faster than unrolled steps. It runs more slowly, but only once per device.
-    start = 0.5 * np.pi / n_plus_1 * (1.0 + 0.7 * start_ratio / (start_ratio + 1.0 / n_plus_1))
-    return iterate(END_STEPS, step, start, xp)
+    start = 0.5 * np.pi / D * (1.0 + 0.7 * start_ratio / (start_ratio + 1.0 / D))
+    return iterate(END_STEPS, step, xp.sin(0.5 * start), xp)
 
 
 def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
-    """Return the limit of alpha for d >= 1, and the frequency w of the limit if it exists.
+    """Return the limit of alpha for d >= 1, and s at the limit if it exists.
 
     The limit is 0 if no alpha is stable, and NaN for invalid input.
     """
-    # Apply Newton's method to sqrt(b), which is nearly linear in w. The lobe itself is the bracket, because b increases
-    # with w along it. If a step leaves the lobe, clip it and do not bisect, because near convergence a midpoint would
+    # Apply Newton's method to sqrt(b), which is nearly linear in s. The lobe itself is the bracket, because b increases
+    # with s along it. If a step leaves the lobe, clip it and do not bisect, because near convergence a midpoint would
     # be a worse approximation.
-    delta, end, end_b, start_angle, start_sine, start_correction = lobe.delta, *lobe[-5:]
+    delta, n, curve, end, end_angle, end_b, start_angle, start_sine, start_correction = lobe
     xp = namespace(beta, delta)
-    b = beta + delta
+    b = expand_wall(0.0, beta).beta + delta
     meets_lobe = (b > 0) & (b < end_b)
     target_b = xp.where(meets_lobe, b, 0.5 * end_b)
     share = target_b / end_b
     r = xp.sqrt(share)
-    omega = xp.minimum(
-        end * (_approximate_arcsine(r * start_sine) / start_angle + start_correction * r * (1.0 - share)), end
-    )
+    angle = end_angle * (_approximate_arcsine(r * start_sine) / start_angle + start_correction * r * (1.0 - share))
+    s = xp.minimum(angle * horner(angle * angle, SINE[:8]), end)
     for _ in range(ROW_STEPS):
-        omega = xp.clip(omega - _compute_newton_step(target_b, LobeTerms(omega, lobe)), 0.0, end)
-    terms = LobeTerms(omega, lobe)
-    alpha_terms = evaluate_alpha_terms(terms)
-    numerator, denominator = 2.0 * terms.s * alpha_terms.projection, terms.c * terms.V
-    # Add the effect of the last Newton step in w to the numerator of alpha, to first order.
+        terms = evaluate_curve(evaluate_wave(s, n), curve)
+        s = xp.clip(s - _compute_newton_step(target_b, terms) / s, 0.0, end)
+    terms = evaluate_curve(evaluate_wave(s, n), curve)
+    # Add the effect of the last Newton step to alpha V and V, to first order.
     step = _compute_newton_step(target_b, terms)
-    numerator -= step * (terms.c * alpha_terms.projection + 2.0 * terms.s * alpha_terms.d_projection)
-    denominator -= step * (terms.c * terms.dV - 0.5 * terms.s * terms.V)
-    return _mask_limit(xp.where(meets_lobe, numerator / denominator, 0.0), b), omega - step
+    limit = (terms.alpha - 2.0 * step * terms.d_alpha) / (terms.V - 2.0 * step * terms.dV)
+    return _mask_limit(xp.where(meets_lobe, limit, 0.0), b), s - step / s
 
 
 def _approximate_arcsine(x: Array) -> Array:
@@ -272,22 +185,16 @@ def _approximate_arcsine(x: Array) -> Array:
     return 2.0 * t * horner(t * t, ARCTAN)
 
 
-def _compute_newton_step(target_b: Array, terms: LobeTerms) -> Array:
-    """Return the Newton step in w from b to ``target_b``, computed with a single division.
+def _compute_newton_step(target_b: Array, terms: CurveTerms) -> Array:
+    """Return s times the Newton step in s from b to ``target_b``, computed with a single division.
 
     The step is ``2 (b - sqrt(target_b b))/b'``, with sqrt(r) approximated by (1 + 3 r)/(3 + r).
     """
     # Divide only once, because XLA fuses successive steps into one loop over the lines only if no quotient is used
     # twice.
-    numerator, d_numerator, denominator, d_denominator = evaluate_offset(terms)
-    target_numerator = target_b * denominator
-    return (
-        4.0
-        * numerator
-        * denominator
-        * (numerator - target_numerator)
-        / ((d_numerator * denominator - numerator * d_denominator) * (3.0 * numerator + target_numerator))
-    )
+    b, V = terms.b, terms.V
+    target = target_b * V
+    return 2.0 * b * V * (b - target) / ((terms.d_b * V - b * terms.dV) * (3.0 * b + target))
 
 
 # Smallest number of points, and of lines of constant beta, with which the labels of a grid are copied from a pattern.

@@ -20,7 +20,7 @@ from zwidth.core.status import Method, Status
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced
 from zwidth.numerics.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
-from zwidth.numerics.held_mass import classify_delays
+from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.results import Stability
 from zwidth.stability.rigid.broadcasting import NAMES, Points, fold_arguments, restore_shape
 from zwidth.stability.rigid.crossover import stable_kernel

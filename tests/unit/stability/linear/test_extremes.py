@@ -11,8 +11,8 @@ import pytest
 
 import zwidth
 from zwidth.model.circle_functions import circle_points
+from zwidth.plant.sampled_states import sample_states
 from zwidth.stability.linear.curve import evaluate_curve
-from zwidth.stability.linear.discretization import discretize_states, evaluate_controller
 
 T = 1e-3
 Draw = Callable[[float, float], float]
@@ -118,10 +118,9 @@ def test_controller_just_below_an_integer_delay_agrees_with_the_state_space(befo
     tip = couple(0.02, 0.02, "tip", 0.5) if parts != "lag" else None
     driven = zwidth.Device(1.0, 5.0 / T, tip, zwidth.Actuator(cutoff=30.0, order=2))
     loop = scene(driven, 2.0 - before).loop
-    response = discretize_states(loop.chain)
-    for w in (1e-3, 0.1, 1.0, 3.0):
-        exact = evaluate_controller(loop.chain, w, response)
-        np.testing.assert_allclose(loop.roots.evaluate_controller(circle_points(w)).value, exact, rtol=1e-11)
+    points = circle_points(np.array([1e-3, 0.1, 1.0, 3.0]))
+    exact = sample_states(loop.chain).controller(points)
+    np.testing.assert_allclose(loop.roots.evaluate_controller(points).value, exact, rtol=1e-11)
 
 
 def test_ill_conditioned_zeros_near_the_origin_are_jointly_accurate():
@@ -130,10 +129,9 @@ def test_ill_conditioned_zeros_near_the_origin_are_jointly_accurate():
     damped = zwidth.Device(1.0, 240.0 / T, couple(5.3, 0.37, "motor", 1.5e-3), actuator=slow)
     hand = zwidth.Operator(2.4e-6, 718.0 / T, 2.7 / T**2, 0.042 / T**2, 0.048 / T)
     loop = scene(damped, 3.0, hand=hand).loop
-    response = discretize_states(loop.chain)
-    for w in (1e-3, 0.1, 1.0, 3.0):
-        exact = evaluate_controller(loop.chain, w, response)
-        np.testing.assert_allclose(loop.roots.evaluate_controller(circle_points(w)).value, exact, rtol=1e-10)
+    points = circle_points(np.array([1e-3, 0.1, 1.0, 3.0]))
+    exact = sample_states(loop.chain).controller(points)
+    np.testing.assert_allclose(loop.roots.evaluate_controller(points).value, exact, rtol=1e-10)
 
 
 def test_undamped_device_is_unstable_with_a_spring_alone():

@@ -20,7 +20,7 @@ import oracles
 import zwidth
 from zwidth.core.errors import InputError
 from zwidth.core.status import Status
-from zwidth.numerics.held_mass import discretize_plant
+from zwidth.plant.rigid_mass import discretize_plant
 
 NEAR_ZERO = [1e-300, 1e-100, 1e-20, 1e-8, 1e-3]
 NEAR_PI = [3.14, math.pi - 1e-6, math.pi - 1e-12, np.nextafter(math.pi, 0), math.pi]

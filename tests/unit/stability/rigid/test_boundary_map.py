@@ -5,7 +5,7 @@ alpha < limit(beta).
 import numpy as np
 import pytest
 
-from zwidth.numerics.held_mass import discretize_plant
+from zwidth.plant.rigid_mass import discretize_plant
 from zwidth.stability.rigid import stiffness_limit as stiffness_limit
 from zwidth.stability.rigid.stiffness_limit import build_long_lobe, find_limit_long_delay, row_limits
 from zwidth.stability.rigid.verdict import is_stable

@@ -10,8 +10,9 @@ from certified_labels import certified_stable
 from mpmath import mp
 
 import oracles
-from zwidth.numerics.held_mass import classify_delays, phi_functions
+from zwidth.plant.rigid_mass import classify_delays, phi_functions
 from zwidth.stability.rigid import certified
+from zwidth.stability.rigid.boundary_curve import expand_curve_with_offset, expand_short_delay_curve
 from zwidth.stability.rigid.certified import (
     CROSSOVER_WIDTH,
     CUBIC_TOLERANCE,
@@ -20,13 +21,8 @@ from zwidth.stability.rigid.certified import (
     enclose_root,
     size_device,
 )
-from zwidth.stability.rigid.crossover import (
-    decide_long_delay,
-    decide_short_delay,
-    expand_gain_difference,
-    expand_long_delay_curve,
-    expand_short_delay_curve,
-)
+from zwidth.stability.rigid.characteristic_polynomial import expand_gain_difference
+from zwidth.stability.rigid.crossover import decide_long_delay, decide_short_delay
 
 flint = pytest.importorskip("flint")
 BITS = 400
@@ -57,11 +53,11 @@ def collect_terms(plant, exact):
         if isinstance(value, Sized) and name not in ("p2", "minus_one_coefficient")
     ]
     pairs = [(getattr(plant, name), getattr(exact, name)) for name in names]
-    for curve in (
-        (expand_long_delay_curve, expand_short_delay_curve) if exact.a0 is not None else (expand_long_delay_curve,)
+    for expand in (
+        (expand_curve_with_offset, expand_short_delay_curve) if exact.a0 is not None else (expand_curve_with_offset,)
     ):
-        parts = zip(curve(plant), curve(exact), strict=True)
-        pairs += [pair for part in parts for pair in zip(*part, strict=True)]
+        for part in zip(expand(plant), expand(exact), strict=True):
+            pairs += zip(*part, strict=True) if isinstance(part[0], tuple) else [part]
     return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
 
 

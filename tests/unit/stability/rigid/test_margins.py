@@ -11,7 +11,7 @@ from compiling import QUICKLY, compile_bends
 
 import zwidth
 from zwidth.core.errors import InputError
-from zwidth.numerics.held_mass import discretize_plant
+from zwidth.plant.rigid_mass import discretize_plant
 from zwidth.stability.rigid.crossover import stable_kernel
 from zwidth.stability.rigid.modulus import compute_squared_distance, find_modulus_margin
 

@@ -12,7 +12,7 @@ from mpmath import mp, mpf
 
 import oracles
 import zwidth
-from zwidth.numerics.held_mass import discretize_mass
+from zwidth.plant.rigid_mass import discretize_mass
 from zwidth.stability.reference import expand_polynomial
 from zwidth.stability.rigid.broadcasting import find_degree
 

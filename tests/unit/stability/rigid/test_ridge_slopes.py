@@ -10,7 +10,6 @@ import pytest
 from compiling import compile_bends
 
 import zwidth
-from zwidth.numerics import evaluate
 from zwidth.stability.rigid.ridge import ridge_kernel, slopes_kernel
 
 
@@ -111,8 +110,7 @@ def differentiate_all(function, delta, d):
     return np.array(sides)
 
 
-def test_gradients_without_compiler_agree_with_compiled_ones(x64):
-    """Gradients at concrete values need no compiler: NumPy evaluates the same source code at complex steps."""
+def test_gradients_outside_and_inside_jit_agree(x64):
     rng = np.random.default_rng(5)
     delta, d = (
         np.concatenate([column, drawn])
@@ -121,31 +119,30 @@ def test_gradients_without_compiler_agree_with_compiled_ones(x64):
         )
     )
     delta, d = jnp.asarray(delta), jnp.asarray(d)
-    concrete = differentiate_all(zwidth.alpha_max, delta, d)
+    direct = differentiate_all(zwidth.alpha_max, delta, d)
     compiled = differentiate_all(jax.jit(lambda *args: zwidth.alpha_max(*args)[:3]), delta, d)
     valid = (delta >= 0.0) & np.isfinite(delta)
-    assert np.isfinite(concrete[..., valid]).all()
-    assert np.isnan(concrete[..., ~valid]).all()
+    assert np.isfinite(direct[..., valid]).all()
+    assert np.isnan(direct[..., ~valid]).all()
     # Errors are relative to the largest derivative of a device, because derivatives by an irrelevant damping are
     # differences of equal terms. Near the corner the derivative of omega grows inversely with the distance, which
     # amplifies rounding errors.
     size = np.abs(compiled).max(axis=(0, 1))
-    assert (np.abs(concrete - compiled) <= 1e-13 * size * np.maximum(1.0, size))[..., valid].all()
+    assert (np.abs(direct - compiled) <= 1e-13 * size * np.maximum(1.0, size))[..., valid].all()
 
 
-def test_first_gradient_compiles_no_kernel(x64, monkeypatch):
-    compiled = []
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda event, duration_secs, **arguments: (
-            compiled.append(arguments.get("fun_name")) if "backend_compile" in event else None
-        )
-    )
-    try:
-        # Disable the cache of compiled kernels in this test only.
-        monkeypatch.setattr(evaluate, "compile_traced", evaluate.compile_traced.__wrapped__)
-        quick = jax.grad(lambda delta: zwidth.alpha_max(delta, 1.25).alpha)(0.3)
-        assert not [name for name in compiled if "by_argument" in str(name) or "plain" in str(name)]
-    finally:
-        jax.monitoring.clear_event_listeners()
-    again = jax.jit(jax.grad(lambda delta: zwidth.alpha_max(delta, 1.25).alpha))(0.3)
-    assert float(quick) == pytest.approx(float(again), rel=1e-13)
+def test_derivatives_of_plain_numbers_in_both_precisions_and_of_any_order():
+    """As a user types them, with a Python integer for the other argument."""
+    expected = zwidth.sensitivities(mass=1.0, damping=0.3, period=1.0, delay=2.0).per_damping
+    for enabled, tolerance in ((True, 1e-13), (False, 1e-5)):
+        with jax.enable_x64(enabled):
+            grad = jax.grad(lambda delta: zwidth.alpha_max(delta, 2).alpha)
+            for function in (grad, jax.jit(grad)):
+                assert float(function(0.3)) == pytest.approx(float(expected), rel=tolerance)
+                assert np.isnan(function(np.nan))
+            assert jax.jit(grad)(0.3).dtype == (np.float64 if enabled else np.float32)
+    with jax.enable_x64(True):
+        third = jax.grad(jax.grad(grad))(0.3)
+        step = 1e-3
+        values = [zwidth.alpha_max(0.3 + k * step, 2).alpha for k in (-2, -1, 1, 2)]
+        assert float(third) == pytest.approx(np.dot((-1, 2, -2, 1), values) / (2 * step**3), rel=1e-3)

@@ -1,0 +1,100 @@
+"""Virtual couplings of a scene that are stable with every passive virtual world (`stability.rigid.virtual_coupling`).
+
+A virtual coupling is a spring K and a damper B between the device and a tool, an object that the computer simulates.
+The coupling is the wall of the scene with a moving tool in place of the fixed one.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from zwidth.core.errors import InputError
+from zwidth.stability.rigid.virtual_coupling import find_margin, find_stiffest
+from zwidth.units.display import compact_repr
+
+if TYPE_CHECKING:
+    from zwidth.analysis.scene import Scene
+    from zwidth.analysis.walls import Walls
+
+
+@compact_repr()
+class SafeCoupling(NamedTuple):
+    """The stiffest virtual coupling that is stable with every passive virtual world, in N/m and N s/m."""
+
+    stiffness: float
+    virtual_damping: float
+
+
+def is_safe_for_every_world(scene: Scene, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
+    """Return whether virtual couplings are stable with every passive tool, virtual world and operator.
+
+    The condition is ``b (B + KT/2) >= sin^2((n+1)w/2) [(B + KT/2)^2 + (KT/2)^2 cot^2(w/2)]`` at all frequencies w, with
+    the delay of n periods; it does not depend on the mass. A simulated world is passive if its integration method keeps
+    it passive: the implicit Euler and the trapezoidal method do. **The semi-implicit Euler method, which most physics
+    engines use, does not**: a light tool can make a coupling unstable for which this method returns True.
+
+    Args:
+        stiffness: K in N/m, >= 0; default: the stiffness of the scene's wall.
+        virtual_damping: B in N s/m, >= 0; default: the damping of the scene's wall.
+
+    Returns:
+        Boolean array of the broadcast shape; False for couplings out of range.
+
+    Raises:
+        InputError: the device is not rigid, the velocity estimate is not the backward difference, or the delay is not
+            an integer number of periods; the condition is not known for them.
+
+    References:
+        Colgate, Schenkel 1994, applied to all impedances with Re(1/Z) >= Re(1/(B + K T/(1 - 1/z))).
+
+    Example:
+        >>> import zwidth
+        >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+        >>> scene.is_safe_for_every_world([4900, 5100, 7600], [0, 0, 2.83])
+        array([ True, False,  True])
+    """
+    n_delay = _find_delay(scene)
+    alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, virtual_damping))
+    delta = float(scene.device.damping) / scene.units.virtual_damping
+    with np.errstate(all="ignore"):
+        safe = find_margin(0.5 * alpha / delta, beta / delta, n_delay) >= 0
+    # Without physical damping, only the absence of a coupling is safe.
+    return safe if delta > 0 else (alpha == 0) & (beta == 0)
+
+
+def max_safe_coupling(scene: Scene) -> SafeCoupling:
+    """Return the stiffest virtual coupling with B >= 0 that is stable with every passive tool, world and operator.
+
+    Its stiffness is ``k b/T`` and its damping ``r b`` with numbers k and r that depend on the delay only: k = 2 without
+    delay, 0.770 with one period of delay. See `is_safe_for_every_world` for the condition, for simulated worlds that
+    are not passive, and for errors.
+
+    Example:
+        >>> import zwidth
+        >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+        >>> scene.max_safe_coupling()
+        SafeCoupling(stiffness=7.698 kN/m, virtual_damping=2.81766 N s/m)
+    """
+    spring, damper = find_stiffest(_find_delay(scene))
+    damping = float(scene.device.damping)
+    return SafeCoupling(2.0 * spring * damping / float(scene.timing.period), damper * damping)
+
+
+def _find_delay(scene: Scene) -> int:
+    """Return the integer delay in periods; raise `InputError` if the condition is not known for the scene."""
+    # The operator may be any passive one, so its parameters do not matter.
+    unsupported = [part for part in scene.nonrigid_parts if not part.startswith("operator")]
+    if unsupported:
+        raise InputError(
+            f"{unsupported[0]}: the condition is known only for a rigid device with the backward difference; "
+            "use is_stable with the tool as part of the device"
+        )
+    delay = float(scene.timing.d)
+    if delay != round(delay):
+        raise InputError(
+            f"delay: got {delay:g} periods; the condition is known only for whole periods; use is_stable with the "
+            "tool as part of the device"
+        )
+    return round(delay)

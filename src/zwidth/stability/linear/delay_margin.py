@@ -1,0 +1,315 @@
+"""Compute the delay margin of stable walls in any linear loop: the smallest delay to be added that makes them unstable.
+
+One more period of delay changes the phase of the open loop L by the angle w and nothing else. At a gain crossover with
+the phase ``p = arg(-L)``, a pole is therefore on the unit circle after m more periods if ``p - m w`` is a multiple of 2
+pi. Therefore loops with delays within one period, the *tabulated delays*, suffice for all longer delays: if m passes an
+integer between two of them, Newton's method solves for the delay. A real pole reaches z = -1 where ``|L(-1)|`` passes
+1. Each result is confirmed: the poles outside the unit circle are counted at all shorter delays that differ from a
+tabulated one by an integer, and the pole on the circle must move outward. Shorter delays without a pole outside, and a
+pole that moves outward, mean that the wall loses stability there.
+
+The plant of the chain, discretized for any delay d = n + f (n integer, 0 <= f < 1), has the response
+
+    G = z^-(n+1) C (z - e^A)^-1 ((z - 1) Gamma(1 - f) + Gamma(1))
+
+with the state Gamma(t) after a unit force held for time t (`plant.sampled_states`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.model.circle_functions import Jet, are_on_circle, circle_points, distances_inside
+from zwidth.model.mechanism import AnyChain
+from zwidth.model.velocity import Estimate
+from zwidth.numerics.root_finding import find_zeros_in_brackets
+from zwidth.plant.sampled_states import integrate_chain
+from zwidth.stability.linear.curve import place_nodes
+from zwidth.stability.linear.roots import POLE_AT_ONE, LoopRoots, find_roots
+from zwidth.stability.open_loop import OpenLoop, find_gain_crossovers
+
+# Delays at which the gain crossovers are computed.
+N_PARTS = 8  # number of these delays per period
+# Distances of further delays from the integer above them, in time constants of the fastest pole. These delays are
+# needed because a strongly damped device tolerates less delay within ln 2 time constants below an integer than at the
+# integer.
+EARLY_DELAYS = np.array([1.0, 0.5, 0.25, 0.1])
+FAST_RATE = 2.0  # decay rate of the fastest pole, per period, above which these delays are added
+# The number of crossovers may differ between two neighboring delays. The crossovers at both delays whose m (see the
+# module docstring) differs from an integer by at most START_ERROR/N_PARTS are then starting points of Newton's method.
+START_ERROR = 1.5
+
+# Settings of Newton's method for the delay, in periods.
+MAX_STEPS = 30
+CONVERGED_STEP = 1e-14  # last step of the delay, relative to 1 + delay
+LOG_TOLERANCE = 1e-9  # largest |log(-L)| at a solution
+NEXT_INTEGER = 1e-9  # distance above an integer, relative to 1 + m, up to which m counts as this integer
+
+# Difference from the earliest starting delay of a wall, in periods, above which starting values are omitted, because
+# they are better approximations of their solutions than that.
+MAX_STARTS = 2.0
+
+BATCH_WALLS = 128  # walls per batch, so large that most of the time is spent on arrays, and not in Python
+
+# Type of the function that tabulates the open loops of walls (arguments: loop, alpha, beta, nodes).
+Tabulate = Callable[[LoopRoots, np.ndarray, np.ndarray, np.ndarray], OpenLoop]
+
+
+class TabulatedDelay(NamedTuple):
+    """The open loops of walls at one delay, described by their gain crossovers."""
+
+    delay: float  # in periods
+    w: np.ndarray  # gain crossovers, ascending, shape (walls, crossovers), padded with NaN
+    phase: np.ndarray  # arg(-L) at the crossovers, in [0, 2 pi), the same shape
+    at_nyquist: np.ndarray  # L at z = -1, shape (walls,)
+    outside: np.ndarray  # number of closed-loop poles outside the unit circle, shape (walls,)
+
+
+def list_delays(chain: AnyChain) -> list[float]:
+    """Return the tabulated delays in periods, from that of the chain to one period more."""
+    d = float(chain.d)
+    fastest = -float(np.linalg.eigvals(chain.realize().A).real.min())
+    early = 1.0 - EARLY_DELAYS / fastest if fastest > FAST_RATE else np.empty(0)
+    grid = np.floor(d) + np.union1d(np.arange(N_PARTS) / N_PARTS, early)
+    grid = np.concatenate([grid, grid + 1.0])
+    return [d, *grid[(grid > d + 1e-9) & (grid < d + 1.0 - 1e-9)].tolist(), d + 1.0]
+
+
+def change_delay(chain: AnyChain, delay: float) -> LoopRoots:
+    """Return the loop of a chain after replacing its delay by ``delay``, in periods."""
+    return find_roots(replace(chain, d=float(delay), n_delay=int(np.floor(delay))))
+
+
+def find_delay_margins(chain: AnyChain, tabulate: Tabulate, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+    """Return the delay margin of each stable wall in periods.
+
+    Args:
+        chain: the chain.
+        tabulate: function that tabulates the open loops of walls.
+        alpha: normalized stiffness, shape (walls,).
+        beta: normalized damping, shape (walls,).
+
+    Returns:
+        The margins; inf for a wall that is stable with any delay, NaN if the result is not confirmed.
+    """
+    margins = np.full(alpha.shape, np.nan)
+    loops = {delay: change_delay(chain, delay) for delay in list_delays(chain)} if alpha.size else {}
+    nodes = [place_nodes(loop) for loop in loops.values()]
+    for start in range(0, alpha.size, BATCH_WALLS):
+        part = slice(start, start + BATCH_WALLS)
+        walls = alpha[part], beta[part]
+        tabulated = [
+            _describe(delay, loop, tabulate(loop, *walls, w), walls)
+            for (delay, loop), w in zip(loops.items(), nodes, strict=True)
+        ]
+        margins[part] = _find_first_losses(chain, tabulated, *walls)
+    return margins
+
+
+def _describe(delay: float, loop: LoopRoots, wall: OpenLoop, walls: tuple[np.ndarray, np.ndarray]) -> TabulatedDelay:
+    """Return the gain crossovers and the number of poles outside the unit circle, for walls at one delay."""
+    with np.errstate(all="ignore"):
+        w = find_gain_crossovers(wall)
+        phase = np.mod(np.angle(-wall.respond(w).value), 2.0 * np.pi)
+        return TabulatedDelay(delay, w, phase, wall.L.value[:, -1].real, count_outside(loop, wall, w, *walls))
+
+
+def count_outside(
+    loop: LoopRoots, wall: OpenLoop, crossovers: np.ndarray, alpha: np.ndarray, beta: np.ndarray
+) -> np.ndarray:
+    """Count the closed-loop poles of each wall outside the unit circle, by the Nyquist criterion.
+
+    Where |L| < 1, the phase of 1 + L is within pi/2 of 0, and where |L| > 1 within pi/2 of the phase of L. Between
+    crossovers the phase of 1 + L therefore changes by a multiple of 2 pi that the phases of L at the crossovers
+    determine, without any node near a zero of 1 + L.
+
+    Args:
+        loop: the loop without a wall.
+        wall: the open loop of each wall.
+        crossovers: its gain crossovers, ascending, shape (walls, crossovers), padded with NaN.
+        alpha: normalized stiffness, shape (walls,).
+        beta: normalized damping, shape (walls,).
+
+    Returns:
+        The counts; NaN if the gain crossovers do not match the gains at the ends of the unit circle.
+    """
+    w, L = wall.w, wall.L.value
+    step = np.angle(L[:, 1:] / L[:, :-1])
+    # At a pole of L on the unit circle the phase jumps by -pi if the path passes the pole on the outside.
+    poles = loop.poles[are_on_circle(loop.poles)]
+    angles = np.angle(1.0 - poles)
+    jumps = np.searchsorted(w, angles[(angles > 0) & (angles < np.pi)]) - 1
+    step[:, jumps] -= np.where(step[:, jumps] > 0, 2.0 * np.pi, 0.0)
+    # Start at z = 1 + 0, where L is real. The path around n poles at z = 1 then changes its phase by -n pi/2.
+    is_integrator = np.abs(loop.poles) <= POLE_AT_ONE
+    n = np.count_nonzero(is_integrator)
+    spring = alpha + beta * loop.estimate.jet(circle_points(np.zeros(1))).value[0].real
+    sign = np.sign(spring * loop.gain * (np.prod(loop.zeros) / np.prod(loop.poles[~is_integrator])).real)
+    start = np.where(sign < 0, np.pi, 0.0)
+    first = start - 0.5 * np.pi * n + np.angle(L[:, 0] * sign * 1j**n)
+    phase = first[:, None] + np.pad(np.cumsum(step, -1), ((0, 0), (1, 0)))
+    k = np.minimum(np.searchsorted(w, crossovers) - 1, w.size - 2)
+    before = np.maximum(k, 0)
+    rows = np.arange(alpha.size)[:, None]
+    at_crossover = phase[rows, before] + np.angle(wall.respond(crossovers).value / L[rows, before])
+    exists = np.isfinite(crossovers)
+    starts_above, ends_above = np.abs(L[:, 0]) > 1.0, np.abs(L[:, -1]) > 1.0
+    # The crossovers end and start an interval with |L| > 1 by turns.
+    side = np.where((np.arange(crossovers.shape[1]) % 2 == 0) == starts_above[:, None], 1.0, -1.0)
+    turns = 2.0 * np.pi * np.where(exists, side * np.round(at_crossover / (2.0 * np.pi)), 0.0).sum(-1)
+    change = turns - np.where(starts_above, start, 0.0) + np.where(ends_above, phase[:, -1], 0.0)
+    unstable = np.count_nonzero((distances_inside(loop.poles) < 0) & ~are_on_circle(loop.poles) & ~is_integrator)
+    matches = (exists.sum(-1) % 2 == 1) == (starts_above != ends_above)
+    return np.where(matches, np.round(unstable - change / np.pi), np.nan)
+
+
+class DelayedPlant:
+    """The response of the plant of a chain at any angle and any delay."""
+
+    def __init__(self, chain: AnyChain) -> None:
+        """Discretize the chain."""
+        self.chain, (self.A, self.B, _) = chain, chain.realize()
+        self.psi, self.full = integrate_chain(chain, self.A, self.B, 1.0)
+
+    def evaluate(self, w: np.ndarray, delay: np.ndarray) -> tuple[Jet, np.ndarray]:
+        """Return G with its derivative in w, and its derivative in the delay, for angles and delays of one shape."""
+        points, n = circle_points(w), np.floor(delay)
+        psi, late = integrate_chain(self.chain, self.A, self.B, 1.0 - (delay - n))
+        zeta, size = points.z_minus_1[:, None], self.B.size
+        inverse = np.linalg.inv(zeta[..., None] * np.eye(size) - self.psi)
+        row = inverse[:, :1] @ np.stack([zeta * late + self.full, late, zeta * (self.B + (psi @ self.B))], -1)
+        resolvent = (inverse[:, 0][:, None] @ inverse @ (zeta * late + self.full)[..., None])[:, 0, 0]
+        # Multiply by z^-(n + 1). The derivative of Gamma(t) is e^(A t) B.
+        power, z = np.exp(-1j * (n + 1.0) * w), points.z
+        value, by_zeta, by_time = row[:, 0].T
+        slope = 1j * z * (by_zeta - resolvent) - 1j * (n + 1.0) * value
+        return Jet(power * value, power * slope), -power * by_time
+
+
+class Starts(NamedTuple):
+    """Starting values of Newton's method: angles and delays near which a wall has a pole on the unit circle."""
+
+    wall: np.ndarray  # index of the wall
+    w: np.ndarray
+    delay: np.ndarray  # in periods
+
+
+def _list_starts(tabulated: list[TabulatedDelay]) -> Starts:
+    """Return the starting values for all walls, from their gain crossovers at the tabulated delays."""
+    # After m = phase/w more periods of delay, L would be -1 at the crossover w if |L| did not change, as is the case
+    # for an integer m. So a solution exists near each integer through which m passes between two tabulated delays. Near
+    # a local minimum of m, the integer below the minimum may also be reached.
+    most = max(each.w.shape[1] for each in tabulated)
+    w, phase = (
+        np.stack([np.pad(part, ((0, 0), (0, most - part.shape[1])), constant_values=np.nan) for part in parts])
+        for parts in ([each.w for each in tabulated], [each.phase for each in tabulated])
+    )
+    delays, count = np.array([each.delay for each in tabulated])[:, None, None], np.isfinite(w).sum(-1, keepdims=True)
+    equal, rise = count[1:] == count[:-1], np.mod(np.diff(phase, axis=0) + np.pi, 2.0 * np.pi) - np.pi
+    m, starts = phase / w, []
+
+    def add(mask: np.ndarray, w: np.ndarray, delay: np.ndarray) -> None:
+        """Append the starting values that a mask of shape (delays, walls, crossovers) selects."""
+        mask, w, delay = np.broadcast_arrays(mask, w, delay)
+        starts.append((np.nonzero(mask)[1], w[mask], delay[mask]))
+
+    for turn in (0.0, 2.0 * np.pi):
+        first, last = (phase[:-1] - turn) / w[:-1], (phase[:-1] + rise - turn) / w[1:]
+        integer = np.maximum(np.ceil(np.minimum(first, last)), 0.0)
+        share = np.where(first == last, 0.0, (integer - first) / np.where(first == last, 1.0, last - first))
+        delay = delays[:-1] + share * np.diff(delays, axis=0) + integer
+        add(equal & (integer <= np.maximum(first, last)), w[:-1] + share * np.diff(w, axis=0), delay)
+        # If two crossovers appear or merge between two delays, the m of one of them may pass through an integer. Start
+        # from all crossovers at both delays whose m is nearly an integer.
+        more = (phase - turn) / w
+        near = (np.abs(more - np.round(more)) <= START_ERROR / N_PARTS) & (np.round(more) >= 0.0)
+        differs = np.pad(~equal, ((1, 1), (0, 0), (0, 0)))
+        add(near & (differs[1:] | differs[:-1]), w, delays + more)
+    middle, least = m[1:-1], np.maximum(m[:-2], m[2:]) - m[1:-1]
+    lowest = equal[1:] & equal[:-1] & (middle <= m[:-2]) & (middle <= m[2:])
+    add(lowest & (middle - np.floor(middle) <= least), w[1:-1], delays[1:-1] + middle)
+    return Starts(*(np.concatenate(part) for part in zip(*starts, strict=True)))
+
+
+def _find_first_losses(
+    chain: AnyChain, tabulated: list[TabulatedDelay], alpha: np.ndarray, beta: np.ndarray
+) -> np.ndarray:
+    """Return the delay margins of some walls in periods; arguments and result as in `find_delay_margins`."""
+    d, plant, estimate = float(chain.d), DelayedPlant(chain), chain.estimate
+    with np.errstate(all="ignore"):
+        starts = _list_starts(tabulated)
+        earliest = np.full(alpha.shape, np.inf)
+        np.minimum.at(earliest, starts.wall, starts.delay)
+        starts = Starts(*(part[starts.delay <= earliest[starts.wall] + MAX_STARTS] for part in starts))
+        walls = alpha[starts.wall], beta[starts.wall]
+        pairs = starts.wall, _solve_delays(plant, estimate, *walls, starts.w, starts.delay)
+        real = _find_real_losses(plant, estimate, tabulated, alpha, beta)
+        margins = np.full(alpha.shape, np.inf)
+        for wall, limit in (pairs, real):
+            np.fmin.at(margins, wall, np.where(limit > d, limit - d, np.nan))
+        end = d + margins * (1.0 - NEXT_INTEGER)
+        confirmed = np.isfinite(margins) | ~np.isfinite([each.w[:, :1] for each in tabulated]).any((0, 2))
+        for each in tabulated:
+            m = each.phase / each.w
+            integer = np.ceil(m - NEXT_INTEGER * (1.0 + m))
+            confirmed &= ((each.outside == 0) & ~(each.delay + integer < end[:, None]).any(1)) | (each.delay >= end)
+    return np.where(confirmed, margins, np.nan)
+
+
+def _find_real_losses(
+    plant: DelayedPlant, estimate: Estimate, tabulated: list[TabulatedDelay], alpha: np.ndarray, beta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the delays at which a real pole leaves the unit circle at z = -1, each with the index of its wall."""
+    L = np.array([each.at_nyquist for each in tabulated])
+    above, delays = np.abs(L) - 1.0, np.array([each.delay for each in tabulated])
+    k, wall = np.nonzero((above[1:] > 0) & (above[:-1] <= 0))
+    controller = alpha + beta * estimate.jet(circle_points(np.full(1, np.pi))).value.real
+
+    def evaluate(delay: np.ndarray) -> np.ndarray:
+        """Return |L(-1)| - 1 for delays in periods."""
+        return np.abs(controller[wall] * plant.evaluate(np.full(delay.shape, np.pi), delay)[0].value) - 1.0
+
+    delay = find_zeros_in_brackets(evaluate, delays[k], delays[k + 1], above[k, wall], above[k + 1, wall])
+    # A pole is at z = -1 if L(-1) = -1. If L(-1) = 1, add one period of delay, because this changes the sign of L(-1).
+    return wall, delay + np.where(L[k, wall] < 0, 0.0, 1.0)
+
+
+def _solve_delays(
+    plant: DelayedPlant, estimate: Estimate, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray, delay: np.ndarray
+) -> np.ndarray:
+    """Return the delays at which a pole leaves the unit circle, by Newton's method on log(-L); NaN if it fails.
+
+    Args:
+        plant: the plant for any delay.
+        estimate: the velocity estimate.
+        alpha: normalized stiffness, one value for each starting value.
+        beta: normalized damping.
+        w: starting values of the angle.
+        delay: starting values of the delay in periods.
+    """
+    solutions, active = np.full(w.shape, np.nan), np.arange(w.size)
+    for _ in range(MAX_STEPS):
+        inside = (w[active] > 0.0) & (w[active] < np.pi) & (delay[active] >= 0.0)
+        solutions[active[~inside]] = np.nan
+        active = active[inside]
+        if not active.size:
+            break
+        G, by_delay = plant.evaluate(w[active], delay[active])
+        F = estimate.jet(circle_points(w[active]))
+        L = Jet(alpha[active] + beta[active] * F.value, beta[active] * F.slope).times(G)
+        residual, d_w, d_delay = np.log(-L.value), L.slope / L.value, by_delay / G.value
+        # L does not depend on the delay if the device comes to rest within a period; both steps are then NaN. The
+        # determinant is positive if the pole moves outward as the delay increases.
+        determinant = (d_delay * d_w.conj()).imag
+        step = (residual * d_w.conj()).imag / determinant
+        w[active] -= (d_delay * residual.conj()).imag / determinant
+        delay[active] -= step
+        is_loss = (np.abs(residual) < LOG_TOLERANCE) & (determinant > 0)
+        solutions[active] = np.where(is_loss, delay[active], np.nan)
+        # Test convergence of the delay only, because near a narrow resonance rounding errors of w keep changing w.
+        active = active[~(np.abs(step) <= CONVERGED_STEP * (1.0 + delay[active]))]
+    return solutions

@@ -1,0 +1,244 @@
+"""Find the angles that determine the stability margins of an open loop L, for many loops at once, in NumPy and JAX.
+
+The closed loop is ``1 + L = 0`` with ``L = G (K P + B V)``: the sampled plant G, and the gain and the response of each
+feedback term, such as position P and velocity V. Only the values of L and of its derivative on the unit circle z =
+e^(jw) are used. L is tabulated at *nodes*, angles w so close that the logarithm of L changes little between neighbors.
+All arrays have the shape (loops, nodes) or (loops, crossovers), with any number of leading axes. NaN fills the entries
+of a loop that has fewer crossovers than others.
+
+The open loop has a *gain crossover* where |L| = 1, and a *phase crossover* where L is real and negative. Both are found
+at sign changes between nodes, and next to a minimum of the magnitude from which tangents at both nodes reach zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.core.types import Array
+from zwidth.core.xp import expand_along, namespace
+from zwidth.model.circle_functions import CirclePoints, Jet, circle_points
+from zwidth.numerics.polynomials import abs2
+from zwidth.numerics.root_finding import find_zeros_in_brackets
+
+MAX_MINIMA = 5  # local minima of |1 + L| between nodes that are refined, the lowest ones first
+ZERO_OF_L = 1e-10  # value of |L| below which L counts as 0, relative to w |dL/dw|
+
+# Type of a real function of L, with its derivative in w.
+RealFunction = Callable[[Jet], tuple[Array, Array]]
+# Type of a response on the unit circle, with its derivative in w.
+Response = Callable[[CirclePoints], Jet]
+
+
+class OpenLoop(NamedTuple):
+    """Open loops, and their values at nodes."""
+
+    respond: Callable[[Array], Jet]  # function from angles of shape (loops, angles) to L and dL/dw
+    w: Array  # nodes, ascending and at most pi, shape (nodes,) or (loops, nodes)
+    L: Jet  # L and dL/dw at the nodes, shape (loops, nodes)
+
+
+def evaluate_open_loop(points: CirclePoints, plant: Response, terms: Sequence[Response], gains: Sequence[Array]) -> Jet:
+    """Return the open loop ``L = G sum_i (gain_i term_i)`` and its derivative in w, for arrays that broadcast.
+
+    Args:
+        points: points of the unit circle.
+        plant: response G of the plant.
+        terms: response of each feedback term.
+        gains: gain of each term.
+    """
+    xp = namespace(points.w)
+    with np.errstate(all="ignore"):
+        value, slope = (
+            sum(gain * part for gain, part in zip(gains, parts, strict=True))
+            for parts in zip(*(term(points) for term in terms), strict=True)
+        )
+        L = Jet(value, slope).times(plant(points))
+        # Set the imaginary part of L at w = pi to 0, because L is real there and only a rounding error would remain.
+        return Jet(xp.where(points.w >= np.pi, L.value.real + 0j, L.value), L.slope)
+
+
+def tabulate_open_loop(w: Array, plant: Response, terms: Sequence[Response], gains: Sequence[Array]) -> OpenLoop:
+    """Return open loops, tabulated at nodes w; the shape of each gain is (loops,), other arguments as above."""
+    columns = [gain[..., None] for gain in gains]
+
+    def respond(w: Array) -> Jet:
+        return evaluate_open_loop(circle_points(w), plant, terms, columns)
+
+    return OpenLoop(respond, w, respond(w))
+
+
+def find_gain_crossovers(loop: OpenLoop, most: int | None = None) -> Array:
+    """Return the angles at which ``|L| = 1``, ascending.
+
+    Args:
+        loop: open loops.
+        most: largest number of crossovers of a loop, required by JAX. Default: as many as exist.
+    """
+
+    def log_gain(L: Jet) -> tuple[Array, Array]:
+        """Return ``log|L|`` and its derivative in w."""
+        return namespace(L.value).log(abs(L.value)), (L.slope / L.value).real
+
+    return _find_zeros(loop, log_gain, most)
+
+
+def find_phase_crossovers(loop: OpenLoop, most: int | None = None) -> Array:
+    """Return the angles in (0, pi] at which L is real and negative, ascending; arguments as `find_gain_crossovers`."""
+
+    def phase_sine(L: Jet) -> tuple[Array, Array]:
+        """Return the sine of arg L and its derivative in w."""
+        unit = L.value / abs(L.value)
+        return unit.imag, unit.real * (L.slope / L.value).imag
+
+    xp = namespace(loop.L.value)
+    # Treat the last node separately if it is at pi, because L is always real there.
+    inner = OpenLoop(loop.respond, loop.w[..., :-1], Jet(*(part[..., :-1] for part in loop.L)))
+    w = _find_zeros(inner, phase_sine, most)
+    w = xp.concatenate([w, xp.full_like(w, np.pi, shape=(*w.shape[:-1], 1))], -1)
+    L = loop.respond(w)
+    # Exclude zeros of L, where the phase jumps: for no gain is L = -1 at these angles, so no pole can lie there.
+    is_crossover = (L.value.real < 0) & (abs(L.value) > ZERO_OF_L * w * abs(L.slope))
+    return xp.where(is_crossover, w, np.nan)
+
+
+def _find_zeros(loop: OpenLoop, function: RealFunction, most: int | None) -> Array:
+    """Return the angles at which a real function of L is zero, ascending."""
+
+    def evaluate(w: Array, part: int) -> Array:
+        return function(loop.respond(w))[part]
+
+    with np.errstate(all="ignore"):
+        value, slope = function(loop.L)
+        xp, w = namespace(value), namespace(value).broadcast_to(loop.w, value.shape)
+        step, sign, size, descent = xp.diff(w), xp.sign(value), abs(value), abs(slope)
+        lowest = xp.minimum(size[..., :-1] - descent[..., :-1] * step, size[..., 1:] - descent[..., 1:] * step)
+        # Between nodes at which the function has equal signs and approaches 0 from both sides, it may have two zeros.
+        # NaN, which occurs because L may be 0 at the Nyquist frequency, is excluded by the comparisons.
+        touches = (sign[..., 1:] == sign[..., :-1]) & (lowest < 0)
+        touches &= (sign[..., :-1] * slope[..., :-1] < 0) & (sign[..., :-1] * slope[..., 1:] > 0)
+        crosses = (value[..., :-1] > 0) != (value[..., 1:] > 0)
+        k, exists = _list_true(crosses, most)
+        j, is_minimum = _list_true(touches, most)
+
+        def take(index: Array, *parts: Array) -> list[Array]:
+            """Return the values at the nodes before and after each interval."""
+            return [xp.take_along_axis(part, index + i, -1) for part in parts for i in (0, 1)]
+
+        low, high, first, last = take(k, w, value)
+        start, end, before, after, *slopes = take(j, w, value, slope)
+        minima = find_zeros_in_brackets(lambda w: evaluate(w, 1), start, xp.where(is_minimum, end, start), *slopes)
+        at_minima = evaluate(minima, 0)
+        is_passed = is_minimum & ((at_minima > 0) != (before > 0))
+        exists = xp.concatenate([exists, is_passed, is_passed], -1)
+        low, high = xp.concatenate([low, start, minima], -1), xp.concatenate([high, minima, end], -1)
+        first, last = xp.concatenate([first, before, at_minima], -1), xp.concatenate([last, at_minima, after], -1)
+        zeros = find_zeros_in_brackets(lambda w: evaluate(w, 0), low, xp.where(exists, high, low), first, last)
+        return xp.sort(xp.where(exists, zeros, np.nan), -1)
+
+
+def _list_true(mask: Array, most: int | None) -> tuple[Array, Array]:
+    """Return the indices along the last axis at which a mask is True, at most ``most``, and which of them exist."""
+    xp, size = namespace(mask), mask.shape[-1]
+    count = min(size, int(mask.sum(-1).max(initial=0)) if most is None else most)
+    index = xp.where(mask, expand_along(np.arange(size), xp.sum(mask, -1)), size)
+    index = xp.partition(index, max(count - 1, 0), -1)[..., :count] if count else index[..., :0]
+    return xp.minimum(index, size - 1), index < size
+
+
+def find_nearest_angle(respond: Callable[[Array], Jet], w: Array, square: Array) -> Array:
+    """Return the angle at which |1 + L| is smallest, from its value at nodes.
+
+    Args:
+        respond: function from angles of shape (loops, angles) to L and dL/dw.
+        w: nodes, ascending, shape (nodes,) or (loops, nodes).
+        square: ``|1 + L|^2`` at the nodes, shape (loops, nodes).
+    """
+    xp = namespace(square)
+
+    def slope(w: Array) -> Array:
+        """Return half the derivative of ``|1 + L|^2`` in w."""
+        loop = respond(w)
+        return ((1.0 + loop.value).conj() * loop.slope).real
+
+    def take(values: Array, index: Array) -> Array:
+        return xp.take_along_axis(values, index, -1)
+
+    with np.errstate(all="ignore"):
+        w = xp.broadcast_to(w, square.shape)
+        index = _list_minima(xp.where(square < np.inf, square, np.inf))
+        # If two nodes coincide, the minimum may lie after the second one. Therefore search up to the second neighbor.
+        index = xp.clip(index[..., None] + expand_along(np.arange(-1, 3), index), 0, w.shape[-1] - 1)
+        angles = take(w, index.reshape(*w.shape[:-1], -1))
+        slopes, angles = (part.reshape(index.shape) for part in (slope(angles), angles))
+        rises = (slopes[..., :-1] <= 0) & (slopes[..., 1:] > 0)
+        first, middle = xp.argmax(rises, -1)[..., None], angles[..., 1]
+        low, high = (xp.where(rises.any(-1), take(angles, first + k)[..., 0], middle) for k in (0, 1))
+        at_low, at_high = (take(slopes, first + k)[..., 0] for k in (0, 1))
+        refined = find_zeros_in_brackets(slope, low, high, at_low, at_high)
+        # Compare each refined minimum with its node, because the minimum may be an end of the range.
+        candidates = xp.concatenate([refined, middle], -1)
+        distance = abs2(1.0 + respond(candidates).value)
+        lowest = xp.argmin(xp.where(distance < np.inf, distance, np.inf), -1)
+        return take(candidates, lowest[..., None])[..., 0]
+
+
+def _list_minima(values: Array) -> Array:
+    """Return the nodes of the lowest `MAX_MINIMA` local minima of values at nodes."""
+    xp = namespace(values)
+    below, inner, above = values[..., :-2], values[..., 1:-1], values[..., 2:]
+    is_minimum = (inner < below) & (inner <= above)
+    # Rank the minima by the lowest point of the parabola through three nodes, as if the nodes were equidistant.
+    lowest = inner - (above - below) ** 2 / (8.0 * (above - inner + (below - inner)))
+    ends = (
+        xp.where(part[..., :1] <= part[..., 1:], part[..., :1], np.inf)
+        for part in (values[..., :2], values[..., :-3:-1])
+    )
+    first, last = ends
+    rank = xp.concatenate([first, xp.where(is_minimum, lowest, np.inf), last], -1)
+    return xp.argpartition(rank, MAX_MINIMA - 1, axis=-1)[..., :MAX_MINIMA]
+
+
+def select_gain_margin(stable: Array, w: Array, gains: Array) -> tuple[Array, Array]:
+    """Return the gain margin, from the gain closest to 1 on a logarithmic scale, and the angle of its phase crossover.
+
+    Args:
+        stable: True if the closed loop is stable, shape (loops,).
+        w: phase crossovers, shape (loops, crossovers).
+        gains: |L| at the phase crossovers, same shape.
+
+    Returns:
+        The factor of the gain that puts a pole on the unit circle, and the angle of this pole. Without crossovers the
+        margin is inf for a stable loop and 0 for an unstable one, and the angle is NaN.
+    """
+    xp = namespace(w, gains)
+    w, gain = _select_nearest(w, abs(xp.log(gains)), gains)
+    return xp.where(xp.isnan(w), xp.where(stable, np.inf, 0.0), 1.0 / gain), w
+
+
+def select_phase_margin(stable: Array, w: Array, phases: Array) -> tuple[Array, Array]:
+    """Return the phase margin in degrees, negative for an unstable loop, and the angle of its gain crossover.
+
+    Args:
+        stable: True if the closed loop is stable, shape (loops,).
+        w: gain crossovers, shape (loops, crossovers).
+        phases: arg(-L) at the gain crossovers in rad, same shape.
+
+    Returns:
+        The margin and the angle of the crossover. Without crossovers the margin is inf for a stable loop and NaN for an
+        unstable one, and the angle is NaN.
+    """
+    xp = namespace(w, phases)
+    w, degrees = _select_nearest(w, abs(phases), xp.degrees(abs(phases)))
+    return xp.where(xp.isnan(w), xp.where(stable, np.inf, np.nan), xp.where(stable, degrees, -degrees)), w
+
+
+def _select_nearest(w: Array, cost: Array, values: Array) -> tuple[Array, Array]:
+    """Return the crossover with the smallest cost and one of its values, both NaN for a loop without crossovers."""
+    xp = namespace(w, cost)
+    nan = xp.full_like(cost, np.nan, shape=(*cost.shape[:-1], 1))
+    k = xp.argmin(xp.nan_to_num(xp.concatenate([cost, nan], -1), nan=np.inf), -1)[..., None]
+    w, value = (xp.take_along_axis(xp.concatenate([part, nan], -1), k, -1)[..., 0] for part in (w, values))
+    return w, value
