@@ -81,7 +81,7 @@ def stiffest_walls(
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=100))
         >>> walls = zwidth.stiffest_walls(scene, {"velocity.cutoff": np.geomspace(10, 400, 100)})
         >>> print(f"{walls.stiffness.min():.0f} to {walls.stiffness.max():.0f} N/m")
-        6847 to 17525 N/m
+        6846 to 18729 N/m
     """
     if isinstance(scenes, SceneOptima):
         return _vary_scene(scenes, parameters or {}, negative_damping)

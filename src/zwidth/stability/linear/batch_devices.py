@@ -213,7 +213,9 @@ def map_loops(
     def run(task: tuple[DeviceBatch, Sizes, np.ndarray, np.ndarray]) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
         batch, sizes, index, members = task
         padded = _pad(members)
-        states = batch.states and SampledStates(*(part[padded] for part in batch.states[:3]), batch.form.lag - 1)
+        states = batch.states
+        if states is not None:
+            states = SampledStates(states.psi[padded], states.full[padded], states.late[padded], states.n_delay)
         with np.errstate(all="ignore"):
             results = function(batch.form, batch.loop.take(padded), sizes, states, index[padded])
         return index[members], tuple(part[..., : members.size] for part in results)

@@ -206,6 +206,8 @@ def sample(form: Form, loop: LoopBatch, sizes: Sizes) -> Sampled:
     decaying = distances_inside(loop.plant_poles) > INSIDE * xp.abs(loop.plant_poles)
     decaying = decaying | (xp.arange(loop.plant_poles.shape[0])[:, None] < loop.integrators)
     resolved = xp.all(crowding < RESOLUTION, 0) & xp.all(decaying, 0) & (loop.integrators <= 2)
+    # With a negative static gain, walls with K > 0 have a pole at z = 1, which the counts along lines leave out.
+    resolved = resolved & (loop.numerator[0] * loop.denominator[0] >= 0)
     ends = evaluate(form, loop, np.pi + 0.0 * loop.gain)
     return Sampled(form, loop, w, parts, slopes, levels, ends, resolved)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from zwidth import Coupling, Device, LowPass, Mode, Scene, Timing
+from zwidth import Coupling, Device, LinearDevice, LowPass, Mode, Scene, Timing
 from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import fill_parameters
 from zwidth.stability.linear.batch_devices import build_loops
@@ -83,3 +83,11 @@ def test_numpy_and_jax_count_the_same():
         outside, doubtful = count(loop, *map(jax.numpy.asarray, (alpha, beta)))
         np.testing.assert_array_equal(outside, expected[0])
         np.testing.assert_array_equal(doubtful, expected[1])
+
+
+def test_a_device_with_negative_static_gain_is_doubtful():
+    scene = Scene(LinearDevice(([-1.0], [0.1, 10.0, 500.0])), Timing(1e-3), velocity=LowPass(cutoff=100))
+    filled = fill_parameters(scene, {"period": np.full(SIZE, 1e-3)})
+    batch = build_loops(build_chain(filled, (0.0, 0)), SIZE)
+    loops = sample(batch.form, batch.loop, Sizes(*count_nodes(batch.form, batch.loop).max(1).tolist()))
+    assert not loops.resolved.any()
