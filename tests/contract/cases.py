@@ -229,6 +229,7 @@ OTHERS = {
     "run": "a configuration: tests/unit/runs/test_run.py",
     "simulate": "whole motions: tests/unit/simulation/test_against_integrator.py",
     "simulate_tolerances": "one scene: tests/unit/analysis/test_tolerances.py",
+    "stiffest_walls": "scenes, or arrays of parameters: tests/unit/analysis/test_batch.py",
     "stable_region": "one device: tests/unit/stability/rigid/test_region.py",
     "step_response": "one wall: tests/unit/stability/rigid/test_step_response.py",
     "to_control": "one scene: tests/unit/analysis/test_walls.py",

@@ -194,9 +194,9 @@ class Butterworth(_Checked):
         xp = namespace(self.cutoff, coded)
         size = xp.tan(_pi(coded) * self.cutoff * coded)
         angles = _pi(coded) * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
-        analog = size * xp.asarray(_unit_vectors(angles))
+        analog = size * xp.asarray(_unit_vectors(angles)).reshape(-1, *[1] * np.ndim(size))
         offsets = -2.0 * analog / (1.0 - analog)
-        gain = xp.prod(offsets).real * 0.5**self.order * _ratio(period, self.coded_period)
+        gain = xp.prod(offsets, 0).real * 0.5**self.order * _ratio(period, self.coded_period)
         return Estimate(1, gain, zeros=np.full(self.order, 2.0 + 0j), poles=offsets)
 
 
@@ -352,7 +352,7 @@ def check_cutoff(cutoff: Any, period: Any) -> None:
     """Raise `InputError` if a cut-off frequency is not below the Nyquist frequency."""
     if is_jax(cutoff) or is_jax(period):
         return
-    if cutoff * period >= 0.5:
+    if np.any(cutoff * period >= 0.5):
         raise InputError(
             f"velocity.cutoff: got {cutoff:g} Hz; it must be below half the sampling rate, {0.5 / period:g} Hz; "
             "lower it, or remove the filter"
