@@ -23,7 +23,7 @@ from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.velocity import ESTIMATES, FOAW
 from zwidth.numerics.evaluate import FEW
-from zwidth.stability.linear.batch_devices import compare_responses, map_loops
+from zwidth.stability.linear.batch_devices import LONGEST_DELAY, compare_responses, map_loops
 from zwidth.stability.linear.batch_lines import count_outside, find_stiffness_limits
 from zwidth.stability.linear.batch_ridge import find_stiffest
 from zwidth.stability.linear.loop_batch import sample
@@ -87,7 +87,7 @@ class Variants:
                 d = to_periods(np.broadcast_to(values.get("delay", float(scene.timing.delay)), period.shape), period)
             else:
                 d = np.full(self.count, float(scene.d))
-            usable = np.full(self.count, self._is_supported(values)) & np.isfinite(d) & (d >= 0) & (period > 0)
+            usable = np.full(self.count, self._is_supported(values)) & (d >= 0) & (d <= LONGEST_DELAY) & (period > 0)
             for name, column in values.items():
                 key = f"mode.{name.rpartition('.')[2]}" if name.startswith("modes.") else name
                 usable &= np.isfinite(column) & (FIELDS[key].allowed.holds(column) if key in FIELDS else False)

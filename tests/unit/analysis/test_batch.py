@@ -124,6 +124,13 @@ def test_an_invalid_scene_does_not_affect_the_others():
     np.testing.assert_array_equal(walls.status, [Status.OK, Status.INVALID_INPUT])
 
 
+def test_long_delays_are_searched_one_by_one():
+    scene = SCENES["low-pass"]
+    walls = stiffest_walls(scene, {"delay": [30e-3, 30.5e-3]})
+    np.testing.assert_array_equal(walls.searched, [True, True])
+    np.testing.assert_allclose(walls.stiffness[0], scene.replace(delay=30e-3).max_stiffness().stiffness)
+
+
 def test_an_empty_list_and_a_single_scene_are_allowed():
     assert stiffest_walls([]).stiffness.shape == (0,)
     assert stiffest_walls(SCENES["low-pass"]).stiffness.shape == ()

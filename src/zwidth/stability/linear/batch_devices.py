@@ -189,15 +189,15 @@ def map_loops(
     Args:
         scene: a scene of this structure, whose other parameters all scenes share.
         values: parameters by dotted path, arrays of shape (scenes,).
-        d: delays in periods, shape (scenes,).
+        d: delays in periods, shape (scenes,), at most `LONGEST_DELAY`; at least one scene.
         function: maps form, loops, `Sizes`, discretized devices, and the indices of the scenes to arrays, whose last
             axis is that of the loops.
 
     Returns:
-        The arrays of the function for all scenes; 0 or False for delays above `LONGEST_DELAY`.
+        The arrays of the function for all scenes.
     """
     whole, tasks = np.floor(d), []
-    for n in np.unique(whole[whole <= LONGEST_DELAY]).astype(int).tolist():
+    for n in np.unique(whole).astype(int).tolist():
         index = _pad(np.flatnonzero(whole == n))
         filled = fill_parameters(scene, {path: column[index] for path, column in values.items()})
         fraction = d[index] if np.any(d[index] != n) else np.float64(n)
