@@ -105,7 +105,7 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     def top(a: Any, b: Any) -> Any:
         return ridge.ridge_kernel(a, b, ANY)
 
-    wide = xp.filter_options(xp.WIDE)
+    wide = xp.WIDE
     yield "WIDE, radius", compiled(quick, wide), compiled(quick), columns
     yield "WIDE, verdict", compiled(stable, wide), compiled(stable), columns
     yield "materialize, ridge", compiled(top), compiled(top, newton__materialize=same), (delta, d)
@@ -115,7 +115,7 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     by_rule, alone = slopes()
     yield "custom_jvp, gradient of ridge", lambda: by_rule, lambda: alone, (delta, d)
     million = tuple(np.tile(np.asarray(column), 16) for column in (delta, d))
-    ridges = evaluate.compile_traced(ridge.ridge_kernel, (ANY,))
+    ridges = evaluate.compile_kernel(ridge.ridge_kernel, (ANY,))
     yield "BLOCK, ridge of a million", in_blocks(ridges, 1 << 16), in_blocks(ridges, 1 << 20), million
     yield (
         "sine series, radius",
@@ -132,7 +132,7 @@ def in_blocks(function: Callable[..., Any], size: int) -> Make:
 
 def slopes() -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Return the gradient outside `jit` by the rule of `numerics.evaluate`, and by JAX alone."""
-    by_rule = evaluate.compile_traced.__wrapped__(ridge.ridge_kernel, (ANY,))
+    by_rule = evaluate.compile_kernel.__wrapped__(ridge.ridge_kernel, (ANY,))
     alone = jax.jit(lambda *columns: ridge.ridge_kernel(*columns, ANY))  # pyright: ignore
     return tuple(jax.grad(lambda *c, f=f: f(*c).alpha.sum(), argnums=(0, 1)) for f in (by_rule, alone))  # type: ignore
 

@@ -5,6 +5,8 @@ from .analysis.assessment import Limit as Limit
 from .analysis.assessment import assess as assess
 from .analysis.assessment import assess_many as assess_many
 from .analysis.assessment import limits_of as limits_of
+from .analysis.batch import StiffestWalls as StiffestWalls
+from .analysis.batch import stiffest_walls as stiffest_walls
 from .analysis.diagnosis import Diagnosis as Diagnosis
 from .analysis.diagnosis import diagnose as diagnose
 from .analysis.recommendation import Recommendation as Recommendation

@@ -34,10 +34,10 @@ and which derivatives it has. `scripts/refresh_contract.py` writes the page from
   statuses are the same. Results outside the domain are NaN.
 - **Derivatives** are finite at good points and NaN at bad points. The tests of the contract cover the first
   derivatives. The tests of each function cover the second derivatives, and the first derivatives of {elsewhere}.
-- **On a graphics processor.** Inside `jit`, functions run on the device of JAX, with the same values and statuses. The
-  tests of the contract also pass on a graphics processor. Direct calls compute small arrays with NumPy, and divide
-  large arrays into blocks that fit into the caches of a CPU. On a graphics processor, therefore call the functions
-  inside your own `jit`.
+- **On devices of JAX.** Direct calls with JAX arrays are computed by compiled code on the devices of these arrays, and
+  their results stay there, also if an array is distributed over several devices (`tests/contract/test_devices.py`).
+  The exceptions compute on the host: `count_poles`, `decay_rate`, `decide_stability`, `spectral_radius`, and
+  `is_stable` with `method="certified"`. The tests of the contract also pass on a graphics processor.
 
 The domains of finite arguments are:
 

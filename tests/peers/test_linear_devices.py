@@ -64,3 +64,25 @@ def test_step_responses_agree_with_python_control(pair):
     n_delay = round(scene.d)
     response = control.step_response(control.feedback(device, wall), np.arange(60 + n_delay) * T).outputs
     np.testing.assert_allclose(scene.state_space().step(60), response[n_delay:], rtol=1e-6, atol=1e-12)
+
+
+def test_margins_of_many_walls_agree_with_python_control(pair):
+    scene, device, _ = pair
+    random, unit = np.random.default_rng(3), control.tf([1.0, 0.0], [1.0, 0.0], T)
+    stiffness = scene.wall.stiffness * random.uniform(0.2, 1.5, 6)
+    damping = scene.wall.virtual_damping * random.uniform(0.5, 1.3, 6)
+    margins = scene.margins(stiffness, damping)
+    w = np.concatenate([np.geomspace(1e-4, 0.1, 2000), np.linspace(0.1, np.pi, 60_000)[1:]])
+    plant: Any = device(np.exp(1j * w))
+    difference: Any = control.tf([1.0, -1.0], [1.0, 0.0], T)
+    estimate = np.asarray(difference(np.exp(1j * w)))
+    for k in range(6):
+        wall: Any = control.ss(stiffness[k] * unit + damping[k] / T * difference)
+        gains, _, distances, *_ = control.stability_margins(device * wall, returnall=True)
+        nearest = gains[gains > 0][np.argmin(np.abs(np.log(gains[gains > 0])))]
+        assert margins.gain_margin[k] == pytest.approx(nearest, rel=1e-5)
+        assert margins.modulus_margin[k] == pytest.approx(np.min(distances), rel=1e-6)
+        # For devices of high order the peer finds gain crossovers at |L| = 1.5 or 0.4, so evaluate L directly.
+        L = plant * (stiffness[k] + damping[k] / T * estimate)
+        i = np.flatnonzero((np.abs(L[1:]) > 1) != (np.abs(L[:-1]) > 1))
+        assert abs(margins.phase_margin[k]) == pytest.approx(np.abs(np.angle(-L[i], deg=True)).min(), abs=0.05)

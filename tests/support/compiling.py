@@ -6,16 +6,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from zwidth.core.xp import filter_options
-
 # These options reduce compilation to a third of the time: XLA simplifies and fuses, but hardly optimizes machine code.
 # Results were equal up to the last digits wherever compared. The library's own compiled functions are tested with full
 # optimization.
-QUICKLY = filter_options(
-    ("xla_backend_optimization_level", 0),
-    ("xla_cpu_use_fusion_emitters", False),
-    ("xla_cpu_parallel_codegen_split_count", 1),
-)
+QUICKLY = {
+    "xla_backend_optimization_level": 0,
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_parallel_codegen_split_count": 1,
+}
 
 
 def compile_bends(slopes: Callable[[Any], Any]) -> Callable[[Any], tuple[np.ndarray, np.ndarray]]:

@@ -23,6 +23,7 @@ import numpy as np
 from zwidth.analysis.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.analysis.measured_loop import MeasuredLoop
 from zwidth.core.errors import InputError
+from zwidth.core.pytrees import list_leaves
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced
 from zwidth.model.checks import Part, check_kind
@@ -112,9 +113,19 @@ class SceneParts(Part):
     @cached_property
     def loop(self) -> LinearLoop:
         """Normalized loop of the scene, in the fastest implementation that supports its parts."""
+        shape = next((np.shape(leaf) for leaf in list_leaves(self) if np.ndim(leaf)), ())
+        if shape:
+            raise InputError(f"scene: got numbers of shape {shape}; map over scenes with jax.vmap")
         if isinstance(self.device, MeasuredDevice):
             return MeasuredLoop(self)
+        if self.nonrigid_parts and self.traced_path is not None:
+            return self.traced_loop
         return LinearLoop(make_plain(self)) if self.nonrigid_parts else RigidLoop(self)
+
+    @cached_property
+    def traced_loop(self) -> Any:
+        """Loop for values that JAX traces, which `zwidth.Scene` defines because it requires JAX."""
+        raise NotImplementedError
 
     def check_parts(self) -> None:
         """Raise `InputError` for an invalid combination of parts, such as a cutoff above the Nyquist frequency."""
@@ -268,6 +279,20 @@ def wrap_function(
     return checked
 
 
+# Methods that are compiled as a whole if JAX traces a scene without closed form. Outside of the caller's own jit, JAX
+# would otherwise compile each operation of the method on its own, which takes ten times as long.
+COMPILED = (
+    "boundary",
+    "is_passive",
+    "margins",
+    "max_stiffness",
+    "passivity_margin",
+    "required",
+    "sensitivities",
+    "spectral_radius",
+)
+
+
 def wrap_methods(kind: type[SceneParts], *, traceable: Collection[str], but: Collection[str]) -> None:
     """Wrap the public methods of a scene class, except those named in ``but``, so that their results print with units.
 
@@ -285,8 +310,13 @@ def _wrap_method(method: Callable[Concatenate[Owner, Parameters], Result], trace
 
     @wraps(method)
     def wrapped(scene: Owner, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        if not traceable and (scene.traced_path is not None or is_traced(*args, *kwargs.values())):
-            refuse_traced(method.__name__, scene, inspect.signature(method).bind(scene, *args, **kwargs).arguments)
+        if scene.traced_path is not None or is_traced(*args, *kwargs.values()):
+            arguments = inspect.signature(method).bind(scene, *args, **kwargs).arguments
+            if not traceable:
+                refuse_traced(method.__name__, scene, arguments)
+            if method.__name__ in COMPILED and scene.traced_path is not None and scene.nonrigid_parts:
+                _, *rest = arguments.items()
+                return with_units(scene.traced_loop.run_compiled(method, dict(rest)), scene.unit_system)
         return with_units(method(scene, *args, **kwargs), scene.unit_system)
 
     return wrapped

@@ -94,7 +94,7 @@ def _find_delay(scene: Scene) -> int:
     delay = float(scene.timing.d)
     if delay != round(delay):
         raise InputError(
-            f"delay: got {delay:g} periods; the condition is known only for whole periods; use is_stable with the "
+            f"delay: got {delay:g} periods; the condition is known only for integer delays; use is_stable with the "
             "tool as part of the device"
         )
     return round(delay)

@@ -1,50 +1,141 @@
 """Stability and stiffness limits of many variants of a scene, for tolerances and uncertain devices.
 
-A *variant* is the scene with other values of some parameters. `Variants` evaluates any scene, one variant after the
-other. `RigidVariants` evaluates all variants of a rigid mass with the backward difference at once, by closed forms on
-arrays. Results have one entry per variant. K and B are the stiffness and damping of a wall in SI units; ``rate`` is
-m/T, ``delta = b T/m``, and d is the delay in periods T, with the mass m and damping b of the device.
+A *variant* is the scene with other values of some parameters. `Variants` evaluates the variants of any scene at once,
+by counts of poles along lines of walls (`zwidth.stability.linear.batch_lines`), and each variant whose result these
+counts do not confirm by itself. `RigidVariants` evaluates variants of a rigid mass with the backward difference by
+closed forms on arrays. Results have one entry per variant. K and B are the stiffness and damping of a wall in SI
+units; ``rate`` is m/T, ``delta = b T/m``, and d is the delay in periods T, with the mass m and damping b of the device.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.core.errors import InputError, ZwidthError
+from zwidth.core.status import RidgeKind, Status
+from zwidth.model.checks import to_periods
+from zwidth.model.device import Device
+from zwidth.model.linear_device import LinearDevice
+from zwidth.model.velocity import ESTIMATES, FOAW
 from zwidth.numerics.evaluate import FEW
+from zwidth.stability.linear.batch_devices import LONGEST_DELAY, compare_responses, map_loops
+from zwidth.stability.linear.batch_lines import count_outside, find_stiffness_limits
+from zwidth.stability.linear.batch_ridge import find_stiffest
+from zwidth.stability.linear.loop_batch import sample
 from zwidth.stability.linear.rows import are_connected
+from zwidth.stability.results import RidgePoint
 from zwidth.stability.rigid.boundary import boundary_point
 from zwidth.stability.rigid.ridge import alpha_max
 from zwidth.stability.rigid.verdict import is_stable
+from zwidth.units.quantities import FIELDS, WALL
 
 RIGID_PARAMETERS = ("mass", "damping", "period", "delay")
 MAX_PIECES = 6  # largest number of pieces of arrays that NumPy evaluates faster than a function compiled by JAX
+LEAST_BATCH = 16  # smallest number of variants that are faster to evaluate at once than one by one
+LONGEST_WINDOW = 64  # in periods, of variants that are evaluated at once; longer ones need too many nodes
+DENSITIES = (1, 2)  # densities of nodes, of which a higher one is used for the variants that the lower one leaves open
+
+
+class _Normalized(NamedTuple):
+    """Parameters of all variants."""
+
+    values: dict[str, np.ndarray]  # varied parameters by dotted path
+    d: np.ndarray  # delay in periods
+    period: np.ndarray
+    mass: np.ndarray  # unit of mass, as `SceneParts.mass`
+    usable: np.ndarray  # variants that can be evaluated at once
+
+
+class BatchRidge(NamedTuple):
+    """Stiffest wall of each variant in normalized parameters, and whether a search of its own was necessary."""
+
+    point: RidgePoint
+    searched: np.ndarray
 
 
 class Variants:
-    """Variants of any scene, evaluated one after the other.
+    """Variants of any scene.
 
     Args:
         scene: the nominal scene.
         drawn: values of each varied parameter by dotted path, arrays of equal length with one value per variant.
     """
 
-    searched = True  # K_max of each variant needs a search, which takes 10 to 50 ms
-
     def __init__(self, scene: Any, drawn: dict[str, np.ndarray]) -> None:
         self.scene, self.drawn = scene, drawn
         (self.count,) = {values.size for values in drawn.values()}
 
-    def scenes(self) -> Iterator[Any]:
-        """Yield the variants one after the other, each as a scene with its parameter values."""
-        for k in range(self.count):
-            yield self.scene.replace(**{name: float(values[k]) for name, values in self.drawn.items()})
+    def build(self, k: int) -> Any:
+        """Return the variant with index k as a scene."""
+        return self.scene.replace(**{name: float(values[k]) for name, values in self.drawn.items()})
+
+    @cached_property
+    def normalized(self) -> _Normalized:
+        """Parameters of all variants, and which of them can be evaluated at once."""
+        scene, nominal = self.scene, self.scene.parameters()
+        values = {name: np.asarray(column, float) for name, column in self.drawn.items() if name not in WALL}
+        if "rate" in values:
+            values["period"] = 1.0 / values.pop("rate")
+        period = values.get("period", np.full(self.count, float(scene.timing.period)))
+        with np.errstate(all="ignore"):
+            if "delay" in values or not scene.timing.in_periods:
+                d = to_periods(np.broadcast_to(values.get("delay", float(scene.timing.delay)), period.shape), period)
+            else:
+                d = np.full(self.count, float(scene.d))
+            usable = np.full(self.count, self._is_supported(values)) & (d >= 0) & (d <= LONGEST_DELAY) & (period > 0)
+            for name, column in values.items():
+                key = f"mode.{name.rpartition('.')[2]}" if name.startswith("modes.") else name
+                usable &= np.isfinite(column) & (FIELDS[key].allowed.holds(column) if key in FIELDS else False)
+            every: dict[str, Any] = {path: values.get(path, value) for path, value in nominal.items()}
+            cutoff = every.get("velocity.cutoff", 0.0) * every.get("velocity.coded_period", period)
+            usable &= cutoff < 0.5
+            usable &= every.get("operator.mass", 1.0) > 0 if "operator.coupling_stiffness" in nominal else True
+        hand = scene.operator
+        rigid = hand is not None and hand.rigid and scene.device.coupling is None
+        mass = every.get("mass", float(scene.mass)) + (every["operator.mass"] if rigid else 0.0)
+        return _Normalized(values, d, period, np.broadcast_to(mass, period.shape), usable)
+
+    def _is_supported(self, values: dict[str, np.ndarray]) -> bool:
+        """Return whether variants of the scene have one structure that can be evaluated at once."""
+        scene, nominal = self.scene, self.scene.parameters()
+        device, velocity = scene.device, scene.velocity
+        known = type(device) in (Device, LinearDevice) and type(velocity) in ESTIMATES.values()
+        sampled = getattr(device, "dt", None) is not None
+        whole = any(isinstance(nominal.get(name), int) for name in values)
+        # A parameter that is 0 may be missing in the structure, such as a spring to ground.
+        changed = any(name.startswith("operator.stiffness") and np.any(column == 0) for name, column in values.items())
+        window = getattr(velocity, "samples", 1)
+        return known and not (sampled or whole or changed or isinstance(velocity, FOAW) or window > LONGEST_WINDOW)
+
+    def _map(self, function: Callable[..., tuple[np.ndarray, ...]], selected: np.ndarray) -> list[np.ndarray]:
+        """Apply a function of form, loops, sizes, devices and indices to the selected variants (`map_loops`)."""
+        values = {name: column[selected] for name, column in self.normalized.values.items()}
+        values.setdefault("mass", np.full(selected.size, float(self.scene.device.mass)))
+        return map_loops(self.scene, values, self.normalized.d[selected], function)
 
     def labels(self, stiffness: float, damping: float) -> np.ndarray:
         """Return a boolean array with one entry per variant: True if the wall is stable on this variant."""
-        return np.array([bool(scene.is_stable(stiffness, damping)) for scene in self.scenes()])
+        mass, period, usable = self.normalized.mass, self.normalized.period, self.normalized.usable
+        stable, left = np.zeros(self.count, bool), np.full(self.count, True)
+        selected = np.flatnonzero(usable & (stiffness > 0) & (self.count >= LEAST_BATCH))
+        if selected.size:
+
+            def label(form, loop, sizes, states, index) -> tuple[np.ndarray, ...]:
+                rate = mass[selected[index]] / period[selected[index]]
+                loops = sample(form, loop, sizes)
+                outside, doubtful = count_outside(loops, stiffness * period[selected[index]] / rate, damping / rate)
+                return outside, np.asarray(doubtful)
+
+            outside, doubtful = self._map(label, selected)
+            stable[selected], left[selected] = outside == 0, doubtful
+        for k in np.flatnonzero(left).tolist():
+            stable[k] = bool(self.build(k).is_stable(stiffness, damping))
+        return stable
 
     def find_stiffness_limits(self, damping: np.ndarray) -> np.ndarray:
         """Return the upper end of the lowest stable interval of K for each variant and each B; 0 if no wall is stable.
@@ -52,23 +143,83 @@ class Variants:
         The interval is the one that starts at K = 0. If the device is unstable without a wall, it is the interval with
         the softest walls of K > 0.
         """
-        intervals = (np.moveaxis(scene.stable_stiffness(damping), -1, 0) for scene in self.scenes())
-        if self.scene.loop.least_stiffness(-np.inf) is not None:
-            ends = np.array([np.min(np.where(high > 0, high, np.inf), -1, initial=np.inf) for _, high in intervals])
-            return np.where(np.isfinite(ends), ends, 0.0)
-        limits = (np.where(are_connected(low, high), high, 0.0) for low, high in intervals)
-        return np.array([limit.max(-1, initial=0.0) for limit in limits])
+        mass, period, usable = self.normalized.mass, self.normalized.period, self.normalized.usable
+        limits, left = np.zeros((self.count, damping.size)), np.full(self.count, True)
+        selected = np.flatnonzero(usable & (self.count >= LEAST_BATCH))
+        if selected.size:
 
-    def stiffest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return K and B of the stiffest stable wall of each variant."""
-        walls = np.array([scene.max_stiffness()[:2] for scene in self.scenes()], float)
-        return walls[:, 0], walls[:, 1]
+            def limit(form, loop, sizes, states, index) -> tuple[np.ndarray, ...]:
+                rate = mass[selected[index]] / period[selected[index]]
+                loops = sample(form, loop, sizes)
+                ends = [find_stiffness_limits(loops, B / rate) for B in damping.tolist()]
+                alpha, doubtful = (np.stack(part) for part in zip(*ends, strict=True))
+                return alpha * rate / period[selected[index]], np.asarray(doubtful.any(0))
+
+            found, doubtful = self._map(limit, selected)
+            limits[selected], left[selected] = found.T, doubtful
+        for k in np.flatnonzero(left).tolist():
+            limits[k] = self._find_limits(self.build(k), damping)
+        return limits
+
+    def _find_limits(self, scene: Any, damping: np.ndarray) -> np.ndarray:
+        """Return the limits of one variant, as described in `find_stiffness_limits`."""
+        low, high = np.moveaxis(scene.stable_stiffness(damping), -1, 0)
+        if self.scene.loop.least_stiffness(-np.inf) is not None:
+            ends = np.min(np.where(high > 0, high, np.inf), -1, initial=np.inf)
+            return np.where(np.isfinite(ends), ends, 0.0)
+        return np.where(are_connected(low, high), high, 0.0).max(-1, initial=0.0)
+
+    def find_ridges(self, negative: bool, least_batch: int = LEAST_BATCH) -> BatchRidge:
+        """Return the stiffest stable wall of each variant, with B >= 0 unless ``negative``.
+
+        Args:
+            negative: True to allow B < 0.
+            least_batch: smallest number of variants that are evaluated at once.
+        """
+        columns = [np.full(self.count, np.nan) for _ in range(3)]
+        kind, status = np.full(self.count, int(RidgeKind.NONE), np.int32), np.zeros(self.count, np.int32)
+        left = np.full(self.count, True)
+        for density in DENSITIES:
+            selected = np.flatnonzero(left & self.normalized.usable)
+            if self.count < least_batch or not selected.size:
+                break
+
+            def solve(form, loop, sizes, states, index, density=density) -> tuple[np.ndarray, ...]:
+                found = find_stiffest(form, loop, sizes._replace(density=density), negative)
+                confirmed = found.confirmed
+                if states is not None:
+                    for w in found.angles:
+                        confirmed = confirmed & compare_responses(form, loop, states, w)
+                return (*found[:3], found.kind, confirmed)
+
+            *found, kinds, confirmed = self._map(solve, selected)
+            done = selected[confirmed]
+            for column, part in zip(columns, found, strict=True):
+                column[done] = part[confirmed]
+            kind[done], left[done] = kinds[confirmed], False
+        for k in np.flatnonzero(left).tolist():
+            *numbers, kind[k], status[k] = self._search_ridge(k, negative)
+            for column, number in zip(columns, numbers, strict=True):
+                column[k] = number
+        return BatchRidge(RidgePoint._make([*columns, kind, status]), left)
+
+    def _search_ridge(self, k: int, negative: bool) -> tuple[float, ...]:
+        """Return the stiffest wall of one variant by a search of its own."""
+        try:
+            return tuple(map(float, self.build(k).loop.stiffest(negative)))
+        except InputError:
+            return math.nan, math.nan, math.nan, int(RidgeKind.NONE), int(Status.INVALID_INPUT)
+        except (ArithmeticError, ZwidthError):
+            return math.nan, math.nan, math.nan, int(RidgeKind.NONE), int(Status.NOT_CONVERGED)
+
+    def stiffest(self, negative: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return K and B of the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
+        point, rate = self.find_ridges(negative).point, self.normalized.mass / self.normalized.period
+        return point.alpha * rate / self.normalized.period, point.beta * rate
 
 
 class RigidVariants(Variants):
     """Variants of a rigid mass with the backward difference, evaluated at once by closed forms."""
-
-    searched = False
 
     def __init__(self, scene: Any, drawn: dict[str, np.ndarray]) -> None:
         super().__init__(scene, drawn)
@@ -108,7 +259,7 @@ class RigidVariants(Variants):
         return point * self.rate
 
     @np.errstate(all="ignore")
-    def stiffest(self) -> tuple[np.ndarray, np.ndarray]:
+    def stiffest(self, negative: bool) -> tuple[np.ndarray, np.ndarray]:
         alpha, beta = self.evaluate(lambda *args: np.stack(alpha_max(*args)[:2]), self.delta, self.d)
         return alpha * self.rate / self.period, beta * self.rate
 

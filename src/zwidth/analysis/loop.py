@@ -23,16 +23,18 @@ import numpy as np
 
 from zwidth.analysis.ensemble import RIGID_PARAMETERS, RigidVariants, Variants
 from zwidth.core.errors import ZwidthError
+from zwidth.core.pytrees import list_leaves
 from zwidth.core.status import Method, RidgeKind, Status
 from zwidth.core.types import Array
 from zwidth.core.xp import is_jax, is_traced, namespace, nan_beyond
 from zwidth.model.circle_functions import circle_points
 from zwidth.model.mechanism import AnyChain, build_chain
-from zwidth.model.parameter_paths import AnyScene, list_parameters, replace_parameters
+from zwidth.model.parameter_paths import AnyScene, list_parameters
 from zwidth.numerics.evaluate import as_float64, check_scalars, evaluate
 from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.linear.boundary import Boundary
 from zwidth.stability.linear.curve import evaluate_curve
+from zwidth.stability.linear.derivatives import SceneSensitivities, compute_sensitivities
 from zwidth.stability.linear.margins import compute_margins, evaluate_walls
 from zwidth.stability.linear.passivity import PassivityCondition, compute_passivity_margins
 from zwidth.stability.linear.poles import (
@@ -44,13 +46,7 @@ from zwidth.stability.linear.poles import (
 )
 from zwidth.stability.linear.poles import spectral_radius as linear_radius
 from zwidth.stability.linear.regions import Outline, StableSet
-from zwidth.stability.linear.ridge import (
-    RidgeSolution,
-    SceneSensitivities,
-    compute_sensitivities,
-    differentiate_stiffness,
-    find_ridge,
-)
+from zwidth.stability.linear.ridge import RidgeSolution, find_ridge
 from zwidth.stability.linear.roots import LoopRoots, find_roots
 from zwidth.stability.linear.rows import Island, find_stable_dampings, find_stable_intervals, label_walls
 from zwidth.stability.results import DominantPole, Margins, RidgePoint, Stability
@@ -262,10 +258,6 @@ class LinearLoop:
 
     def stiffest(self, negative: bool) -> RidgePoint:
         """Return the stiffest stable wall connected to K = 0; ``negative`` allows beta < 0."""
-        if is_traced(*list_parameters(self.scene).values()):
-            from zwidth.stability.linear.traced_ridge import trace_stiffest
-
-            return trace_stiffest(self.scene, negative)
         ridge, status = self.ridge(negative)
         if ridge is None:
             nan = np.float64(math.nan)
@@ -412,10 +404,8 @@ class RigidLoop(LinearLoop):
 
 
 def make_plain(scene: AnyScene) -> AnyScene:
-    """Return a copy of the scene in which JAX numbers are converted to floats, unless JAX traces them."""
-    numbers = list_parameters(scene).items()
-    floats = {path: float(value) for path, value in numbers if is_jax(value) and not is_traced(value)}
-    return replace_parameters(scene, floats) if floats else scene
+    """Return a scene in which JAX numbers are converted to floats and checked."""
+    return scene._rebuild() if any(map(is_jax, list_leaves(scene))) else scene
 
 
 def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None:
@@ -438,9 +428,6 @@ def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
         # Differentiate the active constraints of the stiffest wall implicitly, because the derivative of K_max with
         # respect to the stiffness of the operator has no closed form.
-        ridge = scene.loop.ridge(negative)[0]
-        per["operator.stiffness"] = (
-            math.nan if ridge is None else differentiate_stiffness(scene, ridge, "operator.stiffness")
-        )
+        per["operator.stiffness"] = compute_sensitivities(scene, *scene.loop.ridge(negative)).per["operator.stiffness"]
     per = {path: float(derivative) for path, derivative in per.items()}
     return SceneSensitivities(np.float64(stiffness), per, slopes.point.status)

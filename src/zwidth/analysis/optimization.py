@@ -26,8 +26,8 @@ from zwidth.core.xp import is_jax, is_traced
 from zwidth.model.checks import read_texts
 from zwidth.model.wall import resolve_wall
 from zwidth.numerics.root_finding import find_global_minimum
+from zwidth.stability.linear.derivatives import SceneSensitivities
 from zwidth.stability.linear.margins import find_modulus_margins, tabulate
-from zwidth.stability.linear.ridge import SceneSensitivities
 from zwidth.units.display import compact_repr
 from zwidth.units.parsing import to_float
 from zwidth.units.quantities import FIELDS, WALL
@@ -92,6 +92,7 @@ EXTREMUM_OPTIONS = {"xatol": 1e-6}
 NO_STIFFNESS = 60.0  # negative of the surplus if no wall is stable, which corresponds to K_max = exp(-60) K
 
 Side = Literal["above", "below", "everywhere", "nowhere"]
+SIDES: tuple[Side, ...] = get_args(Side)
 
 
 class Crossing(NamedTuple):
@@ -239,9 +240,8 @@ class SceneOptima(SceneAnalysis):
         Numerics:
             Closed form for a rigid device. Otherwise the highest point of all edges of the stable set, with a relative
             error of about 1e-13 (larger for modes that decay by less than 1e-3 per period, except undamped ones).
-            NOT_CONVERGED if lines of constant B contradict the result. Inside a JAX transformation optimistix refines
-            the solution, with implicit derivatives in every parameter of every part. There the delay, and with a delay
-            also the period, must be plain numbers (`TracedDelayError`).
+            NOT_CONVERGED if lines of constant B contradict the result. Inside JAX transformations the result is the
+            same, with first and second derivatives in every number of the scene, delay and period included.
 
         Example:
             >>> import zwidth
@@ -250,7 +250,10 @@ class SceneOptima(SceneAnalysis):
             >>> print(f"{scene.max_stiffness().stiffness:.0f} N/m")
             11942 N/m
         """
-        alpha, beta, omega, kind, status = self.loop.stiffest(allows_negative(self, negative_damping))
+        if self.nonrigid_parts and self.traced_path is not None:
+            alpha, beta, omega, kind, status = self.traced_loop.trace_stiffest(negative_damping)
+        else:
+            alpha, beta, omega, kind, status = self.loop.stiffest(allows_negative(self, negative_damping))
         mass, period = (value if is_traced(value) else float(value) for value in (self.mass, self.timing.period))
         rate = mass / period
         # Multiply the factors in the same order as `zwidth.max_stiffness`, so that both results are equal.
@@ -281,6 +284,8 @@ class SceneOptima(SceneAnalysis):
             >>> print(f"{scene.sensitivities().per['damping']:.0f} N/m per N s/m")
             572 N/m per N s/m
         """
+        if self.traced_path is not None:
+            return self.traced_loop.trace_sensitivities(negative_damping)
         return self.loop.sensitivities(allows_negative(self, negative_damping))
 
     def required(
@@ -305,7 +310,9 @@ class SceneOptima(SceneAnalysis):
             sufficient ("above" or "below"), "everywhere" if it is in the whole range (``value`` is then the current
             value, or the closest end of the range), or "nowhere"; ``crossings``, all crossings found, each confirmed by
             K_max on both sides; ``range``, the range searched; ``status``, UNREACHABLE with NaN if K_max is below the
-            required stiffness in the whole range.
+            required stiffness in the whole range. Inside JAX transformations ``sufficient_side`` is the index of the
+            side in ("above", "below", "everywhere", "nowhere"), ``crossings`` is empty, and ``value`` has first and
+            second derivatives in the numbers of the scene and in the stiffness (NaN without a crossing).
 
         Numerics:
             K_max is computed at the current value, at 25 values across the range, and at extrema between them that may
@@ -319,6 +326,12 @@ class SceneOptima(SceneAnalysis):
             >>> print(f"{needed.value:.2f} N s/m or {needed.sufficient_side}")
             18.62 N s/m or above
         """
+        if self.traced_path is not None or is_traced(stiffness):
+            stiffness = read_texts("stiffness", stiffness, self.unit_system["N/m"])
+            if within is not None:
+                low, high = read_texts("within", within, "")
+                within = to_float(low), to_float(high)
+            return RequiredValue(*self.traced_loop.trace_required(parameter, stiffness, within, negative_damping))
         stiffness = _read_stiffness(stiffness, self.unit_system["N/m"])
         now = _get_present_value(self, parameter)
         low, high = _choose_range(self, parameter, now, within)

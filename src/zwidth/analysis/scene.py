@@ -7,14 +7,18 @@ The parts are checked in `zwidth.analysis.base`; the analyses are in `zwidth.ana
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from zwidth.analysis.base import WallSI, wrap_methods
 from zwidth.analysis.coupling import is_safe_for_every_world, max_safe_coupling
 from zwidth.analysis.recommendation import SceneAdvice
+from zwidth.core.errors import InputError
 from zwidth.core.types import ArrayLike
 from zwidth.core.xp import is_traced, namespace
+from zwidth.model.measured_device import MeasuredDevice
 from zwidth.numerics.evaluate import as_float64
 from zwidth.simulation.simulate import simulate
 from zwidth.stability.linear.regions import Outline
@@ -36,10 +40,11 @@ class Scene(SceneAdvice):
             it; stability and maximum stiffness do not depend on it.
 
     Numerics:
-        Parameters and walls may be values that JAX traces. Inside ``jit``, ``vmap`` and ``grad``, `max_stiffness` works
-        for every scene. For a rigid scene with the backward difference `boundary`, `is_passive`, `is_stable`,
-        `margins`, `passivity_margin`, `poles` (except with a traced delay) and `spectral_radius` work as well. All
-        other methods raise `InputError` for traced values.
+        A scene is a JAX pytree whose leaves are its numbers, so that it can be an argument of functions inside ``jit``,
+        ``vmap``, ``grad`` and other transformations. There `boundary`, `is_passive`, `is_stable`, `margins`,
+        `max_stiffness`, `passivity_margin`, `required`, `sensitivities` and `spectral_radius` return the same as
+        direct calls, for every scene except one with a measured device; `poles` works for a rigid scene with a plain
+        delay. All other methods raise `InputError` for traced values.
 
     Example:
         >>> import zwidth
@@ -48,6 +53,15 @@ class Scene(SceneAdvice):
         >>> scene.is_stable(10e3, [5, 40])
         array([False,  True])
     """
+
+    @cached_property
+    def traced_loop(self) -> Any:
+        """Loop for values that JAX traces, if there is no closed form; it imports JAX."""
+        if isinstance(self.device, MeasuredDevice):
+            raise InputError("device: got a measured response inside jit, vmap or grad; use a model of the device")
+        from zwidth.analysis.traced_loop import TracedLoop
+
+        return TracedLoop(self)
 
     def boundary(self, omega: ArrayLike) -> WallSI:
         """Return the walls that have a pole pair on the unit circle at a given frequency.
@@ -59,9 +73,8 @@ class Scene(SceneAdvice):
             ``stiffness`` in N/m and ``virtual_damping`` in N s/m; NaN for other frequencies.
         """
         w = (omega if is_traced(omega) else as_float64("omega", omega)) * self.timing.period
-        self._check_traceable(w, *self.units)
         inside, units = (w > 0) & (w < np.pi), self.units
-        alpha, beta = self.loop.critical_walls(namespace(w).where(inside, w, 1.0))
+        alpha, beta = self._loop_for(w).critical_walls(namespace(w).where(inside, w, 1.0))
         walls = alpha * units.stiffness, beta * units.virtual_damping
         return WallSI(*(namespace(inside, part).where(inside, part, np.nan)[()] for part in walls))
 
@@ -84,8 +97,7 @@ class Scene(SceneAdvice):
     """Method that calls `zwidth.simulate` with this scene and all other arguments."""
 
 
-# Methods that work inside jit, vmap and grad: all for a rigid scene with the backward difference; for other scenes
-# only `max_stiffness` and the methods that convert units or replace parameters.
+# Methods that work inside jit, vmap and grad; `poles` only for a rigid scene with the backward difference.
 TRACEABLE = (
     "boundary",
     "is_passive",
@@ -97,6 +109,8 @@ TRACEABLE = (
     "passivity_margin",
     "poles",
     "replace",
+    "required",
+    "sensitivities",
     "spectral_radius",
     "to_si",
 )

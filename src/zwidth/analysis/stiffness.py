@@ -21,7 +21,7 @@ from zwidth.core.status import Status
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import namespace
 from zwidth.model.checks import accept_units
-from zwidth.numerics.evaluate import check_scalars, compile_traced, evaluate
+from zwidth.numerics.evaluate import check_scalars, compile_kernel, evaluate
 from zwidth.plant.rigid_mass import DelayClasses, classify_delays
 from zwidth.stability.rigid.normalization import Normalized, normalize, quantity_status
 from zwidth.stability.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slopes
@@ -132,7 +132,7 @@ def _sensitivities_kernel(mass, damping, period, delay, delta, d, kind) -> Sensi
     xp = namespace(mass, delta, d)
     # If JAX traces the quantities, compile the derivatives with respect to delta and d as a separate function, so that
     # JAX computes them once instead of once per quantity.
-    slopes = slopes_kernel(delta, d, kind) if xp is np else compile_traced(slopes_kernel, (kind,))(delta, d)
+    slopes = slopes_kernel(delta, d, kind) if xp is np else compile_kernel(slopes_kernel, (kind,))(delta, d)
     # Compute the status of entries out of range from the quantities in SI units, because delta or d is NaN there.
     input_status = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
     status = xp.where(input_status == Status.OK, slopes.point.status, input_status).astype(np.int32)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.analysis.base import SceneParts
+from zwidth.analysis.loop import LinearLoop
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced, namespace
@@ -80,16 +81,11 @@ class SceneAnalysis(SceneParts):
     def _broadcast_walls(self, stiffness: Walls, virtual_damping: Walls) -> Sequence[Array]:
         """Convert K in N/m and B in N s/m to arrays alpha and beta of a common shape."""
         walls = self.normalize_walls(stiffness, virtual_damping)
-        self._check_traceable(*walls)
         return namespace(*walls).broadcast_arrays(*walls)
 
-    def _check_traceable(self, *values: Any) -> None:
-        """Raise `InputError` if JAX traces a parameter or a wall, and the loop of the scene does not support this."""
-        if is_traced(*values) and not self.loop.traceable:
-            raise InputError(
-                f"{self.traced_path or 'stiffness, virtual_damping'}: got a value traced by JAX, allowed only for a "
-                "rigid device with the backward difference; pass plain numbers, outside jit, vmap and grad"
-            )
+    def _loop_for(self, *values: Any) -> LinearLoop:
+        """Return the loop of the scene, or the one for walls that JAX traces."""
+        return self.traced_loop if is_traced(*values) and not self.loop.traceable else self.loop
 
     def poles(self, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
         """Return all poles of the closed loop, along a new last axis in no particular order.
@@ -98,7 +94,8 @@ class SceneAnalysis(SceneParts):
         factored polynomial, expanded around z = 1. The error is about 1e-15 times the condition number for a simple
         pole and 1e-16^(1/k) for a k-fold one. The run time per wall is O(degree^3).
         """
-        return self.loop.poles(*self._broadcast_walls(stiffness, virtual_damping))
+        walls = self._broadcast_walls(stiffness, virtual_damping)
+        return self._loop_for(*walls).poles(*walls)
 
     def spectral_radius(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """Return the largest magnitude of the closed-loop poles of each wall.
@@ -107,7 +104,8 @@ class SceneAnalysis(SceneParts):
         by a measured response. If the loop has at most 150 poles, all are computed; otherwise the method counts the
         poles inside circles, with a run time that does not increase with the delay.
         """
-        return self.loop.radius(*self._broadcast_walls(stiffness, virtual_damping))
+        walls = self._broadcast_walls(stiffness, virtual_damping)
+        return self._loop_for(*walls).radius(*walls)
 
     def dominant_pole(self, stiffness: Walls = None, virtual_damping: Walls = None) -> ScenePole:
         """Return the dominant pole of the closed loop with each wall, i.e. the pole of largest magnitude.
@@ -212,8 +210,7 @@ class SceneAnalysis(SceneParts):
         if method != "auto":
             return self.decide_stability(stiffness, virtual_damping, method=method).stable
         walls = self.normalize_walls(stiffness, virtual_damping)
-        self._check_traceable(*walls)
-        return self.loop.labels(*walls)
+        return self._loop_for(*walls).labels(*walls)
 
     def stable_stiffness(self, virtual_damping: ArrayLike | None = None) -> np.ndarray:
         """Return all intervals of the stiffness K in which the walls with a given damping B are stable.
@@ -300,7 +297,7 @@ class SceneAnalysis(SceneParts):
         if obstacle := find_unsupported_reason(**vars(self.device)):
             raise InputError(f"passivity {obstacle}")
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
-        return self.loop.passivity_margin(alpha, beta) * self.units.virtual_damping
+        return self._loop_for(alpha, beta).passivity_margin(alpha, beta) * self.units.virtual_damping
 
     def is_passive(self, stiffness: Walls = None, virtual_damping: Walls = None) -> Array:
         """Return whether walls are passive (positive `passivity_margin`), i.e. stable with every passive operator."""
@@ -317,11 +314,11 @@ class SceneAnalysis(SceneParts):
         the exact discretization of every fractional delay, and is NaN if counts of poles below and above it do not
         confirm it. If no factor, phase or delay moves a pole onto the unit circle, the first three margins are infinite
         for a stable wall, and 0, NaN and 0 for an unstable one. Walls out of range are NaN. A rigid scene uses
-        `zwidth.margins`; otherwise a wall takes some milliseconds, and its delay margin about 0.1 s.
+        `zwidth.margins`. Otherwise a single wall takes about 0.1 s, and many walls in one call a few milliseconds each.
         """
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
-        margins = SceneMargins._make(self.loop.margins(alpha, beta))
+        margins = SceneMargins._make(self._loop_for(alpha, beta).margins(alpha, beta))
         return margins._replace(
             delay_margin=margins.delay_margin * self.timing.period,
             phase_crossover=margins.phase_crossover * hertz,
@@ -337,13 +334,13 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     samples. They are excluded for a device given as a whole system: its true damping is unknown, so a wall with B < 0
     would cancel modeled damping that may not exist.
     """
-    if negative_damping is None and isinstance(scene.device, ResponseDevice):
-        return False
-    if negative_damping is None:
-        estimate = scene.velocity.estimate(scene.timing.period)
-        return estimate.is_difference and bool(is_traced(estimate.gain) or estimate.gain > 0)
-    if not isinstance(negative_damping, bool | np.bool_):
+    if negative_damping is not None and not isinstance(negative_damping, bool | np.bool_):
         raise InputError(f"negative_damping: got {negative_damping!r}; pass True, False or None")
+    if negative_damping is None and not isinstance(scene.device, ResponseDevice):
+        if not scene.nonrigid_parts:
+            return True
+        estimate = scene.velocity.estimate(scene.timing.period)
+        return bool(estimate.is_difference and estimate.gain > 0)
     return bool(negative_damping)
 
 

@@ -237,23 +237,28 @@ Values = TypeVar("Values")
 
 # Compiler option for vector registers twice as wide as XLA's default, without effect on processors that lack them. The
 # spectral radius is computed 1.2 times as fast, and stability 1.04 times as fast.
-WIDE = ("xla_cpu_prefer_vector_width", 512)
+WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 
-@cache
-def filter_options(*options: tuple[str, int]) -> dict[str, int]:
-    """Return the compiler options that the installed XLA accepts; any other option would raise an error."""
+def compile_with_options(
+    function: Callable[..., Any], options: dict[str, bool | int], **arguments: Any
+) -> Callable[..., Any]:
+    """Return ``jax.jit(function, **arguments)`` with options of the compiler, or without if XLA rejects them."""
     import jax
 
-    def are_accepted(values: dict[str, int]) -> bool:
-        try:
-            jax.jit(abs, compiler_options=values).lower(0.0).compile()
-        except jax.errors.JaxRuntimeError:
-            return False
-        return True
+    variants = [jax.jit(function, compiler_options=options, **arguments), jax.jit(function, **arguments)]
 
-    # Test all options together first, because usually all are accepted and a single compilation then suffices.
-    return values if are_accepted(values := dict(options)) else {k: v for k, v in options if are_accepted({k: v})}
+    def call(*values: Any) -> Any:
+        try:
+            return variants[0](*values)
+        except jax.errors.JaxRuntimeError:
+            if len(variants) == 1:
+                raise
+            # Later releases of XLA may lack an option.
+            del variants[0]
+            return variants[0](*values)
+
+    return call
 
 
 def materialize(values: Values, witness: Array) -> Values:

@@ -161,7 +161,7 @@ class _RigidDevices(RigidVariants):
         Returns:
             K and B; both 0 if no wall is stable on enough devices.
         """
-        low, high, damping = 0.0, compute_stiffness_quantile(self.stiffest()[0], reliability), 0.0
+        low, high, damping = 0.0, compute_stiffness_quantile(self.stiffest(True)[0], reliability), 0.0
         least = _NEGLIGIBLE * high
         while high > max((1.0 + _ACCURACY) * low, least):
             stiffness = 0.5 * (low + high)

@@ -13,11 +13,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import MISSING, Field, fields
 from functools import wraps
 from numbers import Real
-from typing import Any, ClassVar, Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 
 from zwidth.core.errors import InputError, UnusableValueError, check_choice
+from zwidth.core.pytrees import HiddenText, is_node, register, register_waiting
 from zwidth.core.types import Array
 from zwidth.core.xp import is_jax, is_traced, namespace, stop_gradient
 from zwidth.units.display import with_units
@@ -57,7 +58,7 @@ class Span(NamedTuple):
         return float(to_periods(np.float64(self.value), np.float64(period)))
 
     def __str__(self) -> str:
-        return f"{short(self.value)} {self.unit}"
+        return f"{self.value if is_jax(self.value) else short(self.value)} {self.unit}"
 
 
 def read_span(value: Any, allowed: Range) -> Span:
@@ -154,13 +155,20 @@ class Part:
     """Base class of the parts of a scene.
 
     The constructor checks all fields and converts them to SI units. ``repr`` returns the expression that creates the
-    part.
+    part. For JAX, a part is a pytree: its numbers and parts are children, all other fields are constant structure.
     """
 
     _owner: ClassVar[str] = ""  # first part of the dotted paths of the fields, as in "coupling.mass"
+    _texts: ClassVar[tuple[str, ...]] = ()  # fields with texts for people, which do not count as structure
+    _child_names: tuple[str, ...] | None = None  # set by `_unflatten`, because its children may be any objects
+
+    def __init_subclass__(cls) -> None:
+        """Register the class as a node of JAX pytrees."""
+        register(cls)
 
     def __post_init__(self) -> None:
         """Convert all fields to SI units; raise `InputError` for a value out of the range in `units.quantities`."""
+        register_waiting()
         # Do not check the value None of a field whose default is None, because this field is optional. If a unit
         # determines the kind of device, store the kind in the attribute ``rotary``.
         items = {f"{self._owner}.{item.name}".lstrip("."): item for item in fields(self)}  # pyright: ignore[reportArgumentType]
@@ -179,6 +187,48 @@ class Part:
                     value = check_number(path, value, self.unit_system[quantity.unit], allowed)
                 object.__setattr__(self, item.name, value)
 
+    def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
+        """Return the children of the part for JAX with their names, and its constant structure."""
+        values = {item.name: getattr(self, item.name) for item in fields(self) if item.init}  # pyright: ignore[reportArgumentType]
+        names = self._child_names
+        if names is None:
+            names = tuple(k for k, value in values.items() if k not in self._texts and self._is_child(k, value))
+        if not names:
+            # The structure is the part itself, which keeps its cached properties.
+            return (), self
+        children = tuple((name, values.pop(name)) for name in names)
+        texts = HiddenText((name, values.pop(name)) for name in self._texts)
+        return children, (names, tuple(values.items()), texts, self.unit_system is SYSTEMS[True])
+
+    def _is_child(self, name: str, value: Any) -> bool:
+        """Return whether a field is a child in the sense of JAX: a number that is not an integer, a part, or parts."""
+        if isinstance(value, tuple):
+            return all(isinstance(each, Part) for each in value)
+        return isinstance(value, float | np.floating | np.ndarray) or is_node(value) or is_jax(value)
+
+    @classmethod
+    def _unflatten(cls, structure: Any, children: Any) -> Any:
+        """Return a part from its structure and its children, which JAX may have replaced by any objects."""
+        if isinstance(structure, Part):
+            return structure
+        names, constants, texts, rotary = structure
+        part = object.__new__(cls)
+        values = dict(zip(names, children, strict=True)) | dict(constants) | {"_child_names": names}
+        # JAX compiles a function once for all texts. A traced part therefore has none, instead of those of one scene.
+        values |= {name: type(text)() if is_traced(*children) else text for name, text in texts}
+        if rotary:
+            values["rotary"] = True
+        for name, value in values.items():
+            object.__setattr__(part, name, value)
+        return part
+
+    def _rebuild(self) -> Self:
+        """Return the part with all numbers converted to floats and checked again, as JAX does not check them."""
+        part = type(self)(**{item.name: _rebuild(getattr(self, item.name)) for item in fields(self) if item.init})  # pyright: ignore[reportArgumentType]
+        if self.unit_system is SYSTEMS[True]:
+            object.__setattr__(part, "rotary", True)
+        return part
+
     @property
     def unit_system(self) -> UnitSystem:
         """The units of the device: those of rotary devices if ``rotary`` is True, otherwise those of linear devices."""
@@ -194,6 +244,13 @@ class Part:
             if text != repr(usual) and (text, usual) != ("False", None):
                 parts.append(f"{item.name}={text}")
         return f"{type(self).__name__}({', '.join(parts)})"
+
+
+def _rebuild(value: Any) -> Any:
+    """Return a checked copy of a part or of a tuple of parts; return other values unchanged."""
+    if isinstance(value, tuple):
+        return tuple(map(_rebuild, value))
+    return value._rebuild() if isinstance(value, Part) else value
 
 
 def _flatten(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:

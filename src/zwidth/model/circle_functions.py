@@ -57,9 +57,10 @@ def circle_points(w: Array) -> CirclePoints:
     return CirclePoints(w, 1.0 + z_minus_1, z_minus_1, 2.0 * c * (c + 1j * s))
 
 
-def distances_inside(offsets: np.ndarray) -> np.ndarray:
+def distances_inside(offsets: Array) -> Array:
     """Return ``1 - |root|`` for roots given by their offsets, without cancellation for roots near 1."""
-    return (2.0 * np.real(offsets) - np.abs(offsets) ** 2) / (1.0 + np.abs(1.0 - offsets))
+    xp = namespace(offsets)
+    return (2.0 * xp.real(offsets) - xp.abs(offsets) ** 2) / (1.0 + xp.abs(1.0 - offsets))
 
 
 def are_on_circle(offsets: np.ndarray) -> np.ndarray:

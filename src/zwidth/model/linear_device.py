@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from zwidth.core.errors import InputError
+from zwidth.core.pytrees import register
 from zwidth.model.exact_polynomials import (
     Polynomial,
     characteristic_polynomial,
@@ -51,6 +52,19 @@ class ResponseDevice:
     rotary: bool = False
     # The damping is 0, because the response already includes the physical damping.
     damping: ClassVar[float] = 0.0
+
+    def __init_subclass__(cls) -> None:
+        """Register the class as a node of JAX pytrees."""
+        register(cls)
+
+    def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
+        """Return no children and the device itself as its structure, because its exact coefficients are constant."""
+        return (), self
+
+    @classmethod
+    def _unflatten(cls, structure: Any, children: Any) -> Any:
+        """Return the device, which is its own structure."""
+        return structure
 
     @property
     def unit_system(self) -> UnitSystem:

@@ -63,6 +63,10 @@ class Operator(Part):
                 "operator.coupling_stiffness too, or add the damping to the device"
             )
 
+    def _is_child(self, name: str, value: Any) -> bool:
+        # A rigid grasp has no damper between hand and device.
+        return super()._is_child(name, value) and not (self.rigid and name == "coupling_damping")
+
     @property
     def rigid(self) -> bool:
         """True if the grasp is rigid, without a spring between hand and device."""

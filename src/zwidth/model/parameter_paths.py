@@ -8,7 +8,7 @@ parameter of another part begins with the name of the part: ``velocity.cutoff``,
 from __future__ import annotations
 
 from dataclasses import MISSING, fields, replace
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,7 @@ class Parts(Protocol):
     def velocity(self) -> Velocity: ...
     @property
     def operator(self) -> Operator | None: ...
+    def _rebuild(self) -> Self: ...
 
 
 AnyScene = TypeVar("AnyScene", bound=Parts)
@@ -167,3 +168,34 @@ def spell_part(part: Any, *, every: bool = False) -> dict[str, Any]:
         # Omit ``rotary=False``, because a device is linear by default.
         if (value is not None if every else default is MISSING or value != default) and value is not False
     }
+
+
+def fill_parameters(scene: AnyScene, values: dict[str, Any]) -> AnyScene:
+    """Return a copy of a scene with arrays as parameters, without checks; only `build_chain` accepts such a scene.
+
+    Args:
+        scene: the scene.
+        values: values by dotted path, such as ``{"mass": numpy.array([0.1, 0.2])}``.
+    """
+    parts = {name: copy_unchecked(part) for _, name, part in _parts(scene)}
+    for prefix, name, part in _parts(scene):
+        for item in fields(part):
+            if prefix + item.name in values:
+                object.__setattr__(parts[name], item.name, values[prefix + item.name])
+    modes = tuple(parts[f"modes.{k}"] for k in range(len(scene.device.modes)))
+    own = {name: parts[name] for name in _OF_DEVICE if name in parts} | ({"modes": modes} if modes else {})
+    for name, part in own.items():
+        object.__setattr__(parts["device"], name, part)
+    filled = copy_unchecked(scene)
+    for name in (*_BARE, *_NAMED):
+        if name in parts:
+            object.__setattr__(filled, name, parts[name])
+    return filled
+
+
+def copy_unchecked(part: Any) -> Any:
+    """Return a copy of a part without its cached properties."""
+    new = object.__new__(type(part))
+    for item in fields(part):
+        object.__setattr__(new, item.name, getattr(part, item.name))
+    return new

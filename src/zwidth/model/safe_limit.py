@@ -41,6 +41,8 @@ class SafeLimit(Part):
         (True, False)
     """
 
+    _texts = ("reason", "warnings")
+
     stiffness: Any
     virtual_damping: Any = 0.0
     reason: str = ""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -34,7 +35,9 @@ class Timing(Part):
     rate: Any = None
     # Delay in periods if the user gave it in periods, otherwise None. This number is stored, because the quotient of
     # delay and period in seconds may have a rounding error.
-    _periods: ClassVar[float | None] = None
+    _periods: ClassVar[Any] = None
+    # True if the delay was given in periods; its number of periods is then constant if the period changes.
+    in_periods: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if (self.period is None) == (self.rate is None):
@@ -46,34 +49,51 @@ class Timing(Part):
         object.__setattr__(self, "period", check_number("period", self.period))
         delay = check_span("delay", self.delay)
         if isinstance(delay, Span):
-            object.__setattr__(self, "_periods", delay.value if delay.unit == "periods" else None)
+            object.__setattr__(self, "in_periods", delay.unit == "periods")
+            object.__setattr__(self, "_periods", delay.value if self.in_periods else None)
             object.__setattr__(self, "delay", delay.seconds(self.period))
 
     def __repr__(self) -> str:
         """Return the expression that creates this timing, with the delay in its original unit, seconds or periods."""
         text = super().__repr__()
-        return text if self._periods is None else text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
+        return text if not self.in_periods else text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
 
-    @property
-    def in_periods(self) -> bool:
-        """True if the delay was given in periods; its number of periods is then constant if the period changes."""
-        return self._periods is not None
+    def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
+        # The delay is a child in the unit in which it stays constant if the period changes.
+        return (("period", self.period), ("delay", self._periods if self.in_periods else self.delay)), self.in_periods
+
+    @classmethod
+    def _unflatten(cls, structure: Any, children: Any) -> Any:
+        timing, (period, delay) = object.__new__(cls), children
+        values = {"period": period, "delay": delay, "rate": None}
+        if structure:
+            # JAX also passes objects that are not numbers; a delay in seconds does not exist for these.
+            with suppress(TypeError):
+                values["delay"] = delay * period
+            values |= {"_periods": delay, "in_periods": True}
+        for name, value in values.items():
+            object.__setattr__(timing, name, value)
+        return timing
+
+    def _rebuild(self) -> Self:
+        delay = f"{float(self._periods)!r} periods" if self.in_periods else self.delay
+        return type(self)(period=self.period, delay=delay)
 
     @property
     def span(self) -> Any:
         """The delay in the unit in which the user gave it: a `Span` in periods, or a number of seconds."""
-        return self.delay if self._periods is None else Span(self._periods, "periods")
+        return Span(self._periods, "periods") if self.in_periods else self.delay
 
     @property
     def delay_text(self) -> str:
         """The delay as text in the unit in which it stays constant if the period changes: "1 period" or "1 ms"."""
-        if self._periods is None:
+        if not self.in_periods:
             return with_unit(float(self.delay), "s")
         return format_periods(self._periods)
 
     @property
     def d(self) -> Any:
         """The delay in periods; an exact integer if it differs from one only by rounding errors."""
-        if self._periods is not None:
-            return np.float64(self._periods)
+        if self.in_periods:
+            return self._periods if is_jax(self._periods) else np.float64(self._periods)
         return to_periods(*(value if is_jax(value) else np.float64(value) for value in (self.delay, self.period)))

@@ -5,8 +5,9 @@ The *coded period* is the sampling period that the constants of an estimate were
 another period T, the program divides position differences by the wrong time, and its cut-off frequency is shifted;
 `Estimate` includes these errors.
 
-Estimates are evaluated with floats, JAX arrays, and balls of python-flint (``flint.arb``). Zeros and poles are stored
-as offsets ``1 - root``, which are accurate for roots near z = 1.
+Estimates are evaluated with floats, balls of python-flint (``flint.arb``), and Taylor objects, whose derivatives are
+exact (`zwidth.numerics.taylor`). Zeros and poles are stored as offsets ``1 - root``, which are accurate for roots near
+z = 1.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from zwidth.core.errors import InputError
-from zwidth.core.xp import is_jax, namespace
+from zwidth.core.xp import is_jax, is_traced, namespace
 from zwidth.model.checks import Part
 from zwidth.model.circle_functions import CirclePoints, Jet, power_jet, product_jet
 from zwidth.model.filter_sections import (
@@ -193,9 +194,9 @@ class Butterworth(_Checked):
         xp = namespace(self.cutoff, coded)
         size = xp.tan(_pi(coded) * self.cutoff * coded)
         angles = _pi(coded) * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
-        analog = size * xp.asarray(_unit_vectors(angles))
+        analog = size * xp.asarray(_unit_vectors(angles)).reshape(-1, *[1] * np.ndim(size))
         offsets = -2.0 * analog / (1.0 - analog)
-        gain = xp.prod(offsets).real * 0.5**self.order * _ratio(period, self.coded_period)
+        gain = xp.prod(offsets, 0).real * 0.5**self.order * _ratio(period, self.coded_period)
         return Estimate(1, gain, zeros=np.full(self.order, 2.0 + 0j), poles=offsets)
 
 
@@ -340,6 +341,9 @@ def is_plain(velocity: Velocity, period: Any) -> bool:
     """Return whether an estimate is the backward difference, divided by the loop's period, with all fields None."""
     if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
         return False
+    if is_traced(period):
+        # A user's estimate may accept only floats.
+        return type(velocity).estimate is BackwardDifference.estimate
     estimate = velocity.estimate(period)
     return estimate.window == 1 and estimate.is_difference and isinstance(estimate.gain, float) and estimate.gain == 1.0
 
@@ -348,7 +352,7 @@ def check_cutoff(cutoff: Any, period: Any) -> None:
     """Raise `InputError` if a cut-off frequency is not below the Nyquist frequency."""
     if is_jax(cutoff) or is_jax(period):
         return
-    if cutoff * period >= 0.5:
+    if np.any(cutoff * period >= 0.5):
         raise InputError(
             f"velocity.cutoff: got {cutoff:g} Hz; it must be below half the sampling rate, {0.5 / period:g} Hz; "
             "lower it, or remove the filter"

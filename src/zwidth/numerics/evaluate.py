@@ -15,15 +15,15 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import nullcontext
-from functools import cache, partial
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache, lru_cache
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from zwidth.core.errors import InputError, PrecisionWarning
 from zwidth.core.types import ArrayLike
-from zwidth.core.xp import WIDE, compute_concretely, filter_options, is_jax, is_traced, materialize, tree_map
+from zwidth.core.xp import WIDE, compile_with_options, compute_concretely, is_jax, is_traced, tree_map
 from zwidth.numerics.blocks import count_points, map_blocks
 from zwidth.units.quantities import SIZES
 
@@ -125,10 +125,10 @@ def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:
     return tree_map(lambda leaf: np.asarray(leaf)[()], result)
 
 
-def broadcast_traced(arguments: Mapping[str, ArrayLike]) -> list[Any]:
-    """Convert arguments, some of them traced by JAX, to arrays of a common shape in JAX's default float type.
+def convert_for_jax(arguments: Mapping[str, ArrayLike]) -> list[Any]:
+    """Convert arguments, some of them JAX arrays, to arrays of JAX's default float type, and check their shapes.
 
-    Arguments that are not traced may have the same types as in a direct call, and are checked in the same way.
+    Arguments that are not JAX arrays may have the same types as in a direct call, and are checked in the same way.
     """
     import jax.numpy as jnp
 
@@ -136,8 +136,25 @@ def broadcast_traced(arguments: Mapping[str, ArrayLike]) -> list[Any]:
     if dtype == np.float32:
         _warn_of_float32()
     arrays = [_as_ambient(name, value, dtype) for name, value in arguments.items()]
-    shape = join_shapes((name, np.shape(array)) for name, array in zip(arguments, arrays, strict=True))
-    return [array if np.shape(array) == shape else jnp.broadcast_to(array, shape) for array in arrays]
+    join_shapes((name, np.shape(array)) for name, array in zip(arguments, arrays, strict=True))
+    return arrays
+
+
+def broadcast_traced(arguments: Mapping[str, ArrayLike]) -> list[Any]:
+    """Convert arguments, some of them traced by JAX, to arrays of a common shape in JAX's default float type."""
+    import jax.numpy as jnp
+
+    return jnp.broadcast_arrays(*convert_for_jax(arguments))
+
+
+def precision(values: Iterable[ArrayLike]) -> AbstractContextManager[Any]:
+    """Return a context in which JAX computes in float64, unless it traces one of the values."""
+    import jax
+
+    if is_traced(*values):
+        return nullcontext()
+    # Inside `jit`, JAX also traces operations on other values, for which it must not be in float64.
+    return compute_concretely() if is_traced(jax.numpy.asarray(0.0)) else jax.enable_x64(True)
 
 
 def _as_ambient(name: str, value: ArrayLike, dtype: Any) -> Any:
@@ -218,12 +235,13 @@ def evaluate(
             with np.errstate(all="ignore"):
                 result = kernel(*numbers, *static)
             return result if isinstance(result, np.generic) else tree_map(_plain, result)
-    if is_traced(*values):
-        return compile_traced(kernel, static)(*broadcast_traced(arguments))
+    if any(map(is_jax, values)):
+        with precision(values):
+            return compile_kernel(kernel, static, weight)(*convert_for_jax(arguments))
     arrays = broadcast(arguments)
     shape = arrays[0].shape
     flat = evaluate_columns(kernel, [array.reshape(-1) for array in arrays], *static, weight=weight, route=route)
-    return to_caller(tree_map(lambda leaf: leaf.reshape(shape), flat), values)
+    return tree_map(lambda leaf: np.asarray(leaf.reshape(shape))[()], flat)
 
 
 def evaluate_columns(
@@ -256,95 +274,92 @@ def _plain(leaf: Any) -> Any:
     return leaf if isinstance(leaf, np.generic) else np.asarray(leaf)[()]
 
 
-@cache
-def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
-    """Return a kernel compiled for traced values, with a rule that computes its derivatives elementwise.
+# Largest number of compiled kernels, and of their derivatives, that are kept.
+CACHED_KERNELS = 256
+
+
+@lru_cache(CACHED_KERNELS)
+def compile_kernel(kernel: Callable[..., Any], static: tuple[Any, ...], weight: int = 1) -> Callable[..., Any]:
+    """Return a kernel compiled by JAX as a function of arrays that broadcast, which JAX can differentiate to any order.
 
     Args:
-        kernel: function of arrays and ``static``.
+        kernel: function of arrays of one shape and ``static``.
         static: further arguments of the kernel, which are constants at compilation.
+        weight: memory of a point relative to a simple kernel.
     """
-    # Define the derivatives by a rule, because the result at a point depends only on the arguments at this point: its
-    # tangent is a sum of one product per argument. Without the rule, `jax.grad` outside `jit` would compile a program
-    # that returns every intermediate result, which takes 1.2 to 1.5 times as long for the ridge
-    # (benchmarks/bench_xla.py).
     import jax
 
-    def plain(*arrays: Any) -> Any:
-        return kernel(*arrays, *static)
+    function = differentiate_elementwise(lambda *arrays: kernel(*arrays, *static))
 
-    def by_argument(active: tuple[bool, ...], *arrays: Any) -> tuple[Any, Any]:
-        """Return the kernel's values, and their derivatives in the ``active`` arguments along a new first axis."""
-        moving = [k for k, moves in enumerate(active) if moves]
+    @jax.jit
+    def whole(*arrays: Any) -> Any:
+        return _map_in_blocks(function, jax.numpy.broadcast_arrays(*arrays), BLOCK // weight)
 
-        def of_moving(*values: Any) -> Any:
-            varied = dict(zip(moving, values, strict=True))
-            return plain(*(varied.get(k, array) for k, array in enumerate(arrays)))
+    return whole
 
-        points = tuple(arrays[k] for k in moving)
-        ones = jax.numpy.ones_like(points[0])
-        if len(moving) == 1:
-            value, slopes = jax.jvp(of_moving, points, (ones,))
-            return value, tree_map(lambda leaf: leaf[None], slopes)
-        sides = tuple(
-            side.reshape(-1, *(1,) * ones.ndim) * ones[None] for side in np.eye(len(moving), dtype=ones.dtype)
-        )
-        # Compute the values once, not once per argument, and make XLA store the derivatives, because several products
-        # use them.
-        value, slopes = jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
-        return value, tree_map(
-            lambda leaf: leaf if leaf.dtype == jax.dtypes.float0 else materialize(leaf, leaf), slopes
-        )
 
-    function = jax.custom_jvp(jax.jit(plain))
+def differentiate_elementwise(kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a kernel as a JAX function whose derivatives, of any order, are computed elementwise.
+
+    A result at a point depends only on the arguments at this point. Its tangent is therefore a sum of one product per
+    argument, and a gradient stores one partial derivative per argument, instead of all intermediate results.
+    """
+    import jax
+
+    function = jax.custom_jvp(kernel)
 
     @cache
-    def sloped(active: tuple[bool, ...]) -> Callable[..., Any]:
-        """Return a compiled function for the kernel's values and their derivatives in the ``active`` arguments."""
-        # Define a derivative rule for the compiled function as well. Without it, `jax.grad` would separate the terms
-        # that are linear in the tangents in each equation of the function, which takes twice as long.
-        compiled = jax.jit(partial(by_argument, active))
-        whole = jax.custom_jvp(compiled)
-        whole.defjvp(lambda primals, tangents: jax.jvp(compiled, primals, tangents))
-        return whole
+    def add_partials(moving: tuple[int, ...]) -> Callable[..., Any]:
+        """Return the kernel with, for each argument that moves, the derivatives of all real results."""
+
+        def compute(*arrays: Any) -> tuple[Any, list[list[Any]]]:
+            value, partials = None, []
+            for k in moving:
+                one = jax.numpy.ones_like(arrays[k])
+                value, change = jax.jvp(lambda x, k=k: kernel(*arrays[:k], x, *arrays[k + 1 :]), (arrays[k],), (one,))
+                partials.append([leaf for leaf in jax.tree.leaves(change) if leaf.dtype != jax.dtypes.float0])
+            return value, partials
+
+        return differentiate_elementwise(compute)
 
     def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-        active = tuple(not isinstance(tangent, jax.custom_derivatives.SymbolicZero) for tangent in tangents)
-        if not any(active):
-            return function(*primals), tree_map(_no_change, function(*primals))
-        value, sides = sloped(active)(*primals)
-        moving = [tangent for tangent, moves in zip(tangents, active, strict=True) if moves]
+        moving = tuple(k for k, t in enumerate(tangents) if not isinstance(t, jax.custom_derivatives.SymbolicZero))
+        value, partials = add_partials(moving)(*primals)
+        real = iter(zip(*partials, strict=True))
 
-        def change(leaf: Any, by: Any) -> Any:
+        def change(leaf: Any) -> Any:
             if not jax.numpy.issubdtype(leaf.dtype, np.inexact):
-                return _no_change(leaf)
-            # Multiply by `jax.lax.mul`, because the product of `jax.numpy` compiles a program even if an argument is
-            # constant.
-            parts = [jax.lax.mul(by[k], tangent) for k, tangent in enumerate(moving)]
-            return sum(parts[1:], parts[0])
+                return np.zeros(leaf.shape, jax.dtypes.float0)
+            return sum(partial * tangents[k] for k, partial in zip(moving, next(real), strict=True))
 
-        return value, tree_map(change, value, sides)
+        return value, jax.tree.map(change, value)
 
     function.defjvp(rule, symbolic_zeros=True)
     return function
 
 
-def _no_change(leaf: Any) -> Any:
-    """Return a zero tangent of the right type, for a constant result or one whose type has no derivative."""
+def _map_in_blocks(function: Callable[..., Any], arrays: Sequence[Any], block: int) -> Any:
+    """Apply a function to arrays that JAX traces; on a processor, to ``block`` points at a time."""
     import jax
+    import jax.numpy as jnp
 
-    if jax.numpy.issubdtype(leaf.dtype, np.inexact):
-        return jax.numpy.zeros_like(leaf)
-    return np.zeros(leaf.shape, jax.dtypes.float0)
+    shape, size = arrays[0].shape, arrays[0].size
+    # Intermediate results of a block fit in the cache: with 2^16 points per block, a million verdicts take 0.4 of the
+    # time and maxima of the stiffness half of it. Several devices share one array, of which a block is not local.
+    if size <= block or jax.default_backend() != "cpu" or jax.device_count() > 1:
+        return function(*arrays)
+    count = -(-size // block)
+    columns = [jnp.pad(a.reshape(-1), (0, count * block - size), mode="edge").reshape(count, block) for a in arrays]
+    results = jax.lax.map(lambda parts: function(*parts), columns)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1)[:size].reshape(shape), results)
 
 
-@cache
+@lru_cache(CACHED_KERNELS)
 def compile_columns(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
     """Return a function of columns that evaluates the kernel in code compiled by JAX."""
-    import jax
 
     def whole(*columns: Any) -> Any:
         count = count_points(columns)
         return kernel(*(column[0] if column.size == 1 < count else column for column in columns), *static)
 
-    return jax.jit(whole, compiler_options=filter_options(WIDE))
+    return compile_with_options(whole, WIDE)

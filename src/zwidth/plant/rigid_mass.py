@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.core.types import Array
-from zwidth.core.xp import horner, is_traced, namespace, nan_unless
+from zwidth.core.xp import horner, is_jax, namespace, nan_unless
 from zwidth.numerics.evaluate import as_float64
 from zwidth.units.quantities import LARGEST_DAMPING, LONGEST_DELAY
 
@@ -190,16 +190,15 @@ class DelayClasses(NamedTuple):
     fractional: bool  # not an integer
 
 
-# All three classes. The value of a delay traced by JAX is unknown at compilation, so the kernel needs the code for all
-# classes.
+# All three classes. The values of JAX arrays are unknown at compilation, so the kernel needs the code for all classes.
 ANY = DelayClasses(True, True, True)
 
 
 def classify_delays(d: Any) -> DelayClasses:
-    """Return the classes of delays in an array, or `ANY` if JAX traces it; NaN and negative values count as short."""
+    """Return the classes of delays in an array, or `ANY` for a JAX array; NaN and negative values count as short."""
     if isinstance(d, float | int):
         return DelayClasses(not d >= 1, d >= 1, isinstance(d, float) and not d.is_integer())
-    if is_traced(d):
+    if is_jax(d):
         return ANY
     d = as_float64("d", d)
     long = d >= 1

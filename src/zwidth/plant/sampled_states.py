@@ -50,7 +50,7 @@ class SampledStates(NamedTuple):
         xp = namespace(self.psi, points.w)
         zeta = points.z_minus_1[..., None]
         force = self.full + 0j * zeta if self.late is None else zeta * self.late + self.full
-        matrix = zeta[..., None] * xp.eye(self.psi.shape[-1]) - self.psi
+        matrix = zeta[..., None] * xp.broadcast_to(xp.eye(self.psi.shape[-1]), self.psi.shape) - self.psi
         state = xp.linalg.solve(matrix, force[..., None])[..., 0]
         return -power_jet(points, self.lag).value / state[..., 0]
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth.core.types import Array
-from zwidth.core.xp import filter_options
+from zwidth.core.xp import compile_with_options
 from zwidth.plant.transition import Transition
 from zwidth.simulation.parameters import ExternalInputs, Options, Parameters, Settings
 from zwidth.simulation.propagation import BodyState, advance, dot, propagate_with_friction, read, times
@@ -33,11 +33,11 @@ SLACK = 1.0 + 1e-9
 # Use XLA's older loop emitters, and generate the code of a program in one part, because this halves the compile time
 # and does not change the run time. Require full optimization even if XLA_FLAGS sets a lower level, because a simulation
 # runs for thousands of periods.
-COMPILER_OPTIONS = (
-    ("xla_cpu_use_fusion_emitters", False),
-    ("xla_cpu_parallel_codegen_split_count", 1),
-    ("xla_backend_optimization_level", 3),
-)
+COMPILER_OPTIONS = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_parallel_codegen_split_count": 1,
+    "xla_backend_optimization_level": 3,
+}
 
 
 class Controller(NamedTuple):
@@ -379,7 +379,7 @@ def compile_block(options: Options) -> Any:
 
         return jax.lax.fori_loop(0, jnp.minimum(BLOCK, ends[-1] - inputs.k[0]), one, (state, rows))
 
-    return jax.jit(block, donate_argnums=2, compiler_options=filter_options(*COMPILER_OPTIONS))
+    return compile_with_options(block, COMPILER_OPTIONS, donate_argnums=2)
 
 
 def run_batch(

@@ -98,9 +98,10 @@ def find_phase_crossovers(loop: OpenLoop, most: int | None = None) -> Array:
     inner = OpenLoop(loop.respond, loop.w[..., :-1], Jet(*(part[..., :-1] for part in loop.L)))
     w = _find_zeros(inner, phase_sine, most)
     w = xp.concatenate([w, xp.full_like(w, np.pi, shape=(*w.shape[:-1], 1))], -1)
-    L = loop.respond(w)
-    # Exclude zeros of L, where the phase jumps: for no gain is L = -1 at these angles, so no pole can lie there.
-    is_crossover = (L.value.real < 0) & (abs(L.value) > ZERO_OF_L * w * abs(L.slope))
+    with np.errstate(all="ignore"):
+        L = loop.respond(w)
+        # Exclude zeros of L, where the phase jumps: for no gain is L = -1 at these angles, so no pole can lie there.
+        is_crossover = (L.value.real < 0) & (abs(L.value) > ZERO_OF_L * w * abs(L.slope))
     return xp.where(is_crossover, w, np.nan)
 
 

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from zwidth.analysis.batch import stiffest_walls
 from zwidth.analysis.scene import Scene
 from zwidth.config.sweep import SweepStudy
 from zwidth.core.errors import InputError, ZwidthError
@@ -258,19 +259,14 @@ def compute_scenes(
         name: np.zeros(shape, bool) if OUTPUTS[name].dtype == "bool" else np.full(shape, np.nan) for name in outputs
     }
     status = np.full(shape, Status.OK, np.uint8)
+    if family == "device":
+        return _compute_stiffest(results, status, study, block)
     for k in range(devices):
         values = {name: float(column[k]) for name, column in block.parameters.items()}
         try:
             scene = _reuse_equal_scene(study.make_scene(values))
-            if family == "wall":
-                walls = block.stiffness[k][:, None], block.virtual_damping[k][None, :]
-                outputs_k, status_k = _compute_walls(scene, outputs, *walls)
-            else:
-                best = scene.max_stiffness()
-                outputs_k, status_k = (
-                    {"stiffness_max": best.stiffness, "virtual_damping_at_max": best.virtual_damping},
-                    best.status,
-                )
+            walls = block.stiffness[k][:, None], block.virtual_damping[k][None, :]
+            outputs_k, status_k = _compute_walls(scene, outputs, *walls)
         except InputError:
             status[k] = Status.INVALID_INPUT
             continue
@@ -281,6 +277,25 @@ def compute_scenes(
         for name in outputs:
             results[name][k] = outputs_k[name]
     return {**results, STATUS_OF[family]: status}
+
+
+def _compute_stiffest(
+    results: dict[str, np.ndarray], status: np.ndarray, study: SweepStudy, block: SceneBlock
+) -> dict[str, np.ndarray]:
+    """Compute the stiffest stable wall of each device of a block, into prepared arrays of shape (D,)."""
+    scenes = []
+    for k in range(status.size):
+        try:
+            scenes.append(study.make_scene({name: float(column[k]) for name, column in block.parameters.items()}))
+        except InputError:
+            status[k] = Status.INVALID_INPUT
+    valid = np.flatnonzero(status == Status.OK)
+    walls = stiffest_walls(scenes)
+    status[valid] = walls.status
+    values = {"stiffness_max": walls.stiffness, "virtual_damping_at_max": walls.virtual_damping}
+    for name, column in results.items():
+        column[valid] = values[name]
+    return {**results, STATUS_OF["device"]: status}
 
 
 def _compute_walls(

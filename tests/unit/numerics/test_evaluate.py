@@ -17,7 +17,7 @@ import xarray
 
 import zwidth
 from zwidth.core.errors import InputError, PrecisionWarning
-from zwidth.core.xp import filter_options, is_jax, is_traced, namespace
+from zwidth.core.xp import WIDE, compile_with_options, is_jax, is_traced, namespace
 from zwidth.numerics import evaluate as module
 from zwidth.numerics.blocks import map_blocks
 from zwidth.numerics.evaluate import FEW, as_float64, check_scalars, evaluate, evaluate_columns
@@ -182,7 +182,7 @@ def test_partially_imported_jax_module_is_ignored(monkeypatch):
     assert not is_traced(object())
 
 
-def test_filter_options_omits_options_unknown_to_xla():
-    valid = "xla_cpu_prefer_vector_width", 256
-    assert filter_options(valid, ("xla_option_of_no_release", 1)) == dict([valid])
-    assert filter_options(("xla_option_of_no_release", 1)) == {}
+@pytest.mark.parametrize("options", [WIDE, {"xla_option_of_no_release": 1}])
+def test_compiler_options_that_xla_rejects_are_omitted(options):
+    double = compile_with_options(lambda x: 2 * x, options)
+    assert [float(double(x)) for x in (1.0, 2.0)] == [2.0, 4.0]

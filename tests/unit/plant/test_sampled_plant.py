@@ -88,7 +88,7 @@ def test_plants_compute_with_jax_arrays(x64):
     np.testing.assert_allclose(by_d, (near[2] - near[3]) / (2 * step), rtol=1e-6)
 
 
-def test_states_of_many_chains_equal_those_of_each_chain():
+def test_states_of_many_chains_equal_those_of_each_chain(x64):
     delta, rate, d = np.array([0.0, 0.1, 0.5]), np.array([0.2, 0.7, 2.0]), np.array([1.0, 1.3, 1.9])
 
     def build_chain(delta, rate, d):
@@ -102,9 +102,10 @@ def test_states_of_many_chains_equal_those_of_each_chain():
         single = SampledStates._make((*(part[k] for part in many[:3]), 1))
         np.testing.assert_allclose(single.controller(POINTS), states.controller(POINTS), rtol=1e-12)
         np.testing.assert_allclose(single.realize().A, realized.A[k], rtol=0)
-    # The leading axes of the matrices broadcast with the points.
+    # The leading axes of the matrices broadcast with the points, also for JAX arrays of equal rank.
     columns = SampledStates._make((*(part[:, None] for part in many[:3]), 1))
-    assert columns.controller(POINTS).shape == (3, 7)
+    on_device, points = jax.tree.map(jnp.asarray, columns), circle_points(jnp.asarray(POINTS.w)[None])
+    np.testing.assert_allclose(jax.jit(on_device.controller)(points), columns.controller(POINTS), rtol=1e-12)
 
 
 @pytest.mark.parametrize("pole", [0, 0.0, -2, -1e-20, 0.3 + 4j])

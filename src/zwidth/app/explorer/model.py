@@ -23,6 +23,7 @@ import numpy as np
 
 from zwidth.analysis.assessment import Assessment, assess, limits_of, round_margin, trace_passivity_boundary
 from zwidth.analysis.scene import Scene
+from zwidth.analysis.walls import allows_negative
 from zwidth.app.printing import format_row, list_slopes, name_verdict, spell_decay, spell_radius
 from zwidth.app.verdict import write_check
 from zwidth.model.device import Device
@@ -142,7 +143,7 @@ def compute_ridge(scene: Scene) -> Curve:
     """Return the stiffest stable walls as the damping of the device rises from 0 to four times its current value."""
     most = _MOST_DAMPING * (float(scene.device.damping) or 0.25 * scene.units.virtual_damping)
     dampings = np.linspace(0.0, most, min(_RIDGE_POINTS, 1 + scene.loop.draws // 25))
-    return scene.loop.vary({"damping": dampings}).stiffest()
+    return scene.loop.vary({"damping": dampings}).stiffest(allows_negative(scene, None))
 
 
 def simulate_hit(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:

@@ -1,4 +1,4 @@
-"""Find the stiffest stable wall of any linear loop, its active constraints, and its derivatives in the parameters.
+"""Find the stiffest stable wall of any linear loop and its active constraints.
 
 The maximum of alpha over the stable set is a smooth maximum of an edge, a corner where two crossings with the boundary
 coincide, or, if only beta >= 0 is allowed, a crossing on the line beta = 0. It solves two conditions on
@@ -7,9 +7,11 @@ coincide, or, if only beta >= 0 is allowed, a crossing on the line beta = 0. It 
     first     r(e^(j w1)) = 0 for a pole pair, or for a real pole at z = -1 or z = 1
     second    the same at w2; or alpha is stationary along the curve of the first condition; or beta = 0
 
-As a parameter changes, the same conditions remain active, so their implicit derivatives are those of alpha (V21). In
-arrays of crossings, a *row* belongs to a line of constant B and a *column* to an arc or crossing line, as in
-`stability.linear.boundary`. A *main* piece of the stable set is one that is connected to K = 0
+As a parameter changes, the same conditions remain active, so their implicit derivatives are those of alpha (V21;
+`stability.linear.derivatives`). In arrays of crossings, a *row* belongs to a line of constant B and a *column* to an
+arc or crossing line, as in `stability.linear.boundary`.
+
+A *main* piece of the stable set is one that is connected to K = 0
 (`stability.linear.regions`).
 """
 
@@ -18,23 +20,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.core.errors import InputError
-from zwidth.core.status import RidgeKind, Status
-from zwidth.core.types import Array
-from zwidth.model.circle_functions import CirclePoints, circle_points, power_jet
-from zwidth.model.mechanism import build_chain
-from zwidth.plant.sampled_states import integrate_chain
+from zwidth.core.status import RidgeKind
 from zwidth.stability.linear.boundary import Boundary
 from zwidth.stability.linear.curve import evaluate_curve
 from zwidth.stability.linear.regions import StableSet
-from zwidth.stability.linear.roots import LoopRoots
 from zwidth.stability.linear.rows import find_stable_intervals
-from zwidth.units.display import compact_repr
-from zwidth.units.quantities import WALL
 
 # Settings of the search for corners.
 CORNER_TOLERANCE = 1e-8  # difference of the two crossings in alpha at a corner, relative to alpha
@@ -220,183 +214,3 @@ def _find_nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[floa
     heights = row.alpha[0, near]
     step = (heights[1] - heights[0]) / ((slopes[0] - slopes[1]) or np.inf)
     return row.w[0, near].tolist(), heights.tolist(), slopes.tolist(), float(step)
-
-
-def _differentiate_conditions(loop: LoopRoots, ridge: RidgeSolution) -> tuple[np.ndarray, list[int]]:
-    """Return the Jacobian of the active constraints with respect to the free unknowns.
-
-    The five possible equations are Re r and Im r at w1, the same at w2, and Im dr/dw at w1; the unknowns are alpha,
-    beta, w1 and w2. An angle is free only if it belongs to a pole pair. At a smooth maximum w1 may stay fixed, because
-    it changes alpha only to second order (envelope theorem).
-
-    Returns:
-        The square Jacobian, and the indices of its equations.
-    """
-    points = circle_points(np.array([ridge.w1, ridge.w2]))
-    with np.errstate(all="ignore"):
-        q, f = loop.evaluate_controller(points), loop.estimate.jet(points)
-        slope = ridge.beta * f.slope - q.slope
-    matrix = np.zeros((5, 4))
-    matrix[[0, 2], 0] = 1.0
-    matrix[:, 1] = _stack_equations(f.value, f.slope)
-    matrix[:2, 2], matrix[2:4, 3] = _stack_equations(slope, slope)[:4].reshape(2, 2)
-    is_pair = ridge.first == Condition.PAIR, ridge.second == Condition.PAIR
-    equations, unknowns = [0, 1] if is_pair[0] else [0], [0]
-    if ridge.second != Condition.NO_DAMPING:
-        unknowns.append(1)
-    if ridge.second <= Condition.PLUS_ONE:
-        equations += [2, 3] if is_pair[1] else [2]
-    elif ridge.second == Condition.STATIONARY and not is_pair[0]:
-        equations.append(4)
-    if ridge.second != Condition.STATIONARY:
-        unknowns += [2 + k for k in range(2) if is_pair[k]]
-    return matrix[np.ix_(equations, unknowns)], equations
-
-
-def _stack_equations(value: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the five equations, or their derivatives, for given r and dr/dw (or their derivatives) at two angles."""
-    return np.array([value[0].real, value[0].imag, value[1].real, value[1].imag, slope[0].imag])
-
-
-DIFFERENCE_STEP = 1e-3  # step relative to the parameter; the truncation error is of the order of its sixth power
-COMPLEX_STEP = 1e-30  # imaginary step; its square is negligible
-# Fraction of its unit below which the step of a parameter is relative to the unit and not to the value, because steps
-# relative to such small values caused rounding errors of the derivative of up to 3e-6.
-SMALL_PARAMETER = 1e-5
-# Sixth-order finite differences: pairs of offset (in steps) and weight of the central difference, and the weights of
-# the one-sided difference at 0, 1, ... 6 steps.
-CENTRAL_DIFFERENCE = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
-ONE_SIDED_DIFFERENCE = [-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6]
-RESPONSE_TOLERANCE = 1e-8  # largest relative difference of G by the matrices of the chain and by its roots
-
-
-@compact_repr()
-class SceneSensitivities(NamedTuple):
-    """K_max in N/m, its derivatives by dotted path in N/m per unit of the parameter, and the `zwidth.Status`."""
-
-    stiffness: Array
-    per: dict[str, float]
-    status: Array
-
-
-def compute_sensitivities(scene: Any, ridge: RidgeSolution | None, status: Status) -> SceneSensitivities:
-    """Return K_max and its derivatives in all parameters of a scene; NaN if ``ridge`` is None."""
-    paths = list_ridge_parameters(scene)
-    if ridge is None:
-        return SceneSensitivities(np.float64(math.nan), dict.fromkeys(paths, math.nan), np.int32(status))
-    per = {path: differentiate_stiffness(scene, ridge, path) for path in paths}
-    status = Status.NOT_CONVERGED if any(math.isnan(slope) for slope in per.values()) else status
-    return SceneSensitivities(np.float64(ridge.alpha * scene.units.stiffness), per, np.int32(status))
-
-
-def list_ridge_parameters(scene: Any) -> tuple[str, ...]:
-    """Return the dotted paths of the real-valued parameters of a scene on which K_max depends."""
-    paths = [path for path, value in scene.parameters().items() if not isinstance(value, int | np.integer)]
-    rigid = scene.operator is not None and scene.operator.rigid
-    excluded = (*WALL, "operator.coupling_damping") if rigid else WALL
-    return tuple(path for path in paths if path not in excluded)
-
-
-def differentiate_stiffness(scene: Any, ridge: RidgeSolution, path: str) -> float:
-    """Return the derivative of K_max in one parameter, with the same active constraints (V21); NaN if inaccurate."""
-    matrix, equations = _differentiate_conditions(scene.loop.roots, ridge)
-    points = circle_points(np.array([ridge.w1, ridge.w2]))
-    # Reduce the integer delay by one if the period changes and the delay is an integer: a longer period shortens a
-    # delay measured in periods, so the delay becomes a fractional one with a smaller integer part.
-    n = scene.integer_delay - (path == "period" and scene.d == scene.integer_delay > 0)
-    for weights in _list_differences(scene, path):
-        try:
-            states = [
-                [weight * part for part in _collect_dependencies(scene.replace(**{path: value}), n, points)]
-                for value, weight in weights
-            ]
-        except InputError:
-            # Try the next, one-sided difference, because the value of the parameter is at an end of its range.
-            continue
-        d_unit, d_delay, d_A, d_B, d_f, d_f_slope = (np.sum(part, axis=0) for part in zip(*states, strict=True))
-        q, q_slope = _differentiate_controller(scene, n, points, d_A, d_B, d_delay)
-        residual, slope = ridge.beta * d_f - q, ridge.beta * d_f_slope - q_slope
-        try:
-            d_alpha = -np.linalg.solve(matrix, _stack_equations(residual, slope)[equations])[0]
-        except np.linalg.LinAlgError:
-            break
-        return float(scene.units.stiffness * d_alpha + ridge.alpha * d_unit)
-    return math.nan
-
-
-def _collect_dependencies(scene: Any, n: int, points: CirclePoints) -> tuple[Any, ...]:
-    """Return the quantities that determine K_max: unit of stiffness, delay, A, B, and F and dF/dw at two angles."""
-    delay = scene.timing.delay / scene.timing.period
-    chain = build_chain(scene, (delay, n))
-    if chain.sampled:
-        # Raise an error if the loop's period differs from that of a sampled system.
-        chain.check()
-    return (scene.units.stiffness, delay, *chain.realize()[:2], *chain.estimate.jet(points))
-
-
-def _differentiate_controller(
-    scene: Any, n: int, points: CirclePoints, d_A: np.ndarray, d_B: np.ndarray, d_delay: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of q and dq/dw with respect to a parameter, by the chain rule.
-
-    Args:
-        scene: the scene.
-        n: integer delay.
-        points: the two angles of the ridge.
-        d_A: derivative of the matrix A of the chain in the parameter.
-        d_B: derivative of its matrix B.
-        d_delay: derivative of the delay in periods.
-
-    Returns:
-        Both derivatives at the angles; NaN where G by the matrices of the chain differs from G by its roots, because
-        rounding errors then dominate.
-    """
-    chain = scene.loop.chain
-    # Differentiate the discretization by the complex-step method, because it has no cancellation.
-    A, B = (value + 1j * COMPLEX_STEP * d for value, d in zip(chain.realize(), (d_A, d_B), strict=False))
-    fraction = chain.d - n + 1j * COMPLEX_STEP * d_delay
-    steps = (
-        *integrate_chain(chain, A, B, 1.0),
-        integrate_chain(chain, A, B, 1.0 - fraction)[1],
-    )
-    (psi, full, late), (d_psi, d_full, d_late) = (
-        [f(x) for x in steps] for f in (np.real, lambda x: x.imag / COMPLEX_STEP)
-    )
-    lag, slopes = n + 1, np.full((2, points.w.size), complex(np.nan, np.nan))
-    exact, z_power = scene.loop.roots.evaluate_controller(points).value, power_jet(points, lag)
-    for k, (zeta, zeta_slope) in enumerate(zip(points.z_minus_1, 1j * points.z, strict=True)):
-        with np.errstate(all="ignore"):
-            try:
-                inverse = np.linalg.inv(zeta * np.eye(len(psi)) - psi)
-            except np.linalg.LinAlgError:
-                continue
-            # Compute the state x = (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1)), and its derivatives in w, in the
-            # parameter p, and in both.
-            x = inverse @ (zeta * late + full)
-            x_w = inverse @ (zeta_slope * late - zeta_slope * x)
-            x_p = inverse @ (d_psi @ x + zeta * d_late + d_full)
-            x_wp = inverse @ (d_psi @ x_w + zeta_slope * d_late - zeta_slope * x_p)
-            value, slope = z_power.value[k] / x[0] ** 2, z_power.slope[k] / x[0] ** 2
-            if abs(z_power.value[k] / x[0] + exact[k]) <= RESPONSE_TOLERANCE * abs(exact[k]):
-                slopes[0, k] = value * x_p[0]
-                slopes[1, k] = slope * x_p[0] + value * (x_wp[0] - 2.0 * x_p[0] * x_w[0] / x[0])
-    return slopes[0], slopes[1]
-
-
-def _list_differences(scene: Any, path: str) -> Iterator[list[tuple[float, float]]]:
-    """Yield sixth-order finite differences for a parameter: central, above its value, and below its value.
-
-    Each is a list of values of the parameter and their weights.
-    """
-    value = float(scene.parameters()[path])
-    period = float(scene.timing.period)
-    units = {"mass": scene.mass, "damping": scene.mass / period, "stiffness": scene.mass / period**2, "delay": period}
-    unit = float(next((unit for name, unit in units.items() if path.endswith(name)), 0.0))
-    # A step relative to the unit is accurate, because A and B are linear in dampings and stiffnesses and smooth in the
-    # delay. For a mass the step must be relative to the value, because A and B depend on its inverse.
-    least = 0.0 if path.endswith("mass") else SMALL_PARAMETER * unit
-    step = DIFFERENCE_STEP * (abs(value) if abs(value) > least else unit)
-    yield from ([[(value + k * step, weight / step) for k, weight in CENTRAL_DIFFERENCE]] if value > 3.0 * step else [])
-    yield from (
-        [(value + side * k * step, side * w / step) for k, w in enumerate(ONE_SIDED_DIFFERENCE)] for side in (1, -1)
-    )

@@ -106,24 +106,26 @@ class Wave(NamedTuple):
     inverses: Any = None  # 1/s and 1/cos(omega/2)
 
 
-def evaluate_wave(s: Array, n: Array, undelayed: bool = False) -> Wave:
+def evaluate_wave(s: Array, n: Array, undelayed: bool = False, low: bool = False) -> Wave:
     """Return the terms of a frequency on the lobe, with derivatives that are finite up to omega = pi.
 
     Args:
         s: sin(omega/2), 0 < s <= 1; s = 1 only for n = 0.
         n: Integer delay, or the delay d for the paper's z^(1+d).
         undelayed: True if n = 0 for all points.
+        low: True if omega < pi/2 for all points, as on the lobe for n >= 1.
     """
     xp = namespace(s, n)
     y, q = s * s, (1.0 - s) * (1.0 + s)
     cos_w = q - y
     # Replace cos(omega/2) by 1 at the corner (y = 1) to avoid a division by 0. The quotients are not used there,
     # because n is 0.
-    cos_half = xp.sqrt(xp.where(s < 1.0, q, 1.0))
+    cos_half = xp.sqrt(q if low else xp.where(s < 1.0, q, 1.0))
     is_low = y < 0.5
-    small = xp.where(is_low, s, cos_half)
+    small = s if low else xp.where(is_low, s, cos_half)
     half_omega = small * horner(4.0 * small * small - 1.0, ARCSINE)
-    half_omega = xp.where(is_low, half_omega, 0.5 * np.pi - half_omega)
+    if not low:
+        half_omega = xp.where(is_low, half_omega, 0.5 * np.pi - half_omega)
     # Divide only once, because XLA fuses the operations before and after a quotient into separate loops.
     per_sin = 1.0 / (s * cos_half)
     per_cos = s * per_sin

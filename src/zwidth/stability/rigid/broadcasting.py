@@ -19,7 +19,7 @@ import numpy as np
 
 from zwidth.core.errors import TracedDelayError
 from zwidth.core.types import ArrayLike
-from zwidth.core.xp import is_traced
+from zwidth.core.xp import is_jax, is_traced, lazy_jax, namespace
 from zwidth.numerics.evaluate import (
     FEW,
     Route,
@@ -29,7 +29,7 @@ from zwidth.numerics.evaluate import (
     check_scalars,
     evaluate_columns,
     join_shapes,
-    to_caller,
+    precision,
 )
 from zwidth.stability.reference import Degree
 from zwidth.units.quantities import LONGEST_DELAY
@@ -57,25 +57,31 @@ def map_by_degree(
         values: alpha, beta, delta and d; the delays may differ.
         *static: Further arguments of the kernel.
         lead: Fill shorter vectors with leading zeros, for coefficients; otherwise with NaN at the end, for poles.
-        route: Route of `evaluate_columns`; with "numpy" the kernel receives all points of a degree at once.
+        route: Route of `evaluate_columns`; with "numpy" the kernel receives all points of a degree at once. JAX arrays
+            are computed by compiled code.
 
     Returns:
         Array of the broadcast shape with an additional last axis, whose length is that of the longest vector.
     """
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
-    traced = is_traced(*values)
-    if traced:
+    if any(map(is_jax, values)):
         if is_traced(values[-1]):
             raise TracedDelayError(
                 "d: got a traced value, but the number of poles depends on it; pass d as a plain number, "
                 "for example through jit's static_argnums or a closure"
             )
-        delays, arrays = as_float64("d", values[-1]), broadcast_traced(arguments)
-        import jax.numpy as xp
-    else:
-        arrays, xp = broadcast(arguments), np
-        delays = arrays[-1]
+        with precision(values):
+            return _join_degrees(kernel, broadcast_traced(arguments), as_float64("d", values[-1]), static, lead)
+    arrays = broadcast(arguments)
+    return _join_degrees(kernel, arrays, arrays[-1], static, lead, route)
+
+
+def _join_degrees(
+    kernel: Callable[..., Any], arrays: list[Any], delays: np.ndarray, static: tuple, lead: bool, route: Route = "auto"
+) -> Any:
+    """Return the vectors of all points for arrays of one shape; ``delays`` are the values of d, in NumPy."""
+    xp = namespace(*arrays)
     shape = np.shape(arrays[0])
     columns: list[Any] = [xp.reshape(array, -1) for array in arrays]
     # Replace delays out of range by 0, so that they do not affect the length of the result.
@@ -83,7 +89,10 @@ def map_by_degree(
     vectors, indices = [], []
     for delay, group, index in group_by_value(tuple(columns), 0.5 * (np.floor(defined) + np.ceil(defined))):
         degree = find_degree(delay)
-        if traced or route == "numpy":
+        if xp is not np:
+            constants = range(len(group), len(group) + 1 + len(static))
+            vectors.append(lazy_jax.jit(kernel, static_argnums=constants)(*group, degree, *static))
+        elif route == "numpy":
             with np.errstate(all="ignore"):
                 vectors.append(kernel(*group, degree, *static))
         else:
@@ -96,8 +105,7 @@ def map_by_degree(
     if others:
         order = np.argsort(np.concatenate(indices), kind="stable")
         result = xp.concatenate([_pad_vectors(vector, longest, lead, xp) for vector in vectors])[order]
-    result = result.reshape(*shape, longest)
-    return result if traced else to_caller(result, values)
+    return result.reshape(*shape, longest)
 
 
 def _pad_vectors(part: Any, longest: int, lead: bool, xp: Any) -> Any:

@@ -174,7 +174,7 @@ def decide_long_delay(
     # Evaluate E and F = H sin w, the real and imaginary part of (z - c) conj M.
     E, F = horner(y, curve.E), sin_half * cos_half * horner(y, curve.H) * 2.0
     cos_full = phase.cosine * cos_half - phase.sine * sin_half  # cos((n + 1) w)
-    # Compute the boundary point, multiplied by V cos(w/2) > 0 (boundary.md, B1, second form):
+    # Compute the boundary point, multiplied by V cos(w/2) > 0 (boundary.md, B1, with half angles):
     #   alpha_w -> 2 sin(w/2) projection
     #   beta_w  -> sine_F - phase.cosine E
     #   beta_w + delta -> boundary_offset, rearranged so that nothing cancels

@@ -98,13 +98,13 @@ def evaluate_lobe(s: Array, lobe: Lobe) -> CurvePoint:
     if lobe.long_lobe is None:
         return evaluate_short_delay_curve(s * s, lobe.short_curve).divide(s)
     if lobe.short_curve is None:
-        return evaluate_curve(evaluate_wave(s, lobe.plant.whole), lobe.long_lobe.curve).divide(s)
+        return evaluate_curve(evaluate_wave(s, lobe.plant.whole, low=True), lobe.long_lobe.curve).divide(s)
     xp = namespace(s, lobe.d)
     # Evaluate the form that is not selected at a valid s, because a NaN in it would make the derivatives of the
     # selected one NaN, too.
     short_s, long_s = xp.where(lobe.is_short, s, 0.5), xp.where(lobe.is_short, 0.5, s)
     short = evaluate_short_delay_curve(short_s * short_s, lobe.short_curve).divide(short_s)
-    long = evaluate_curve(evaluate_wave(long_s, lobe.plant.whole), lobe.long_lobe.curve).divide(long_s)
+    long = evaluate_curve(evaluate_wave(long_s, lobe.plant.whole, low=True), lobe.long_lobe.curve).divide(long_s)
     return CurvePoint(*(xp.where(lobe.is_short, *pair) for pair in zip(short, long, strict=True)))
 
 

@@ -8,11 +8,13 @@ with the same delay d form one convex set, scaled by delta.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from zwidth.core.types import Array, ArrayLike
-from zwidth.core.xp import is_traced, namespace, nan_with_nan_derivatives, stop_gradient
-from zwidth.numerics.evaluate import as_number, check_scalars, evaluate, to_caller
+from zwidth.core.xp import namespace, nan_with_nan_derivatives, stop_gradient
+from zwidth.numerics.evaluate import as_number, check_scalars, evaluate
 from zwidth.numerics.root_finding import integrate
 from zwidth.plant.rigid_mass import ANY, DelayClasses, classify_delays, is_valid_device
 from zwidth.stability.passivity import limit_margin
@@ -73,11 +75,7 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
         >>> print(f"{zwidth.passivity_margin(0.2, 0.3, 1.0, 0):.2f}")
         0.60
     """
-    values = (alpha, beta, delta, d)
-    arguments = dict(zip(NAMES, values, strict=True))
-    if is_traced(*values):
-        return evaluate(_margin_kernel, arguments, ANY)
-    return evaluate(_margin_kernel, arguments, NO_DELAY if classify_delays(d) == NO_DELAY else ANY)
+    return _evaluate(_margin_kernel, (alpha, beta, delta, d))
 
 
 def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -100,12 +98,18 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         >>> bool(zwidth.is_passive(0.2, 0.3, 1.0, 0)), bool(zwidth.is_passive(0.2, 0.9, 1.0, 0))
         (True, False)
     """
-    values = (alpha, beta, delta, d)
-    margin = passivity_margin(*values)
-    if is_traced(*values):
-        return margin > 0
-    # Compare in NumPy, because JAX would warn about the type outside float64 mode.
-    return to_caller(np.asarray(margin) > 0, values)
+    return _evaluate(_passive_kernel, (alpha, beta, delta, d))
+
+
+def _evaluate(kernel: Callable[..., Array], values: tuple[ArrayLike, ...]) -> Array:
+    """Evaluate a kernel of alpha, beta, delta and d, by its simpler form if no delay differs from 0."""
+    kind = classify_delays(values[3])
+    return evaluate(kernel, dict(zip(NAMES, values, strict=True)), NO_DELAY if kind == NO_DELAY else ANY)
+
+
+def _passive_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
+    """Return whether the wall is passive, elementwise."""
+    return _margin_kernel(alpha, beta, delta, d, kind) > 0
 
 
 def passive_stiffness_slope(d: float) -> tuple[float, float]:

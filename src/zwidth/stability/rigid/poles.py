@@ -20,7 +20,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -28,10 +28,19 @@ import numpy as np
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.status import Status
 from zwidth.core.types import Array, ArrayLike, Coefficients, Radii, RadiiFirst, Reals, Roots, RootsFirst
-from zwidth.core.xp import epsilon, is_traced, iterate, materialize, namespace, nan_with_nan_derivatives
+from zwidth.core.xp import (
+    epsilon,
+    is_jax,
+    is_traced,
+    iterate,
+    lazy_jax,
+    materialize,
+    namespace,
+    nan_with_nan_derivatives,
+)
 from zwidth.numerics.blocks import map_blocks
 from zwidth.numerics.complex_pairs import Pair, make_complex
-from zwidth.numerics.evaluate import as_float64, to_caller
+from zwidth.numerics.evaluate import CACHED_KERNELS, as_float64, precision, to_caller
 from zwidth.numerics.polynomials import abs2, companion
 from zwidth.stability.reference import Degree, compute_poles, expand_loop
 from zwidth.stability.rigid.broadcasting import count_uncompiled_points, find_degree, map_by_degree
@@ -250,7 +259,7 @@ def _check_arguments(values: tuple[ArrayLike, ...], method: str = "companion") -
 def _compute_by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Roots:
     """Return the poles of columns of one degree by eigenvalues; concrete matrices go to LAPACK on all processors."""
     columns = alpha, beta, delta, d
-    if is_traced(*columns):
+    if is_jax(alpha):
         # Compile a single program, because JAX would otherwise compile every operation separately when it
         # differentiates outside `jit`.
         return _compile_by_degree(pole_kernel, degree)(*columns)
@@ -266,7 +275,7 @@ def _compute_by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, deg
     return compute_block(*columns) if few else map_blocks(compute_block, columns, max(1, BLOCK_SIZE // degree.poles**2))
 
 
-@cache
+@lru_cache(CACHED_KERNELS)
 def _compile_by_degree(kernel: Callable[..., Any], degree: Degree) -> Any:
     """Return the compiled kernel for one degree, cached."""
     import jax
@@ -360,6 +369,8 @@ def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, 
         raise InputError(
             "method: 'aberth' falls back on the host; inside a JAX transformation use 'auto' or 'companion'"
         )
+    if method == "aberth" and any(map(is_jax, values)):
+        return to_caller(poles(*map(np.asarray, values), method=method), values)
     return map_by_degree(_find_poles, values, method, route="numpy")
 
 
@@ -367,7 +378,7 @@ def _find_poles(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degre
     """Return the poles of columns of one degree, by Aberth's iteration for many walls of low degree."""
     columns = alpha, beta, delta, d
     few = alpha.size <= count_uncompiled_points(degree)
-    if method == "auto" and (few or is_traced(*columns) or degree.poles > MAX_ABERTH_POLES):
+    if method == "auto" and (few or is_jax(alpha) or degree.poles > MAX_ABERTH_POLES):
         method = "companion"
     if method == "companion":
         return _compute_by_companion(*columns, degree)
@@ -387,11 +398,17 @@ def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: 
     values = (alpha, beta, delta, d)
     _check_arguments(values)
     all_poles = map_by_degree(_compute_by_companion, values, route="numpy")
-    xp = namespace(all_poles) if is_traced(*values) else np
-    z: Any = xp.asarray(all_poles)
+    if is_jax(all_poles):
+        with precision(values):
+            return lazy_jax.jit(_find_largest)(all_poles, lazy_jax.numpy.asarray(alpha))
+    return _find_largest(np.asarray(all_poles), np.asarray(alpha))[()]
+
+
+def _find_largest(z: Any, alpha: Any) -> Reals:
+    """Return the largest magnitude of the poles of each wall, which are along the last axis."""
+    xp = namespace(z)
     # Ignore missing poles: NaN after the other poles of a wall with a lower degree.
     missing = xp.isnan(z.real) & ~xp.isnan(z[..., :1].real)
     radius = xp.max(xp.where(missing, 0.0, xp.abs(z)), axis=-1)
     # Without stiffness one pole is exactly 1, but the computed one has a rounding error.
-    radius = xp.where(xp.asarray(alpha) == 0, xp.maximum(radius, 1.0), radius)
-    return radius if xp is not np else to_caller(radius, values)
+    return xp.where(alpha == 0, xp.maximum(radius, 1.0), radius)

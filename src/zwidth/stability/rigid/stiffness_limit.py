@@ -9,14 +9,16 @@ and all other notation is that of `stability.rigid.boundary_curve`.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.core.types import Array
-from zwidth.core.xp import SINE, horner, iterate, materialize, namespace, nan_beyond
-from zwidth.numerics.evaluate import FEW, Route, evaluate_columns
-from zwidth.plant.rigid_mass import DiscretePlant, discretize_plant
+from zwidth.core.types import Array, ArrayLike
+from zwidth.core.xp import SINE, horner, iterate, materialize, namespace, nan_beyond, within
+from zwidth.numerics.evaluate import FEW, Route, compile_kernel, convert_for_jax, evaluate_columns, precision
+from zwidth.plant.rigid_mass import DelayClasses, DiscretePlant, discretize_plant
 from zwidth.stability.rigid.boundary_curve import (
     Curve,
     CurveTerms,
@@ -26,8 +28,9 @@ from zwidth.stability.rigid.boundary_curve import (
     expand_curve_with_offset,
     expand_short_delay_curve,
 )
-from zwidth.stability.rigid.broadcasting import Points, group_by_value
+from zwidth.stability.rigid.broadcasting import MIN_DENSE_SIZE, Points, group_by_value
 from zwidth.stability.rigid.characteristic_polynomial import expand_wall
+from zwidth.stability.rigid.crossover import stable_kernel
 from zwidth.units.quantities import WALL_RANGE
 
 # Numbers of Newton steps, each of which doubles the number of correct digits.
@@ -101,7 +104,7 @@ def build_long_lobe(plant: DiscretePlant) -> LongLobe:
     curve, n, em = expand_curve_with_offset(plant), plant.whole, plant.em
     xp, D = namespace(plant.delta), n + 1.0
     end = _find_lobe_end(curve, n, em / (plant.p1 + plant.f * em), n + plant.f)
-    wave = evaluate_wave(end, n)
+    wave = evaluate_wave(end, n, low=True)
     terms, end_angle = evaluate_curve(wave, curve), wave.half_omega
     end_b = terms.b / terms.V
     # Approximate the lobe by ``sqrt(b/end_b) = sin(start_angle w/2/end_angle)/sin(start_angle)``, where w/2 = end_angle
@@ -133,7 +136,7 @@ def _find_lobe_end(curve: Curve, n: Array, start_ratio: Array, d: Array) -> Arra
     limit = xp.sin(xp.minimum(0.5 * np.pi / (d + 0.5), 0.5 * np.pi))
 
     def step(s: Array) -> Array:
-        wave = evaluate_wave(s, n)
+        wave = evaluate_wave(s, n, low=True)
         E, H, _, dE, dH, _ = evaluate_polynomials(wave, curve)
         y, q, sin_squared = wave.y, wave.q, 4.0 * wave.y * wave.q
         # The product of sine and cosine of the phase approximates its difference from pi, divided by sin w; take a
@@ -148,7 +151,7 @@ def _find_lobe_end(curve: Curve, n: Array, start_ratio: Array, d: Array) -> Arra
 
     # Use a loop, which compiles five times faster than unrolled steps. It runs more slowly, but only once per device.
     start = 0.5 * np.pi / D * (1.0 + 0.7 * start_ratio / (start_ratio + 1.0 / D))
-    return iterate(END_STEPS, step, xp.sin(0.5 * start), xp)
+    return iterate(END_STEPS, step, xp.sin(0.5 * start), xp, lambda old, new: bool(np.all(old == new)))
 
 
 def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
@@ -169,9 +172,9 @@ def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
     angle = end_angle * (_approximate_arcsine(r * start_sine) / start_angle + start_correction * r * (1.0 - share))
     s = xp.minimum(angle * horner(angle * angle, SINE[:8]), end)
     for _ in range(ROW_STEPS):
-        terms = evaluate_curve(evaluate_wave(s, n), curve)
+        terms = evaluate_curve(evaluate_wave(s, n, low=True), curve)
         s = xp.clip(s - _compute_newton_step(target_b, terms) / s, 0.0, end)
-    terms = evaluate_curve(evaluate_wave(s, n), curve)
+    terms = evaluate_curve(evaluate_wave(s, n, low=True), curve)
     # Add the effect of the last Newton step to alpha V and V, to first order.
     step = _compute_newton_step(target_b, terms)
     limit = (terms.alpha - 2.0 * step * terms.d_alpha) / (terms.V - 2.0 * step * terms.dV)
@@ -201,6 +204,8 @@ def _compute_newton_step(target_b: Array, terms: CurveTerms) -> Array:
 # For smaller grids it is faster to compare each point with its limit.
 MIN_PATTERN_SIZE = 1 << 16
 MIN_PATTERN_ROWS = 8
+# Smallest number of walls per line of constant beta with which JAX computes the limits of the lines.
+MIN_ROW_LENGTH = 32
 
 
 def label_grid(points: Points) -> np.ndarray:
@@ -209,6 +214,47 @@ def label_grid(points: Points) -> np.ndarray:
     # lobe, an error of 1e-15 of the largest limit.
     alpha, beta = nan_beyond(WALL_RANGE, points.alpha, points.beta)
     return _compare_with_limits(alpha, row_limits(beta, points.delta, points.d))
+
+
+def label_jax_arrays(arguments: Mapping[str, ArrayLike], kind: DelayClasses) -> Array:
+    """Return whether each wall is stable, in code compiled by JAX; as `label_grid` does if the shapes form a grid.
+
+    Args:
+        arguments: alpha, beta, delta and d by name, some of them JAX arrays; they broadcast.
+        kind: classes of the delays.
+    """
+    values = arguments.values()
+    with precision(values):
+        arrays = convert_for_jax(arguments)
+        shape, rows = (np.broadcast_shapes(*map(np.shape, parts)) for parts in (arrays, arrays[1:]))
+        if np.prod(shape) >= MIN_DENSE_SIZE and MIN_ROW_LENGTH * np.prod(rows) <= np.prod(shape):
+            return _compile_labels(kind)(*arrays)
+        return compile_kernel(stable_kernel, (kind,))(*arrays)
+
+
+@cache
+def _compile_labels(kind: DelayClasses) -> Callable[..., Array]:
+    """Return a function, compiled by JAX, that compares alpha with the limit of its line of constant beta."""
+    import jax
+    import jax.numpy as jnp
+
+    @jax.jit
+    def label(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+        rank = max(map(jnp.ndim, (alpha, beta, delta, d)))
+        alpha, beta, delta, d = (
+            jnp.reshape(x, (1,) * (rank - jnp.ndim(x)) + jnp.shape(x)) for x in (alpha, beta, delta, d)
+        )
+        limits = [
+            compute(beta, *jnp.broadcast_arrays(delta, d))
+            for compute, occurs in ((_short_limit, kind.short), (_long_limit, kind.long))
+            if occurs
+        ]
+        limit = jnp.where(d < 1.0, *limits) if len(limits) > 1 else limits[0]
+        # Without `materialize`, XLA would repeat the last Newton step and the tests of the range at each point.
+        limit = materialize(jnp.where(within(beta, WALL_RANGE), limit, 0.0), beta)
+        return materialize(jnp.where((alpha > 0.0) & within(alpha, WALL_RANGE), alpha, jnp.inf), alpha) < limit
+
+    return label
 
 
 def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, route: Route = "auto") -> np.ndarray:

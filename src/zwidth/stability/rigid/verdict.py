@@ -18,15 +18,15 @@ import numpy as np
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.status import Method, Status
 from zwidth.core.types import Array, ArrayLike
-from zwidth.core.xp import is_traced
-from zwidth.numerics.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
+from zwidth.core.xp import is_jax, is_traced
+from zwidth.numerics.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, precision, to_caller
 from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.results import Stability
 from zwidth.stability.rigid.broadcasting import NAMES, Points, fold_arguments, restore_shape
 from zwidth.stability.rigid.crossover import stable_kernel
 from zwidth.stability.rigid.normalization import wall_status
 from zwidth.stability.rigid.poles import radius_by_companion
-from zwidth.stability.rigid.stiffness_limit import label_grid
+from zwidth.stability.rigid.stiffness_limit import label_grid, label_jax_arrays
 
 StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
 STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
@@ -81,16 +81,18 @@ def is_stable(
     arguments, numbers = dict(zip(NAMES, values, strict=True)), are_numbers(*values)
     if method != "auto":
         check_choice("method", method, STABILITY_METHODS)
-    if method in ("auto", "crossover") and (numbers or is_traced(*values)):
-        return evaluate(stable_kernel, arguments, classify_delays(d))
+    if method in ("auto", "crossover") and (numbers or any(map(is_jax, values))):
+        kind = classify_delays(d)
+        return evaluate(stable_kernel, arguments, kind) if numbers else label_jax_arrays(arguments, kind)
     check_scalars(arguments)
+    if method == "companion" and any(map(is_jax, values)):
+        with precision(values):
+            return radius_by_companion(*values) < 1.0
     if is_traced(*values):
-        if method == "certified":
-            raise InputError(
-                "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
-                "'auto', 'crossover' or 'companion'"
-            )
-        return radius_by_companion(*values) < 1.0
+        raise InputError(
+            "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
+            "'auto', 'crossover' or 'companion'"
+        )
     points, shape = fold_arguments(values)
     return to_caller(restore_shape(_decide(points, method)[0], shape), values)
 

@@ -14,10 +14,11 @@ from waiting import LONGEST
 
 import zwidth
 from zwidth import Actuator, Butterworth, Coupling, Device, LowPass, Operator, Scene, Status, Timing, WindowedDifference
-from zwidth.core.errors import InputError, TracedDelayError
+from zwidth.core.errors import InputError
 from zwidth.core.status import RidgeKind
 from zwidth.stability.linear.curve import evaluate_curve
-from zwidth.stability.linear.ridge import Condition, RidgeSolution, find_ridge, list_ridge_parameters
+from zwidth.stability.linear.derivatives import list_ridge_parameters
+from zwidth.stability.linear.ridge import Condition, RidgeSolution, find_ridge
 
 # Mass 0.1 kg, period and delay 1 ms: K_max in kN/m at b = 0 and b = 10 N s/m, from a grid search with polynomial roots,
 # with a step of 10 N/m.
@@ -281,20 +282,10 @@ def test_rigid_scene_is_differentiable_in_delay_and_damping(x64):
     )
 
 
-def test_traced_delay_or_period_raises():
-    scene = PAPER.replace(velocity=LowPass(cutoff=100.0))
-    for path in ("delay", "period"):
-        with pytest.raises(TracedDelayError, match=r"timing: got a traced delay or period.*sensitivities"):
-            jax.grad(lambda value, path=path: scene.replace(**{path: value}).max_stiffness().stiffness)(1e-3)
-
-
-@pytest.mark.parametrize("method", ["is_stable", "margins", "stable_stiffness", "passivity_margin", "state_space"])
+@pytest.mark.parametrize("method", ["poles", "stable_stiffness", "state_space"])
 def test_traced_parameter_is_named_in_the_error(method):
     scene = PAPER.replace(velocity=LowPass(cutoff=100.0), stiffness=1e3, virtual_damping=1.0)
-    with pytest.raises(
-        InputError,
-        match=rf"damping: got a value (traced by JAX; call {method} with plain|that JAX traces; give) numbers",
-    ):
+    with pytest.raises(InputError, match=r"(damping|poles): got a value traced by JAX"):
         jax.jit(lambda damping: getattr(scene.replace(damping=damping), method)())(5.0)
 
 

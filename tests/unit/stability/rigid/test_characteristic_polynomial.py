@@ -80,19 +80,18 @@ def test_open_loop_and_gain_difference_on_the_unit_circle(wall):
     plant = discretize_plant(delta, d)
     w, h = 0.9, 1e-4
 
-    def log_loop(w):
+    def evaluate_loop(w):
         z = np.exp(1j * w)
         M = plant.a2 * z + plant.a1 + plant.a0 / z
         T, B = z ** (plant.whole + 1) * (z - 1) * (z - plant.c), M * (alpha * z + beta * (z - 1))
         return B / T, np.abs(B) ** 2 - np.abs(T) ** 2
 
-    loop, rate, curvature = differentiate_open_loop(w, alpha, beta, plant)
-    before, at, after = (np.log(log_loop(x)[0]) for x in (w - h, w, w + h))
-    np.testing.assert_allclose(loop, log_loop(w)[0], rtol=1e-13)
-    np.testing.assert_allclose(rate, (after - before) / (2 * h), rtol=1e-6)
-    np.testing.assert_allclose(curvature, (after - 2 * at + before) / h**2, rtol=1e-5)
+    loop, slope = differentiate_open_loop(w, alpha, beta, plant)
+    before, after = (np.log(evaluate_loop(x)[0]) for x in (w - h, w + h))
+    np.testing.assert_allclose(loop, evaluate_loop(w)[0], rtol=1e-13)
+    np.testing.assert_allclose(slope / loop, (after - before) / (2 * h), rtol=1e-6)
     assert evaluate_on_unit_circle(w, alpha, beta, plant).abs2_Z == pytest.approx(abs(np.exp(1j * w) - plant.c) ** 2)
-    difference = log_loop(w)[1]
+    difference = evaluate_loop(w)[1]
     assert horner(1 - np.cos(w), expand_gain_difference(alpha, beta, plant)) == pytest.approx(difference, rel=1e-12)
     in_v = expand_gain_difference_at_nyquist(alpha, beta, plant)
     assert horner(1 + np.cos(w), in_v) == pytest.approx(-difference, rel=1e-12)

@@ -1,0 +1,173 @@
+"""Stiffest walls of many scenes at once.
+
+Scenes of one structure, i.e. with the same kinds of parts and the same orders, are evaluated together
+(`zwidth.analysis.ensemble.Variants`). Each result that the counts of poles do not confirm is computed again by
+`Scene.max_stiffness`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.analysis.base import check_scene
+from zwidth.analysis.ensemble import Variants
+from zwidth.analysis.optimization import SceneOptima
+from zwidth.analysis.walls import allows_negative
+from zwidth.core.errors import InputError, describe_choice
+from zwidth.core.status import RidgeKind, Status
+from zwidth.core.types import ArrayLike
+from zwidth.model.measured_device import MeasuredDevice
+from zwidth.model.parameter_paths import find_parts
+from zwidth.numerics.evaluate import as_float64, join_shapes
+from zwidth.stability.results import RidgePoint
+from zwidth.stability.rigid.ridge import alpha_max
+from zwidth.units.display import compact_repr
+from zwidth.units.quantities import WALL
+
+
+@compact_repr(stiffness="N/m", virtual_damping="N s/m", frequency="Hz", kind=RidgeKind)
+class StiffestWalls(NamedTuple):
+    """Stiffest stable walls of many scenes; all arrays have one entry per scene."""
+
+    stiffness: np.ndarray  # K_max in N/m
+    virtual_damping: np.ndarray  # in N s/m
+    frequency: np.ndarray  # of the pole pair on the unit circle, in Hz
+    kind: np.ndarray  # code of `zwidth.RidgeKind`
+    status: np.ndarray  # code of `zwidth.Status`; the values are NaN unless it is 0
+    searched: np.ndarray  # True if the scene needed a search of its own
+
+
+def stiffest_walls(
+    scenes: Iterable[SceneOptima] | SceneOptima,
+    parameters: Mapping[str, ArrayLike] | None = None,
+    *,
+    negative_damping: bool | None = None,
+) -> StiffestWalls:
+    """Return the stiffest stable wall of each of many scenes, as `Scene.max_stiffness` does for one scene.
+
+    Args:
+        scenes: scenes of any kinds; or one scene together with ``parameters``.
+        parameters: arrays of values in SI units by dotted path, such as ``{"velocity.cutoff": [50, 100]}``. They
+            broadcast; all other parameters are those of the scene.
+        negative_damping: as for `Scene.max_stiffness`.
+
+    Returns:
+        StiffestWalls of the broadcast shape, or of shape (scenes,): the fields of `Scene.max_stiffness`, and
+        ``searched``. INVALID_INPUT with NaN if a scene is invalid with its parameters.
+
+    Raises:
+        InputError: an object is not a scene, a parameter is unknown, or shapes do not broadcast.
+
+    Numerics:
+        The boundary curve is evaluated at common nodes for all scenes of one structure. Bisection of the largest K with
+        a stable B, and Newton's method, find the wall. Counts of poles on three lines confirm that it is stable and
+        connected to K = 0 and that no wall more than 4e-10 stiffer is (docs/theory/scenes.md, V23, V24). Scenes without
+        this confirmation are searched one by one: up to a few percent. Some 0.1 to 1 ms per scene; a searched one takes
+        10 to 50 ms. The result for a scene does not depend on the others.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section VII (rigid device).
+
+    Example:
+        >>> import numpy as np
+        >>> import zwidth
+        >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
+        >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=100))
+        >>> walls = zwidth.stiffest_walls(scene, {"velocity.cutoff": np.geomspace(10, 400, 100)})
+        >>> print(f"{walls.stiffness.min():.0f} to {walls.stiffness.max():.0f} N/m")
+        6846 to 18729 N/m
+    """
+    if isinstance(scenes, SceneOptima):
+        return _vary_scene(scenes, parameters or {}, negative_damping)
+    if parameters is not None:
+        raise InputError("parameters: allowed only together with one scene; pass a zwidth.Scene as the first argument")
+    members = list(scenes)
+    table = np.full((3, len(members)), np.nan)
+    kind = np.full(len(members), int(RidgeKind.NONE), np.int32)
+    status = np.full(len(members), int(Status.INVALID_INPUT), np.int32)
+    searched = np.ones(len(members), bool)
+    groups: dict[Any, list[int]] = {}
+    for k, scene in enumerate(members):
+        check_scene(scene, "stiffest_walls")
+        if negative_damping is not None:
+            allows_negative(scene, negative_damping)
+        # Leave out an invalid scene, such as one with a cutoff above the Nyquist frequency.
+        with suppress(InputError):
+            groups.setdefault((_describe_structure(scene), allows_negative(scene, negative_damping)), []).append(k)
+    for (_, negative), index in groups.items():
+        walls = _solve_group([members[k] for k in index], negative)
+        table[:, index], kind[index], status[index] = walls[:3], walls.kind, walls.status
+        searched[index] = walls.searched
+    return StiffestWalls._make([*table, kind, status, searched])
+
+
+def _vary_scene(scene: SceneOptima, parameters: Mapping[str, ArrayLike], negative: bool | None) -> StiffestWalls:
+    """Return the stiffest walls of one scene with varied parameters."""
+    check_scene(scene, "stiffest_walls")
+    known = {**scene.parameters(), "rate": 1.0}
+    for name in parameters:
+        if name not in known:
+            raise InputError(f"parameters: {describe_choice(name, tuple(known))}")
+    columns = {name: as_float64(name, value) for name, value in parameters.items()}
+    shape = join_shapes((name, column.shape) for name, column in columns.items()) if columns else ()
+    drawn = {name: np.broadcast_to(column, shape).ravel() for name, column in columns.items()}
+    variants = Variants(scene, drawn or {"mass": np.full(1, float(scene.device.mass))})
+    walls = _convert(variants, *variants.find_ridges(allows_negative(scene, negative), 1))
+    return StiffestWalls(*(column.reshape(shape) for column in walls))
+
+
+class _ListedVariants(Variants):
+    """Scenes of one structure, which differ in their parameters only."""
+
+    def __init__(self, scenes: list[SceneOptima], drawn: dict[str, np.ndarray]) -> None:
+        super().__init__(scenes[0], drawn)
+        self.scenes = scenes
+
+    def build(self, k: int) -> SceneOptima:
+        return self.scenes[k]
+
+
+def _solve_group(scenes: list[SceneOptima], negative: bool) -> StiffestWalls:
+    """Return the stiffest walls of scenes of one structure."""
+    parameters = [scene.parameters() for scene in scenes]
+    names = [name for name, value in parameters[0].items() if isinstance(value, float) and name not in WALL]
+    columns = {name: np.array([each[name] for each in parameters]) for name in names}
+    # Keep a spring to ground that is 0 in all scenes as a plain 0, because it is then missing in the structure.
+    variants = _ListedVariants(
+        scenes, {name: c for name, c in columns.items() if name != "operator.stiffness" or c.any()}
+    )
+    if not scenes[0].nonrigid_parts and negative:
+        point = alpha_max(*(np.array([float(getattr(scene, name)) for scene in scenes]) for name in ("delta", "d")))
+        return _convert(variants, RidgePoint(*map(np.asarray, point)), np.zeros(len(scenes), bool))
+    return _convert(variants, *variants.find_ridges(negative, 1))
+
+
+def _convert(variants: Variants, point: RidgePoint, searched: np.ndarray) -> StiffestWalls:
+    """Convert the ridge points of variants to SI units."""
+    mass, period = variants.normalized.mass, variants.normalized.period
+    with np.errstate(all="ignore"):
+        rate = mass / period
+        numbers = point.alpha * rate / period, point.beta * rate, point.omega / (2.0 * math.pi * period)
+    return StiffestWalls._make([*numbers, point.kind.astype(np.int32), point.status.astype(np.int32), searched])
+
+
+def _describe_structure(scene: SceneOptima) -> tuple[Any, ...]:
+    """Return a hashable description of a scene without its continuous parameters."""
+    if isinstance(scene.device, MeasuredDevice):
+        return (id(scene),)
+    parts = {"device": scene.device, **find_parts(scene)}
+    described: list[Any] = []
+    for name, part in parts.items():
+        described.append((name, type(part)))
+        for item in fields(part):
+            value = getattr(part, item.name)
+            if not isinstance(value, float | np.floating) and item.name not in ("coupling", "actuator", "modes"):
+                described.append((name, item.name, value))
+    ground = scene.operator is not None and scene.operator.stiffness == 0
+    return (*described, ground, not scene.nonrigid_parts)

@@ -1,0 +1,176 @@
+"""Loop of a scene inside JAX transformations, for scenes that have no closed form.
+
+The leaves of the scene (its numbers) and the walls are arguments of a function that NumPy computes (`analysis.
+traced_answers`): it rebuilds the scene, calls the loop that a direct call would use, and returns the derivatives with
+the values. One program is therefore compiled per structure of a scene, and it is small. A batch is one call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zwidth.analysis.loop import LinearLoop
+from zwidth.analysis.traced_answers import ANSWERS, INVALID
+from zwidth.core.errors import InputError, ZwidthError
+from zwidth.core.status import Status
+from zwidth.core.types import Array
+from zwidth.model.mechanism import AnyChain
+from zwidth.numerics.evaluate import broadcast_traced
+from zwidth.numerics.host_function import call_host
+from zwidth.stability.linear.derivatives import SceneSensitivities, list_ridge_parameters
+from zwidth.stability.results import Margins, RidgePoint
+
+KEPT_SCENES = 32  # scenes whose loops are kept, because values and derivatives are computed by several calls
+MAX_POINTS = 1 << 16  # points per call; larger calls could be computed by JAX, which must not run in a callback
+
+
+@lru_cache(KEPT_SCENES)
+def _build_scene(structure: Any, leaves: tuple[float, ...]) -> Any:
+    """Return a scene from its structure and its leaves; raise `InputError` if a number is not allowed."""
+    return structure.unflatten(leaves)._rebuild()
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question about scenes of one structure, as a function of their leaves and of further arguments."""
+
+    structure: Any  # treedef of the scene
+    method: str  # key of `ANSWERS`
+    options: tuple[Any, ...] = ()
+
+    def __call__(self, order: int, points: np.ndarray) -> list[np.ndarray]:
+        """Return values and derivatives at points, one row of leaves and further arguments per point."""
+        count, size = self.structure.num_leaves, points.shape[1]
+        results = [np.full((len(points), ANSWERS[self.method][1], *[size] * k), np.nan) for k in range(order + 1)]
+        results[0][:] = INVALID.get(self.method, np.nan)
+        scenes, groups = np.unique(points[:, :count], axis=0, return_inverse=True, equal_nan=True)
+        for k, leaves in enumerate(scenes.tolist()):
+            rows = np.flatnonzero(groups.reshape(-1) == k)
+            for part in np.split(rows, range(MAX_POINTS, rows.size, MAX_POINTS)):
+                try:
+                    answer = self._answer(tuple(leaves), points[part, count:], order)
+                except (ZwidthError, ArithmeticError):
+                    continue
+                for result, values in zip(results, answer, strict=True):
+                    result[part] = values
+        return results
+
+    def _answer(self, leaves: tuple[float, ...], points: np.ndarray, order: int) -> list[np.ndarray]:
+        """Return values and derivatives for one scene."""
+        scene = _build_scene(self.structure, leaves)
+        with np.errstate(all="ignore"):
+            return ANSWERS[self.method][0](scene, points, order, *self.options)
+
+
+def ask(scene: Any, method: str, *arguments: Array, options: tuple[Any, ...] = ()) -> Sequence[Any]:
+    """Return the results of a question about a traced scene, a list of arrays.
+
+    Args:
+        scene: the scene.
+        method: key of `ANSWERS`.
+        *arguments: further arguments, which broadcast; none for a question with one answer per scene.
+        options: constant arguments.
+    """
+    leaves, structure = jax.tree.flatten(scene)
+    return _ask(Question(structure, method, options), leaves, arguments)
+
+
+@partial(jax.jit, static_argnums=0)
+def _ask(question: Question, leaves: Sequence[Any], arguments: Sequence[Any]) -> Sequence[Any]:
+    """Return the results of a question for leaves and further arguments."""
+    numbers = broadcast_traced({f"number {k} of the scene": leaf for k, leaf in enumerate(leaves)})
+    given = broadcast_traced({f"argument {k}": each for k, each in enumerate(arguments)}) if arguments else []
+    shape = np.shape(given[0]) if given else ()
+    points = jnp.stack([jnp.broadcast_to(each, shape).reshape(-1) for each in (*numbers, *given)], 1)
+    results = jax.vmap(partial(call_host, question, ANSWERS[question.method][1]))(points)
+    return [column.reshape(shape) for column in results.T]
+
+
+@cache
+def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a compiled function of constant arguments, scene and further arguments of a method."""
+
+    @partial(jax.jit, static_argnums=0)
+    def run(constants: tuple[tuple[str, Any], ...], scene: Any, numbers: Mapping[str, Any]) -> Any:
+        return method(scene, **dict(constants), **numbers)
+
+    return run
+
+
+class TracedLoop(LinearLoop):
+    """Analyses of a scene inside JAX transformations; see `LinearLoop` for the methods."""
+
+    traceable = True
+
+    @cached_property
+    def chain(self) -> AnyChain:
+        raise InputError(
+            "scene: got values traced by JAX; this question needs plain numbers, outside jit, vmap and grad"
+        )
+
+    def labels(self, alpha: Array, beta: Array) -> Array:
+        return ask(self.scene, "labels", alpha, beta)[0] > 0.5
+
+    def radius(self, alpha: Array, beta: Array) -> Array:
+        return ask(self.scene, "radius", alpha, beta)[0]
+
+    def critical_walls(self, w: Array) -> tuple[Array, Array]:
+        alpha, beta = ask(self.scene, "critical_walls", w)
+        return alpha, beta
+
+    def trace_stiffest(self, negative_damping: bool | None) -> RidgePoint:
+        """Return the stiffest stable wall; ``negative_damping`` as for `zwidth.Scene.max_stiffness`."""
+        alpha, beta, omega, kind, status = ask(self.scene, "stiffest", options=(negative_damping,))
+        return RidgePoint(alpha, beta, omega, kind.astype(jnp.int32), status.astype(jnp.int32))
+
+    def margins(self, alpha: Array, beta: Array, wanted: Container[str] = Margins._fields) -> Margins:
+        return Margins(*ask(self.scene, "margins", alpha, beta))
+
+    def passivity_margin(self, alpha: Array, beta: Array) -> Array:
+        return ask(self.scene, "passivity_margin", alpha, beta)[0]
+
+    def poles(self, alpha: Array, beta: Array) -> Any:
+        raise InputError(
+            "poles: got a value traced by JAX, allowed only for a rigid device with the backward difference"
+        )
+
+    def trace_sensitivities(self, negative_damping: bool | None) -> SceneSensitivities:
+        """Return K_max and its derivatives by dotted path; see `zwidth.Scene.sensitivities`."""
+        timing = self.scene.timing
+
+        def maximum(scene: Any) -> tuple[Any, Any]:
+            wall = scene.max_stiffness(negative_damping=negative_damping)
+            return wall.stiffness, wall.status
+
+        (stiffness, status), slopes = jax.value_and_grad(maximum, has_aux=True)(self.scene)
+        values = slopes.parameters()
+        if timing.in_periods:
+            values["delay"] = slopes.timing.span.value / timing.period
+        per = {path: values[path] for path in list_ridge_parameters(self.scene)}
+        is_missing = jnp.isnan(sum(per.values(), stiffness)) & (status == Status.OK)
+        return SceneSensitivities(stiffness, per, jnp.where(is_missing, int(Status.NOT_CONVERGED), status))
+
+    def trace_required(
+        self, parameter: str, stiffness: Any, within: tuple[Any, ...] | None, negative_damping: bool | None
+    ) -> tuple[Any, ...]:
+        """Return the fields of the result of `zwidth.Scene.required`, without the crossings."""
+        options = (parameter, within, negative_damping)
+        value, side, low, high, status = ask(self.scene, "required", stiffness, options=options)
+        return value, side.astype(jnp.int32), (), (low, high), status.astype(jnp.int32)
+
+    def run_compiled(self, method: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+        """Call a method of the scene as one compiled program, whose arguments are the scene and all arrays."""
+        numbers = {name: value for name, value in arguments.items() if isinstance(value, jax.Array | np.ndarray)}
+        constants = tuple((name, value) for name, value in arguments.items() if name not in numbers)
+        try:
+            hash(constants)
+        except TypeError:
+            return method(self.scene, **arguments)
+        return _compile(method)(constants, self.scene, numbers)

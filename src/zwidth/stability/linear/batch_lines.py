@@ -1,0 +1,299 @@
+"""Count the unstable poles along lines of walls for many loops at once, with the same source code for NumPy and JAX.
+
+A *line* consists of the walls
+
+    alpha = a0 + a1 t        beta = b0 + b1 t
+
+with real t: a line of constant B, a line of constant K, or a *ray* from K = B = 0. On the unit circle, a wall of the
+line has a pole at ``z = e^(jw)`` if and only if (docs/theory/scenes.md, V23)
+
+    k(w) = Im((q - c0) conj c1) = 0      t = Re((q - c0) conj c1)/|c1|^2      c0 = a0 + b0 F,  c1 = a1 + b1 F
+
+A pole pair leaves the unit circle as t increases if k increases with w at the crossing, and enters it if k decreases.
+So the number of poles outside the circle follows from the sign changes of k between nodes. A result is *doubtful* if
+the nodes do not resolve k; the caller then has to use `stability.linear.boundary`, whose nodes are adapted to one loop.
+Symbols, nodes and shapes are those of `stability.linear.loop_batch`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.core.types import Array
+from zwidth.core.xp import iterate, namespace
+from zwidth.model.circle_functions import distances_inside
+from zwidth.stability.linear.loop_batch import Sampled, Values, evaluate, split_values
+
+MOST_CROSSINGS = 12  # changes of sign of k from node to node per line without delay; a line with more is doubtful
+MOST_TURNS = 3  # steps per line in which k may turn; a line with more is doubtful
+TURN_STEPS = 10  # steps for the extremum of k
+TURN_TOLERANCE = 1e-12  # |k| at an extremum, relative to its terms, below which its sign is unclear
+STEPS = 10  # largest number of Newton steps for the angle of a crossing
+CONVERGED_STEP = 1e-13  # relative to w
+LARGEST_STEP = 1e-9  # the last step of a crossing that is not doubtful, relative to w
+VECTOR_SIZE = 16  # lists of crossings are padded to a multiple of this, because NumPy rounds differently in a remainder
+ON_CIRCLE = 1e-6  # distance of a zero of G from the circle below which it is not counted as inside or outside
+
+
+class Line(NamedTuple):
+    """Walls ``(a0 + a1 t, b0 + b1 t)``; numbers, or arrays of one value per loop."""
+
+    a0: Any = 0.0
+    b0: Any = 0.0
+    a1: Any = 0.0
+    b1: Any = 0.0
+
+
+def combine(line: Line, parts: tuple[Array, Array, Array]) -> Array:
+    """Return k of a line, or its derivative, from the parts of `_split`."""
+    a0, b0, a1, b1 = line
+    weights = a1, b1, a0 * b1 - b0 * a1
+    return sum(
+        weight * part for weight, part in zip(weights, parts, strict=True) if not isinstance(weight, float) or weight
+    )
+
+
+def find_position(line: Line, values: Values) -> Array:
+    """Return t of the wall of a line that has a pole at the angle of the values, if k is 0 there."""
+    xp = namespace(values.q)
+    direction = line.a1 + line.b1 * values.f
+    distance = values.q - line.a0 - line.b0 * values.f
+    return (distance * xp.conj(direction)).real / (direction.real**2 + direction.imag**2)
+
+
+class Cells(NamedTuple):
+    """Selected steps between nodes, listed one after the other."""
+
+    cell: Array  # index of the node before
+    loop: Array  # index of the loop
+    slot: Array  # running number in its loop
+    valid: Array  # False for padding
+    crowded: Array  # of each loop: it has more steps than listed
+    most: int  # largest number of listed steps per loop
+
+
+def list_cells(selected: Array, most: int) -> Cells:
+    """List the selected steps between nodes, at most ``most`` per loop, from a mask of shape (nodes - 1, loops)."""
+    xp, (count, n) = namespace(selected), selected.shape
+    if xp is np:
+        cell, loop = np.nonzero(selected)
+        slot = np.cumsum(selected, 0, dtype=np.int32)[cell, loop] - 1
+        crowded = np.bincount(loop, minlength=n) > most
+        padding = (0, -cell.size % VECTOR_SIZE)
+        columns = (np.pad(part, padding) for part in (cell, loop, slot, slot < most))
+        return Cells._make([*columns, crowded, most])
+    first = xp.sort(xp.where(selected, xp.arange(count)[:, None], count), 0)[:most]
+    slot, loop = xp.meshgrid(xp.arange(most), xp.arange(n), indexing="ij")
+    valid = first < count
+    columns = (part.reshape(-1) for part in (xp.where(valid, first, 0), loop, slot, valid))
+    return Cells._make([*columns, xp.sum(selected, 0) > most, most])
+
+
+def list_changes(loops: Sampled, positive: Array) -> Cells:
+    """List the steps between nodes over which k changes its sign, from the signs of k at the nodes."""
+    # Each period of delay turns q by one revolution and adds up to two crossings.
+    most = MOST_CROSSINGS + 2 * (loops.form.lag + loops.form.window)
+    return list_cells(positive[1:] != positive[:-1], most)
+
+
+def tabulate(cells: Cells, values: Array, fill: float) -> Array:
+    """Arrange values of listed steps in an array of shape (most, loops); ``fill`` for missing ones."""
+    xp, shape = namespace(values), (cells.most, cells.crowded.size)
+    if xp is np:
+        table = np.full(shape, fill, np.result_type(values, type(fill)))
+        table[cells.slot[cells.valid], cells.loop[cells.valid]] = values[cells.valid]
+        return table
+    return xp.where(cells.valid, values, fill).reshape(shape)
+
+
+class Crossings(NamedTuple):
+    """Crossings of the stability boundary by one line per loop, in ascending order of t."""
+
+    t: Array  # shape (crossings, loops); infinite for unused entries
+    leaving: Array  # net number of poles that leave the circle as t increases
+    w: Array  # angle of the poles on the circle; only the node before it if interpolated
+    cell: Array  # index of the node before the crossing, -1 for the pole at z = -1
+    doubtful: Array  # shape (loops,)
+
+    def count_gaps(self, outside: Array, origin: Array | float = 0.0) -> Array:
+        """Return the number of poles outside in each gap between crossings, shape (crossings + 1, loops).
+
+        Args:
+            outside: number of poles outside at the position ``origin`` of each line.
+            origin: a value of t.
+        """
+        xp = namespace(self.t)
+        leaving = xp.where(xp.isfinite(self.t), self.leaving, 0.0)
+        first = outside - xp.sum(xp.where(self.t < origin, leaving, 0.0), 0)
+        return xp.concatenate([first[None], first + xp.cumsum(leaving, 0)])
+
+    def count_at(self, start: Array, t: Array) -> Array:
+        """Return the number of poles outside at positions t > 0 of a ray, from that of its softest walls."""
+        xp = namespace(self.t)
+        return start + xp.sum(xp.where((self.t > 0) & (self.t < t), self.leaving, 0.0), 0)
+
+
+def sort_crossings(t: Array, leaving: Array, w: Array, cell: Array, doubtful: Array) -> Crossings:
+    """Return crossings in ascending order of t."""
+    xp = namespace(t)
+    t = xp.where(xp.isnan(t), np.inf, t)
+    order = xp.argsort(t, 0)
+    return Crossings._make([*(xp.take_along_axis(part, order, 0) for part in (t, leaving, w, cell)), doubtful])
+
+
+def find_crossings(loops: Sampled, line: Line) -> Crossings:
+    """Find all crossings of the stability boundary by one line per loop, to full accuracy."""
+    xp, w, n = namespace(loops.w), loops.w, loops.w.shape[1]
+    k, slope = combine(line, loops.parts), combine(line, loops.slopes)
+    positive = k > 0
+    cells = list_changes(loops, positive)
+    # If k turns back between two nodes of equal sign, it may have two zeros between them. Its tangents at both nodes
+    # bound k if k is convex (or concave) there.
+    sign = xp.where(positive[:-1], 1.0, -1.0)
+    before, falls, rises = k[:-1] * sign, slope[:-1] * sign, slope[1:] * sign
+    turning = (k[1:] * sign > 0) & (falls < 0) & (rises > 0)
+    lowest = before + falls * (k[1:] * sign - rises * (w[1:] - w[:-1]) - before) / xp.where(turning, falls - rises, 1.0)
+    turns = list_cells(turning & (lowest <= 0), MOST_TURNS)
+    middle, unclear = _find_turns(loops, line, turns, k, slope)
+    # Search for zeros of k in three lists of brackets: between two nodes, and on both sides of a turn.
+    lists = cells, turns, turns
+    index = [xp.concatenate([getattr(part, name) for part in lists]) for name in ("cell", "loop")]
+    ends = (cells.cell, cells.cell + 1), (turns.cell, None), (None, turns.cell + 1)
+    brackets = []
+    for side in (0, 1):
+        nodes = [
+            middle if end[side] is None else (w[end[side], part.loop], k[end[side], part.loop])
+            for part, end in zip(lists, ends, strict=True)
+        ]
+        brackets += [xp.concatenate(column) for column in zip(*nodes, strict=True)]
+    low, first, high, last = brackets
+    part, each = loops.loop.take(index[1]), _take_line(line, index[1], n)
+    rising = last > first
+
+    def refine(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        low, high, x, move = state
+        parts, slopes = split_values(evaluate(loops.form, part, x))
+        value = combine(each, parts)
+        passed = (value > 0) == rising
+        low, high = xp.where(passed, low, x), xp.where(passed, x, high)
+        new = x - value / combine(each, slopes)
+        new = xp.where((new >= low) & (new <= high), new, 0.5 * (low + high))
+        done = move <= CONVERGED_STEP * x
+        return low, high, xp.where(done, x, new), xp.where(done, move, xp.abs(new - x))
+
+    # Start from the secant, or on both sides of a turn from the parabola with its vertex there.
+    share = first / xp.where(first == last, 1.0, first - last)
+    near, far = xp.sqrt(xp.maximum(share, 0.0)), 1.0 - xp.sqrt(xp.maximum(1.0 - share, 0.0))
+    splits = cells.cell.size, cells.cell.size + turns.cell.size
+    share = xp.concatenate([share[: splits[0]], far[splits[0] : splits[1]], near[splits[1] :]])
+    start = low + share * (high - low)
+    state = iterate(STEPS, refine, (low, high, start, high - low), xp, lambda old, new: bool(np.all(old[2] == new[2])))
+    crossing, move = state[2:]
+    crosses = (first > 0) != (last > 0)
+    t = xp.where(crosses, find_position(each, evaluate(loops.form, part, crossing)), np.inf)
+    leaving = xp.where(crosses, xp.where(rising, 2.0, -2.0), 0.0)
+    poor = crosses & (move > LARGEST_STEP * crossing)
+    columns = [
+        _tabulate_lists(lists, values, fill)
+        for values, fill in ((t, np.inf), (leaving, 0.0), (crossing, np.nan), (index[0], -1), (poor, False))
+    ]
+    # Add the pole at z = -1. Between the last node and z = -1, k must not change its sign.
+    end, end_slope = cross_end(loops, line)
+    turned = (end_slope != 0) & xp.isfinite(end_slope) & ((k[-1] > 0) != (end_slope < 0))
+    doubtful = unclear | cells.crowded | turns.crowded | xp.any(columns[4], 0) | turned
+    doubtful = doubtful | xp.any(~xp.isfinite(k), 0)
+    last_row = end[None], xp.sign(end_slope)[None], xp.full((1, n), np.pi), xp.full((1, n), -1)
+    t, leaving, angle, cell = (xp.concatenate(both) for both in zip(columns[:4], last_row, strict=True))
+    return sort_crossings(t, leaving, angle, cell, doubtful)
+
+
+def _take_line(line: Line, index: Array, n: int) -> Line:
+    """Return the lines of the loops with the given indices."""
+    xp = namespace(index, *line)
+    return Line(*(xp.broadcast_to(xp.asarray(part), (n,))[index] for part in line))
+
+
+def _tabulate_lists(lists: tuple[Cells, ...], values: Array, fill: float) -> Array:
+    """Arrange the values of several lists, one after the other, below each other; see `tabulate`."""
+    tables, start = [], 0
+    for cells in lists:
+        tables.append(tabulate(cells, values[start : start + cells.cell.size], fill))
+        start += cells.cell.size
+    return namespace(values).concatenate(tables)
+
+
+def _find_turns(loops: Sampled, line: Line, turns: Cells, k: Array, slope: Array) -> tuple[tuple[Array, Array], Array]:
+    """Return angle and value of the extremum of k in each listed step, and the loops in which its sign is unclear."""
+    xp, w = namespace(loops.w), loops.w
+    part, each = loops.loop.take(turns.loop), _take_line(line, turns.loop, w.shape[1])
+
+    def bisect(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        low, high, first, last, x, side = state
+        value = combine(each, split_values(evaluate(loops.form, part, x))[1])
+        before = (value > 0) == (first > 0)
+        # The Illinois method
+        new_first = xp.where(before, value, xp.where(side < 0, 0.5 * first, first))
+        new_last = xp.where(before, xp.where(side > 0, 0.5 * last, last), value)
+        low, high = xp.where(before, x, low), xp.where(before, high, x)
+        new = high - new_last * (high - low) / (new_last - new_first)
+        new = xp.where((new > low) & (new < high), new, 0.5 * (low + high))
+        return low, high, new_first, new_last, new, xp.where(before, 1.0, -1.0)
+
+    low, high = w[turns.cell, turns.loop], w[turns.cell + 1, turns.loop]
+    first, last = slope[turns.cell, turns.loop], slope[turns.cell + 1, turns.loop]
+    begin = low, high, first, last, 0.5 * (low + high), 0.0 * low
+    x = iterate(TURN_STEPS, bisect, begin, xp)[4]
+    parts = split_values(evaluate(loops.form, part, x))[0]
+    value, node = combine(each, parts), k[turns.cell, turns.loop]
+    size = sum(
+        abs(weight * term)
+        for weight, term in zip((each.a1, each.b1, each.a0 * each.b1 - each.b0 * each.a1), parts, strict=True)
+    )
+    unclear = xp.any(tabulate(turns, xp.abs(value) <= TURN_TOLERANCE * size, False), 0)
+    return (xp.where(turns.valid, x, low), xp.where(turns.valid, value, node)), unclear
+
+
+def cross_end(loops: Sampled, line: Line) -> tuple[Array, Array]:
+    """Return t of the wall with a pole at z = -1, infinite if there is none, and the derivative of k there."""
+    xp = namespace(loops.w)
+    t = find_position(line, loops.ends)
+    return xp.where(xp.isfinite(t), t, np.inf), combine(line, split_values(loops.ends)[1])
+
+
+def count_far(loops: Sampled) -> tuple[Array, Array]:
+    """Return the least and the largest possible number of poles outside the circle for alpha -> inf."""
+    # As many poles as G has zeros approach these zeros, the others go to infinity (V14). A pole near a zero on the
+    # circle may be inside or outside.
+    xp, loop = namespace(loops.w), loops.loop
+    depth = distances_inside(loop.plant_zeros)
+    excess = loops.form.lag + loop.denominator.shape[0] - 1 - loop.plant_zeros.shape[0]
+    return excess + xp.sum(depth < -ON_CIRCLE, 0), excess + xp.sum(depth <= ON_CIRCLE, 0)
+
+
+def count_outside(loops: Sampled, alpha: Array, beta: Array) -> tuple[Array, Array]:
+    """Return the number of poles outside the circle of one wall per loop, alpha > 0, and whether it is doubtful."""
+    xp, ray = namespace(loops.w), Line(a1=alpha, b1=beta)
+    crossings = find_crossings(loops, ray)
+    start = loops.count_start(combine(ray, tuple(part[:1] for part in loops.parts))[0])
+    near = xp.any(xp.abs(crossings.t - 1.0) < LARGEST_STEP, 0)
+    return crossings.count_at(start, 1.0), crossings.doubtful | near | ~loops.resolved
+
+
+def find_stiffness_limits(loops: Sampled, beta: Array) -> tuple[Array, Array]:
+    """Return the upper end of the stable interval of alpha that starts at K = 0, and whether the end is doubtful.
+
+    The lines are those of one beta per loop. The end is 0 if the softest walls with this beta are unstable.
+    """
+    xp = namespace(loops.w)
+    row = find_crossings(loops, Line(b0=beta, a1=1.0))
+    # Count the poles of a wall of the line, reached on a ray; it is stiff enough to be far from the pole at z = 1.
+    alpha = 0.1 * (xp.abs(beta) + 0.1)
+    outside, doubtful = count_outside(loops, alpha, beta)
+    t = xp.concatenate([xp.full((1, beta.size), -np.inf), row.t])
+    gap = xp.sum(row.t <= 0, 0)[None]
+    start = xp.take_along_axis(row.count_gaps(outside, alpha), gap, 0)[0]
+    end = xp.take_along_axis(xp.concatenate([t[1:], xp.full((1, beta.size), np.inf)]), gap, 0)[0]
+    near = xp.any(xp.abs(row.t - alpha) < LARGEST_STEP * alpha, 0) | (end < 1e-5 * alpha)
+    return xp.where(start == 0, end, 0.0), doubtful | row.doubtful | near | ~xp.isfinite(end) | (start < 0)

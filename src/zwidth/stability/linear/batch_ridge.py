@@ -1,0 +1,347 @@
+"""Find the stiffest stable wall of many loops at once and confirm each by counts of poles.
+
+The search bisects for the largest alpha at which a line of constant K has a stable interval of beta, solves the two
+conditions that bound this interval (`stability.linear.ridge`), and confirms the result alpha by three lines (V24): with
+a relative distance `MARGIN`,
+
+    the ray to the wall          has no crossing below it, so this wall is stable and connected to K = 0
+    the line of constant K above has no stable wall, so no piece connected to K = 0 extends above it
+    the line beta = 0            has no stable wall above it; needed if only beta >= 0 is allowed and the line of
+                                 constant K has a stable wall with beta < 0
+
+A wall for which this holds is within `MARGIN` of the stiffest one, so no other constraint can be binding below it.
+Symbols and shapes are those of `stability.linear.batch_lines`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.core.status import RidgeKind
+from zwidth.core.types import Array
+from zwidth.core.xp import iterate, namespace
+from zwidth.stability.linear.batch_lines import (
+    Crossings,
+    Line,
+    combine,
+    count_far,
+    count_outside,
+    cross_end,
+    find_crossings,
+    list_changes,
+    sort_crossings,
+    tabulate,
+)
+from zwidth.stability.linear.loop_batch import Form, LoopBatch, Sampled, Sizes, Values, evaluate, sample
+
+MARGIN = 4e-10  # relative distance in alpha of the walls that confirm a maximum
+LOG_RANGE = (-9.0, 2.0)  # log10 alpha of the first bracket of the maximum
+BISECTIONS = 20
+CLOSE_CELLS = 4  # steps between two crossings up to which they may enclose a smooth maximum
+NEWTON_STEPS = 8
+SECANT_STEPS = 14
+# Relative to w. An error of this size changes alpha by its square only, because alpha is stationary.
+CONVERGED_PEAK = 1e-7
+CONVERGED_STEP = 1e-13  # relative to w
+# Levels of alpha on the path from a maximum to K = 0, relative to it.
+LEVELS = (0.96, 0.8, 0.55, 0.3, 0.1, 0.02)
+THINNEST = 1e-4  # width of an interval of beta in the bisection, relative to its upper end; thinner ones may be false
+LARGEST_BETA = 50.0  # of a stable interval; crossings near zeros of F on the unit circle are farther away
+LEAST = -2  # marks the end of an interval at beta = 0, in place of the index of a node
+CLEAR = 1e-12  # smallest distance between two crossings in t, relative to t, at which their order is certain
+
+
+class Stiffest(NamedTuple):
+    """Stiffest stable wall of each loop, shape (loops,); valid only where ``confirmed``."""
+
+    alpha: Array
+    beta: Array
+    omega: Array
+    kind: Array
+    confirmed: Array
+    angles: Array  # of the active constraints, shape (2, loops)
+
+
+class _Interval(NamedTuple):
+    """The widest stable interval of beta on a line of constant K per loop, and the nodes before its ends."""
+
+    exists: Array
+    low: Array  # index of a node; -1 for a pole at z = -1; `LEAST` for beta = 0
+    high: Array
+
+
+def find_stiffest(form: Form, loop: LoopBatch, sizes: Sizes, negative: bool) -> Stiffest:
+    """Return the stiffest stable wall connected to K = 0 of each loop.
+
+    Args:
+        form: structure of the loops.
+        loop: the loops.
+        sizes: numbers of nodes.
+        negative: False to require beta >= 0.
+    """
+    loops = sample(form, loop, sizes)
+    xp, n = namespace(loops.w), loop.gain.size
+    axis, start = find_crossings(loops, Line(a1=1.0)), loops.count_start(loops.parts[0][0])
+    least = -np.inf if negative else 0.0
+    on_axis = _place_axis(axis, loops.w)
+
+    def halve(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        low, high, left, right = state
+        middle = 0.5 * (low + high)
+        found = _find_interval(loops, axis, on_axis, start, 10.0**middle, least)
+        kept = (xp.where(found.exists, new, old) for new, old in ((found.low, left), (found.high, right)))
+        return xp.where(found.exists, middle, low), xp.where(found.exists, high, middle), *kept
+
+    none = xp.full((n,), -1)
+    begin = xp.full((n,), LOG_RANGE[0]), xp.full((n,), LOG_RANGE[1]), none, none
+    low, _, left, right = iterate(BISECTIONS, halve, begin, xp)
+    alpha, beta, angles, kind = _solve(loops, axis, 10.0**low, left, right)
+    omega = xp.where(kind == RidgeKind.CORNER, xp.max(angles, 0), angles[0])
+    confirmed = _confirm(loops, axis, start, (alpha, beta, sizes.density > 1), negative)
+    return Stiffest(alpha, beta, omega, kind, confirmed, angles)
+
+
+def _place_axis(axis: Crossings, w: Array) -> Array:
+    """Return the alpha at which the curve crosses beta = 0 in each step between nodes, shape (nodes, loops).
+
+    NaN marks a step without such a crossing.
+    """
+    xp, (nodes, n) = namespace(w), w.shape
+    # Collect all entries without a step in the last row, which belongs to no step.
+    row = xp.where(xp.isfinite(axis.t) & (axis.cell >= 0), axis.cell, nodes - 1)
+    index = row, xp.broadcast_to(xp.arange(n), row.shape)
+    table = xp.full((nodes, n), np.nan)
+    if xp is not np:
+        return table.at[index].set(axis.t)
+    table[index] = axis.t
+    return table
+
+
+def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> Crossings:
+    """Return the crossings of a line of constant K per loop, interpolated linearly between nodes.
+
+    ``on_axis`` is the alpha at which the curve crosses the line beta = 0 in each step between nodes; NaN without one.
+    """
+    xp, n = namespace(loops.w), alpha.size
+    k = loops.parts[1] + alpha * loops.parts[2]
+    positive = k > 0
+    cells = list_changes(loops, positive)
+    before, after = (k[cells.cell + offset, cells.loop] for offset in (0, 1))
+    share, level = before / (before - after), alpha[cells.loop]
+    ends = [
+        loops.levels[0][cells.cell + offset, cells.loop] - level * loops.levels[1][cells.cell + offset, cells.loop]
+        for offset in (0, 1)
+    ]
+    # Let the sign of beta agree with the crossings of the line beta = 0, where the count of poles starts: it is that of
+    # the node on the same side of this line.
+    t, axis = (1.0 - share) * ends[0] + share * ends[1], on_axis[cells.cell, cells.loop]
+    nodes = [tuple(part[cells.cell + offset, cells.loop] for part in loops.parts) for offset in (0, 1)]
+    (low_beta, low_alpha), (high_beta, high_alpha) = ((q / f, -cross / f) for q, cross, f in nodes)
+    beta = xp.where((level > axis) == (high_alpha > low_alpha), high_beta, low_beta)
+    kept = xp.isnan(axis) | (nodes[0][2] * nodes[1][2] <= 0) | (t * beta > 0)
+    t = xp.where(kept, t, 1e-9 * beta)
+    end, end_slope = cross_end(loops, Line(a0=alpha, b1=1.0))
+    columns = (
+        (t, np.inf, end),
+        (xp.where(after > before, 2.0, -2.0), 0.0, xp.sign(end_slope)),
+        (loops.w[cells.cell, cells.loop], np.nan, xp.full((n,), np.pi)),
+        (cells.cell, -1, xp.full((n,), -1)),
+    )
+    t, leaving, w, cell = (xp.concatenate([tabulate(cells, each, fill), last[None]]) for each, fill, last in columns)
+    return sort_crossings(t, leaving, w, cell, cells.crowded)
+
+
+def _find_interval(
+    loops: Sampled, axis: Crossings, on_axis: Array, start: Array, alpha: Array, least: float
+) -> _Interval:
+    """Return the widest stable interval of beta >= ``least`` at one alpha per loop."""
+    xp, n = namespace(loops.w), alpha.size
+    crossings = _interpolate_level(loops, alpha, on_axis)
+    counts = crossings.count_gaps(axis.count_at(start, alpha))
+    infinite = xp.full((1, n), np.inf)
+    low, high = xp.concatenate([-infinite, crossings.t]), xp.concatenate([crossings.t, infinite])
+    none = xp.full((1, n), -1)
+    place = xp.concatenate([none, crossings.cell]), xp.concatenate([crossings.cell, none])
+    width = high - xp.maximum(low, least)
+    width = xp.where((counts == 0) & (high < LARGEST_BETA) & (width > THINNEST * xp.abs(high)), width, -1.0)
+    best = xp.argmax(width, 0)[None]
+    exists = (xp.take_along_axis(width, best, 0)[0] > 0) & ~crossings.doubtful
+    left, right = (xp.take_along_axis(part, best, 0)[0] for part in (xp.where(low < least, LEAST, place[0]), place[1]))
+    return _Interval(exists, left, right)
+
+
+class _Curve(NamedTuple):
+    """Alpha and beta of the boundary curve at angles w, and their derivatives in w."""
+
+    alpha: Array
+    beta: Array
+    alpha_slope: Array
+    beta_slope: Array
+
+
+def _trace(values: Values) -> _Curve:
+    """Return the points of the boundary curve (V8)."""
+    q, q_slope, f, f_slope = values
+    beta = q.imag / f.imag
+    beta_slope = (q_slope.imag - beta * f_slope.imag) / f.imag
+    alpha_slope = q_slope.real - beta_slope * f.real - beta * f_slope.real
+    return _Curve(q.real - beta * f.real, beta, alpha_slope, beta_slope)
+
+
+def _solve(loops: Sampled, axis: Crossings, alpha: Array, left: Array, right: Array) -> tuple[Array, ...]:
+    """Solve the two conditions at the ends of the last stable interval of the bisection.
+
+    Args:
+        loops: the loops.
+        axis: crossings of the line beta = 0.
+        alpha: alpha of the interval.
+        left: lower end of the interval, as in `_Interval`.
+        right: upper end.
+
+    Returns:
+        alpha, beta, both angles and the kind of the maximum; NaN if no conditions were found.
+    """
+    xp, w = namespace(loops.w), loops.w
+    form, loop, nodes = loops.form, loops.loop, w.shape[0]
+    clipped = left == LEAST
+    # If the interval ends at beta = 0, a smooth maximum may lie in the step in which the curve crosses this line.
+    undamped = xp.argmin(xp.abs(xp.log(xp.where(axis.t > 0, axis.t, np.inf) / alpha)), 0)[None]
+    undamped, rest, crossed = (xp.take_along_axis(part, undamped, 0)[0] for part in (axis.t, axis.w, axis.cell))
+    first = xp.where(clipped, crossed, xp.minimum(left, right))
+    second = xp.where(clipped, crossed, xp.maximum(left, right))
+    close = (first >= 0) & (second - first <= CLOSE_CELLS)
+
+    def pick(index: Array) -> Array:
+        return xp.take_along_axis(w, xp.clip(index, 0, nodes - 1)[None], 0)[0]
+
+    peak, converged = _find_peak(form, loop, [(pick(first - more), pick(second + 1 + more)) for more in (0, 1, 2)])
+    top = _trace(evaluate(form, loop, peak))
+    # At a corner, either both angles belong to pole pairs, or one pole is at z = -1.
+    pair = first >= 0
+    starts = [0.5 * (pick(cell) + pick(cell + 1)) for cell in (xp.where(pair, first, second), second)]
+    end, f_end = loops.ends.q.real, loops.ends.f.real
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        one, other = (_trace(evaluate(form, loop, x)) for x in state)
+        gap = one.alpha - other.alpha, one.beta - other.beta
+        determinant = other.alpha_slope * one.beta_slope - one.alpha_slope * other.beta_slope
+        moves = [
+            (other.alpha_slope * gap[1] - other.beta_slope * gap[0]) / determinant,
+            (one.alpha_slope * gap[1] - one.beta_slope * gap[0]) / determinant,
+        ]
+        at_end = (one.alpha + one.beta * f_end - end) / (one.alpha_slope + one.beta_slope * f_end)
+        new = state[0] - xp.where(pair, moves[0], at_end), state[1] - moves[1]
+        return tuple(
+            xp.where(xp.abs(after - before) <= CONVERGED_STEP * before, before, after)
+            for after, before in zip(new, state, strict=True)
+        )
+
+    corner = iterate(NEWTON_STEPS, step, tuple(starts), xp, lambda old, new: bool(np.all(old[0] == new[0])))
+    meeting = _trace(evaluate(form, loop, corner[0]))
+    # Two crossings in distant steps bound a corner or, where nodes are dense, a smooth maximum: take the nearer one.
+    distance = [
+        xp.where(ok, xp.abs(xp.log(one.alpha / alpha)), np.inf) for one, ok in ((top, converged), (meeting, ~clipped))
+    ]
+    smooth = xp.where(close | clipped, distance[0] < 0.1, ~(distance[0] > distance[1]))
+    smooth = smooth & converged & (first >= 0) & (~clipped | ((top.beta > 0) & (top.alpha > undamped)))
+    kinds = [smooth, clipped, ~clipped & (second >= 0)]
+    found = [
+        xp.select(kinds, choices, np.nan)
+        for choices in (
+            [top.alpha, undamped, meeting.alpha],
+            [top.beta, 0.0 * undamped, meeting.beta],
+            [peak, rest, corner[0]],
+            [peak, rest, xp.where(pair, corner[1], np.pi)],
+        )
+    ]
+    codes = [int(kind) for kind in (RidgeKind.SMOOTH, RidgeKind.NO_DAMPING, RidgeKind.CORNER)]
+    return found[0], found[1], xp.stack(found[2:]), xp.select(kinds, codes, int(RidgeKind.NONE))
+
+
+def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Return the angle in a bracket at which alpha has a maximum along the curve, and whether the search converged.
+
+    The brackets are tried in order of their width. The Illinois method keeps a bracket of the maximum.
+    """
+    xp = namespace(loop.gain)
+
+    def slope(w: Array) -> Array:
+        return _trace(evaluate(form, loop, w)).alpha_slope
+
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        low, high, first, last, x, side, _ = state
+        value = slope(x)
+        before = value > 0
+        last = xp.where(before, xp.where(side > 0, 0.5 * last, last), value)
+        first = xp.where(before, value, xp.where(side < 0, 0.5 * first, first))
+        low, high = xp.where(before, x, low), xp.where(before, high, x)
+        new = high - last * (high - low) / (last - first)
+        new = xp.where((new > low) & (new < high), new, 0.5 * (low + high))
+        return low, high, first, last, new, xp.where(before, 1.0, -1.0), xp.abs(new - x)
+
+    # Take the first bracket over which the derivative changes from + to -.
+    low, high = brackets[-1]
+    first, last = slope(low), slope(high)
+    for bracket in brackets[-2::-1]:
+        ends = slope(bracket[0]), slope(bracket[1])
+        better = (ends[0] > 0) & (ends[1] < 0)
+        pairs = zip((*bracket, *ends), (low, high, first, last), strict=True)
+        low, high, first, last = (xp.where(better, new, old) for new, old in pairs)
+    begin = low, high, first, last, 0.5 * (low + high), 0.0 * low, high - low
+    *_, x, _, move = iterate(SECANT_STEPS, step, begin, xp)
+    return x, (first > 0) & (last < 0) & (move <= CONVERGED_PEAK * x)
+
+
+def _confirm(loops: Sampled, axis: Crossings, start: Array, found: tuple[Array, ...], negative: bool) -> Array:
+    """Return whether each wall is the stiffest one within `MARGIN` (V24)."""
+    alpha, beta, accurate = found
+    xp, above = namespace(loops.w), alpha * (1.0 + MARGIN)
+    level = find_crossings(loops, Line(a0=above, b1=1.0))
+    outside = axis.count_at(start, above)
+    counts, axis_counts = level.count_gaps(outside), axis.count_gaps(start)
+    infinite = xp.full((1, alpha.size), np.inf)
+    bounded = xp.all(counts > 0, 0)
+    if not negative:
+        right = xp.all((counts > 0) | (xp.concatenate([level.t, infinite]) < 0), 0)
+        beyond = xp.concatenate([axis.t, infinite]) > above
+        bounded = bounded | (right & xp.all((axis_counts > 0) | ~beyond, 0))
+    direction = Line(a1=alpha, b1=beta)
+    ray = find_crossings(loops, direction)
+    first = loops.count_start(combine(direction, tuple(part[:1] for part in loops.parts))[0])
+    connected = (first == 0) & ~xp.any((ray.t > 0) & (ray.t < 1.0 - MARGIN), 0)
+    if accurate:
+        connected = connected | _are_connected(loops, axis, start, alpha, beta)
+    far = count_far(loops)
+    consistent = (axis_counts[-1] >= far[0]) & (axis_counts[-1] <= far[1]) & xp.all(counts >= 0, 0)
+    # The order of two crossings must be certain.
+    clear = xp.all(level.t[1:] - level.t[:-1] > CLEAR * xp.abs(level.t[1:]), 0, where=xp.isfinite(level.t[1:]))
+    certain = ~axis.doubtful & ~level.doubtful & ~ray.doubtful
+    return loops.resolved & certain & consistent & clear & bounded & connected & (alpha > 0)
+
+
+def _are_connected(loops: Sampled, axis: Crossings, start: Array, alpha: Array, beta: Array) -> Array:
+    """Return whether a path of stable walls connects the wall below each maximum to K = 0.
+
+    The path follows lines of constant B from each of the `LEVELS` to the next one and, at the last one, a ray.
+    """
+    xp, connected, low, high = namespace(alpha), True, beta, beta
+    infinite, below = xp.full((1, alpha.size), np.inf), alpha
+    for share in LEVELS:
+        above, below = below, share * alpha
+        level = find_crossings(loops, Line(a0=below, b1=1.0))
+        stable = level.count_gaps(axis.count_at(start, below)) == 0
+        ends = xp.concatenate([-infinite, level.t]), xp.concatenate([level.t, infinite])
+        overlap = xp.minimum(ends[1], high) - xp.maximum(ends[0], low)
+        best = xp.argmax(xp.where(stable & xp.isfinite(overlap), overlap, -1.0), 0)[None]
+        reached, new_low, new_high = (xp.take_along_axis(part, best, 0)[0] for part in (stable & (overlap >= 0), *ends))
+        middle = 0.5 * (xp.maximum(new_low, low) + xp.minimum(new_high, high))
+        path = find_crossings(loops, Line(b0=middle, a1=1.0))
+        free = ~xp.any((path.t > below) & (path.t < above * (1.0 - MARGIN)), 0)
+        connected = connected & reached & free & ~level.doubtful & ~path.doubtful
+        low, high = new_low, new_high
+    ray = Line(a1=below, b1=0.5 * (low + high))
+    path = find_crossings(loops, ray)
+    outside, _ = count_outside(loops, ray.a1, ray.b1)
+    return connected & ~xp.any((path.t > 0) & (path.t < 1.0), 0) & (outside == 0) & ~path.doubtful

@@ -1,0 +1,292 @@
+"""Differentiate the answers about any linear loop in all numbers of its scene, exactly, in NumPy.
+
+An answer u, such as the stiffest wall or a margin, solves equations ``F(p, u) = 0`` in the numbers p of the scene. They
+are formulated here in Taylor arithmetic (`zwidth.numerics.taylor`), evaluated at the solution, and differentiated by
+the implicit function theorem. With ``z = e^lambda``, the velocity estimate F, the critical controller ``q = -1/G``, and
+the matrices of the discretized device (`plant.sampled_states`; delay d = n + f),
+
+    q = -e^((n + 1) lambda)/x_1,   (z - 1 - Psi) x = (z - 1) Gamma(1 - f) + Gamma(1)
+
+A wall (alpha, beta) has a pole at z if and only if ``r = alpha + beta F - q`` is 0 there. A prime denotes d/dlambda.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.core.pytrees import list_leaves, replace_leaves
+from zwidth.core.status import Status
+from zwidth.core.types import Array
+from zwidth.model.circle_functions import circle_points
+from zwidth.model.mechanism import build_chain
+from zwidth.model.parameter_paths import list_parameters
+from zwidth.model.velocity import Estimate
+from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, flow, seed, solve, stack
+from zwidth.stability.linear.ridge import Condition, RidgeSolution
+from zwidth.units.display import compact_repr
+from zwidth.units.quantities import WALL
+
+RESPONSE_TOLERANCE = 1e-8  # largest relative difference of q by the matrices of the chain and by its roots
+# Sixth-order central difference, as pairs of offset (in steps) and weight, for velocity estimates that accept only
+# floats; and its step, relative to the parameter.
+CENTRAL_DIFFERENCE = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
+DIFFERENCE_STEP = 1e-3
+
+Pair = tuple[Taylor, Taylor]  # a function of lambda and its derivative
+
+
+class LoopTerms:
+    """The functions q and F of a loop, as functions of the numbers of its scene and of further variables."""
+
+    def __init__(self, scene: Any, variables: Sequence[Taylor], n: int, more_delay: Taylor | None = None) -> None:
+        """Discretize the device.
+
+        Args:
+            scene: the scene.
+            variables: its leaves, then further variables.
+            n: integer part of the delay.
+            more_delay: delay in periods to be added to that of the scene.
+        """
+        self.scene, self.variables = scene, variables
+        self.varied = replace_leaves(scene, iter(variables))
+        timing, self.one = self.varied.timing, variables[0] * 0.0 + 1.0
+        d: Any = timing._periods if timing.in_periods else timing.delay / timing.period
+        # Replace the value of the quotient, whose rounding error `Timing.d` removes.
+        self.d = Taylor(np.float64(scene.d), d.first, d.second)
+        delay = self.d if more_delay is None else self.d + more_delay
+        chain = build_chain(self.varied, (self.d, n), Estimate())
+        A, B = (stack(part, self.one) for part in chain.realize()[:2])
+        self.lag = n + 1
+        if chain.sampled:
+            self.psi, self.full = A + stack(-np.eye(len(A.v)), self.one), B
+            self.late = B
+        else:
+            self.psi, self.full = flow(A, B, self.one)
+            self.late = flow(A, B, self.one - (delay - n))[1]
+
+    def controller(self, lam: Taylor) -> Pair:
+        """Return q and q'."""
+        z, zeta = lam.exp(), lam.expm1()
+        size = len(self.full.v)
+        matrix = zeta.map(lambda part: np.multiply.outer(np.eye(size), part)) - self.psi
+        late = self.late * z.map(lambda part: np.asarray(part)[None])
+        x = solve(matrix, self.full + late - self.late)
+        change = solve(matrix, late - x * z.map(lambda part: np.asarray(part)[None]))
+        q = -(lam * self.lag).exp() / x[0]
+        return q, q * (self.one * self.lag - change[0] / x[0])
+
+    def estimate(self, lam: Taylor) -> Pair:
+        """Return F and F'."""
+        velocity, period = self.varied.velocity, self.varied.timing.period
+        try:
+            return evaluate_estimate(velocity.estimate(period), lam, self.one)
+        except (TypeError, ValueError, AttributeError):
+            # An estimate of a user may accept only floats.
+            return self._difference_estimate(lam)
+
+    def _difference_estimate(self, lam: Taylor) -> Pair:
+        """Return F and F' with first derivatives by finite differences of an estimate that accepts only floats."""
+        leaves = list_leaves(self.scene)
+        names = [id(each) for each in (self.varied.timing.period, *list_leaves(self.varied.velocity))]
+        at = Taylor(lam.v, np.zeros(0))
+
+        def evaluate(values: list[Any]) -> Pair:
+            scene = replace_leaves(self.scene, iter(values))
+            return evaluate_estimate(scene.velocity.estimate(scene.timing.period), at, at * 0.0 + 1.0)
+
+        pair = evaluate_estimate(self.scene.velocity.estimate(self.scene.timing.period), lam, self.one)
+        for k, variable in enumerate(self.variables[: len(leaves)]):
+            step = DIFFERENCE_STEP * leaves[k]
+            if id(variable) in names and step:
+                for offset, weight in CENTRAL_DIFFERENCE:
+                    moved = evaluate([*leaves[:k], leaves[k] + offset * step, *leaves[k + 1 :]])
+                    for part, value in zip(pair, moved, strict=True):
+                        part.first = part.first + 0j
+                        part.first[..., k] += weight / step * value.v
+        for part in pair:
+            part.second = None if part.second is None else part.second + np.nan
+        return pair
+
+    def residual(self, alpha: Taylor, beta: Taylor, lam: Taylor) -> tuple[Taylor, Taylor, Taylor]:
+        """Return r and r', both divided by |q|, and F."""
+        (q, q_slope), (f, f_slope) = self.controller(lam), self.estimate(lam)
+        scale = 1.0 / (abs(q.v) or 1.0)
+        return (alpha + beta * f - q) * scale, (beta * f_slope - q_slope) * scale, f
+
+
+def evaluate_estimate(estimate: Estimate, lam: Taylor, one: Taylor) -> Pair:
+    """Return F and F' of a velocity estimate whose gain, zeros and poles are numbers or Taylor objects."""
+    z, zeta = lam.exp(), lam.expm1()
+    value, slope = one * estimate.gain, one * 0.0
+    for zero in np.ravel(estimate.zeros):
+        factor = zeta + zero
+        value, slope = value * factor, slope * factor + value * z
+    for pole in np.ravel(estimate.poles):
+        factor = zeta + pole
+        value = value / factor
+        slope = (slope - value * z) / factor
+    if estimate.lag:
+        power = (lam * -estimate.lag).exp()
+        value, slope = value * power, (slope - value * estimate.lag) * power
+    if n := estimate.window:
+        difference = -(lam * -n).expm1() / n
+        value, slope = value * difference, slope * difference + value * (lam * -n).exp()
+    return value, slope
+
+
+# A function that returns the real equations of a question, for the terms of the loop and the further variables.
+Equations = Callable[[LoopTerms, Sequence[Taylor]], Sequence[Taylor]]
+
+
+def differentiate(
+    scene: Any,
+    order: int,
+    parameters: Sequence[float],
+    unknowns: Sequence[float],
+    equations: Equations,
+    added_delay: float | None = None,
+) -> Implicit:
+    """Return the derivatives of the unknowns of equations in the leaves of a scene and in further parameters.
+
+    Args:
+        scene: the scene, whose leaves are floats.
+        order: 1, or 2 for second derivatives.
+        parameters: values of the further parameters.
+        unknowns: values of the unknowns.
+        equations: function of the terms of the loop, and of further parameters and unknowns, that returns as many
+            equations as there are unknowns; raises `ArithmeticError` if derivatives are not available.
+        added_delay: value of the first unknown if it is a delay in periods to be added to that of the scene.
+
+    Returns:
+        The derivatives, NaN if they are not available.
+    """
+    n = int(np.floor(scene.d + (added_delay or 0.0)))
+    leaves = list_leaves(scene)
+
+    def compute(n: int) -> Implicit:
+        variables = seed([*leaves, *parameters, *unknowns], order)
+        added = None if added_delay is None else variables[len(leaves) + len(parameters)]
+        terms = LoopTerms(scene, variables, n, added)
+        return differentiate_implicitly(list(equations(terms, variables[len(leaves) :])))
+
+    index, size = index_parameters(scene), len(leaves) + len(parameters)
+    is_sampled = getattr(scene.device, "dt", None) is not None
+    has_kink = not is_sampled and hasattr(scene.device, "system") and n == scene.d > 0 and added_delay is None
+    with np.errstate(all="ignore"):
+        try:
+            result = compute(n)
+            if has_kink:
+                # Without inertia, the answer has a kink at integer delays. A longer period shortens the delay.
+                _replace_derivatives(result, compute(n - 1), index["period"])
+        except (ArithmeticError, np.linalg.LinAlgError):
+            return Implicit(*(np.full((len(unknowns), *[size] * k), np.nan) for k in (1, 2)))
+    if is_sampled:
+        # A sampled device is valid for one period and one delay only.
+        for path in ("period", "delay"):
+            _replace_derivatives(result, None, index[path])
+    return result
+
+
+def _replace_derivatives(result: Implicit, other: Implicit | None, k: int) -> None:
+    """Replace the derivatives in the parameter with the index k by those of ``other``, or by NaN."""
+    result.first[:, k] = math.nan if other is None else other.first[:, k]
+    if result.second is not None:
+        second = None if other is None else other.second
+        result.second[:, k, :] = math.nan if second is None else second[:, k, :]
+        result.second[:, :, k] = math.nan if second is None else second[:, :, k]
+
+
+def index_parameters(scene: Any) -> dict[str, int]:
+    """Return the index of each parameter among the leaves of a scene, by dotted path."""
+    marked = replace_leaves(scene, iter(map(float, range(len(list_leaves(scene))))))
+    index = {path: int(value) for path, value in list_parameters(marked).items() if isinstance(value, float)}
+    if marked.timing.in_periods:
+        index["delay"] = int(marked.timing._periods)
+    return index
+
+
+def agrees_with_roots(scene: Any, terms: LoopTerms, *angles: float) -> bool:
+    """Return whether q by the matrices of the device agrees with q by its roots; rounding errors dominate otherwise."""
+    exact = scene.loop.roots.evaluate_controller(circle_points(np.array(angles))).value
+    for w, q in zip(angles, exact, strict=True):
+        value = terms.controller(terms.one * (1j * w))[0].v
+        if not abs(value - q) <= RESPONSE_TOLERANCE * abs(q):
+            return False
+    return True
+
+
+def split(value: Taylor) -> list[Taylor]:
+    """Return the real and the imaginary part."""
+    return [value.real, value.imag]
+
+
+def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> Implicit:
+    """Return the derivatives of alpha, beta and omega of the stiffest wall in the leaves of a scene (V21)."""
+    is_pair = ridge.first == Condition.PAIR, ridge.second == Condition.PAIR
+    free = [k for k in range(2) if is_pair[k]]
+    extra = [ridge.alpha, ridge.beta, *((ridge.w1, ridge.w2)[k] for k in free)]
+
+    def equations(terms: LoopTerms, unknowns: Sequence[Taylor]) -> list[Taylor]:
+        alpha, beta, *angles = unknowns
+        if not agrees_with_roots(scene, terms, ridge.w1, ridge.w2):
+            raise ArithmeticError("rounding errors dominate the response")
+        w = [terms.one * ridge.w1, terms.one * ridge.w2]
+        for k, angle in zip(free, angles, strict=True):
+            w[k] = angle
+        r, slope, f = terms.residual(alpha, beta, w[0] * 1j)
+        result = split(r) if is_pair[0] else [r.real]
+        if ridge.second == Condition.NO_DAMPING:
+            return [*result, beta]
+        if ridge.second == Condition.STATIONARY:
+            slope = slope * 1j
+            return [*result, (f.conjugate() * slope).imag if is_pair[0] else slope.imag]
+        r = terms.residual(alpha, beta, w[1] * 1j)[0]
+        return [*result, *(split(r) if is_pair[1] else [r.real])]
+
+    result = differentiate(scene, order, [], extra, equations)
+    # Append the derivatives of omega, which is constant if it belongs to a real pole.
+    angles = (ridge.w1, ridge.w2)
+    rows = [0, 1, 2 + free.index(angles.index(ridge.omega)) if angles.index(ridge.omega) in free else None]
+
+    def select(part: np.ndarray | None) -> np.ndarray | None:
+        return None if part is None else np.stack([0.0 * part[0] if row is None else part[row] for row in rows])
+
+    first = select(result.first)
+    assert first is not None
+    return Implicit(first, select(result.second))
+
+
+@compact_repr()
+class SceneSensitivities(NamedTuple):
+    """K_max in N/m, its derivatives by dotted path in N/m per unit of the parameter, and the `zwidth.Status`."""
+
+    stiffness: Array
+    per: dict[str, Any]
+    status: Array
+
+
+def list_ridge_parameters(scene: Any) -> tuple[str, ...]:
+    """Return the dotted paths of the real-valued parameters of a scene on which K_max depends."""
+    paths = [path for path, value in scene.parameters().items() if not isinstance(value, int | np.integer)]
+    rigid = scene.operator is not None and scene.operator.rigid
+    excluded = (*WALL, "operator.coupling_damping") if rigid else WALL
+    return tuple(path for path in paths if path not in excluded)
+
+
+def compute_sensitivities(scene: Any, ridge: RidgeSolution | None, status: Status) -> SceneSensitivities:
+    """Return K_max and its derivatives in all parameters of a scene; NaN if ``ridge`` is None."""
+    paths = list_ridge_parameters(scene)
+    if ridge is None:
+        return SceneSensitivities(np.float64(math.nan), dict.fromkeys(paths, math.nan), np.int32(status))
+    slopes, index = differentiate_ridge(scene, ridge, 1).first[0], index_parameters(scene)
+    varied = replace_leaves(scene, iter(seed(list_leaves(scene), 1)))
+    unit = varied.mass / varied.timing.period / varied.timing.period
+    per = {path: float(unit.v * slopes[index[path]] + ridge.alpha * unit.first[index[path]]) for path in paths}
+    if scene.timing.in_periods:
+        per["delay"] /= scene.timing.period
+    status = Status.NOT_CONVERGED if any(map(math.isnan, per.values())) else status
+    return SceneSensitivities(np.float64(ridge.alpha * scene.units.stiffness), per, np.int32(status))

@@ -1,0 +1,98 @@
+"""Crossovers, pole counts and margins of many loops at once, against eigenvalues, single walls and JAX."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from any_loop import KINDS, closed_loop_matrix, random_scene
+
+import zwidth
+from zwidth.core.xp import namespace
+from zwidth.model.circle_functions import Jet
+from zwidth.stability.linear.delay_margin import count_outside
+from zwidth.stability.linear.margins import tabulate
+from zwidth.stability.open_loop import (
+    OpenLoop,
+    find_gain_crossovers,
+    find_nearest_angle,
+    find_phase_crossovers,
+    select_gain_margin,
+    select_phase_margin,
+)
+
+
+def draw_walls(scene, rng, count):
+    """Return K and B of random walls around the stiffest stable one."""
+    top, unit = scene.max_stiffness(), scene.units
+    stiffness = float(top.stiffness) if top.status == 0 else 0.1 * float(unit.stiffness)
+    damping = abs(float(np.nan_to_num(top.virtual_damping))) + 0.1 * float(unit.virtual_damping)
+    return stiffness * 10.0 ** rng.uniform(-2, 0.3, count), damping * rng.uniform(-0.2, 1.5, count)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_counts_of_unstable_poles_agree_with_eigenvalues(kind):
+    rng = np.random.default_rng(11)
+    for _ in range(4):
+        scene = random_scene(kind, rng)
+        K, B = draw_walls(scene, rng, 40)
+        radii = np.array(
+            [np.abs(np.linalg.eigvals(closed_loop_matrix(scene, *wall))) for wall in zip(K, B, strict=True)]
+        )
+        alpha, beta = scene.normalize_walls(K, B)
+        walls = tabulate(scene.loop.roots, alpha, beta, scene.loop.boundary.w)
+        with np.errstate(all="ignore"):
+            counts = count_outside(scene.loop.roots, walls, find_gain_crossovers(walls), alpha, beta)
+        # Leave out walls within the rounding errors of the eigenvalues.
+        clear = np.abs(radii - 1.0).min(1) > 1e-7
+        assert clear.sum() > 30
+        np.testing.assert_array_equal(counts[clear], (radii > 1.0).sum(1)[clear])
+
+
+@pytest.mark.parametrize("kind", ["filter", "all", "driven"])
+def test_margins_of_many_walls_equal_those_of_single_walls(kind):
+    rng = np.random.default_rng(12)
+    scene = random_scene(kind, rng)
+    K, B = draw_walls(scene, rng, 12)
+    many = np.array(scene.margins(K.reshape(3, 4), B.reshape(3, 4)))
+    assert many.shape == (7, 3, 4)
+    single = np.array([scene.margins(*wall) for wall in zip(K.tolist(), B.tolist(), strict=True)])
+    np.testing.assert_allclose(many.reshape(7, -1).T, single, rtol=1e-9)
+
+
+def evaluate_integrator(w):
+    """Return ``L = g e^(-j d w)/(j w)`` and its derivative, for two gains g and the delay d = 3."""
+    xp = namespace(w)
+    with np.errstate(invalid="ignore"):
+        value = xp.asarray([[0.4], [0.01]]) * (xp.cos(3.0 * w) - 1j * xp.sin(3.0 * w)) / (1j * w)
+        return Jet(value, value * (-3j - 1.0 / w))
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_crossovers_of_a_delayed_integrator(xp, x64):
+    w = xp.asarray(
+        np.broadcast_to(np.concatenate([np.geomspace(1e-3, 0.1, 60), np.linspace(0.1, np.pi, 90)[1:]]), (2, 149))
+    )
+    loop = OpenLoop(evaluate_integrator, w, evaluate_integrator(w))
+    most = None if xp is np else 4
+    gain, phase = find_gain_crossovers(loop, most), find_phase_crossovers(loop, most)
+    np.testing.assert_allclose(np.asarray(gain)[:, 0], [0.4, 0.01], rtol=1e-13)
+    assert np.isnan(np.asarray(gain)[:, 1:]).all()
+    # arg L = -pi/2 - 3 w is -pi at pi/6 and -3 pi at 5 pi/6.
+    np.testing.assert_allclose(np.asarray(phase)[:, :1], np.pi / 6, rtol=1e-12)
+    at_phase = abs(evaluate_integrator(phase).value)
+    margin, crossover = select_gain_margin(xp.asarray([True, True]), phase, at_phase)
+    np.testing.assert_allclose(margin, np.pi / 6 / np.array([0.4, 0.01]), rtol=1e-12)
+    np.testing.assert_allclose(crossover, np.pi / 6, rtol=1e-12)
+    degrees, _ = select_phase_margin(xp.asarray([True, False]), gain, xp.angle(-evaluate_integrator(gain).value))
+    np.testing.assert_allclose(degrees, np.degrees([np.pi / 2 - 1.2, -(np.pi / 2 - 0.03)]), rtol=1e-12)
+    nearest = np.asarray(find_nearest_angle(evaluate_integrator, w, abs(1.0 + loop.L.value) ** 2))
+    dense = np.linspace(1e-3, np.pi, 400_001)
+    distance = abs(1.0 + evaluate_integrator(dense).value)
+    np.testing.assert_allclose(nearest, dense[distance.argmin(1)], atol=1e-5)
+
+
+def test_best_damping_maximizes_the_modulus_margin():
+    scene = zwidth.Scene(zwidth.Device(0.1, 3.0), zwidth.Timing(1e-3, 1e-3), velocity=zwidth.LowPass(cutoff=100))
+    best = scene.best_damping(1e3, goal="robust")
+    margins = scene.margins(1e3, best.virtual_damping * np.array([1.0, 0.99, 1.01])).modulus_margin
+    assert best.modulus_margin == pytest.approx(margins[0], rel=1e-12)
+    assert (margins[1:] < margins[0]).all()
