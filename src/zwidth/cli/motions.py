@@ -163,7 +163,7 @@ def _draw_motion(motion: Any) -> Any:
     if int(motion.outcome) == MotionKind.REST and moving.any():
         settled = motion.time[np.flatnonzero(moving)[-1] + 1]
         # Convert to the unit of the axis, which may be ms, by the second sample.
-        unit = ax.lines[0].get_xdata()[1] / motion.time[1]
+        unit = np.asarray(ax.lines[0].get_xdata())[1] / motion.time[1]
         ax.set_xlim(0.0, min(3.0 * settled * unit, ax.get_xlim()[1]))
     return ax.figure
 

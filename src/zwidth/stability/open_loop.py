@@ -199,7 +199,10 @@ def _list_minima(values: Array) -> Array:
     )
     first, last = ends
     rank = xp.concatenate([first, xp.where(is_minimum, lowest, np.inf), last], -1)
-    return xp.argpartition(rank, MAX_MINIMA - 1, axis=-1)[..., :MAX_MINIMA]
+    if xp is not np:
+        # Sort, because XLA cannot select on arrays that are distributed over devices.
+        return xp.argsort(rank, axis=-1)[..., :MAX_MINIMA]
+    return np.argpartition(rank, MAX_MINIMA - 1, axis=-1)[..., :MAX_MINIMA]
 
 
 def select_gain_margin(stable: Array, w: Array, gains: Array) -> tuple[Array, Array]:

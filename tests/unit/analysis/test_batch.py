@@ -138,7 +138,7 @@ def test_an_empty_list_and_a_single_scene_are_allowed():
 
 def test_wrong_arguments_are_named():
     with pytest.raises(InputError, match="scene: got 3"):
-        stiffest_walls([3])
+        stiffest_walls([3])  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match=r"parameters: .*velocity.cut"):
         stiffest_walls(SCENES["low-pass"], {"velocity.cut": [1.0]})
     with pytest.raises(InputError, match="parameters: allowed only"):

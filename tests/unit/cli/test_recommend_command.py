@@ -55,7 +55,7 @@ def test_passive_wall_and_its_loss_of_stiffness():
 
 def test_options_of_the_passive_wall_recommend_it():
     text = " ".join(recommend().stdout.split())
-    wall, options = re.search(r"a passive wall has (K = [\d.]+) .*?: recommend (--passive .*? soft) ", text).groups()
+    ((wall, options),) = re.findall(r"a passive wall has (K = [\d.]+) .*?: recommend (--passive .*? soft) ", text)
     again = json.loads(recommend(*options.split(), "--json").stdout)["recommended"]
     assert again["passive"]
     assert again["stiffness"] == pytest.approx(1e3 * float(wall.removeprefix("K = ")), rel=5e-3)

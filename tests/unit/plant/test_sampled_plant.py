@@ -97,13 +97,13 @@ def test_states_of_many_chains_equal_those_of_each_chain(x64):
 
     many = sample_states(build_chain(delta, rate, d))
     realized = many.realize()
-    for k, one in enumerate(zip(delta, rate, d, strict=True)):
-        states = sample_states(build_chain(*one))
-        single = SampledStates._make((*(part[k] for part in many[:3]), 1))
+    for k in range(delta.size):
+        states = sample_states(build_chain(delta[k], rate[k], d[k]))
+        single = SampledStates(many.psi[k], many.full[k], many.late[k], 1)
         np.testing.assert_allclose(single.controller(POINTS), states.controller(POINTS), rtol=1e-12)
         np.testing.assert_allclose(single.realize().A, realized.A[k], rtol=0)
     # The leading axes of the matrices broadcast with the points, also for JAX arrays of equal rank.
-    columns = SampledStates._make((*(part[:, None] for part in many[:3]), 1))
+    columns = SampledStates(many.psi[:, None], many.full[:, None], many.late[:, None], 1)
     on_device, points = jax.tree.map(jnp.asarray, columns), circle_points(jnp.asarray(POINTS.w)[None])
     np.testing.assert_allclose(jax.jit(on_device.controller)(points), columns.controller(POINTS), rtol=1e-12)
 

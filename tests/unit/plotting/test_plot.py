@@ -98,10 +98,10 @@ def test_recommendation_is_drawn_with_its_response():
 def test_text_of_the_stiffest_wall_is_inside_the_frame(size):
     knob = zwidth.Scene(zwidth.Device("60 g cm^2", "0.02 mN m s"), TIMING)
     for scene in (RIGID, knob):
-        figure, ax = plt.subplots(figsize=size)
+        _, ax = plt.subplots(figsize=size)
         plot.region(scene, ax)
         (text,) = ax.texts
-        frame, box = ax.get_window_extent(), text.get_window_extent(figure.canvas.get_renderer())
+        frame, box = ax.get_window_extent(), text.get_window_extent()
         assert frame.x0 <= box.x0, size
         assert box.x1 <= frame.x1, size
 

@@ -117,9 +117,9 @@ studies:
         assert data.pole_angle.attrs["units"] == "rad/period"
         assert data.frequency.attrs["units"] == "Hz"
         assert (data.status == Status.OK).all()
-        velocity = {"velocity": zwidth.LowPass(cutoff=100)} if parts else {}
+        velocity = zwidth.LowPass(cutoff=100) if parts else zwidth.BackwardDifference()
         for delay in (0, 1.5e-3):
-            scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, delay), **velocity)
+            scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, delay), velocity=velocity)
             selected = data.sel(delay=delay)
             K, B = np.meshgrid(selected.stiffness, selected.virtual_damping, indexing="ij")
             angle = np.abs(np.angle(scene.poles(K, B)))

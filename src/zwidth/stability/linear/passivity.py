@@ -199,7 +199,7 @@ def find_needed_damping(condition: PassivityCondition, alpha: np.ndarray, beta: 
     best = values.max(-1)
     # Store all undecided intervals of angles of all walls side by side: the index of the wall, the two ends, the
     # required damping at each end, and an upper bound of the required damping.
-    wall = np.repeat(np.arange(alpha.size), w.size - 1)
+    wall: np.ndarray = np.repeat(np.arange(alpha.size), w.size - 1)
     low, high = (np.tile(end, alpha.size) for end in (w[:-1], w[1:]))
     at_low, at_high = values[:, :-1].reshape(-1), values[:, 1:].reshape(-1)
     curvature = condition.bound_curvature(stiffness[:, None], beta[:, None], w[:-1], w[1:]).reshape(-1)
@@ -214,7 +214,8 @@ def find_needed_damping(condition: PassivityCondition, alpha: np.ndarray, beta: 
         undecided &= ~is_flat[wall]
         if not undecided.any():
             break
-        wall, low, high, at_low, at_high = (part[undecided] for part in (wall, low, high, at_low, at_high))
+        wall, low, high = wall[undecided], low[undecided], high[undecided]
+        at_low, at_high = at_low[undecided], at_high[undecided]
         angles = low + (high - low) * SHARES
         inner = condition.require_damping(stiffness[wall], beta[wall], angles)
         np.maximum.at(best, wall, inner.max(0))

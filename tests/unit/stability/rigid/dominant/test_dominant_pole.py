@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import partial
 
 import jax
 import numpy as np
@@ -72,9 +73,9 @@ def test_walls_as_typed_by_a_user():
 
 @pytest.mark.parametrize("d", [1, 1.5])
 def test_angle_and_its_derivative_inside_jit(d, x64):
-    walls = [column[:40] for column in random_walls(40, seed=8)[:3]]
-    direct = zwidth.dominant_pole(*walls, d)
-    inside = jax.jit(lambda *wall: zwidth.dominant_pole(*wall, d), compiler_options=QUICKLY)(*walls)
+    alpha, beta, delta, _ = random_walls(40, seed=8)
+    direct = zwidth.dominant_pole(alpha, beta, delta, d)
+    inside = jax.jit(partial(zwidth.dominant_pole, d=d), compiler_options=QUICKLY)(alpha, beta, delta)
     np.testing.assert_allclose(inside.angle, direct.angle, atol=1e-9)
     np.testing.assert_allclose(inside.radius, direct.radius, rtol=1e-9)
     np.testing.assert_array_equal(inside.status, direct.status)
