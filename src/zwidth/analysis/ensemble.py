@@ -41,7 +41,7 @@ LONGEST_WINDOW = 64  # in periods, of variants that are evaluated at once; longe
 DENSITIES = (1, 2)  # densities of nodes, of which a higher one is used for the variants that the lower one leaves open
 
 
-class _Normalized(NamedTuple):
+class _NormalizedVariants(NamedTuple):
     """Parameters of all variants."""
 
     values: dict[str, np.ndarray]  # varied parameters by dotted path
@@ -75,7 +75,7 @@ class Variants:
         return self.scene.replace(**{name: float(values[k]) for name, values in self.drawn.items()})
 
     @cached_property
-    def normalized(self) -> _Normalized:
+    def normalized(self) -> _NormalizedVariants:
         """Parameters of all variants, and which of them can be evaluated at once."""
         scene, nominal = self.scene, self.scene.parameters()
         values = {name: np.asarray(column, float) for name, column in self.drawn.items() if name not in WALL}
@@ -98,7 +98,7 @@ class Variants:
         hand = scene.operator
         rigid = hand is not None and hand.rigid and scene.device.coupling is None
         mass = every.get("mass", float(scene.mass)) + (every["operator.mass"] if rigid else 0.0)
-        return _Normalized(values, d, period, np.broadcast_to(mass, period.shape), usable)
+        return _NormalizedVariants(values, d, period, np.broadcast_to(mass, period.shape), usable)
 
     def _is_supported(self, values: dict[str, np.ndarray]) -> bool:
         """Return whether variants of the scene have one structure that can be evaluated at once."""

@@ -100,6 +100,7 @@ class Scene(SceneAdvice):
 # Methods that work inside jit, vmap and grad; `poles` only for a rigid scene with the backward difference.
 TRACEABLE = (
     "boundary",
+    "dominant_pole",
     "is_passive",
     "is_stable",
     "margins",

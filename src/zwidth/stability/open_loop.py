@@ -172,7 +172,7 @@ def find_nearest_angle(respond: Callable[[Array], Jet], w: Array, square: Array)
         index = _list_minima(xp.where(square < np.inf, square, np.inf))
         # If two nodes coincide, the minimum may lie after the second one. Therefore search up to the second neighbor.
         index = xp.clip(index[..., None] + expand_along(np.arange(-1, 3), index), 0, w.shape[-1] - 1)
-        angles = take(w, index.reshape(*w.shape[:-1], -1))
+        angles = take(w, index.reshape(*w.shape[:-1], index.shape[-2] * index.shape[-1]))
         slopes, angles = (part.reshape(index.shape) for part in (slope(angles), angles))
         rises = (slopes[..., :-1] <= 0) & (slopes[..., 1:] > 0)
         first, middle = xp.argmax(rises, -1)[..., None], angles[..., 1]

@@ -87,7 +87,7 @@ def test_diagnosis_is_not_that_of_the_simulated_hit():
 def test_time_axis_ends_after_the_motion():
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(rate=1000, delay=1e-3))
     figure = _draw_motion(scene.simulate(8008, 33.45, start_position=1e-3, periods=300))
-    (ax,) = figure.axes
+    ax = figure.axes[0]
     assert ax.get_xlabel().endswith("in ms")
     assert 30 < ax.get_xlim()[1] < 100
     figure = _draw_motion(scene.simulate(25e3, 33.45, start_position=1e-3, periods=50))

@@ -33,7 +33,7 @@ RESPONSE_TOLERANCE = 1e-10
 LARGEST_RATE = 1e6  # of the entries of A, squares of frequencies in rad per period
 
 
-class _Plant(NamedTuple):
+class _SampledBatch(NamedTuple):
     """G of each loop, with the fields of `LoopBatch`."""
 
     numerator: Array
@@ -82,14 +82,14 @@ def compare_responses(form: Form, loop: LoopBatch, states: SampledStates, w: Any
     return xp.abs(evaluate(form, loop, points.w).q / states.controller(points) - 1.0) < RESPONSE_TOLERANCE
 
 
-def _discretize_rigid(damping: Any, fraction: Any, size: int) -> _Plant:
+def _discretize_rigid(damping: Any, fraction: Any, size: int) -> _SampledBatch:
     """Return G of rigid masses in closed form."""
     xp = namespace(damping, fraction)
     delta = xp.broadcast_to(xp.asarray(damping), (size,)) + 0.0
     plant = discretize_mass(delta, xp.broadcast_to(xp.asarray(fraction), (size,)) + 0.0)
     h, q = factor_numerator(plant)
     one = xp.ones_like(delta)
-    return _Plant(
+    return _SampledBatch(
         xp.stack([plant.a2 + plant.a1 + plant.a0, 2.0 * plant.a2 + plant.a1, plant.a2]),
         xp.stack([0.0 * one, plant.em, one]),
         xp.stack([one + h / plant.a2, one + q]) + 0j,
@@ -123,13 +123,13 @@ def _sample(A: Array, B: Array, chain: AnyChain) -> SampledStates:
     return SampledStates(psi, full, late, chain.n_delay)
 
 
-def _factor(chain: AnyChain, states: SampledStates) -> _Plant:
+def _factor(chain: AnyChain, states: SampledStates) -> _SampledBatch:
     """Return G of discretized devices as polynomials, and its zeros and poles."""
     psi, late = states.psi, states.late
     xp = namespace(psi)
     zeros = -xp.linalg.eigvals(_realize_zeros(states)).T + 0j
     offsets, integrators = _find_poles(chain, psi)
-    return _Plant(late[:, 0] * _expand(zeros), _expand(offsets), zeros, offsets, integrators)
+    return _SampledBatch(late[:, 0] * _expand(zeros), _expand(offsets), zeros, offsets, integrators)
 
 
 def _realize_zeros(states: SampledStates) -> Array:

@@ -63,7 +63,7 @@ def find_position(line: Line, values: Values) -> Array:
     return (distance * xp.conj(direction)).real / (direction.real**2 + direction.imag**2)
 
 
-class Cells(NamedTuple):
+class NodeCells(NamedTuple):
     """Selected steps between nodes, listed one after the other."""
 
     cell: Array  # index of the node before
@@ -74,7 +74,7 @@ class Cells(NamedTuple):
     most: int  # largest number of listed steps per loop
 
 
-def list_cells(selected: Array, most: int) -> Cells:
+def list_cells(selected: Array, most: int) -> NodeCells:
     """List the selected steps between nodes, at most ``most`` per loop, from a mask of shape (nodes - 1, loops)."""
     xp, (count, n) = namespace(selected), selected.shape
     if xp is np:
@@ -83,22 +83,22 @@ def list_cells(selected: Array, most: int) -> Cells:
         crowded = np.bincount(loop, minlength=n) > most
         padding = (0, -cell.size % VECTOR_SIZE)
         columns = (np.pad(part, padding) for part in (cell, loop, slot, slot < most))
-        return Cells._make([*columns, crowded, most])
+        return NodeCells._make([*columns, crowded, most])
     first = xp.sort(xp.where(selected, xp.arange(count)[:, None], count), 0)[:most]
     slot, loop = xp.meshgrid(xp.arange(most), xp.arange(n), indexing="ij")
     valid = first < count
     columns = (part.reshape(-1) for part in (xp.where(valid, first, 0), loop, slot, valid))
-    return Cells._make([*columns, xp.sum(selected, 0) > most, most])
+    return NodeCells._make([*columns, xp.sum(selected, 0) > most, most])
 
 
-def list_changes(loops: Sampled, positive: Array) -> Cells:
+def list_changes(loops: Sampled, positive: Array) -> NodeCells:
     """List the steps between nodes over which k changes its sign, from the signs of k at the nodes."""
     # Each period of delay turns q by one revolution and adds up to two crossings.
     most = MOST_CROSSINGS + 2 * (loops.form.lag + loops.form.window)
     return list_cells(positive[1:] != positive[:-1], most)
 
 
-def tabulate(cells: Cells, values: Array, fill: float) -> Array:
+def tabulate(cells: NodeCells, values: Array, fill: float) -> Array:
     """Arrange values of listed steps in an array of shape (most, loops); ``fill`` for missing ones."""
     xp, shape = namespace(values), (cells.most, cells.crowded.size)
     if xp is np:
@@ -108,8 +108,8 @@ def tabulate(cells: Cells, values: Array, fill: float) -> Array:
     return xp.where(cells.valid, values, fill).reshape(shape)
 
 
-class Crossings(NamedTuple):
-    """Crossings of the stability boundary by one line per loop, in ascending order of t."""
+class LineCrossings(NamedTuple):
+    """LineCrossings of the stability boundary by one line per loop, in ascending order of t."""
 
     t: Array  # shape (crossings, loops); infinite for unused entries
     leaving: Array  # net number of poles that leave the circle as t increases
@@ -135,15 +135,15 @@ class Crossings(NamedTuple):
         return start + xp.sum(xp.where((self.t > 0) & (self.t < t), self.leaving, 0.0), 0)
 
 
-def sort_crossings(t: Array, leaving: Array, w: Array, cell: Array, doubtful: Array) -> Crossings:
+def sort_crossings(t: Array, leaving: Array, w: Array, cell: Array, doubtful: Array) -> LineCrossings:
     """Return crossings in ascending order of t."""
     xp = namespace(t)
     t = xp.where(xp.isnan(t), np.inf, t)
     order = xp.argsort(t, 0)
-    return Crossings._make([*(xp.take_along_axis(part, order, 0) for part in (t, leaving, w, cell)), doubtful])
+    return LineCrossings._make([*(xp.take_along_axis(part, order, 0) for part in (t, leaving, w, cell)), doubtful])
 
 
-def find_crossings(loops: Sampled, line: Line) -> Crossings:
+def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
     """Find all crossings of the stability boundary by one line per loop, to full accuracy."""
     xp, w, n = namespace(loops.w), loops.w, loops.w.shape[1]
     k, slope = combine(line, loops.parts), combine(line, loops.slopes)
@@ -215,7 +215,7 @@ def _take_line(line: Line, index: Array, n: int) -> Line:
     return Line(*(xp.broadcast_to(xp.asarray(part), (n,))[index] for part in line))
 
 
-def _tabulate_lists(lists: tuple[Cells, ...], values: Array, fill: float) -> Array:
+def _tabulate_lists(lists: tuple[NodeCells, ...], values: Array, fill: float) -> Array:
     """Arrange the values of several lists, one after the other, below each other; see `tabulate`."""
     tables, start = [], 0
     for cells in lists:
@@ -224,7 +224,9 @@ def _tabulate_lists(lists: tuple[Cells, ...], values: Array, fill: float) -> Arr
     return namespace(values).concatenate(tables)
 
 
-def _find_turns(loops: Sampled, line: Line, turns: Cells, k: Array, slope: Array) -> tuple[tuple[Array, Array], Array]:
+def _find_turns(
+    loops: Sampled, line: Line, turns: NodeCells, k: Array, slope: Array
+) -> tuple[tuple[Array, Array], Array]:
     """Return angle and value of the extremum of k in each listed step, and the loops in which its sign is unclear."""
     xp, w = namespace(loops.w), loops.w
     part, each = loops.loop.take(turns.loop), _take_line(line, turns.loop, w.shape[1])

@@ -23,8 +23,8 @@ from zwidth.core.status import RidgeKind
 from zwidth.core.types import Array
 from zwidth.core.xp import iterate, namespace
 from zwidth.stability.linear.batch_lines import (
-    Crossings,
     Line,
+    LineCrossings,
     combine,
     count_far,
     count_outside,
@@ -64,7 +64,7 @@ class Stiffest(NamedTuple):
     angles: Array  # of the active constraints, shape (2, loops)
 
 
-class _Interval(NamedTuple):
+class _OptimumRange(NamedTuple):
     """The widest stable interval of beta on a line of constant K per loop, and the nodes before its ends."""
 
     exists: Array
@@ -103,7 +103,7 @@ def find_stiffest(form: Form, loop: LoopBatch, sizes: Sizes, negative: bool) -> 
     return Stiffest(alpha, beta, omega, kind, confirmed, angles)
 
 
-def _place_axis(axis: Crossings, w: Array) -> Array:
+def _place_axis(axis: LineCrossings, w: Array) -> Array:
     """Return the alpha at which the curve crosses beta = 0 in each step between nodes, shape (nodes, loops).
 
     NaN marks a step without such a crossing.
@@ -119,7 +119,7 @@ def _place_axis(axis: Crossings, w: Array) -> Array:
     return table
 
 
-def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> Crossings:
+def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> LineCrossings:
     """Return the crossings of a line of constant K per loop, interpolated linearly between nodes.
 
     ``on_axis`` is the alpha at which the curve crosses the line beta = 0 in each step between nodes; NaN without one.
@@ -154,8 +154,8 @@ def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> Crossing
 
 
 def _find_interval(
-    loops: Sampled, axis: Crossings, on_axis: Array, start: Array, alpha: Array, least: float
-) -> _Interval:
+    loops: Sampled, axis: LineCrossings, on_axis: Array, start: Array, alpha: Array, least: float
+) -> _OptimumRange:
     """Return the widest stable interval of beta >= ``least`` at one alpha per loop."""
     xp, n = namespace(loops.w), alpha.size
     crossings = _interpolate_level(loops, alpha, on_axis)
@@ -169,10 +169,10 @@ def _find_interval(
     best = xp.argmax(width, 0)[None]
     exists = (xp.take_along_axis(width, best, 0)[0] > 0) & ~crossings.doubtful
     left, right = (xp.take_along_axis(part, best, 0)[0] for part in (xp.where(low < least, LEAST, place[0]), place[1]))
-    return _Interval(exists, left, right)
+    return _OptimumRange(exists, left, right)
 
 
-class _Curve(NamedTuple):
+class _CurveNodes(NamedTuple):
     """Alpha and beta of the boundary curve at angles w, and their derivatives in w."""
 
     alpha: Array
@@ -181,23 +181,23 @@ class _Curve(NamedTuple):
     beta_slope: Array
 
 
-def _trace(values: Values) -> _Curve:
+def _trace(values: Values) -> _CurveNodes:
     """Return the points of the boundary curve (V8)."""
     q, q_slope, f, f_slope = values
     beta = q.imag / f.imag
     beta_slope = (q_slope.imag - beta * f_slope.imag) / f.imag
     alpha_slope = q_slope.real - beta_slope * f.real - beta * f_slope.real
-    return _Curve(q.real - beta * f.real, beta, alpha_slope, beta_slope)
+    return _CurveNodes(q.real - beta * f.real, beta, alpha_slope, beta_slope)
 
 
-def _solve(loops: Sampled, axis: Crossings, alpha: Array, left: Array, right: Array) -> tuple[Array, ...]:
+def _solve(loops: Sampled, axis: LineCrossings, alpha: Array, left: Array, right: Array) -> tuple[Array, ...]:
     """Solve the two conditions at the ends of the last stable interval of the bisection.
 
     Args:
         loops: the loops.
         axis: crossings of the line beta = 0.
         alpha: alpha of the interval.
-        left: lower end of the interval, as in `_Interval`.
+        left: lower end of the interval, as in `_OptimumRange`.
         right: upper end.
 
     Returns:
@@ -294,7 +294,7 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
     return x, (first > 0) & (last < 0) & (move <= CONVERGED_PEAK * x)
 
 
-def _confirm(loops: Sampled, axis: Crossings, start: Array, found: tuple[Array, ...], negative: bool) -> Array:
+def _confirm(loops: Sampled, axis: LineCrossings, start: Array, found: tuple[Array, ...], negative: bool) -> Array:
     """Return whether each wall is the stiffest one within `MARGIN` (V24)."""
     alpha, beta, accurate = found
     xp, above = namespace(loops.w), alpha * (1.0 + MARGIN)
@@ -321,7 +321,7 @@ def _confirm(loops: Sampled, axis: Crossings, start: Array, found: tuple[Array, 
     return loops.resolved & certain & consistent & clear & bounded & connected & (alpha > 0)
 
 
-def _are_connected(loops: Sampled, axis: Crossings, start: Array, alpha: Array, beta: Array) -> Array:
+def _are_connected(loops: Sampled, axis: LineCrossings, start: Array, alpha: Array, beta: Array) -> Array:
     """Return whether a path of stable walls connects the wall below each maximum to K = 0.
 
     The path follows lines of constant B from each of the `LEVELS` to the next one and, at the last one, a ray.

@@ -190,7 +190,7 @@ class DelayedPlant:
         return Jet(power * value, power * slope), -power * by_time
 
 
-class Starts(NamedTuple):
+class StartingPoints(NamedTuple):
     """Starting values of Newton's method: angles and delays near which a wall has a pole on the unit circle."""
 
     wall: np.ndarray  # index of the wall
@@ -198,7 +198,7 @@ class Starts(NamedTuple):
     delay: np.ndarray  # in periods
 
 
-def _list_starts(tabulated: list[TabulatedDelay]) -> Starts:
+def _list_starts(tabulated: list[TabulatedDelay]) -> StartingPoints:
     """Return the starting values for all walls, from their gain crossovers at the tabulated delays."""
     # After m = phase/w more periods of delay, L would be -1 at the crossover w if |L| did not change, as is the case
     # for an integer m. So a solution exists near each integer through which m passes between two tabulated delays. Near
@@ -232,7 +232,7 @@ def _list_starts(tabulated: list[TabulatedDelay]) -> Starts:
     middle, least = m[1:-1], np.maximum(m[:-2], m[2:]) - m[1:-1]
     lowest = equal[1:] & equal[:-1] & (middle <= m[:-2]) & (middle <= m[2:])
     add(lowest & (middle - np.floor(middle) <= least), w[1:-1], delays[1:-1] + middle)
-    return Starts(*(np.concatenate(part) for part in zip(*starts, strict=True)))
+    return StartingPoints(*(np.concatenate(part) for part in zip(*starts, strict=True)))
 
 
 def _find_first_losses(
@@ -244,7 +244,7 @@ def _find_first_losses(
         starts = _list_starts(tabulated)
         earliest = np.full(alpha.shape, np.inf)
         np.minimum.at(earliest, starts.wall, starts.delay)
-        starts = Starts(*(part[starts.delay <= earliest[starts.wall] + MAX_STARTS] for part in starts))
+        starts = StartingPoints(*(part[starts.delay <= earliest[starts.wall] + MAX_STARTS] for part in starts))
         walls = alpha[starts.wall], beta[starts.wall]
         pairs = starts.wall, _solve_delays(plant, estimate, *walls, starts.w, starts.delay)
         real = _find_real_losses(plant, estimate, tabulated, alpha, beta)
