@@ -307,13 +307,13 @@ class SceneOptima(SceneAnalysis):
 
         Returns:
             ``value``, the sufficient value closest to the current one; ``sufficient_side``, the side of ``value`` on
-            which K_max is sufficient ("above" or "below"), "everywhere" if K_max is in the whole range (``value`` is
-            then the current value, or the closest end of the range), or "nowhere"; ``crossings``, all crossings found,
-            each confirmed by K_max on both sides; ``range``, the range searched; ``status``, UNREACHABLE with NaN if
-            K_max is below the required stiffness in the whole range. Inside JAX transformations ``sufficient_side`` is
-            the index of the side in ("above", "below", "everywhere", "nowhere"), ``crossings`` is empty, and ``value``
-            has first and second derivatives in the numbers of the scene and in the stiffness (NaN if no crossing is
-            found).
+            which K_max is sufficient ("above" or "below"), "everywhere" if K_max is sufficient in the whole range
+            (``value`` is then the current value, or the closest end of the range), or "nowhere"; ``crossings``, all
+            crossings found, each confirmed by K_max on both sides; ``range``, the range searched; ``status``,
+            UNREACHABLE with NaN if K_max is below the required stiffness in the whole range. Inside JAX transformations
+            ``sufficient_side`` is the index of the side in ("above", "below", "everywhere", "nowhere"), ``crossings``
+            is empty, and ``value`` has first and second derivatives with respect to the numbers of the scene and the
+            stiffness (NaN if no crossing is found).
 
         Numerics:
             K_max is computed at the current value, at 25 values across the range, and at extrema between them that may

@@ -1,7 +1,7 @@
-"""Compute margins, spectral radius and other results of a scene in NumPy, with exact derivatives, for use inside JAX.
+"""Compute results for a scene in NumPy, such as margins, with exact derivatives, for calls from JAX.
 
-A wall has the normalized stiffness alpha and damping beta. L is its open loop, and w is the angle of a point on the
-unit circle, in rad per period. F is the velocity estimate, G the device, and q = -1/G the critical controller.
+A wall has the stiffness alpha and the damping beta, both normalized; L is the open loop, and w is an angle on the unit
+circle, in rad per period. F is the velocity estimate, G the device, and q = -1/G the critical controller.
 
 Each function in `ANSWERS` has three arguments: a scene whose parameters are floats; an array with one row per point,
 which contains the alpha and beta of a wall, or an angle w; and the order of the highest derivative, 0, 1 or 2. The
@@ -35,7 +35,8 @@ POLE_TOLERANCE = 1e-9  # largest |1 + L| at this angle; the relative error of th
 ANGLE_STEPS = 12  # Newton steps for the angle
 N_ANGLES = 8  # number of angles, those with the smallest |1 + L|, at which each Newton step starts
 
-# Values (points, results), first derivatives (points, results, variables), and second derivatives, up to the order.
+# Values, first derivatives and second derivatives, up to the requested order, as arrays of shape (points, results),
+# (points, results, variables) and (points, results, variables, variables).
 Derivatives = list[np.ndarray]
 
 
@@ -205,7 +206,7 @@ def _find_delayed_angle(scene: Any, wall: list[float], delay: float) -> float | 
         best = np.argsort(np.where(np.isnan(distance), np.inf, distance))[:N_ANGLES]
         if distance[best[0]] <= POLE_TOLERANCE:
             return float(w[best[0]])
-        # Start Newton steps at the angles with L closest to -1. Keep these angles too, because a step may move away.
+        # Start Newton steps at the angles with L closest to -1. Keep these angles, because a step may increase |1 + L|.
         w, step = w[best], ((1.0 + L.value[best]) / L.slope[best]).real
         w = np.concatenate([w, np.clip(np.where(w < np.pi, w - step, w), 0.0, np.pi)])
     return None
@@ -353,7 +354,8 @@ ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {
 }
 """Function that computes results with derivatives, and their number, for each method of `zwidth.analysis.loop`."""
 
-# Values for scenes with a parameter out of range, if not all values are NaN. The label 0 means "not stable".
+# Values for scenes with a parameter out of range, for methods whose values are then not all NaN; the label 0 means
+# "not stable".
 INVALID = {
     "stiffest": [np.nan, np.nan, np.nan, RidgeKind.NONE, Status.INVALID_INPUT],
     "labels": [0.0],

@@ -41,7 +41,7 @@ def _build_scene(structure: Any, leaves: tuple[float, ...]) -> Any:
 
 @dataclass(frozen=True)
 class Question:
-    """A method for scenes of one structure, as a NumPy function of the scene's numbers and of further arguments."""
+    """A method of the loop for scenes of one structure, as a NumPy function of numbers and further arguments."""
 
     structure: Any  # structure of the scene, a JAX treedef
     method: str  # name of the method, a key of `ANSWERS`
@@ -72,7 +72,7 @@ class Question:
 
 
 def ask(scene: Any, method: str, *arguments: Array, options: tuple[Any, ...] = ()) -> Sequence[Any]:
-    """Return the results of a method for a scene that JAX traces, as a list of arrays.
+    """Return the results of a method of the loop for a scene that JAX traces, as a list of arrays.
 
     Args:
         scene: the scene.
@@ -86,7 +86,7 @@ def ask(scene: Any, method: str, *arguments: Array, options: tuple[Any, ...] = (
 
 @partial(jax.jit, static_argnums=0)
 def _ask(question: Question, leaves: Sequence[Any], arguments: Sequence[Any]) -> Sequence[Any]:
-    """Return the results of a method for the numbers of a scene and further arguments."""
+    """Return the results of a method of the loop for the numbers of a scene and further arguments."""
     numbers = broadcast_traced({f"number {k} of the scene": leaf for k, leaf in enumerate(leaves)})
     given = broadcast_traced({f"argument {k}": each for k, each in enumerate(arguments)}) if arguments else []
     shape = np.shape(given[0]) if given else ()
@@ -97,7 +97,7 @@ def _ask(question: Question, leaves: Sequence[Any], arguments: Sequence[Any]) ->
 
 @cache
 def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function, compiled by JAX, that calls a method with constant arguments, a scene and arrays."""
+    """Return a function, compiled by JAX, that calls a scene method with constant arguments, a scene and arrays."""
 
     @partial(jax.jit, static_argnums=0)
     def run(constants: tuple[tuple[str, Any], ...], scene: Any, numbers: Mapping[str, Any]) -> Any:

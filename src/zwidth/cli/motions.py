@@ -31,7 +31,7 @@ from zwidth.units.quantities import ANY, POSITIVE
 
 TIME_CONSTANTS = 8.0  # default length of a simulation, in time constants of the linear loop
 FEWEST_PERIODS = 300  # shortest default length of a simulation, in sampling periods
-MOVING = 0.02  # a figure shows deviations from the final position above this fraction of the range of positions
+MOVING = 0.02  # deviation from the final position that counts as motion in figures, relative to the range
 MOST_PERIODS = 20_000  # longest default length of a simulation, in sampling periods
 DEFAULT_DEPTH = 1e-3  # m or rad; default depth from which the device is released, if no encoder is given
 DEFAULT_STEPS = 50  # default depth in encoder steps, if an encoder is given

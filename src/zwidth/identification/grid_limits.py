@@ -34,7 +34,7 @@ class GridLimits:
 
     @cached_property
     def damping_limits(self) -> np.ndarray:
-        """For each device, the largest B below which walls with K -> 0+ are stable; infinite if no limit exists."""
+        """Limit of B for each device, below which all walls with K -> 0+ are stable; infinite if no limit exists."""
         return _cross_first(self.critical * self.velocity.conj(), self.critical / self.velocity)
 
     def limit_stiffness(self, virtual_damping: np.ndarray) -> np.ndarray:

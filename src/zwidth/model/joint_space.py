@@ -234,10 +234,10 @@ def _project(direction: Any, jacobian: Any, joints: int) -> np.ndarray:
 def _normalize(
     factor: np.ndarray, vector: np.ndarray, damper: np.ndarray, spring: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the force vector w, damping D and stiffness S in coordinates L' q, in which the mass matrix is I."""
+    """Return force vector w, damping D and stiffness S in the coordinates L' q, with the mass matrix M = L L'."""
 
     def transform(matrix: np.ndarray) -> np.ndarray:
-        """Return L^-1 A L^-T for a symmetric matrix A and the Cholesky factor L, without rounding asymmetry."""
+        """Return L^-1 A L^-T for a symmetric matrix A and the Cholesky factor L; the result is exactly symmetric."""
         half = np.linalg.solve(factor, matrix)
         whole = np.linalg.solve(factor, half.T)
         return 0.5 * (whole + whole.T)
@@ -272,7 +272,7 @@ def _clear(matrix: np.ndarray, size: float) -> np.ndarray:
 
 
 def _realize(w: np.ndarray, D: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a minimal state-space model (A, B, C) with an exact pole at s = 0 for every free motion.
+    """Return a minimal state-space model (A, B, C) whose poles at s = 0, those of motions without springs, are exact.
 
     The free motions N (the null space of the stiffness S) are those without springs, R are the other motions; q are
     positions and v velocities. The free positions affect the output only by their sum w_N' q_N, which is one state y0;

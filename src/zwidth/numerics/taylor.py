@@ -27,7 +27,7 @@ class Taylor:
         self.second = second
 
     def chain(self, v: Any, slope: Any, curvature: Any) -> Taylor:
-        """Return f(v) for an elementwise function f, given its value, slope and curvature (f, f', f'') at v."""
+        """Apply an elementwise function f, given its value, first and second derivative at v."""
         slope, curvature = np.asarray(slope)[..., None], np.asarray(curvature)[..., None, None]
         if self.second is None:
             return Taylor(v, slope * self.first)
@@ -149,7 +149,7 @@ def seed(values: Sequence[float], order: int) -> list[Taylor]:
 
 
 def stack(entries: Any, like: Taylor) -> Taylor:
-    """Combine numbers and zero-dimensional Taylor objects into one array; ``like`` is any Taylor of these variables."""
+    """Combine numbers and scalar Taylor objects into one Taylor array; ``like`` is any Taylor of these variables."""
     objects = np.asarray(entries, object)
     zero = like * 0.0
     parts = [each if isinstance(each, Taylor) else zero + each for each in objects.ravel()]
