@@ -124,7 +124,7 @@ class SceneParts(Part):
 
     @cached_property
     def traced_loop(self) -> Any:
-        """Loop for values that JAX traces, which `zwidth.Scene` defines because it requires JAX."""
+        """Loop for parameters and walls that JAX traces; `zwidth.Scene` defines it, because it requires JAX."""
         raise NotImplementedError
 
     def check_parts(self) -> None:
@@ -279,8 +279,8 @@ def wrap_function(
     return checked
 
 
-# Methods that are compiled as a whole if JAX traces a scene without closed form. Outside of the caller's own jit, JAX
-# would otherwise compile each operation of the method on its own, which takes ten times as long.
+# Methods that are compiled as one program if JAX traces the scene and the scene has no closed form. Without this, JAX
+# would compile each operation of the method separately outside jit, e.g. in grad, which takes ten times as long.
 COMPILED = (
     "boundary",
     "is_passive",

@@ -116,7 +116,7 @@ def _advise(
 
 
 def _spell_change(recommendation: Any, wall: WallChoice) -> str:
-    """Return a text with another wall and its loss or gain of stiffness, relative to the recommended wall."""
+    """Return a text that describes a wall and its loss or gain of stiffness, compared with the recommended wall."""
     ratio = wall.stiffness / recommendation.stiffness
     percent = max(100.0 * (1.0 - ratio), 0.1)
     cost = f"costs {percent:.{2 if percent < 99.0 else 3}g} % of the stiffness"
@@ -125,10 +125,10 @@ def _spell_change(recommendation: Any, wall: WallChoice) -> str:
 
 
 def price_passivity(recommendation: Any) -> str:
-    """Return a text with the passive wall under the same requirements, its options and its loss of stiffness.
+    """Return a text that describes the passive wall for the same requirements, its options and its loss of stiffness.
 
-    It is "" if the recommended wall is passive, or if passivity cannot be determined. The wall is accurate to about
-    0.2 %.
+    The text is empty if the recommended wall is passive, or if its passivity cannot be determined. The passive wall is
+    accurate to about 0.2 %.
     """
     scene, requirements = recommendation.scene, recommendation.requirements
     if recommendation.verdict is None or recommendation.verdict.passive is not False:
@@ -138,7 +138,7 @@ def price_passivity(recommendation: Any) -> str:
     )
     if wall.status != Status.OK:
         return "no passive wall satisfies the same requirements"
-    # List all requirements, because --passive replaces the defaults.
+    # State every requirement as an option, because the option --passive replaces the default requirements.
     options = {
         "--stiffness-fraction": requirements.stiffness_fraction and f"{100.0 * requirements.stiffness_fraction:.4g}%",
         "--gain-margin": requirements.gain_margin and f"{requirements.gain_margin:g}",

@@ -1,7 +1,7 @@
 """Virtual couplings of a scene that are stable with every passive virtual world (`stability.rigid.virtual_coupling`).
 
 A virtual coupling is a spring K and a damper B between the device and a tool, an object that the computer simulates.
-The coupling is the wall of the scene with a moving tool in place of the fixed one.
+If the tool were fixed, the coupling would be a wall; by default, K and B are therefore those of the scene's wall.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ class SafeCoupling(NamedTuple):
 def is_safe_for_every_world(scene: Scene, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
     """Return whether virtual couplings are stable with every passive tool, virtual world and operator.
 
-    The condition is ``b (B + KT/2) >= sin^2((n+1)w/2) [(B + KT/2)^2 + (KT/2)^2 cot^2(w/2)]`` at all frequencies w, with
-    the delay of n periods; it does not depend on the mass. A simulated world is passive if its integration method keeps
-    it passive: the implicit Euler and the trapezoidal method do. **The semi-implicit Euler method, which most physics
-    engines use, does not**: a light tool can make a coupling unstable for which this method returns True.
+    The condition is ``b (B + KT/2) >= sin^2((n+1)w/2) [(B + KT/2)^2 + (KT/2)^2 cot^2(w/2)]`` at all frequencies w
+    (rad per period), with the damping b of the device, the period T and a delay of n periods; the mass has no effect. A
+    simulated world is passive if its integration method preserves passivity, as the implicit Euler and the trapezoidal
+    method do. **The semi-implicit Euler method, which most physics
+    engines use, does not**: with a light tool, a coupling can be unstable although this function returns True.
 
     Args:
         stiffness: K in N/m, >= 0; default: the stiffness of the scene's wall.
@@ -60,16 +61,16 @@ def is_safe_for_every_world(scene: Scene, stiffness: Walls = None, virtual_dampi
     delta = float(scene.device.damping) / scene.units.virtual_damping
     with np.errstate(all="ignore"):
         safe = find_margin(0.5 * alpha / delta, beta / delta, n_delay) >= 0
-    # Without physical damping, only the absence of a coupling is safe.
+    # Without physical damping, the only safe coupling is none, K = B = 0.
     return safe if delta > 0 else (alpha == 0) & (beta == 0)
 
 
 def max_safe_coupling(scene: Scene) -> SafeCoupling:
     """Return the stiffest virtual coupling with B >= 0 that is stable with every passive tool, world and operator.
 
-    Its stiffness is ``k b/T`` and its damping ``r b`` with numbers k and r that depend on the delay only: k = 2 without
-    delay, 0.770 with one period of delay. See `is_safe_for_every_world` for the condition, for simulated worlds that
-    are not passive, and for errors.
+    The stiffness is ``k b/T`` and the damping ``r b``, with the damping b of the device, the period T, and factors k
+    and r that depend only on the delay: k = 2 without delay, 0.770 with one period of delay. For the condition, for
+    simulated worlds that are not passive, and for errors, see `is_safe_for_every_world`.
 
     Example:
         >>> import zwidth
@@ -83,8 +84,8 @@ def max_safe_coupling(scene: Scene) -> SafeCoupling:
 
 
 def _find_delay(scene: Scene) -> int:
-    """Return the integer delay in periods; raise `InputError` if the condition is not known for the scene."""
-    # The operator may be any passive one, so its parameters do not matter.
+    """Return the delay, an integer number of periods; raise `InputError` if no condition is known for the scene."""
+    # Ignore the operator of the scene, because the condition covers every passive operator.
     unsupported = [part for part in scene.nonrigid_parts if not part.startswith("operator")]
     if unsupported:
         raise InputError(

@@ -66,7 +66,7 @@ ON_CIRCLE = 1e-7
 
 
 class DominantMode(NamedTuple):
-    """Dominant pole (pole of largest magnitude) of the closed loop with one wall, also on the unit circle."""
+    """Dominant pole (pole of largest magnitude) of the closed loop with one wall, also if it is on the unit circle."""
 
     marginal: bool  # poles on the unit circle, none outside: one at z = 1, or all poles of an undamped plant
     radius: float  # spectral radius
@@ -177,7 +177,7 @@ class LinearLoop:
 
     def dominant_poles(self, alpha: np.ndarray, beta: np.ndarray) -> DominantPole:
         """Return the dominant pole of each wall, with times in periods; NaN for invalid walls."""
-        # Pass zeros for delta and d as in `decide`.
+        # Pass zeros for delta and d, because the device and the delay were already checked with the scene.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         stable = label_walls(self.boundary, alpha, beta).reshape(-1)
@@ -404,7 +404,7 @@ class RigidLoop(LinearLoop):
 
 
 def make_plain(scene: AnyScene) -> AnyScene:
-    """Return a scene in which JAX numbers are converted to floats and checked."""
+    """Return the scene with all JAX numbers converted to floats and checked."""
     return scene._rebuild() if any(map(is_jax, list_leaves(scene))) else scene
 
 

@@ -241,7 +241,7 @@ class SceneOptima(SceneAnalysis):
             Closed form for a rigid device. Otherwise the highest point of all edges of the stable set, with a relative
             error of about 1e-13 (larger for modes that decay by less than 1e-3 per period, except undamped ones).
             NOT_CONVERGED if lines of constant B contradict the result. Inside JAX transformations the result is the
-            same, with first and second derivatives in every number of the scene, delay and period included.
+            same, with first and second derivatives in every number of the scene, including delay and period.
 
         Example:
             >>> import zwidth
@@ -306,13 +306,14 @@ class SceneOptima(SceneAnalysis):
             negative_damping: as for `max_stiffness`.
 
         Returns:
-            ``value``, the sufficient value closest to the current one; ``sufficient_side``, its side on which K_max is
-            sufficient ("above" or "below"), "everywhere" if it is in the whole range (``value`` is then the current
-            value, or the closest end of the range), or "nowhere"; ``crossings``, all crossings found, each confirmed by
-            K_max on both sides; ``range``, the range searched; ``status``, UNREACHABLE with NaN if K_max is below the
-            required stiffness in the whole range. Inside JAX transformations ``sufficient_side`` is the index of the
-            side in ("above", "below", "everywhere", "nowhere"), ``crossings`` is empty, and ``value`` has first and
-            second derivatives in the numbers of the scene and in the stiffness (NaN without a crossing).
+            ``value``, the sufficient value closest to the current one; ``sufficient_side``, the side of ``value`` on
+            which K_max is sufficient ("above" or "below"), "everywhere" if K_max is sufficient in the whole range
+            (``value`` is then the current value, or the closest end of the range), or "nowhere"; ``crossings``, all
+            crossings found, each confirmed by K_max on both sides; ``range``, the range searched; ``status``,
+            UNREACHABLE with NaN if K_max is below the required stiffness in the whole range. Inside JAX transformations
+            ``sufficient_side`` is the index of the side in ("above", "below", "everywhere", "nowhere"), ``crossings``
+            is empty, and ``value`` has first and second derivatives with respect to the numbers of the scene and the
+            stiffness (NaN if no crossing is found).
 
         Numerics:
             K_max is computed at the current value, at 25 values across the range, and at extrema between them that may

@@ -41,10 +41,10 @@ class Scene(SceneAdvice):
 
     Numerics:
         A scene is a JAX pytree whose leaves are its numbers, so that it can be an argument of functions inside ``jit``,
-        ``vmap``, ``grad`` and other transformations. There `boundary`, `is_passive`, `is_stable`, `margins`,
-        `max_stiffness`, `passivity_margin`, `required`, `sensitivities` and `spectral_radius` return the same as
-        direct calls, for every scene except one with a measured device; `poles` works for a rigid scene with a plain
-        delay. All other methods raise `InputError` for traced values.
+        ``vmap``, ``grad`` and other transformations. Inside these, `boundary`, `is_passive`, `is_stable`, `margins`,
+        `max_stiffness`, `passivity_margin`, `required`, `sensitivities` and `spectral_radius` return the same values
+        as direct calls, for every scene except one with a measured device. `poles` works for a rigid scene whose delay
+        is not traced. All other methods raise `InputError` for traced values.
 
     Example:
         >>> import zwidth
@@ -56,7 +56,7 @@ class Scene(SceneAdvice):
 
     @cached_property
     def traced_loop(self) -> Any:
-        """Loop for values that JAX traces, if there is no closed form; it imports JAX."""
+        """Loop for parameters and walls that JAX traces, if the scene has no closed form; this property imports JAX."""
         if isinstance(self.device, MeasuredDevice):
             raise InputError("device: got a measured response inside jit, vmap or grad; use a model of the device")
         from zwidth.analysis.traced_loop import TracedLoop
@@ -97,7 +97,8 @@ class Scene(SceneAdvice):
     """Method that calls `zwidth.simulate` with this scene and all other arguments."""
 
 
-# Methods that work inside jit, vmap and grad; `poles` only for a rigid scene with the backward difference.
+# Methods that work inside the JAX transformations jit, vmap and grad. `poles` works there only for a rigid scene with
+# the backward difference.
 TRACEABLE = (
     "boundary",
     "dominant_pole",

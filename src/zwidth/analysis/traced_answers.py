@@ -1,9 +1,13 @@
-"""Answers about the walls of one scene with their derivatives, computed in NumPy for `zwidth.analysis.traced_loop`.
+"""Compute results for a scene in NumPy, such as margins, with exact derivatives, for calls from JAX.
 
-Each function of `ANSWERS` takes a scene with plain numbers, the further arguments of a question, one row per point, and
-the order of the highest derivative, 0, 1 or 2. The value is that of a direct call. The derivatives follow from the
-equations that the answer solves (`stability.linear.derivatives`); where they do not exist, they are NaN. Arguments are
-the normalized alpha and beta of walls, or angles w; r, q and F are defined in the module just named.
+A wall has the stiffness alpha and the damping beta, both normalized; L is the open loop, and w is an angle on the unit
+circle, in rad per period. F is the velocity estimate, G the device, and q = -1/G the critical controller.
+
+Each function in `ANSWERS` has three arguments: a scene whose parameters are floats; an array with one row per point,
+which contains the alpha and beta of a wall, or an angle w; and the order of the highest derivative, 0, 1 or 2. The
+values equal those of a direct call. The variables of the derivatives are the numbers of the scene (the leaves of its
+JAX pytree) and the entries of the row. The derivatives follow from the equations that the result solves
+(`stability.linear.derivatives`); where they do not exist, they are NaN.
 """
 
 from __future__ import annotations
@@ -26,28 +30,30 @@ from zwidth.stability.linear.margins import evaluate_walls
 from zwidth.stability.linear.passivity import PassivityCondition
 from zwidth.stability.linear.poles import compute_poles_minus_one, log_modulus
 
-# Search for the angle of the pole on the unit circle after the delay margin is added.
-POLE_TOLERANCE = 1e-9  # largest |1 + L| at this angle; the delay margin has a relative error of about 1e-12
-ANGLE_STEPS = 12  # Newton steps
-N_ANGLES = 8  # starting angles
+# Constants of the search for the angle of the pole that is on the unit circle if the delay grows by the delay margin.
+POLE_TOLERANCE = 1e-9  # largest |1 + L| at this angle; the relative error of the delay margin is about 1e-12
+ANGLE_STEPS = 12  # Newton steps for the angle
+N_ANGLES = 8  # number of angles, those with the smallest |1 + L|, at which each Newton step starts
 
-Derivatives = list[np.ndarray]  # values, first and second derivatives of one point or of several
+# Values, first derivatives and second derivatives, up to the requested order, as arrays of shape (points, results),
+# (points, results, variables) and (points, results, variables, variables).
+Derivatives = list[np.ndarray]
 
 
 def no_derivatives(values: np.ndarray, arguments: int, order: int, fill: float = 0.0) -> Derivatives:
-    """Return values whose derivatives are all 0, or ``fill``."""
+    """Return values together with derivatives that are all 0, or all ``fill``."""
     return [values, *(np.full((*values.shape, *[arguments] * k), fill) for k in range(1, order + 1))]
 
 
 def fill_rows(results: Derivatives, point: Any, rows: Sequence[int], parts: Implicit, factor: float = 1.0) -> None:
-    """Insert the derivatives of unknowns into the rows of the results of one point, multiplied by a factor."""
+    """Store the derivatives of unknowns, multiplied by a factor, in the given rows of the results for one point."""
     for result, part in zip(results[1:], parts, strict=False):
         for k, row in enumerate(rows):
             result[point, row] = factor * part[k] if part is not None else np.nan
 
 
 def find_stiffest(scene: Any, points: np.ndarray, order: int, negative_damping: bool | None) -> Derivatives:
-    """Return alpha, beta, omega, kind and status of the stiffest wall."""
+    """Return alpha, beta, angular frequency, kind and status of the stiffest stable wall, with derivatives."""
     negative = allows_negative(scene, negative_damping)
     top = scene.loop.stiffest(negative)
     results = no_derivatives(np.array([[*top]], float), len(list_leaves(scene)), order)
@@ -59,13 +65,13 @@ def find_stiffest(scene: Any, points: np.ndarray, order: int, negative_damping: 
 
 
 def label_walls(scene: Any, points: np.ndarray, order: int) -> Derivatives:
-    """Return 1 for stable walls and 0 for others."""
+    """Return 1 for stable walls and 0 for all other walls; all derivatives are 0."""
     stable = np.asarray(scene.loop.labels(*points.T), float)
     return no_derivatives(stable.reshape(-1, 1), len(list_leaves(scene)) + 2, order)
 
 
 def find_radius(scene: Any, points: np.ndarray, order: int) -> Derivatives:
-    """Return the spectral radius."""
+    """Return the spectral radius of walls, with derivatives."""
     radius = np.asarray(scene.loop.radius(*points.T)).reshape(-1, 1)
     results = no_derivatives(radius, len(list_leaves(scene)) + 2, order, np.nan)
 
@@ -78,10 +84,10 @@ def find_radius(scene: Any, points: np.ndarray, order: int) -> Derivatives:
         try:
             zeta = compute_poles_minus_one(scene.loop.roots, *wall[:, None])[0]
         except InputError:
-            continue  # more poles than are computed: no derivatives
+            continue  # too many poles to compute all; the derivatives remain NaN
         pole = np.log1p(zeta[np.argmax(log_modulus(zeta))])
         parts = differentiate(scene, order, wall.tolist(), [pole.real, abs(pole.imag)], equations)
-        # The radius is the exponential of the first unknown.
+        # Convert the derivatives of the first unknown, log(radius), to those of the radius.
         first = radius[k, 0] * parts.first[:1]
         second = parts.second if order < 2 or parts.second is None else radius[k, 0] * parts.second[:1]
         second = None if second is None else second + first[:, :, None] * parts.first[:1, None, :]
@@ -90,7 +96,7 @@ def find_radius(scene: Any, points: np.ndarray, order: int) -> Derivatives:
 
 
 def find_boundary(scene: Any, points: np.ndarray, order: int) -> Derivatives:
-    """Return alpha and beta of the walls with a pole pair on the unit circle at angles w."""
+    """Return alpha and beta of the walls that have a pole pair on the unit circle at the angles w, with derivatives."""
     walls = np.stack(scene.loop.critical_walls(points[:, 0]), -1)
     results = no_derivatives(walls, len(list_leaves(scene)) + 1, order)
 
@@ -104,7 +110,7 @@ def find_boundary(scene: Any, points: np.ndarray, order: int) -> Derivatives:
 
 
 def find_margins(scene: Any, points: np.ndarray, order: int) -> Derivatives:
-    """Return the margins in the order of `zwidth.Margins`, normalized."""
+    """Return the normalized stability margins of walls, in the order of `zwidth.Margins`, with derivatives."""
     margins = np.stack([np.broadcast_to(part, len(points)) for part in scene.loop.margins(*points.T)], -1)
     results = no_derivatives(margins, len(list_leaves(scene)) + 2, order, np.nan)
     for k in range(len(points)) if order else ():
@@ -145,12 +151,15 @@ def find_margins(scene: Any, points: np.ndarray, order: int) -> Derivatives:
 
 
 def _first(part: np.ndarray | None) -> np.ndarray | None:
-    """Return the first row of second derivatives."""
+    """Return the second derivatives of the first unknown; None if second derivatives are not computed."""
     return None if part is None else part[:1]
 
 
 def _at_angle(meet: Callable[..., list[Taylor]], unknowns: list[float], w: float) -> tuple[list[float], Any]:
-    """Return the unknowns and the equations of a margin at an angle, which is fixed at 0 and at pi."""
+    """Return the unknowns and the equations of a stability margin that is attained at the angle w.
+
+    The angle is an additional unknown unless it is 0 or pi. These two angles are constant, and one equation suffices.
+    """
     fixed = w in (0.0, np.pi)
 
     def equations(terms: LoopTerms, values: Sequence[Taylor]) -> list[Taylor]:
@@ -162,23 +171,23 @@ def _at_angle(meet: Callable[..., list[Taylor]], unknowns: list[float], w: float
 
 
 def _meet_gain(terms: LoopTerms, alpha: Taylor, beta: Taylor, gain: Taylor, w: Taylor) -> list[Taylor]:
-    """Return the equations of a pole at the angle w if K and B are multiplied by ``gain``."""
+    """Return the equations for a pole on the unit circle, at the angle w, if K and B are multiplied by ``gain``."""
     return split(terms.residual(alpha * gain, beta * gain, w * 1j)[0])
 
 
 def _meet_phase(terms: LoopTerms, alpha: Taylor, beta: Taylor, angle: Taylor, w: Taylor) -> list[Taylor]:
-    """Return the equations of the gain crossover w with the phase ``angle`` of -L."""
+    """Return the equations for a gain crossover (|L| = 1) at the angle w, where -L has the phase ``angle``."""
     q, f = terms.controller(w * 1j)[0], terms.estimate(w * 1j)[0]
     return split(((alpha + beta * f) * (angle * -1j).exp() - q) / abs(q.v))
 
 
 def _meet_delay(terms: LoopTerms, alpha: Taylor, beta: Taylor, delay: Taylor, w: Taylor) -> list[Taylor]:
-    """Return the equations of a pole at the angle w; the terms include the additional delay."""
+    """Return the equations for a pole on the unit circle at the angle w; ``terms`` include the additional delay."""
     return split(terms.residual(alpha, beta, w * 1j)[0])
 
 
 def _meet_distance(terms: LoopTerms, alpha: Taylor, beta: Taylor, distance: Taylor, w: Taylor) -> list[Taylor]:
-    """Return the equations of the smallest distance of L from -1, at the angle w."""
+    """Return the equations for the smallest distance of L from -1, which is attained at the angle w."""
     (q, q_slope), (f, f_slope) = terms.controller(w * 1j), terms.estimate(w * 1j)
     L = -(alpha + beta * f) / q
     slope = (-(beta * f_slope) - L * q_slope) / q
@@ -188,7 +197,7 @@ def _meet_distance(terms: LoopTerms, alpha: Taylor, beta: Taylor, distance: Tayl
 
 
 def _find_delayed_angle(scene: Any, wall: list[float], delay: float) -> float | None:
-    """Return the angle of the pole that reaches the unit circle if the delay margin is added to the delay."""
+    """Return the angle w of the pole that is on the unit circle if the delay grows by ``delay``, the delay margin."""
     chain, (alpha, beta) = scene.loop.chain, wall
     loop, w = change_delay(chain, float(chain.d) + delay), np.append(scene.loop.boundary.w, np.pi)
     for _ in range(ANGLE_STEPS):
@@ -197,21 +206,22 @@ def _find_delayed_angle(scene: Any, wall: list[float], delay: float) -> float | 
         best = np.argsort(np.where(np.isnan(distance), np.inf, distance))[:N_ANGLES]
         if distance[best[0]] <= POLE_TOLERANCE:
             return float(w[best[0]])
-        # Newton steps from the angles at which L is closest to -1; keep these angles as well.
+        # Start Newton steps at the angles with L closest to -1. Keep these angles, because a step may increase |1 + L|.
         w, step = w[best], ((1.0 + L.value[best]) / L.slope[best]).real
         w = np.concatenate([w, np.clip(np.where(w < np.pi, w - step, w), 0.0, np.pi)])
     return None
 
 
-NODES_PER_PERIOD = 32  # angles per period of delay and window, among which the largest required damping is sought
-NEWTON_STEPS = 2  # for the angle; the search before has half of the digits
-MARGIN_TOLERANCE = (
-    1e-9  # relative difference of the margin at this angle and its value, above which derivatives are NaN
-)
+# Constants of the search for the angle at which the passivity condition requires the largest damping.
+NODES_PER_PERIOD = 32  # grid angles per period of the delay and of the velocity window
+NEWTON_STEPS = 2  # Newton steps that refine the angle, because the minimizer is accurate to half of the digits only
+# Largest relative difference between the margin of a direct call and the margin at the refined angle. Above it, the
+# derivatives are NaN.
+MARGIN_TOLERANCE = 1e-9
 
 
 def find_passivity_margin(scene: Any, points: np.ndarray, order: int) -> Derivatives:
-    """Return the passivity margin, normalized."""
+    """Return the normalized passivity margin of walls, with derivatives."""
     margin = np.asarray(scene.loop.passivity_margin(*points.T), float).reshape(-1, 1)
     size = len(list_leaves(scene)) + 2
     results = no_derivatives(margin, size, order, np.nan)
@@ -235,7 +245,7 @@ def find_passivity_margin(scene: Any, points: np.ndarray, order: int) -> Derivat
 
 
 def _find_worst_angle(scene: Any, alpha: float, beta: float) -> float:
-    """Return the angle at which a passive wall requires the largest damping, with half of the digits."""
+    """Return the angle w at which a passive wall requires the largest damping, accurate to half of the digits."""
     from scipy.optimize import minimize_scalar
 
     estimate = scene.velocity.estimate(scene.timing.period)
@@ -257,9 +267,10 @@ def _find_worst_angle(scene: Any, alpha: float, beta: float) -> float:
 
 
 def _evaluate_passivity(scene: Any, wall: np.ndarray, w: float) -> Taylor:
-    """Return the passivity margin by the condition at one angle, in terms of leaves, alpha, beta and the angle.
+    """Return the passivity margin that the passivity condition yields at one angle w, with derivatives.
 
-    The formulas are those of `stability.linear.passivity`.
+    The variables are the numbers of the scene, alpha, beta and w. The formulas are those of
+    `stability.linear.passivity`.
     """
     leaves = list_leaves(scene)
     variables = seed([*leaves, *wall.tolist(), w], 2)
@@ -282,7 +293,7 @@ def _evaluate_passivity(scene: Any, wall: np.ndarray, w: float) -> Taylor:
 
 
 def find_required(scene: Any, points: np.ndarray, order: int, parameter: str, *options: Any) -> Derivatives:
-    """Return the required value of a parameter, its side, both ends of the range, and a status."""
+    """Return required parameter value, sufficient side, both ends of the range, and status, with derivatives."""
     within, negative = options
     count = len(list_leaves(scene))
     results = no_derivatives(np.full((len(points), 5), np.nan), count + 1, order)
@@ -302,7 +313,7 @@ def find_required(scene: Any, points: np.ndarray, order: int, parameter: str, *o
 def _differentiate_required(
     scene: Any, parameter: str, value: float, stiffness: float, order: int, negative: bool | None
 ) -> Implicit:
-    """Return the derivatives of a required value in the leaves of a scene and in the required stiffness."""
+    """Return the derivatives of a required parameter value in the numbers of the scene and the required stiffness."""
     path, x = ("period", 1.0 / value) if parameter == "rate" else (parameter, value)
     changed = scene.replace(**{path: x})
     count, index = len(list_leaves(scene)), index_parameters(changed)[path]
@@ -313,7 +324,7 @@ def _differentiate_required(
     K = alpha * varied.mass / varied.timing.period / varied.timing.period
 
     def move(part: np.ndarray) -> np.ndarray:
-        """Add the stiffness as a parameter, and move the derivatives in the required parameter to the unknown."""
+        """Add the stiffness as a variable, and move the derivatives in the parameter to the last variable."""
         moved = np.zeros(tuple(size + 2 for size in part.shape))
         moved[tuple(slice(count) for _ in part.shape)] = part
         for axis in range(part.ndim):
@@ -327,7 +338,7 @@ def _differentiate_required(
     result = differentiate_implicitly([equation])
     if parameter != "rate":
         return result
-    # The rate is the reciprocal of the period.
+    # The unknown is the period. Convert its derivatives to those of the rate 1/period.
     period = Taylor(x, result.first[0], None if result.second is None else result.second[0]).reciprocal()
     return Implicit(period.first[None], None if period.second is None else period.second[None])
 
@@ -341,9 +352,10 @@ ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {
     "passivity_margin": (find_passivity_margin, 1),
     "required": (find_required, 5),
 }
-"""Functions that compute answers, with the numbers of their results, by method of `zwidth.analysis.loop`."""
+"""Function that computes results with derivatives, and their number, for each method of `zwidth.analysis.loop`."""
 
-# Values of invalid scenes: NaN, except for the kind and the status of the stiffest wall, and False for labels.
+# Values for scenes with a parameter out of range, for methods whose values are then not all NaN; the label 0 means
+# "not stable".
 INVALID = {
     "stiffest": [np.nan, np.nan, np.nan, RidgeKind.NONE, Status.INVALID_INPUT],
     "labels": [0.0],

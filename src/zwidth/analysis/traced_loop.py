@@ -1,8 +1,10 @@
-"""Loop of a scene inside JAX transformations, for scenes that have no closed form.
+"""Analyses of a scene inside JAX transformations such as jit and grad, if the scene has no closed form.
 
-The leaves of the scene (its numbers) and the walls are arguments of a function that NumPy computes (`analysis.
-traced_answers`): it rebuilds the scene, calls the loop that a direct call would use, and returns the derivatives with
-the values. One program is therefore compiled per structure of a scene, and it is small. A batch is one call.
+NumPy computes the values and derivatives of each method (`analysis.traced_answers`), and the compiled JAX program calls
+NumPy. The arguments of such a call are the numbers of the scene (the *leaves* of its JAX pytree) and the walls. The
+call rebuilds the scene from the numbers, and evaluates the same loop as outside a transformation. The compiled program
+is therefore small, and JAX compiles it once per *structure* of a scene, i.e. once for all values of the numbers. A
+batch of scenes or walls takes a single call.
 """
 
 from __future__ import annotations
@@ -27,26 +29,26 @@ from zwidth.numerics.host_function import call_host
 from zwidth.stability.linear.derivatives import SceneSensitivities, list_ridge_parameters
 from zwidth.stability.results import Margins, RidgePoint
 
-KEPT_SCENES = 32  # scenes whose loops are kept, because values and derivatives are computed by several calls
-MAX_POINTS = 1 << 16  # points per call; larger calls could be computed by JAX, which must not run in a callback
+KEPT_SCENES = 32  # cached scenes with their loops, because values and derivatives are computed in several calls
+MAX_POINTS = 1 << 16  # points per NumPy call; zwidth might use JAX for more, but JAX must not run inside a callback
 
 
 @lru_cache(KEPT_SCENES)
 def _build_scene(structure: Any, leaves: tuple[float, ...]) -> Any:
-    """Return a scene from its structure and its leaves; raise `InputError` if a number is not allowed."""
+    """Return the scene with a given structure and given numbers; raise `InputError` if a number is not allowed."""
     return structure.unflatten(leaves)._rebuild()
 
 
 @dataclass(frozen=True)
 class Question:
-    """A question about scenes of one structure, as a function of their leaves and of further arguments."""
+    """A method of the loop for scenes of one structure, as a NumPy function of numbers and further arguments."""
 
-    structure: Any  # treedef of the scene
-    method: str  # key of `ANSWERS`
+    structure: Any  # structure of the scene, a JAX treedef
+    method: str  # name of the method, a key of `ANSWERS`
     options: tuple[Any, ...] = ()
 
     def __call__(self, order: int, points: np.ndarray) -> list[np.ndarray]:
-        """Return values and derivatives at points, one row of leaves and further arguments per point."""
+        """Return values and derivatives; a row of ``points`` contains a scene's numbers and the further arguments."""
         count, size = self.structure.num_leaves, points.shape[1]
         results = [np.full((len(points), ANSWERS[self.method][1], *[size] * k), np.nan) for k in range(order + 1)]
         results[0][:] = INVALID.get(self.method, np.nan)
@@ -63,20 +65,20 @@ class Question:
         return results
 
     def _answer(self, leaves: tuple[float, ...], points: np.ndarray, order: int) -> list[np.ndarray]:
-        """Return values and derivatives for one scene."""
+        """Return values and derivatives of the method for one scene, at several points."""
         scene = _build_scene(self.structure, leaves)
         with np.errstate(all="ignore"):
             return ANSWERS[self.method][0](scene, points, order, *self.options)
 
 
 def ask(scene: Any, method: str, *arguments: Array, options: tuple[Any, ...] = ()) -> Sequence[Any]:
-    """Return the results of a question about a traced scene, a list of arrays.
+    """Return the results of a method of the loop for a scene that JAX traces, as a list of arrays.
 
     Args:
         scene: the scene.
-        method: key of `ANSWERS`.
-        *arguments: further arguments, which broadcast; none for a question with one answer per scene.
-        options: constant arguments.
+        method: name of the method, a key of `ANSWERS`.
+        *arguments: further arrays, such as walls, which are broadcast; none for a method with one result per scene.
+        options: further arguments that JAX does not trace.
     """
     leaves, structure = jax.tree.flatten(scene)
     return _ask(Question(structure, method, options), leaves, arguments)
@@ -84,7 +86,7 @@ def ask(scene: Any, method: str, *arguments: Array, options: tuple[Any, ...] = (
 
 @partial(jax.jit, static_argnums=0)
 def _ask(question: Question, leaves: Sequence[Any], arguments: Sequence[Any]) -> Sequence[Any]:
-    """Return the results of a question for leaves and further arguments."""
+    """Return the results of a method of the loop for the numbers of a scene and further arguments."""
     numbers = broadcast_traced({f"number {k} of the scene": leaf for k, leaf in enumerate(leaves)})
     given = broadcast_traced({f"argument {k}": each for k, each in enumerate(arguments)}) if arguments else []
     shape = np.shape(given[0]) if given else ()
@@ -95,7 +97,7 @@ def _ask(question: Question, leaves: Sequence[Any], arguments: Sequence[Any]) ->
 
 @cache
 def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a compiled function of constant arguments, scene and further arguments of a method."""
+    """Return a function, compiled by JAX, that calls a scene method with constant arguments, a scene and arrays."""
 
     @partial(jax.jit, static_argnums=0)
     def run(constants: tuple[tuple[str, Any], ...], scene: Any, numbers: Mapping[str, Any]) -> Any:
@@ -142,7 +144,7 @@ class TracedLoop(LinearLoop):
         )
 
     def trace_sensitivities(self, negative_damping: bool | None) -> SceneSensitivities:
-        """Return K_max and its derivatives by dotted path; see `zwidth.Scene.sensitivities`."""
+        """Return K_max and its derivatives by dotted path of the parameter; see `zwidth.Scene.sensitivities`."""
         timing = self.scene.timing
 
         def maximum(scene: Any) -> tuple[Any, Any]:
@@ -160,13 +162,13 @@ class TracedLoop(LinearLoop):
     def trace_required(
         self, parameter: str, stiffness: Any, within: tuple[Any, ...] | None, negative_damping: bool | None
     ) -> tuple[Any, ...]:
-        """Return the fields of the result of `zwidth.Scene.required`, without the crossings."""
+        """Return the fields of the result of `zwidth.Scene.required`, with an empty tuple of crossings."""
         options = (parameter, within, negative_damping)
         value, side, low, high, status = ask(self.scene, "required", stiffness, options=options)
         return value, side.astype(jnp.int32), (), (low, high), status.astype(jnp.int32)
 
     def run_compiled(self, method: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-        """Call a method of the scene as one compiled program, whose arguments are the scene and all arrays."""
+        """Call a method of the scene as one compiled JAX program, whose inputs are the scene and all arrays."""
         numbers = {name: value for name, value in arguments.items() if isinstance(value, jax.Array | np.ndarray)}
         constants = tuple((name, value) for name, value in arguments.items() if name not in numbers)
         try:

@@ -49,13 +49,13 @@ class SceneMargins(Margins):
 
 @compact_repr(decay_rate="1/s", angle="rad", frequency="Hz")
 class ScenePole(NamedTuple):
-    """Dominant pole of the closed loop with a wall; arrays for several walls."""
+    """Dominant pole (pole of largest magnitude) of the closed loop with a wall; fields are arrays for several walls."""
 
     radius: Array  # magnitude of the pole, the spectral radius
     angle: Array  # angle of the pole in rad per period, from 0 to pi
     decay_rate: Array  # decay rate in 1/s
     frequency: Array  # frequency in Hz, ``angle/(2 pi T)``; 0 if the response does not oscillate
-    status: Array  # code of `Status`
+    status: Array  # code of `zwidth.Status`
 
 
 class SceneAnalysis(SceneParts):
@@ -84,7 +84,7 @@ class SceneAnalysis(SceneParts):
         return namespace(*walls).broadcast_arrays(*walls)
 
     def _loop_for(self, *values: Any) -> LinearLoop:
-        """Return the loop of the scene, or the one for walls that JAX traces."""
+        """Return the loop of the scene, or `traced_loop` if JAX traces the given walls or frequencies."""
         return self.traced_loop if is_traced(*values) and not self.loop.traceable else self.loop
 
     def poles(self, stiffness: Walls = None, virtual_damping: Walls = None) -> np.ndarray:
@@ -112,7 +112,7 @@ class SceneAnalysis(SceneParts):
 
         After faster components have decayed, the response oscillates with ``frequency`` in Hz and decays with
         ``decay_rate`` in 1/s. The radius and the method are those of `spectral_radius`; if several poles have the same
-        magnitude, the angle is that of any of them. Values that cannot be computed are NaN, with a ``status`` that is
+        magnitude, the angle is that of one of them. Values that cannot be computed are NaN, and their ``status`` is
         not 0.
 
         Example:
@@ -314,7 +314,7 @@ class SceneAnalysis(SceneParts):
         the exact discretization of every fractional delay, and is NaN if counts of poles below and above it do not
         confirm it. If no factor, phase or delay moves a pole onto the unit circle, the first three margins are infinite
         for a stable wall, and 0, NaN and 0 for an unstable one. Walls out of range are NaN. A rigid scene uses
-        `zwidth.margins`. Otherwise a single wall takes about 0.1 s, and many walls in one call a few milliseconds each.
+        `zwidth.margins`. For other scenes, one wall takes about 0.1 s, and many walls in one call some ms per wall.
         """
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)

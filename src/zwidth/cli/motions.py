@@ -31,7 +31,7 @@ from zwidth.units.quantities import ANY, POSITIVE
 
 TIME_CONSTANTS = 8.0  # default length of a simulation, in time constants of the linear loop
 FEWEST_PERIODS = 300  # shortest default length of a simulation, in sampling periods
-MOVING = 0.02  # deviation from the final position, relative to the range of positions, that a figure must show
+MOVING = 0.02  # deviation from the final position that counts as motion in figures, relative to the range
 MOST_PERIODS = 20_000  # longest default length of a simulation, in sampling periods
 DEFAULT_DEPTH = 1e-3  # m or rad; default depth from which the device is released, if no encoder is given
 DEFAULT_STEPS = 50  # default depth in encoder steps, if an encoder is given
@@ -63,7 +63,7 @@ def diagnose(scene: Any, hardware: dict[str, Any], as_json: bool) -> None:
 
 
 def _list_thin_margins(scene: Any) -> list[str]:
-    """Return a list with a caution on the small margins of a stable wall; empty if all margins are large enough."""
+    """Return a list with one caution that names the small margins of a stable wall; empty if all are large enough."""
     from zwidth.analysis.assessment import assess
     from zwidth.analysis.cautions import find_thin
 
@@ -73,7 +73,7 @@ def _list_thin_margins(scene: Any) -> list[str]:
 
 
 def _list_cautions(scene: Any) -> list[str]:
-    """Return the cautions on the safe limit and on values that the user has not given."""
+    """Return the cautions about the safe limit and about parameters that the user has omitted."""
     return [*printing.list_limit_cautions(scene), *printing.list_omission_cautions(scene, find_omitted())]
 
 
@@ -152,7 +152,7 @@ def simulate(
 
 
 def _draw_motion(motion: Any) -> Any:
-    """Return a figure of a motion over time; the time axis ends at three times the time in which it comes to rest."""
+    """Return a figure of a motion; if the device comes to rest, the time axis ends at three times the time to rest."""
     import numpy as np
 
     from zwidth.plotting import plot
@@ -162,7 +162,7 @@ def _draw_motion(motion: Any) -> Any:
     moving = abs(motion.position - motion.position[-1]) > MOVING * np.ptp(motion.position)
     if int(motion.outcome) == MotionKind.REST and moving.any():
         settled = motion.time[np.flatnonzero(moving)[-1] + 1]
-        # Convert to the unit of the axis, which may be ms, by the second sample.
+        # Find the unit of the time axis, s or ms, by comparing the time of the second sample.
         unit = np.asarray(ax.lines[0].get_xdata())[1] / motion.time[1]
         ax.set_xlim(0.0, min(3.0 * settled * unit, ax.get_xlim()[1]))
     return ax.figure

@@ -1,7 +1,8 @@
 """Registration of classes as nodes of JAX pytrees, without importing JAX.
 
-JAX flattens an object of a registered class, a *node* of a *pytree*, into its *leaves*, which it can trace, batch and
-differentiate, and into its constant *structure*. A class must be registered before JAX flattens an object of it, but
+A *pytree* is a tree of objects that JAX can *flatten*, i.e. split into its *leaves*, the numbers that JAX traces,
+batches and differentiates, and its constant *structure*. An object of a registered class is a *node* of such a tree;
+its *children* are nodes or leaves. A class must be registered before JAX flattens an object of this class, but
 importing zwidth must not import JAX, which takes 0.4 s. `register` therefore registers a class at once if JAX is
 loaded, otherwise as soon as the program imports JAX.
 """
@@ -15,24 +16,24 @@ from types import ModuleType
 from typing import Any, Protocol
 
 _nodes: set[type] = set()  # registered classes
-_waiting: list[type[Node]] = []  # those of them that JAX does not know yet
+_waiting: list[type[Node]] = []  # registered classes that are not yet passed to JAX
 
 
 class Node(Protocol):
-    """A class whose objects can be flattened for JAX."""
+    """A class whose objects JAX can flatten into children and a constant structure."""
 
     def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
-        """Return the children of the object with their names, and its structure, which is hashable."""
+        """Return the children of the object with their names, and its constant, hashable structure."""
         ...
 
     @classmethod
     def _unflatten(cls, structure: Any, children: Any) -> Any:
-        """Return an object from its structure and its children, without checks, because children may be tracers."""
+        """Return an object from its structure and its children, without checks, because JAX may pass tracers."""
         ...
 
 
 class HiddenText(tuple[Any, ...]):
-    """Values that a pytree carries along with its structure: all of them compare equal, and JAX compiles once."""
+    """Texts in the structure of a JAX pytree; they always compare equal, so that JAX compiles once for all texts."""
 
     __slots__ = ()
 
@@ -47,19 +48,19 @@ class HiddenText(tuple[Any, ...]):
 
 
 def register(kind: type[Node]) -> None:
-    """Register a class as a node of JAX pytrees, at once if JAX is loaded, otherwise when it is imported."""
+    """Register a class as a node of JAX pytrees: at once if JAX is loaded, otherwise when JAX is imported."""
     _nodes.add(kind)
     _waiting.append(kind)
     register_waiting()
 
 
 def is_node(value: object) -> bool:
-    """Return whether the class of an object is registered."""
+    """Return whether the class of an object is registered as a node of JAX pytrees."""
     return type(value) in _nodes
 
 
 def list_leaves(tree: Any) -> list[Any]:
-    """Return the leaves of an object of a registered class, or of a tuple of such objects, in the order of JAX."""
+    """Return the leaves (numbers) of a registered object, or of a tuple of such objects, in the order of JAX."""
     if not (is_node(tree) or isinstance(tree, tuple)):
         return [tree]
     children = tree if isinstance(tree, tuple) else [child for _, child in tree._flatten()[0]]
@@ -67,7 +68,7 @@ def list_leaves(tree: Any) -> list[Any]:
 
 
 def replace_leaves(tree: Any, leaves: Iterator[Any]) -> Any:
-    """Return a copy of an object with other leaves, without checks."""
+    """Return a copy of a JAX pytree in which the leaves are replaced by the given ones, without checks."""
     if isinstance(tree, tuple):
         return tuple([replace_leaves(each, leaves) for each in tree])
     if not is_node(tree):
@@ -77,8 +78,8 @@ def replace_leaves(tree: Any, leaves: Iterator[Any]) -> Any:
 
 
 def register_waiting() -> None:
-    """Register all waiting classes if JAX is loaded."""
-    # ``vars`` does not load the module, unlike ``getattr``, if it is a lazy module (importlib.util.LazyLoader).
+    """Pass all waiting classes to JAX if JAX is loaded."""
+    # Use ``vars``, because ``getattr`` would load JAX if its module is lazy (importlib.util.LazyLoader).
     if not _waiting or "tree_util" not in vars(sys.modules.get("jax", sys)):
         return
     from jax.tree_util import GetAttrKey, register_pytree_with_keys
@@ -98,10 +99,10 @@ def register_waiting() -> None:
 
 
 class _Watcher:
-    """A finder of modules (`sys.meta_path`) that registers the waiting classes after the import of JAX."""
+    """An import finder (`sys.meta_path`) that passes the waiting classes to JAX as soon as JAX is imported."""
 
     def find_spec(self, name: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Return the specification of the module `jax` by the other finders; None for other modules."""
+        """Return the import specification of `jax`, obtained from the other finders; None for other modules."""
         if name != "jax":
             return None
         others = (finder for finder in sys.meta_path if finder is not self)

@@ -20,9 +20,9 @@ import numpy as np
 from zwidth.core.types import Array
 
 # Constants of the maximization over B (`find_highest`), on a grid that is repeatedly refined around its best point.
-_DAMPINGS = 33  # number of points of the first grid
-_REFINED = 9  # number of points of each refined grid
-_TIMES = 3  # number of refinements
+_DAMPINGS = 33  # number of values of B on the first grid
+_REFINED = 9  # number of values of B on each refined grid
+_TIMES = 3  # number of refinements of the grid
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class GridLimits:
 
     @cached_property
     def damping_limits(self) -> np.ndarray:
-        """Upper limit of B for each device, below which walls with K -> 0+ are stable; infinite if no limit exists."""
+        """Limit of B for each device, below which all walls with K -> 0+ are stable; infinite if no limit exists."""
         return _cross_first(self.critical * self.velocity.conj(), self.critical / self.velocity)
 
     def limit_stiffness(self, virtual_damping: np.ndarray) -> np.ndarray:
-        """Return the stability limit of each device at a given B: the K below which all walls are stable; 0 if none is.
+        """Return, for each device, the K below which all walls with a given B are stable; 0 if no such wall is stable.
 
         Args:
             virtual_damping: B, one value for all devices or one per device.
@@ -80,7 +80,7 @@ def _cross_first(criterion: Array, value: Array) -> np.ndarray:
     """Return the smallest positive Re(``value``) at the frequencies at which Im(``criterion``) crosses zero.
 
     Rows are devices and columns frequencies. Both arrays are interpolated linearly between neighboring frequencies. At
-    the last frequency, ``criterion`` counts as real, because this frequency is at or near z = -1.
+    the last frequency, ``criterion`` is treated as real, because this frequency is at or near z = -1.
 
     Returns:
         One value per device; infinite if no such frequency exists.

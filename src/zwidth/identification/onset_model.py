@@ -126,11 +126,11 @@ class Onsets:
 def _differentiate_controller(
     plant: SampledPlant, delta: float, points: CirclePoints, q: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of q of a rigid mass with respect to the damping delta and the delay d.
+    """Return the derivatives of the critical controller q of a rigid mass with respect to damping delta and delay d.
 
     Args:
         plant: the sampled rigid mass.
-        delta: its damping b T/m.
+        delta: normalized damping b T/m of the mass.
         points: points of the unit circle.
         q: value of q at these points.
     """

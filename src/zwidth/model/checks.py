@@ -155,15 +155,16 @@ class Part:
     """Base class of the parts of a scene.
 
     The constructor checks all fields and converts them to SI units. ``repr`` returns the expression that creates the
-    part. For JAX, a part is a pytree: its numbers and parts are children, all other fields are constant structure.
+    part. Each part is a JAX pytree: numbers and nested parts are its children, all other fields its constant structure.
     """
 
     _owner: ClassVar[str] = ""  # first part of the dotted paths of the fields, as in "coupling.mass"
-    _texts: ClassVar[tuple[str, ...]] = ()  # fields with texts for people, which do not count as structure
-    _child_names: tuple[str, ...] | None = None  # set by `_unflatten`, because its children may be any objects
+    _texts: ClassVar[tuple[str, ...]] = ()  # fields with texts for the user; JAX does not compile again if they change
+    # Names of the children; set if JAX creates the part, because the types of its children are then arbitrary.
+    _child_names: tuple[str, ...] | None = None
 
     def __init_subclass__(cls) -> None:
-        """Register the class as a node of JAX pytrees."""
+        """Register each subclass as a node of JAX pytrees."""
         register(cls)
 
     def __post_init__(self) -> None:
@@ -188,33 +189,33 @@ class Part:
                 object.__setattr__(self, item.name, value)
 
     def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
-        """Return the children of the part for JAX with their names, and its constant structure."""
+        """Return the named children of the part as a node of a JAX pytree, and its constant structure."""
         values = {item.name: getattr(self, item.name) for item in fields(self) if item.init}  # pyright: ignore[reportArgumentType]
         names = self._child_names
         if names is None:
             names = tuple(k for k, value in values.items() if k not in self._texts and self._is_child(k, value))
         if not names:
-            # The structure is the part itself, which keeps its cached properties.
+            # A part without children is its own structure, so that JAX keeps its cached properties.
             return (), self
         children = tuple((name, values.pop(name)) for name in names)
         texts = HiddenText((name, values.pop(name)) for name in self._texts)
         return children, (names, tuple(values.items()), texts, self.unit_system is SYSTEMS[True])
 
     def _is_child(self, name: str, value: Any) -> bool:
-        """Return whether a field is a child in the sense of JAX: a number that is not an integer, a part, or parts."""
+        """Return whether a field is a child in JAX pytrees: a non-integer number, a part, or a tuple of parts."""
         if isinstance(value, tuple):
             return all(isinstance(each, Part) for each in value)
         return isinstance(value, float | np.floating | np.ndarray) or is_node(value) or is_jax(value)
 
     @classmethod
     def _unflatten(cls, structure: Any, children: Any) -> Any:
-        """Return a part from its structure and its children, which JAX may have replaced by any objects."""
+        """Return a part from its structure and its children; JAX may have replaced the children by any objects."""
         if isinstance(structure, Part):
             return structure
         names, constants, texts, rotary = structure
         part = object.__new__(cls)
         values = dict(zip(names, children, strict=True)) | dict(constants) | {"_child_names": names}
-        # JAX compiles a function once for all texts. A traced part therefore has none, instead of those of one scene.
+        # Leave texts empty in a traced part, because JAX uses the compiled function for parts with other texts too.
         values |= {name: type(text)() if is_traced(*children) else text for name, text in texts}
         if rotary:
             values["rotary"] = True
@@ -223,7 +224,7 @@ class Part:
         return part
 
     def _rebuild(self) -> Self:
-        """Return the part with all numbers converted to floats and checked again, as JAX does not check them."""
+        """Return the part with all numbers converted to floats and checked, because JAX sets numbers unchecked."""
         part = type(self)(**{item.name: _rebuild(getattr(self, item.name)) for item in fields(self) if item.init})  # pyright: ignore[reportArgumentType]
         if self.unit_system is SYSTEMS[True]:
             object.__setattr__(part, "rotary", True)
@@ -247,7 +248,7 @@ class Part:
 
 
 def _rebuild(value: Any) -> Any:
-    """Return a checked copy of a part or of a tuple of parts; return other values unchanged."""
+    """Return a checked copy of a part, or of each part in a tuple; return any other value unchanged."""
     if isinstance(value, tuple):
         return tuple(map(_rebuild, value))
     return value._rebuild() if isinstance(value, Part) else value

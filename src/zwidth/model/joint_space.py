@@ -7,8 +7,9 @@ The joints have coordinates q, the mass matrix M, the damping matrix D and the s
 The wall measures the displacement x of the point along the unit vector n, with the Jacobian J of the point, and the
 motors produce the joint torques J' n f that correspond to a force f along n. The point is free in all other directions.
 With the Cholesky factor L of M = L L' and the coordinates L' q, the mass matrix becomes the identity, and force and
-position have the same vector w = L^-1 J' n. Motions orthogonal to all vectors that products of D and S generate from w
-are neither excited nor measured; they are left out. If a single motion remains, the device is a rigid mass
+position have the same vector w = L^-1 J' n. The smallest subspace that contains w, and that D and S map into itself, is
+the part of the motion that is excited and measured; all other motions are left out. If a single motion remains, the
+device is a rigid mass
 
     m = 1/(n' J M^-1 J' n)
 
@@ -30,9 +31,9 @@ from zwidth.core.errors import InputError, check_choice, format_install_command
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
 
-# Relative size below which a component of a vector, or an eigenvalue, is a rounding error.
+# Relative size below which a component of a vector, or an eigenvalue, is treated as a rounding error.
 NEGLIGIBLE = 1e-11
-# Largest relative asymmetry of a symmetric matrix that is computed in floating point.
+# Largest asymmetry of a matrix, relative to its largest entry, that is attributed to rounding errors.
 ASYMMETRY = 1e-6
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -49,8 +50,9 @@ def from_mass_matrix(
     """Return the device that a wall along one direction acts on, for an arm with several joints in one pose.
 
     The motors of all joints produce the torques ``J' n f`` for a force f along the direction n, and the wall measures
-    the displacement ``n' J q`` of the point. All other directions are free. A joint without motor and encoder has a
-    column of zeros in the Jacobian. Friction, gravity and the dependence on the pose are not included.
+    the displacement ``n' J q`` of the point, with the joint coordinates q and the Jacobian J. All other directions are
+    free. A joint without motor and encoder has a column of zeros in J. Friction, gravity and the dependence on the pose
+    are not included.
 
     Args:
         mass_matrix: symmetric, positive definite matrix M of the joints, shape (joints, joints), in kg m^2 for hinges
@@ -59,10 +61,10 @@ def from_mass_matrix(
             symmetric matrix without negative eigenvalues.
         direction: direction n of the wall, of any length > 0: "x", "y" or "z", or a vector with one component per row
             of the Jacobian. It may be omitted if the Jacobian has a single row.
-        jacobian: Jacobian J of the point, with one column per joint and one row per axis: its velocity is ``J q'``.
-            None if ``direction`` is in joint coordinates.
-        stiffness: springs of the joints to ground in N m/rad or N/m, as for ``damping``. An elastic joint between two
-            coordinates is a matrix ``[[k, -k], [-k, k]]``.
+        jacobian: Jacobian J of the point, with one column per joint and one row per axis: the velocity of the point is
+            ``J q'`` for the joint velocities q'. None if ``direction`` is in joint coordinates.
+        stiffness: stiffness of springs from the joints to ground in N m/rad or N/m, in the same form as ``damping``. A
+            spring k between two coordinates has the matrix ``[[k, -k], [-k, k]]``.
         rotary: True if the direction is an axis of rotation. A `Device` then has rotary units; a `LinearDevice` prints
             the units of a linear device in any case.
 
@@ -140,7 +142,7 @@ def from_mujoco(
         Device(mass=0.04, damping=0.3, rotary=True)
     """
     try:
-        # Its type stubs lack most functions.
+        # Declare it as Any, because the type stubs of MuJoCo lack most functions.
         mujoco: Any = import_module("mujoco")
     except ImportError:
         command = format_install_command("mujoco")
@@ -171,11 +173,11 @@ def from_mujoco(
 
 
 def _read_matrix(name: str, value: Any, joints: int | None) -> np.ndarray:
-    """Return a symmetric matrix of the joints; for damping and stiffness, expand a number or one number per joint.
+    """Return a symmetric matrix of the joints; a number, or one number per joint, is converted to a diagonal matrix.
 
     Args:
-        name: field, for messages.
-        value: matrix; or number or vector if ``joints`` is given.
+        name: name of the field, for error messages.
+        value: matrix; if ``joints`` is given, also a number or a vector.
         joints: number of joints, or None if the matrix determines it.
     """
     try:
@@ -204,7 +206,7 @@ def _read_matrix(name: str, value: Any, joints: int | None) -> np.ndarray:
 
 
 def _project(direction: Any, jacobian: Any, joints: int) -> np.ndarray:
-    """Return J' n, the joint torques for a unit force along the direction, shape (joints,)."""
+    """Return the joint torques J' n for a unit force along the direction n, with the Jacobian J; shape (joints,)."""
     try:
         rows = np.eye(joints) if jacobian is None else np.array(jacobian, float)
         if isinstance(direction, str):
@@ -232,10 +234,10 @@ def _project(direction: Any, jacobian: Any, joints: int) -> np.ndarray:
 def _normalize(
     factor: np.ndarray, vector: np.ndarray, damper: np.ndarray, spring: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return w, D and S in the coordinates L' q, in which the mass matrix is the identity."""
+    """Return force vector w, damping D and stiffness S in the coordinates L' q, with the mass matrix M = L L'."""
 
     def transform(matrix: np.ndarray) -> np.ndarray:
-        """Return L^-1 A L^-T, exactly symmetric."""
+        """Return L^-1 A L^-T for a symmetric matrix A and the Cholesky factor L; the result is exactly symmetric."""
         half = np.linalg.solve(factor, matrix)
         whole = np.linalg.solve(factor, half.T)
         return 0.5 * (whole + whole.T)
@@ -244,17 +246,17 @@ def _normalize(
 
 
 def _reduce(w: np.ndarray, D: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Restrict the system to the smallest subspace that contains w and that D and S map into itself.
+    """Restrict the system to the smallest subspace that contains the force vector w and is invariant under D and S.
 
-    D and S are symmetric, so the orthogonal complement is invariant as well: its motions are neither excited nor
-    measured.
+    The damping D and the stiffness S are symmetric, so the orthogonal complement of the subspace is invariant as well:
+    its motions are neither excited nor measured.
     """
     basis = [w / np.linalg.norm(w)]
     sizes = [float(np.linalg.norm(matrix, 2)) for matrix in (D, S)]
     for vector in basis:
         for matrix, size in zip((D, S), sizes, strict=True):
             image = matrix @ vector
-            # Orthogonalize twice, because a single pass leaves rounding errors relative to the removed part.
+            # Orthogonalize twice, because the rounding errors of one pass are relative to the removed component.
             for _ in range(2):
                 image = image - sum((image @ base) * base for base in basis)
             if np.linalg.norm(image) > NEGLIGIBLE * size and len(basis) < len(w):
@@ -264,23 +266,23 @@ def _reduce(w: np.ndarray, D: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _clear(matrix: np.ndarray, size: float) -> np.ndarray:
-    """Return a symmetric matrix with rounding errors, relative to ``size``, replaced by 0."""
+    """Return a symmetric matrix, with entries that are rounding errors relative to ``size`` replaced by 0."""
     matrix = 0.5 * (matrix + matrix.T)
     return np.where(np.abs(matrix) > NEGLIGIBLE * size, matrix, 0.0)
 
 
 def _realize(w: np.ndarray, D: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a minimal state-space model (A, B, C) with an exact pole at s = 0 for every free motion.
+    """Return a minimal state-space model (A, B, C) whose poles at s = 0, those of motions without springs, are exact.
 
-    The null space N of S is the set of motions without springs. Their positions appear only in the sum w_N' q_N, which
-    is one state y0; the states are (y0, q_R, v_N, v_R) with the remaining motions R. Without this separation, rounding
-    errors would move poles at s = 0.
+    The free motions N (the null space of the stiffness S) are those without springs, R are the other motions; q are
+    positions and v velocities. The free positions affect the output only by their sum w_N' q_N, which is one state y0;
+    the states are (y0, q_R, v_N, v_R). Without this separation, rounding errors would move the poles at s = 0.
     """
     stiffness, vectors = np.linalg.eigh(S)
     free = stiffness <= NEGLIGIBLE * max(stiffness[-1], 0.0)
     N, R = vectors[:, free], stiffness[~free]
     if N.shape[1]:
-        # Order the free motions by their damping, so that an undamped one is an exact double integrator.
+        # Diagonalize the damping of the free motions, so that an undamped motion is an exact double integrator.
         damping, turn = np.linalg.eigh(N.T @ D @ N)
         N = N @ turn
         undamped = damping <= NEGLIGIBLE * np.linalg.norm(D, 2)
@@ -305,7 +307,7 @@ def _realize(w: np.ndarray, D: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _load(mujoco: Any, model: Any) -> Any:
-    """Return the MuJoCo model of a path, or the model itself."""
+    """Return the MuJoCo model in the file with the given path; return a loaded model unchanged."""
     if isinstance(model, mujoco.MjModel):
         return model
     if not isinstance(model, str | Path):
@@ -321,7 +323,7 @@ def _load(mujoco: Any, model: Any) -> Any:
 
 
 def _reject_constraints(model: Any) -> None:
-    """Raise `InputError` for parts of a model that change its motion but not its mass matrix."""
+    """Raise `InputError` if a MuJoCo model has parts that affect its motion, but not its mass matrix."""
     tendons = np.any(model.tendon_stiffness) or np.any(model.tendon_damping)
     faults = {
         "equality constraints": model.neq > 0,
@@ -334,7 +336,7 @@ def _reject_constraints(model: Any) -> None:
 
 
 def _read_pose(model: Any, pose: Any) -> np.ndarray:
-    """Return the joint positions of a pose."""
+    """Return the joint positions of a pose, given as None, the name of a keyframe, or joint positions."""
     if pose is None:
         return np.array(model.qpos0)
     if isinstance(pose, str):
@@ -350,7 +352,7 @@ def _read_pose(model: Any, pose: Any) -> np.ndarray:
 
 
 def _find_point(mujoco: Any, model: Any, name: str) -> tuple[str, int]:
-    """Return "site" or "body" with the index of the point of a given name."""
+    """Return "site" or "body", and the index of the site or body with the given name in a MuJoCo model."""
     for kind, count, code in (
         ("site", model.nsite, mujoco.mjtObj.mjOBJ_SITE),
         ("body", model.nbody, mujoco.mjtObj.mjOBJ_BODY),
@@ -363,7 +365,7 @@ def _find_point(mujoco: Any, model: Any, name: str) -> tuple[str, int]:
 
 
 def _find_driven(mujoco: Any, model: Any) -> np.ndarray:
-    """Return True for the degrees of freedom of all joints with actuators, or for all if there are no actuators."""
+    """Return a Boolean array, True for each degree of freedom with an actuator; all True without any actuators."""
     if not model.nu:
         return np.ones(model.nv, bool)
     on_joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))

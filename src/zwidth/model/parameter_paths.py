@@ -171,11 +171,11 @@ def spell_part(part: Any, *, every: bool = False) -> dict[str, Any]:
 
 
 def fill_parameters(scene: AnyScene, values: dict[str, Any]) -> AnyScene:
-    """Return a copy of a scene with arrays as parameters, without checks; only `build_chain` accepts such a scene.
+    """Return an unchecked copy of a scene in which parameters are arrays; only `build_chain` accepts such a scene.
 
     Args:
         scene: the scene.
-        values: values by dotted path, such as ``{"mass": numpy.array([0.1, 0.2])}``.
+        values: arrays by dotted path, such as ``{"mass": numpy.array([0.1, 0.2])}``.
     """
     parts = {name: copy_unchecked(part) for _, name, part in _parts(scene)}
     for prefix, name, part in _parts(scene):
@@ -194,7 +194,7 @@ def fill_parameters(scene: AnyScene, values: dict[str, Any]) -> AnyScene:
 
 
 def copy_unchecked(part: Any) -> Any:
-    """Return a copy of a part without its cached properties."""
+    """Return a copy of a part or a scene, without checks and without its cached properties."""
     new = object.__new__(type(part))
     for item in fields(part):
         object.__setattr__(new, item.name, getattr(part, item.name))

@@ -59,7 +59,7 @@ class Timing(Part):
         return text if not self.in_periods else text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
 
     def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
-        # The delay is a child in the unit in which it stays constant if the period changes.
+        # Pass the delay to JAX in the unit in which it was given, because it is constant in this unit.
         return (("period", self.period), ("delay", self._periods if self.in_periods else self.delay)), self.in_periods
 
     @classmethod
@@ -67,7 +67,7 @@ class Timing(Part):
         timing, (period, delay) = object.__new__(cls), children
         values = {"period": period, "delay": delay, "rate": None}
         if structure:
-            # JAX also passes objects that are not numbers; a delay in seconds does not exist for these.
+            # Keep the delay in periods if JAX passes objects that are not numbers and cannot be multiplied.
             with suppress(TypeError):
                 values["delay"] = delay * period
             values |= {"_periods": delay, "in_periods": True}

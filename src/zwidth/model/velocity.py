@@ -5,9 +5,9 @@ The *coded period* is the sampling period that the constants of an estimate were
 another period T, the program divides position differences by the wrong time, and its cut-off frequency is shifted;
 `Estimate` includes these errors.
 
-Estimates are evaluated with floats, balls of python-flint (``flint.arb``), and Taylor objects, whose derivatives are
-exact (`zwidth.numerics.taylor`). Zeros and poles are stored as offsets ``1 - root``, which are accurate for roots near
-z = 1.
+Estimates can be evaluated with floats, with balls of python-flint (``flint.arb``, numbers with an error bound), and
+with Taylor objects (numbers with exact derivatives, `zwidth.numerics.taylor`). Zeros and poles are stored as offsets
+``1 - root``, which are accurate for roots near z = 1.
 """
 
 from __future__ import annotations
@@ -342,7 +342,7 @@ def is_plain(velocity: Velocity, period: Any) -> bool:
     if any(getattr(velocity, item.name) is not None for item in fields(velocity)):
         return False
     if is_traced(period):
-        # A user's estimate may accept only floats.
+        # Compare the methods instead of their results, because a method written by the user may accept only floats.
         return type(velocity).estimate is BackwardDifference.estimate
     estimate = velocity.estimate(period)
     return estimate.window == 1 and estimate.is_difference and isinstance(estimate.gain, float) and estimate.gain == 1.0

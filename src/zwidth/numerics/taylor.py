@@ -1,10 +1,9 @@
 """Arithmetic with values and their first and second derivatives, in NumPy: exact derivatives without compilation.
 
-A `Taylor` holds an array v and its derivatives in m variables, as the last axes of further arrays: first derivatives
-of shape (..., m), second derivatives of shape (..., m, m). Sums, products and functions of them follow from the chain
-rule (forward mode; Griewank, Walther 2008, Evaluating Derivatives, chapter 13). Formulas that are written for numbers,
-such as the transfer functions of parts, also compute with zero-dimensional Taylor objects, and with NumPy arrays of
-such objects.
+A `Taylor` is an array v with its derivatives in m variables: ``first`` has shape (..., m) and ``second`` (..., m, m).
+Sums, products and functions of Taylor objects follow from the chain rule (forward mode; Griewank, Walther 2008,
+Evaluating Derivatives, chapter 13). Formulas that are written for numbers, such as the transfer functions of parts,
+also accept zero-dimensional Taylor objects and NumPy arrays of such objects.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-SERIES_TERMS = 18  # terms of the exponential series for norms up to 1/2; the first omitted term is below 1e-21
+SERIES_TERMS = 18  # terms of the series of e^M for matrices of norm <= 1/2; the first omitted term is below 1e-21
 
 
 class Taylor:
@@ -28,7 +27,7 @@ class Taylor:
         self.second = second
 
     def chain(self, v: Any, slope: Any, curvature: Any) -> Taylor:
-        """Return a function of the array, elementwise, from its value and its first two derivatives."""
+        """Apply an elementwise function f, given its value, first and second derivative at v."""
         slope, curvature = np.asarray(slope)[..., None], np.asarray(curvature)[..., None, None]
         if self.second is None:
             return Taylor(v, slope * self.first)
@@ -36,7 +35,7 @@ class Taylor:
         return Taylor(v, slope * self.first, slope[..., None] * self.second + curvature * square)
 
     def map(self, function: Any) -> Taylor:
-        """Return a function that is linear over the real numbers, such as the real part or a slice."""
+        """Apply a function that is linear over the real numbers, such as the real part or a slice."""
         second = None if self.second is None else function(self.second)
         return Taylor(function(self.v), function(self.first), second)
 
@@ -81,7 +80,7 @@ class Taylor:
     def __getitem__(self, index: Any) -> Taylor:
         return self.map(lambda part: part[index])
 
-    # Comparisons are those of the values.
+    # Compare the values only; derivatives are ignored.
     def __lt__(self, other: Any) -> bool:
         return bool(self.v < getattr(other, "v", other))
 
@@ -99,7 +98,7 @@ class Taylor:
         inverse = 1.0 / self.v
         return self.chain(inverse, -(inverse**2), 2.0 * inverse**3)
 
-    # NumPy calls these methods for its functions of the same names.
+    # For objects, NumPy functions call the method of the same name: np.exp(x) calls x.exp().
     def exp(self) -> Taylor:
         """Return the exponential."""
         v = np.exp(self.v)
@@ -126,22 +125,22 @@ class Taylor:
         return self.chain(v, 0.5 / v, -0.25 / v**3)
 
     def conjugate(self) -> Taylor:
-        """Return the complex conjugate; all variables are real."""
+        """Return the complex conjugate; the variables of the derivatives are real."""
         return self.map(np.conj)
 
     @property
     def real(self) -> Taylor:
-        """The real part; all variables are real."""
+        """The real part; the variables of the derivatives are real."""
         return self.map(np.real)
 
     @property
     def imag(self) -> Taylor:
-        """The imaginary part."""
+        """The imaginary part; the variables of the derivatives are real."""
         return self.map(np.imag)
 
 
 def seed(values: Sequence[float], order: int) -> list[Taylor]:
-    """Return variables with the given values, as zero-dimensional arrays with derivatives up to ``order``, 1 or 2."""
+    """Return independent variables with given values, as Taylor objects with derivatives up to ``order``, 1 or 2."""
     count = len(values)
     units = np.eye(count)
     return [
@@ -150,7 +149,7 @@ def seed(values: Sequence[float], order: int) -> list[Taylor]:
 
 
 def stack(entries: Any, like: Taylor) -> Taylor:
-    """Return an array of numbers and zero-dimensional Taylor objects as one Taylor; ``like`` has the same variables."""
+    """Combine numbers and scalar Taylor objects into one Taylor array; ``like`` is any Taylor of these variables."""
     objects = np.asarray(entries, object)
     zero = like * 0.0
     parts = [each if isinstance(each, Taylor) else zero + each for each in objects.ravel()]
@@ -162,7 +161,7 @@ def stack(entries: Any, like: Taylor) -> Taylor:
 
 
 def multiply(a: Taylor, b: Taylor) -> Taylor:
-    """Return the product of two matrices."""
+    """Return the product of two matrices, with derivatives."""
     first = np.tensordot(a.v, b.first, (1, 0)) + np.tensordot(a.first, b.v, (1, 0)).swapaxes(1, 2)
     second = None
     if a.second is not None:
@@ -173,7 +172,7 @@ def multiply(a: Taylor, b: Taylor) -> Taylor:
 
 
 def solve(matrix: Taylor, right: Taylor) -> Taylor:
-    """Return the solution x of ``matrix x = right`` for a vector on the right side."""
+    """Return the solution x of ``matrix x = right`` for a vector ``right``, with derivatives."""
     inverse = np.linalg.inv(matrix.v)
     v = inverse @ right.v
     first = np.tensordot(inverse, right.first - np.einsum("ijm,j->im", matrix.first, v), 1)
@@ -186,8 +185,8 @@ def solve(matrix: Taylor, right: Taylor) -> Taylor:
 
 
 def flow(A: Taylor, B: Taylor, time: Taylor) -> tuple[Taylor, Taylor]:
-    """Return ``e^(A t) - 1`` and the state after a unit force held for time t from rest, of ``x' = A x + B u``."""
-    # As in `plant.transition.compute_transition`: a series for a short time, which is then doubled.
+    """Return ``e^(A t) - 1`` and x(t) for ``x' = A x + B u`` with x(0) = 0 and the constant input u = 1."""
+    # Sum the series for a short time, then double the time repeatedly, as in `plant.transition.compute_transition`.
     size = len(A.v)
     norm = float(np.abs(A.v * time.v).sum(0).max())
     doublings = int(np.ceil(np.log2(max(2.0 * norm, 1.0))))
@@ -205,18 +204,18 @@ def flow(A: Taylor, B: Taylor, time: Taylor) -> tuple[Taylor, Taylor]:
 
 
 def _expand(x: Taylor, axes: int) -> Taylor:
-    """Return a zero-dimensional Taylor as an array with some axes of length 1."""
+    """Return a zero-dimensional Taylor, reshaped to the given number of axes of length 1."""
     return x.map(lambda part: np.asarray(part)[(None,) * axes])
 
 
 def _join(a: Taylor, b: Taylor) -> Taylor:
-    """Return two matrices side by side."""
+    """Return the block matrix [a, b], with derivatives."""
     second = None if a.second is None else np.concatenate([a.second, b.second], 1)
     return Taylor(np.concatenate([a.v, b.v], 1), np.concatenate([a.first, b.first], 1), second)
 
 
 class Implicit(NamedTuple):
-    """Derivatives of the solution u(p) of a system of equations in the parameters p; NaN if the system is singular."""
+    """Derivatives of the solution u(p) of a system of equations with parameters p; NaN if the system is singular."""
 
     first: np.ndarray  # (unknowns, parameters)
     second: np.ndarray | None  # (unknowns, parameters, parameters)
@@ -226,8 +225,8 @@ def differentiate_implicitly(equations: Sequence[Taylor]) -> Implicit:
     """Return the derivatives of the solution u of ``F(p, u) = 0`` by the implicit function theorem.
 
     Args:
-        equations: real F at the solution; the variables are the parameters p, followed by as many unknowns u as there
-            are equations.
+        equations: components of F at the solution, which are real. The variables of their derivatives are all
+            parameters p, followed by the unknowns u, whose number equals that of the equations.
     """
     count = len(equations)
     slopes = np.array([each.first for each in equations])

@@ -39,7 +39,7 @@ MARKS: dict[str, dict[str, Any]] = {
 }
 _LETTER_WIDTH = 4.4  # mean width of a letter of the text next to a mark, in points
 _FRAME_MARGIN = 0.8  # width of a panel outside the frame of its axes, in inches
-_MARGINS = 1.08  # width of the stiffness axis without text, relative to the largest stiffness
+_MARGINS = 1.08  # width of the stiffness axis without room for text, relative to the largest stiffness
 _WIDEST_TEXT = 0.45  # largest width of a text to the right of the stiffest wall, relative to the panel
 # Line style of each kind of outline.
 _DASHES = {"outline": style.SOLID, "island": style.DASHED, "hole": style.DOTTED, "passive": style.DASH_DOTTED}
@@ -116,7 +116,7 @@ def mark_wall(
 
 
 def _estimate_width(ax: Axes) -> float:
-    """Return the width of the frame of an Axes in points; with a layout engine, the one expected after the layout."""
+    """Return the width of the frame of an Axes in points, as expected after a layout engine has arranged the figure."""
     figure, spec = style.figure_of(ax), ax.get_subplotspec()
     width = figure.get_figwidth() * ax.get_position().width
     if figure.get_layout_engine() is not None:
@@ -125,7 +125,7 @@ def _estimate_width(ax: Axes) -> float:
 
 
 def _measure_width(text: str) -> float:
-    """Return the approximate width of a text next to a mark, with its distance from the mark, in points."""
+    """Return the approximate width of a text next to a mark in points, including its distance from the mark."""
     return _LETTER_WIDTH * max(len(line.replace("$", "")) for line in text.split("\n")) + 8.0
 
 

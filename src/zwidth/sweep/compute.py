@@ -47,7 +47,7 @@ MAX_EXPANDED = 1 << 20  # largest number of points whose parameters are expanded
 # JAX and compiling the kernel.
 MAX_NUMPY = 1 << 20
 # Smallest number of walls per device for which the dominant poles are computed by power series over cells of the grid
-# (`stability.rigid.dominant.grid`). For fewer walls they are computed one by one.
+# (`stability.rigid.dominant.grid`). For fewer walls, each pole is computed separately.
 MIN_GRID_WALLS = 1 << 8
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 

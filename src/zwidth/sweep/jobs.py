@@ -282,7 +282,7 @@ def compute_scenes(
 def _compute_stiffest(
     results: dict[str, np.ndarray], status: np.ndarray, study: SweepStudy, block: SceneBlock
 ) -> dict[str, np.ndarray]:
-    """Compute the stiffest stable wall of each device of a block, into prepared arrays of shape (D,)."""
+    """Compute the stiffest stable wall of each of the D devices of a block; write to arrays of shape (D,)."""
     scenes = []
     for k in range(status.size):
         try:
