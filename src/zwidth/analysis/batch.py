@@ -1,8 +1,8 @@
 """Stiffest walls of many scenes at once.
 
 Scenes of one structure, i.e. with the same kinds of parts and the same orders, are evaluated together
-(`zwidth.analysis.ensemble.Variants`). Each result that the counts of poles do not confirm is computed again by
-`Scene.max_stiffness`.
+(`zwidth.analysis.ensemble.Variants`). Pole counts confirm each result. A scene without a confirmed result is searched
+by itself, by `Scene.max_stiffness`.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class StiffestWalls(NamedTuple):
     virtual_damping: np.ndarray  # in N s/m
     frequency: np.ndarray  # of the pole pair on the unit circle, in Hz
     kind: np.ndarray  # code of `zwidth.RidgeKind`
-    status: np.ndarray  # code of `zwidth.Status`; the values are NaN unless it is 0
-    searched: np.ndarray  # True if the scene needed a search of its own
+    status: np.ndarray  # code of `zwidth.Status`; the walls are NaN unless this code is 0
+    searched: np.ndarray  # True if the scene was searched by itself
 
 
 def stiffest_walls(
@@ -59,17 +59,18 @@ def stiffest_walls(
 
     Returns:
         StiffestWalls of the broadcast shape, or of shape (scenes,): the fields of `Scene.max_stiffness`, and
-        ``searched``. INVALID_INPUT with NaN if a scene is invalid with its parameters.
+        ``searched``. If a scene is invalid with its parameters, its wall is NaN with the status INVALID_INPUT.
 
     Raises:
         InputError: an object is not a scene, a parameter is unknown, or shapes do not broadcast.
 
     Numerics:
-        The boundary curve is evaluated at common nodes for all scenes of one structure. Bisection of the largest K with
-        a stable B, and Newton's method, find the wall. Counts of poles on three lines confirm that it is stable and
-        connected to K = 0 and that no wall more than 4e-10 stiffer is (docs/theory/scenes.md, V23, V24). Scenes without
-        this confirmation are searched one by one: up to a few percent. Some 0.1 to 1 ms per scene; a searched one takes
-        10 to 50 ms. The result for a scene does not depend on the others.
+        The stability boundary of all scenes of one structure is evaluated together. Bisection for the largest K with a
+        stable B, followed by Newton's method, yields the wall. Pole counts along three lines of walls confirm that this
+        wall is stable and connected to K = 0, and that no such wall is stiffer by more than a relative 4e-10
+        (docs/theory/scenes.md, V23, V24). Scenes without this confirmation, up to a few percent, are searched one by
+        one. The time is about 0.1 to 1 ms per scene, and 10 to 50 ms per searched scene. The result for a scene does
+        not depend on the other scenes.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII (rigid device).
@@ -97,7 +98,7 @@ def stiffest_walls(
         check_scene(scene, "stiffest_walls")
         if negative_damping is not None:
             allows_negative(scene, negative_damping)
-        # Leave out an invalid scene, such as one with a cutoff above the Nyquist frequency.
+        # Skip an invalid scene, such as one with a cutoff above the Nyquist frequency; its wall remains NaN.
         with suppress(InputError):
             groups.setdefault((_describe_structure(scene), allows_negative(scene, negative_damping)), []).append(k)
     for (_, negative), index in groups.items():
@@ -108,7 +109,7 @@ def stiffest_walls(
 
 
 def _vary_scene(scene: SceneOptima, parameters: Mapping[str, ArrayLike], negative: bool | None) -> StiffestWalls:
-    """Return the stiffest walls of one scene with varied parameters."""
+    """Return the stiffest walls of one scene for arrays of parameters."""
     check_scene(scene, "stiffest_walls")
     known = {**scene.parameters(), "rate": 1.0}
     for name in parameters:
@@ -138,7 +139,8 @@ def _solve_group(scenes: list[SceneOptima], negative: bool) -> StiffestWalls:
     parameters = [scene.parameters() for scene in scenes]
     names = [name for name, value in parameters[0].items() if isinstance(value, float) and name not in WALL]
     columns = {name: np.array([each[name] for each in parameters]) for name in names}
-    # Keep a spring to ground that is 0 in all scenes as a plain 0, because it is then missing in the structure.
+    # Do not vary the stiffness of a spring to ground that is 0 in all scenes, because models without this spring have a
+    # different structure.
     variants = _ListedVariants(
         scenes, {name: c for name, c in columns.items() if name != "operator.stiffness" or c.any()}
     )
@@ -149,7 +151,7 @@ def _solve_group(scenes: list[SceneOptima], negative: bool) -> StiffestWalls:
 
 
 def _convert(variants: Variants, point: RidgePoint, searched: np.ndarray) -> StiffestWalls:
-    """Convert the ridge points of variants to SI units."""
+    """Convert the stiffest walls of variants from normalized to SI units."""
     mass, period = variants.normalized.mass, variants.normalized.period
     with np.errstate(all="ignore"):
         rate = mass / period
@@ -158,7 +160,7 @@ def _convert(variants: Variants, point: RidgePoint, searched: np.ndarray) -> Sti
 
 
 def _describe_structure(scene: SceneOptima) -> tuple[Any, ...]:
-    """Return a hashable description of a scene without its continuous parameters."""
+    """Return a hashable description of the structure of a scene: everything except its continuous parameters."""
     if isinstance(scene.device, MeasuredDevice):
         return (id(scene),)
     parts = {"device": scene.device, **find_parts(scene)}

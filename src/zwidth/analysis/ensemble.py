@@ -1,10 +1,10 @@
 """Stability and stiffness limits of many variants of a scene, for tolerances and uncertain devices.
 
-A *variant* is the scene with other values of some parameters. `Variants` evaluates the variants of any scene at once,
-by counts of poles along lines of walls (`zwidth.stability.linear.batch_lines`), and each variant whose result these
-counts do not confirm by itself. `RigidVariants` evaluates variants of a rigid mass with the backward difference by
-closed forms on arrays. Results have one entry per variant. K and B are the stiffness and damping of a wall in SI
-units; ``rate`` is m/T, ``delta = b T/m``, and d is the delay in periods T, with the mass m and damping b of the device.
+A *variant* is the scene with other values of some parameters. `Variants` evaluates all variants of any scene at once,
+by pole counts along lines of walls (`zwidth.stability.linear.batch_lines`). Variants whose results the pole counts do
+not confirm are evaluated one by one. `RigidVariants` evaluates variants of a rigid mass with the backward difference by
+closed forms on arrays. Results have one entry per variant. K and B are the stiffness and damping of a wall in SI units;
+``rate`` is m/T, ``delta = b T/m``, and d is the delay in periods T, with the mass m and damping b of the device.
 """
 
 from __future__ import annotations
@@ -37,25 +37,26 @@ from zwidth.units.quantities import FIELDS, WALL
 RIGID_PARAMETERS = ("mass", "damping", "period", "delay")
 MAX_PIECES = 6  # largest number of pieces of arrays that NumPy evaluates faster than a function compiled by JAX
 LEAST_BATCH = 16  # smallest number of variants that are faster to evaluate at once than one by one
-LONGEST_WINDOW = 64  # in periods, of variants that are evaluated at once; longer ones need too many nodes
-DENSITIES = (1, 2)  # densities of nodes, of which a higher one is used for the variants that the lower one leaves open
+LONGEST_WINDOW = 64  # longest velocity window, in periods, of variants evaluated at once; longer windows take too long
+# Densities of the frequency grid. The higher one is used for variants that are not confirmed with the lower one.
+DENSITIES = (1, 2)
 
 
 class _NormalizedVariants(NamedTuple):
-    """Parameters of all variants."""
+    """Parameters of all variants, from which their normalized parameters follow."""
 
     values: dict[str, np.ndarray]  # varied parameters by dotted path
     d: np.ndarray  # delay in periods
     period: np.ndarray
     mass: np.ndarray  # unit of mass, as `SceneParts.mass`
-    usable: np.ndarray  # variants that can be evaluated at once
+    usable: np.ndarray  # True for variants that can be evaluated at once
 
 
 class BatchRidge(NamedTuple):
-    """Stiffest wall of each variant in normalized parameters, and whether a search of its own was necessary."""
+    """Stiffest wall of each variant in normalized parameters."""
 
     point: RidgePoint
-    searched: np.ndarray
+    searched: np.ndarray  # True for variants that were searched one by one
 
 
 class Variants:
@@ -76,7 +77,7 @@ class Variants:
 
     @cached_property
     def normalized(self) -> _NormalizedVariants:
-        """Parameters of all variants, and which of them can be evaluated at once."""
+        """Parameters of all variants, and flags for the variants that can be evaluated at once."""
         scene, nominal = self.scene, self.scene.parameters()
         values = {name: np.asarray(column, float) for name, column in self.drawn.items() if name not in WALL}
         if "rate" in values:
@@ -101,13 +102,13 @@ class Variants:
         return _NormalizedVariants(values, d, period, np.broadcast_to(mass, period.shape), usable)
 
     def _is_supported(self, values: dict[str, np.ndarray]) -> bool:
-        """Return whether variants of the scene have one structure that can be evaluated at once."""
+        """Return whether all variants of the scene have the same structure, and one that can be evaluated at once."""
         scene, nominal = self.scene, self.scene.parameters()
         device, velocity = scene.device, scene.velocity
         known = type(device) in (Device, LinearDevice) and type(velocity) in ESTIMATES.values()
         sampled = getattr(device, "dt", None) is not None
         whole = any(isinstance(nominal.get(name), int) for name in values)
-        # A parameter that is 0 may be missing in the structure, such as a spring to ground.
+        # Without a spring to ground a model has a different structure, so its stiffness must not be 0 in any variant.
         changed = any(name.startswith("operator.stiffness") and np.any(column == 0) for name, column in values.items())
         window = getattr(velocity, "samples", 1)
         return known and not (sampled or whole or changed or isinstance(velocity, FOAW) or window > LONGEST_WINDOW)
@@ -140,8 +141,8 @@ class Variants:
     def find_stiffness_limits(self, damping: np.ndarray) -> np.ndarray:
         """Return the upper end of the lowest stable interval of K for each variant and each B; 0 if no wall is stable.
 
-        The interval is the one that starts at K = 0. If the device is unstable without a wall, it is the interval with
-        the softest walls of K > 0.
+        The lowest interval starts at K = 0. If the device is unstable without a wall, the lowest interval is the first
+        one with K > 0.
         """
         mass, period, usable = self.normalized.mass, self.normalized.period, self.normalized.usable
         limits, left = np.zeros((self.count, damping.size)), np.full(self.count, True)
@@ -162,7 +163,7 @@ class Variants:
         return limits
 
     def _find_limits(self, scene: Any, damping: np.ndarray) -> np.ndarray:
-        """Return the limits of one variant, as described in `find_stiffness_limits`."""
+        """Return the limits of K of one variant for each B, as described in `find_stiffness_limits`."""
         low, high = np.moveaxis(scene.stable_stiffness(damping), -1, 0)
         if self.scene.loop.least_stiffness(-np.inf) is not None:
             ends = np.min(np.where(high > 0, high, np.inf), -1, initial=np.inf)
@@ -204,7 +205,7 @@ class Variants:
         return BatchRidge(RidgePoint._make([*columns, kind, status]), left)
 
     def _search_ridge(self, k: int, negative: bool) -> tuple[float, ...]:
-        """Return the stiffest wall of one variant by a search of its own."""
+        """Return the stiffest wall of the variant with index k, computed by itself."""
         try:
             return tuple(map(float, self.build(k).loop.stiffest(negative)))
         except InputError:
@@ -251,7 +252,7 @@ class RigidVariants(Variants):
 
     @np.errstate(all="ignore")
     def find_damping_limits(self, stiffness: float, side: str) -> np.ndarray:
-        """Return the smallest ("lower" side) or largest ("upper" side) stable B of each variant at K; NaN if none."""
+        """Return the smallest (``side`` "lower") or largest ("upper") stable B of each variant at K, or NaN."""
         alpha = stiffness * self.period / self.rate
         point = self.evaluate(
             lambda *args: boundary_point(*args[:2], alpha=args[2], side=side).beta, self.delta, self.d, alpha
@@ -265,7 +266,7 @@ class RigidVariants(Variants):
 
     @staticmethod
     def evaluate(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
-        """Evaluate a function of arrays, in small pieces if NumPy then takes less time than compilation by JAX.
+        """Evaluate a function of arrays, in small pieces if this takes less time than compilation by JAX.
 
         A function called with at most ``FEW`` elements runs in NumPy; with more elements JAX compiles it.
         """

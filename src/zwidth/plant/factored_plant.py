@@ -5,7 +5,7 @@ With ``zeta = z - 1``, the plant is (`plant.sampled_states`; docs/theory/scenes.
     G(z) = C (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1)) / z^(n+1) = gain prod(z - zeros)/(z^lag prod(z - poles))
 
 The poles follow from those of the continuous-time device, ``z = e^p``. The zeros of a rigid mass have a closed form;
-those of a linear system are computed in decimal arithmetic (`plant.sampled_zeros`), all others by Aberth's method.
+the zeros of a linear system are computed in decimal arithmetic (`plant.sampled_zeros`), all others by Aberth's method.
 Roots are stored as *offsets* 1 - root, because the poles of slow motions lie near z = 1 and would lose their
 significant digits in z.
 """
@@ -26,13 +26,14 @@ from zwidth.plant.sampled_states import SampledStates, sample_states
 from zwidth.plant.sampled_zeros import find_sampled_zeros
 
 # Settings for the zeros of G.
-SLOW_ZERO = 0.1  # |zeta| below which a zero starts from its continuous-time counterpart
+SLOW_ZERO = 0.1  # |zeta| below which the iteration for a zero starts from a zero of the continuous-time device
 MAX_STEPS = 30  # largest number of Aberth steps
 CONVERGED_STEP = 1e-13  # last Aberth step, relative to |zeta|
 CLUSTER_RADIUS = 1e-2  # |z| of zeros near z = 0 that rounding errors may make inseparable
-RESPONSE_TOLERANCE = 1e-11  # relative difference of q by roots and by matrices, above which the cluster is not refined
-TEST_ANGLE = 0.5  # angle in rad per sample at which the two are compared
-FAR_ZERO = 1e-17  # 1/|zeta| of a zero below which the zero is dropped
+# Relative difference of q = -1/G from roots and q from matrices, above which the cluster is not refined.
+RESPONSE_TOLERANCE = 1e-11
+TEST_ANGLE = 0.5  # angle in rad per sample at which q from roots and q from matrices are compared
+FAR_ZERO = 1e-17  # 1/|zeta| below which a zero is dropped, because it is far from the unit circle
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def _factor_rigid_mass(chain: Chain) -> FactoredPlant:
 
 
 def _factor_system(system: System) -> FactoredPlant:
-    """Return the zeros, poles and gain of a linear device, which a sampled device states itself."""
+    """Return the zeros, poles and gain of a linear device; a device in discrete time already contains them."""
     device, period, lag = system.device, float(system.period), system.n_delay + (system.d != system.n_delay)
     if system.sampled:
         gain, (zeros, poles) = device.gain, device.offsets
@@ -92,7 +93,7 @@ def _factor_system(system: System) -> FactoredPlant:
 
 
 def _factor_bodies(chain: Chain) -> FactoredPlant:
-    """Return the zeros, poles and gain of a device from bodies, modes and an actuator, by Aberth's method."""
+    """Return the zeros, poles and gain of a device that consists of bodies, modes and an actuator."""
     plant = sample_states(chain)
     continuous_zeros, poles = chain.continuous
     poles = -np.expm1(poles)
@@ -105,16 +106,17 @@ def _factor_bodies(chain: Chain) -> FactoredPlant:
         # Drop one zero if the delay is just below an integer, because this zero is then so far from the unit circle
         # that it has no effect on the circle and Aberth's method would not converge to it.
         numerator = numerator[1:]
-    # Rounding errors of the coefficients hide zeros near the poles of a slow mode. Start the iteration for these zeros
-    # from the zeros of the continuous-time response, which approximate them.
+    # Zeros near the poles of a slow mode are below the numerical resolution of the coefficients. Start the iteration
+    # for these zeros from those of the continuous-time response, which are close to them.
     with np.errstate(all="ignore"):
         slow = np.expm1(continuous_zeros)
     slow = slow[np.abs(slow) < SLOW_ZERO]
     zeros = np.roots(numerator).astype(complex)
     zeros[np.argsort(np.abs(zeros))[: slow.size]] = slow
     candidates, point = [], circle_points(np.float64(TEST_ANGLE))
-    # Refine all zeros first. Modes that decay within a period have a cluster of zeros near z = 0, which the determinant
-    # may not separate; then keep the roots of ``numerator`` in this cluster, because they are accurate as a group.
+    # First refine all zeros. Modes that decay within a period lead to a cluster of zeros near z = 0, which Aberth's
+    # method may not separate. In this case, keep the roots of ``numerator`` in the cluster, because they are accurate
+    # as a group.
     for is_refined in (np.full(zeros.shape, True), np.abs(1.0 + zeros) > CLUSTER_RADIUS):
         # Move real starting values off the real axis, because Aberth's steps keep real values real, and two zeros that
         # are real according to the coefficients may be a complex pair.

@@ -40,7 +40,7 @@ GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(SERIES_TERMS)]
 
 
 class PhiFunctions(NamedTuple):
-    """Values of c, phi1, phi2, psi and gap at one argument x, computed together from one exponential."""
+    """Values of c = e^-x, phi1 = (1 - c)/x, phi2 = (1 - phi1)/x, psi = phi1 - phi2 and gap = phi2 - psi at x."""
 
     c: Array
     phi1: Array
@@ -50,7 +50,7 @@ class PhiFunctions(NamedTuple):
 
 
 def phi_functions(x: Array) -> PhiFunctions:
-    """Compute the functions c, phi1, phi2, psi and gap of the module docstring at x >= 0.
+    """Compute c = e^-x, phi1 = (1 - c)/x, phi2 = (1 - phi1)/x, psi = phi1 - phi2 and gap = phi2 - psi at x >= 0.
 
     Their relative errors are below 30 units of 2^-53 if that of ``xp.exp`` is below 8 units.
     """
@@ -81,7 +81,7 @@ Functions = Callable[[Any], Any]
 
 
 class Plant(NamedTuple):
-    """The discretized device: the coefficients of its numerator N(z), and its pole c."""
+    """The discretized device: its numerator ``N(z) = a2 z^2 + a1 z + a0`` and its pole c."""
 
     c: Array  # e^-delta, the pole besides z = 1
     em: Array  # 1 - c, without cancellation
@@ -124,8 +124,8 @@ def discretize_mass(
 def differentiate_mass(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
     """Return the derivatives of `discretize_mass` in delta and in the fraction f of the delay, in closed form.
 
-    The derivative of N(1) in f is exactly 0. That of automatic differentiation is a rounding error, with which the
-    derivatives of the maximum stiffness in d would have errors 80 times as large at d = 500.
+    The derivative of N(1) in f is exactly 0. Automatic differentiation would yield a rounding error instead of 0. This
+    would make the errors of the derivatives of the maximum stiffness in d 80 times as large at d = 500.
     """
     f, t = fraction, 1.0 - fraction
     c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
@@ -167,7 +167,7 @@ def _compute_chi(x: Array, gap: Array) -> Array:
 
 
 def factor_numerator(plant: Plant) -> tuple[Array, Array]:
-    """Return h and q of ``N(z) = (a2 z + h)(z + q)``, both >= 0 because the zeros of N are real and not positive."""
+    """Return h >= 0 and q >= 0 of ``N(z) = (a2 z + h)(z + q)``; the zeros of N are real and not positive."""
     xp = namespace(plant.a1)
     h = 0.5 * (plant.a1 + xp.sqrt(xp.maximum(plant.a1 * plant.a1 - 4.0 * plant.a2 * plant.a0, 0.0)))
     return h, plant.a0 / h
@@ -183,14 +183,14 @@ def split_delay(d: Array) -> tuple[Array, Array]:
 
 
 class DelayClasses(NamedTuple):
-    """Flags that state which classes of delays occur among the points of a kernel, so that it omits all other code."""
+    """Flags for the classes of delays in an array. A compiled function omits the code for all other classes."""
 
-    short: bool  # below one period
-    long: bool  # of one period or more
-    fractional: bool  # not an integer
+    short: bool  # True if some delay is below one period
+    long: bool  # True if some delay is one period or more
+    fractional: bool  # True if some delay is not an integer
 
 
-# All three classes. The values of JAX arrays are unknown at compilation, so the kernel needs the code for all classes.
+# All three classes. JAX compiles functions before the values of arrays are known, so it needs the code for all classes.
 ANY = DelayClasses(True, True, True)
 
 
@@ -209,9 +209,9 @@ class DiscretePlant(NamedTuple):
     """Delay, discretized device and phi-functions of points (delta, d); all NaN if delta or d is out of range."""
 
     delta: Array
-    whole: Array  # n
-    f: Array
-    c: Array
+    whole: Array  # integer delay n
+    f: Array  # fractional delay
+    c: Array  # e^-delta, the pole besides z = 1
     em: Array  # 1 - c
     p1: Array  # phi1(delta) = a2 + a1 + a0
     p2: Array  # phi2(delta)
@@ -222,7 +222,7 @@ class DiscretePlant(NamedTuple):
     a1: Array
     a0: Array
     gap: Array  # N(-1) = a2 - a1 + a0
-    minus_one_coefficient: Array  # r; P(-1) has the sign of a stable loop if and only if r (alpha + 2 beta) < 1
+    minus_one_coefficient: Array  # r; a stable loop requires r (alpha + 2 beta) < 1, from its sign at z = -1
 
 
 def discretize_plant(delta: Array, d: Array, kind: DelayClasses = ANY) -> DiscretePlant:

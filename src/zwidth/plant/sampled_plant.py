@@ -27,8 +27,8 @@ from zwidth.core.xp import namespace
 from zwidth.model.circle_functions import CirclePoints, Jet, power_jet
 from zwidth.plant.rigid_mass import Plant, discretize_mass, split_delay
 
-# Least |zeta^2 - 1| of a pole pair with damping ratio zeta. Pairs that are closer to a double pole are moved apart,
-# because partial fractions require distinct poles.
+# Least |zeta^2 - 1| of a pole pair with the damping ratio zeta. The poles of a pair closer to a double pole are moved
+# apart to this distance, because partial fractions require distinct poles.
 LEAST_SEPARATION = 1e-5
 
 
@@ -51,7 +51,7 @@ class SampledPlant(NamedTuple):
         return rigid / (1.0 - rigid * self.parts_response(points)) if len(self.poles) else rigid
 
     def rigid_controller(self, points: CirclePoints) -> Jet:
-        """Return q of the rigid mass alone and its derivative with respect to the angle w."""
+        """Return q = -1/G0 of the rigid mass without other parts, and its derivative in the angle w."""
         slope = 1j * points.z
         poles = Jet(points.z_minus_1, slope).times(Jet(points.z_minus_1 + self.rigid.em, slope))
         numerator = Jet(
@@ -61,7 +61,7 @@ class SampledPlant(NamedTuple):
         return Jet(-value, -derivative)
 
     def parts_response(self, points: CirclePoints) -> Array:
-        """Return the part of G that the poles other than those of the rigid mass contribute."""
+        """Return the contribution to G of all poles except those of the rigid mass."""
         total, xp = 0.0 * points.z, namespace(points.w, *self.poles)
         for pole, residue in zip(self.poles, self.residues, strict=True):
             late, full = integrate_pole(pole, 1.0 - self.fraction), integrate_pole(pole, 1.0)

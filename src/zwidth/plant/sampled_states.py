@@ -88,7 +88,7 @@ def sample_chain(chain: AnyChain) -> SampledPlant | SampledStates:
 
 
 def sample_states(chain: AnyChain) -> SampledStates:
-    """Return the sampled plant of a chain in state space; parameters of many chains along a last axis yield a batch."""
+    """Return the sampled plant in state space of one chain, or of many, if parameters have one value per chain."""
     A, B, _ = chain.realize()
     if A.ndim > 2:
         xp = namespace(A)

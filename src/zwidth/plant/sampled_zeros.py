@@ -26,7 +26,7 @@ NEGLIGIBLE_DIGITS = 3
 
 
 def find_sampled_zeros(device: LinearDevice, period: float, fraction: float) -> tuple[float, np.ndarray]:
-    """Return the leading coefficient of the discretized numerator, in SI units, and ``1 - z`` of its zeros.
+    """Return the leading coefficient of the sampled numerator, in SI units, and the offsets 1 - z of its zeros.
 
     Args:
         device: the continuous-time system.
@@ -69,7 +69,8 @@ def _expand_response(device: LinearDevice, period: float, fraction: float, digit
     transition, full, output = _discretize(denominator, numerator, Decimal(period))
     response = _expand_numerator(transition, full, output)
     if fraction:
-        # The newer force contributes z N(newer), the older one N(full - newer), and N is linear.
+        # In each period, the newer force contributes z N(newer) to the numerator, and the older force N(full - newer).
+        # N denotes the numerator as a linear function of the state after the period.
         newer = _discretize(denominator, numerator, Decimal(period) * (1 - Decimal(fraction)))[1]
         late = _expand_numerator(transition, newer, output)
         response = [a + b - c for a, b, c in zip([*late, 0], [0, *response], [0, *late], strict=True)]
@@ -104,7 +105,7 @@ def _discretize(
     block[order - 1, :order] = [-monic[order - k] / unit ** (order - k) for k in range(order)]
     block[order - 1, order] = Decimal(1)
     exponential = _exponentiate(block, time * unit)
-    # The state x_k is the k-th derivative of the response of 1/denominator, times unit^(order - k).
+    # State k is the k-th derivative of the response of 1/denominator(s) to the force, times unit^(order - k).
     padded = [Decimal(0)] * (order - len(numerator)) + numerator
     output = np.array([padded[order - 1 - k] / denominator[0] * unit**k / unit**order for k in range(order)], object)
     return exponential[:order, :order], exponential[:order, order], output

@@ -2,8 +2,8 @@
 
 The system is ``x' = A x + B u`` with the state x and constant inputs u, or ``x' = rate @ z`` with ``rate = [A, B]`` and
 ``z = (x, u)``. Over a time t the state changes by ``change @ z`` with ``change = [e^(A t) - 1, Gamma(t)]``, where
-Gamma(t) is the state after unit inputs held for the time t from rest. A power ``z @ drain @ z`` that dampers dissipate
-adds up to the energy ``z @ loss @ z``.
+Gamma(t) is the state after unit inputs held for the time t from rest. If dampers dissipate the power ``z @ drain @ z``,
+the energy dissipated over the time t is ``z @ loss @ z``, with z at the start.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ MAX_DOUBLINGS = 36  # largest number of doublings of the time; 2^36 exceeds twic
 
 
 class Transition(NamedTuple):
-    """Matrices of the motion over given times; the leading axes are those of the times."""
+    """Matrices of the response over given times t; the leading axes are those of t."""
 
     change: Any  # change of the state per z = (x, u), shape (..., n, n + inputs)
     loss: Any = None  # quadratic form in z of the dissipated energy, shape (..., n + inputs, n + inputs)
 
 
 def compute_transition(rate: Any, time: Any, drain: Any = None) -> Transition:
-    """Return the exact motion of ``x' = rate @ (x, u)`` with constant inputs u over given times.
+    """Compute the exact change of state of ``x' = rate @ (x, u)``, with constant inputs u, over given times.
 
     Args:
         rate: matrices [A, B] of shape (..., n, n + inputs), in NumPy or JAX.
@@ -35,10 +35,9 @@ def compute_transition(rate: Any, time: Any, drain: Any = None) -> Transition:
             without them the loss is not computed.
     """
     # Evaluate the series for the time divided by a power of 2, then double the time repeatedly: y(2 t) = y(t) (2 +
-    # y(t)) for y = e^(A t) - 1, and similarly Gamma. This keeps the relative accuracy of slow and of strongly damped
-    # modes, unlike e^(A t). Write the evaluation as two program loops, because these make the program short, and the
-    # compile time of derivatives is proportional to its length: with JAX's own exponential, derivatives of
-    # `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to compile.
+    # y(t)) for y = e^(A t) - 1, and similarly for Gamma. This preserves the relative accuracy of slow and of strongly
+    # damped modes, unlike the computation of e^(A t). Both steps are loops, because JAX compiles short programs faster:
+    # with JAX's own exponential, compiling derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long.
     xp = namespace(rate, time)
     n, time = rate.shape[-2], time[..., None, None] if xp.ndim(time) else time
     norm = stop_gradient(xp.abs(rate[..., :n] * time).sum(-2, keepdims=True).max(-1, keepdims=True), xp)

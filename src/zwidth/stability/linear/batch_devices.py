@@ -1,10 +1,11 @@
-"""Discretize many devices of one structure at once, as batches of loops (`stability.linear.loop_batch`).
+"""Discretize many devices of one structure at once: compute the sampled plant G of each loop.
 
-The devices are given by one chain (`model.mechanism`) whose parameters are arrays with one value per loop, along the
-last axis. With ``zeta = z - 1`` and ``Psi = e^A - 1``, the poles of G are eigenvalues of Psi, and its zeros those of a
-similar matrix. Numerator and denominator are polynomials in zeta, lowest power first, expanded from these roots,
-because roots in the left half-plane of zeta yield sums of positive terms. The values of G are compared with those of
-the matrices.
+A *chain* (`model.mechanism`) is the model ``x' = A x + B u`` of a device, with one value per loop of each parameter,
+along the last axis. With ``zeta = z - 1`` and ``Psi = e^A - 1``, the poles of G are eigenvalues of Psi, and the zeros
+of G are eigenvalues of a similar matrix. Numerator and denominator of G are polynomials in zeta, lowest power first.
+They are expanded from these roots, because roots in the left half-plane of zeta yield sums of positive terms. The
+result is checked: the critical controller ``q = -1/G`` from the polynomials must agree with q from the matrices. The
+loops form a batch (`stability.linear.loop_batch`).
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from zwidth.plant.sampled_states import SampledStates, integrate_chain
 from zwidth.stability.linear.batch_lines import VECTOR_SIZE
 from zwidth.stability.linear.loop_batch import Form, LoopBatch, Sizes, count_nodes, evaluate
 
-# Angles in rad per sample at which the values of q by polynomials and by matrices are compared, and their largest
-# relative difference.
+# Angles in rad per sample at which q = -1/G from polynomials and q from matrices are compared, and the largest relative
+# difference that is accepted.
 TEST_ANGLES = (1e-2, 1e-1, 0.5, 2.0)
 RESPONSE_TOLERANCE = 1e-10
-LARGEST_RATE = 1e6  # of the entries of A, squares of frequencies in rad per period
+LARGEST_RATE = 1e6  # largest entry of A, in (rad per period)^2, of devices that are evaluated in batches
 
 
 class _SampledBatch(NamedTuple):
-    """G of each loop, with the fields of `LoopBatch`."""
+    """The sampled plant G of each loop, with the fields of `LoopBatch`."""
 
     numerator: Array
     denominator: Array
@@ -44,15 +45,15 @@ class _SampledBatch(NamedTuple):
 
 
 class DeviceBatch(NamedTuple):
-    """Loops of one structure, and the discretized devices whose first axis is that of the loops; None if rigid."""
+    """Loops of one structure, and their discretized devices in state space."""
 
     form: Form
     loop: LoopBatch
-    states: SampledStates | None
+    states: SampledStates | None  # the first axis is that of the loops; None for rigid devices
 
 
 def build_loops(chain: AnyChain, size: int) -> DeviceBatch:
-    """Return the loops of a chain whose parameters are numbers or arrays of shape (size,)."""
+    """Return the loops of a chain whose parameters are numbers or arrays of shape (size,), one value per loop."""
     f, fraction = chain.estimate, chain.d - chain.n_delay
     form, states, A = Form(chain.n_delay + 1, f.window, f.lag), None, np.zeros((size, 1, 1))
     if isinstance(chain, Chain) and chain.rigid:
@@ -66,8 +67,8 @@ def build_loops(chain: AnyChain, size: int) -> DeviceBatch:
     estimate = [xp.broadcast_to(xp.asarray(f.gain), (size,)), *(xp.broadcast_to(r, (r.shape[0], size)) for r in roots)]
     loop = LoopBatch._make([*plant[:2], *estimate, *plant[2:]])
     if states is not None:
-        # Make the gain of a loop NaN, and thereby all its results, if rounding errors spoil its polynomials, or if a
-        # part is so fast that a scene may refuse it.
+        # Set the gain of a loop to NaN, so that all its results are NaN, if its polynomials have large rounding errors,
+        # or if its device is so fast that a scene with this device may be rejected as invalid.
         exact = xp.all(xp.stack([compare_responses(form, loop, states, w) for w in TEST_ANGLES]), 0)
         slow = xp.max(xp.abs(A), (1, 2)) < LARGEST_RATE
         loop = loop._replace(gain=xp.where(exact & slow, loop.gain, np.nan))
@@ -75,7 +76,7 @@ def build_loops(chain: AnyChain, size: int) -> DeviceBatch:
 
 
 def compare_responses(form: Form, loop: LoopBatch, states: SampledStates, w: Any) -> Array:
-    """Return whether q by the polynomials agrees with q by the matrices at an angle, or at one angle per loop."""
+    """Return whether q = -1/G from the polynomials agrees with q from the matrices at angles w, per loop."""
     xp = namespace(loop.gain)
     w = w + 0.0 * loop.numerator[0]
     points = circle_points(xp.where(xp.isfinite(w), w, 0.5))
@@ -83,7 +84,7 @@ def compare_responses(form: Form, loop: LoopBatch, states: SampledStates, w: Any
 
 
 def _discretize_rigid(damping: Any, fraction: Any, size: int) -> _SampledBatch:
-    """Return G of rigid masses in closed form."""
+    """Return the sampled plant G of rigid masses in closed form."""
     xp = namespace(damping, fraction)
     delta = xp.broadcast_to(xp.asarray(damping), (size,)) + 0.0
     plant = discretize_mass(delta, xp.broadcast_to(xp.asarray(fraction), (size,)) + 0.0)
@@ -108,7 +109,7 @@ def _stack_states(chain: AnyChain, size: int) -> tuple[Array, Array]:
             for part, axes in ((A, 2), (B, 1))
         )
         return xp.moveaxis(A, -1, 0) + 0.0, xp.moveaxis(B, -1, 0) + 0.0
-    # The matrices of a linear system do not depend on the period; only their units do.
+    # Realize the linear system in units of 1 s and 1 kg, then convert the matrices to the units of each loop.
     A, B, _ = System(chain.device, 1.0, 1.0, chain.d, chain.n_delay, chain.estimate).realize()
     xp = namespace(chain.period, chain.mass)
     period = xp.broadcast_to(xp.asarray(chain.period), (size,))[:, None]
@@ -116,7 +117,7 @@ def _stack_states(chain: AnyChain, size: int) -> tuple[Array, Array]:
 
 
 def _sample(A: Array, B: Array, chain: AnyChain) -> SampledStates:
-    """Return the sampled plants; without a fractional delay, ``late`` is ``full``, which adds a zero at z = 0."""
+    """Discretize devices in state space; for integer delays ``late`` is ``full``, which adds a zero of G at z = 0."""
     fraction = chain.d - chain.n_delay
     psi, full = integrate_chain(chain, A, B, 1.0)
     late = full if is_zero(fraction) else integrate_chain(chain, A, B, 1.0 - fraction)[1]
@@ -124,7 +125,7 @@ def _sample(A: Array, B: Array, chain: AnyChain) -> SampledStates:
 
 
 def _factor(chain: AnyChain, states: SampledStates) -> _SampledBatch:
-    """Return G of discretized devices as polynomials, and its zeros and poles."""
+    """Return the sampled plants G of discretized devices as polynomials, with their zeros and poles."""
     psi, late = states.psi, states.late
     xp = namespace(psi)
     zeros = -xp.linalg.eigvals(_realize_zeros(states)).T + 0j
@@ -133,10 +134,10 @@ def _factor(chain: AnyChain, states: SampledStates) -> _SampledBatch:
 
 
 def _realize_zeros(states: SampledStates) -> Array:
-    """Return matrices whose eigenvalues are the zeros of G in zeta.
+    """Return matrices whose eigenvalues are the zeros of G in ``zeta = z - 1``.
 
-    G is 0 if a force u with ``(zeta - Psi) x = (zeta late + full) u`` leaves the position, the first entry of x, at 0.
-    With y = x - late u, without its first entry, this is an eigenvalue problem of (y, u).
+    At a zero of G, a state x and a force u exist with ``(zeta - Psi) x = (zeta late + full) u`` and the position 0. The
+    position is the first entry of x. Let y be ``x - late u`` without its first entry; then (y, u) is an eigenvector.
     """
     xp = namespace(states.psi)
     psi, full, late, _ = states
@@ -158,7 +159,7 @@ def _expand(offsets: Array) -> Array:
 
 
 def _find_poles(chain: AnyChain, psi: Array) -> tuple[Array, Array]:
-    """Return the offsets of all poles of G, and the number of those at z = 1, which are first."""
+    """Return the offsets 1 - z of all poles of G, and the number of poles at z = 1, which come first."""
     xp, size = namespace(psi), psi.shape[0]
     if isinstance(chain, System):
         device = chain.device
@@ -176,22 +177,22 @@ def _find_poles(chain: AnyChain, psi: Array) -> tuple[Array, Array]:
 
 
 BLOCK_SIZE = 1 << 9  # loops per call; their arrays fit in the cache
-LONGEST_DELAY = 24  # in periods; longer delays need so many nodes that a batch saves little time
+LONGEST_DELAY = 24  # in periods; longer delays need so many evaluations that a batch saves little time
 
 
 def map_loops(
     scene: Parts, values: dict[str, np.ndarray], d: np.ndarray, function: Callable[..., tuple[np.ndarray, ...]]
 ) -> list[np.ndarray]:
-    """Apply a function to the loops of many scenes of one structure, in blocks of loops with equally many nodes.
+    """Apply a function to the loops of many scenes of one structure, in blocks of loops that have equally many nodes.
 
-    The results for a scene do not depend on the other scenes, bit for bit.
+    The results for a scene are bit for bit the same, whatever the other scenes are.
 
     Args:
-        scene: a scene of this structure, whose other parameters all scenes share.
-        values: parameters by dotted path, arrays of shape (scenes,).
-        d: delays in periods, shape (scenes,), at most `LONGEST_DELAY`; at least one scene.
-        function: maps form, loops, `Sizes`, discretized devices, and the indices of the scenes to arrays, whose last
-            axis is that of the loops.
+        scene: one scene of this structure; parameters that are not in ``values`` have its values in all scenes.
+        values: varied parameters by dotted path, arrays of shape (scenes,).
+        d: delays in periods, at most `LONGEST_DELAY`, shape (scenes,) with at least one scene.
+        function: function of five arguments (form, loops, `Sizes`, discretized devices, indices of the scenes) that
+            returns arrays whose last axis is that of the loops.
 
     Returns:
         The arrays of the function for all scenes.
@@ -229,5 +230,5 @@ def map_loops(
 
 
 def _pad(index: np.ndarray) -> np.ndarray:
-    """Return indices, padded with the last one to a multiple of `VECTOR_SIZE`."""
+    """Return an array of indices, padded with copies of its last entry to a multiple of `VECTOR_SIZE`."""
     return np.pad(index, (0, -index.size % VECTOR_SIZE), mode="edge")

@@ -1,18 +1,17 @@
-"""Count the unstable poles along lines of walls for many loops at once, with the same source code for NumPy and JAX.
+"""Count unstable poles along lines of walls ``(a0 + a1 t, b0 + b1 t)`` for many loops at once, in NumPy or JAX.
 
-A *line* consists of the walls
-
-    alpha = a0 + a1 t        beta = b0 + b1 t
-
-with real t: a line of constant B, a line of constant K, or a *ray* from K = B = 0. On the unit circle, a wall of the
-line has a pole at ``z = e^(jw)`` if and only if (docs/theory/scenes.md, V23)
+A pole is at ``z = e^(jw)`` only if ``k(w) = 0``; k is tabulated at angles w, the *nodes*. On a *line*, the walls have
+the normalized stiffness ``alpha = a0 + a1 t`` and damping ``beta = b0 + b1 t`` with real t. Examples are lines of
+constant K, lines of constant B, and *rays*, which start at K = B = 0. With the critical controller q and the velocity
+estimate F, a wall of the line has a pole at ``z = e^(jw)`` if and only if (docs/theory/scenes.md, V23)
 
     k(w) = Im((q - c0) conj c1) = 0      t = Re((q - c0) conj c1)/|c1|^2      c0 = a0 + b0 F,  c1 = a1 + b1 F
 
-A pole pair leaves the unit circle as t increases if k increases with w at the crossing, and enters it if k decreases.
-So the number of poles outside the circle follows from the sign changes of k between nodes. A result is *doubtful* if
-the nodes do not resolve k; the caller then has to use `stability.linear.boundary`, whose nodes are adapted to one loop.
-Symbols, nodes and shapes are those of `stability.linear.loop_batch`.
+Such a wall is a *crossing* of the line and the stability boundary. As t increases past a crossing, a pole pair leaves
+the unit circle if k increases with w, and enters it if k decreases. The number of poles outside the unit circle
+therefore follows from the sign changes of k between nodes. A result is *doubtful* if the nodes do not resolve k; the
+caller then has to use `stability.linear.boundary`, whose nodes are adapted to one loop. Symbols, nodes and shapes are
+those of `stability.linear.loop_batch`.
 """
 
 from __future__ import annotations
@@ -26,19 +25,21 @@ from zwidth.core.xp import iterate, namespace
 from zwidth.model.circle_functions import distances_inside
 from zwidth.stability.linear.loop_batch import Sampled, Values, evaluate, split_values
 
-MOST_CROSSINGS = 12  # changes of sign of k from node to node per line without delay; a line with more is doubtful
-MOST_TURNS = 3  # steps per line in which k may turn; a line with more is doubtful
-TURN_STEPS = 10  # steps for the extremum of k
-TURN_TOLERANCE = 1e-12  # |k| at an extremum, relative to its terms, below which its sign is unclear
-STEPS = 10  # largest number of Newton steps for the angle of a crossing
-CONVERGED_STEP = 1e-13  # relative to w
-LARGEST_STEP = 1e-9  # the last step of a crossing that is not doubtful, relative to w
-VECTOR_SIZE = 16  # lists of crossings are padded to a multiple of this, because NumPy rounds differently in a remainder
-ON_CIRCLE = 1e-6  # distance of a zero of G from the circle below which it is not counted as inside or outside
+MOST_CROSSINGS = 12  # sign changes of k per line without delay; the result of a line with more is doubtful
+MOST_TURNS = 3  # node intervals per line in which an extremum of k is computed; a line with more is doubtful
+TURN_STEPS = 10  # steps of the search for an extremum of k
+TURN_TOLERANCE = 1e-12  # |k| at an extremum, relative to the terms of k, below which the sign of k is unclear
+STEPS = 10  # largest number of Newton steps for the angle w of a crossing
+CONVERGED_STEP = 1e-13  # last Newton step, relative to w
+LARGEST_STEP = 1e-9  # last Newton step, relative to w, above which a crossing is doubtful
+# Arrays are padded to a multiple of this length, because NumPy may round the elements after the last full vector
+# differently.
+VECTOR_SIZE = 16
+ON_CIRCLE = 1e-6  # distance from the unit circle below which a zero of G counts as neither inside nor outside
 
 
 class Line(NamedTuple):
-    """Walls ``(a0 + a1 t, b0 + b1 t)``; numbers, or arrays of one value per loop."""
+    """A line of walls ``(a0 + a1 t, b0 + b1 t)``; each field is a number, or an array with one value per loop."""
 
     a0: Any = 0.0
     b0: Any = 0.0
@@ -47,7 +48,7 @@ class Line(NamedTuple):
 
 
 def combine(line: Line, parts: tuple[Array, Array, Array]) -> Array:
-    """Return k of a line, or its derivative, from the parts of `_split`."""
+    """Return k(w) of a line, or its derivative, as a linear combination of the three functions of `split_values`."""
     a0, b0, a1, b1 = line
     weights = a1, b1, a0 * b1 - b0 * a1
     return sum(
@@ -56,7 +57,7 @@ def combine(line: Line, parts: tuple[Array, Array, Array]) -> Array:
 
 
 def find_position(line: Line, values: Values) -> Array:
-    """Return t of the wall of a line that has a pole at the angle of the values, if k is 0 there."""
+    """Return the position t of the wall of a line with a pole at the angle w, where k(w) = 0; from q and F at w."""
     xp = namespace(values.q)
     direction = line.a1 + line.b1 * values.f
     distance = values.q - line.a0 - line.b0 * values.f
@@ -64,18 +65,18 @@ def find_position(line: Line, values: Values) -> Array:
 
 
 class NodeCells(NamedTuple):
-    """Selected steps between nodes, listed one after the other."""
+    """Selected intervals between neighboring nodes, listed one after the other for all loops."""
 
-    cell: Array  # index of the node before
+    cell: Array  # index of the node at the lower end of the interval
     loop: Array  # index of the loop
-    slot: Array  # running number in its loop
+    slot: Array  # number of the interval among those of its loop
     valid: Array  # False for padding
-    crowded: Array  # of each loop: it has more steps than listed
-    most: int  # largest number of listed steps per loop
+    crowded: Array  # for each loop: True if it has more selected intervals than are listed
+    most: int  # largest number of listed intervals per loop
 
 
 def list_cells(selected: Array, most: int) -> NodeCells:
-    """List the selected steps between nodes, at most ``most`` per loop, from a mask of shape (nodes - 1, loops)."""
+    """List the node intervals that a mask of shape (nodes - 1, loops) selects, up to ``most`` per loop."""
     xp, (count, n) = namespace(selected), selected.shape
     if xp is np:
         cell, loop = np.nonzero(selected)
@@ -92,14 +93,14 @@ def list_cells(selected: Array, most: int) -> NodeCells:
 
 
 def list_changes(loops: Sampled, positive: Array) -> NodeCells:
-    """List the steps between nodes over which k changes its sign, from the signs of k at the nodes."""
-    # Each period of delay turns q by one revolution and adds up to two crossings.
+    """List the node intervals in which k changes its sign; ``positive`` is True at the nodes with k > 0."""
+    # Each period of delay adds one revolution of the phase of q, and with it up to two crossings.
     most = MOST_CROSSINGS + 2 * (loops.form.lag + loops.form.window)
     return list_cells(positive[1:] != positive[:-1], most)
 
 
 def tabulate(cells: NodeCells, values: Array, fill: float) -> Array:
-    """Arrange values of listed steps in an array of shape (most, loops); ``fill`` for missing ones."""
+    """Arrange one value per listed node interval in an array of shape (most, loops), filled up with ``fill``."""
     xp, shape = namespace(values), (cells.most, cells.crowded.size)
     if xp is np:
         table = np.full(shape, fill, np.result_type(values, type(fill)))
@@ -112,17 +113,17 @@ class LineCrossings(NamedTuple):
     """LineCrossings of the stability boundary by one line per loop, in ascending order of t."""
 
     t: Array  # shape (crossings, loops); infinite for unused entries
-    leaving: Array  # net number of poles that leave the circle as t increases
-    w: Array  # angle of the poles on the circle; only the node before it if interpolated
-    cell: Array  # index of the node before the crossing, -1 for the pole at z = -1
-    doubtful: Array  # shape (loops,)
+    leaving: Array  # number of poles that leave the unit circle as t increases, minus those that enter it
+    w: Array  # angle of the poles on the unit circle; for interpolated crossings the angle of the node below
+    cell: Array  # index of the node below the angle of the crossing; -1 for a pole at z = -1
+    doubtful: Array  # True for loops whose nodes do not resolve k, shape (loops,)
 
     def count_gaps(self, outside: Array, origin: Array | float = 0.0) -> Array:
-        """Return the number of poles outside in each gap between crossings, shape (crossings + 1, loops).
+        """Return the number of poles outside the unit circle between crossings, shape (crossings + 1, loops).
 
         Args:
-            outside: number of poles outside at the position ``origin`` of each line.
-            origin: a value of t.
+            outside: number of poles outside the unit circle at ``t = origin``, for each loop.
+            origin: position on the line at which the number of poles outside is known.
         """
         xp = namespace(self.t)
         leaving = xp.where(xp.isfinite(self.t), self.leaving, 0.0)
@@ -130,7 +131,7 @@ class LineCrossings(NamedTuple):
         return xp.concatenate([first[None], first + xp.cumsum(leaving, 0)])
 
     def count_at(self, start: Array, t: Array) -> Array:
-        """Return the number of poles outside at positions t > 0 of a ray, from that of its softest walls."""
+        """Return the number of poles outside the unit circle at t > 0 on a ray; ``start`` is the number for t -> 0."""
         xp = namespace(self.t)
         return start + xp.sum(xp.where((self.t > 0) & (self.t < t), self.leaving, 0.0), 0)
 
@@ -144,20 +145,22 @@ def sort_crossings(t: Array, leaving: Array, w: Array, cell: Array, doubtful: Ar
 
 
 def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
-    """Find all crossings of the stability boundary by one line per loop, to full accuracy."""
+    """Compute all crossings of the stability boundary by one line per loop, to full accuracy."""
     xp, w, n = namespace(loops.w), loops.w, loops.w.shape[1]
     k, slope = combine(line, loops.parts), combine(line, loops.slopes)
     positive = k > 0
     cells = list_changes(loops, positive)
-    # If k turns back between two nodes of equal sign, it may have two zeros between them. Its tangents at both nodes
-    # bound k if k is convex (or concave) there.
+    # If k has the same sign at two neighboring nodes and an extremum between them, it may have two zeros there.
+    # Tangents at both nodes bound k if k is convex or concave between them. Search for the extremum if the tangents
+    # meet beyond 0.
     sign = xp.where(positive[:-1], 1.0, -1.0)
     before, falls, rises = k[:-1] * sign, slope[:-1] * sign, slope[1:] * sign
     turning = (k[1:] * sign > 0) & (falls < 0) & (rises > 0)
     lowest = before + falls * (k[1:] * sign - rises * (w[1:] - w[:-1]) - before) / xp.where(turning, falls - rises, 1.0)
     turns = list_cells(turning & (lowest <= 0), MOST_TURNS)
     middle, unclear = _find_turns(loops, line, turns, k, slope)
-    # Search for zeros of k in three lists of brackets: between two nodes, and on both sides of a turn.
+    # Search for zeros of k in three lists of brackets: between nodes with opposite signs of k, from a node to an
+    # extremum of k, and from an extremum to the next node.
     lists = cells, turns, turns
     index = [xp.concatenate([getattr(part, name) for part in lists]) for name in ("cell", "loop")]
     ends = (cells.cell, cells.cell + 1), (turns.cell, None), (None, turns.cell + 1)
@@ -183,7 +186,7 @@ def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
         done = move <= CONVERGED_STEP * x
         return low, high, xp.where(done, x, new), xp.where(done, move, xp.abs(new - x))
 
-    # Start from the secant, or on both sides of a turn from the parabola with its vertex there.
+    # Start from the zero of the secant; next to an extremum, start from the zero of a parabola with its vertex there.
     share = first / xp.where(first == last, 1.0, first - last)
     near, far = xp.sqrt(xp.maximum(share, 0.0)), 1.0 - xp.sqrt(xp.maximum(1.0 - share, 0.0))
     splits = cells.cell.size, cells.cell.size + turns.cell.size
@@ -199,7 +202,8 @@ def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
         _tabulate_lists(lists, values, fill)
         for values, fill in ((t, np.inf), (leaving, 0.0), (crossing, np.nan), (index[0], -1), (poor, False))
     ]
-    # Add the pole at z = -1. Between the last node and z = -1, k must not change its sign.
+    # Add the wall of the line that has a pole at z = -1. A loop is doubtful if k changes its sign between the last node
+    # and z = -1.
     end, end_slope = cross_end(loops, line)
     turned = (end_slope != 0) & xp.isfinite(end_slope) & ((k[-1] > 0) != (end_slope < 0))
     doubtful = unclear | cells.crowded | turns.crowded | xp.any(columns[4], 0) | turned
@@ -216,7 +220,7 @@ def _take_line(line: Line, index: Array, n: int) -> Line:
 
 
 def _tabulate_lists(lists: tuple[NodeCells, ...], values: Array, fill: float) -> Array:
-    """Arrange the values of several lists, one after the other, below each other; see `tabulate`."""
+    """Apply `tabulate` to each of several lists, whose ``values`` are concatenated, and stack the resulting arrays."""
     tables, start = [], 0
     for cells in lists:
         tables.append(tabulate(cells, values[start : start + cells.cell.size], fill))
@@ -227,7 +231,7 @@ def _tabulate_lists(lists: tuple[NodeCells, ...], values: Array, fill: float) ->
 def _find_turns(
     loops: Sampled, line: Line, turns: NodeCells, k: Array, slope: Array
 ) -> tuple[tuple[Array, Array], Array]:
-    """Return angle and value of the extremum of k in each listed step, and the loops in which its sign is unclear."""
+    """Return angle and value of the extremum of k in each listed interval, and per loop if its sign is unclear."""
     xp, w = namespace(loops.w), loops.w
     part, each = loops.loop.take(turns.loop), _take_line(line, turns.loop, w.shape[1])
 
@@ -235,7 +239,7 @@ def _find_turns(
         low, high, first, last, x, side = state
         value = combine(each, split_values(evaluate(loops.form, part, x))[1])
         before = (value > 0) == (first > 0)
-        # The Illinois method
+        # Illinois method, a variant of regula falsi, for the zero of the derivative of k
         new_first = xp.where(before, value, xp.where(side < 0, 0.5 * first, first))
         new_last = xp.where(before, xp.where(side > 0, 0.5 * last, last), value)
         low, high = xp.where(before, x, low), xp.where(before, high, x)
@@ -258,16 +262,16 @@ def _find_turns(
 
 
 def cross_end(loops: Sampled, line: Line) -> tuple[Array, Array]:
-    """Return t of the wall with a pole at z = -1, infinite if there is none, and the derivative of k there."""
+    """Return the position t of the wall with a pole at z = -1, infinite if none exists, and dk/dw at z = -1."""
     xp = namespace(loops.w)
     t = find_position(line, loops.ends)
     return xp.where(xp.isfinite(t), t, np.inf), combine(line, split_values(loops.ends)[1])
 
 
 def count_far(loops: Sampled) -> tuple[Array, Array]:
-    """Return the least and the largest possible number of poles outside the circle for alpha -> inf."""
-    # As many poles as G has zeros approach these zeros, the others go to infinity (V14). A pole near a zero on the
-    # circle may be inside or outside.
+    """Return a lower and an upper bound of the number of poles outside the unit circle for alpha -> inf."""
+    # One pole approaches each zero of the plant G, and the other poles go to infinity (V14). A pole near a zero on the
+    # unit circle may be inside or outside.
     xp, loop = namespace(loops.w), loops.loop
     depth = distances_inside(loop.plant_zeros)
     excess = loops.form.lag + loop.denominator.shape[0] - 1 - loop.plant_zeros.shape[0]
@@ -275,7 +279,7 @@ def count_far(loops: Sampled) -> tuple[Array, Array]:
 
 
 def count_outside(loops: Sampled, alpha: Array, beta: Array) -> tuple[Array, Array]:
-    """Return the number of poles outside the circle of one wall per loop, alpha > 0, and whether it is doubtful."""
+    """Return the number of poles outside the unit circle of one wall (alpha > 0) per loop, and if it is doubtful."""
     xp, ray = namespace(loops.w), Line(a1=alpha, b1=beta)
     crossings = find_crossings(loops, ray)
     start = loops.count_start(combine(ray, tuple(part[:1] for part in loops.parts))[0])
@@ -286,11 +290,13 @@ def count_outside(loops: Sampled, alpha: Array, beta: Array) -> tuple[Array, Arr
 def find_stiffness_limits(loops: Sampled, beta: Array) -> tuple[Array, Array]:
     """Return the upper end of the stable interval of alpha that starts at K = 0, and whether the end is doubtful.
 
-    The lines are those of one beta per loop. The end is 0 if the softest walls with this beta are unstable.
+    Each loop has one line of constant B, given by ``beta``. The end is 0 if the softest walls of this line are
+    unstable.
     """
     xp = namespace(loops.w)
     row = find_crossings(loops, Line(b0=beta, a1=1.0))
-    # Count the poles of a wall of the line, reached on a ray; it is stiff enough to be far from the pole at z = 1.
+    # Start from the pole count of one wall of the line, which is determined along a ray to this wall. Its alpha is well
+    # above 0, because at alpha = 0 a pole may be at z = 1.
     alpha = 0.1 * (xp.abs(beta) + 0.1)
     outside, doubtful = count_outside(loops, alpha, beta)
     t = xp.concatenate([xp.full((1, beta.size), -np.inf), row.t])

@@ -1,16 +1,20 @@
-"""Find the stiffest stable wall of many loops at once and confirm each by counts of poles.
+"""Find the stiffest stable wall of many loops at once, and confirm each wall by pole counts.
 
-The search bisects for the largest alpha at which a line of constant K has a stable interval of beta, solves the two
-conditions that bound this interval (`stability.linear.ridge`), and confirms the result alpha by three lines (V24): with
-a relative distance `MARGIN`,
+A wall has the normalized stiffness alpha and damping beta. On the *boundary curve* a wall has a pole at ``e^(jw)``. The
+*nodes* are the angles w at which the curve is tabulated. The search has three steps:
 
-    the ray to the wall          has no crossing below it, so this wall is stable and connected to K = 0
-    the line of constant K above has no stable wall, so no piece connected to K = 0 extends above it
-    the line beta = 0            has no stable wall above it; needed if only beta >= 0 is allowed and the line of
-                                 constant K has a stable wall with beta < 0
+1. Bisection for the largest alpha at which the line of constant K has a stable interval of beta.
+2. Newton's method for the two conditions that hold at the ends of this interval (`stability.linear.ridge`).
+3. Confirmation of the wall by pole counts along three lines, with the relative margin `MARGIN` (V24):
 
-A wall for which this holds is within `MARGIN` of the stiffest one, so no other constraint can be binding below it.
-Symbols and shapes are those of `stability.linear.batch_lines`.
+    the ray to the wall          has no crossing below the wall, so the wall is stable and connected to K = 0
+    the line of constant K       slightly above the wall has no stable wall, so no set of stable walls that is
+                                 connected to K = 0 extends above this line
+    the line beta = 0            has no stable wall above the line of constant K; needed if only beta >= 0 is allowed
+                                 and the line of constant K has a stable wall with beta < 0
+
+The alpha of a confirmed wall is within `MARGIN` of that of the stiffest wall. Symbols and shapes are those of
+`stability.linear.batch_lines`.
 """
 
 from __future__ import annotations
@@ -36,21 +40,25 @@ from zwidth.stability.linear.batch_lines import (
 )
 from zwidth.stability.linear.loop_batch import Form, LoopBatch, Sampled, Sizes, Values, evaluate, sample
 
-MARGIN = 4e-10  # relative distance in alpha of the walls that confirm a maximum
+MARGIN = 4e-10  # relative distance in alpha between a maximum and the line of constant K that confirms it
 LOG_RANGE = (-9.0, 2.0)  # log10 alpha of the first bracket of the maximum
-BISECTIONS = 20
-CLOSE_CELLS = 4  # steps between two crossings up to which they may enclose a smooth maximum
-NEWTON_STEPS = 8
-SECANT_STEPS = 14
-# Relative to w. An error of this size changes alpha by its square only, because alpha is stationary.
+BISECTIONS = 20  # steps of the bisection for the largest alpha
+CLOSE_CELLS = 4  # largest number of nodes between two crossings that may enclose a smooth maximum of alpha
+NEWTON_STEPS = 8  # for the angles of a corner
+SECANT_STEPS = 14  # for the angle of a smooth maximum of alpha
+# Largest last step of the angle w of a smooth maximum, relative to w. An error of w changes the maximum of alpha only
+# by its square, because alpha is stationary there.
 CONVERGED_PEAK = 1e-7
-CONVERGED_STEP = 1e-13  # relative to w
-# Levels of alpha on the path from a maximum to K = 0, relative to it.
+CONVERGED_STEP = 1e-13  # last Newton step of an angle w, relative to w
+# Values of alpha on the path of stable walls from a maximum to K = 0, relative to the alpha of the maximum.
 LEVELS = (0.96, 0.8, 0.55, 0.3, 0.1, 0.02)
-THINNEST = 1e-4  # width of an interval of beta in the bisection, relative to its upper end; thinner ones may be false
-LARGEST_BETA = 50.0  # of a stable interval; crossings near zeros of F on the unit circle are farther away
-LEAST = -2  # marks the end of an interval at beta = 0, in place of the index of a node
-CLEAR = 1e-12  # smallest distance between two crossings in t, relative to t, at which their order is certain
+# Least width of a stable interval of beta in the bisection, relative to its upper end. Thinner intervals may be errors
+# of the interpolation between nodes.
+THINNEST = 1e-4
+# Largest beta at the upper end of a stable interval. Crossings near zeros of the velocity estimate have a larger beta.
+LARGEST_BETA = 50.0
+LEAST = -2  # code for the lower end of an interval at beta = 0, in place of the index of a node
+CLEAR = 1e-12  # smallest relative distance between two crossings of a line at which their order is certain
 
 
 class Stiffest(NamedTuple):
@@ -58,26 +66,26 @@ class Stiffest(NamedTuple):
 
     alpha: Array
     beta: Array
-    omega: Array
-    kind: Array
-    confirmed: Array
-    angles: Array  # of the active constraints, shape (2, loops)
+    omega: Array  # angle w of the poles on the unit circle
+    kind: Array  # code of `RidgeKind`
+    confirmed: Array  # True if pole counts confirm the wall
+    angles: Array  # angles w of the poles of the two active constraints, shape (2, loops)
 
 
 class _OptimumRange(NamedTuple):
-    """The widest stable interval of beta on a line of constant K per loop, and the nodes before its ends."""
+    """The widest stable interval of beta on one line of constant K per loop, as the nodes next to its ends."""
 
     exists: Array
-    low: Array  # index of a node; -1 for a pole at z = -1; `LEAST` for beta = 0
-    high: Array
+    low: Array  # index of the node before the lower end; -1 for a pole at z = -1; `LEAST` for beta = 0
+    high: Array  # index of the node before the upper end; -1 for a pole at z = -1
 
 
 def find_stiffest(form: Form, loop: LoopBatch, sizes: Sizes, negative: bool) -> Stiffest:
     """Return the stiffest stable wall connected to K = 0 of each loop.
 
     Args:
-        form: structure of the loops.
-        loop: the loops.
+        form: orders, integer delay and window, which all loops share.
+        loop: coefficients and roots of the loops.
         sizes: numbers of nodes.
         negative: False to require beta >= 0.
     """
@@ -104,12 +112,12 @@ def find_stiffest(form: Form, loop: LoopBatch, sizes: Sizes, negative: bool) -> 
 
 
 def _place_axis(axis: LineCrossings, w: Array) -> Array:
-    """Return the alpha at which the curve crosses beta = 0 in each step between nodes, shape (nodes, loops).
+    """Return the alpha at which the boundary curve crosses beta = 0 between each node and the next.
 
-    NaN marks a step without such a crossing.
+    The result has the shape (nodes, loops); it is NaN between two nodes without such a crossing.
     """
     xp, (nodes, n) = namespace(w), w.shape
-    # Collect all entries without a step in the last row, which belongs to no step.
+    # Write crossings that do not lie between two nodes into the last row, because no interval starts at the last node.
     row = xp.where(xp.isfinite(axis.t) & (axis.cell >= 0), axis.cell, nodes - 1)
     index = row, xp.broadcast_to(xp.arange(n), row.shape)
     table = xp.full((nodes, n), np.nan)
@@ -120,9 +128,12 @@ def _place_axis(axis: LineCrossings, w: Array) -> Array:
 
 
 def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> LineCrossings:
-    """Return the crossings of a line of constant K per loop, interpolated linearly between nodes.
+    """Return the crossings of the boundary curve by one line of constant K per loop, interpolated between nodes.
 
-    ``on_axis`` is the alpha at which the curve crosses the line beta = 0 in each step between nodes; NaN without one.
+    Args:
+        loops: the loops.
+        alpha: normalized stiffness of the line of each loop.
+        on_axis: alpha at which the curve crosses beta = 0 between each node and the next, from `_place_axis`.
     """
     xp, n = namespace(loops.w), alpha.size
     k = loops.parts[1] + alpha * loops.parts[2]
@@ -134,8 +145,8 @@ def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> LineCros
         loops.levels[0][cells.cell + offset, cells.loop] - level * loops.levels[1][cells.cell + offset, cells.loop]
         for offset in (0, 1)
     ]
-    # Let the sign of beta agree with the crossings of the line beta = 0, where the count of poles starts: it is that of
-    # the node on the same side of this line.
+    # If the curve crosses beta = 0 between two nodes, the interpolated beta must have the sign of beta at the node on
+    # the same side of this crossing. Otherwise the pole count, which starts at beta = 0, would be wrong.
     t, axis = (1.0 - share) * ends[0] + share * ends[1], on_axis[cells.cell, cells.loop]
     nodes = [tuple(part[cells.cell + offset, cells.loop] for part in loops.parts) for offset in (0, 1)]
     (low_beta, low_alpha), (high_beta, high_alpha) = ((q / f, -cross / f) for q, cross, f in nodes)
@@ -156,7 +167,7 @@ def _interpolate_level(loops: Sampled, alpha: Array, on_axis: Array) -> LineCros
 def _find_interval(
     loops: Sampled, axis: LineCrossings, on_axis: Array, start: Array, alpha: Array, least: float
 ) -> _OptimumRange:
-    """Return the widest stable interval of beta >= ``least`` at one alpha per loop."""
+    """Return the widest stable interval of beta >= ``least`` on the line of constant K with this alpha, per loop."""
     xp, n = namespace(loops.w), alpha.size
     crossings = _interpolate_level(loops, alpha, on_axis)
     counts = crossings.count_gaps(axis.count_at(start, alpha))
@@ -173,7 +184,7 @@ def _find_interval(
 
 
 class _CurveNodes(NamedTuple):
-    """Alpha and beta of the boundary curve at angles w, and their derivatives in w."""
+    """Walls (alpha, beta) with a pole at ``e^(jw)``, and their derivatives in the angle w."""
 
     alpha: Array
     beta: Array
@@ -182,7 +193,7 @@ class _CurveNodes(NamedTuple):
 
 
 def _trace(values: Values) -> _CurveNodes:
-    """Return the points of the boundary curve (V8)."""
+    """Return the walls on the boundary curve, from the values of q and F at angles w (docs/theory/scenes.md, V8)."""
     q, q_slope, f, f_slope = values
     beta = q.imag / f.imag
     beta_slope = (q_slope.imag - beta * f_slope.imag) / f.imag
@@ -191,22 +202,23 @@ def _trace(values: Values) -> _CurveNodes:
 
 
 def _solve(loops: Sampled, axis: LineCrossings, alpha: Array, left: Array, right: Array) -> tuple[Array, ...]:
-    """Solve the two conditions at the ends of the last stable interval of the bisection.
+    """Compute the stiffest wall, starting from the last stable interval of beta that the bisection found.
 
     Args:
         loops: the loops.
-        axis: crossings of the line beta = 0.
-        alpha: alpha of the interval.
-        left: lower end of the interval, as in `_OptimumRange`.
-        right: upper end.
+        axis: crossings of the boundary curve with the line beta = 0.
+        alpha: normalized stiffness at which the interval was found.
+        left: lower end of the interval, the field ``low`` of `_OptimumRange`.
+        right: upper end of the interval, the field ``high`` of `_OptimumRange`.
 
     Returns:
-        alpha, beta, both angles and the kind of the maximum; NaN if no conditions were found.
+        alpha, beta, the two angles and the kind of the maximum; NaN if no active constraints were found.
     """
     xp, w = namespace(loops.w), loops.w
     form, loop, nodes = loops.form, loops.loop, w.shape[0]
     clipped = left == LEAST
-    # If the interval ends at beta = 0, a smooth maximum may lie in the step in which the curve crosses this line.
+    # If the interval ends at beta = 0, a smooth maximum may lie between the two nodes at which the curve crosses beta =
+    # 0.
     undamped = xp.argmin(xp.abs(xp.log(xp.where(axis.t > 0, axis.t, np.inf) / alpha)), 0)[None]
     undamped, rest, crossed = (xp.take_along_axis(part, undamped, 0)[0] for part in (axis.t, axis.w, axis.cell))
     first = xp.where(clipped, crossed, xp.minimum(left, right))
@@ -218,7 +230,7 @@ def _solve(loops: Sampled, axis: LineCrossings, alpha: Array, left: Array, right
 
     peak, converged = _find_peak(form, loop, [(pick(first - more), pick(second + 1 + more)) for more in (0, 1, 2)])
     top = _trace(evaluate(form, loop, peak))
-    # At a corner, either both angles belong to pole pairs, or one pole is at z = -1.
+    # At a corner, either two pole pairs are on the unit circle, or one pole pair is, together with a pole at z = -1.
     pair = first >= 0
     starts = [0.5 * (pick(cell) + pick(cell + 1)) for cell in (xp.where(pair, first, second), second)]
     end, f_end = loops.ends.q.real, loops.ends.f.real
@@ -240,7 +252,8 @@ def _solve(loops: Sampled, axis: LineCrossings, alpha: Array, left: Array, right
 
     corner = iterate(NEWTON_STEPS, step, tuple(starts), xp, lambda old, new: bool(np.all(old[0] == new[0])))
     meeting = _trace(evaluate(form, loop, corner[0]))
-    # Two crossings in distant steps bound a corner or, where nodes are dense, a smooth maximum: take the nearer one.
+    # Two crossings with many nodes between them enclose a corner or, where nodes are dense, a smooth maximum of alpha.
+    # Use the one whose alpha is closer to that of the bisection.
     distance = [
         xp.where(ok, xp.abs(xp.log(one.alpha / alpha)), np.inf) for one, ok in ((top, converged), (meeting, ~clipped))
     ]
@@ -261,9 +274,10 @@ def _solve(loops: Sampled, axis: LineCrossings, alpha: Array, left: Array, right
 
 
 def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Return the angle in a bracket at which alpha has a maximum along the curve, and whether the search converged.
+    """Return the angle w at which alpha is maximal along the boundary curve, and whether the search converged.
 
-    The brackets are tried in order of their width. The Illinois method keeps a bracket of the maximum.
+    The search uses the narrowest of the ``brackets``, ordered by their width, in which alpha has a maximum. The
+    Illinois method (a variant of regula falsi) then solves for the angle at which the derivative of alpha is 0.
     """
     xp = namespace(loop.gain)
 
@@ -281,7 +295,7 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
         new = xp.where((new > low) & (new < high), new, 0.5 * (low + high))
         return low, high, first, last, new, xp.where(before, 1.0, -1.0), xp.abs(new - x)
 
-    # Take the first bracket over which the derivative changes from + to -.
+    # Use the narrowest bracket over which the derivative of alpha changes from positive to negative.
     low, high = brackets[-1]
     first, last = slope(low), slope(high)
     for bracket in brackets[-2::-1]:
@@ -295,7 +309,7 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
 
 
 def _confirm(loops: Sampled, axis: LineCrossings, start: Array, found: tuple[Array, ...], negative: bool) -> Array:
-    """Return whether each wall is the stiffest one within `MARGIN` (V24)."""
+    """Return whether pole counts confirm that each wall is the stiffest one within `MARGIN` (docs/theory, V24)."""
     alpha, beta, accurate = found
     xp, above = namespace(loops.w), alpha * (1.0 + MARGIN)
     level = find_crossings(loops, Line(a0=above, b1=1.0))
@@ -315,16 +329,17 @@ def _confirm(loops: Sampled, axis: LineCrossings, start: Array, found: tuple[Arr
         connected = connected | _are_connected(loops, axis, start, alpha, beta)
     far = count_far(loops)
     consistent = (axis_counts[-1] >= far[0]) & (axis_counts[-1] <= far[1]) & xp.all(counts >= 0, 0)
-    # The order of two crossings must be certain.
+    # Reject a loop in which two crossings are so close that rounding errors may exchange their order.
     clear = xp.all(level.t[1:] - level.t[:-1] > CLEAR * xp.abs(level.t[1:]), 0, where=xp.isfinite(level.t[1:]))
     certain = ~axis.doubtful & ~level.doubtful & ~ray.doubtful
     return loops.resolved & certain & consistent & clear & bounded & connected & (alpha > 0)
 
 
 def _are_connected(loops: Sampled, axis: LineCrossings, start: Array, alpha: Array, beta: Array) -> Array:
-    """Return whether a path of stable walls connects the wall below each maximum to K = 0.
+    """Return whether a path of stable walls leads from the wall just below each maximum to K = 0.
 
-    The path follows lines of constant B from each of the `LEVELS` to the next one and, at the last one, a ray.
+    The path follows lines of constant B from each of the `LEVELS` of alpha to the next lower one. From the lowest level
+    it follows a straight line to K = B = 0.
     """
     xp, connected, low, high = namespace(alpha), True, beta, beta
     infinite, below = xp.full((1, alpha.size), np.inf), alpha

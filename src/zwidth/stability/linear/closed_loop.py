@@ -1,7 +1,7 @@
 """Realize the open and the closed loop of a wall in state space.
 
 In normalized units, a wall (alpha, beta) acts on the sampled position y through the velocity estimate F with the force
-``u = -(alpha + beta F) y``; a held external force acts on the first body, without delay.
+``u = -(alpha + beta F) y``. An external force, held constant over each period, acts on the first body without delay.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from zwidth.plant.sampled_states import integrate_chain, sample_states
 
 
 def realize_open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
-    """Return ``L = (alpha + beta F) G`` in state space, from the wall's input position to the sampled position."""
+    """Return the open loop ``L = (alpha + beta F) G`` in state space, from the input of the wall to the position."""
     f = realize_estimate(chain.estimate)
     wall = StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D)
     return connect_in_series(wall, sample_states(chain).realize())

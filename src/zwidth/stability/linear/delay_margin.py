@@ -1,14 +1,17 @@
-"""Compute the delay margin of stable walls in any linear loop: the smallest delay to be added that makes them unstable.
+"""Compute the delay margin of stable walls in any linear loop: the smallest additional delay that makes them unstable.
 
-One more period of delay changes the phase of the open loop L by the angle w and nothing else. At a gain crossover with
-the phase ``p = arg(-L)``, a pole is therefore on the unit circle after m more periods if ``p - m w`` is a multiple of 2
-pi. Therefore loops with delays within one period, the *tabulated delays*, suffice for all longer delays: if m passes an
-integer between two of them, Newton's method solves for the delay. A real pole reaches z = -1 where ``|L(-1)|`` passes
-1. Each result is confirmed: the poles outside the unit circle are counted at all shorter delays that differ from a
-tabulated one by an integer, and the pole on the circle must move outward. Shorter delays without a pole outside, and a
-pole that moves outward, mean that the wall loses stability there.
+At a gain crossover w the open loop L has ``|L| = 1``. Each period of delay adds -w to the phase of L and leaves |L|
+unchanged. At a gain crossover with ``p = arg(-L)``, a pole is therefore on the unit circle after m more periods if
+``p - m w`` is a multiple of 2 pi. Loops with delays within one period, the *tabulated delays*, thus suffice for all
+longer delays: if m passes an integer between two tabulated delays, Newton's method solves for the delay. A real pole
+reaches z = -1 at a delay at which ``|L(-1)|`` passes 1.
 
-The plant of the chain, discretized for any delay d = n + f (n integer, 0 <= f < 1), has the response
+Each result is confirmed: the poles outside the unit circle are counted at all shorter delays that differ from a
+tabulated one by an integer, and the pole on the circle must move outward. If no shorter delay has a pole outside, and
+the pole moves outward, the wall becomes unstable at this delay.
+
+A *chain* is the plant of a scene with its delay. Discretized for any delay d = n + f (n integer, 0 <= f < 1), it has
+the response
 
     G = z^-(n+1) C (z - e^A)^-1 ((z - 1) Gamma(1 - f) + Gamma(1))
 
@@ -32,30 +35,31 @@ from zwidth.stability.linear.curve import place_nodes
 from zwidth.stability.linear.roots import POLE_AT_ONE, LoopRoots, find_roots
 from zwidth.stability.open_loop import OpenLoop, find_gain_crossovers
 
-# Delays at which the gain crossovers are computed.
-N_PARTS = 8  # number of these delays per period
-# Distances of further delays from the integer above them, in time constants of the fastest pole. These delays are
+N_PARTS = 8  # number of delays per period at which the gain crossovers are tabulated
+# Distances of additional tabulated delays from the next larger integer, in time constants of the fastest pole. They are
 # needed because a strongly damped device tolerates less delay within ln 2 time constants below an integer than at the
 # integer.
 EARLY_DELAYS = np.array([1.0, 0.5, 0.25, 0.1])
-FAST_RATE = 2.0  # decay rate of the fastest pole, per period, above which these delays are added
-# The number of crossovers may differ between two neighboring delays. The crossovers at both delays whose m (see the
-# module docstring) differs from an integer by at most START_ERROR/N_PARTS are then starting points of Newton's method.
+FAST_RATE = 2.0  # decay rate of the fastest pole, per period, above which the additional delays are tabulated
+# If the number of gain crossovers w differs between two neighboring tabulated delays, Newton's method starts at each of
+# these crossovers at which m = arg(-L)/w differs from an integer by at most START_ERROR/N_PARTS.
 START_ERROR = 1.5
 
 # Settings of Newton's method for the delay, in periods.
 MAX_STEPS = 30
 CONVERGED_STEP = 1e-14  # last step of the delay, relative to 1 + delay
 LOG_TOLERANCE = 1e-9  # largest |log(-L)| at a solution
-NEXT_INTEGER = 1e-9  # distance above an integer, relative to 1 + m, up to which m counts as this integer
+NEXT_INTEGER = (
+    1e-9  # largest distance above an integer, relative to 1 + m, at which m = arg(-L)/w counts as the integer
+)
 
-# Difference from the earliest starting delay of a wall, in periods, above which starting values are omitted, because
-# they are better approximations of their solutions than that.
+# Omit starting delays that exceed the smallest one of the same wall by more than this, in periods. Each starting delay
+# differs less than this from its solution, so later ones cannot yield the smallest delay.
 MAX_STARTS = 2.0
 
-BATCH_WALLS = 128  # walls per batch, so large that most of the time is spent on arrays, and not in Python
+BATCH_WALLS = 128  # walls per batch; so many that array operations take most of the time, not the Python interpreter
 
-# Type of the function that tabulates the open loops of walls (arguments: loop, alpha, beta, nodes).
+# Type of a function that tabulates the open loops L of walls at given angles (arguments: loop, alpha, beta, angles).
 Tabulate = Callable[[LoopRoots, np.ndarray, np.ndarray, np.ndarray], OpenLoop]
 
 
@@ -70,7 +74,7 @@ class TabulatedDelay(NamedTuple):
 
 
 def list_delays(chain: AnyChain) -> list[float]:
-    """Return the tabulated delays in periods, from that of the chain to one period more."""
+    """Return the tabulated delays in periods, from the delay of the chain to one period more."""
     d = float(chain.d)
     fastest = -float(np.linalg.eigvals(chain.realize().A).real.min())
     early = 1.0 - EARLY_DELAYS / fastest if fastest > FAST_RATE else np.empty(0)
@@ -88,7 +92,7 @@ def find_delay_margins(chain: AnyChain, tabulate: Tabulate, alpha: np.ndarray, b
     """Return the delay margin of each stable wall in periods.
 
     Args:
-        chain: the chain.
+        chain: device and delay.
         tabulate: function that tabulates the open loops of walls.
         alpha: normalized stiffness, shape (walls,).
         beta: normalized damping, shape (walls,).
@@ -123,14 +127,14 @@ def count_outside(
 ) -> np.ndarray:
     """Count the closed-loop poles of each wall outside the unit circle, by the Nyquist criterion.
 
-    Where |L| < 1, the phase of 1 + L is within pi/2 of 0, and where |L| > 1 within pi/2 of the phase of L. Between
-    crossovers the phase of 1 + L therefore changes by a multiple of 2 pi that the phases of L at the crossovers
-    determine, without any node near a zero of 1 + L.
+    Where |L| < 1, the phase of 1 + L differs from 0 by less than pi/2. Where |L| > 1, it differs from the phase of L by
+    less than pi/2. The phases of L at the crossovers therefore determine by which multiple of 2 pi the phase of 1 + L
+    changes between crossovers, and no node is needed near a zero of 1 + L.
 
     Args:
         loop: the loop without a wall.
         wall: the open loop of each wall.
-        crossovers: its gain crossovers, ascending, shape (walls, crossovers), padded with NaN.
+        crossovers: gain crossovers of each wall, ascending, shape (walls, crossovers), padded with NaN.
         alpha: normalized stiffness, shape (walls,).
         beta: normalized damping, shape (walls,).
 
@@ -139,12 +143,13 @@ def count_outside(
     """
     w, L = wall.w, wall.L.value
     step = np.angle(L[:, 1:] / L[:, :-1])
-    # At a pole of L on the unit circle the phase jumps by -pi if the path passes the pole on the outside.
+    # At a pole of L on the unit circle, the phase of L changes by -pi, because the path passes the pole on the outside.
     poles = loop.poles[are_on_circle(loop.poles)]
     angles = np.angle(1.0 - poles)
     jumps = np.searchsorted(w, angles[(angles > 0) & (angles < np.pi)]) - 1
     step[:, jumps] -= np.where(step[:, jumps] > 0, 2.0 * np.pi, 0.0)
-    # Start at z = 1 + 0, where L is real. The path around n poles at z = 1 then changes its phase by -n pi/2.
+    # Start at a real z slightly above 1, where L is real. From there, the path around n poles at z = 1 changes the
+    # phase of L by -n pi/2.
     is_integrator = np.abs(loop.poles) <= POLE_AT_ONE
     n = np.count_nonzero(is_integrator)
     spring = alpha + beta * loop.estimate.jet(circle_points(np.zeros(1))).value[0].real
@@ -158,7 +163,7 @@ def count_outside(
     at_crossover = phase[rows, before] + np.angle(wall.respond(crossovers).value / L[rows, before])
     exists = np.isfinite(crossovers)
     starts_above, ends_above = np.abs(L[:, 0]) > 1.0, np.abs(L[:, -1]) > 1.0
-    # The crossovers end and start an interval with |L| > 1 by turns.
+    # The crossovers alternately end and start an interval with |L| > 1.
     side = np.where((np.arange(crossovers.shape[1]) % 2 == 0) == starts_above[:, None], 1.0, -1.0)
     turns = 2.0 * np.pi * np.where(exists, side * np.round(at_crossover / (2.0 * np.pi)), 0.0).sum(-1)
     change = turns - np.where(starts_above, start, 0.0) + np.where(ends_above, phase[:, -1], 0.0)
@@ -168,15 +173,15 @@ def count_outside(
 
 
 class DelayedPlant:
-    """The response of the plant of a chain at any angle and any delay."""
+    """The response G of the sampled plant of a chain at any angle and any delay."""
 
     def __init__(self, chain: AnyChain) -> None:
-        """Discretize the chain."""
+        """Discretize the device of the chain."""
         self.chain, (self.A, self.B, _) = chain, chain.realize()
         self.psi, self.full = integrate_chain(chain, self.A, self.B, 1.0)
 
     def evaluate(self, w: np.ndarray, delay: np.ndarray) -> tuple[Jet, np.ndarray]:
-        """Return G with its derivative in w, and its derivative in the delay, for angles and delays of one shape."""
+        """Return G with its derivative in w, and the derivative of G in the delay, at given angles and delays."""
         points, n = circle_points(w), np.floor(delay)
         psi, late = integrate_chain(self.chain, self.A, self.B, 1.0 - (delay - n))
         zeta, size = points.z_minus_1[:, None], self.B.size
@@ -200,9 +205,9 @@ class StartingPoints(NamedTuple):
 
 def _list_starts(tabulated: list[TabulatedDelay]) -> StartingPoints:
     """Return the starting values for all walls, from their gain crossovers at the tabulated delays."""
-    # After m = phase/w more periods of delay, L would be -1 at the crossover w if |L| did not change, as is the case
-    # for an integer m. So a solution exists near each integer through which m passes between two tabulated delays. Near
-    # a local minimum of m, the integer below the minimum may also be reached.
+    # At the crossover w, L is -1 after m = phase/w more periods of delay if m is an integer, because |L| does not
+    # change. A solution therefore exists near each integer that m passes between two tabulated delays. Near a local
+    # minimum of m, m may also reach the integer below the minimum.
     most = max(each.w.shape[1] for each in tabulated)
     w, phase = (
         np.stack([np.pad(part, ((0, 0), (0, most - part.shape[1])), constant_values=np.nan) for part in parts])
@@ -223,8 +228,8 @@ def _list_starts(tabulated: list[TabulatedDelay]) -> StartingPoints:
         share = np.where(first == last, 0.0, (integer - first) / np.where(first == last, 1.0, last - first))
         delay = delays[:-1] + share * np.diff(delays, axis=0) + integer
         add(equal & (integer <= np.maximum(first, last)), w[:-1] + share * np.diff(w, axis=0), delay)
-        # If two crossovers appear or merge between two delays, the m of one of them may pass through an integer. Start
-        # from all crossovers at both delays whose m is nearly an integer.
+        # If two crossovers appear or merge between two delays, m may pass an integer at one of them. Start from all
+        # crossovers at both delays at which m is nearly an integer.
         more = (phase - turn) / w
         near = (np.abs(more - np.round(more)) <= START_ERROR / N_PARTS) & (np.round(more) >= 0.0)
         differs = np.pad(~equal, ((1, 1), (0, 0), (0, 0)))
@@ -238,7 +243,7 @@ def _list_starts(tabulated: list[TabulatedDelay]) -> StartingPoints:
 def _find_first_losses(
     chain: AnyChain, tabulated: list[TabulatedDelay], alpha: np.ndarray, beta: np.ndarray
 ) -> np.ndarray:
-    """Return the delay margins of some walls in periods; arguments and result as in `find_delay_margins`."""
+    """Return the delay margins of one batch of walls in periods, as in `find_delay_margins`, from tabulated delays."""
     d, plant, estimate = float(chain.d), DelayedPlant(chain), chain.estimate
     with np.errstate(all="ignore"):
         starts = _list_starts(tabulated)
@@ -263,7 +268,7 @@ def _find_first_losses(
 def _find_real_losses(
     plant: DelayedPlant, estimate: Estimate, tabulated: list[TabulatedDelay], alpha: np.ndarray, beta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the delays at which a real pole leaves the unit circle at z = -1, each with the index of its wall."""
+    """Return the delays at which a real pole leaves the unit circle at z = -1, after the indices of their walls."""
     L = np.array([each.at_nyquist for each in tabulated])
     above, delays = np.abs(L) - 1.0, np.array([each.delay for each in tabulated])
     k, wall = np.nonzero((above[1:] > 0) & (above[:-1] <= 0))
@@ -274,7 +279,7 @@ def _find_real_losses(
         return np.abs(controller[wall] * plant.evaluate(np.full(delay.shape, np.pi), delay)[0].value) - 1.0
 
     delay = find_zeros_in_brackets(evaluate, delays[k], delays[k + 1], above[k, wall], above[k + 1, wall])
-    # A pole is at z = -1 if L(-1) = -1. If L(-1) = 1, add one period of delay, because this changes the sign of L(-1).
+    # A pole is at z = -1 if L(-1) = -1. If L(-1) = 1, add one period of delay, which changes the sign of L(-1).
     return wall, delay + np.where(L[k, wall] < 0, 0.0, 1.0)
 
 

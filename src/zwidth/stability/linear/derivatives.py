@@ -1,13 +1,14 @@
-"""Differentiate the answers about any linear loop in all numbers of its scene, exactly, in NumPy.
+"""Compute exact derivatives of results, such as a margin, in all numbers of a scene, in NumPy.
 
-An answer u, such as the stiffest wall or a margin, solves equations ``F(p, u) = 0`` in the numbers p of the scene. They
-are formulated here in Taylor arithmetic (`zwidth.numerics.taylor`), evaluated at the solution, and differentiated by
-the implicit function theorem. With ``z = e^lambda``, the velocity estimate F, the critical controller ``q = -1/G``, and
-the matrices of the discretized device (`plant.sampled_states`; delay d = n + f),
+F is the velocity estimate, q = -1/G the critical controller, ``r = alpha + beta F - q``, and ``z = e^lambda``. A wall
+(alpha, beta) has a pole at z if and only if r is 0 there. Results such as the stiffest wall or a margin solve equations
+in r and its derivatives. These equations are evaluated at the solution in Taylor arithmetic (`zwidth.numerics.taylor`)
+and differentiated by the implicit function theorem. With the matrices of the discretized device
+(`plant.sampled_states`; delay d = n + f),
 
     q = -e^((n + 1) lambda)/x_1,   (z - 1 - Psi) x = (z - 1) Gamma(1 - f) + Gamma(1)
 
-A wall (alpha, beta) has a pole at z if and only if ``r = alpha + beta F - q`` is 0 there. A prime denotes d/dlambda.
+A prime denotes d/dlambda. The *leaves* of a scene are its numbers, in the order of `list_leaves`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from zwidth.stability.linear.ridge import Condition, RidgeSolution
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import WALL
 
-RESPONSE_TOLERANCE = 1e-8  # largest relative difference of q by the matrices of the chain and by its roots
+RESPONSE_TOLERANCE = 1e-8  # largest relative difference of q = -1/G computed from matrices and from roots
 # Sixth-order central difference, as pairs of offset (in steps) and weight, for velocity estimates that accept only
 # floats; and its step, relative to the parameter.
 CENTRAL_DIFFERENCE = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
@@ -40,14 +41,14 @@ Pair = tuple[Taylor, Taylor]  # a function of lambda and its derivative
 
 
 class LoopTerms:
-    """The functions q and F of a loop, as functions of the numbers of its scene and of further variables."""
+    """Taylor expansions of q = -1/G and the velocity estimate F in the numbers of a scene and in further variables."""
 
     def __init__(self, scene: Any, variables: Sequence[Taylor], n: int, more_delay: Taylor | None = None) -> None:
         """Discretize the device.
 
         Args:
             scene: the scene.
-            variables: its leaves, then further variables.
+            variables: the numbers of the scene in the order of `list_leaves`, then further variables.
             n: integer part of the delay.
             more_delay: delay in periods to be added to that of the scene.
         """
@@ -55,7 +56,7 @@ class LoopTerms:
         self.varied = replace_leaves(scene, iter(variables))
         timing, self.one = self.varied.timing, variables[0] * 0.0 + 1.0
         d: Any = timing._periods if timing.in_periods else timing.delay / timing.period
-        # Replace the value of the quotient, whose rounding error `Timing.d` removes.
+        # Use the value of d of the scene, because the quotient has a rounding error, which `Timing.d` removes.
         self.d = Taylor(np.float64(scene.d), d.first, d.second)
         delay = self.d if more_delay is None else self.d + more_delay
         chain = build_chain(self.varied, (self.d, n), Estimate())
@@ -69,7 +70,7 @@ class LoopTerms:
             self.late = flow(A, B, self.one - (delay - n))[1]
 
     def controller(self, lam: Taylor) -> Pair:
-        """Return q and q'."""
+        """Return q = -1/G and its derivative in lambda = log z."""
         z, zeta = lam.exp(), lam.expm1()
         size = len(self.full.v)
         matrix = zeta.map(lambda part: np.multiply.outer(np.eye(size), part)) - self.psi
@@ -80,16 +81,16 @@ class LoopTerms:
         return q, q * (self.one * self.lag - change[0] / x[0])
 
     def estimate(self, lam: Taylor) -> Pair:
-        """Return F and F'."""
+        """Return the velocity estimate F and its derivative in lambda = log z."""
         velocity, period = self.varied.velocity, self.varied.timing.period
         try:
             return evaluate_estimate(velocity.estimate(period), lam, self.one)
         except (TypeError, ValueError, AttributeError):
-            # An estimate of a user may accept only floats.
+            # A user-defined velocity estimate may accept only floats.
             return self._difference_estimate(lam)
 
     def _difference_estimate(self, lam: Taylor) -> Pair:
-        """Return F and F' with first derivatives by finite differences of an estimate that accepts only floats."""
+        """Return F and F' of an estimate that accepts only floats, with first derivatives by finite differences."""
         leaves = list_leaves(self.scene)
         names = [id(each) for each in (self.varied.timing.period, *list_leaves(self.varied.velocity))]
         at = Taylor(lam.v, np.zeros(0))
@@ -112,14 +113,14 @@ class LoopTerms:
         return pair
 
     def residual(self, alpha: Taylor, beta: Taylor, lam: Taylor) -> tuple[Taylor, Taylor, Taylor]:
-        """Return r and r', both divided by |q|, and F."""
+        """Return the residual r = alpha + beta F - q and its derivative in lambda, both divided by |q|, and F."""
         (q, q_slope), (f, f_slope) = self.controller(lam), self.estimate(lam)
         scale = 1.0 / (abs(q.v) or 1.0)
         return (alpha + beta * f - q) * scale, (beta * f_slope - q_slope) * scale, f
 
 
 def evaluate_estimate(estimate: Estimate, lam: Taylor, one: Taylor) -> Pair:
-    """Return F and F' of a velocity estimate whose gain, zeros and poles are numbers or Taylor objects."""
+    """Return F and dF/dlambda of a velocity estimate whose gain, zeros and poles are numbers or Taylor objects."""
     z, zeta = lam.exp(), lam.expm1()
     value, slope = one * estimate.gain, one * 0.0
     for zero in np.ravel(estimate.zeros):
@@ -138,7 +139,8 @@ def evaluate_estimate(estimate: Estimate, lam: Taylor, one: Taylor) -> Pair:
     return value, slope
 
 
-# A function that returns the real equations of a question, for the terms of the loop and the further variables.
+# Type of a function that returns the real equations of a result, such as a margin. Its arguments are q and F of the
+# loop (`LoopTerms`), and the further parameters and the unknowns.
 Equations = Callable[[LoopTerms, Sequence[Taylor]], Sequence[Taylor]]
 
 
@@ -150,15 +152,15 @@ def differentiate(
     equations: Equations,
     added_delay: float | None = None,
 ) -> Implicit:
-    """Return the derivatives of the unknowns of equations in the leaves of a scene and in further parameters.
+    """Return the derivatives of the solution of equations in the numbers of a scene and in further parameters.
 
     Args:
-        scene: the scene, whose leaves are floats.
+        scene: the scene, whose numbers are floats.
         order: 1, or 2 for second derivatives.
         parameters: values of the further parameters.
         unknowns: values of the unknowns.
-        equations: function of the terms of the loop, and of further parameters and unknowns, that returns as many
-            equations as there are unknowns; raises `ArithmeticError` if derivatives are not available.
+        equations: function of `LoopTerms`, and of the further parameters followed by the unknowns. It returns one
+            equation per unknown, and raises `ArithmeticError` if derivatives are not available.
         added_delay: value of the first unknown if it is a delay in periods to be added to that of the scene.
 
     Returns:
@@ -180,7 +182,8 @@ def differentiate(
         try:
             result = compute(n)
             if has_kink:
-                # Without inertia, the answer has a kink at integer delays. A longer period shortens the delay.
+                # Without inertia, the result has a kink at integer delays. For the derivative in the period, use the
+                # side of smaller delays, because a longer period reduces the delay in periods.
                 _replace_derivatives(result, compute(n - 1), index["period"])
         except (ArithmeticError, np.linalg.LinAlgError):
             return Implicit(*(np.full((len(unknowns), *[size] * k), np.nan) for k in (1, 2)))
@@ -201,7 +204,7 @@ def _replace_derivatives(result: Implicit, other: Implicit | None, k: int) -> No
 
 
 def index_parameters(scene: Any) -> dict[str, int]:
-    """Return the index of each parameter among the leaves of a scene, by dotted path."""
+    """Return the index of each parameter in the list of all numbers of a scene, by dotted path."""
     marked = replace_leaves(scene, iter(map(float, range(len(list_leaves(scene))))))
     index = {path: int(value) for path, value in list_parameters(marked).items() if isinstance(value, float)}
     if marked.timing.in_periods:
@@ -210,7 +213,7 @@ def index_parameters(scene: Any) -> dict[str, int]:
 
 
 def agrees_with_roots(scene: Any, terms: LoopTerms, *angles: float) -> bool:
-    """Return whether q by the matrices of the device agrees with q by its roots; rounding errors dominate otherwise."""
+    """Return whether q from matrices agrees with q from zeros and poles; otherwise rounding errors dominate."""
     exact = scene.loop.roots.evaluate_controller(circle_points(np.array(angles))).value
     for w, q in zip(angles, exact, strict=True):
         value = terms.controller(terms.one * (1j * w))[0].v
@@ -220,12 +223,12 @@ def agrees_with_roots(scene: Any, terms: LoopTerms, *angles: float) -> bool:
 
 
 def split(value: Taylor) -> list[Taylor]:
-    """Return the real and the imaginary part."""
+    """Return the real and the imaginary part of a Taylor object."""
     return [value.real, value.imag]
 
 
 def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> Implicit:
-    """Return the derivatives of alpha, beta and omega of the stiffest wall in the leaves of a scene (V21)."""
+    """Return the derivatives of alpha, beta and omega of the stiffest wall in all numbers of a scene (V21)."""
     is_pair = ridge.first == Condition.PAIR, ridge.second == Condition.PAIR
     free = [k for k in range(2) if is_pair[k]]
     extra = [ridge.alpha, ridge.beta, *((ridge.w1, ridge.w2)[k] for k in free)]
@@ -248,7 +251,7 @@ def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> Implici
         return [*result, *(split(r) if is_pair[1] else [r.real])]
 
     result = differentiate(scene, order, [], extra, equations)
-    # Append the derivatives of omega, which is constant if it belongs to a real pole.
+    # Append the derivatives of the angle omega, which are 0 if omega is the constant angle of a real pole.
     angles = (ridge.w1, ridge.w2)
     rows = [0, 1, 2 + free.index(angles.index(ridge.omega)) if angles.index(ridge.omega) in free else None]
 

@@ -1,9 +1,10 @@
-"""Evaluate many linear loops of one form at angles on the unit circle, with the same source code for NumPy and JAX.
+"""Evaluate the plant G and velocity estimate F of many loops at angles w on the unit circle, in NumPy or JAX.
 
-All loops of a batch have the same *form*: orders, integer delay and window. The last axis of every array belongs to the
-loops, the first one to coefficients, roots or angles. The *nodes* are the angles at which a batch is evaluated; each
-loop has its own. q = -1/G is the critical controller and F the velocity estimate (`stability.linear.roots`). Roots are
-stored as offsets 1 - z, and polynomials by their coefficients in zeta = z - 1.
+Each loop is evaluated at its own *nodes*, a list of angles w; ``q = -1/G`` is the critical controller. All loops of a
+batch have the same *form*: orders, integer delay and window of the velocity estimate. The last axis of every array is
+that of the loops, the first axis that of coefficients, roots or angles. Roots are stored as *offsets* 1 - z, and
+polynomials by their coefficients in ``zeta = z - 1`` (`stability.linear.roots`). On a line of walls, k(w) is the
+function whose zeros are the angles of poles on the unit circle (`stability.linear.batch_lines`).
 """
 
 from __future__ import annotations
@@ -23,28 +24,30 @@ SPLIT = 0.3  # width of the two ranges with geometric spacing
 FIRST_NODE = 1e-3  # first node, relative to the distance of the nearest root from z = 1
 LAST_NODE = 1e-4  # pi - w of the last node, as in `stability.linear.curve.place_nodes`
 LOW_RATIO, HIGH_RATIO = 0.2, 0.25  # steps in log w near 0, and in log(pi - w) near pi
-STEP, PHASE_STEP = 0.08, 0.4  # largest step between these ranges, and of the phase of z^lag
-BUCKET = 32  # the numbers of nodes in the ranges are multiples of this, so that many loops share a shape
-NEAR_CIRCLE = 0.25  # distance from the circle of a root with its own nodes, relative to its angle (at most 1 rad)
-CLUSTER_NODES = 31  # nodes around one root
-CLUSTER_REACH = 0.15  # largest distance of these nodes from the root
-CLOSEST = 1e-7  # their smallest spacing
-# Largest sum of step/distance over all zeros of G and poles of F at which a step between nodes counts as resolved. It
-# is below 2, the ratio for a root in the middle of the step.
+STEP, PHASE_STEP = 0.08, 0.4  # in rad between these ranges: largest step of w, and of the phases of powers of z
+BUCKET = 32  # the numbers of nodes in the ranges are multiples of this, so that many loops have arrays of equal shape
+# A zero of G or pole of F has additional nodes if its distance from the unit circle is below this fraction of its angle
+# (of 1 rad for larger angles).
+NEAR_CIRCLE = 0.25
+CLUSTER_NODES = 31  # number of additional nodes near one root
+CLUSTER_REACH = 0.15  # largest distance of these additional nodes from the angle of the root, in rad
+CLOSEST = 1e-7  # distance from the unit circle, in rad, below which the spacing of these nodes decreases no further
+# A step between two nodes counts as resolved if the sum of step/distance over all zeros of G and poles of F is below
+# this limit. The limit is below 2, the ratio for a root in the middle of the step.
 RESOLUTION = 1.9
-INSIDE = 1e-10  # smallest distance inside the unit circle, relative to the distance from z = 1, of a decaying pole
+INSIDE = 1e-10  # a pole inside the unit circle by less than this, relative to |1 - z|, counts as on the circle
 
 
 class Form(NamedTuple):
     """The structure that all loops of a batch share."""
 
-    lag: int  # of G: integer delay plus 1 for a fractional delay
-    window: int  # of the velocity estimate, as in `Estimate`
-    estimate_lag: int
+    lag: int  # power of 1/z in G: the integer delay plus 1
+    window: int  # window of the velocity estimate F in samples; 0 without a window
+    estimate_lag: int  # power of 1/z in F
 
     @property
     def phase_rate(self) -> float:
-        """Bound on the derivative of the phases of the powers of z in q and F, in rad per rad."""
+        """Upper bound of the derivative in w of the phases of all powers of z in q and F."""
         return self.lag + self.window + abs(self.estimate_lag) + 1.0
 
 
@@ -53,11 +56,11 @@ class LoopBatch(NamedTuple):
 
     numerator: Array  # shape (coefficients, loops)
     denominator: Array
-    gain: Array  # of F, shape (loops,)
+    gain: Array  # gain of F, shape (loops,)
     zeros: Array  # offsets 1 - z of the zeros of F, shape (zeros, loops)
-    poles: Array  # offsets of the poles of F
-    plant_zeros: Array  # offsets of the zeros of G
-    plant_poles: Array  # offsets of the poles of G, those at z = 1 first
+    poles: Array  # offsets 1 - z of the poles of F
+    plant_zeros: Array  # offsets 1 - z of the zeros of G
+    plant_poles: Array  # offsets 1 - z of the poles of G; poles at z = 1 come first
     integrators: Array  # number of poles of G at z = 1
 
     def take(self, index: Array) -> LoopBatch:
@@ -66,7 +69,7 @@ class LoopBatch(NamedTuple):
 
 
 class Values(NamedTuple):
-    """q, F and their derivatives at angles w."""
+    """The critical controller q, the velocity estimate F, and their derivatives in w, at angles w."""
 
     q: Array
     q_slope: Array
@@ -75,7 +78,7 @@ class Values(NamedTuple):
 
 
 def evaluate(form: Form, loop: LoopBatch, w: Array) -> Values:
-    """Return q and F and their derivatives in w at angles of shape (..., loops)."""
+    """Return q = -1/G, F, and their derivatives in w, at angles w of shape (..., loops)."""
     xp, points = namespace(w), circle_points(w)
     top, top_slope = _horner(loop.numerator, points.z_minus_1)
     bottom, bottom_slope = _horner(loop.denominator, points.z_minus_1)
@@ -91,17 +94,17 @@ def evaluate(form: Form, loop: LoopBatch, w: Array) -> Values:
 
 
 def _subtract_root(points: CirclePoints, offset: Array) -> Jet:
-    """Return z - root and its derivative in w, without cancellation for roots near z = 1 or z = -1."""
+    """Return z - root and its derivative in w, from the offset 1 - root, without cancellation near z = 1 and z = -1."""
     xp = namespace(points.w)
     value, left = points.z_minus_1 + offset, offset.real > 1.0
     if xp is not np or left.any():
-        # Roots near z = -1 need z + 1, which is accurate there (V16).
+        # For roots near z = -1 compute z - root from z + 1, which is accurate near z = -1 (V16).
         value = xp.where(left, points.z_plus_1 + (offset - 2.0), value)
     return Jet(value, 1j * points.z)
 
 
 def _horner(coefficients: Array, x: Array) -> tuple[Array, Array]:
-    """Return a polynomial and its derivative at x; the coefficients are given from the lowest power up."""
+    """Return the values of a polynomial and of its derivative at x, from coefficients in order of ascending powers."""
     value, slope = coefficients[-1] + 0.0 * x, 0.0 * x
     for coefficient in coefficients[-2::-1]:
         value, slope = value * x + coefficient, slope * x + value
@@ -109,12 +112,12 @@ def _horner(coefficients: Array, x: Array) -> tuple[Array, Array]:
 
 
 class Sizes(NamedTuple):
-    """Numbers of nodes, which determine the shapes of all arrays."""
+    """Numbers of nodes of a loop, which determine the shapes of all arrays."""
 
-    low: int  # near w = 0
-    high: int  # near pi
-    clusters: int  # roots with their own nodes
-    density: int = 1  # factor of all numbers of nodes
+    low: int  # nodes near w = 0
+    high: int  # nodes near w = pi
+    clusters: int  # zeros of G and poles of F that have additional nodes
+    density: int = 1  # factor by which all numbers of nodes are multiplied
 
 
 def count_nodes(form: Form, loop: LoopBatch) -> np.ndarray:
@@ -129,7 +132,7 @@ def count_nodes(form: Form, loop: LoopBatch) -> np.ndarray:
 
 
 def _find_ends(form: Form, loop: LoopBatch) -> tuple[Array, Array]:
-    """Return the first node, and the distance of the last node from pi."""
+    """Return the angle of the first node, and pi minus the angle of the last node."""
     xp = namespace(loop.gain)
     roots = xp.concatenate([loop.plant_zeros, loop.plant_poles, loop.zeros, loop.poles])
     ends = []
@@ -141,7 +144,10 @@ def _find_ends(form: Form, loop: LoopBatch) -> tuple[Array, Array]:
 
 
 def _find_near(loop: LoopBatch) -> tuple[Array, Array, Array]:
-    """Return angle, distance from the circle, and nearness of the zeros of G and poles of F in the upper half-plane."""
+    """Return angle, distance from the unit circle, and a flag for each zero of G and pole of F.
+
+    The flag is True for roots in the upper half-plane that are so close to the unit circle that they need more nodes.
+    """
     xp = namespace(loop.gain)
     roots = xp.concatenate([loop.plant_zeros, loop.poles])
     angle, distance = xp.angle(1.0 - roots), xp.abs(distances_inside(roots))
@@ -172,27 +178,30 @@ def place_nodes(form: Form, loop: LoopBatch, sizes: Sizes) -> Array:
 
 
 class Sampled(NamedTuple):
-    """Loops with the values at their nodes from which k of every line follows (V23)."""
+    """Loops with values of q and F at their nodes, from which k(w) of any line of walls can be computed (V23)."""
 
     form: Form
     loop: LoopBatch
     w: Array
     parts: tuple[Array, Array, Array]  # Im q, Im(q conj F), Im F
     slopes: tuple[Array, Array, Array]  # their derivatives in w
-    levels: tuple[Array, Array]  # Re(q conj F)/|F|^2 and Re F/|F|^2, of which t on a line of constant K consists
-    ends: Values  # at z = -1
-    resolved: Array  # of each loop: whether the nodes resolve q and F
+    levels: tuple[Array, Array]  # Re(q conj F)/|F|^2 and Re F/|F|^2: the first minus alpha times the second is beta
+    ends: Values  # q and F at z = -1
+    resolved: Array  # for each loop: True if the nodes resolve q and F
 
     def count_start(self, k_first: Array) -> Array:
-        """Return the number of poles outside the circle for the softest walls of a ray, from k at the first node."""
-        # For t -> 0 the other poles are inside. One pole at z = 1 enters the circle, or two of them form a pair close
-        # to z = 1: both are outside if k is positive at small angles (V23).
+        """Return the number of poles outside the unit circle for the softest walls of a ray, from k at the first node.
+
+        A ray is a line of walls that starts at K = B = 0.
+        """
+        # For K = B = 0, one or two poles are at z = 1, and all other poles are inside the unit circle. For the softest
+        # walls of the ray, the poles near z = 1 are outside if k > 0 at small angles, and inside otherwise (V23).
         xp = namespace(k_first)
         return xp.where(k_first < 0, 0.0, self.loop.integrators)
 
 
 def sample(form: Form, loop: LoopBatch, sizes: Sizes) -> Sampled:
-    """Evaluate loops at their nodes."""
+    """Evaluate q and F of loops at their nodes."""
     xp, w = namespace(loop.gain), place_nodes(form, loop, sizes)
     values = evaluate(form, loop, w)
     parts, slopes = split_values(values)
@@ -206,14 +215,15 @@ def sample(form: Form, loop: LoopBatch, sizes: Sizes) -> Sampled:
     decaying = distances_inside(loop.plant_poles) > INSIDE * xp.abs(loop.plant_poles)
     decaying = decaying | (xp.arange(loop.plant_poles.shape[0])[:, None] < loop.integrators)
     resolved = xp.all(crowding < RESOLUTION, 0) & xp.all(decaying, 0) & (loop.integrators <= 2)
-    # With a negative static gain, walls with K > 0 have a pole at z = 1, which the counts along lines leave out.
+    # Mark loops with a negative static gain as not resolved, because a wall with K > 0 then may have a pole at z = 1,
+    # which the pole counts along lines do not include.
     resolved = resolved & (loop.numerator[0] * loop.denominator[0] >= 0)
     ends = evaluate(form, loop, np.pi + 0.0 * loop.gain)
     return Sampled(form, loop, w, parts, slopes, levels, ends, resolved)
 
 
 def split_values(values: Values) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
-    """Return Im q, Im(q conj F) and Im F, and their derivatives in w."""
+    """Return Im q, Im(q conj F) and Im F, and their derivatives in w, for q = -1/G and the velocity estimate F."""
     q, q_slope, f, f_slope = values
     cross = q.imag * f.real - q.real * f.imag
     cross_slope = q_slope.imag * f.real - q_slope.real * f.imag + q.imag * f_slope.real - q.real * f_slope.imag

@@ -1,10 +1,10 @@
 """Compute gain, phase, modulus and delay margin of walls in any linear loop, from all crossovers of the open loop.
 
-The open loop is ``L = G (alpha + beta F)`` with the plant G and the velocity estimate F of `stability.linear.roots`.
-Its crossovers and its distance from -1 are computed by `stability.open_loop`, for many walls at once, at nodes that all
-walls share: those of `stability.linear.curve`, which resolve G and F, and further nodes that resolve the controller
-``alpha + beta F`` and low gain crossovers. A *chain* is the plant of a scene with its delay
-(`plant.sampled_states`).
+The open loop is ``L = G (alpha + beta F)`` with the plant G and the velocity estimate F of `stability.linear.roots`,
+for a wall with the normalized stiffness alpha and damping beta. `stability.open_loop` computes the crossovers of L and
+the distance of L from -1, for many walls at once. All walls share the *nodes*, the angles at which L is tabulated:
+those of `stability.linear.curve`, which resolve G and F, and further nodes that resolve the controller ``alpha + beta
+F`` and gain crossovers at low frequencies. A *chain* is the plant of a scene with its delay (`plant.sampled_states`).
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from zwidth.stability.open_loop import (
 from zwidth.stability.results import Margins
 from zwidth.units.quantities import WALL_RANGE
 
-BATCH_WALLS = 128  # walls per batch, so large that most of the time is spent on arrays, and not in Python
-# Largest number of halvings of an interval between two nodes near a zero of the controller.
+BATCH_WALLS = 128  # walls per batch; so many that array operations take most of the time, not the Python interpreter
+# Largest number of halvings of an interval between two nodes near a zero of the controller alpha + beta F.
 MAX_HALVINGS = 40
-MAX_CONTROLLER_CHANGE = 0.25  # largest change of the controller between neighboring nodes, relative to its magnitude
+MAX_CONTROLLER_CHANGE = 0.25  # largest relative change of the controller between neighboring nodes
 
 
 def respond_to_position(points: CirclePoints) -> Jet:
-    """Return the response of the position that the stiffness of the wall multiplies, which is the sampled position."""
+    """Return the constant 1: the spring force of the wall is proportional to the sampled position itself."""
     return Jet(np.ones(()), np.zeros(()))
 
 
 def evaluate_walls(loop: LoopRoots, alpha: Array, beta: Array, points: CirclePoints) -> Jet:
-    """Return L of walls and its derivative in w at points of the unit circle, for arrays that broadcast."""
+    """Return L of walls and its derivative in w at points of the unit circle; walls and points broadcast."""
     return evaluate_open_loop(points, loop.evaluate_response, (respond_to_position, loop.estimate.jet), (alpha, beta))
 
 
 def tabulate(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, nodes: np.ndarray) -> OpenLoop:
-    """Return L for each wall, tabulated at the nodes of the loop and at further nodes that all walls need."""
+    """Return L of each wall, tabulated at the nodes of the loop and at further nodes that the walls need."""
     w = np.append(nodes[nodes < np.pi], np.pi)
     n_integrators = int(np.count_nonzero(np.abs(loop.poles) <= POLE_AT_ONE))
     if n_integrators:
@@ -76,7 +76,7 @@ def tabulate(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, nodes: np.nda
 
 
 def find_modulus_margins(wall: OpenLoop) -> tuple[np.ndarray, np.ndarray]:
-    """Return the minimum of ``|1 + L|`` of each wall, and the angle at which it is reached; 0 if it is at z = 1."""
+    """Return the minimum of ``|1 + L|`` of each wall, and the angle of this minimum, 0 for z = 1."""
     w = find_nearest_angle(wall.respond, wall.w, abs2(1.0 + wall.L.value))
     distance = np.abs(1.0 + wall.respond(w[:, None]).value[:, 0])
     at_one = np.abs(1.0 + evaluate_at_one(wall))
@@ -96,14 +96,14 @@ def compute_margins(
     """Return the margins of walls, with delays in periods and angles in rad per sample.
 
     Args:
-        chain: the chain.
-        boundary: the stability boundary of its loop.
+        chain: device and delay.
+        boundary: the stability boundary of the loop.
         alpha: normalized stiffness, any shape.
         beta: normalized damping, the same shape.
         wanted: names of the margins; the others are NaN.
 
     Returns:
-        Margins of that shape; NaN for walls out of range.
+        Margins of the shape of ``alpha``; NaN for walls out of range.
     """
     shape, stable = alpha.shape, label_walls(boundary, alpha, beta).reshape(-1)
     alpha, beta = alpha.reshape(-1), beta.reshape(-1)
@@ -113,7 +113,7 @@ def compute_margins(
         part = in_range[start : start + BATCH_WALLS]
         for name, values in _compute_batch(boundary, alpha[part], beta[part], stable[part], wanted).items():
             out[name][part] = values
-    # Omit the delay margin of a sampled system, which does not define its response at fractional delays.
+    # Leave the delay margin of a sampled system NaN, because its response is not defined at fractional delays.
     if "delay_margin" in wanted and not chain.sampled:
         limited = in_range[stable[in_range]]
         out["delay_margin"][in_range] = 0.0
@@ -124,7 +124,7 @@ def compute_margins(
 def _compute_batch(
     boundary: Boundary, alpha: np.ndarray, beta: np.ndarray, stable: np.ndarray, wanted: Container[str]
 ) -> dict[str, np.ndarray]:
-    """Return the margins of some walls by name, except the delay margin; arguments as in `compute_margins`."""
+    """Return the margins of one batch of walls by name, without the delay margin; see `compute_margins`."""
     wall, out = tabulate(boundary.loop, alpha, beta, boundary.w), {}
     with np.errstate(all="ignore"):
         if "gain_margin" in wanted:

@@ -1,8 +1,8 @@
 """Compute the passivity margin of walls with any velocity estimate, on a device that is a single mass.
 
-Colgate's condition (docs/theory/passivity.md, P4) is a lower bound on the physical damping at every frequency. For the
-wall ``C = alpha + beta F``, the velocity estimate ``F = (z - 1) E``, and the delay d = n + f (n integer, 0 <= f < 1),
-the required damping at ``z = e^(jw)``, with s = sin(w/2), is
+Colgate's condition requires a physical damping of at least N(w) at every ``z = e^(jw)`` (docs/theory/passivity.md, P4).
+For the wall ``C = alpha + beta F``, the velocity estimate ``F = (z - 1) E``, and the delay d = n + f (n integer,
+0 <= f < 1), with s = sin(w/2), the required damping is
 
     N(w) = (-a + sqrt(a^2 + 4 f (1 - f) |C|^2))/4
     a = -alpha sin((n + 1/2) w)/s + 2 beta Re(z^-n E) - 2 f Re(z^-(n+1) C)
@@ -27,9 +27,9 @@ from zwidth.numerics.polynomials import abs2
 from zwidth.stability.passivity import limit_margin, solve_larger_root
 
 # Settings of the search for the maximum of N.
-N_NODES = 129  # initial angles
+N_NODES = 129  # number of angles w at which the search starts
 MAX_INTERVALS = 1 << 18  # largest number of undecided intervals in one round
-N_PARTS = 16  # parts into which an interval is divided
+N_PARTS = 16  # number of parts into which an undecided interval of angles is divided
 MAX_ROUNDS = 20  # largest number of rounds in which the undecided intervals are divided
 SHARES = np.arange(1, N_PARTS)[:, None] / N_PARTS  # inner points of a divided interval, relative to its width
 CERTIFIED_ERROR = 1e-13  # largest relative error of the maximum
@@ -60,11 +60,11 @@ UNSUPPORTED = {
 def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
     """Return the reason why no passivity condition is available for a device; "" if a condition is available.
 
-    The condition requires that the force acts on the point whose position is sensed.
+    A condition is available only if the force acts on the point whose position is sensed.
 
     Args:
         coupling: coupling of the device.
-        **parts: its other fields.
+        **parts: the other fields of the device.
     """
     for name, (description, reason) in UNSUPPORTED.items():
         part = parts.get(name)
@@ -101,15 +101,15 @@ class PassivityCondition:
         )
         denominator = polynomial.polyfromroots([*-estimate.poles, *[-1.0] * lag]).real
         spring = numerator[0] / denominator[0]
-        # Compute the numerator of E by dividing that of F - F(1) by zeta: drop the constant coefficient, which is 0. If
-        # F is constant, no coefficient remains.
+        # Divide the numerator of F - F(1) by zeta to obtain the numerator of E: drop the constant coefficient, which is
+        # 0. If F is constant, no coefficient remains.
         quotient = np.trim_zeros(polynomial.polysub(numerator, spring * denominator)[1:], "b")
         quotient = quotient if quotient.size else np.zeros(1)
         E = Estimate(0, quotient[-1], lag, -polynomial.polyroots(quotient) + 0j, estimate.poles)
         return cls(E, float(spring), n, float(d - n))
 
     def _evaluate_quotient(self, w: np.ndarray) -> np.ndarray:
-        """Return E at angles w; for a windowed difference, E has the mean of z^-1 to z^-window as a factor."""
+        """Return E = (F - F(1))/(z - 1) at angles w; a window contributes the mean of z^-1 to z^-window as a factor."""
         n, value = self.quotient.window, replace(self.quotient, window=0).jet(circle_points(w)).value
         if n:
             s = np.sin(0.5 * w)
@@ -128,7 +128,7 @@ class PassivityCondition:
         return solve_larger_root(-0.5 * a, f * (1.0 - f) * abs2(wall), np)[0]
 
     def bound_curvature(self, alpha: np.ndarray, beta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return a bound of ``|M''|`` on each interval of angles [low, high]."""
+        """Return an upper bound of ``|M''|``, with the matrix M(w), on each interval [low, high] of w."""
         n, f = self.integer_delay, self.fractional_delay
         difference = _bound_difference(low, high, 0.0)
         damper = _multiply_bounds(self._bound_quotient(low, high), _bound_power(n, low))
@@ -141,7 +141,7 @@ class PassivityCondition:
         return 0.5 * (bound + np.sqrt(f * (1.0 - f)) * abs(beta) * wall)
 
     def _bound_quotient(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return bounds of |E| and of its first two derivatives in w on each interval of angles [low, high]."""
+        """Return bounds of |E| and of the first two derivatives of E in w on each interval [low, high] of w."""
         f = self.quotient
         value = _multiply_bounds((abs(f.gain) + 0.0 * low, 0.0 * low, 0.0 * low), _bound_power(abs(f.lag), low))
         if f.window:
@@ -163,7 +163,7 @@ class PassivityCondition:
 
 
 def _multiply_bounds(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-    """Return bounds of a product and its first two derivatives, from those of both factors."""
+    """Return bounds of a product and of its first two derivatives, from the same bounds of both factors."""
     return (
         one[0] * other[0],
         one[1] * other[0] + one[0] * other[1],
@@ -206,8 +206,8 @@ def find_needed_damping(condition: PassivityCondition, alpha: np.ndarray, beta: 
     for round_ in range(MAX_ROUNDS + 1):
         upper = np.maximum(at_low, at_high) + curvature * (high - low) ** 2 / 8.0
         undecided = upper > (best + CERTIFIED_ERROR * (np.abs(best) + 1e-300))[wall]
-        # Return the upper bound, a conservative result, for walls with too many undecided intervals, because their N is
-        # almost flat.
+        # For walls with too many undecided intervals, N is almost constant over these intervals. Return the upper bound
+        # of N for these walls, a conservative result.
         count = np.bincount(wall[undecided], minlength=alpha.size)
         is_flat = (count > MAX_INTERVALS) | ((round_ == MAX_ROUNDS) & (count > 0))
         np.maximum.at(best, wall[undecided & is_flat[wall]], upper[undecided & is_flat[wall]])

@@ -1,14 +1,15 @@
 """Compute all closed-loop poles and the spectral radius of walls in any linear loop.
 
-With ``zeta = z - 1`` and the offsets t = 1 - root of the poles and b = 1 - root of the zeros of the open loop, the
-characteristic polynomial is
+Poles are the zeros z of the characteristic polynomial P, stored as ``zeta = z - 1``. With the offsets 1 - root of the
+open loop, t for its poles and b for its zeros,
 
     P = z^lag prod(zeta + t) Q + gain prod(zeta + b) (alpha Q + beta R),     F = R/Q
 
-with numerator R and denominator Q of the velocity estimate. Companion eigenvalues are the starting values of Aberth's
-method (Aberth 1973, Math. Comp. 27) on this factored form, which keeps the significant digits of poles near z = 1; the
-coefficients of P lose them. For the same reason poles are returned as zeta. For long delays the spectral radius is
-found by counting the poles in circles (`numerics.pole_counting`), at a cost that does not depend on the delay.
+with the numerator R and the denominator Q of the velocity estimate F. Companion eigenvalues are the starting values of
+Aberth's method (Aberth 1973, Math. Comp. 27). It uses the factored form of P, because the coefficients of P lose the
+significant digits of poles near z = 1. For the same reason, poles are stored as zeta. For long delays the spectral
+radius is found by counting the poles in circles (`numerics.pole_counting`), at a cost that does not depend on the
+delay.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from zwidth.numerics.polynomials import abs2, companion, compute_aberth_step
 from zwidth.stability.linear.roots import LoopRoots, affine_polynomial, factor_open_loop
 from zwidth.units.quantities import MOST_POLES, WALL_RANGE
 
-# Aberth's method
+# Aberth's method for the poles
 MAX_STEPS = 60
-CONVERGED_STEP = 4e-16  # relative to |zeta|
-LONGEST_STEP = 0.5
+CONVERGED_STEP = 4e-16  # last step of a pole, relative to |zeta|
+LONGEST_STEP = 0.5  # largest |step| of zeta; longer steps are shortened to this
 
 # Limits for the restart of poles that did not converge.
 NEAR_ONE = 1e-6  # |zeta| below which eigenvalues have no significant digits
-UNCONVERGED_STEP = 1e-3  # relative to |zeta|
+UNCONVERGED_STEP = 1e-3  # step of a pole, relative to |zeta|, above which the pole has not converged
 MAX_RESTARTS = 4
 
 REAL_TOLERANCE = 1e-13  # imaginary part of a real pole, relative to |zeta|; smaller imaginary parts are rounding errors
@@ -43,7 +44,7 @@ BLOCK_SIZE = 1 << 20  # values per block of walls; eigenvalues and pole differen
 
 
 class FactoredValue(NamedTuple):
-    """P, its derivative, and the sum of the magnitudes of its terms, which scales the rounding error of P."""
+    """The polynomial P, its derivative, and the sum of the magnitudes of its terms, which scales its rounding error."""
 
     value: Array
     slope: Array
@@ -166,8 +167,8 @@ def compute_poles_minus_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array
         for k in range(0, walls.size, block):
             part = walls[k : k + block]
             out[part] = _find_poles(loop, alpha[part], beta[part]) if damped else _find_spring_poles(loop, alpha[part])
-    # Set imaginary parts to 0 where they are rounding errors of real poles. Complex pairs are not affected, because
-    # even just off the real axis their imaginary parts are about 1e-8.
+    # Set imaginary parts to 0 if they are rounding errors of real poles. Complex pairs are not affected, because the
+    # imaginary part of a pair is at least about 1e-8, even close to a double real pole.
     out = np.where(np.abs(np.imag(out)) <= REAL_TOLERANCE * np.abs(out), np.real(out) + 0j, out)
     return out.reshape(*shape, order)
 
@@ -221,8 +222,8 @@ MAX_STARTS = 16  # points from which Newton's method starts
 NEWTON_STEPS = 12
 ON_CIRCLE = 1e-6  # largest difference of log|z| from the log radius; bounded by `MAX_BRACKET_WIDTH`
 
-# Largest |log radius| at which the radius may contradict the verdict on stability. For a larger contradiction the
-# result is NaN, because either the radius or the verdict may be wrong.
+# Largest |log radius| at which the computed radius may contradict the result of the stability test. For a larger
+# contradiction the radius is NaN, because either of the two may be wrong.
 VERDICT_TOLERANCE = 1e-7
 
 
@@ -270,12 +271,12 @@ def _find_angle(loop: LoopRoots, alpha: float, beta: float, log_radius: float) -
 def agree_with_verdict(log: np.ndarray, stable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the spectral radius of each wall, below 1 if and only if ``stable`` is True, and its logarithm.
 
-    Within rounding errors of the stability boundary the computed radius may contradict the verdict; it is then 1, or
-    the next smaller float64 for a stable wall.
+    If a wall is on the stability boundary within rounding errors, the computed radius may contradict ``stable``. The
+    radius is then 1, or the next smaller float64 for a stable wall.
 
     Args:
         log: computed log radius, shape (walls,).
-        stable: verdict on each wall, shape (walls,).
+        stable: True for stable walls, shape (walls,).
 
     Returns:
         Arrays of shape (walls,); NaN for a contradiction larger than `VERDICT_TOLERANCE`.
@@ -286,7 +287,7 @@ def agree_with_verdict(log: np.ndarray, stable: np.ndarray) -> tuple[np.ndarray,
 
 
 def spectral_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, stable: np.ndarray) -> np.ndarray:
-    """Return the spectral radius ``max|z|`` of each wall, in agreement with its verdict (`agree_with_verdict`)."""
+    """Return the spectral radius ``max|z|`` of each wall, below 1 if and only if ``stable`` is True."""
     return agree_with_verdict(compute_log_radius(loop, alpha, beta), stable)[0]
 
 

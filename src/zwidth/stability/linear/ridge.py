@@ -1,18 +1,19 @@
 """Find the stiffest stable wall of any linear loop and its active constraints.
 
-The maximum of alpha over the stable set is a smooth maximum of an edge, a corner where two crossings with the boundary
-coincide, or, if only beta >= 0 is allowed, a crossing on the line beta = 0. It solves two conditions on
-``r(z) = alpha + beta F(z) - q(z)`` (q and F as in `stability.linear.roots`; docs/theory/scenes.md, V19):
+A wall has the normalized stiffness alpha and damping beta. Arcs of the boundary of the stable set are called *edges*.
+On an edge, a pole is on the unit circle at ``e^(jw)``. The maximum of alpha over the stable set is a smooth maximum on
+an edge, a corner where two edges meet, or, if only beta >= 0 is allowed, a point of an edge with beta = 0. It solves
+two conditions on ``r(z) = alpha + beta F(z) - q(z)`` (q and F as in `stability.linear.roots`; docs/theory/scenes.md,
+V19):
 
     first     r(e^(j w1)) = 0 for a pole pair, or for a real pole at z = -1 or z = 1
     second    the same at w2; or alpha is stationary along the curve of the first condition; or beta = 0
 
-As a parameter changes, the same conditions remain active, so their implicit derivatives are those of alpha (V21;
-`stability.linear.derivatives`). In arrays of crossings, a *row* belongs to a line of constant B and a *column* to an
-arc or crossing line, as in `stability.linear.boundary`.
+If a parameter changes slightly, the same conditions remain active, so the derivatives of alpha follow from them by the
+implicit function theorem (V21; `stability.linear.derivatives`). In arrays of crossings, a *row* belongs to a line of
+constant B and a *column* to an arc or crossing line, as in `stability.linear.boundary`.
 
-A *main* piece of the stable set is one that is connected to K = 0
-(`stability.linear.regions`).
+A *main* piece of the stable set is one that is connected to K = 0 (`stability.linear.regions`).
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from zwidth.stability.linear.rows import find_stable_intervals
 
 # Settings of the search for corners.
 CORNER_TOLERANCE = 1e-8  # difference of the two crossings in alpha at a corner, relative to alpha
-NEAR_CORNER = 1e-5  # largest relative distance from the start, in beta; for an end of the curve, in alpha
+NEAR_CORNER = 1e-5  # largest relative change of beta from its starting value; at an end of the curve, of alpha
 MAX_STEPS = 4  # Newton steps
-CONVERGED_STEP = 1e-15  # relative to beta
+CONVERGED_STEP = 1e-15  # last Newton step, relative to beta
 
-ON_LOSSLESS = 1e-9  # tolerance of the lossless damping, relative to the width of the stable set in beta
+ON_LOSSLESS = 1e-9  # largest distance from the lossless damping, relative to the width of the stable set in beta
 # If the alpha of a stable wall exceeds the computed maximum by more than this fraction, the result is rejected. Smaller
 # differences are rounding errors.
 CONTRADICTION = 1e-7
@@ -57,7 +58,7 @@ class Condition(IntEnum):
 
 
 class RidgeSolution(NamedTuple):
-    """The stiffest stable wall and its two active constraints; ``w2`` equals w1 if the second one has no angle."""
+    """The stiffest stable wall and its two active constraints; w2 is w1 if the second constraint has no angle."""
 
     alpha: float
     beta: float
@@ -201,7 +202,8 @@ def _find_nearest_two(b: Boundary, alpha: float, beta: float) -> tuple[list[floa
     """Return the two crossings nearest to a wall on its line of constant B.
 
     Returns:
-        Their angles, alphas, and derivatives d alpha/d beta; and the Newton step in beta to where their alphas agree.
+        The angles, alphas and derivatives d alpha/d beta of the crossings, and the Newton step in beta that makes both
+        alphas equal.
     """
     row = b.find_crossings(np.array([beta]))
     distance = np.abs(row.alpha[0] - alpha)

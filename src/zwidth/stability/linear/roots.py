@@ -47,7 +47,7 @@ class LoopRoots(FactoredPlant):
         return bool(np.any((distances_inside(self.poles) < 0) & ~are_on_circle(self.poles)))
 
     def as_damper(self) -> LoopRoots | None:
-        """Return the loop of walls with K = 0, in which the damping B takes the place of K as the loop gain.
+        """Return the loop of walls with stiffness K = 0, in which the damping B is the loop gain instead of K.
 
         The zero of the velocity estimate at z = 1 cancels a pole of the device there. Return None if the zero or the
         pole does not exist.
@@ -68,10 +68,10 @@ class LoopRoots(FactoredPlant):
         return LoopRoots(self.gain * float(f.gain) / max(f.window, 1), max(lag, 0), zeros, poles, Estimate())
 
     def contract_powers(self) -> tuple[LoopRoots, int]:
-        """Return the loop in the variable z^k, for the largest k for which G and F are functions of z^k, and this k.
+        """Return the loop in the variable z^k, for the largest k such that G and F are functions of z^k, and this k.
 
         Returns:
-            The loop whose poles are the k-th powers of the poles of this one, and k. For most loops k is 1.
+            The loop whose poles are the k-th powers of the poles of this loop, and k. For most loops k is 1.
         """
         f = self.estimate
         parts = [_expand(each) for each in (self.zeros, self.poles, f.zeros, f.poles)]
@@ -86,12 +86,12 @@ class LoopRoots(FactoredPlant):
         return replace(self, lag=lags[0], zeros=roots[0], poles=roots[1], estimate=slow), k
 
     def bound_variation(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """Return a bound on the relative derivatives of q and F in w, over the angles within ``reach`` of w."""
+        """Return a bound of the relative derivatives of q = -1/G and F in w, over all angles within ``reach`` of w."""
         z_minus_1 = circle_points(w).z_minus_1[..., None]
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         distance = np.abs(z_minus_1 + roots) - reach[..., None]
-        # Use at least a small distance from a root on the unit circle, because near the root the phase of the factor z
-        # - root hardly varies (V16) and only the modulus must be resolved.
+        # Limit the distance from a root on the unit circle from below. Near the root, the phase of the factor (z -
+        # root) hardly varies (V16), and only its modulus must be resolved.
         floor = np.where(are_on_circle(roots), np.where(roots == 0, 1e-9, 1e-5), 0.5 * np.abs(distances_inside(roots)))
         by_roots = (1.0 / np.maximum(distance, floor)).sum(-1)
         return by_roots + self.lag + self.estimate.window + abs(self.estimate.lag) + 1.0
@@ -120,7 +120,7 @@ def expand_estimate(loop: LoopRoots) -> tuple[np.ndarray, np.ndarray]:
 
 
 def affine_polynomial(loop: LoopRoots) -> Affine:
-    """Return the coefficients of D, N1 and N2, which determine P for any wall."""
+    """Return the coefficients of D, N1 and N2 in the characteristic polynomial ``D + alpha N1 + beta N2``."""
     f_numerator, f_denominator = expand_estimate(loop)
     denominator, numerator = np.pad(_expand(loop.poles), (0, loop.lag)), loop.gain * _expand(loop.zeros)
     parts = [
