@@ -143,6 +143,12 @@ class TracedLoop(LinearLoop):
             "poles: got a value traced by JAX, allowed only for a rigid device with the backward difference"
         )
 
+    def dominant_poles(self, alpha: Array, beta: Array) -> Any:
+        raise InputError(
+            "dominant_pole: got a value traced by JAX, allowed only for a rigid device with the backward difference; "
+            "use spectral_radius"
+        )
+
     def trace_sensitivities(self, negative_damping: bool | None) -> SceneSensitivities:
         """Return K_max and its derivatives by dotted path of the parameter; see `zwidth.Scene.sensitivities`."""
         timing = self.scene.timing

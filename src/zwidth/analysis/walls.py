@@ -121,7 +121,8 @@ class SceneAnalysis(SceneParts):
             >>> print(f"{scene.dominant_pole(5000, 10).frequency:.1f} Hz")
             37.3 Hz
         """
-        radius, angle, rate, status = self.loop.dominant_poles(*self._broadcast_walls(stiffness, virtual_damping))
+        walls = self._broadcast_walls(stiffness, virtual_damping)
+        radius, angle, rate, status = self._loop_for(*walls).dominant_poles(*walls)
         period = self.timing.period
         return ScenePole(radius, angle, rate / period, angle / (2.0 * np.pi * period), status)
 

@@ -54,6 +54,14 @@ def test_rigid_scene_inside_jit(x64):
     assert frequency == pytest.approx(float(scene.dominant_pole(10e3, 20).frequency), rel=1e-9)
 
 
+def test_other_scenes_refuse_traced_walls():
+    scene = make_scene()
+    with pytest.raises(zwidth.InputError, match="dominant_pole: got a value traced by JAX"):
+        jax.jit(lambda K: scene.dominant_pole(K, 20).frequency)(1e3)
+    with pytest.raises(zwidth.InputError, match="dominant_pole: got a value traced by JAX"):
+        jax.jit(lambda scene: scene.dominant_pole(1e3, 20).frequency)(scene)
+
+
 def test_frequency_is_that_of_the_assessment():
     scene = make_scene().replace(wall=zwidth.VirtualWall(2000, 10))
     verdict, pole = zwidth.assess(scene), scene.dominant_pole()
