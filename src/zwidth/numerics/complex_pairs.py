@@ -1,4 +1,4 @@
-"""Complex arrays as pairs of real arrays, for loops that XLA compiles."""
+"""Complex arrays as pairs of real arrays, because XLA (the compiler of JAX) compiles real arrays to faster loops."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Pair:
         return Pair(self.real * other, self.imag * other)
 
     def over(self, other: Pair) -> Pair:
-        """Return the quotient of this array and another one."""
+        """Return this complex array divided by ``other``."""
         size = abs2(other)
         real = (self.real * other.real + self.imag * other.imag) / size
         return Pair(real, (self.imag * other.real - self.real * other.imag) / size)
@@ -43,8 +43,8 @@ class Pair:
 
 def make_complex(re: Array, im: Array) -> Array:
     """Return the complex array re + j im."""
-    # For JAX, create one complex array, which XLA computes in a single loop. XLA would compute two real arrays in two
-    # loops, both of which repeat the shared operations.
+    # For JAX, call `jax.lax.complex`: XLA then computes both parts in a single loop. For two separate real arrays, XLA
+    # would use two loops and repeat the operations that both parts share.
     if namespace(re) is not np:
         from jax.lax import complex as make_complex
 

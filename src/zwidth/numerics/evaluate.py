@@ -128,7 +128,7 @@ def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:
 def convert_for_jax(arguments: Mapping[str, ArrayLike]) -> list[Any]:
     """Convert arguments, some of them JAX arrays, to arrays of JAX's default float type, and check their shapes.
 
-    Arguments that are not JAX arrays may have the same types as in a direct call, and are checked in the same way.
+    The other arguments may have the same types as in calls without JAX arrays, and they are checked in the same way.
     """
     import jax.numpy as jnp
 
@@ -148,12 +148,13 @@ def broadcast_traced(arguments: Mapping[str, ArrayLike]) -> list[Any]:
 
 
 def precision(values: Iterable[ArrayLike]) -> AbstractContextManager[Any]:
-    """Return a context in which JAX computes in float64, unless it traces one of the values."""
+    """Return a context in which JAX computes in float64; if JAX traces one of the values, the context has no effect."""
     import jax
 
     if is_traced(*values):
         return nullcontext()
-    # Inside `jit`, JAX also traces operations on other values, for which it must not be in float64.
+    # Inside `jit`, JAX traces all operations, even on values that are not traced. Changing the float type is not
+    # allowed for traced operations, so compute these values outside the trace (`compute_concretely`).
     return compute_concretely() if is_traced(jax.numpy.asarray(0.0)) else jax.enable_x64(True)
 
 
@@ -274,18 +275,18 @@ def _plain(leaf: Any) -> Any:
     return leaf if isinstance(leaf, np.generic) else np.asarray(leaf)[()]
 
 
-# Largest number of compiled kernels, and of their derivatives, that are kept.
+# Largest number of compiled kernels that each cache of compiled functions keeps.
 CACHED_KERNELS = 256
 
 
 @lru_cache(CACHED_KERNELS)
 def compile_kernel(kernel: Callable[..., Any], static: tuple[Any, ...], weight: int = 1) -> Callable[..., Any]:
-    """Return a kernel compiled by JAX as a function of arrays that broadcast, which JAX can differentiate to any order.
+    """Return a kernel, compiled by JAX, as a function of arrays that broadcast; JAX can differentiate it to any order.
 
     Args:
         kernel: function of arrays of one shape and ``static``.
         static: further arguments of the kernel, which are constants at compilation.
-        weight: memory of a point relative to a simple kernel.
+        weight: memory that a point needs, relative to a simple kernel.
     """
     import jax
 
@@ -301,8 +302,9 @@ def compile_kernel(kernel: Callable[..., Any], static: tuple[Any, ...], weight: 
 def differentiate_elementwise(kernel: Callable[..., Any]) -> Callable[..., Any]:
     """Return a kernel as a JAX function whose derivatives, of any order, are computed elementwise.
 
-    A result at a point depends only on the arguments at this point. Its tangent is therefore a sum of one product per
-    argument, and a gradient stores one partial derivative per argument, instead of all intermediate results.
+    The result at a point depends only on the arguments at this point. Its directional derivative is therefore a sum
+    with one term per argument: partial derivative times change of the argument. For gradients, JAX stores only these
+    partial derivatives instead of all intermediate results.
     """
     import jax
 
@@ -310,7 +312,10 @@ def differentiate_elementwise(kernel: Callable[..., Any]) -> Callable[..., Any]:
 
     @cache
     def add_partials(moving: tuple[int, ...]) -> Callable[..., Any]:
-        """Return the kernel with, for each argument that moves, the derivatives of all real results."""
+        """Return a function that computes the results of the kernel, and their partial derivatives in some arguments.
+
+        ``moving`` are the indices of these arguments, whose tangents (changes) in JAX are not known to be 0.
+        """
 
         def compute(*arrays: Any) -> tuple[Any, list[list[Any]]]:
             value, partials = None, []
@@ -339,13 +344,14 @@ def differentiate_elementwise(kernel: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _map_in_blocks(function: Callable[..., Any], arrays: Sequence[Any], block: int) -> Any:
-    """Apply a function to arrays that JAX traces; on a processor, to ``block`` points at a time."""
+    """Apply a function to arrays that JAX traces; on a CPU, to blocks of ``block`` points, one after another."""
     import jax
     import jax.numpy as jnp
 
     shape, size = arrays[0].shape, arrays[0].size
-    # Intermediate results of a block fit in the cache: with 2^16 points per block, a million verdicts take 0.4 of the
-    # time and maxima of the stiffness half of it. Several devices share one array, of which a block is not local.
+    # Use blocks on a CPU, because the intermediate results of a block fit in the cache: with 2^16 points per block, a
+    # million stability tests take 40 % of the time without blocks, and a million maxima of the stiffness take 50 %.
+    # With several JAX devices, use no blocks, because a block of a distributed array would not lie on one device.
     if size <= block or jax.default_backend() != "cpu" or jax.device_count() > 1:
         return function(*arrays)
     count = -(-size // block)

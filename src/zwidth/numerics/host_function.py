@@ -1,8 +1,9 @@
 """Functions that NumPy computes with their derivatives, for use inside JAX transformations.
 
-`call_host` evaluates such a function by a callback of JAX, for a whole batch at once under `jax.vmap`. The function
-also returns its first and second derivatives, as matrices. A compiled program therefore contains only the callback and
-products with these matrices, and is compiled fast. Third derivatives are NaN.
+A *host function* is such a NumPy function; it also returns its first and second derivatives as arrays. `call_host`
+evaluates it by a callback of JAX; under `jax.vmap`, one callback serves the whole batch. A program compiled by JAX
+therefore contains only the callback and products with the arrays of derivatives, and is compiled fast. Third
+derivatives are NaN.
 """
 
 from __future__ import annotations
@@ -15,21 +16,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# Maps the order of the highest derivative, 0 to 2, and points of shape (points, arguments) to a list of arrays: values
-# of shape (points, results), first derivatives (points, results, arguments), second derivatives. It must be hashable.
+# Type of a host function. Arguments: the order of the highest derivative (0 to 2), and an array of points with the
+# shape (points, arguments). Result: a list of arrays, namely the values with the shape (points, results), then the
+# first derivatives (points, results, arguments), then the second derivatives (points, results, arguments, arguments).
+# The function must be hashable.
 HostFunction: TypeAlias = Callable[[int, np.ndarray], list[np.ndarray]]
 
 CACHED = 256  # number of functions whose compiled programs are kept
 
 
 def call_host(function: HostFunction, count: int, point: jax.Array) -> jax.Array:
-    """Return the ``count`` results of a function that NumPy computes, at one point, a vector of arguments."""
+    """Return the ``count`` results of a host function at one point, which is a vector of arguments."""
     return _make_differentiable(function, count)(point)
 
 
 @lru_cache(CACHED)
 def _make_differentiable(function: HostFunction, count: int) -> Callable[[jax.Array], jax.Array]:
-    """Return the function with derivative rules of first and second order."""
+    """Return the host function as a JAX function with rules for its first and second derivatives."""
 
     def request(order: int, point: jax.Array) -> list[jax.Array]:
         return _request(function, count, order, point)
@@ -68,11 +71,11 @@ def _make_differentiable(function: HostFunction, count: int) -> Callable[[jax.Ar
 
 
 def _request(function: HostFunction, count: int, order: int, point: jax.Array) -> list[jax.Array]:
-    """Return values and derivatives up to ``order`` at one point, by a callback."""
+    """Return the values of a host function and its derivatives up to ``order`` at one point, by a callback of JAX."""
     size, dtype = point.shape[0], point.dtype
     shapes = [(count, *(size,) * k) for k in range(order + 1)]
-    # Pass numbers to the callback and back as bits, because the thread of the callback may use JAX's default precision,
-    # which would round them to float32.
+    # Pass the float64 numbers to the callback and back as int32 bit patterns, because the callback may run in a thread
+    # with JAX's default precision, which would round the numbers to float32.
     bits = jax.lax.bitcast_convert_type(point, jnp.int32)
     total = sum(int(np.prod(shape)) for shape in shapes)
     result = jax.pure_callback(
@@ -87,7 +90,7 @@ def _request(function: HostFunction, count: int, order: int, point: jax.Array) -
 
 
 def _answer(function: HostFunction, order: int, dtype: np.dtype, bits: Any) -> np.ndarray:
-    """Compute values and derivatives at a batch of points, in one row of bits per point."""
+    """Compute values and derivatives of a host function at a batch of points; input and output are bit patterns."""
     bits = np.ascontiguousarray(bits)
     tail = bits.shape[bits.ndim - (2 if dtype.itemsize == 8 else 1) :]
     points = bits.view(dtype).reshape(-1, tail[0]).astype(np.float64)

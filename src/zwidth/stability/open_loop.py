@@ -1,13 +1,14 @@
-"""Find the angles that determine the stability margins of an open loop L, for many loops at once, in NumPy and JAX.
+"""Find the angles w that determine the stability margins of open loops L, with the same source code for NumPy and JAX.
 
-The closed loop is ``1 + L = 0`` with ``L = G (K P + B V)``: the sampled plant G, and the gain and the response of each
-feedback term, such as position P and velocity V. Only the values of L and of its derivative on the unit circle z =
-e^(jw) are used. L is tabulated at *nodes*, angles w so close that the logarithm of L changes little between neighbors.
-All arrays have the shape (loops, nodes) or (loops, crossovers), with any number of leading axes. NaN fills the entries
-of a loop that has fewer crossovers than others.
+L(z) at z = e^(jw) is tabulated at *nodes*, angles w so close that log L changes little between neighbors. The closed
+loop has poles where ``1 + L = 0``, with ``L = G (K P + B V)``: G is the sampled plant, K and B are gains, and P and V
+are the responses of the feedback terms, such as position and velocity. Only the values of L and dL/dw on the unit
+circle are used. All arrays have the shape (loops, nodes) or (loops, crossovers), where "loops" stands for any number of
+axes. If a loop has fewer crossovers than others, its remaining entries are NaN.
 
-The open loop has a *gain crossover* where |L| = 1, and a *phase crossover* where L is real and negative. Both are found
-at sign changes between nodes, and next to a minimum of the magnitude from which tangents at both nodes reach zero.
+The open loop has a *gain crossover* where |L| = 1, and a *phase crossover* where L is real and negative. Both are zeros
+of real functions of L, found between two nodes with different signs. Between nodes with equal signs, two zeros are
+possible if the tangents at both nodes reach 0 in between; they are found on both sides of the minimum of the magnitude.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from zwidth.model.circle_functions import CirclePoints, Jet, circle_points
 from zwidth.numerics.polynomials import abs2
 from zwidth.numerics.root_finding import find_zeros_in_brackets
 
-MAX_MINIMA = 5  # local minima of |1 + L| between nodes that are refined, the lowest ones first
-ZERO_OF_L = 1e-10  # value of |L| below which L counts as 0, relative to w |dL/dw|
+MAX_MINIMA = 5  # largest number of local minima of |1 + L| at the nodes that are refined, the lowest ones first
+ZERO_OF_L = 1e-10  # value of |L|, relative to w |dL/dw|, below which L counts as 0
 
-# Type of a real function of L, with its derivative in w.
+# Type of a function that returns a real function of L, and its derivative in w.
 RealFunction = Callable[[Jet], tuple[Array, Array]]
-# Type of a response on the unit circle, with its derivative in w.
+# Type of a function that returns a frequency response on the unit circle, and its derivative in w.
 Response = Callable[[CirclePoints], Jet]
 
 
 class OpenLoop(NamedTuple):
-    """Open loops, and their values at nodes."""
+    """Open loops L, and their values at the nodes."""
 
     respond: Callable[[Array], Jet]  # function from angles of shape (loops, angles) to L and dL/dw
     w: Array  # nodes, ascending and at most pi, shape (nodes,) or (loops, nodes)
@@ -61,7 +62,10 @@ def evaluate_open_loop(points: CirclePoints, plant: Response, terms: Sequence[Re
 
 
 def tabulate_open_loop(w: Array, plant: Response, terms: Sequence[Response], gains: Sequence[Array]) -> OpenLoop:
-    """Return open loops, tabulated at nodes w; the shape of each gain is (loops,), other arguments as above."""
+    """Return open loops, tabulated at the nodes w.
+
+    Each gain has the shape (loops,). The other arguments are those of `evaluate_open_loop`.
+    """
     columns = [gain[..., None] for gain in gains]
 
     def respond(w: Array) -> Jet:
@@ -75,7 +79,8 @@ def find_gain_crossovers(loop: OpenLoop, most: int | None = None) -> Array:
 
     Args:
         loop: open loops.
-        most: largest number of crossovers of a loop, required by JAX. Default: as many as exist.
+        most: number of sign changes per loop for which the result has space; required for JAX. By default, the largest
+            number of sign changes that a loop has.
     """
 
     def log_gain(L: Jet) -> tuple[Array, Array]:
@@ -86,7 +91,7 @@ def find_gain_crossovers(loop: OpenLoop, most: int | None = None) -> Array:
 
 
 def find_phase_crossovers(loop: OpenLoop, most: int | None = None) -> Array:
-    """Return the angles in (0, pi] at which L is real and negative, ascending; arguments as `find_gain_crossovers`."""
+    """Return the angles in (0, pi] at which L is real and negative, ascending; see `find_gain_crossovers`."""
 
     def phase_sine(L: Jet) -> tuple[Array, Array]:
         """Return the sine of arg L and its derivative in w."""
@@ -94,19 +99,20 @@ def find_phase_crossovers(loop: OpenLoop, most: int | None = None) -> Array:
         return unit.imag, unit.real * (L.slope / L.value).imag
 
     xp = namespace(loop.L.value)
-    # Treat the last node separately if it is at pi, because L is always real there.
+    # Exclude the last node from the search and append the angle pi instead, because L is always real at w = pi.
     inner = OpenLoop(loop.respond, loop.w[..., :-1], Jet(*(part[..., :-1] for part in loop.L)))
     w = _find_zeros(inner, phase_sine, most)
     w = xp.concatenate([w, xp.full_like(w, np.pi, shape=(*w.shape[:-1], 1))], -1)
     with np.errstate(all="ignore"):
         L = loop.respond(w)
-        # Exclude zeros of L, where the phase jumps: for no gain is L = -1 at these angles, so no pole can lie there.
+        # Exclude zeros of L, at which the phase jumps: L is 0 at these angles for any gain, so that no closed-loop pole
+        # can occur there.
         is_crossover = (L.value.real < 0) & (abs(L.value) > ZERO_OF_L * w * abs(L.slope))
     return xp.where(is_crossover, w, np.nan)
 
 
 def _find_zeros(loop: OpenLoop, function: RealFunction, most: int | None) -> Array:
-    """Return the angles at which a real function of L is zero, ascending."""
+    """Return the angles at which a real function of L is 0, ascending; ``most`` as in `find_gain_crossovers`."""
 
     def evaluate(w: Array, part: int) -> Array:
         return function(loop.respond(w))[part]
@@ -116,8 +122,9 @@ def _find_zeros(loop: OpenLoop, function: RealFunction, most: int | None) -> Arr
         xp, w = namespace(value), namespace(value).broadcast_to(loop.w, value.shape)
         step, sign, size, descent = xp.diff(w), xp.sign(value), abs(value), abs(slope)
         lowest = xp.minimum(size[..., :-1] - descent[..., :-1] * step, size[..., 1:] - descent[..., 1:] * step)
-        # Between nodes at which the function has equal signs and approaches 0 from both sides, it may have two zeros.
-        # NaN, which occurs because L may be 0 at the Nyquist frequency, is excluded by the comparisons.
+        # If the function has equal signs at two neighboring nodes, but its magnitude decreases from both nodes inward,
+        # it may have two zeros between them. The comparisons are False for NaN, which occurs if L is 0 at the Nyquist
+        # frequency.
         touches = (sign[..., 1:] == sign[..., :-1]) & (lowest < 0)
         touches &= (sign[..., :-1] * slope[..., :-1] < 0) & (sign[..., :-1] * slope[..., 1:] > 0)
         crosses = (value[..., :-1] > 0) != (value[..., 1:] > 0)
@@ -125,7 +132,7 @@ def _find_zeros(loop: OpenLoop, function: RealFunction, most: int | None) -> Arr
         j, is_minimum = _list_true(touches, most)
 
         def take(index: Array, *parts: Array) -> list[Array]:
-            """Return the values at the nodes before and after each interval."""
+            """Return values at the nodes before and after the intervals that start at the nodes ``index``."""
             return [xp.take_along_axis(part, index + i, -1) for part in parts for i in (0, 1)]
 
         low, high, first, last = take(k, w, value)
@@ -141,7 +148,11 @@ def _find_zeros(loop: OpenLoop, function: RealFunction, most: int | None) -> Arr
 
 
 def _list_true(mask: Array, most: int | None) -> tuple[Array, Array]:
-    """Return the indices along the last axis at which a mask is True, at most ``most``, and which of them exist."""
+    """Return the first indices along the last axis at which a mask is True, and a mask of the valid ones.
+
+    The result has ``most`` indices per row or, if ``most`` is None, as many as the row with the most True entries
+    needs.
+    """
     xp, size = namespace(mask), mask.shape[-1]
     count = min(size, int(mask.sum(-1).max(initial=0)) if most is None else most)
     index = xp.where(mask, expand_along(np.arange(size), xp.sum(mask, -1)), size)
@@ -150,7 +161,7 @@ def _list_true(mask: Array, most: int | None) -> tuple[Array, Array]:
 
 
 def find_nearest_angle(respond: Callable[[Array], Jet], w: Array, square: Array) -> Array:
-    """Return the angle at which |1 + L| is smallest, from its value at nodes.
+    """Return the angle w at which |1 + L| is smallest, from the values of |1 + L|^2 at nodes.
 
     Args:
         respond: function from angles of shape (loops, angles) to L and dL/dw.
@@ -170,7 +181,8 @@ def find_nearest_angle(respond: Callable[[Array], Jet], w: Array, square: Array)
     with np.errstate(all="ignore"):
         w = xp.broadcast_to(w, square.shape)
         index = _list_minima(xp.where(square < np.inf, square, np.inf))
-        # If two nodes coincide, the minimum may lie after the second one. Therefore search up to the second neighbor.
+        # Search from the node before each minimum to the second node after it, because the next node may coincide with
+        # the minimum and the true minimum may lie after both.
         index = xp.clip(index[..., None] + expand_along(np.arange(-1, 3), index), 0, w.shape[-1] - 1)
         angles = take(w, index.reshape(*w.shape[:-1], index.shape[-2] * index.shape[-1]))
         slopes, angles = (part.reshape(index.shape) for part in (slope(angles), angles))
@@ -179,7 +191,8 @@ def find_nearest_angle(respond: Callable[[Array], Jet], w: Array, square: Array)
         low, high = (xp.where(rises.any(-1), take(angles, first + k)[..., 0], middle) for k in (0, 1))
         at_low, at_high = (take(slopes, first + k)[..., 0] for k in (0, 1))
         refined = find_zeros_in_brackets(slope, low, high, at_low, at_high)
-        # Compare each refined minimum with its node, because the minimum may be an end of the range.
+        # Include the nodes in the comparison, because the smallest value may occur at an end of the range, where the
+        # derivative is not 0.
         candidates = xp.concatenate([refined, middle], -1)
         distance = abs2(1.0 + respond(candidates).value)
         lowest = xp.argmin(xp.where(distance < np.inf, distance, np.inf), -1)
@@ -187,11 +200,12 @@ def find_nearest_angle(respond: Callable[[Array], Jet], w: Array, square: Array)
 
 
 def _list_minima(values: Array) -> Array:
-    """Return the nodes of the lowest `MAX_MINIMA` local minima of values at nodes."""
+    """Return the indices of the nodes with the `MAX_MINIMA` lowest local minima of ``values``."""
     xp = namespace(values)
     below, inner, above = values[..., :-2], values[..., 1:-1], values[..., 2:]
     is_minimum = (inner < below) & (inner <= above)
-    # Rank the minima by the lowest point of the parabola through three nodes, as if the nodes were equidistant.
+    # Rank each minimum by the lowest point of the parabola through its node and both neighbors, as if nodes were
+    # equidistant.
     lowest = inner - (above - below) ** 2 / (8.0 * (above - inner + (below - inner)))
     ends = (
         xp.where(part[..., :1] <= part[..., 1:], part[..., :1], np.inf)
@@ -200,13 +214,14 @@ def _list_minima(values: Array) -> Array:
     first, last = ends
     rank = xp.concatenate([first, xp.where(is_minimum, lowest, np.inf), last], -1)
     if xp is not np:
-        # Sort, because XLA cannot select on arrays that are distributed over devices.
+        # In JAX, sort all values, because XLA cannot find only the smallest ones in arrays that are distributed over
+        # devices.
         return xp.argsort(rank, axis=-1)[..., :MAX_MINIMA]
     return np.argpartition(rank, MAX_MINIMA - 1, axis=-1)[..., :MAX_MINIMA]
 
 
 def select_gain_margin(stable: Array, w: Array, gains: Array) -> tuple[Array, Array]:
-    """Return the gain margin, from the gain closest to 1 on a logarithmic scale, and the angle of its phase crossover.
+    """Return the gain margin and the angle of its phase crossover, the one with |L| closest to 1 (logarithmic scale).
 
     Args:
         stable: True if the closed loop is stable, shape (loops,).
@@ -214,8 +229,8 @@ def select_gain_margin(stable: Array, w: Array, gains: Array) -> tuple[Array, Ar
         gains: |L| at the phase crossovers, same shape.
 
     Returns:
-        The factor of the gain that puts a pole on the unit circle, and the angle of this pole. Without crossovers the
-        margin is inf for a stable loop and 0 for an unstable one, and the angle is NaN.
+        The factor by which the gain must change to put a pole on the unit circle, and the angle of this pole. Without
+        crossovers the factor is inf for a stable loop and 0 for an unstable one, and the angle is NaN.
     """
     xp = namespace(w, gains)
     w, gain = _select_nearest(w, abs(xp.log(gains)), gains)
@@ -223,7 +238,7 @@ def select_gain_margin(stable: Array, w: Array, gains: Array) -> tuple[Array, Ar
 
 
 def select_phase_margin(stable: Array, w: Array, phases: Array) -> tuple[Array, Array]:
-    """Return the phase margin in degrees, negative for an unstable loop, and the angle of its gain crossover.
+    """Return the phase margin in degrees, which is negative for an unstable loop, and the angle of its gain crossover.
 
     Args:
         stable: True if the closed loop is stable, shape (loops,).
@@ -240,7 +255,7 @@ def select_phase_margin(stable: Array, w: Array, phases: Array) -> tuple[Array, 
 
 
 def _select_nearest(w: Array, cost: Array, values: Array) -> tuple[Array, Array]:
-    """Return the crossover with the smallest cost and one of its values, both NaN for a loop without crossovers."""
+    """Return the crossover with the smallest cost, and the value at this crossover; both are NaN without crossovers."""
     xp = namespace(w, cost)
     nan = xp.full_like(cost, np.nan, shape=(*cost.shape[:-1], 1))
     k = xp.argmin(xp.nan_to_num(xp.concatenate([cost, nan], -1), nan=np.inf), -1)[..., None]

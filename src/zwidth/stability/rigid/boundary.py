@@ -206,12 +206,12 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
             lambda s, curve, alpha: evaluate_lobe(s, curve).alpha - alpha, s, lambda *_: True, curve, number
         )
         point = evaluate_lobe(s, curve)
-        # Do not refine s by a further Newton step, because near the ridge the step would be a quotient of rounding
-        # errors.
+        # Do not refine s by a further Newton step, because near the ridge both numerator and denominator of the step
+        # would be rounding errors.
         alpha, beta = number, compute_damping(point.b, curve)
     omega = compute_frequency(s)
     if curve.short_curve is not None and line != "lower":
-        # If the point is not on the lobe, it is on the line of walls with a pole at z = -1.
+        # Replace points that are not on the lobe by points on the line of walls with a pole at z = -1.
         alpha_on_line, beta_on_line = find_on_corner_line(number, curve, is_row)
         alpha, beta = xp.where(on_lobe, alpha, alpha_on_line), xp.where(on_lobe, beta, beta_on_line)
         omega = xp.where(on_lobe, omega, np.pi)
@@ -338,7 +338,8 @@ def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     """Compute the area of the stable set: the integral of alpha db along the lobe and, beyond a corner, a triangle."""
     xp = namespace(delta, d)
     curve = build_lobe(delta, d, kind)
-    # Without a corner, alpha is 0 at the end of the lobe.
+    # Attach derivatives to the end of the lobe: without a corner, it is the s with alpha = 0; a corner is fixed at s =
+    # 1 (infinite slope).
     end = attach_root_derivatives(
         lambda x, curve: evaluate_lobe(x, curve).alpha,
         curve.end,

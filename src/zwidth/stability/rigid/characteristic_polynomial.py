@@ -1,8 +1,9 @@
-"""The characteristic polynomial P of the rigid loop: its factors, their values, derivatives and expansions.
+"""Characteristic polynomial P = T + B of the rigid loop, in factors.
 
-All other modules of `stability.rigid` take P from this module; only `stability.reference` evaluates P independently. A
-wall has the normalized stiffness alpha and damping beta, its device the normalized damping delta, and the delay is d =
-n + f periods (n integer, 0 <= f < 1). With the discretized device (`plant.rigid_mass`),
+T = z^(1+n) (z - 1)(z - c) is the part of device and delay, B = M W that of the wall, with W = alpha z + beta (z - 1)
+and M = a2 z + a1 + a0/z. A wall has the normalized stiffness alpha and damping beta, its device has the normalized
+damping delta, and the delay is d = n + f periods (n integer, 0 <= f < 1). With the coefficients of the discretized
+device (`plant.rigid_mass`),
 
     P = T + B
     T = z^(1+n) (z - 1)(z - c)         device and delay, c = e^-delta
@@ -11,7 +12,8 @@ n + f periods (n integer, 0 <= f < 1). With the discretized device (`plant.rigid
     W = alpha z + beta (z - 1)         `expand_wall`
 
 For integer delays, a0 = q = 0, and ``-delta^2 P`` is the paper's eq. (17), the normalized form of its eq. (11). For
-fractional delays, z P is a polynomial. At a *gain crossover*, |T| = |B|; L = B/T is the open loop.
+fractional delays, z P is a polynomial. L = B/T is the open loop; at a *gain crossover*, |L| = 1. All other modules of
+`stability.rigid` take P from this module; only `stability.reference` evaluates P independently.
 
 References:
     Hulin, Preusche, Hirzinger 2006, eqs. (11), (15), (17).
@@ -31,43 +33,43 @@ from zwidth.stability.rigid.normalization import valid_wall
 
 
 class WallFactor(NamedTuple):
-    """The factor W of P, ``W = alpha z + beta (z - 1) = s z - beta``."""
+    """The factor ``W = alpha z + beta (z - 1) = s z - beta`` of P."""
 
-    alpha: Any  # coefficient of z, the value at z = 1
+    alpha: Any  # coefficient of z, and the value of W at z = 1
     beta: Any  # coefficient of z - 1
-    s: Any  # derivative of W
+    s: Any  # derivative of W in z, alpha + beta
 
 
 def expand_wall(alpha: Any, beta: Any) -> WallFactor:
-    """Return the factor W of a wall, in any arithmetic; W is linear in (alpha, beta).
+    """Return the factor W of a wall, for arrays and other types of numbers; W is linear in (alpha, beta).
 
-    No other function derives the signs of the wall's terms from the paper's eq. (11); `recover_wall` is the inverse.
+    The signs of the wall's terms in the paper's eq. (11) occur in this function only; `recover_wall` is its inverse.
     """
     return WallFactor(alpha, beta, alpha + beta)
 
 
 def recover_wall(alpha: Any, beta: Any) -> tuple[Any, Any]:
-    """Return the stiffness and damping of the wall whose factor W has the coefficients alpha of z and beta of z - 1."""
+    """Return stiffness and damping of the wall with the factor ``W = alpha z + beta (z - 1)``."""
     return alpha, beta
 
 
 class LoopFactors(NamedTuple):
-    """The factors of P for each loop; all NaN for a loop with an argument out of range."""
+    """The coefficients of the factors of P for each loop; all are NaN if an argument of the loop is out of range."""
 
-    alpha: Array  # coefficients of W, see `WallFactor`
+    alpha: Array  # alpha, beta and s: the coefficients of W, see `WallFactor`
     beta: Array
     s: Array
     n_plus_1: Array  # n + 1, the exponent of z in T
     d_plus_1: Array  # d + 1
-    c: Array
+    c: Array  # e^-delta, the pole of the device
     em: Array  # 1 - c
-    a2: Array
+    a2: Array  # coefficient of z in M
     h: Array  # -h/a2 is the larger zero of M
     q: Array  # -q is the smaller zero of M; 0 for integer delays
 
 
 def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> LoopFactors:
-    """Return the factors of P; ``fractional`` is True if any delay is fractional."""
+    """Return the coefficients of the factors of P; ``fractional`` is True if any delay is fractional."""
     xp = namespace(alpha, beta, delta, d)
     valid = valid_wall(alpha, beta, delta, d)
     delta, d = xp.where(valid, delta, 1.0), xp.where(valid, d, 0.0)
@@ -79,7 +81,7 @@ def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: b
 
 
 class FactorValues(NamedTuple):
-    """The values of the factors of P at a point z, and their derivatives in z; that of W is the field s of the loop."""
+    """The values of the factors A, N and W of P at a point z, and their derivatives in z; dW/dz is `LoopFactors.s`."""
 
     A: Any  # (z - 1)(z - c)
     dA: Any
@@ -90,12 +92,12 @@ class FactorValues(NamedTuple):
 
 
 def evaluate_factors(z: Any, z_minus_1: Any, loop: LoopFactors, fractional: bool) -> FactorValues:
-    """Return the factors of P at z, accurate also near z = 1.
+    """Return the values of the factors of P at z, with small relative errors also near z = 1.
 
-    With these factors, P is ``z^(1+n) A + N W`` for integer delays, and z P is ``z^(2+n) A + N W`` for fractional ones.
+    For integer delays, ``P = z^(1+n) A + N W``; for fractional delays, ``z P = z^(2+n) A + N W``.
 
     Args:
-        z: Points, complex or of another type with the operations + and *.
+        z: Points: complex numbers, or objects of another type with the operations + and *.
         z_minus_1: z - 1.
         loop: Factors of P.
         fractional: Whether any delay is fractional.
@@ -109,17 +111,17 @@ def evaluate_factors(z: Any, z_minus_1: Any, loop: LoopFactors, fractional: bool
 
 
 def bound_wall_part(abs_z: Any, abs_z_minus_1: Any, loop: LoopFactors, fractional: bool) -> Array:
-    """Return an upper bound of ``|N W|``, the sum of the magnitudes of its terms, from |z| and |z - 1|."""
+    """Return the sum of the magnitudes of the terms of N W, an upper bound of ``|N W|``, from |z| and |z - 1|."""
     xp = namespace(loop.alpha)
     N = (loop.a2 * abs_z + loop.h) * (abs_z + loop.q if fractional else 1.0)
     return N * (xp.abs(loop.alpha) * abs_z + xp.abs(loop.beta) * abs_z_minus_1)
 
 
 class CircleFactors(NamedTuple):
-    """The five factors of T and B on a circle |z| = r: values at z = r, and slopes of the squared moduli.
+    """The five factors of T and B on a circle |z| = r, each as a pair (value, slope).
 
-    At ``z = r e^(j w)``, ``|factor|^2 = value^2 + slope x`` with x = sin^2(w/2), because a factor z - a with real a
-    satisfies ``|z - a|^2 = (r - a)^2 + 4 r a x``.
+    The value is that at z = r. At ``z = r e^(j w)``, ``|factor|^2 = value^2 + slope x`` with x = sin^2(w/2), because a
+    factor z - a with real a satisfies ``|z - a|^2 = (r - a)^2 + 4 r a x``.
     """
 
     z_minus_1: tuple[Any, Any]
@@ -130,7 +132,7 @@ class CircleFactors(NamedTuple):
 
 
 def expand_on_circle(r: Any, r_minus_1: Any, loop: LoopFactors) -> CircleFactors:
-    """Return the factors of T and B on the circle |z| = r, for r > 0."""
+    """Return value and slope of each factor of T and B on the circle |z| = r, for r > 0."""
     four_r, ratio = 4.0 * r, loop.q / r
     return CircleFactors(
         (r_minus_1, four_r),
@@ -142,23 +144,23 @@ def expand_on_circle(r: Any, r_minus_1: Any, loop: LoopFactors) -> CircleFactors
 
 
 class UnitCircleFactors(NamedTuple):
-    """The factors of L at ``z = e^(j w)``, with y = sin^2(w/2) and u = 1 - cos w = 2 y.
+    """The factors of the open loop L = B/T at ``z = e^(j w)``.
 
-    ``L = -(W/z) M Z e^(-j (n + 1/2) w)/(2 |Z|^2 sin(w/2))`` with ``z - c = j conj(Z)``.
+    ``L = -(W/z) M Z e^(-j (n + 1/2) w)/(2 |Z|^2 sin(w/2))``, where Z is defined by ``z - c = j conj(Z)``.
     """
 
     sine: Array  # sin(w/2)
     cosine: Array  # cos(w/2)
-    u: Array
+    u: Array  # 1 - cos w
     sin_w: Array
     W: tuple[Array, Array]  # real and imaginary part of W/z
-    M: tuple[Array, Array]
-    Z: tuple[Array, Array]
+    M: tuple[Array, Array]  # real and imaginary part of M
+    Z: tuple[Array, Array]  # real and imaginary part of Z
     abs2_Z: Array  # |z - c|^2
 
 
 def evaluate_on_unit_circle(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> UnitCircleFactors:
-    """Return the factors of the open loop L at z = e^(j w), w in (0, pi], without cancellation near both ends."""
+    """Return the factors of the open loop L at z = e^(j w), 0 < w <= pi, without cancellation near w = 0 and w = pi."""
     xp, wall = namespace(w, alpha), expand_wall(alpha, beta)
     sine, cosine = xp.sin(0.5 * w), xp.cos(0.5 * w)
     u, sin_w = 2.0 * sine * sine, 2.0 * sine * cosine
@@ -170,13 +172,14 @@ def evaluate_on_unit_circle(w: Array, alpha: Array, beta: Array, plant: Discrete
 
 
 def differentiate_open_loop(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Jet:
-    """Return L at z = e^(j w), and its derivative in w from that of log L."""
+    """Return the open loop L at z = e^(j w) and its derivative in w, computed as ``L d(log L)/dw``."""
     xp, wall_beta = namespace(w, alpha), expand_wall(alpha, beta).beta
     point, n_plus_half = evaluate_on_unit_circle(w, alpha, beta, plant), plant.whole + 0.5
     W, M, Z = (re + 1j * im for re, im in (point.W, point.M, point.Z))
     z, conj_Z = xp.cos(w) + 1j * point.sin_w, xp.conj(Z)
-    # The derivatives of W/z = alpha + beta (1 - conj z) and of M follow from those of z and conj z, j z and -j conj z;
-    # the derivative of conj Z is z.
+    # Compute ``rate`` = d(log L)/dw as the sum over all factors. On the circle, dz/dw = j z and d(conj z)/dw = -j conj
+    # z, so that the factor W/z = alpha + beta (1 - conj z) has the derivative j beta conj z, and conj Z has the
+    # derivative z.
     rate = 1j * wall_beta * xp.conj(z) / W + 1j * (plant.a2 * z - plant.a0 * xp.conj(z)) / M - z / conj_Z
     rate = rate - 1j * n_plus_half - 0.5 * point.cosine / point.sine
     delay = xp.cos(n_plus_half * w) - 1j * xp.sin(n_plus_half * w)
@@ -185,17 +188,18 @@ def differentiate_open_loop(w: Array, alpha: Array, beta: Array, plant: Discrete
 
 
 def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]:
-    """Expand |B|^2 - |T|^2 on the unit circle in powers of u = 1 - cos w, in any arithmetic.
+    """Expand |B|^2 - |T|^2 at z = e^(j w) in powers of u = 1 - cos w, for arrays and other types of numbers.
 
-    Here alpha and beta are the coefficients of W; |B|^2 = |M|^2 |W|^2, |T|^2 = 2 u (em^2 + 2 c u) and em = 1 - c.
-    There are three coefficients if a0 is None, i.e. for integer d, otherwise four. For alpha > 0 the polynomial is
-    positive at u = 0 and has at most one root in (0, 2), the gain crossover, above which it is negative.
+    On the unit circle, |B|^2 = |M|^2 |W|^2 and |T|^2 = 2 u (em^2 + 2 c u) with em = 1 - c. Three coefficients are
+    returned if a0 is None, i.e. for integer d, otherwise four. For alpha > 0 the polynomial is positive at u = 0 and
+    has at most one root in (0, 2), the gain crossover, above which the polynomial is negative.
     """
     p1_squared, cross, alpha_squared = plant.p1 * plant.p1, beta * (alpha + beta) * 2, alpha * alpha
-    # With ``|W|^2 = alpha^2 + cross u``, compute ``bend = cross/2 - delta^2`` in factored form, to avoid cancellation
-    # near beta = delta. The term ``2 phi1^2 bend`` contains the term -2 em^2 of |T|^2, because em = delta phi1.
+    # Write |W|^2 as alpha^2 + cross u. Compute bend = cross/2 - delta^2 in factored form, to avoid cancellation near
+    # beta = delta. In the coefficient of u, 2 phi1^2 bend includes the term -2 em^2 from |T|^2, because em = delta phi1
+    # (phi1 is ``plant.p1``).
     bend = (beta - plant.delta) * (beta + plant.delta) + alpha * beta
-    # The expansion of V is phi1^2 - 2 m1 u + product u^2; for integer d, a0 = 0 and therefore product = 0.
+    # The expansion of |M|^2 is phi1^2 - 2 m1 u + product u^2; for integer d, a0 = 0 and therefore product = 0.
     if plant.a0 is None:
         m1 = plant.a1 * plant.a2
         return p1_squared * alpha_squared, (p1_squared * bend - m1 * alpha_squared) * 2, m1 * cross * -2 - plant.c * 4
@@ -206,16 +210,16 @@ def expand_gain_difference(alpha: Any, beta: Any, plant: Any) -> tuple[Any, ...]
 
 
 def evaluate_at_nyquist(alpha: Any, beta: Any, plant: Any) -> tuple[Any, Any]:
-    """Return B at z = -1, and T there divided by ``(-1)^(n+1)``, in any arithmetic, for the coefficients of W."""
+    """Return the wall part B and the device part T/(-1)^(n+1) of P at z = -1, for arrays and other types of numbers."""
     return plant.gap * (alpha + beta * 2.0), (plant.c + 1.0) * 2.0
 
 
 def expand_gain_difference_at_nyquist(alpha: Array, beta: Array, plant: DiscretePlant) -> tuple[Array, ...]:
-    """Expand |T|^2 - |B|^2 on the unit circle in powers of v = 1 + cos w, for the coefficients of W."""
+    """Expand |T|^2 - |B|^2 at z = e^(j w) in powers of v = 1 + cos w, which is 0 at the Nyquist frequency w = pi."""
     wall, device = evaluate_at_nyquist(alpha, beta, plant)
     W_nyquist, sigma, mu = alpha + 2.0 * beta, plant.a2 + plant.a0, plant.a2 - plant.a0
     W_squared, cross, product = W_nyquist * W_nyquist, 2.0 * beta * (alpha + beta), 4.0 * plant.a2 * plant.a0
-    # The expansions are gap^2 + g1 v + product v^2 for |M|^2, and W_squared - cross v for |W|^2.
+    # In powers of v, |M|^2 is gap^2 + g1 v + product v^2, and |W|^2 is W_squared - cross v.
     g1 = 2.0 * (mu * mu - plant.gap * sigma)
     return (
         (device - wall) * (device + wall),
@@ -234,27 +238,27 @@ def expand_at_one(loop: LoopFactors) -> tuple[Array, Array, Array]:
 
 
 class TaylorSeries(NamedTuple):
-    """Taylor series in u of ``-P/(z M)`` at z = z0 (1 + u), and quantities from which its remainder is bounded."""
+    """Taylor series in u of ``-P/(z M)`` at z = z0 (1 + u), and the quantities that bound its remainder."""
 
-    terms: Any  # coefficients (terms, points)
-    f: Any  # (z - 1)/z at u = 0, the factor of beta in W/z
-    sizes: list[Any]  # moduli of z - 1, z - c, q0, rho, z/(z + q), all at u = 0; see the code
+    terms: Any  # coefficients of the series, shape (terms, points)
+    f: Any  # (z0 - 1)/z0, the factor of beta in W/z at z0
+    sizes: list[Any]  # moduli of z - 1, z - c, q0, rho and z/(z + q) at z = z0 (q0, rho: see `expand_taylor`)
 
 
 def expand_taylor(z_minus_1: Any, z_to_n: Any, loop: LoopFactors, fractional: bool, count: int) -> TaylorSeries:
-    """Return the Taylor series of ``-P/(z M) = -T/(z M) - W/z`` around points z0, by NumPy.
+    """Return the Taylor series of ``-P/(z M) = -T/(z M) - W/z`` at z = z0 (1 + u) in powers of u.
 
     Args:
         z_minus_1: z0 - 1.
         z_to_n: z0^n.
-        loop: Factors of P, one loop per point.
+        loop: Coefficients of the factors of P, one loop per point.
         fractional: Whether the delays are fractional.
         count: Order of the series.
     """
     z, z_minus_c = z_minus_1 + 1.0, z_minus_1 + loop.em
     inverse_numerator = 1.0 / (loop.a2 * z + loop.h)
-    # Multiply the series in u of the factors of ``-T/(z M) = -z^n (z - 1)(z - c)/((a2 z + h)(1 + q/z))``, one after the
-    # other.
+    # Multiply the series in u of the factors of ``-T/(z M) = -z^n (z - 1)(z - c)/((a2 z + h)(1 + q/z))`` one by one.
+    # The divisor a2 z + h is proportional to 1 + rho u; q0 collects the constant factors of -T/(z M).
     q0, rho, z_over_z_plus_q = -z_to_n * inverse_numerator, loop.a2 * z * inverse_numerator, z / (z + loop.q)
     if fractional:
         q0 = q0 * z_over_z_plus_q
@@ -276,7 +280,7 @@ def expand_taylor(z_minus_1: Any, z_to_n: Any, loop: LoopFactors, fractional: bo
 
 
 def _divide_series(terms: np.ndarray, x: Any) -> None:
-    """Divide power series in u by 1 + x u in place, as 1/(1 + x u) = (1 - x u)(1 + x^2 u^2)(1 + x^4 u^4) ..."""
+    """Divide power series in u by 1 + x u in place, by 1/(1 + x u) = (1 - x u)(1 + x^2 u^2)(1 + x^4 u^4) ..."""
     power, x = 1, -x
     while power < len(terms):
         terms[power:] += x * terms[:-power]

@@ -276,7 +276,7 @@ def find_gain_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tupl
     xp = namespace(alpha, plant.delta)
     alpha, beta, _ = expand_wall(alpha, beta)
     in_u = expand_gain_difference(alpha, beta, plant)
-    # The expansion in v is positive at v = 0, i.e. at z = -1, if the crossover exists.
+    # Expand |T|^2 - |B|^2 in powers of v. At v = 0, i.e. z = -1, it is positive if the crossover exists.
     in_v = expand_gain_difference_at_nyquist(alpha, beta, plant)
     wall_at_nyquist, device_at_nyquist = evaluate_at_nyquist(alpha, beta, plant)
     # If the polynomial in u is positive at u = 1, the crossover can only lie above w = pi/2; solve for v there.

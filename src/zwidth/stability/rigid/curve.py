@@ -1,14 +1,14 @@
 """Find points of the stability lobe of a rigid device: its end, its peak, and its points at given beta or alpha.
 
-The boundary curve starts at omega = 0 in (alpha, beta) = (0, -delta). Its first part, the lobe, bounds the stable set.
-The lobe ends where alpha is 0 again or, for short delays and strong damping, at omega = pi in the *corner*, a wall with
-a double pole at z = -1. Along the lobe, ``b = beta + delta`` increases, and alpha has a single maximum, the *peak*
-(docs/theory/one-lobe.md, Theorems A and B). Therefore the stable walls on lines of constant beta (rows) and of constant
-alpha (columns) are intervals (Theorem C), and each root below is the only one in its bracket. If the lobe ends in the
-corner, some of these intervals end on the line of walls with a pole at z = -1, which passes through the corner.
+A point of the lobe is given by s = sin(omega/2); y = s^2, b = beta + delta. The boundary curve starts at omega = 0 in
+(alpha, beta) = (0, -delta). Its first part, the lobe, bounds the stable set. The lobe ends where alpha is 0 again or,
+for short delays and strong damping, at omega = pi in the *corner*, a wall with a double pole at z = -1. Along the lobe,
+``b = beta + delta`` increases, and alpha has a single maximum, the *peak* (docs/theory/one-lobe.md, Theorems A and B).
+Therefore the stable walls on lines of constant beta (rows) and of constant alpha (columns) are intervals (Theorem C),
+and each root below is the only one in its bracket. If the lobe ends in the corner, some of these intervals end on the
+line of walls with a pole at z = -1, which passes through the corner.
 
-The delay is d = n + f. A point of the lobe is given by ``s = sin(omega/2)``; ``y = s^2``. Other notation as in
-`stability.rigid.boundary_curve`.
+The delay is d = n + f. Other notation is that of `stability.rigid.boundary_curve`.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
         root, to_corner = _find_short_end(stop_gradient(short_curve, xp))
         ends.append(root)
     if kind.long:
-        # Compute the end of the lobe and the starting values of Newton's method without derivatives, because the
-        # solution does not depend on its starting values.
+        # Compute the end of the lobe and the starting values of Newton's method without derivatives (`stop_gradient`),
+        # because converged solutions do not depend on starting values.
         long_lobe = build_long_lobe(stop_gradient(plant, xp))
         if xp is not np:
             long_lobe = long_lobe._replace(delta=plant.delta, curve=expand_curve_with_offset(plant))
@@ -84,7 +84,7 @@ def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
 
 
 def _find_short_end(short_curve: Any) -> tuple[Array, Array]:
-    """Return, for n = 0, s at the end of the lobe (1, or the zero of alpha), and whether alpha > 0 up to s = 1."""
+    """Return s at the end of the lobe for n = 0, and whether the lobe ends in the corner (alpha > 0 up to s = 1)."""
     a, s, t = short_curve[2]
     xp = namespace(a)
     discriminant = s * s - 4.0 * a * t
@@ -94,14 +94,14 @@ def _find_short_end(short_curve: Any) -> tuple[Array, Array]:
 
 
 def evaluate_lobe(s: Array, lobe: Lobe) -> CurvePoint:
-    """Return the point of the lobe at s."""
+    """Return the point of the lobe at s = sin(omega/2), with derivatives."""
     if lobe.long_lobe is None:
         return evaluate_short_delay_curve(s * s, lobe.short_curve).divide(s)
     if lobe.short_curve is None:
         return evaluate_curve(evaluate_wave(s, lobe.plant.whole, low=True), lobe.long_lobe.curve).divide(s)
     xp = namespace(s, lobe.d)
-    # Evaluate the form that is not selected at a valid s, because a NaN in it would make the derivatives of the
-    # selected one NaN, too.
+    # Evaluate both formulas, d < 1 and d >= 1, for all devices. Replace s by 0.5 in the formula that is not selected,
+    # because its NaN would make the derivatives of the selected values NaN, too.
     short_s, long_s = xp.where(lobe.is_short, s, 0.5), xp.where(lobe.is_short, 0.5, s)
     short = evaluate_short_delay_curve(short_s * short_s, lobe.short_curve).divide(short_s)
     long = evaluate_curve(evaluate_wave(long_s, lobe.plant.whole, low=True), lobe.long_lobe.curve).divide(long_s)
@@ -109,7 +109,7 @@ def evaluate_lobe(s: Array, lobe: Lobe) -> CurvePoint:
 
 
 def compute_frequency(s: Array) -> Array:
-    """Return omega at s, with the derivative 0 at the corner, because the corner is always at omega = pi."""
+    """Return omega = 2 arcsin(s); its derivative is set to 0 at s = 1, because the corner stays at omega = pi."""
     xp = namespace(s)
     inside = s < 1.0
     s = xp.where(inside, s, 0.5)
@@ -117,8 +117,8 @@ def compute_frequency(s: Array) -> Array:
 
 
 def find_on_corner_line(given: Array, lobe: Lobe, is_row: bool) -> tuple[Array, Array]:
-    """Return the wall with a pole at z = -1 at a given beta (``is_row``) or alpha; arbitrary if there is no corner."""
-    # -W(-1) = alpha + 2 beta is constant on the line.
+    """Return the wall with a pole at z = -1 and a given beta (``is_row``) or alpha; arbitrary without a corner."""
+    # On the line of walls with a pole at z = -1, alpha + 2 beta is constant (the factor -W of P at z = -1).
     total = 1.0 / namespace(lobe.d).where(lobe.to_corner, lobe.plant.minus_one_coefficient, 1.0)
     if is_row:
         return total - 2.0 * expand_wall(0.0, given).beta, given
@@ -128,24 +128,24 @@ def find_on_corner_line(given: Array, lobe: Lobe, is_row: bool) -> tuple[Array, 
 class RowLimit(NamedTuple):
     """The largest stable alpha at one beta: on the lobe or, beyond the corner, on the line of poles at -1."""
 
-    s: Array  # the nearer end of the lobe if no point of the lobe has this beta
+    s: Array  # s = sin(omega/2) of the point; of the nearer end of the lobe if no point of the lobe has this beta
     meets_lobe: Array  # a point of the lobe has this beta
     beyond: Array  # the limit is on the line of walls with a pole at z = -1
     alpha: Array  # the value that `zwidth.is_stable` compares alpha with
 
 
 def compute_offset(beta: Array, lobe: Lobe) -> Array:
-    """Return b at the damping beta of a wall."""
+    """Return b = beta + delta for the damping beta of a wall."""
     return expand_wall(0.0, beta).beta + lobe.plant.delta
 
 
 def compute_damping(b: Array, lobe: Lobe) -> Array:
-    """Return the damping beta of a wall from b."""
+    """Return the damping beta = b - delta of a wall."""
     return recover_wall(0.0, b - lobe.plant.delta)[1]
 
 
 def find_row_end(beta: Array, lobe: Lobe) -> RowLimit:
-    """Return the largest stable alpha at one beta, from the only point of the lobe with this b."""
+    """Return the largest stable alpha at one beta, from the only point of the lobe with this beta."""
     xp = namespace(beta, lobe.d)
     b = compute_offset(beta, lobe)
     limits = []
@@ -172,7 +172,7 @@ def find_peak(lobe: Lobe, kind: DelayClasses) -> Peak:
 
 
 def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
-    """Return s of the point of the lobe with a given alpha, and whether the lobe ends in the corner before this point.
+    """Return s of the lobe point with a given alpha, and whether the lobe ends in the corner before such a point.
 
     Args:
         alpha: Normalized stiffness, 0 < alpha < ``top.alpha``.
@@ -181,7 +181,8 @@ def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[A
         upper: Return the point with the larger beta, i.e. after the peak; otherwise the one before the peak.
 
     Returns:
-        s; and whether the stable interval ends on the line of walls with a pole at z = -1 instead.
+        s = sin(omega/2) of the point; and True if no such point exists after the peak, so that the interval of stable
+        beta ends on the line of walls with a pole at z = -1 instead.
     """
     xp = namespace(alpha, lobe.d)
     never = alpha < 0
@@ -197,8 +198,7 @@ def find_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[A
 def _find_short_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> tuple[Array, Array]:
     """Return s of the point with a given alpha before or after the peak, from a zero of a cubic in y, for n = 0.
 
-    The cubic ``(alpha(y) - alpha) V`` is ``-c0 + c1 y + c2 y^2 + c3 y^3``. The second value is that of
-    `find_column_end`.
+    The cubic is ``V (alpha(y) - alpha) = -c0 + c1 y + c2 y^2 + c3 y^3``. The second result is as in `find_column_end`.
     """
     xp = namespace(alpha, lobe.d)
     _, (v0, v1, v2), (a, s, t) = lobe.short_curve
@@ -225,9 +225,11 @@ def _find_short_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> 
 
 
 def _find_long_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> Array:
-    """Return s of the point with a given alpha, by Newton's method in variables in which alpha is nearly linear."""
-    # After the peak, solve sqrt(1 - alpha(s)/top.alpha) = S for s. Before the peak, solve
-    # sqrt(top.alpha/alpha(s) - 1) = G for 1/s. The left sides are nearly linear in s and in 1/s.
+    """Return s of the lobe point with a given alpha for n >= 1, by Newton's method in nearly linear variables."""
+    # With alpha(s) on the lobe and share = alpha/top.alpha, solve one of two equivalent equations. After the peak,
+    # solve sqrt(1 - alpha(s)/top.alpha) = sqrt(1 - share) = S for s, because the left side is nearly linear in s.
+    # Before the peak, solve sqrt(top.alpha/alpha(s) - 1) = sqrt(1/share - 1) = G for 1/s, because the left side is
+    # nearly linear in 1/s.
     xp = namespace(alpha, lobe.d)
     share = alpha / top.alpha
     S = xp.sqrt(xp.maximum(1.0 - share, 0.0))
@@ -241,8 +243,8 @@ def _find_long_column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> A
             return xp.minimum(xp.maximum(s - xp.where(point.d_alpha < 0, step, 0.0), top.s), lobe.end)
 
         return iterate(COLUMN_STEPS, outwards, s, xp)
-    # Near s = 0, alpha is approximately alpha_rate s^2. Start from an interpolation between this parabola and
-    # the peak.
+    # Near s = 0, the lobe is approximately alpha = alpha_rate s^2. Start from an interpolation between this parabola
+    # and the peak.
     curve = lobe.long_lobe.curve
     alpha_rate = 4.0 * ((lobe.plant.whole + 1.0) * curve.E[0] + curve.H[0]) / curve.at_one**2
     start_ratio = 2.0 * top.alpha / (alpha_rate * top.s * top.s)

@@ -1,16 +1,16 @@
 """Find the modulus margin of the rigid loop: the least distance ``|1 + L|`` of its Nyquist curve from -1.
 
-L = B/T is the open loop of `stability.rigid.characteristic_polynomial`, with the factors W, M and Z at the frequency w
-(`UnitCircleFactors`), c = e^-delta and em = 1 - c, for the wall (alpha, beta) and the delay d = n + f. Its gain |L|
-decreases strictly with frequency (docs/theory/one-crossover.md, Theorem 1), and ``|1 + L| >= ||L| - 1|``. Both bound
-the range of frequencies in which the minimum can lie:
+L is the open loop at z = e^(jw), with the factors W, M and Z (`stability.rigid.characteristic_polynomial`,
+`UnitCircleFactors`), for the wall (alpha, beta) and the delay d = n + f. Two facts limit the range of frequencies in
+which the minimum can lie: the gain |L| decreases strictly with frequency (docs/theory/one-crossover.md, Theorem 1), and
+``|1 + L| >= ||L| - 1|``. Therefore:
 
 - If the distance is r at one frequency, the minimum lies where ``1 - r <= |L| <= 1 + r``.
 - Within one turn of the phase on either side of the gain crossover there is a frequency at which L is real and
   negative. Its distance is ``||L| - 1|``, and all frequencies beyond it are farther from -1.
 
-So at most two turns of the phase have to be sampled, whatever the delay. `stability.open_loop` refines the lowest
-samples, as for every linear loop.
+So at most two turns of the phase of L have to be sampled, for any delay. `stability.open_loop` then refines the lowest
+samples; it does the same for all linear loops.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def evaluate_gain_and_phase(w: Array, alpha: Array, beta: Array, plant: Discrete
 
     With the factors W, M and Z of L,
 
-        |L|^2 = |W|^2 |M|^2 / (2 u |Z|^2)      u = 1 - cos w
+        |L|^2 = |W|^2 |M|^2 / (2 u |Z|^2)      with u = 1 - cos w
         phase = arg W + arg M + arg Z - (n + 1/2) w = pi + arg L
 
     The principal values of these arguments are continuous in w, so the phase needs no unwrapping.
@@ -64,7 +64,7 @@ SAMPLES_ABOVE = 48
 
 
 def compute_squared_distance(w: Array, alpha: Array, beta: Array, plant: DiscretePlant) -> Array:
-    """Return ``|1 + L|^2`` at w in (0, pi]."""
+    """Return ``|1 + L|^2``, the squared distance of L from -1, at frequencies w in (0, pi]."""
     xp = namespace(w, alpha)
     delay_phase = (2.0 * plant.whole + 1.0) * (0.5 * w)
     sine, _, _, _, W, M, Z, abs2_Z = evaluate_on_unit_circle(w, alpha, beta, plant)
@@ -85,7 +85,7 @@ def find_modulus_margin(alpha: Array, beta: Array, plant: DiscretePlant) -> tupl
     wall = alpha, beta, plant
 
     def slope(w: Array, *wall: Any) -> Array:
-        """Return half the derivative of ``|1 + L|^2`` in w."""
+        """Return half the derivative of ``|1 + L|^2`` with respect to w."""
         loop = differentiate_open_loop(w, *wall)
         return xp.real(xp.conj(1.0 + loop.value) * loop.slope)
 

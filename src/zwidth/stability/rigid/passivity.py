@@ -102,13 +102,13 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
 
 
 def _evaluate(kernel: Callable[..., Array], values: tuple[ArrayLike, ...]) -> Array:
-    """Evaluate a kernel of alpha, beta, delta and d, by its simpler form if no delay differs from 0."""
+    """Evaluate a kernel for alpha, beta, delta and d; if all delays are 0, use its simpler form for d = 0."""
     kind = classify_delays(values[3])
     return evaluate(kernel, dict(zip(NAMES, values, strict=True)), NO_DELAY if kind == NO_DELAY else ANY)
 
 
 def _passive_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
-    """Return whether the wall is passive, elementwise."""
+    """Return whether each wall is passive, elementwise."""
     return _margin_kernel(alpha, beta, delta, d, kind) > 0
 
 

@@ -1,7 +1,7 @@
 """Compute all closed-loop poles: by eigenvalues, or by Aberth's iteration for many walls at once.
 
 The eigenvalues are those of the companion matrix of the characteristic polynomial P (`stability.reference`). Newton's
-method on the factors of P (`stability.rigid.characteristic_polynomial`) then refines them.
+method, with P evaluated from its factors (`stability.rigid.characteristic_polynomial`), then refines the eigenvalues.
 
 Aberth's iteration (Ehrlich 1967, Aberth 1973) updates all approximations z_i of a wall together. With P monic of
 degree N, q_i the product of z_i - z_j over all j != i, and q_i' its derivative in z_i, one step subtracts
@@ -405,7 +405,7 @@ def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: 
 
 
 def _find_largest(z: Any, alpha: Any) -> Reals:
-    """Return the largest magnitude of the poles of each wall, which are along the last axis."""
+    """Return the largest magnitude of the poles of each wall; the poles are along the last axis of ``z``."""
     xp = namespace(z)
     # Ignore missing poles: NaN after the other poles of a wall with a lower degree.
     missing = xp.isnan(z.real) & ~xp.isnan(z[..., :1].real)

@@ -1,10 +1,10 @@
 """Compute the maximum stiffness of rigid devices, alpha_max(delta, d), with derivatives in delta and d.
 
-The point of maximum stiffness is the *ridge* (docs/theory/boundary.md, B2): a smooth maximum of alpha on the stability
-lobe, or the *corner*, a wall with a double pole at z = -1. It is given by s = sin(omega/2), with its frequency omega.
-`stability.rigid.ridge_newton` solves the optimality condition T(s) = 0. The derivatives of s follow from T by the
-implicit function theorem, those of alpha by the envelope theorem, because alpha is stationary in s. For strong damping,
-alpha_max is proportional to delta; `stiffness_slope` returns the factor, the paper's eq. (22).
+The *ridge* is the point of maximum stiffness, given by s = sin(omega/2) with its frequency omega. It is a smooth
+maximum of alpha on the stability lobe, or the *corner*, a wall with a double pole at z = -1 (docs/theory/boundary.md,
+B2). `stability.rigid.ridge_newton` solves the optimality condition T(s) = 0. The derivatives of s follow from T by the
+implicit function theorem, and those of alpha by the envelope theorem, because alpha is stationary in s. For strong
+damping, alpha_max is proportional to delta; `stiffness_slope` returns the factor, the paper's eq. (22).
 
 The delay is d = n + f. The plant has the numerator N(z) = a2 z^2 + a1 z + a0 and the pole c = e^-delta; a0, a1 and a2
 consist of phi1(x) = (1 - e^-x)/x, phi2 = (1 - phi1)/x, psi = (phi1 - e^-x)/x and gap = phi2 - psi.
@@ -49,20 +49,21 @@ from zwidth.stability.rigid.ridge_newton import (
 
 
 def differentiable_ridge(plant: Plant, n: Array, start: Start, kind: DelayClasses) -> Ridge:
-    """Return the ridge of one plant with a delay of n periods; for JAX, with exact derivatives in ``plant`` and n."""
+    """Return the ridge of one plant with a delay of n periods; JAX can differentiate it exactly in ``plant`` and n."""
     ridge = solve_ridge if namespace(plant.a2, n) is np else _jax_ridge()
     return ridge(plant, n, start, kind)
 
 
 @cache
 def _jax_ridge() -> Any:
-    """Return `solve_ridge` as a JAX function whose derivatives in the plant and in n are exact to any order."""
+    """Return `solve_ridge` as a JAX function with exact derivatives of any order in the plant and in n."""
     import jax
 
     function = jax.custom_jvp(solve_ridge, nondiff_argnums=(3,))
 
     def rule(kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
-        # Call the function with this rule again, because derivatives of higher order require those of s.
+        # Call ``function``, i.e. apply this derivative rule recursively, because derivatives of higher order require
+        # the derivatives of s.
         ridge = function(*primals, kind)
         return ridge, jax.jvp(lambda plant, n: _vary_ridge(ridge, plant, n, kind), primals[:2], tangents[:2])[1]
 
@@ -71,10 +72,11 @@ def _jax_ridge() -> Any:
 
 
 def _vary_ridge(ridge: Ridge, plant: Plant, n: Array, kind: DelayClasses) -> Ridge:
-    """Return a ridge that was computed before, as a function of ``plant`` and n, for JAX to differentiate."""
+    """Return a computed ridge again, as an expression in ``plant`` and n that JAX can differentiate."""
     xp, undelayed, curve = namespace(ridge.s), not kind.long, expand_curve(plant)
     is_corner = ridge.s >= 1.0
-    # s is the root of T, except at a corner, which stays at s = 1.
+    # Attach the derivatives of s as the root of the optimality condition T(s) = 0. A corner stays at s = 1, without
+    # derivatives.
     s = attach_root_derivatives(
         lambda s, curve, n: evaluate_stationarity(s, curve, n, undelayed)[0],
         xp.where(is_corner, 0.5, ridge.s),
@@ -82,11 +84,12 @@ def _vary_ridge(ridge: Ridge, plant: Plant, n: Array, kind: DelayClasses) -> Rid
         *(curve, n),
         slope=lambda s, curve, n: evaluate_stationarity(s, curve, n, undelayed)[1],
     )
-    # Compute omega from s by arctan and not by the series in `evaluate_wave`, whose derivative has fewer digits.
+    # Compute omega = 2 arcsin(s) by arctan and not by the series in `evaluate_wave`, whose derivative has fewer correct
+    # digits.
     omega = xp.where(is_corner, np.pi, 2.0 * xp.arctan(s / xp.sqrt((1.0 - s) * (1.0 + s))))
     s = xp.where(is_corner, 1.0, s)
-    # Compute alpha at the computed s: its derivatives are those at constant s, because alpha is stationary (envelope
-    # theorem).
+    # Compute alpha at the constant s of the ridge and beta at the s with derivatives. For alpha, derivatives at
+    # constant s suffice, because alpha is stationary in s (envelope theorem).
     alpha, beta = (evaluate_wall(evaluate_wave(value, n, undelayed), curve) for value in (ridge.s, s))
     return Ridge(alpha[0], beta[1], omega, s, ridge.last)
 
@@ -113,7 +116,7 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, method: RidgeMethod = "auto") -
 
     Numerics:
         alpha to about 1e-15 relative, because at a maximum the error of alpha is of second order in that of omega. JAX
-        can trace the function in delta and d and differentiate it to any order. The first derivatives of alpha are
+        can trace the function in delta and d, and can differentiate it to any order. The first derivatives of alpha are
         continuous, also at the transition to the corner (d = 0: delta = 3.65936162742...) and at integer d > 0. The
         second derivatives of alpha and the first ones of beta and omega jump there; at integer d they are those from
         the right. For strong damping the second derivative in delta decreases as delta^-3. Its rounding error is 1e-15

@@ -1,8 +1,9 @@
 """Find the ridge, the point of maximum stiffness, by Newton's method on its closed-form optimality condition.
 
-The stability *lobe* is the first part of the boundary curve (`stability.rigid.boundary_curve`), on which the loop has a
-pole at z = e^(j omega). Points of the curve are given by s = sin(omega/2), y = s^2; n is the integer part of the delay.
-T is the derivative of alpha in y, up to a positive factor (docs/theory/boundary.md, B2).
+Points of the curve are given by s = sin(omega/2), y = s^2; T(s) = 0 is the condition, with T = dalpha/dy times a
+positive factor (docs/theory/boundary.md, B2). The curve is the boundary curve (`stability.rigid.boundary_curve`), on
+which the loop has a pole at z = e^(j omega); its first part is the stability *lobe*. n is the integer part of the
+delay; gap, mu and sigma are fields of `Curve`.
 
 The lobe has a single maximum of alpha (docs/theory/one-lobe.md, Theorem B), so no search is needed: a fitted start and
 three Newton steps suffice. The maximum is smooth (T = 0), or it is the *corner* at y = 1, the wall with a double pole
@@ -39,7 +40,8 @@ class Corner(NamedTuple):
 
 def find_corner(curve: Curve, n: Array) -> Corner:
     """Return the corner, in which the lobe may end; it is the ridge if alpha increases up to the corner."""
-    # The lobe ends in the corner only if n = 0 and arg M increases up to pi, i.e. gap > 0 and mu > 0.
+    # The lobe ends in the corner only if n = 0 and the phase of M (`stability.rigid.characteristic_polynomial`)
+    # increases up to omega = pi, i.e. gap > 0 and mu > 0.
     xp = namespace(curve.sigma, n)
     E = sum(curve.E[1:], curve.E[0])
     H = curve.H[0] + curve.H[1]

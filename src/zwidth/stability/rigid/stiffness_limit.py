@@ -1,10 +1,12 @@
-"""Compute the stability limit of alpha for given beta, delta and d in closed form.
+"""Compute the stability limit of alpha for given beta, delta and delay d = n + f in closed form.
 
-For each (beta, delta, d), d = n + f, the stable walls are ``0 < alpha < limit`` (docs/theory/one-lobe.md, Theorem C).
-The *limit* is the point with this beta on the *lobe*, the first part of the boundary curve, or a point of the line of
-walls with a pole at z = -1, which cuts the lobe off in the *corner*. All walls with one (beta, delta, d) form a *line
-of constant beta*, also called row. A point of the curve is given by s = sin(w/2) for its frequency w; b = beta + delta,
-and all other notation is that of `stability.rigid.boundary_curve`.
+Points of the boundary curve are given by s = sin(w/2), with the frequency w of the pole; b = beta + delta. Other
+notation is that of `stability.rigid.boundary_curve`.
+
+All walls with one (beta, delta, d) form a *line of constant beta*, also called row. The stable walls on this line are
+``0 < alpha < limit`` (docs/theory/one-lobe.md, Theorem C). The *limit* is the point with this beta on the *lobe*, the
+first part of the boundary curve, or a point of the line of walls with a pole at z = -1, which cuts the lobe off in the
+*corner*.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
 
 
 class LongLobe(NamedTuple):
-    """The boundary curve of a device with d >= 1, the end of its lobe, and starts of Newton's method."""
+    """The boundary curve of a device with d >= 1, the end of its lobe, and data for Newton's starting values."""
 
     delta: Array
     n: Array
@@ -50,8 +52,8 @@ class LongLobe(NamedTuple):
     end: Array  # s at the end of the lobe
     end_angle: Array  # w/2 at the end of the lobe
     end_b: Array  # b at the end of the lobe
-    # Newton's method for s at a given b starts from the solution of ``sqrt(b/end_b) = sin(start_angle
-    # w/2/end_angle)/start_sine``, plus a correction.
+    # For a given b, Newton's method finds s. It starts from the angle w/2 that solves ``sqrt(b/end_b) = sin(start_angle
+    # (w/2)/end_angle)/start_sine``, plus a correction.
     start_angle: Array
     start_sine: Array
     start_correction: Array
@@ -100,17 +102,18 @@ def _mask_limit(limit: Array, b: Array) -> Array:
 
 
 def build_long_lobe(plant: DiscretePlant) -> LongLobe:
-    """Return the boundary curve of one device, the end of its lobe, and starts of Newton's method."""
+    """Return the boundary curve of one device, the end of its lobe, and data for Newton's starting values."""
     curve, n, em = expand_curve_with_offset(plant), plant.whole, plant.em
     xp, D = namespace(plant.delta), n + 1.0
     end = _find_lobe_end(curve, n, em / (plant.p1 + plant.f * em), n + plant.f)
     wave = evaluate_wave(end, n, low=True)
     terms, end_angle = evaluate_curve(wave, curve), wave.half_omega
     end_b = terms.b / terms.V
-    # Approximate the lobe by ``sqrt(b/end_b) = sin(start_angle w/2/end_angle)/sin(start_angle)``, where w/2 = end_angle
-    # and b = end_b at the end of the lobe. This curve has the right derivative there, where strong damping makes the
-    # lobe nearly flat; `start_correction` corrects the derivative at w = 0. The error is at most 0.4 %. The relative
-    # derivative at the end is start_angle/tan(start_angle); a rational function inverts it. ds/dw is cos(w/2)/2.
+    # Approximate the lobe by ``sqrt(b/end_b) = sin(start_angle (w/2)/end_angle)/sin(start_angle)``, with an error of at
+    # most 0.4 %. At the end of the lobe, w/2 = end_angle and b = end_b; choose start_angle so that the derivative is
+    # correct there, because strong damping makes the lobe nearly flat at its end. The relative derivative of the
+    # approximation at the end is start_angle/tan(start_angle), which a rational function inverts. start_correction
+    # corrects the derivative at w = 0. To convert derivatives from s to w, use ds/dw = cos(w/2)/2.
     slope = end_angle * end * xp.sqrt(wave.q) * (terms.d_b / terms.b - terms.dV / terms.V)
     flat = xp.clip(1.0 - slope, 0.0, 1.0)
     start_angle = xp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
@@ -119,19 +122,19 @@ def build_long_lobe(plant: DiscretePlant) -> LongLobe:
     # of the lobe. For strong damping and long delays db/dw vanishes there, and each Newton step would only halve an
     # error.
     start_angle = _approximate_arcsine(start_sine)
-    # At w = 0, b is b_rate (w/2)^2.
+    # Near w = 0, b is approximately b_rate (w/2)^2.
     b_rate = (curve.excess[0] + 2.0 * n * D * curve.E[0] + (4.0 * n + 2.0) * curve.H[0]) / curve.at_one**2
     start_correction = xp.sqrt(end_b / b_rate) / end_angle - start_sine / start_angle
-    # Materialize, so that XLA computes the lobe once per device and not once per line of constant beta.
+    # Use `materialize`, so that XLA computes the lobe once per device and not once per line of constant beta.
     return materialize(
         LongLobe(plant.delta, n, curve, end, end_angle, end_b, start_angle, start_sine, start_correction), plant.delta
     )
 
 
 def _find_lobe_end(curve: Curve, n: Array, start_ratio: Array, d: Array) -> Array:
-    """Return the first s > 0 at which alpha is 0: the phase of ``e^(j D w) (E + j H sin w)`` reaches pi there."""
-    # Solve for the w with the phase pi by Newton's method, because the phase is nearly linear in w. ``start_ratio``,
-    # which is E/H at w = 0, determines the start between pi/(2 D), for an undamped device, and pi/D.
+    """Return the first s > 0 with alpha = 0: the phase of ``e^(j D w) (E + j H sin w)``, D = n + 1, is pi at this s."""
+    # Solve "phase = pi" for w by Newton's method, because the phase is nearly linear in w. The starting value lies
+    # between pi/(2 D), for an undamped device, and pi/D; it is determined by ``start_ratio``, the ratio E/H at w = 0.
     xp, D = namespace(n), n + 1.0
     limit = xp.sin(xp.minimum(0.5 * np.pi / (d + 0.5), 0.5 * np.pi))
 
@@ -139,13 +142,13 @@ def _find_lobe_end(curve: Curve, n: Array, start_ratio: Array, d: Array) -> Arra
         wave = evaluate_wave(s, n, low=True)
         E, H, _, dE, dH, _ = evaluate_polynomials(wave, curve)
         y, q, sin_squared = wave.y, wave.q, 4.0 * wave.y * wave.q
-        # The product of sine and cosine of the phase approximates its difference from pi, divided by sin w; take a
-        # limited step if the difference exceeds pi/2.
+        # Compute ``remaining``: the difference between the phase and pi, approximated by sine times cosine of the phase
+        # and divided by sin w. If the difference exceeds pi/2 (cosine >= 0), take a limited step instead.
         size = E * E + sin_squared * H * H
         cosine = wave.kappa * E - sin_squared * wave.tau * H
         per_sine = 1.0 / xp.sqrt(sin_squared)
         remaining = xp.where(cosine < 0, (wave.tau * E + wave.kappa * H) * cosine, -0.2 * size * per_sine)
-        # Multiply the step in w by ds/dw = cos(w/2)/2.
+        # Convert the step from w to s by the factor ds/dw = cos(w/2)/2.
         rate = D * size + E * ((q - y) * H + 2.0 * y * q * dH) - 2.0 * y * q * H * dE
         return xp.minimum(s - s * q * remaining / rate, limit)
 
@@ -155,13 +158,13 @@ def _find_lobe_end(curve: Curve, n: Array, start_ratio: Array, d: Array) -> Arra
 
 
 def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
-    """Return the limit of alpha for d >= 1, and s at the limit if it exists.
+    """Return the limit of alpha for d >= 1, and s = sin(w/2) at the limit; s is arbitrary if the limit is 0.
 
     The limit is 0 if no alpha is stable, and NaN for invalid input.
     """
-    # Apply Newton's method to sqrt(b), which is nearly linear in s. The lobe itself is the bracket, because b increases
-    # with s along it. If a step leaves the lobe, clip it and do not bisect, because near convergence a midpoint would
-    # be a worse approximation.
+    # Apply Newton's method to sqrt(b), which is nearly linear in s. The root is bracketed by the ends of the lobe,
+    # because b increases with s along the lobe. If a step leaves the lobe, clip it and do not bisect, because near
+    # convergence a midpoint would be a worse approximation.
     delta, n, curve, end, end_angle, end_b, start_angle, start_sine, start_correction = lobe
     xp = namespace(beta, delta)
     b = expand_wall(0.0, beta).beta + delta
@@ -175,7 +178,7 @@ def find_limit_long_delay(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
         terms = evaluate_curve(evaluate_wave(s, n, low=True), curve)
         s = xp.clip(s - _compute_newton_step(target_b, terms) / s, 0.0, end)
     terms = evaluate_curve(evaluate_wave(s, n, low=True), curve)
-    # Add the effect of the last Newton step to alpha V and V, to first order.
+    # Correct V alpha and V to first order for one more Newton step, instead of evaluating the curve again.
     step = _compute_newton_step(target_b, terms)
     limit = (terms.alpha - 2.0 * step * terms.d_alpha) / (terms.V - 2.0 * step * terms.dV)
     return _mask_limit(xp.where(meets_lobe, limit, 0.0), b), s - step / s
@@ -189,12 +192,12 @@ def _approximate_arcsine(x: Array) -> Array:
 
 
 def _compute_newton_step(target_b: Array, terms: CurveTerms) -> Array:
-    """Return s times the Newton step in s from b to ``target_b``, computed with a single division.
+    """Return s times the Newton step in s = sin(w/2) that changes b to ``target_b``, computed with a single division.
 
     The step is ``2 (b - sqrt(target_b b))/b'``, with sqrt(r) approximated by (1 + 3 r)/(3 + r).
     """
-    # Divide only once, because XLA fuses successive steps into one loop over the lines only if no quotient is used
-    # twice.
+    # Divide only once: XLA fuses successive Newton steps into one loop over the lines of constant beta only if no
+    # quotient is used twice.
     b, V = terms.b, terms.V
     target = target_b * V
     return 2.0 * b * V * (b - target) / ((terms.d_b * V - b * terms.dV) * (3.0 * b + target))
@@ -204,7 +207,8 @@ def _compute_newton_step(target_b: Array, terms: CurveTerms) -> Array:
 # For smaller grids it is faster to compare each point with its limit.
 MIN_PATTERN_SIZE = 1 << 16
 MIN_PATTERN_ROWS = 8
-# Smallest number of walls per line of constant beta with which JAX computes the limits of the lines.
+# Smallest number of walls per line of constant beta for which JAX computes the limit of each line first; for fewer
+# walls it tests each wall separately.
 MIN_ROW_LENGTH = 32
 
 
@@ -217,11 +221,14 @@ def label_grid(points: Points) -> np.ndarray:
 
 
 def label_jax_arrays(arguments: Mapping[str, ArrayLike], kind: DelayClasses) -> Array:
-    """Return whether each wall is stable, in code compiled by JAX; as `label_grid` does if the shapes form a grid.
+    """Return whether each wall is stable, in code compiled by JAX.
+
+    If the shapes of the arguments form a grid, alpha is compared with the limit of its line of constant beta, as in
+    `label_grid`; otherwise each wall is tested separately.
 
     Args:
-        arguments: alpha, beta, delta and d by name, some of them JAX arrays; they broadcast.
-        kind: classes of the delays.
+        arguments: alpha, beta, delta and d by name, at least one of them a JAX array; their shapes broadcast.
+        kind: `DelayClasses` that occur in d.
     """
     values = arguments.values()
     with precision(values):
@@ -250,7 +257,8 @@ def _compile_labels(kind: DelayClasses) -> Callable[..., Array]:
             if occurs
         ]
         limit = jnp.where(d < 1.0, *limits) if len(limits) > 1 else limits[0]
-        # Without `materialize`, XLA would repeat the last Newton step and the tests of the range at each point.
+        # Use `materialize`, because XLA would otherwise repeat the last Newton step and the range checks at each point
+        # of the grid.
         limit = materialize(jnp.where(within(beta, WALL_RANGE), limit, 0.0), beta)
         return materialize(jnp.where((alpha > 0.0) & within(alpha, WALL_RANGE), alpha, jnp.inf), alpha) < limit
 

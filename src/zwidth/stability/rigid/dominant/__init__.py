@@ -1,6 +1,7 @@
 """The dominant pole of the rigid loop, i.e. the pole of largest modulus, computed with a certificate.
 
-`spectral_radius` has the public functions. `arrays` chooses between two methods for many walls: `search` finds and
-certifies the pole of each wall, `grid` computes one power series (`series`) per cell of a grid of walls. `pole_count`
-is the certificate of both, `steps` has the Newton and Halley steps.
+The module `spectral_radius` contains the public functions. `arrays` chooses between two methods for many walls:
+`search` finds and certifies the pole of each wall separately; `grid` divides a grid of walls into cells and computes
+one power series (`series`) per cell. Both methods certify their results by counting poles (`pole_count`). `steps`
+contains the Newton and Halley steps.
 """

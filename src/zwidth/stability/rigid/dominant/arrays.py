@@ -1,12 +1,13 @@
 """Compute the dominant pole of each wall of an array, certified: spectral radii and decay rates.
 
 The dominant pole e^(re + j im) is the pole of largest modulus. e^re is the spectral radius, -re the decay rate per
-period. A result is certified by counting the poles outside a circle (`stability.rigid.dominant.pole_count`).
+period. A result is certified by counting the poles outside a circle (`stability.rigid.dominant.pole_count`); walls
+without a certificate are *open*.
 
 The walls are given by *columns*: one-dimensional arrays of alpha, beta, delta and d. Most walls are computed by one
-compiled kernel (`stability.rigid.dominant.search`). Walls that it does not certify are computed again by slower methods
-in NumPy. On grids of alpha and beta, Taylor series serve whole *cells* of neighboring walls
-(`stability.rigid.dominant.grid`); walls that these leave open are computed one by one.
+compiled kernel (`stability.rigid.dominant.search`). Walls that this kernel does not certify are computed again by
+slower methods in NumPy. On grids of alpha and beta, one Taylor series serves a whole *cell* of neighboring walls
+(`stability.rigid.dominant.grid`); walls without a certified series are computed one by one.
 """
 
 from __future__ import annotations
@@ -36,36 +37,40 @@ from zwidth.stability.rigid.dominant.search import (
 )
 from zwidth.stability.rigid.normalization import wall_status
 
-# If a count is uncertain because of rounding errors, it is repeated with error bounds that are larger than the required
-# accuracy by these factors, up to `MAX_ERROR`.
+# If a pole count is uncertain because of rounding errors, the count is repeated with larger error bounds: the required
+# accuracy times these factors, up to `MAX_ERROR`.
 ERROR_FACTORS = 10.0 ** np.arange(12)
 MAX_ERROR = 0.1  # largest relative error of a radius that is certified
 # Largest float64 below 1: radius of stable walls whose computed radius rounds to 1.
 BELOW_ONE = 1.0 - 2.0**-53
-# Bound of the rounding error of a computed radius. For alpha = 0, a radius below 1 plus this bound is set to 1.
+# Bound of the rounding error of a computed radius. For alpha = 0, a radius below 1 + RADIUS_ROUNDING is set to 1,
+# because one pole is exactly 1.
 RADIUS_ROUNDING = 1e-13
 # Largest certified relative error of a decay rate; with a larger error the rate is NaN.
 MAX_RATE_ERROR = 1e-3
-# Value of |log radius| below which the closed-form verdict, instead of the computed radius, decides on which side of
-# the unit circle a pole is. Within 1e-10 of the stability boundary, one in ten computed radii is on the wrong side.
+# Value of |log radius| below which the closed-form stability verdict, not the computed radius, decides whether the
+# radius is above or below 1. Within 1e-10 of the stability boundary, one in ten computed radii is on the wrong side of
+# 1.
 VERDICT_WIDTH = 1e-7
-# Upper limit of the error of the |log radius| of a grid that is added to `VERDICT_WIDTH`.
+# Upper limit of the accuracy that is added to `VERDICT_WIDTH` for walls of a grid, because their |log radius| has this
+# error.
 MAX_UNCERTAIN_WIDTH = 1e-5
-# Value of |sin(im)| below which a pole is counted as real, i.e. without a conjugate.
+# Value of |sin(im)| below which a pole e^(re + j im) counts as real, i.e. as one pole and not as a conjugate pair.
 REAL_AXIS_WIDTH = 1e-6
-# Smallest number of walls per device with which a grid is computed by cells; for fewer walls, computing them one by one
-# is faster.
+# Smallest number of walls per device for which a grid is computed by cells; for fewer walls, computing each wall
+# separately is faster.
 SMALLEST_MAP = 1 << 11
 # Number of walls per batch in NumPy. Smaller batches take longer per wall.
 BATCH_SIZE = 1 << 13
-# The same for open walls, whose arrays have four rows: NumPy rounds complex products in arrays of 256 KB differently.
+# Number of open walls per batch in NumPy. It is smaller, because their arrays have four rows, one per starting point,
+# and NumPy rounds complex products differently in arrays of 256 KB or more.
 OPEN_BATCH_SIZE = 1 << 11
-# Largest number of walls that are computed one by one without testing whether they form a grid.
+# Largest number of walls for which each wall is computed separately, without a test whether the walls form a grid.
 FEW_FOR_CELLS = 1 << 13
 # Number of walls per compiled batch. All large batches have this size, so that they share one compiled program.
 PIECE = BLOCK >> 3
 
-# Default of the largest relative error of radii and rates.
+# Default accuracy: largest relative error of spectral radii and decay rates.
 ACCURACY = 1e-9
 NOT_REQUESTED = np.empty(0)  # placeholder for results that are not requested
 
@@ -73,13 +78,13 @@ NOT_REQUESTED = np.empty(0)  # placeholder for results that are not requested
 def compute_dominant_poles(columns: list[np.ndarray], accuracy: float, route: Route = "auto") -> DominantPoles:
     """Return the dominant pole of each wall, given columns of alpha, beta, delta and d of equal length.
 
-    With the routes "numpy" and "jax", the result of a wall does not depend on the other walls.
+    With ``route`` "numpy" or "jax", the result for a wall does not depend on the other walls.
     """
     fractional = columns[3] != np.floor(columns[3])
     if not fractional.any() or fractional.all():
         return _compute_by_kind(columns, accuracy, bool(fractional.any()), route)
-    # Compute the walls with fractional and with integer delays separately, because counting poles requires the zeros of
-    # a cubic for fractional delays, and only those of a quadratic for integer delays.
+    # Compute walls with fractional and with integer delays separately: counting poles requires the zeros of a cubic
+    # polynomial for fractional delays, but only of a quadratic one for integer delays.
     results = DominantPoles(*(np.empty(fractional.size) for _ in DominantPoles._fields))
     for index in (np.flatnonzero(fractional), np.flatnonzero(~fractional)):
         for leaf, values in zip(
@@ -90,12 +95,12 @@ def compute_dominant_poles(columns: list[np.ndarray], accuracy: float, route: Ro
 
 
 def _compute_by_kind(columns: list[np.ndarray], accuracy: float, fractional: bool, route: Route) -> DominantPoles:
-    """Return the dominant poles of walls whose delays are all fractional or all integer, as ``fractional`` states."""
+    """Return the dominant poles of walls whose delays are all fractional (``fractional`` is True) or all integer."""
     size = columns[0].size
     arguments = [*columns, np.full(size, accuracy)]
     with np.errstate(all="ignore"):
         if size == 1 and route == "auto":
-            # Use plain numbers, which are several times faster than arrays of length 1.
+            # Compute with plain numbers, which is several times faster than with arrays of length 1.
             results = [
                 np.reshape(leaf, 1)
                 for leaf in quick_kernel(*(column[0] for column in arguments), fractional=fractional)
@@ -107,7 +112,7 @@ def _compute_by_kind(columns: list[np.ndarray], accuracy: float, fractional: boo
             )
             results = [np.concatenate(leaves)[:size] for leaves in results]
         else:
-            # Pad all batches to one size, because programs compiled for other sizes may round differently.
+            # Pad all batches to the size PIECE, because a program compiled for another size may round differently.
             results = map_blocks(compile_columns(quick_kernel, (fractional,)), arguments, PIECE, exact=True)
     return _certify_open_walls(columns, DominantPoles(*(np.array(leaf) for leaf in results)), accuracy, fractional)
 
@@ -115,7 +120,7 @@ def _compute_by_kind(columns: list[np.ndarray], accuracy: float, fractional: boo
 def _certify_open_walls(
     columns: list[np.ndarray], poles: DominantPoles, accuracy: float, fractional: bool
 ) -> DominantPoles:
-    """Certify the open poles in place: from other starting points, by bisection, then with larger error bounds."""
+    """Certify open poles in place: from other starting points, then by bisection, then with larger error bounds."""
     open_walls = np.flatnonzero(~poles.certified)
     # Skip invalid walls, which cannot be certified.
     open_walls = open_walls[np.asarray(wall_status(*(column[open_walls] for column in columns))) == Status.OK]
@@ -143,16 +148,17 @@ def _certify_open_walls(
 def _map_in_batches(
     function: Callable[[list[np.ndarray]], Any], columns: list[np.ndarray], size: int = BATCH_SIZE
 ) -> list[Any]:
-    """Apply a function to batches of walls, one after another, because a second thread would not save time."""
+    """Apply a function to batches of walls in a single thread, because a second thread would not save time."""
     starts = range(0, max(columns[0].size, 1), size)
     with np.errstate(all="ignore"):
         return [function([column[start : start + size] for column in columns]) for start in starts]
 
 
 def arrange_as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
-    """Return points arranged as a grid over alpha and beta for one or more devices; None without a large enough grid.
+    """Return points arranged as a grid over alpha and beta for one or more devices; None if they form no large grid.
 
-    A line of walls is a grid, too: its missing axis is the first one, which must have length 1.
+    A line of walls is a grid, too. The first axis of ``points``, which must then have length 1, serves as the axis that
+    the line lacks.
 
     Returns:
         The grid; the axes of ``points`` in the order of the grid (devices, beta, alpha); and the lengths of these axes.
@@ -160,7 +166,7 @@ def arrange_as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, .
     shape, wall_axes = points.shape, []
     for name in ("beta", "alpha"):
         varying = [axis for axis, length in enumerate(getattr(points, name).shape) if length > 1] or [0]
-        # Compare the arguments by name and not by identity, because the same array may be passed for two of them.
+        # Compare the arguments by name and not by identity, because the same array may be passed for two arguments.
         others = [array for other, array in points._asdict().items() if other != name]
         if len(varying) > 1 or any(other.shape[varying[0]] > 1 for other in others):
             return None
@@ -180,19 +186,19 @@ class WallPoles(NamedTuple):
     """Spectral radii of walls, with the decay rate and the angle of the dominant pole if requested."""
 
     radius: np.ndarray  # NaN without a certified error bound
-    certified: np.ndarray  # True if the requested accuracy is certified
+    certified: np.ndarray  # True if the requested accuracy of the radius is certified
     rate: np.ndarray  # NaN if fewer than three digits are certified
-    angle: np.ndarray  # in [0, pi]; NaN if only the radius is certified
+    angle: np.ndarray  # in [0, pi]; NaN if the radius is certified, but not the pole
 
     def map(self, function: Callable[[np.ndarray], np.ndarray]) -> WallPoles:
-        """Return the results with a function applied to each array, e.g. to change the layout."""
+        """Return the results after applying a function to each array, e.g. a function that changes its shape."""
         return WallPoles(*(leaf if leaf is NOT_REQUESTED else function(leaf) for leaf in self))
 
 
 def area_poles(area: Area, accuracy: float, with_rate: bool = False, with_angle: bool = False) -> WallPoles:
-    """Compute the dominant poles of a grid by Taylor series in cells of walls; walls where these fail, one by one.
+    """Compute the dominant poles of a grid by one Taylor series per cell; if the series of a wall fails, separately.
 
-    Nothing is compiled, and the result of a wall does not depend on the window of the grid.
+    Nothing is compiled. The result for a wall does not depend on the window, the part of the grid that is computed.
     """
     radius, re, *im = compute_grid_poles(area, accuracy, with_angle)
     rate, angle = -re if with_rate else NOT_REQUESTED, im[0] if with_angle else NOT_REQUESTED
@@ -217,7 +223,7 @@ def list_poles(
     with_angle: bool = False,
     route: Route = "auto",
 ) -> WallPoles:
-    """Compute the dominant poles of columns of equal length one by one; the columns may include invalid walls."""
+    """Compute the dominant poles of walls given by columns, each wall separately; walls may be invalid."""
     size = columns[0].size
     if route != "auto":
         columns = [column[pad_to_16(np.arange(size))] for column in columns]
@@ -236,9 +242,9 @@ def list_poles(
 def find_poles(
     arrays: list[np.ndarray], accuracy: float, with_rate: bool = False, with_angle: bool = False
 ) -> WallPoles:
-    """Compute the dominant poles of arrays of equal shape, by cells if the arrays form a grid."""
+    """Compute the dominant poles of walls given by arrays of equal shape; by cells if the walls form a grid."""
     shape = arrays[0].shape
-    # Add a first axis of length 1, because a line of walls has only one axis.
+    # Add a first axis of length 1, because `arrange_as_area` needs two axes and a line of walls has only one.
     arranged = (
         arrange_as_area(Points(*(fold(array[None]) for array in arrays))) if arrays[0].size > FEW_FOR_CELLS else None
     )
@@ -257,9 +263,10 @@ def find_poles(
 def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: float) -> np.ndarray:
     """Return the decay rates of dominant poles; NaN if the certified relative error exceeds `MAX_RATE_ERROR`."""
     rate, allowed, width = 0.0 - poles.re, MAX_RATE_ERROR * np.abs(poles.re), certification_width(poles.re, accuracy)
-    # Add ``width`` to the error, because the count does not exclude other poles that are larger by up to this distance.
+    # Add ``width``, the distance in log |z| from the pole to the circle of the count, because other poles up to this
+    # circle are not excluded.
     error = np.minimum(poles.error, poles.pole_error + width)
-    # If alpha and beta + delta are 0, both poles near 1 are exactly 1, so that the rate 0 has no error.
+    # If alpha = 0 and beta + delta = 0, both poles near 1 are exactly 1, so that the decay rate 0 has no error.
     error[(poles.re == 0) & (columns[0] == 0) & (columns[1] == -columns[2])] = 0.0
     is_fractional = columns[3] != np.floor(columns[3])
     with np.errstate(all="ignore"):
@@ -268,8 +275,8 @@ def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: flo
             if not index.size:
                 continue
             loop = factor_loop(*(column[index] for column in columns), fractional=fractional)
-            # Count the poles outside a slightly smaller circle. If only the dominant pole is outside, the error of the
-            # rate is that of this pole.
+            # Count the poles outside a slightly smaller circle. If only the dominant pole (or conjugate pair) is
+            # outside, no other pole can be larger, and the error of the rate is the error of this pole.
             poles_outside = count_poles(poles.re[index] - width[index], loop, fractional)
             is_only = poles_outside.certain & (
                 poles_outside.outside == np.where(np.sin(poles.im[index]) < REAL_AXIS_WIDTH, 1, 2)
@@ -279,13 +286,13 @@ def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: flo
 
 
 def _place_by_verdict(radius: np.ndarray, columns: list[np.ndarray]) -> np.ndarray:
-    """Move radii close to 1 to the side of 1 that agrees with the stability verdict."""
+    """Replace radii close to 1 by values below 1 for stable walls and by values of at least 1 for unstable walls."""
     if not radius.size:
         return radius
     alpha, beta, delta, d = columns
     with np.errstate(all="ignore"):
         stable = np.asarray(stable_kernel(alpha, beta, delta, d, classify_delays(d)))
-    # For alpha = 0 one pole is exactly 1: remove the rounding error of the radius. Limit the radius of a stable wall to
-    # the largest float64 below 1.
+    # For alpha = 0, set the radius to 1 if it is 1 up to rounding errors, because one pole is exactly 1. Limit the
+    # radius of a stable wall to the largest float64 below 1.
     outside = np.where((alpha == 0) & (radius < 1.0 + RADIUS_ROUNDING), 1.0, np.maximum(radius, 1.0))
     return np.where(stable, np.minimum(radius, BELOW_ONE), outside)

@@ -1,8 +1,9 @@
 """Count the poles outside a circle |z| = r by the argument principle, from the gain crossovers on that circle.
 
-P = T + B with the factors of `stability.rigid.characteristic_polynomial`; the zeros of M are real and not positive. A
-*crossover* is a point of the circle with |T| = |B|. On ``z = r e^(j w)``, 0 < w < pi, the squared modulus of each
-factor is linear in x = sin^2(w/2), and its imaginary part does not change sign. Therefore
+The poles are the zeros of P = T + B. A *crossover* is a point of the circle with |T| = |B|, given by x = sin^2(w/2) at
+z = r e^(j w). T and B have the factors of `stability.rigid.characteristic_polynomial`; the zeros of M are real and not
+positive. For 0 < w < pi, the squared modulus of each factor is linear in x, and the imaginary part of the factor does
+not change its sign. Therefore
 
 - |T|^2 - |B|^2 is a quadratic in x for integer delays and a cubic for fractional ones; its zeros are the crossovers;
 - the principal values of all arguments are continuous in w, so that no phase has to be unwrapped.
@@ -26,16 +27,16 @@ from zwidth.stability.rigid.crossover import find_first_root
 
 # Largest number of steps of the bracketed iteration for a zero of the cubic |T|^2 - |B|^2.
 CUBIC_STEPS = 6
-# Factor by which the bounds of a cell are widened, to cover their rounding errors.
+# Factor that enlarges the bounds on the changes within a cell, to cover the rounding errors of these bounds.
 WIDENING = 1.0 + 1e-12
-# If the wall varies within a cell, the angle w of a crossover varies within an interval. This interval is divided into
-# four equal pieces, and the phase change is bounded on each piece. The positions are those of the ends of the pieces
-# (even indices) and of their midpoints (odd indices), from 0 to 1 in the interval.
+# For the walls of a cell, the angle w of a crossover varies within an interval. This interval is divided into four
+# equal pieces, and the phase change is bounded on each piece. PIECE_POINTS are the ends (even indices) and the
+# midpoints (odd indices) of the pieces, as fractions of the interval.
 PIECE_POINTS = np.arange(9)[:, None, None] / 8.0
 
 
 class _Circle(NamedTuple):
-    """The factors of T and B on one circle, and |T|^2 - |B|^2 as a polynomial in x.
+    """The factors of T and B on one circle |z| = r, and |T|^2 - |B|^2 as a polynomial in x = sin^2(w/2).
 
     T and B are divided by the larger of r^(1+n) and 1.
     """
@@ -43,8 +44,8 @@ class _Circle(NamedTuple):
     r: Array
     r_minus_1: Array
     r_minus_c: Array
-    wall: Array  # s r - beta
-    numerator: Array  # a2 r + h
+    wall: Array  # W at z = r, i.e. s r - beta
+    numerator: Array  # a2 z + h at z = r
     factors: CircleFactors
     h: tuple[Array, Array, Array, Array]  # |T|^2 - |B|^2, lowest power of x first
     at_start: tuple[Array, Array]  # |T| and |B| at x = 0, i.e. z = r
@@ -66,7 +67,7 @@ class _Circle(NamedTuple):
 
 
 def _evaluate_on_circle(log_r: Array, loop: LoopFactors, fractional: bool, xp: Any) -> _Circle:
-    """Evaluate the factors of T and B, and |T|^2 - |B|^2, on the circle |z| = e^log_r."""
+    """Compute the factors of T and B, and the coefficients of |T|^2 - |B|^2 in x, on the circle |z| = e^log_r."""
     r, r_minus_1 = xp.exp(log_r), xp.expm1(log_r)
     factors = expand_on_circle(r, r_minus_1, loop)
     (r_minus_c, c1), (wall, w1), (numerator, m1), (one_plus_ratio, g1) = factors[1:]
@@ -104,7 +105,7 @@ def _find_quadratic_zeros(h0: Array, h1: Array, h2: Array, xp: Any) -> list[Arra
 
 
 def _find_cubic_zeros(circle: _Circle, xp: Any) -> list[Array]:
-    """Return the zeros of the cubic |T|^2 - |B|^2 in (0, 1), one per interval between its extrema; NaN if none."""
+    """Return the zeros of the cubic |T|^2 - |B|^2 in 0 < x < 1, one per interval between its extrema; NaN if none."""
     h0, h1, h2, h3 = circle.h
     low, high = _find_quadratic_zeros(h1, 2.0 * h2, 3.0 * h3, xp)
     low, high = (xp.where(xp.isfinite(x), xp.clip(x, 0.0, 1.0), 0.0) for x in (low, high))
@@ -115,7 +116,7 @@ def _find_cubic_zeros(circle: _Circle, xp: Any) -> list[Array]:
 
 
 def _find_zero_between(piece: tuple[Array, ...], circle: _Circle, xp: Any) -> Array:
-    """Return the zero of the cubic |T|^2 - |B|^2 on an interval on which it is monotone; NaN if it has none there.
+    """Return the zero of the cubic |T|^2 - |B|^2 on an interval on which the cubic is monotone; NaN if it has no zero.
 
     In each step, the next iterate is the zero of the parabola with the value and first two derivatives of the cubic.
 
@@ -147,12 +148,13 @@ def _find_zero_between(piece: tuple[Array, ...], circle: _Circle, xp: Any) -> Ar
 
 
 def _find_only_zero(circle: _Circle, xp: Any) -> tuple[Array, Array]:
-    """Return a zero of |T|^2 - |B|^2 in (0, 1) if its signs at 0 and 1 differ, and whether it is the only one."""
+    """Return a zero x of |T|^2 - |B|^2, whose signs at x = 0 and 1 must differ, and whether it is the only one."""
     h0, h1, h2, h3 = circle.h
     sign = xp.where(h0 > 0, 1.0, -1.0)
     x = find_first_root(tuple([sign * h for h in circle.h]))
-    # Given different signs at 0 and 1, the cubic has a single zero in (0, 1) if it is monotone or has only one extremum
-    # there. Require in addition that the iteration has converged.
+    # Given different signs at x = 0 and 1, the cubic has a single zero in (0, 1) if it is monotone or has only one
+    # extremum in this interval. The four conditions are each sufficient for this. Require in addition that the
+    # iteration has converged.
     is_only_zero = (
         (h2 * h2 < 3.0 * h1 * h3)
         | (h1 * circle.differentiate(1.0) < 0)
@@ -165,10 +167,9 @@ def _find_only_zero(circle: _Circle, xp: Any) -> tuple[Array, Array]:
 def _evaluate_phase_difference(
     x: Array, circle: _Circle, loop: LoopFactors, fractional: bool, xp: Any
 ) -> tuple[Array, Array, Array]:
-    """Return arg T - arg B at a crossover x, the angle w of the crossover, and a bound on d(arg T - arg B)/dw.
+    """Return arg T - arg B at a crossover x, the angle w of the crossover, and a bound on |d(arg T - arg B)/dw|.
 
-    Returns:
-        ``arg T - arg B``, continued from w = 0; w; and a bound on the magnitude of its derivative in w.
+    The phase difference arg T - arg B is continuous in w from w = 0 on.
     """
     y = 1.0 - x
     im, drop = 2.0 * circle.r * xp.sqrt(x * y), 2.0 * circle.r * x
@@ -176,8 +177,8 @@ def _evaluate_phase_difference(
     sign = xp.where(loop.s < 0, -1.0, 1.0)
     wall_re, wall_im = sign * (circle.wall - loop.s * drop), sign * loop.s * im
     numerator_re, numerator_im = circle.numerator - loop.a2 * drop, loop.a2 * im
-    # Add 2 pi to the principal value of the sum if necessary: arg((z - 1)/(a2 z + h)) is in (0, pi) and arg((z - c)/W)
-    # in (-pi, pi).
+    # Compute the sum of two arguments: arg((z - 1)/(a2 z + h)), which is in (0, pi), and arg((z - c)/W), which is in
+    # (-pi, pi). Add 2 pi to the principal value of the sum if the sum exceeds pi.
     p_re, p_im = re_z_minus_1 * numerator_re + im * numerator_im, im * numerator_re - re_z_minus_1 * numerator_im
     q_re, q_im = re_z_minus_c * wall_re + im * wall_im, im * wall_re - re_z_minus_c * wall_im
     v_re, v_im = p_re * q_re - p_im * q_im, p_re * q_im + p_im * q_re
@@ -186,10 +187,12 @@ def _evaluate_phase_difference(
     w = invert_haversine(x, y, xp)
     theta = loop.n_plus_1 * w + phase + xp.where(loop.s < 0, np.pi, 0.0)
     if fractional:
-        # Subtract arg(1 + q/z) = arg(z + q) - w, which is in [-pi, 0].
+        # Subtract the argument of the factor 1 + q/z of B. It equals arg(z + q) - w and is in [-pi, 0], so that its
+        # principal value is continuous.
         ratio = loop.q / circle.r
         theta = theta - angle(1.0 + ratio - 2.0 * ratio * x, -ratio * im / circle.r)
-    # Bound the derivative in w. That of arg(z - a) is the real part of z/(z - a) = 1 + a/(z - a).
+    # Bound the derivative of arg T - arg B in w by the sum of those of its terms. The derivative of arg(z - a) is the
+    # real part of z/(z - a) = 1 + a/(z - a).
     rate = loop.n_plus_1 + 0.0 * x
     parts = [
         (1.0, re_z_minus_1, im),
@@ -203,11 +206,11 @@ def _evaluate_phase_difference(
 
 
 class PoleCount(NamedTuple):
-    """The number of poles on and outside a circle, and whether this count is certain."""
+    """The number of poles on or outside a circle, and whether this count is certain."""
 
-    outside: Array  # number of poles that are not inside
+    outside: Array  # number of poles that are not inside the circle
     certain: Array  # True if rounding errors cannot have changed the count
-    crossovers: list[Array]  # w of the crossovers; arbitrary for those that do not exist
+    crossovers: list[Array]  # angles w of the crossovers; arbitrary for crossovers that do not exist
 
     @property
     def all_inside(self) -> Array:
@@ -222,8 +225,8 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
         log_r: Logarithm of the radius of the circle.
         loop: Factors of P.
         fractional: Whether any delay is fractional.
-        single: Assume a single crossover (only for fractional delays). This halves the time; if there is not exactly
-            one crossover, the count is marked uncertain.
+        single: Assume that the circle has a single crossover (only for fractional delays). This halves the time. If the
+            number of crossovers is not one, the count is marked as uncertain.
 
     Returns:
         The count, elementwise.
@@ -247,12 +250,12 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
 
     def evaluate_phase(x: Array) -> tuple[Array, Array, Array]:
         theta, w, rate = _evaluate_phase_difference(x, circle, loop, fractional, xp)
-        # Also return the change of theta = arg T - arg B by a rounding error of the crossover x, in rounding units.
-        # This change is large if |T| and |B| have nearly the same slope at the crossover.
+        # As the third result, return the error of theta = arg T - arg B that a rounding error of the crossover x
+        # causes, in rounding units. This error is large if |T| and |B| have nearly the same slope at the crossover.
         return theta, w, rate * circle.sum_magnitudes(x) / (xp.abs(circle.differentiate(x)) * xp.sqrt(x * (1.0 - x)))
 
-    # For three zeros, let JAX trace the function only once, which halves the compile time. For two zeros this would
-    # double the run time.
+    # For three zeros, use `apply_each`, so that JAX traces the function only once; this halves the compile time. For
+    # two zeros `apply_each` would double the run time.
     phases = list(map(evaluate_phase, zeros)) if len(zeros) < 3 else apply_each(evaluate_phase, zeros, xp)
     for valid, (theta, w, shift) in zip(valid_masks, phases, strict=True):
         turns = theta / (2.0 * np.pi)
@@ -261,8 +264,8 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
         device_larger = device_larger != valid
         certain = certain & (~valid | (0.5 - xp.abs(turns - nearest) > tolerance + 4.0 * eps * shift))
         crossovers.append(w)
-    # At each crossover the larger of |T| and |B| changes. Mark the count as uncertain if this contradicts the larger
-    # one at z = -r.
+    # Along the circle, |T| > |B| changes to |T| < |B| or back at each crossover. Mark the count as uncertain if the
+    # result of these changes contradicts the comparison of |T| and |B| at z = -r.
     certain = certain & (device_larger == device_larger_at_end)
     return PoleCount(loop.n_plus_1 + 2.0 - (stop - start + 2.0 * full_turns), certain, crossovers)
 
@@ -279,13 +282,13 @@ def count_poles_in_cell(
         fractional: Whether any delay is fractional.
 
     Returns:
-        The number of poles outside, and whether it is certified for every wall of the cell.
+        The number of poles outside the circle, and whether this number is certified for every wall of the cell.
     """
     circle = _evaluate_on_circle(log_r, loop, fractional, np)
     a, b = half
     r, abs_r_minus_1, power = circle.r, np.abs(circle.r_minus_1), loop.n_plus_1 * log_r
-    # Bound the changes of three quantities over the walls of the cell: W = alpha z + beta (z - 1) at x = 0, and the
-    # coefficients w0 and w1 of |W|^2 = w0 + w1 x.
+    # Bound the changes of three quantities over the walls of the cell: W at z = r (wall_change), and the coefficients
+    # w0 and w1 of |W|^2 = w0 + w1 x (e0 and e1).
     (_, w1), (_, m1), (one_plus_ratio, g1) = circle.factors[2:]
     wall_change = a * r + b * abs_r_minus_1
     e0 = (2.0 * np.abs(circle.wall) * wall_change + wall_change * wall_change) * WIDENING + 1e-14 * circle.wall**2
@@ -312,8 +315,7 @@ def count_poles_in_cell(
     (device_larger, device_larger_at_end, low), (other_larger, other_larger_at_end, high) = bounds
     certain = (device_larger == other_larger) & (device_larger_at_end == other_larger_at_end)
     start, stop, wall_at_end = _evaluate_end_arguments(circle, loop, device_larger, device_larger_at_end)
-    # At z = r and z = -r, require that W has the same sign for all walls of the cell, unless |T| is larger than |B|
-    # there.
+    # At z = r and at z = -r, require |T| > |B| or that W has the same sign for all walls of the cell.
     certain &= (device_larger | (np.abs(circle.wall) > wall_change)) & (
         device_larger_at_end | (np.abs(wall_at_end) > a * r + b * (1.0 + r))
     )
@@ -325,8 +327,8 @@ def count_poles_in_cell(
     first, x, second = cuts[:-1:2], cuts[1::2], cuts[2::2]
     turns = _evaluate_phase_difference(x, circle, loop, fractional, np)[0] / (2.0 * np.pi)
     nearest = np.round(turns[0])
-    # Bound the derivative of arg(z - a), the real part of z/(z - a) = 1 + a/(z - a), on each piece, by evaluating it at
-    # that end of the piece at which |z - a| is smallest.
+    # On each piece, bound the derivative of arg T - arg B in w. For each factor z - a, the derivative of arg(z - a) is
+    # the real part of z/(z - a) = 1 + a/(z - a); use the end of the piece at which |z - a| is smaller.
     least_wall = np.sqrt(np.maximum(circle.wall**2 + np.minimum(w1 * first, w1 * second), 0.0))
     rate = (
         loop.n_plus_1
@@ -351,7 +353,7 @@ def count_poles_in_cell(
 def _evaluate_end_arguments(
     circle: _Circle, loop: LoopFactors, device_larger: Array, device_larger_at_end: Array
 ) -> tuple[Array, Array, Array]:
-    """Return arg P/pi at z = r and at z = -r, where arg P is that of the larger of T and B; and W at z = -r."""
+    """Return arg(P)/pi at z = r and at z = -r, from the larger of the two terms T and B of P; and W at z = -r."""
     xp = namespace(circle.r)
     half = xp.where(loop.s < 0, -1.0, 1.0)
     start = xp.where(
@@ -365,5 +367,5 @@ def _evaluate_end_arguments(
 
 
 def _may_cancel(sizes: tuple[Array, Array], tolerance: Array) -> Array:
-    """Return whether T + B may be 0 within rounding errors at z = r or z = -r, given |T| and |B| there."""
+    """Return whether T + B may be 0 up to rounding errors at a point z = r or z = -r, given |T| and |B| there."""
     return namespace(tolerance).abs(sizes[0] - sizes[1]) <= tolerance * sizes[1]

@@ -1,16 +1,17 @@
-"""Find the dominant pole of one loop: two starting points, a fixed number of steps, and one certificate.
+"""Find the dominant pole (largest |z|) of one loop from two starting points, with a certificate.
 
-The dominant pole (largest |z|) is usually one of two: the *slow pole*, the pole near z = 1 that belongs to the wall's
-slow dynamics; or the *first pair*, the complex pair at the smallest angle among the poles that a delay places around
-the origin (the *ring*). Halley's method (`stability.rigid.dominant.steps`) refines both, then only the larger one.
+The dominant pole is usually the *slow pole*, the larger pole near z = 1, or the *first pair*, the complex pair at the
+smallest angle among the poles that a delay places around the origin. Halley's method (`stability.rigid.dominant.steps`)
+refines both, then only the larger one.
 
-Certificate: let r be the modulus of the result and tol the tolerance. A count (`stability.rigid.dominant.pole_count`)
-shows that all poles lie inside ``|z| = r (1 + tol)``, and a pole lies within tol of the result. Then the spectral
-radius is r to within tol. If this fails, more starting points are tried, and finally the radius is bisected by counts.
+Certificate: let r be the modulus of the result and tol the tolerance. If a count of poles
+(`stability.rigid.dominant.pole_count`) shows that all poles lie inside ``|z| = r (1 + tol)``, and a pole lies within
+tol of the result, the spectral radius is r to within tol. Without a certificate, more starting points are tried, and
+finally the radius is bisected by counts of poles.
 
 P = T + B has the factors of `stability.rigid.characteristic_polynomial`; a *crossover* is a point with |T| = |B| on a
-circle. All positions are logarithms: a pole is ``e^(re + j im)`` with 0 <= im <= pi. The same source code serves NumPy
-and JAX; `stability.rigid.dominant.arrays` applies it to arrays, `traced_kernel` inside JAX transformations.
+circle. Poles are given by their logarithms: a pole is ``e^(re + j im)`` with 0 <= im <= pi. The same source code serves
+NumPy and JAX. `stability.rigid.dominant.arrays` applies it to arrays; `traced_kernel` is for JAX transformations.
 """
 
 from __future__ import annotations
@@ -50,34 +51,34 @@ from zwidth.stability.rigid.dominant.steps import (
 from zwidth.stability.rigid.normalization import valid_wall
 
 # Numbers of Halley steps.
-STEPS_ON_BOTH = 2  # from both starting points
-STEPS_ON_LARGER = 3  # then from the larger of both results
-STEPS_ON_ALL = 10  # without a certificate: from four starting points
+STEPS_ON_BOTH = 2  # from both starting points (slow pole and first pair)
+STEPS_ON_LARGER = 3  # then from the result with the larger modulus
+STEPS_ON_ALL = 10  # from each of four starting points, for walls without a certificate
 
-# Distance in log z between a point and a pole below which a sequence of steps has converged.
+# Largest distance in log z from a pole at which a sequence of Halley steps counts as converged.
 CONVERGED_RADIUS = 1e-6
-# Before a Newton step, the distance to the nearest pole is at most R = N |P/P'|, with the degree N >= 3 of P. After the
-# step, of length R/N, this pole is at a distance of at most RADIUS_AFTER_STEP R.
+# Before a Newton step, the distance to the nearest pole is at most R = N |P/P'|, where N >= 3 is the degree of P. The
+# step has the length R/N. After the step, the distance to this pole is at most RADIUS_AFTER_STEP R.
 RADIUS_AFTER_STEP = 1.4
-# Distance in log r from a pole to the circle on which poles are counted: the larger of the following two, but at most
-# the tolerance of the radius.
-COUNT_ROUNDING = 4096.0  # rounding error of a count, in rounding units of log r
-RATE_WIDTH = 2e-11  # relative to |re|; small enough for accurate decay rates
+# Distance in log r from the dominant pole to the circle on which poles are counted: the larger of the following two
+# distances, but at most the tolerance of the radius.
+COUNT_ROUNDING = 4096.0  # distance needed because of rounding errors of a count, in rounding units of log r
+RATE_WIDTH = 2e-11  # distance relative to |re|; small enough for accurate decay rates
 
 ANGLE_ROUNDING = 8.0  # rounding error of the angle pi of negative real poles, in rounding units
 
-# Bisection of the radius to full precision. The last digits matter if many poles have nearly the same modulus, because
-# then the angles of the crossovers on the circle depend on them.
+# Bisection of the radius to full precision. If many poles have nearly the same modulus, even the last digits of the
+# radius matter, because the angles of the crossovers on the circle then depend on them.
 MIN_LOG_RADIUS = -690.0  # e^-690 = 2e-300 is close to the smallest float64
 BISECTIONS = 62
 POLISHING_STEPS = 6  # Halley steps after the bisection
-BISECTIONS_PER_COUNT = 3  # per call in NumPy; for few walls, counting on 7 circles takes as long as on one
-# Largest number of circles on which the last certificate counts poles, each ten times as far from the pole as the
-# previous one, because on a closer circle the rounding error of the count may be too large.
+BISECTIONS_PER_COUNT = 3  # per call in NumPy, by counts on 7 circles, which for few walls take as long as on one
+# Largest number of circles that are tried for the certificate after a bisection. Each circle is ten times as far from
+# the pole as the previous one, because the rounding error of the count may be too large on a closer circle.
 MAX_TRIALS = 6
 
-RESCUE_SIZE = 1 << 9  # walls that a JAX program computes at once by bisection
-# Angles of the third and of the fourth starting point, relative to the angle of the first pair.
+RESCUE_SIZE = 1 << 9  # number of walls that a JAX program computes at once by bisection
+# Angles of the third and of the fourth starting point (`list_starts`), relative to the angle of the first pair.
 OFF_AXIS_RATIO = 0.1  # close to the real axis, but not on it
 BETWEEN_RATIO = 0.5  # near a third pole that exists for short delays
 
@@ -88,33 +89,33 @@ class DominantPoles(NamedTuple):
     re: Array
     im: Array
     error: Array  # certified relative error of the radius; infinite without a certificate
-    pole_error: Array  # bound of |re - true re|; infinite if only the radius is certified
+    pole_error: Array  # bound of the error of re; infinite if the radius is certified, but not the pole
 
     @property
     def certified(self) -> Array:
-        """True if an error bound is certified."""
+        """True for walls with a certified error bound of the radius."""
         return self.error < np.inf
 
 
 def round_to_real(poles: DominantPoles) -> Array:
-    """Return im of the poles, with exactly 0 or pi for poles that are real to within their error."""
+    """Return im of the poles; for poles that are real up to their error bound, exactly 0 or pi."""
     xp, error = namespace(poles.im), poles.pole_error + ANGLE_ROUNDING * epsilon(poles.im)
     return xp.where(poles.im <= poles.pole_error, 0.0, xp.where(np.pi - poles.im <= error, np.pi, poles.im))
 
 
 def _bound_log_radius(loop: LoopFactors) -> Array:
-    """Return the logarithm of a radius above the moduli of all poles: |T| > |B| on every larger circle."""
+    """Return the logarithm of a radius that exceeds the moduli of all poles: |T| > |B| on all larger circles."""
     xp = namespace(loop.alpha)
     wall_bound = bound_wall_part(1.0, 2.0, loop, True)
     bound_root = xp.sqrt(wall_bound)
-    # For r > 1 use |T| >= r^(1+n) (r - 1)^2 and |B| <= wall_bound r^2.
+    # For |z| = r > 1, |T| >= r^(1+n) (r - 1)^2 and |B| <= wall_bound r^2; return an r for which |T| > |B| follows.
     bound = xp.log1p(xp.where(loop.n_plus_1 > 1, bound_root, bound_root + wall_bound))
     steep_bound = xp.maximum(np.log(2.0), xp.log(4.0 * wall_bound) / loop.n_plus_1)
     return 1e-9 + xp.where(loop.n_plus_1 > 1, xp.minimum(bound, steep_bound), bound)
 
 
 def approximate_slow_pole(loop: LoopFactors) -> tuple[Array, Array]:
-    """Approximate the larger pole near 1, from the Taylor polynomial of P of second order in z - 1."""
+    """Approximate the slow pole by the larger zero of the second-order Taylor polynomial of ``P/z^(1+n)`` at z = 1."""
     xp = namespace(loop.alpha)
     constant, linear, quadratic = expand_at_one(loop)
     quadratic = xp.where(quadratic > 0.1, quadratic, 1.0)
@@ -134,12 +135,12 @@ def approximate_slow_pole(loop: LoopFactors) -> tuple[Array, Array]:
 def approximate_first_pair(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
     """Approximate the first pair: its angle from the delay, and its radius r from |T| = |B| with simplified factors.
 
-    Only the factor r^(1+n) depends on r; all other factors of T and B are evaluated on the unit circle.
+    Only the factor z^(1+n) of T is evaluated at |z| = r, all other factors of T and B at |z| = 1.
     """
     xp = namespace(loop.alpha)
     im = np.pi / (loop.d_plus_1 + 1.0)
-    # If beta is so negative that W is nearly a negative multiple of z - 1, arg B changes by pi. The angle of the first
-    # pair is then about twice as large.
+    # If beta is so negative that the factor W = alpha z + beta (z - 1) of B is nearly a negative multiple of z - 1, arg
+    # B changes by pi, and the angle of the first pair is about twice as large.
     im = xp.where((loop.alpha < -loop.beta * im) & (loop.n_plus_1 > 1), 2.0 * im, im)
     x = xp.sin(0.5 * im) ** 2
     n_plus_1 = loop.n_plus_1
@@ -152,7 +153,7 @@ def approximate_first_pair(loop: LoopFactors, fractional: bool) -> tuple[Array, 
 
 
 def approximate_larger_pole(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
-    """Approximate the larger of the slow pole and the first pair by a few Halley steps on both."""
+    """Approximate the larger of the slow pole and the first pair by a few Halley steps from approximations of both."""
     xp = namespace(loop.alpha)
 
     def follow(start: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -164,7 +165,7 @@ def approximate_larger_pole(loop: LoopFactors, fractional: bool) -> tuple[Array,
 
 
 def find_candidate(loop: LoopFactors, fractional: bool) -> tuple[Array, Array]:
-    """Return the larger of the slow pole and the first pair, nearly converged."""
+    """Return the larger of the slow pole and the first pair, nearly converged, as a candidate for the dominant pole."""
     start = approximate_larger_pole(loop, fractional)
     return iterate(STEPS_ON_LARGER, lambda point: halley_step(*point, loop, fractional), start, namespace(loop.alpha))
 
@@ -181,19 +182,19 @@ def certification_width(re: Array, tolerance: Any, spread: Any = 1.0) -> Array:
 def certify_pole(
     re: Array, im: Array, tolerance: Any, loop: LoopFactors, fractional: bool, single: bool, spread: Any = 1.0
 ) -> DominantPoles:
-    """Take a Newton step, and certify within the tolerance that the modulus of the result is the spectral radius.
+    """Take a Newton step, and certify that the modulus of the result is the spectral radius within the tolerance.
 
     Args:
-        re: Log modulus of a pole, nearly converged.
+        re: Logarithm of the modulus of an approximate pole, nearly converged.
         im: Argument of this pole.
-        tolerance: Relative error of the radius.
+        tolerance: Largest relative error of the spectral radius.
         loop: Factors of P.
         fractional: Whether any delay is fractional.
-        single: Count with a single crossover, see `pole_count.count_poles`.
+        single: Count poles under the assumption of a single crossover, see `pole_count.count_poles`.
         spread: Factor of the distance from the pole to the circle on which poles are counted.
     """
     xp = namespace(re, loop.alpha)
-    # Set the pole to exactly 1 if alpha = 0 and no pole is larger, because one pole is then exactly 1.
+    # If alpha = 0, one pole is exactly 1. Set the result to 1 unless the approximate pole is larger.
     at_one = (loop.alpha == 0) & ~(re > tolerance)
     step = newton_step(re, im, loop, fractional)
     re, im = (xp.where(at_one, 0.0, part) for part in shift_pole(re, im, step.re, step.im))
@@ -207,17 +208,16 @@ def certify_pole(
 def quick_kernel(
     alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool
 ) -> DominantPoles:
-    """Return the dominant pole of each wall from two starting points; for most walls it is certified."""
+    """Return the dominant pole of each wall, from two starting points; for most walls the pole is certified."""
     loop = materialize(factor_loop(alpha, beta, delta, d, fractional), delta)
     return certify_pole(*find_candidate(loop, fractional), tolerance, loop, fractional, fractional)
 
 
-# The following functions certify the walls that `quick_kernel` leaves without a certificate; ``loop`` contains only
-# these.
+# The following functions serve the walls that `quick_kernel` does not certify; ``loop`` contains only these walls.
 
 
 def bound_radius(poles: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
-    """Certify the radius, but not the pole, by counts on a slightly larger and a slightly smaller circle."""
+    """Certify the spectral radius, but not the pole, by counts on a slightly larger and a slightly smaller circle."""
     above, below = (count_poles(poles.re + side, loop, fractional) for side in (tolerance, -tolerance))
     certified = above.all_inside & above.certain & ~below.all_inside & below.certain
     return poles._replace(
@@ -226,16 +226,17 @@ def bound_radius(poles: DominantPoles, tolerance: float, loop: LoopFactors, frac
 
 
 def list_starts(loop: LoopFactors, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return four starting points, of shape (4, loops): both approximations, and two at other angles."""
-    # The third starting point is the slow pole moved onto the real axis if it is complex, and off the axis otherwise,
-    # because steps from the real axis never leave it and other steps rarely reach it.
+    """Return four starting points, of shape (4, loops): approximate slow pole and first pair, and two others."""
+    # For the third starting point, move the slow pole onto the real axis if it is complex, otherwise off the real axis.
+    # Reason: Halley steps from a point on the real axis never leave the axis, and steps from other points rarely reach
+    # it.
     (slow, turn), pair = approximate_slow_pole(loop), approximate_first_pair(loop, fractional)
     other = np.where(turn > 0, 0.0, OFF_AXIS_RATIO * pair[1])
     return np.stack([slow, pair[0], slow, 0.0 * slow]), np.stack([turn, pair[1], other, BETWEEN_RATIO * pair[1]])
 
 
 def certify_starts(_: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
-    """Certify the largest of the poles to which four starting points lead, counting any number of crossovers."""
+    """Certify the largest pole found from four starting points; the count allows any number of crossovers."""
     starts = list_starts(loop, fractional)
     re, im = iterate(STEPS_ON_ALL, lambda point: halley_step(*point, loop, fractional), starts, np)
     converged = newton_step(re, im, loop, fractional).radius < CONVERGED_RADIUS
@@ -244,13 +245,13 @@ def certify_starts(_: DominantPoles, tolerance: float, loop: LoopFactors, fracti
 
 
 def find_by_bisection(loop: LoopFactors, fractional: bool) -> tuple[Array, Array, Array]:
-    """Bisect the spectral radius by counts, and approximate the dominant pole on the circle with this radius.
+    """Bisect the spectral radius by counting poles, and approximate the dominant pole on the circle with this radius.
 
     Returns:
-        The log radius; re and im of the pole, refined by Halley steps. Near multiple poles, these may not converge.
+        The log radius; and re and im of the pole, refined by Halley steps, which may not converge near multiple poles.
     """
     xp = namespace(loop.alpha)
-    # With NumPy, count on several circles at once, because for few walls this does not take longer than on one circle.
+    # With NumPy, count poles on several circles at once, because for few walls this takes no longer than on one circle.
     bits = BISECTIONS_PER_COUNT if xp is np else 1
 
     def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -262,8 +263,8 @@ def find_by_bisection(loop: LoopFactors, fractional: bool) -> tuple[Array, Array
 
     high = _bound_log_radius(loop)
     _, radius = iterate(-(-BISECTIONS // bits), step, (0.0 * high + MIN_LOG_RADIUS, high), xp)
-    # On the circle with the bisected radius, the pole is at a crossover or on the real axis. Choose the candidate that
-    # is nearest to a pole.
+    # On the circle with the bisected radius, the dominant pole is at a crossover or on the real axis. Of these angles,
+    # choose the one with the smallest bound of the distance to a pole.
     angles = [0.0 * radius, 0.0 * radius + np.pi, *count_poles(radius, loop, fractional).crossovers]
     distances = apply_each(lambda im: newton_step(radius, im, loop, fractional).radius, angles, xp)
     im, least_distance = angles[0], np.inf
@@ -273,15 +274,16 @@ def find_by_bisection(loop: LoopFactors, fractional: bool) -> tuple[Array, Array
 
 
 def bisect_radius(_: DominantPoles, tolerance: float, loop: LoopFactors, fractional: bool) -> DominantPoles:
-    """Certify the pole that bisection of the radius yields."""
+    """Certify the dominant pole that is found by bisection of the spectral radius."""
     radius, re, im = find_by_bisection(loop, fractional)
     poles = certify_pole(re, im, tolerance, loop, fractional, False)
-    # Keep the bisected radius if the steps have not converged, as is usual near multiple poles.
+    # Keep the bisected radius if the pole is not certified; near multiple poles the Halley steps usually do not
+    # converge.
     return poles._replace(re=np.where(poles.certified, poles.re, radius))
 
 
 def _find_traced(loop: LoopFactors, fractional: bool) -> DominantPoles:
-    """Return the dominant poles under JAX transformations: by `find_candidate`, otherwise by `find_by_bisection`."""
+    """Return the dominant poles under JAX transformations: by `find_candidate`, or else by `find_by_bisection`."""
     import jax.numpy as xp
     from jax.lax import fori_loop, while_loop
 
@@ -291,7 +293,7 @@ def _find_traced(loop: LoopFactors, fractional: bool) -> DominantPoles:
     length = min(size, RESCUE_SIZE)
 
     def rescue(state: tuple[DominantPoles, Array]) -> tuple[DominantPoles, Array]:
-        """Compute some of the open walls by bisection."""
+        """Compute the dominant poles of some of the open (not certified) walls by bisection."""
         results, is_open = state
         index = xp.nonzero(is_open, size=length, fill_value=size)[0]
         part = LoopFactors(*(column.at[index].get(mode="clip") for column in columns))
@@ -301,7 +303,7 @@ def _find_traced(loop: LoopFactors, fractional: bool) -> DominantPoles:
             trial = certify_pole(best.re, best.im, tolerance, part, fractional, False, 10.0**k)
             return DominantPoles(*(xp.where(best.certified, *pair) for pair in zip(best, trial, strict=True)))
 
-        # Each trial also takes a Newton step.
+        # Try to certify the poles on up to MAX_TRIALS circles. Each call of `certify_pole` also takes a Newton step.
         none = xp.full_like(re, np.inf)
         found = fori_loop(0, MAX_TRIALS, certify, DominantPoles(re, im, none, none))
         results = DominantPoles(
@@ -317,7 +319,7 @@ def _find_traced(loop: LoopFactors, fractional: bool) -> DominantPoles:
 def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> tuple[Array, Array]:
     """Return re and im of the dominant pole, with their derivatives, under JAX transformations.
 
-    They are NaN if the pole could not be certified, or if it is a multiple one.
+    The values are NaN if the pole could not be certified or is a multiple pole.
     """
     xp = namespace(alpha, beta, delta, d)
     loop = materialize(factor_loop(alpha, beta, delta, d, fractional), delta)

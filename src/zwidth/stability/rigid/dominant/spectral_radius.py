@@ -1,7 +1,7 @@
 """Return the dominant pole of arrays of walls: its modulus (the spectral radius), angle and decay rate.
 
-The dominant pole is the pole with the largest modulus. `stability.rigid.dominant.arrays` computes and certifies it.
-With method "companion", `stability.rigid.poles` computes all poles instead. This module has the public functions.
+The dominant pole is the pole with the largest modulus. `stability.rigid.dominant.arrays` computes and certifies it;
+with method "companion", `stability.rigid.poles` computes all poles instead. This module contains the public functions.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from zwidth.stability.rigid.poles import radius_by_companion
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
 
-# Smallest relative error that may be required. For smaller ones, the circles on which poles are counted would be closer
-# to each other than the rounding errors of the counts.
+# Smallest relative error that may be requested. With a smaller one, the circles on which poles are counted would be so
+# close together that rounding errors make the counts uncertain.
 MIN_ACCURACY = 1e-12
 
 
@@ -41,8 +41,8 @@ def spectral_radius(
 ) -> Array:
     """Return the spectral radius of the loop: the modulus of its dominant pole.
 
-    The spectral radius is ``max |z|`` over ``P(z) = 0``, see `zwidth.char_poly`. The loop is stable if it is below 1.
-    A response decays by this factor per period, after faster components have decayed.
+    The spectral radius is ``max |z|`` over ``P(z) = 0``, see `zwidth.char_poly`. The loop is stable if the radius is
+    below 1. A response decays by this factor per period, after faster components have decayed.
 
     Args:
         alpha: normalized stiffness K T^2/m.
@@ -53,8 +53,8 @@ def spectral_radius(
             a circle, at a cost independent of d; "companion" computes all poles.
         accuracy: largest relative error, 1e-9 by default, at least 1e-12. If two poles nearly coincide, the radius is
             ill-conditioned: rounding errors of the coefficients then change it by up to 1e-8, whatever the accuracy
-            (2.8e-9 was observed near a double pole at z = -1). A larger value saves next to no time. Has no effect on
-            "companion".
+            (2.8e-9 was observed near a double pole at z = -1). A larger ``accuracy`` saves next to no time. It has no
+            effect with method "companion".
 
     Returns:
         Array of the broadcast shape: below 1 if and only if `zwidth.is_stable` returns True. NaN for a point out of
@@ -69,9 +69,9 @@ def spectral_radius(
         Direct calls compute in float64; grids and up to 262,144 other walls are computed without JAX. Inside `jit` the
         function computes in JAX's default float type, d may be traced, and a radius within rounding error of 1 may be
         on either side of 1. On grids, one Taylor series with a certified bound serves a cell of walls
-        (`stability.rigid.dominant.grid`). Derivatives are those of the dominant pole, up to the second order; NaN
-        if this pole is a multiple one. Near a k-fold pole the error of the radius is about 1e-16^(1/k), whatever the
-        accuracy. If the radius is within 1e-16 of 1, use `decay_rate`.
+        (`stability.rigid.dominant.grid`). Derivatives are those of the dominant pole, up to the second order; they are
+        NaN if this pole is a multiple pole. Near a k-fold pole the error of the radius is about 1e-16^(1/k), whatever
+        the accuracy. If the radius is within 1e-16 of 1, use `decay_rate`.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
@@ -106,18 +106,19 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         d: delay in periods, >= 0, integer or fractional. All four broadcast.
 
     Returns:
-        Array of the broadcast shape, per period: positive if and only if `zwidth.is_stable` returns True, 0 with a pole
-        at 1, negative for growing responses. NaN for a point out of range, and if fewer than three digits of the rate
-        are certain: within about 1e-12 of the boundary in alpha or beta, and near (almost) dominant multiple poles.
+        Array of the broadcast shape, per period: positive if and only if `zwidth.is_stable` returns True, 0 if the
+        dominant pole is 1, negative for growing responses. NaN for a point out of range, and if fewer than three digits
+        of the rate are certain: within about 1e-12 of the boundary in alpha or beta, and near (almost) dominant
+        multiple poles.
 
     Raises:
         InputError: an argument is no real number or a scalar out of range, or shapes do not broadcast.
 
     Numerics:
-        The logarithm of the dominant pole of `zwidth.spectral_radius`, computed from z - 1. For soft walls the rate has
-        at least 11 digits, however small it is; for a pole pair near the unit circle its absolute error is about 1e-16.
-        A certified error bound is below a thousandth of the rate, otherwise the rate is NaN. If the magnitudes of some
-        poles agree within 1e-12, the rate is that of any of them. Inside `jit` it has the ambient precision and no
+        The rate is computed from z - 1, for the dominant pole z of `zwidth.spectral_radius`. For soft walls the rate
+        has at least 11 digits, however small it is; for a pole pair near the unit circle its absolute error is about
+        1e-16. If the certified error bound is not below a thousandth of the rate, the rate is NaN. If the magnitudes of
+        some poles agree within 1e-12, the rate is that of any of them. Inside `jit` it has the ambient precision and no
         error bound.
 
     References:
