@@ -37,7 +37,7 @@ class StiffestWalls(NamedTuple):
 
     stiffness: np.ndarray  # K_max in N/m
     virtual_damping: np.ndarray  # in N s/m
-    frequency: np.ndarray  # of the pole pair on the unit circle, in Hz
+    frequency: np.ndarray  # frequency of the pole pair on the unit circle, in Hz
     kind: np.ndarray  # code of `zwidth.RidgeKind`
     status: np.ndarray  # code of `zwidth.Status`; the walls are NaN unless this code is 0
     searched: np.ndarray  # True if the scene was searched by itself

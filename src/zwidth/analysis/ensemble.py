@@ -48,7 +48,7 @@ class _NormalizedVariants(NamedTuple):
     values: dict[str, np.ndarray]  # varied parameters by dotted path
     d: np.ndarray  # delay in periods
     period: np.ndarray
-    mass: np.ndarray  # unit of mass, as `SceneParts.mass`
+    mass: np.ndarray  # unit of mass: the mass in kg that the force of the wall acts on
     usable: np.ndarray  # True for variants that can be evaluated at once
 
 
@@ -114,7 +114,7 @@ class Variants:
         return known and not (sampled or whole or changed or isinstance(velocity, FOAW) or window > LONGEST_WINDOW)
 
     def _map(self, function: Callable[..., tuple[np.ndarray, ...]], selected: np.ndarray) -> list[np.ndarray]:
-        """Apply a function of form, loops, sizes, devices and indices to the selected variants (`map_loops`)."""
+        """Apply a function to the loops of the selected variants, as described in `map_loops`."""
         values = {name: column[selected] for name, column in self.normalized.values.items()}
         values.setdefault("mass", np.full(selected.size, float(self.scene.device.mass)))
         return map_loops(self.scene, values, self.normalized.d[selected], function)

@@ -36,8 +36,8 @@ class SampledPlant(NamedTuple):
     """The sampled plant as the sum of a rigid mass and of first-order parts."""
 
     rigid: Plant  # zero-order-hold discretization of the rigid mass, with the fractional delay
-    poles: Sequence[Any]  # p of the other parts, numbers or arrays
-    residues: Sequence[Any]  # r of the other parts
+    poles: Sequence[Any]  # poles p of the first-order parts, numbers or arrays
+    residues: Sequence[Any]  # residues r of the first-order parts
     n_delay: Any  # integer delay n
     fraction: Any  # fractional delay f
 
@@ -135,7 +135,7 @@ def _expand_lag(lag: Sequence[Any]) -> tuple[list[Any], list[Any]]:
 
 
 def _solve_quadratic(w: Any, ratio: Any) -> list[Any]:
-    """Return the two roots of ``s^2 + 2 zeta w s + w^2``; a double root is split slightly.
+    """Return the two roots of ``s^2 + 2 zeta w s + w^2``; a double root is replaced by two close roots.
 
     Args:
         w: natural frequency.

@@ -98,7 +98,7 @@ def _discretize(
     monic = [value / denominator[0] for value in denominator]
     # Scale time so that all coefficients of the denominator are at most 1.
     sizes = [(abs(value).ln() / k).exp() for k, value in enumerate(monic) if k and value]
-    unit = max(sizes, default=Decimal(1))  # must not depend on ``time``, because responses of two times are combined
+    unit = max(sizes, default=Decimal(1))  # independent of ``time``, because responses at two times are combined
     block = np.full((order + 1, order + 1), Decimal(0), object)
     for k in range(order - 1):
         block[k, k + 1] = Decimal(1)

@@ -110,7 +110,7 @@ def tabulate(cells: NodeCells, values: Array, fill: float) -> Array:
 
 
 class LineCrossings(NamedTuple):
-    """LineCrossings of the stability boundary by one line per loop, in ascending order of t."""
+    """Crossings of the stability boundary by one line of walls per loop, in ascending order of the position t."""
 
     t: Array  # shape (crossings, loops); infinite for unused entries
     leaving: Array  # number of poles that leave the unit circle as t increases, minus those that enter it
@@ -137,7 +137,7 @@ class LineCrossings(NamedTuple):
 
 
 def sort_crossings(t: Array, leaving: Array, w: Array, cell: Array, doubtful: Array) -> LineCrossings:
-    """Return crossings in ascending order of t."""
+    """Sort crossings by their position t on the line, in ascending order."""
     xp = namespace(t)
     t = xp.where(xp.isnan(t), np.inf, t)
     order = xp.argsort(t, 0)
@@ -214,7 +214,7 @@ def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
 
 
 def _take_line(line: Line, index: Array, n: int) -> Line:
-    """Return the lines of the loops with the given indices."""
+    """Return the lines of walls of the loops with the given indices."""
     xp = namespace(index, *line)
     return Line(*(xp.broadcast_to(xp.asarray(part), (n,))[index] for part in line))
 

@@ -64,7 +64,7 @@ Tabulate = Callable[[LoopRoots, np.ndarray, np.ndarray, np.ndarray], OpenLoop]
 
 
 class TabulatedDelay(NamedTuple):
-    """The open loops of walls at one delay, described by their gain crossovers."""
+    """The gain crossovers of the open loops L of walls at one delay."""
 
     delay: float  # in periods
     w: np.ndarray  # gain crossovers, ascending, shape (walls, crossovers), padded with NaN
@@ -307,8 +307,8 @@ def _solve_delays(
         F = estimate.jet(circle_points(w[active]))
         L = Jet(alpha[active] + beta[active] * F.value, beta[active] * F.slope).times(G)
         residual, d_w, d_delay = np.log(-L.value), L.slope / L.value, by_delay / G.value
-        # L does not depend on the delay if the device comes to rest within a period; both steps are then NaN. The
-        # determinant is positive if the pole moves outward as the delay increases.
+        # If the device comes to rest within a period, L does not depend on the delay, and both steps are NaN. A
+        # positive determinant means that the pole moves outward as the delay increases.
         determinant = (d_delay * d_w.conj()).imag
         step = (residual * d_w.conj()).imag / determinant
         w[active] -= (d_delay * residual.conj()).imag / determinant

@@ -32,8 +32,8 @@ from zwidth.units.display import compact_repr
 from zwidth.units.quantities import WALL
 
 RESPONSE_TOLERANCE = 1e-8  # largest relative difference of q = -1/G computed from matrices and from roots
-# Sixth-order central difference, as pairs of offset (in steps) and weight, for velocity estimates that accept only
-# floats; and its step, relative to the parameter.
+# Pairs of offset (in steps) and weight of a sixth-order central difference, and its step relative to the parameter. The
+# difference is used for velocity estimates that accept only floats.
 CENTRAL_DIFFERENCE = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
 DIFFERENCE_STEP = 1e-3
 
@@ -188,7 +188,7 @@ def differentiate(
         except (ArithmeticError, np.linalg.LinAlgError):
             return Implicit(*(np.full((len(unknowns), *[size] * k), np.nan) for k in (1, 2)))
     if is_sampled:
-        # A sampled device is valid for one period and one delay only.
+        # A device in discrete time is valid for one period and one delay only, so these derivatives do not exist.
         for path in ("period", "delay"):
             _replace_derivatives(result, None, index[path])
     return result

@@ -22,7 +22,7 @@ from zwidth.model.velocity import Estimate
 # and condensed near zeros of G and poles of F that are close to the unit circle, where q or F changes fast.
 SPLIT = 0.3  # width of the two ranges with geometric spacing
 FIRST_NODE = 1e-3  # first node, relative to the distance of the nearest root from z = 1
-LAST_NODE = 1e-4  # pi - w of the last node, as in `stability.linear.curve.place_nodes`
+LAST_NODE = 1e-4  # scale of pi - w of the last node, as in `stability.linear.curve.place_nodes`
 LOW_RATIO, HIGH_RATIO = 0.2, 0.25  # steps in log w near 0, and in log(pi - w) near pi
 STEP, PHASE_STEP = 0.08, 0.4  # in rad between these ranges: largest step of w, and of the phases of powers of z
 BUCKET = 32  # the numbers of nodes in the ranges are multiples of this, so that many loops have arrays of equal shape
@@ -123,8 +123,8 @@ class Sizes(NamedTuple):
 def count_nodes(form: Form, loop: LoopBatch) -> np.ndarray:
     """Return the `Sizes` of each loop of a NumPy batch, shape (3, loops).
 
-    Loops of equal sizes can be computed together. The sizes of a loop do not depend on the other loops, so its results
-    do not depend on them either.
+    Loops of equal sizes can be computed together. Neither the sizes of a loop nor its results depend on the other
+    loops.
     """
     first, last = _find_ends(form, loop)
     counts = np.log(SPLIT / np.stack([first, last])) / np.array([[LOW_RATIO], [HIGH_RATIO]])
@@ -184,7 +184,7 @@ class Sampled(NamedTuple):
     loop: LoopBatch
     w: Array
     parts: tuple[Array, Array, Array]  # Im q, Im(q conj F), Im F
-    slopes: tuple[Array, Array, Array]  # their derivatives in w
+    slopes: tuple[Array, Array, Array]  # derivatives in w of the three ``parts``
     levels: tuple[Array, Array]  # Re(q conj F)/|F|^2 and Re F/|F|^2: the first minus alpha times the second is beta
     ends: Values  # q and F at z = -1
     resolved: Array  # for each loop: True if the nodes resolve q and F

@@ -26,7 +26,7 @@ from zwidth.model.velocity import Estimate
 from zwidth.numerics.polynomials import abs2
 from zwidth.stability.passivity import limit_margin, solve_larger_root
 
-# Settings of the search for the maximum of N.
+# Settings of the search for the maximum of the required damping N(w).
 N_NODES = 129  # number of angles w at which the search starts
 MAX_INTERVALS = 1 << 18  # largest number of undecided intervals in one round
 N_PARTS = 16  # number of parts into which an undecided interval of angles is divided
@@ -80,7 +80,7 @@ def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
 
 @dataclass(frozen=True)
 class PassivityCondition:
-    """Colgate's condition of passivity for one velocity estimate and one delay."""
+    """Colgate's passivity condition for one velocity estimate F and one delay n + f in periods."""
 
     quotient: Estimate  # E
     spring: float  # F(1)
@@ -118,7 +118,7 @@ class PassivityCondition:
         return value
 
     def require_damping(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the required damping N at angles in [0, pi]; ``alpha`` >= 0 includes the stiffness ``beta F(1)``."""
+        """Return the required damping N at angles w in [0, pi]; ``alpha`` >= 0 includes the stiffness ``beta F(1)``."""
         n, f = self.integer_delay, self.fractional_delay
         s = np.sin(0.5 * w)
         kernel = np.where(s == 0, 2.0 * n + 1.0, np.sin((n + 0.5) * w) / np.where(s == 0, 1.0, s))
@@ -172,7 +172,7 @@ def _multiply_bounds(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...])
 
 
 def _bound_power(exponent: int, like: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return bounds of z^exponent or z^-exponent and its first two derivatives in w, in the shape of ``like``."""
+    """Return bounds of z^exponent (or z^-exponent) and of its first two derivatives in w, in the shape of ``like``."""
     return 1.0 + 0.0 * like, exponent + 0.0 * like, float(exponent) ** 2 + 0.0 * like
 
 
@@ -183,7 +183,7 @@ def _bound_difference(low: np.ndarray, high: np.ndarray, offset: complex) -> tup
 
 
 def find_needed_damping(condition: PassivityCondition, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Return the maximum of N over all frequencies for each wall, with a relative error below 1e-13.
+    """Return the maximum of the required damping N(w) over all w for each wall, with a relative error below 1e-13.
 
     Args:
         condition: the condition for velocity estimate and delay.

@@ -52,7 +52,7 @@ class FactoredValue(NamedTuple):
 
 
 def _product(zeta: Array, offsets: Array, factor: float = 1.0) -> Jet:
-    """Return ``factor prod(zeta + offset)`` and its derivative in zeta."""
+    """Return the product of ``factor`` and all ``zeta + offset``, and its derivative in zeta = z - 1."""
     product = Jet(np.full_like(zeta, factor), np.zeros_like(zeta))
     for offset in offsets:
         product = product.times(Jet(zeta + offset, 1.0))
@@ -60,13 +60,13 @@ def _product(zeta: Array, offsets: Array, factor: float = 1.0) -> Jet:
 
 
 def _power(zeta: Array, exponent: int) -> Jet:
-    """Return ``z^exponent`` and its derivative in z."""
+    """Return ``z^exponent`` and its derivative in z, from zeta = z - 1."""
     lower = (1.0 + zeta) ** (exponent - 1) if exponent else np.ones_like(zeta)
     return Jet(lower * (1.0 + zeta) if exponent else lower, exponent * lower)
 
 
 def _difference(zeta: Array, window: int) -> Jet:
-    """Return ``(z^window - 1)/window`` and its derivative in z."""
+    """Return ``(z^window - 1)/window`` and its derivative in z, from zeta = z - 1."""
     power, slope = _power(zeta, window)
     log_z = 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -0.999))
     exponent = window * (log_z + 1j * np.arctan2(zeta.imag, 1.0 + zeta.real))
@@ -83,7 +83,7 @@ def log_modulus(zeta: Array) -> Array:
 
 
 def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> FactoredValue:
-    """Return P, its derivative in zeta and the scale of its rounding error, for arrays that broadcast."""
+    """Return the polynomial P, its derivative in zeta and the scale of its rounding error; the arrays broadcast."""
     f = loop.estimate
     delay = f.window + f.lag
     g_denominator = _product(zeta, loop.poles).times(_power(zeta, loop.lag))
@@ -105,8 +105,8 @@ def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
     monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
     zeta = np.linalg.eigvals(companion(monic)) - 1.0 + 0j
     _refine_poles(loop, alpha, beta, zeta, np.arange(len(zeta)))
-    # Aberth's steps keep real approximations real and complex pairs complex. If rounding errors have split a nearly
-    # double real pole into a complex pair of eigenvalues, or vice versa, they do not converge. Therefore multiply
+    # Aberth's steps keep real approximations real and complex pairs complex. They do not converge if rounding errors
+    # have turned two nearly equal real poles into a complex pair of eigenvalues, or vice versa. Therefore multiply
     # approximations that have not converged by different complex factors, and repeat.
     for restart in range(MAX_RESTARTS):
         P = evaluate_polynomial(loop, alpha[:, None], beta[:, None], zeta)
@@ -206,7 +206,8 @@ def is_marginal(loop: LoopRoots, alpha: float, beta: float) -> bool:
 
 
 # If a loop has more poles than MAX_COMPUTED_POLES, counting them in circles is faster than computing all of them,
-# except for a velocity window above MAX_COUNTED_WINDOW samples: it adds as many zeros, which makes counting slow.
+# except if the velocity window is longer than MAX_COUNTED_WINDOW samples. Such a window adds many zeros, which makes
+# counting slow.
 MAX_COMPUTED_POLES = 150
 MAX_COUNTED_WINDOW = 40
 
@@ -214,13 +215,13 @@ MAX_COUNTED_WINDOW = 40
 N_CIRCLES = 16  # circles per call
 MAX_ROUNDS = 24
 BRACKET_WIDTH = 4e-16  # target width, relative to max(1, |log radius|)
-MAX_BRACKET_WIDTH = 1e-6  # a wider final bracket, caused by inconclusive counts, means NaN
+MAX_BRACKET_WIDTH = 1e-6  # if the final bracket is wider, because counts were inconclusive, the result is NaN
 
 # Search for the dominant pole on the circle whose radius is the spectral radius.
 POINTS_PER_POLE = 8  # points on the half circle per pole at which P is evaluated
 MAX_STARTS = 16  # points from which Newton's method starts
 NEWTON_STEPS = 12
-ON_CIRCLE = 1e-6  # largest difference of log|z| from the log radius; bounded by `MAX_BRACKET_WIDTH`
+ON_CIRCLE = 1e-6  # largest difference between log|z| of the pole and the log radius
 
 # Largest |log radius| at which the computed radius may contradict the result of the stability test. For a larger
 # contradiction the radius is NaN, because either of the two may be wrong.
@@ -228,7 +229,7 @@ VERDICT_TOLERANCE = 1e-7
 
 
 def compute_log_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Return ``log max|z|`` over the poles of each wall, shape (walls,); NaN if it cannot be computed."""
+    """Return the logarithm of the spectral radius of each wall, shape (walls,); NaN if it cannot be computed."""
     if loop.order <= MAX_COMPUTED_POLES or loop.estimate.window > MAX_COUNTED_WINDOW:
         return log_modulus(compute_poles_minus_one(loop, alpha, beta)).max(-1)
     return np.array([_bracket_log_radius(loop, a, b) for a, b in zip(alpha.tolist(), beta.tolist(), strict=True)])
@@ -246,7 +247,7 @@ def compute_dominant_poles(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray)
 
 
 def _find_angle(loop: LoopRoots, alpha: float, beta: float, log_radius: float) -> float:
-    """Return the angle of the pole with a known log radius by Newton's method; NaN if it does not converge."""
+    """Return the angle of a pole with a known log|z|, by Newton's method; NaN if the method does not converge."""
     if not np.isfinite(log_radius):
         return np.nan
     angles = np.linspace(0.0, np.pi, POINTS_PER_POLE * loop.order)
@@ -292,7 +293,7 @@ def spectral_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, stable
 
 
 def _bracket_log_radius(loop: LoopRoots, alpha: float, beta: float) -> float:
-    """Return ``log max|z|`` of one wall, by narrowing a bracket with counts of the poles in circles."""
+    """Return the log of the spectral radius of one wall, by narrowing a bracket with counts of poles in circles."""
     if not (np.isfinite(alpha) and np.isfinite(beta)):
         return np.nan
     zeros, poles, gain, lag = factor_open_loop(loop, alpha, beta)

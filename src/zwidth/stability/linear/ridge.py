@@ -32,7 +32,7 @@ from zwidth.stability.linear.regions import StableSet
 from zwidth.stability.linear.rows import find_stable_intervals
 
 # Settings of the search for corners.
-CORNER_TOLERANCE = 1e-8  # difference of the two crossings in alpha at a corner, relative to alpha
+CORNER_TOLERANCE = 1e-8  # largest difference in alpha of the two crossings at a corner, relative to alpha
 NEAR_CORNER = 1e-5  # largest relative change of beta from its starting value; at an end of the curve, of alpha
 MAX_STEPS = 4  # Newton steps
 CONVERGED_STEP = 1e-15  # last Newton step, relative to beta
@@ -53,7 +53,7 @@ class Condition(IntEnum):
     PAIR = 0  # a pole pair on the unit circle
     MINUS_ONE = 1  # a pole at z = -1
     PLUS_ONE = 2  # a pole at z = 1
-    STATIONARY = 3  # d alpha/dw = 0 along the curve
+    STATIONARY = 3  # d alpha/dw = 0 along the boundary curve
     NO_DAMPING = 4  # beta = 0
 
 
