@@ -145,7 +145,7 @@ class LinearLoop:
             method: "auto", "crossover", "companion" or "certified".
             exact: K and B in SI units, which the method "certified" uses instead of the rounded alpha and beta.
         """
-        # Pass zeros for delta and d, because the device and the delay were already checked when the scene was created.
+        # Check only alpha and beta, with zeros in place of delta and d, because these were checked with the scene.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         if method == "certified":
@@ -177,7 +177,7 @@ class LinearLoop:
 
     def dominant_poles(self, alpha: np.ndarray, beta: np.ndarray) -> DominantPole:
         """Return the dominant pole of each wall, with times in periods; NaN for invalid walls."""
-        # Pass zeros for delta and d, because the device and the delay were already checked with the scene.
+        # Check only alpha and beta, with zeros in place of delta and d, because these were checked with the scene.
         status = wall_status(alpha, beta, np.float64(0.0), np.float64(0.0))
         alpha, beta = nan_beyond(WALL_RANGE, alpha, beta)
         stable = label_walls(self.boundary, alpha, beta).reshape(-1)

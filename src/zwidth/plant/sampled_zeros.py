@@ -70,7 +70,8 @@ def _expand_response(device: LinearDevice, period: float, fraction: float, digit
     response = _expand_numerator(transition, full, output)
     if fraction:
         # In each period, the newer force contributes z N(newer) to the numerator, and the older force N(full - newer).
-        # N denotes the numerator as a linear function of the state after the period.
+        # N(x) is the numerator of the response if x is the state at the end of a period with a held unit force; N is
+        # linear in x.
         newer = _discretize(denominator, numerator, Decimal(period) * (1 - Decimal(fraction)))[1]
         late = _expand_numerator(transition, newer, output)
         response = [a + b - c for a, b, c in zip([*late, 0], [0, *response], [0, *late], strict=True)]

@@ -57,7 +57,7 @@ def combine(line: Line, parts: tuple[Array, Array, Array]) -> Array:
 
 
 def find_position(line: Line, values: Values) -> Array:
-    """Return the position t of the wall of a line with a pole at the angle w, where k(w) = 0; from q and F at w."""
+    """Return the parameter t of that wall on a line which has a pole at the angle w, from the values q and F at w."""
     xp = namespace(values.q)
     direction = line.a1 + line.b1 * values.f
     distance = values.q - line.a0 - line.b0 * values.f

@@ -315,7 +315,8 @@ def count_poles_in_cell(
     (device_larger, device_larger_at_end, low), (other_larger, other_larger_at_end, high) = bounds
     certain = (device_larger == other_larger) & (device_larger_at_end == other_larger_at_end)
     start, stop, wall_at_end = _evaluate_end_arguments(circle, loop, device_larger, device_larger_at_end)
-    # At z = r and at z = -r, require |T| > |B| or that W has the same sign for all walls of the cell.
+    # The count is certain only if, at z = r and at z = -r, either |T| > |B| or the wall's factor W of B has the same
+    # sign for all walls of the grid cell.
     certain &= (device_larger | (np.abs(circle.wall) > wall_change)) & (
         device_larger_at_end | (np.abs(wall_at_end) > a * r + b * (1.0 + r))
     )

@@ -50,9 +50,9 @@ def _sine_and_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
 
 
 def _store_pair(value: Any, witness: Array) -> Any:
-    """Return a `Pair` (real and imaginary part) unchanged, but make XLA compute and store it once for several loops."""
-    # Without `materialize`, each of five loops would evaluate the sine and cosine series of the pair again, and a step
-    # would take 1.4 times as long.
+    """Return a `Pair` (real and imaginary part) unchanged, but make XLA compute it once and store it."""
+    # Without `materialize`, each of five loops of the compiled program would evaluate the sine and cosine series of the
+    # pair again, and a step would take 1.4 times as long.
     return Pair(*materialize((value.real, value.imag), witness))
 
 
