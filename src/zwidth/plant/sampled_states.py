@@ -46,7 +46,7 @@ class SampledStates(NamedTuple):
         return self.n_delay if self.late is None else self.n_delay + 1
 
     def controller(self, points: CirclePoints) -> Array:
-        """Return ``q = -1/G`` at points of the unit circle, differentiable in JAX because no pole or zero is computed."""
+        """Return ``q = -1/G`` at points of the unit circle. Without roots, it is differentiable in JAX."""
         xp = namespace(self.psi, points.w)
         zeta = points.z_minus_1[..., None]
         force = self.full + 0j * zeta if self.late is None else zeta * self.late + self.full
