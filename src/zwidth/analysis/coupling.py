@@ -14,6 +14,9 @@ from zwidth.core.errors import InputError
 from zwidth.stability.rigid.virtual_coupling import find_margin, find_stiffest
 from zwidth.units.display import compact_repr
 
+# Relative distance of the stiffest safe coupling from the limit; the search for the limit is accurate to about 1e-15.
+INWARD = 1e-12
+
 if TYPE_CHECKING:
     from zwidth.analysis.scene import Scene
     from zwidth.analysis.walls import Walls
@@ -79,6 +82,8 @@ def max_safe_coupling(scene: Scene) -> SafeCoupling:
         SafeCoupling(stiffness=7.698 kN/m, virtual_damping=2.81766 N s/m)
     """
     spring, damper = find_stiffest(_find_delay(scene))
+    # Reduce the stiffness slightly, so that `is_safe_for_every_world` is true in spite of rounding errors.
+    spring *= 1.0 - INWARD
     damping = float(scene.device.damping)
     return SafeCoupling(2.0 * spring * damping / float(scene.timing.period), damper * damping)
 

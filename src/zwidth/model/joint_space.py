@@ -314,7 +314,11 @@ def _load(mujoco: Any, model: Any) -> Any:
         raise InputError(f"model: got {model!r}; it must be a path or a mujoco.MjModel")
     path = Path(model).expanduser()
     if not path.is_file():
-        raise InputError(f"model: got {str(path)!r}, which is not a file; give the path of an .xml, .urdf or .mjb file")
+        text = str(model)
+        shown = text if len(text) <= 60 and text.isprintable() else f"a text of {len(text)} characters"
+        raise InputError(
+            f"model: got {shown!r}, which is not a file; give the path of an .xml, .urdf or .mjb file, or a MjModel"
+        )
     load = mujoco.MjModel.from_binary_path if path.suffix == ".mjb" else mujoco.MjModel.from_xml_path
     try:
         return load(str(path))

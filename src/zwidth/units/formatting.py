@@ -33,7 +33,8 @@ def plain(value: float, digits: int = 4) -> str:
 def with_unit(value: float, unit: str, digits: int = 4) -> str:
     """Format a quantity with an SI prefix of its unit, as in ``19.87 kN/m``, and masses in grams, ``100.0 g``.
 
-    Numbers without unit, "1" or "", have no prefix. Inertias are in g cm^2, as in data sheets of motors.
+    Numbers without unit, "1" or "", and reciprocal units such as "1/s" have no prefix. Inertias are in g cm^2, as in
+    data sheets of motors.
     """
     if unit in ("", "1"):
         return plain(value, digits)
@@ -43,6 +44,8 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
         value, unit = 1e3 * value, "g"
     if not math.isfinite(value) or value == 0:
         return f"{plain(value)} {unit}" if value == 0 else plain(value)
+    if unit.startswith("1/"):
+        return f"{plain(value, digits)} {unit}"
     power = min(9, max(-9, 3 * math.floor(math.log10(abs(value)) / 3)))
     # Use the next prefix if rounding yields 1000, as for 999.96 with four digits.
     if abs(float(f"{value / 10**power:.{digits - 1}e}")) >= 1000 and power < 9:

@@ -56,6 +56,7 @@ def test_limits(n_delay, without_damper, stiffest, virtual_damping):
     top = scene.max_safe_coupling()
     assert top.stiffness == pytest.approx(stiffest, rel=1e-4)
     assert top.virtual_damping == pytest.approx(virtual_damping, abs=0.01)
+    assert scene.is_safe_for_every_world(*top)
     assert scene.is_safe_for_every_world(0.999 * top.stiffness, top.virtual_damping)
     assert not scene.is_safe_for_every_world(1.001 * top.stiffness, top.virtual_damping)
 
@@ -88,6 +89,14 @@ def test_no_passive_world_makes_a_safe_coupling_unstable():
         else:
             unstable_beyond += radius > 1 + 1e-9
     assert unstable_beyond > 10
+
+
+def test_stiffest_safe_coupling_is_safe():
+    rng = np.random.default_rng(3)
+    for _ in range(100):
+        mass, damping = 10 ** rng.uniform(-3, 1), 10 ** rng.uniform(-3, 2)
+        scene = make_scene(int(rng.integers(0, 8)), mass, damping)
+        assert scene.is_safe_for_every_world(*scene.max_safe_coupling())
 
 
 def test_units_and_wall_of_the_scene():
