@@ -22,13 +22,14 @@ from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError, describe_choice
 from zwidth.core.status import RidgeKind, Status
 from zwidth.core.types import ArrayLike
+from zwidth.model.checks import read_texts
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.parameter_paths import find_parts
 from zwidth.numerics.evaluate import as_float64, join_shapes
 from zwidth.stability.results import RidgePoint
 from zwidth.stability.rigid.ridge import alpha_max
 from zwidth.units.display import compact_repr
-from zwidth.units.quantities import WALL
+from zwidth.units.quantities import FIELDS, WALL
 
 
 @compact_repr(stiffness="N/m", virtual_damping="N s/m", frequency="Hz", kind=RidgeKind)
@@ -53,8 +54,8 @@ def stiffest_walls(
 
     Args:
         scenes: scenes of any kinds; or one scene together with ``parameters``.
-        parameters: arrays of values in SI units by dotted path, such as ``{"velocity.cutoff": [50, 100]}``. They
-            broadcast; all other parameters are those of the scene.
+        parameters: arrays of values by dotted path, in SI units or as texts with units, such as
+            ``{"velocity.cutoff": [50, 100]}``. They broadcast; all other parameters are those of the scene.
         negative_damping: as for `Scene.max_stiffness`.
 
     Returns:
@@ -115,7 +116,8 @@ def _vary_scene(scene: SceneOptima, parameters: Mapping[str, ArrayLike], negativ
     for name in parameters:
         if name not in known:
             raise InputError(f"parameters: {describe_choice(name, tuple(known))}")
-    columns = {name: as_float64(name, value) for name, value in parameters.items()}
+    units = {name: scene.unit_system[FIELDS[name].unit] if name in FIELDS else "" for name in parameters}
+    columns = {name: as_float64(name, read_texts(name, value, units[name])) for name, value in parameters.items()}
     shape = join_shapes((name, column.shape) for name, column in columns.items()) if columns else ()
     drawn = {name: np.broadcast_to(column, shape).ravel() for name, column in columns.items()}
     variants = Variants(scene, drawn or {"mass": np.full(1, float(scene.device.mass))})

@@ -101,7 +101,8 @@ def from_mass_matrix(
         ) from None
     w, D, S = _reduce(*_normalize(factor, vector, damper, spring))
     if len(w) == 1 and S[0, 0] == 0.0:
-        mass = 1.0 / float(w @ w)
+        # Solve with M instead of its factor, because a product of two square roots is not exact.
+        mass = 1.0 / float(vector @ np.linalg.solve(inertia, vector))
         return Device(mass, float(D[0, 0]) * mass, rotary=rotary)
     return LinearDevice(_realize(w, D, S))
 

@@ -221,7 +221,7 @@ def _list_minima(values: Array) -> Array:
 
 
 def select_gain_margin(stable: Array, w: Array, gains: Array) -> tuple[Array, Array]:
-    """Return the gain margin and the angle of its phase crossover, the one with |L| closest to 1 (logarithmic scale).
+    """Return the gain margin, i.e. the gain factor closest to 1 on a logarithmic scale, and the angle of its crossover.
 
     Args:
         stable: True if the closed loop is stable, shape (loops,).

@@ -167,3 +167,9 @@ def test_measured_devices_are_searched_one_by_one():
     top = scene.max_stiffness()
     np.testing.assert_allclose(walls.stiffness, [top.stiffness], rtol=0, atol=0)
     assert walls.searched.all()
+
+
+def test_values_may_be_texts_with_units():
+    walls = stiffest_walls(SCENES["low-pass"], {"mass": ["100 g", "0.2 kg"], "delay": ["1 ms", "2 ms"]})
+    numbers = stiffest_walls(SCENES["low-pass"], {"mass": [0.1, 0.2], "delay": [1e-3, 2e-3]})
+    np.testing.assert_array_equal(walls.stiffness, numbers.stiffness)

@@ -126,6 +126,7 @@ def test_response_equals_that_of_the_joints():
 
 def test_lists_as_a_user_types_them():
     assert zwidth.from_mass_matrix([[2, 0], [0, 1]], direction=[0, 3]) == zwidth.Device(1.0)
+    assert zwidth.from_mass_matrix([[2, 0], [0, 1]], 1, direction=[1, 0]).mass == 2.0
     assert zwidth.from_mass_matrix([[4]], 2, jacobian=[[2]]) == zwidth.Device(1.0, 0.5)
     knob = zwidth.from_mass_matrix([[1e-4]], 1e-4, rotary=True)
     assert knob == zwidth.Device(1e-4, 1e-4, rotary=True)

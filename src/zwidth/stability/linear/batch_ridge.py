@@ -62,7 +62,7 @@ CLEAR = 1e-12  # smallest relative distance between two crossings of a line at w
 
 
 class Stiffest(NamedTuple):
-    """Stiffest stable wall of each loop, shape (loops,); valid only where ``confirmed``."""
+    """Stiffest stable wall of each loop: arrays of shape (loops,), valid only if ``confirmed`` is True."""
 
     alpha: Array
     beta: Array

@@ -84,7 +84,7 @@ def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
 
 
 def _find_short_end(short_curve: Any) -> tuple[Array, Array]:
-    """Return s at the end of the lobe for n = 0, and whether the lobe ends in the corner (alpha > 0 up to s = 1)."""
+    """Return s at the end of the lobe for n = 0, and True if that is the corner s = 1, with alpha > 0 up to it."""
     a, s, t = short_curve[2]
     xp = namespace(a)
     discriminant = s * s - 4.0 * a * t

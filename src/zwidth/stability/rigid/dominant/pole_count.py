@@ -254,8 +254,8 @@ def count_poles(log_r: Array, loop: LoopFactors, fractional: bool, single: bool 
         # causes, in rounding units. This error is large if |T| and |B| have nearly the same slope at the crossover.
         return theta, w, rate * circle.sum_magnitudes(x) / (xp.abs(circle.differentiate(x)) * xp.sqrt(x * (1.0 - x)))
 
-    # For three zeros, use `apply_each`, so that JAX traces the function only once; this halves the compile time. For
-    # two zeros `apply_each` would double the run time.
+    # With three zeros, `apply_each` lets JAX trace the function only once, which halves the compile time. With two
+    # zeros, `apply_each` would double the run time.
     phases = list(map(evaluate_phase, zeros)) if len(zeros) < 3 else apply_each(evaluate_phase, zeros, xp)
     for valid, (theta, w, shift) in zip(valid_masks, phases, strict=True):
         turns = theta / (2.0 * np.pi)
