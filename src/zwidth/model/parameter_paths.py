@@ -16,9 +16,11 @@ from zwidth.core.errors import InputError, describe_choice
 from zwidth.core.xp import is_jax
 from zwidth.model.actuator import Actuator
 from zwidth.model.device import Coupling, Device
+from zwidth.model.feedback import Feedback, IntegralFeedback
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.operator import Operator
+from zwidth.model.position import Position
 from zwidth.model.timing import Timing
 from zwidth.model.velocity import BackwardDifference, Velocity, name_estimate
 from zwidth.model.wall import NoWall, VirtualWall
@@ -39,6 +41,10 @@ class Parts(Protocol):
     def velocity(self) -> Velocity: ...
     @property
     def operator(self) -> Operator | None: ...
+    @property
+    def position(self) -> Position | None: ...
+    @property
+    def feedback(self) -> Feedback | IntegralFeedback | None: ...
     def _rebuild(self) -> Self: ...
 
 
@@ -50,7 +56,7 @@ PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator}
 """Classes of the optional parts of a scene, by name, in the order in which descriptions list these parts."""
 _OF_DEVICE = ("coupling", "actuator")  # optional parts that are fields of the device
 # Fields of the scene with whose names the paths of their parameters begin.
-_NAMED = ("velocity", *(name for name in PARTS if name not in _OF_DEVICE))
+_NAMED = ("velocity", "position", "feedback", *(name for name in PARTS if name not in _OF_DEVICE))
 
 
 def find_parts(scene: Parts) -> dict[str, Any]:
