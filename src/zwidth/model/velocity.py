@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -98,7 +98,7 @@ class BackwardDifference(_Checked):
 
     def estimate(self, period: Any) -> Estimate:
         """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
-        return Estimate(window=1, gain=_ratio(period, self.coded_period))
+        return Estimate(window=1, gain=get_coded_ratio(period, self.coded_period))
 
 
 @dataclass(frozen=True, repr=False)
@@ -118,7 +118,7 @@ class WindowedDifference(_Checked):
 
     def estimate(self, period: Any) -> Estimate:
         """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
-        return Estimate(window=self.samples, gain=_ratio(period, self.coded_period))
+        return Estimate(window=self.samples, gain=get_coded_ratio(period, self.coded_period))
 
 
 @dataclass(frozen=True, repr=False)
@@ -158,13 +158,13 @@ class LowPass(_Checked):
         coded = period if self.coded_period is None else self.coded_period
         if self.time_constant is None:
             check_cutoff(self.cutoff, coded)
-            decay = 2.0 * _pi(coded) * self.cutoff * coded
+            decay = 2.0 * get_pi(coded) * self.cutoff * coded
         else:
             decay = coded / self.time_constant
         xp = namespace(decay)
         offset = -xp.expm1(-decay)
-        poles = xp.stack([_as_complex(xp.asarray(offset))] * self.order)
-        gain = offset**self.order * _ratio(period, self.coded_period)
+        poles = xp.stack([as_complex(xp.asarray(offset))] * self.order)
+        gain = offset**self.order * get_coded_ratio(period, self.coded_period)
         return Estimate(1, gain, -self.order, poles=poles)
 
 
@@ -192,49 +192,42 @@ class Butterworth(_Checked):
         # The analog poles are on a circle, whose radius is prewarped so that the bilinear transform s = (z - 1)/(z + 1)
         # yields the cut-off frequency.
         xp = namespace(self.cutoff, coded)
-        size = xp.tan(_pi(coded) * self.cutoff * coded)
-        angles = _pi(coded) * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
+        size = xp.tan(get_pi(coded) * self.cutoff * coded)
+        angles = get_pi(coded) * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
         analog = size * xp.asarray(_unit_vectors(angles)).reshape(-1, *[1] * np.ndim(size))
         offsets = -2.0 * analog / (1.0 - analog)
-        gain = xp.prod(offsets, 0).real * 0.5**self.order * _ratio(period, self.coded_period)
+        gain = xp.prod(offsets, 0).real * 0.5**self.order * get_coded_ratio(period, self.coded_period)
         return Estimate(1, gain, zeros=np.full(self.order, 2.0 + 0j), poles=offsets)
 
 
 @dataclass(frozen=True, repr=False)
-class VelocityFilter(Part):
-    """Any linear estimate ``F(z) = numerator/denominator``, from position in m to velocity in m/s.
+class RationalFilter(Part):
+    """Base class of filters that are given by the coefficients of their transfer function ``numerator/denominator``.
 
     Args:
-        numerator: coefficients in 1/s, highest power of z first; or a list of sections in series, each a list of
-            coefficients.
-        denominator: coefficients or sections, as for the numerator. The degree must be at least that of the numerator
-            (a causal filter), and all roots must be inside the unit circle. Use sections for a filter of high order,
-            because rounding errors in the coefficients of a single polynomial move its poles.
-
-    Example:
-        >>> import zwidth
-        >>> zwidth.VelocityFilter([1000, -1000], [1, 0]).estimate(1e-3).gain
-        1.0
-        >>> from scipy import signal
-        >>> sos = signal.butter(8, 2, fs=1000, output="sos")
-        >>> velocity = zwidth.VelocityFilter([[1000, -1000], *sos[:, :3]], [[1, 0], *sos[:, 3:]])
+        numerator: coefficients, highest power of z first; or a list of sections in series, each a list of coefficients.
+        denominator: coefficients or sections, of at least the degree of the numerator.
     """
+
+    _owner = "velocity"
+    _poles_inside: ClassVar[bool] = True  # all poles must be inside the unit circle
 
     numerator: Any
     denominator: Any
 
     def __post_init__(self) -> None:
         for name in ("numerator", "denominator"):
-            sections: tuple[Any, ...] = read_sections(name, getattr(self, name))
+            sections: tuple[Any, ...] = read_sections(f"{self._owner}.{name}", getattr(self, name))
             (first, *others) = sections
             object.__setattr__(self, name, sections if others else first)
         top, bottom = (sum(len(section) - 1 for section in part) for part in self._sections)
         if top > bottom:
             raise InputError(
-                f"velocity.numerator: got degree {top} over a denominator of degree {bottom}, so the filter needs "
+                f"{self._owner}.numerator: got degree {top} over a denominator of degree {bottom}, so the filter needs "
                 "future samples; multiply the denominator by z"
             )
-        self._check_poles()
+        if self._poles_inside:
+            self._check_poles()
 
     def _check_poles(self) -> None:
         """Raise `InputError` with the likely cause if a pole is on or outside the unit circle."""
@@ -242,14 +235,14 @@ class VelocityFilter(Part):
         largest = np.max(np.abs(1.0 - poles), initial=0.0)
         if largest < 1.0:
             return
-        got = f"velocity.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
+        got = f"{self._owner}.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
         # Report rounding errors of the coefficients as the cause only if several poles are near z = 1, because they
         # hardly move a single pole; a single pole at z = 1 is probably an intended integrator.
         slow = np.abs(poles) < NEXT_TO_ONE
         if np.sum(slow) != 1 and any(is_rounding(section) for section in self._sections[1]):
             cause = "Cause: rounding errors of the coefficients; use sections in series (scipy.signal: output='sos')"
         elif np.any(poles[slow] == 0):
-            cause = "Integral action: model controller and sampled device in series as one LinearDevice (K = 1)"
+            cause = "For an integral gain, pass feedback=zwidth.Feedback.integral(gain) to the scene"
         else:
             cause = "Check the coefficients: highest power first"
         raise InputError(got + cause)
@@ -271,21 +264,46 @@ class VelocityFilter(Part):
             roots.append(np.concatenate([offsets(np.trim_zeros(section, "b")) for section in sections]))
         return roots[0], roots[1], trailing[1] - trailing[0]
 
-    def estimate(self, period: Any) -> Estimate:
-        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
+    def factor(self, unit: Any) -> Estimate:
+        """Return the transfer function multiplied by ``unit``, in factored form."""
         tops, bottoms = self._sections
-        gain = period
+        gain = unit
         for section in tops:
             gain = section[0] * gain
         for section in bottoms:
             gain = gain / section[0]
-        if hasattr(period, "mid"):
-            # If the period is a ball, compute the roots as balls from the exact coefficients, because zeros at z = 1
-            # must be exact.
+        if hasattr(unit, "mid"):
+            # If the unit is a ball, compute the roots as balls from the exact coefficients, because zeros at z = 1 must
+            # be exact.
             exact = (np.concatenate([ball_offsets(section) for section in part]) for part in (tops, bottoms))
             return Estimate(0, gain, 0, *exact)
         zeros, poles, lag = self._roots
         return Estimate(0, gain, lag, zeros, poles)
+
+
+@dataclass(frozen=True, repr=False)
+class VelocityFilter(RationalFilter):
+    """Any linear estimate ``F(z) = numerator/denominator``, from position in m to velocity in m/s.
+
+    Args:
+        numerator: coefficients in 1/s, highest power of z first; or a list of sections in series, each a list of
+            coefficients.
+        denominator: coefficients or sections, as for the numerator. The degree must be at least that of the numerator
+            (a causal filter), and all roots must be inside the unit circle. Use sections for a filter of high order,
+            because rounding errors in the coefficients of a single polynomial move its poles.
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.VelocityFilter([1000, -1000], [1, 0]).estimate(1e-3).gain
+        1.0
+        >>> from scipy import signal
+        >>> sos = signal.butter(8, 2, fs=1000, output="sos")
+        >>> velocity = zwidth.VelocityFilter([[1000, -1000], *sos[:, :3]], [[1, 0], *sos[:, 3:]])
+    """
+
+    def estimate(self, period: Any) -> Estimate:
+        """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
+        return self.factor(period)
 
 
 @dataclass(frozen=True, repr=False)
@@ -348,18 +366,18 @@ def is_plain(velocity: Velocity, period: Any) -> bool:
     return estimate.window == 1 and estimate.is_difference and isinstance(estimate.gain, float) and estimate.gain == 1.0
 
 
-def check_cutoff(cutoff: Any, period: Any) -> None:
+def check_cutoff(cutoff: Any, period: Any, owner: str = "velocity") -> None:
     """Raise `InputError` if a cut-off frequency is not below the Nyquist frequency."""
     if is_jax(cutoff) or is_jax(period):
         return
     if np.any(cutoff * period >= 0.5):
         raise InputError(
-            f"velocity.cutoff: got {cutoff:g} Hz; it must be below half the sampling rate, {0.5 / period:g} Hz; "
+            f"{owner}.cutoff: got {cutoff:g} Hz; it must be below half the sampling rate, {0.5 / period:g} Hz; "
             "lower it, or remove the filter"
         )
 
 
-def _ratio(period: Any, coded: Any) -> Any:
+def get_coded_ratio(period: Any, coded: Any) -> Any:
     """Return the period of the loop divided by the coded period; 1 if the coded period is None."""
     return 1.0 if coded is None else period / coded
 
@@ -367,12 +385,12 @@ def _ratio(period: Any, coded: Any) -> Any:
 # The functions below implement operations that differ between floats, JAX arrays and balls.
 
 
-def _pi(like: Any) -> Any:
+def get_pi(like: Any) -> Any:
     """Return pi as a ball if the argument is a ball, otherwise as a float."""
     return like.pi() if hasattr(like, "pi") else np.pi
 
 
-def _as_complex(value: Any) -> Any:
+def as_complex(value: Any) -> Any:
     """Convert an array to complex dtype; return an array of balls unchanged, because balls need no conversion."""
     return value if value.dtype == object else value + 0j
 
