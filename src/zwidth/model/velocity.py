@@ -30,6 +30,7 @@ from zwidth.model.filter_sections import (
     offsets,
     read_sections,
 )
+from zwidth.model.system_forms import pair_roots, read_roots, read_sos
 from zwidth.units.quantities import Range
 
 
@@ -202,28 +203,41 @@ class Butterworth(_Checked):
 
 @dataclass(frozen=True, repr=False)
 class VelocityFilter(Part):
-    """Any linear estimate ``F(z) = numerator/denominator``, from position in m to velocity in m/s.
+    """Any linear estimate F(z) from position in m to velocity in m/s, by coefficients, sections or roots.
+
+    F is the product of all given forms: numerator/denominator, second-order sections, and zeros, poles and gain. For
+    example, a difference as numerator and denominator, and the sections of a low-pass.
 
     Args:
         numerator: coefficients in 1/s, highest power of z first; or a list of sections in series, each a list of
             coefficients.
-        denominator: coefficients or sections, as for the numerator. The degree must be at least that of the numerator
-            (a causal filter), and all roots must be inside the unit circle. Use sections for a filter of high order,
-            because rounding errors in the coefficients of a single polynomial move its poles.
+        denominator: coefficients or sections, as for the numerator. The degree of F's denominator must be at least that
+            of its numerator (a causal filter), and all poles must be inside the unit circle. Use sections or roots for
+            a filter of high order, because rounding errors in the coefficients of a single polynomial move its poles.
+        sos: second-order sections, rows of the coefficients b0 b1 b2 a0 a1 a2, as of scipy.signal with
+            ``output="sos"``.
+        zeros: zeros of F; complex zeros together with their conjugates. Default: none, if ``poles`` is given.
+        poles: poles of F, as the zeros; requires ``gain``.
+        gain: ratio of the leading coefficients; requires ``poles``.
 
     Example:
         >>> import zwidth
         >>> zwidth.VelocityFilter([1000, -1000], [1, 0]).estimate(1e-3).gain
         1.0
         >>> from scipy import signal
-        >>> sos = signal.butter(8, 2, fs=1000, output="sos")
-        >>> velocity = zwidth.VelocityFilter([[1000, -1000], *sos[:, :3]], [[1, 0], *sos[:, 3:]])
+        >>> low_pass = signal.butter(8, 2, fs=1000, output="sos")
+        >>> velocity = zwidth.VelocityFilter([1000, -1000], [1, 0], sos=low_pass)
     """
 
-    numerator: Any
-    denominator: Any
+    numerator: Any = None
+    denominator: Any = None
+    sos: Any = None
+    zeros: Any = None
+    poles: Any = None
+    gain: Any = None
 
     def __post_init__(self) -> None:
+        self._combine_forms()
         for name in ("numerator", "denominator"):
             sections: tuple[Any, ...] = read_sections(name, getattr(self, name))
             (first, *others) = sections
@@ -236,6 +250,36 @@ class VelocityFilter(Part):
             )
         self._check_poles()
 
+    def _combine_forms(self) -> None:
+        """Convert all given forms to sections of numerator and denominator, and set the other fields to None."""
+        if (self.numerator is None) != (self.denominator is None) or (self.poles is None) != (self.gain is None):
+            raise InputError("velocity: got half of a form; give numerator and denominator, sos, or poles and gain")
+        top, bottom = ([] if part is None else [part] for part in (self.numerator, self.denominator))
+        if self.sos is not None:
+            rows = read_sos("velocity.sos", self.sos)
+            top, bottom = [*top, rows[:, :3]], [*bottom, rows[:, 3:]]
+        if self.poles is not None:
+            try:
+                (gain,) = np.ravel(self.gain).astype(float).tolist()
+                zeros, poles = (pair_roots(read_roots(roots)) for roots in (self.zeros, self.poles))
+            except (TypeError, ValueError, OverflowError):
+                raise InputError(
+                    f"velocity.poles: got {self.zeros!r}, {self.poles!r}, {self.gain!r}; zeros and poles must be "
+                    "numbers, complex ones with their conjugates, and the gain one number"
+                ) from None
+            top, bottom = [*top, [[gain], *zeros]], [*bottom, [[1.0], *poles]]
+        elif self.zeros is not None:
+            raise InputError("velocity.zeros: got zeros without poles; add poles and gain")
+        if not top:
+            raise InputError("velocity: got no coefficients; give numerator and denominator, sos, or poles and gain")
+        if self.sos is None and self.poles is None:
+            return
+        for name, forms in (("numerator", top), ("denominator", bottom)):
+            sections = [section for form in forms for section in read_sections(name, form)]
+            object.__setattr__(self, name, sections)
+        for name in ("sos", "zeros", "poles", "gain"):
+            object.__setattr__(self, name, None)
+
     def _check_poles(self) -> None:
         """Raise `InputError` with the likely cause if a pole is on or outside the unit circle."""
         poles = self._roots[1]
@@ -247,7 +291,9 @@ class VelocityFilter(Part):
         # hardly move a single pole; a single pole at z = 1 is probably an intended integrator.
         slow = np.abs(poles) < NEXT_TO_ONE
         if np.sum(slow) != 1 and any(is_rounding(section) for section in self._sections[1]):
-            cause = "Cause: rounding errors of the coefficients; use sections in series (scipy.signal: output='sos')"
+            cause = (
+                "Cause: rounding errors of the coefficients; use sections in series (sos=, scipy.signal: output='sos')"
+            )
         elif np.any(poles[slow] == 0):
             cause = "Integral action: model controller and sampled device in series as one LinearDevice (K = 1)"
         else:
