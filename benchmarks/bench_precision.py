@@ -4,12 +4,13 @@
     python benchmarks/bench_precision.py [--points 1000000] [--checked 1000] [--runs 7]
                                          [--write benchmarks/results/precision.md]
 
-All functions are called inside `jit` with JAX arrays. Speeds are ratios of times that are measured alternately.
+All functions are called inside `jit` with JAX arrays. Speeds are ratios of CPU times that are measured alternately.
 """
 
 from __future__ import annotations
 
 import platform
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -58,10 +59,10 @@ def find_errors(walls: Walls, name: str) -> np.ndarray:
     return np.abs(np.where(same, 0.0, rounded) - np.where(same, 0.0, exact)) / size
 
 
-def head_row(first: str, cells: Any) -> list[str]:
-    """Return the two first lines of a table in Markdown."""
+def head_row(first: str, cells: Iterable[str], align: str = "--:") -> list[str]:
+    """Return the two first lines of a table in Markdown; ``align`` is the alignment of the first column."""
     cells = list(cells)
-    return [f"| {first} | {' | '.join(cells)} |", f"|--:|{'--:|' * len(cells)}"]
+    return [f"| {first} | {' | '.join(cells)} |", f"|{align}|{'--:|' * len(cells)}"]
 
 
 def format_error(error: float) -> str:
@@ -77,7 +78,7 @@ def largest(errors: np.ndarray, chosen: Any = True) -> str:
     return f"{text} ({missing} NaN)" if missing else text
 
 
-def tabulate_labels(walls: Walls, distance: np.ndarray, wrong: np.ndarray) -> list[str]:
+def tabulate_labels(distance: np.ndarray, wrong: np.ndarray) -> list[str]:
     """Return the table of the largest distances of wrong labels, by delay and damping."""
     lines = head_row("d", (f"delta = {delta:g}" for delta in DELTAS))
     for d, distances, is_wrong in zip(DELAYS, distance, wrong, strict=True):
@@ -88,7 +89,7 @@ def tabulate_labels(walls: Walls, distance: np.ndarray, wrong: np.ndarray) -> li
 
 def tabulate_distances(distance: np.ndarray, wrong: np.ndarray, errors: dict[str, np.ndarray]) -> list[str]:
     """Return the table of the errors by the distance from the boundary."""
-    lines = head_row("distance", ["wrong labels", *errors])
+    lines = head_row("distance", ["wrong labels", *errors], "---")
     for decade in range(NEAREST, FARTHEST + 1):
         chosen = (distance >= 10.0**decade) & (distance < 10.0 ** (decade + 1))
         cells = [f"{100 * wrong[chosen].mean():.2g} %", *(largest(error, chosen) for error in errors.values())]
@@ -96,24 +97,42 @@ def tabulate_distances(distance: np.ndarray, wrong: np.ndarray, errors: dict[str
     return lines
 
 
-def tabulate_speeds(points: int, runs: int) -> list[str]:
-    """Return the table of the times of float32 and mixed precision, divided by those of float64, and their labels."""
+def tabulate_speeds(points: int, runs: int) -> tuple[list[str], dict[str, list[float]]]:
+    """Return the table of times and labels of float32 and mixed precision, and the times relative to float64."""
     lines = head_row("d", ["float32: time", "mixed: time", "float32: wrong", "mixed: wrong", "mixed: in float64"])
+    ratios: dict[str, list[float]] = {"float32": [], "mixed": []}
     for d in DELAYS:
         walls = scattered(d, points)
         calls = {name: prepare(function, walls, dtype) for name, (function, dtype) in LABELS.items()}
         labels = {name: np.asarray(call()) for name, call in calls.items()}
         # Measure the three precisions alternately, so that other programs slow down all of them.
-        seconds = {name: np.inf for name in calls}
+        seconds = dict.fromkeys(calls, np.inf)
         for _ in range(runs):
             for name, call in calls.items():
-                seconds[name] = min(seconds[name], float(time_calls(call, 1)[0].min()))
-        ratios = [f"{seconds[name] / seconds['float64']:.2g}" for name in ("float32", "mixed")]
-        wrong = [f"{np.sum(labels[name] != labels['float64']):,}" for name in ("float32", "mixed")]
-        is_open = prepare(lambda *wall: label_in_float32(*wall, ANY)[1], walls, "float64")()
-        lines.append(f"| {d:g} | {' | '.join([*ratios, *wrong, f'{np.sum(np.asarray(is_open)):,}'])} |")
+                seconds[name] = min(seconds[name], float(time_calls(call, 1)[1].min()))
+        for name, values in ratios.items():
+            values.append(seconds[name] / seconds["float64"])
+        is_open = prepare(lambda *wall: label_in_float32(*wall, kind=ANY)[1], walls, "float64")()
+        cells = [f"{values[-1]:.2g}" for values in ratios.values()]
+        cells += [f"{np.sum(labels[name] != labels['float64']):,}" for name in ratios]
+        lines.append(f"| {d:g} | {' | '.join([*cells, f'{np.sum(np.asarray(is_open)):,}'])} |")
         print(lines[-1], flush=True)
-    return lines
+    return lines, ratios
+
+
+def tabulate_choice(farthest: float, ratios: dict[str, list[float]]) -> list[str]:
+    """Return the table of the precisions: selection, error, time and recommended use."""
+    times = {name: f"{min(values):.1f} to {max(values):.1f}" for name, values in ratios.items()}
+    x64 = '`jax.config.update("jax_enable_x64", True)`'
+    return [
+        "| precision | selection | distance of wrong labels | time on a CPU | recommended use |",
+        "|---|---|--:|--:|---|",
+        f"| float64 | direct calls; inside `jit` after {x64} | rounding errors of float64 | 1 | always; the default |",
+        f'| mixed | `is_stable(..., precision="mixed")`; inside `jit` after {x64} | as float64 | {times["mixed"]} '
+        "| stability labels on a GPU with slow float64 arithmetic |",
+        f"| float32 | inside `jit` with JAX's default settings | up to {farthest:.0e} | {times['float32']} "
+        "| previews, and values that need few digits |",
+    ]
 
 
 def measure_all(points: int, checked: int, runs: int) -> str:
@@ -123,14 +142,20 @@ def measure_all(points: int, checked: int, runs: int) -> str:
     wrong = labels[0] != labels[1]
     errors = {name: find_errors(walls, name) for name in QUANTITIES}
     units = {name: "relative" if unit == "1" else unit for name, (_, unit) in QUANTITIES.items()}
-    by_delay = head_row("quantity", ["error", *(f"d = {d:g}" for d in DELAYS)])
+    by_delay = head_row("quantity", ["error", *(f"d = {d:g}" for d in DELAYS)], "---")
     by_delay += [f"| {name} | {units[name]} | {' | '.join(map(largest, errors[name]))} |" for name in QUANTITIES]
     by_distance = {f"{name}, {units[name]}": errors[name] for name in OF_WALLS}
+    speeds, ratios = tabulate_speeds(points, runs)
     lines = [
         "# Precision",
         "",
-        "The command `benchmarks/bench_precision.py --write` writes this page, with JAX "
-        f"{jax.__version__} and Python {platform.python_version()}.",
+        "## Choice of a precision",
+        "",
+        "The command `benchmarks/bench_precision.py --write` writes the tables of this section, with JAX",
+        f"{jax.__version__} and Python {platform.python_version()}. Distances from the stability boundary are relative",
+        "to alpha. Times are CPU times of `is_stable` for scattered walls, divided by the time in float64.",
+        "",
+        *tabulate_choice(float(distance[wrong].max()), ratios),
         "",
         "## Errors of float32",
         "",
@@ -140,25 +165,25 @@ def measure_all(points: int, checked: int, runs: int) -> str:
         "",
         "Largest relative distance in alpha from the boundary at which a label of `is_stable` is wrong:",
         "",
-        *tabulate_labels(walls, distance, wrong),
+        *tabulate_labels(distance, wrong),
         "",
         f"Largest errors over these values of delta, with the number of NaN among {checked * len(DELTAS):,} walls:",
         "",
         *by_delay,
         "",
         "Share of wrong labels, and largest errors by relative distance from the boundary, over all values of d and",
-        "delta. On the boundary the delay margin of some devices jumps from 0, because a longer delay makes them stable",
-        "again.",
+        "delta. On the boundary the delay margin of some devices jumps from 0, because they are stable again with a",
+        "longer delay.",
         "",
         *tabulate_distances(distance, wrong, by_distance),
         "",
         "## Speed of each precision",
         "",
-        f"Time of `is_stable` for {points:,} scattered walls inside `jit` on a CPU, divided by the time in float64",
+        f"CPU time of `is_stable` for {points:,} scattered walls inside `jit`, divided by the CPU time in float64",
         f"(fastest of {runs} runs). The next columns contain the number of labels that differ from those in float64,",
-        "and the number of walls that mixed precision computes in float64. On GPUs the ratios are not measured.",
+        "and the number of walls that mixed precision computes in float64. On GPUs the times are not measured.",
         "",
-        *tabulate_speeds(points, runs),
+        *speeds,
     ]
     return "\n".join([*lines, ""])
 

@@ -1,4 +1,4 @@
-"""Functions inside `jit` in float64 and float32, and `is_stable` in mixed precision: their problems, speeds and errors."""
+"""Functions inside `jit` in float64, float32 and mixed precision, and walls at which their errors are measured."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ DELTAS = (0.0, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)
 DELAYS = (0.0, 0.5, 1.0, 2.0, 3.25, 8.0, 50.0, 500.0)
 # Decades of the relative distance in alpha from the boundary.
 NEAREST, FARTHEST = -7, -1
-
 
 
 def find_alpha(_alpha: Any, _beta: Any, delta: Any, d: Any) -> Any:
@@ -88,5 +87,6 @@ def draw_rounded_walls(delta: float, d: float, points: int) -> tuple[Walls, np.n
     point = boundary(omega, delta, d)
     offset = 10.0 ** generator.uniform(NEAREST, FARTHEST + 1, points) * generator.choice([-0.9, 0.9], points)
     columns = np.asarray(point.alpha) * (1.0 + offset), np.asarray(point.beta), np.full(points, delta)
-    walls = Walls(*(np.float32(column).astype(float) for column in columns), np.full(points, float(d)))
+    alpha, beta, delta_column = (np.float32(column).astype(float) for column in columns)
+    walls = Walls(alpha, beta, delta_column, np.full(points, float(d)))
     return walls, np.abs(walls.alpha / row_limits(*walls[1:]) - 1.0)

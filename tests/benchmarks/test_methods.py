@@ -64,7 +64,11 @@ def test_small_run_measures_every_method(rows):
         ("passive", "worst frequency"),
         ("alpha_max", "newton"),
         *(("stable", f"jit {precision}") for precision in ("float64", "float32", "mixed")),
-        *((quantity, f"jit {dtype}") for quantity in ("spectral_radius", "alpha_max") for dtype in ("float64", "float32")),
+        *(
+            (quantity, f"jit {dtype}")
+            for quantity in ("spectral_radius", "alpha_max")
+            for dtype in ("float64", "float32")
+        ),
     }
     assert {row.method for row in rows if row.baseline} == set(available())
     for row in rows:

@@ -32,7 +32,7 @@ and which derivatives it has. `scripts/refresh_contract.py` writes the page from
   Bad points have the results described above.
 - **Inside `jit`, without x64.** At the valid points of the tests, float32 values agree with those of direct calls to
   {single:.1e}, relative and absolute, and the statuses are the same. Results outside the domain are NaN. The page [how
-  to choose](how-to-choose.md#precision) lists the errors near and far from the stability boundary. For walls beside
+  to choose](how-to-choose.md#precision) lists the errors near and far from the stability boundary. For walls near
   the boundary, `tests/contract/test_float32.py` compares these errors with bounds.
 - **Derivatives** are finite at good points and NaN at bad points. The tests of the contract cover the first
   derivatives. The tests of each function cover the second derivatives, and the first derivatives of {elsewhere}.

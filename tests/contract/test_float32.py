@@ -1,8 +1,8 @@
 """Errors of float32 inside `jit`, against bounds that follow from the rounding errors and from float64 results.
 
 Two bounds are used. A label may only be wrong for a wall that the running error bound of
-`stability.rigid.mixed_precision` leaves open. Any other value may differ by `COUNT` rounding errors of its terms, and by
-the change that results from changing each argument by `COUNT` rounding errors.
+`stability.rigid.mixed_precision` leaves open. Any other value may differ by `COUNT` rounding errors of its terms, plus
+the change of the value if each argument changes by `COUNT` rounding errors.
 """
 
 import jax
@@ -67,7 +67,7 @@ SIZES = {
 def find_changes(walls):
     """Return the sum of the changes of each quantity if alpha, beta or delta changes by `COUNT` rounding errors."""
     center = evaluate_quantities(*walls)
-    total = {name: 0.0 for name in center}
+    total = dict.fromkeys(center, 0.0)
     for argument in range(3):
         moved = []
         for side in (-1.0, 1.0):
@@ -83,7 +83,7 @@ def test_wrong_float32_labels_belong_to_open_walls():
     walls = draw_near_boundary(1, 300)
     expected, labels = zwidth.is_stable(*walls), compute_in_float32(zwidth.is_stable, walls)
     with jax.enable_x64(True):
-        stable, is_open = jax.jit(lambda *wall: label_in_float32(*wall, ANY))(*walls)
+        stable, is_open = jax.jit(lambda *wall: label_in_float32(*wall, kind=ANY))(*walls)
     stable, is_open, wrong = np.asarray(stable), np.asarray(is_open), labels != expected
     assert 0 < wrong.sum() < 0.1 * wrong.size
     assert not np.any(wrong & ~is_open)
@@ -114,7 +114,9 @@ def quantities():
     return walls, center, changes, compute_in_float32(evaluate_quantities, walls)
 
 
-@pytest.mark.parametrize("name", ["spectral_radius", "alpha_max", "boundary_point", "gain_margin", *SIZES, "delay_margin"])
+@pytest.mark.parametrize(
+    "name", ["spectral_radius", "alpha_max", "boundary_point", "gain_margin", *SIZES, "delay_margin"]
+)
 def test_float32_errors_are_bounded_by_rounding_errors_and_condition(name, quantities):
     walls, center, changes, rounded = quantities
     value, exact, change = rounded[name].astype(float), center[name], changes[name]

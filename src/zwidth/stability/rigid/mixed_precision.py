@@ -113,11 +113,11 @@ def label_in_mixed_precision(alpha: Array, beta: Array, delta: Array, d: Array, 
         # The length of ``index`` is fixed at compilation. Unused entries are 0, the index of the first wall, which
         # float64 may decide as well.
         index = jnp.nonzero(is_open, size=capacity, fill_value=0)[0]
-        labels = stable_kernel(*(x[index] if x.ndim else x for x in columns), kind)
+        labels = stable_kernel(*(x[index] if x.ndim else x for x in columns), kind=kind)
         return stable.at[index].set(labels)
 
     def decide_all() -> Array:
-        return jnp.broadcast_to(stable_kernel(*columns, kind), stable.shape)
+        return jnp.broadcast_to(stable_kernel(*columns, kind=kind), stable.shape)
 
     return lazy_jax.lax.cond(is_open.sum() <= capacity, decide_open, decide_all).reshape(shape)
 
@@ -127,8 +127,8 @@ def label_in_float32(alpha: Array, beta: Array, delta: Array, d: Array, kind: De
 
     Both are False for an unstable wall and for invalid input.
     """
-    wall, plant = [round_to_float32(value) for value in (alpha, beta)], bound_device(delta, d, kind)
-    code = decide_wall_codes(*wall, plant, kind, bound_root, bound_phase)
+    plant = bound_device(delta, d, kind)
+    code = decide_wall_codes(round_to_float32(alpha), round_to_float32(beta), plant, kind, bound_root, bound_phase)
     # Check the ranges in float64, because a small number may be 0 in float32.
     possible = valid_wall(alpha, beta, delta, d) & (alpha > 0)
     return possible & (code == STABLE), possible & (code >= OPEN)
@@ -144,7 +144,7 @@ def bound_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
     """Return the discretized device of float64 arrays delta and d, with bounded errors (step M2)."""
     # Split the delay in float64, because the fraction of a long delay would lose its digits in float32.
     whole, f = split_delay(d)
-    plant = discretize_split_delay(*(x.astype(np.float32) for x in (delta, whole, f, 1.0 - f)), kind)
+    plant = discretize_split_delay(*(x.astype(np.float32) for x in (delta, whole, f, 1.0 - f)), kind=kind)
     relative = FRACTIONAL_PLANT_ERROR if kind.fractional else INTEGER_PLANT_ERROR
     bounded = DiscretePlant(*(Bounded(value, relative * abs(value) + TINY) for value in plant))
     # The rounding error of delta changes c by up to delta c 2^-24.

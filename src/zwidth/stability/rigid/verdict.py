@@ -64,10 +64,10 @@ def is_stable(
             points). "auto" is "crossover". On a grid of one device it compares alpha with the stability limit at each
             beta, by the same closed form.
         precision: number type of the closed form. "auto" is float64 in a direct call, and inside `jit` JAX's default
-            type. "mixed" computes every wall in float32 with a bound of its rounding errors, and computes the walls
-            that this bound leaves open, about 1 in 10,000, again in float64. Its labels are those of float64. It is
-            meant for processors with slow float64 arithmetic, such as many GPUs; on a CPU it is slower than "auto". On
-            grids, float64 requires one comparison per wall, and "mixed" is the same as "auto".
+            type. "mixed" computes each wall in float32 with an error bound. If the bound does not decide the label, as
+            for fewer than 1 in 1,000 random walls, "mixed" computes the wall again in float64. All its labels are those
+            of float64. On a CPU, "mixed" is slower than "auto"; it is meant for processors with slow float64
+            arithmetic, such as many GPUs. Large grids are computed as by "auto", with one comparison per wall.
 
     Returns:
         Boolean array of the broadcast shape, possibly read-only. False for unstable walls and for invalid input (NaN,
@@ -98,10 +98,10 @@ def is_stable(
         check_choice("method", method, STABILITY_METHODS)
     kernel = stable_kernel if precision == "auto" else _select_kernel(precision, method, values)
     if method in ("auto", "crossover"):
-        if any(map(is_jax, values)):
-            return label_jax_arrays(arguments, classify_delays(d), kernel)
         if numbers and kernel is stable_kernel:
             return evaluate(kernel, arguments, classify_delays(d))
+        if not numbers and any(map(is_jax, values)):
+            return label_jax_arrays(arguments, classify_delays(d), kernel)
     check_scalars(arguments)
     if method == "companion" and any(map(is_jax, values)):
         with choose_precision(values):
