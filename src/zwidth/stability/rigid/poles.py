@@ -32,7 +32,6 @@ from zwidth.core.xp import (
     is_traced,
     iterate,
     lazy_jax,
-    materialize,
     namespace,
     nan_with_nan_derivatives,
 )
@@ -71,7 +70,7 @@ BLOCK_SIZE = 1 << 15
 def factor_with_pole_axis(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> LoopFactors:
     """Return the factors of P of each wall, with a new first axis for its poles; NaN if the wall is out of range."""
     xp = namespace(alpha, beta, delta, d)
-    loop = materialize(factor_loop(alpha, beta, delta, d, degree.fractional), delta)
+    loop = factor_loop(alpha, beta, delta, d, degree.fractional)
     return LoopFactors(*(xp.asarray(part)[None] for part in loop))
 
 
