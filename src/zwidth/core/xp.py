@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache, reduce
+from functools import lru_cache, reduce
 from math import factorial
 from typing import Any, TypeVar
 
@@ -171,7 +171,7 @@ def horner(x: Any, coefficients: Sequence[Any]) -> Any:
     return total
 
 
-@cache
+@lru_cache(256)
 def _polynomial(coefficients: tuple[float, ...]) -> Callable[[Any], Any]:
     """Return a polynomial with constant coefficients as a JAX function that is traced once.
 

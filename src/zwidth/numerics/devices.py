@@ -8,8 +8,7 @@ from typing import Any
 
 from zwidth.core.types import Array
 from zwidth.core.xp import is_traced
-
-CACHED_FUNCTIONS = 256  # number of functions whose compiled programs are kept
+from zwidth.numerics.evaluate import CACHED_KERNELS
 
 
 def map_on_devices(function: Callable[..., Any], arrays: Sequence[Array]) -> Any:
@@ -38,7 +37,7 @@ def map_on_devices(function: Callable[..., Any], arrays: Sequence[Array]) -> Any
     return function(*arrays)
 
 
-@lru_cache(CACHED_FUNCTIONS)
+@lru_cache(CACHED_KERNELS)
 def _compile_parts(function: Callable[..., Any], mesh: Any, spec: Any, count: int) -> Callable[..., Any]:
     """Return a function that applies another function of ``count`` arrays on each device to its part of the arrays."""
     import jax
