@@ -18,6 +18,7 @@ import numpy as np
 
 from zwidth.core.errors import InputError, ZwidthError
 from zwidth.core.status import RidgeKind, Status
+from zwidth.core.xp import within
 from zwidth.model.checks import to_periods
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
@@ -32,7 +33,7 @@ from zwidth.stability.results import RidgePoint
 from zwidth.stability.rigid.boundary import boundary_point
 from zwidth.stability.rigid.ridge import alpha_max
 from zwidth.stability.rigid.verdict import is_stable
-from zwidth.units.quantities import FIELDS, WALL
+from zwidth.units.quantities import FIELDS, WALL, WALL_RANGE
 
 RIGID_PARAMETERS = ("mass", "damping", "period", "delay")
 MAX_PIECES = 6  # largest number of pieces of arrays that NumPy evaluates faster than a function compiled by JAX
@@ -89,7 +90,8 @@ class Variants:
             else:
                 d = np.full(self.count, float(scene.d))
             usable = np.full(self.count, self._is_supported(values)) & (d >= 0) & (d <= LONGEST_DELAY) & (period > 0)
-            for name, column in values.items():
+            walls = {name: self.drawn[name] for name in WALL if name in self.drawn}
+            for name, column in (values | walls).items():
                 key = f"mode.{name.rpartition('.')[2]}" if name.startswith("modes.") else name
                 usable &= np.isfinite(column) & (FIELDS[key].allowed.holds(column) if key in FIELDS else False)
             every: dict[str, Any] = {path: values.get(path, value) for path, value in nominal.items()}
@@ -101,8 +103,8 @@ class Variants:
         mass = every.get("mass", float(scene.mass)) + (every["operator.mass"] if rigid else 0.0)
         return _NormalizedVariants(values, d, period, np.broadcast_to(mass, period.shape), usable)
 
-    def _is_supported(self, values: dict[str, np.ndarray]) -> bool:
-        """Return whether all variants of the scene have the same structure, and one that can be evaluated at once."""
+    def _is_supported(self, values: dict[str, np.ndarray]) -> bool | np.ndarray:
+        """Return whether variants have the structure of the scene, and one that can be evaluated at once."""
         scene, nominal = self.scene, self.scene.parameters()
         device, velocity = scene.device, scene.velocity
         known = type(device) in (Device, LinearDevice) and type(velocity) in ESTIMATES.values()
@@ -121,22 +123,32 @@ class Variants:
 
     def labels(self, stiffness: float, damping: float) -> np.ndarray:
         """Return a boolean array with one entry per variant: True if the wall is stable on this variant."""
-        mass, period, usable = self.normalized.mass, self.normalized.period, self.normalized.usable
+        mass, period = self.normalized.mass, self.normalized.period
+        with np.errstate(all="ignore"):
+            rate = mass / period
+            return self.label_normalized(stiffness * period / rate, damping / rate)
+
+    def label_normalized(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """Return a boolean array: True if the wall (alpha, beta) with the index of a variant is stable on it."""
         stable, left = np.zeros(self.count, bool), np.full(self.count, True)
-        selected = np.flatnonzero(usable & (stiffness > 0) & (self.count >= LEAST_BATCH))
-        if selected.size:
+        inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE) & (alpha > 0)
+        selected = np.flatnonzero(self.normalized.usable & inside)
+        if selected.size >= LEAST_BATCH:
 
             def label(form, loop, sizes, states, index) -> tuple[np.ndarray, ...]:
-                rate = mass[selected[index]] / period[selected[index]]
                 loops = sample(form, loop, sizes)
-                outside, doubtful = count_outside(loops, stiffness * period[selected[index]] / rate, damping / rate)
+                outside, doubtful = count_outside(loops, alpha[selected[index]], beta[selected[index]])
                 return outside, np.asarray(doubtful)
 
             outside, doubtful = self._map(label, selected)
             stable[selected], left[selected] = outside == 0, doubtful
         for k in np.flatnonzero(left).tolist():
-            stable[k] = bool(self.build(k).is_stable(stiffness, damping))
+            stable[k] = self._label(k, alpha[k : k + 1], beta[k : k + 1])
         return stable
+
+    def _label(self, k: int, alpha: np.ndarray, beta: np.ndarray) -> bool:
+        """Return whether one wall is stable on the variant with the index k."""
+        return bool(self.build(k).loop.labels(alpha, beta)[0])
 
     def find_stiffness_limits(self, damping: np.ndarray) -> np.ndarray:
         """Return the upper end of the lowest stable interval of K for each variant and each B; 0 if no wall is stable.
