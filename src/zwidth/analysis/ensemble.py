@@ -37,7 +37,7 @@ from zwidth.units.quantities import FIELDS, WALL, WALL_RANGE
 
 RIGID_PARAMETERS = ("mass", "damping", "period", "delay")
 MAX_PIECES = 6  # largest number of pieces of arrays that NumPy evaluates faster than a function compiled by JAX
-LEAST_BATCH = 16  # smallest number of variants that are faster to evaluate at once than one by one
+LEAST_BATCH = 6  # smallest number of variants that are faster to evaluate at once than one by one
 LONGEST_WINDOW = 64  # longest velocity window, in periods, of variants evaluated at once; longer windows take too long
 # Densities of the frequency grid. The higher one is used for variants that are not confirmed with the lower one.
 DENSITIES = (1, 2)
@@ -182,19 +182,14 @@ class Variants:
             return np.where(np.isfinite(ends), ends, 0.0)
         return np.where(are_connected(low, high), high, 0.0).max(-1, initial=0.0)
 
-    def find_ridges(self, negative: bool, least_batch: int = LEAST_BATCH) -> BatchRidge:
-        """Return the stiffest stable wall of each variant, with B >= 0 unless ``negative``.
-
-        Args:
-            negative: True to allow B < 0.
-            least_batch: smallest number of variants that are evaluated at once.
-        """
+    def find_ridges(self, negative: bool) -> BatchRidge:
+        """Return the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
         columns = [np.full(self.count, np.nan) for _ in range(3)]
         kind, status = np.full(self.count, int(RidgeKind.NONE), np.int32), np.zeros(self.count, np.int32)
         left = np.full(self.count, True)
         for density in DENSITIES:
             selected = np.flatnonzero(left & self.normalized.usable)
-            if self.count < least_batch or not selected.size:
+            if self.count < LEAST_BATCH or not selected.size:
                 break
 
             def solve(form, loop, sizes, states, index, density=density) -> tuple[np.ndarray, ...]:

@@ -95,6 +95,23 @@ def test_walls_of_a_scene_do_not_depend_on_the_other_scenes():
         np.testing.assert_array_equal(one, np.concatenate(parts))
 
 
+def test_few_scenes_are_searched_one_by_one():
+    scene, values = SCENES["low-pass"], {"mass": [0.1, 0.2, 0.3]}
+    walls = stiffest_walls(scene, values)
+    assert walls.searched.all()
+    expected = [scene.replace(mass=mass).max_stiffness().stiffness for mass in values["mass"]]
+    np.testing.assert_array_equal(walls.stiffness, expected)
+
+
+def test_a_wall_that_only_a_bent_path_connects_to_zero_stiffness_is_confirmed():
+    # Just below this maximum, no wall with the same B is stable, and the ray from K = B = 0 leaves the stable set.
+    device = Device(0.137, 0.497, coupling=Coupling(0.617, 30300.0, 83.9))
+    scene = Scene(device, Timing("1.8 ms", "2.89 ms"))
+    walls = stiffest_walls(scene, {"mass": np.linspace(0.135, 0.139, 9)})
+    assert not walls.searched.any()
+    np.testing.assert_allclose(walls.stiffness[4], scene.max_stiffness().stiffness, rtol=1e-9)
+
+
 def test_scenes_of_different_structures_may_be_mixed():
     scenes = [*SCENES.values(), Scene(Device(0.1, 10), Timing(1e-3, 1e-3)), Scene(Device(0.1, 50), Timing(1e-3))]
     walls = stiffest_walls(scenes)

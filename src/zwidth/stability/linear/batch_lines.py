@@ -64,6 +64,11 @@ def find_position(line: Line, values: Values) -> Array:
     return (distance * xp.conj(direction)).real / (direction.real**2 + direction.imag**2)
 
 
+def pad_index(index: np.ndarray) -> np.ndarray:
+    """Return an array of indices, padded with copies of its last entry to a multiple of `VECTOR_SIZE`."""
+    return np.concatenate([index, np.repeat(index[-1:], -index.size % VECTOR_SIZE)])
+
+
 class NodeCells(NamedTuple):
     """Selected intervals between neighboring nodes, listed one after the other for all loops."""
 
@@ -82,9 +87,9 @@ def list_cells(selected: Array, most: int) -> NodeCells:
         cell, loop = np.nonzero(selected)
         slot = np.cumsum(selected, 0, dtype=np.int32)[cell, loop] - 1
         crowded = np.bincount(loop, minlength=n) > most
-        padding = (0, -cell.size % VECTOR_SIZE)
-        columns = (np.pad(part, padding) for part in (cell, loop, slot, slot < most))
-        return NodeCells._make([*columns, crowded, most])
+        padding = np.zeros(-cell.size % VECTOR_SIZE, int)
+        cell, loop, slot, valid = (np.concatenate([part, padding]) for part in (cell, loop, slot, slot < most))
+        return NodeCells(cell, loop, slot, valid > 0, crowded, most)
     first = xp.sort(xp.where(selected, xp.arange(count)[:, None], count), 0)[:most]
     slot, loop = xp.meshgrid(xp.arange(most), xp.arange(n), indexing="ij")
     valid = first < count
@@ -117,6 +122,10 @@ class LineCrossings(NamedTuple):
     w: Array  # angle of the poles on the unit circle; for interpolated crossings the angle of the node below
     cell: Array  # index of the node below the angle of the crossing; -1 for a pole at z = -1
     doubtful: Array  # True for loops whose nodes do not resolve k, shape (loops,)
+
+    def take(self, index: Array) -> LineCrossings:
+        """Return the crossings of the loops with the given indices."""
+        return LineCrossings(*(part[..., index] for part in self))
 
     def count_gaps(self, outside: Array, origin: Array | float = 0.0) -> Array:
         """Return the number of poles outside the unit circle between crossings, shape (crossings + 1, loops).
@@ -250,7 +259,7 @@ def _find_turns(
     low, high = w[turns.cell, turns.loop], w[turns.cell + 1, turns.loop]
     first, last = slope[turns.cell, turns.loop], slope[turns.cell + 1, turns.loop]
     begin = low, high, first, last, 0.5 * (low + high), 0.0 * low
-    x = iterate(TURN_STEPS, bisect, begin, xp)[4]
+    x = iterate(TURN_STEPS if turns.cell.size else 0, bisect, begin, xp)[4]
     parts = split_values(evaluate(loops.form, part, x))[0]
     value, node = combine(each, parts), k[turns.cell, turns.loop]
     size = sum(
