@@ -13,7 +13,8 @@ A wall has the normalized stiffness alpha and damping beta. On the *boundary cur
     the line beta = 0            has no stable wall above the line of constant K; needed if only beta >= 0 is allowed
                                  and the line of constant K has a stable wall with beta < 0
 
-If the ray has a crossing below the wall, a path of straight sections between stable walls replaces the ray. The alpha of a confirmed wall is within `MARGIN` of that of the stiffest wall. Symbols and shapes are those of
+If the ray has a crossing below the wall, a path of straight sections between stable walls replaces the ray. The alpha
+of a confirmed wall is within `MARGIN` of that of the stiffest wall. Symbols and shapes are those of
 `stability.linear.batch_lines`.
 """
 
