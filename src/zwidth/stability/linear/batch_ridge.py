@@ -46,7 +46,7 @@ LOG_RANGE = (-9.0, 2.0)  # log10 alpha of the first bracket of the maximum
 BISECTIONS = 20  # steps of the bisection for the largest alpha
 CLOSE_CELLS = 4  # largest number of nodes between two crossings that may enclose a smooth maximum of alpha
 NEWTON_STEPS = 8  # for the angles of a corner
-SECANT_STEPS = 14  # for the angle of a smooth maximum of alpha
+SECANT_STEPS = 24  # for the angle of a smooth maximum of alpha; 10 to 15 suffice in most cases
 # Largest last step of the angle w of a smooth maximum, relative to w. An error of w changes the maximum of alpha only
 # by its square, because alpha is stationary there.
 CONVERGED_PEAK = 1e-7
@@ -286,7 +286,7 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
         return _trace(evaluate(form, loop, w)).alpha_slope
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        low, high, first, last, x, side, _ = state
+        low, high, first, last, x, side, move = state
         value = slope(x)
         before = value > 0
         last = xp.where(before, xp.where(side > 0, 0.5 * last, last), value)
@@ -294,7 +294,9 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
         low, high = xp.where(before, x, low), xp.where(before, high, x)
         new = high - last * (high - low) / (last - first)
         new = xp.where((new > low) & (new < high), new, 0.5 * (low + high))
-        return low, high, first, last, new, xp.where(before, 1.0, -1.0), xp.abs(new - x)
+        done = move <= CONVERGED_STEP * x
+        move = xp.where(done, move, xp.abs(new - x))
+        return low, high, first, last, xp.where(done, x, new), xp.where(before, 1.0, -1.0), move
 
     # Use the narrowest bracket over which the derivative of alpha changes from positive to negative.
     low, high = brackets[-1]
@@ -305,7 +307,7 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
         pairs = zip((*bracket, *ends), (low, high, first, last), strict=True)
         low, high, first, last = (xp.where(better, new, old) for new, old in pairs)
     begin = low, high, first, last, 0.5 * (low + high), 0.0 * low, high - low
-    *_, x, _, move = iterate(SECANT_STEPS, step, begin, xp)
+    *_, x, _, move = iterate(SECANT_STEPS, step, begin, xp, lambda old, new: bool(np.all(old[4] == new[4])))
     return x, (first > 0) & (last < 0) & (move <= CONVERGED_PEAK * x)
 
 
