@@ -123,7 +123,7 @@ def _vary_scene(scene: SceneOptima, parameters: Mapping[str, ArrayLike], negativ
     columns = {name: as_float64(name, read_texts(name, value, units[name])) for name, value in parameters.items()}
     shape = join_shapes((name, column.shape) for name, column in columns.items()) if columns else ()
     drawn = {name: np.broadcast_to(column, shape).ravel() for name, column in columns.items()}
-    variants = Variants(scene, drawn or {"mass": np.full(1, float(scene.device.mass))})
+    variants = scene.loop.vary(drawn or {"mass": np.full(1, float(scene.device.mass))})
     walls = _convert(variants, *variants.find_ridges(allows_negative(scene, negative)))
     return StiffestWalls(*(column.reshape(shape) for column in walls))
 

@@ -31,6 +31,7 @@ from zwidth.stability.linear.loop_batch import sample
 from zwidth.stability.linear.rows import are_connected
 from zwidth.stability.results import RidgePoint
 from zwidth.stability.rigid.boundary import boundary_point
+from zwidth.stability.rigid.normalization import quantity_status
 from zwidth.stability.rigid.ridge import alpha_max
 from zwidth.stability.rigid.verdict import is_stable
 from zwidth.units.quantities import FIELDS, WALL, WALL_RANGE
@@ -82,7 +83,8 @@ class Variants:
         scene, nominal = self.scene, self.scene.parameters()
         values = {name: np.asarray(column, float) for name, column in self.drawn.items() if name not in WALL}
         if "rate" in values:
-            values["period"] = 1.0 / values.pop("rate")
+            with np.errstate(divide="ignore"):
+                values["period"] = 1.0 / values.pop("rate")
         period = values.get("period", np.full(self.count, float(scene.timing.period)))
         with np.errstate(all="ignore"):
             if "delay" in values or not scene.timing.in_periods:
@@ -220,10 +222,12 @@ class Variants:
         except (ArithmeticError, ZwidthError):
             return math.nan, math.nan, math.nan, int(RidgeKind.NONE), int(Status.NOT_CONVERGED)
 
-    def stiffest(self, negative: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return K and B of the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
-        point, rate = self.find_ridges(negative).point, self.normalized.mass / self.normalized.period
-        return point.alpha * rate / self.normalized.period, point.beta * rate
+    def stiffest(self, negative: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return K, B and `Status` of the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
+        point, period = self.find_ridges(negative).point, self.normalized.period
+        with np.errstate(all="ignore"):
+            rate = self.normalized.mass / period
+            return point.alpha * rate / period, point.beta * rate, point.status
 
 
 class RigidVariants(Variants):
@@ -267,9 +271,15 @@ class RigidVariants(Variants):
         return point * self.rate
 
     @np.errstate(all="ignore")
-    def stiffest(self, negative: bool) -> tuple[np.ndarray, np.ndarray]:
-        alpha, beta = self.evaluate(lambda *args: np.stack(alpha_max(*args)[:2]), self.delta, self.d)
-        return alpha * self.rate / self.period, beta * self.rate
+    def find_ridges(self, negative: bool) -> BatchRidge:
+        if not negative:
+            return super().find_ridges(negative)
+        *numbers, kind, status = self.evaluate(lambda *args: np.stack(alpha_max(*args)), self.delta, self.d)
+        valid = quantity_status(**self.drawn) == Status.OK
+        numbers = [np.where(valid, column, np.nan) for column in numbers]
+        kind = np.where(valid, kind, int(RidgeKind.NONE)).astype(np.int32)
+        status = np.where(valid, status, int(Status.INVALID_INPUT)).astype(np.int32)
+        return BatchRidge(RidgePoint._make([*numbers, kind, status]), np.full(self.count, False))
 
     @staticmethod
     def evaluate(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:

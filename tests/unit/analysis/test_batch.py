@@ -190,3 +190,16 @@ def test_values_may_be_texts_with_units():
     walls = stiffest_walls(SCENES["low-pass"], {"mass": ["100 g", "0.2 kg"], "delay": ["1 ms", "2 ms"]})
     numbers = stiffest_walls(SCENES["low-pass"], {"mass": [0.1, 0.2], "delay": [1e-3, 2e-3]})
     np.testing.assert_array_equal(walls.stiffness, numbers.stiffness)
+
+
+def test_rigid_devices_have_a_closed_form():
+    scene = Scene(Device(0.1, 10), Timing("1 ms", "1 ms"))
+    values = {"mass": [0.1, 0.2, -1, 0.3], "damping": [10, 0, -5, np.nan]}
+    walls = stiffest_walls(scene, values)
+    np.testing.assert_array_equal(walls.status == Status.OK, [True, True, False, False])
+    assert not walls.searched.any()
+    expected = [float(scene.replace(mass=m, damping=b).max_stiffness().stiffness) for m, b in ((0.1, 10), (0.2, 0))]
+    np.testing.assert_allclose(walls.stiffness, [*expected, np.nan, np.nan], rtol=1e-14)
+    rates = stiffest_walls(scene, {"rate": [1000, 2000, 0]})
+    np.testing.assert_allclose(rates.stiffness[1], scene.replace(rate=2000).max_stiffness().stiffness, rtol=1e-14)
+    assert rates.status[2] == Status.INVALID_INPUT
