@@ -124,7 +124,7 @@ def _vary_scene(scene: SceneOptima, parameters: Mapping[str, ArrayLike], negativ
     shape = join_shapes((name, column.shape) for name, column in columns.items()) if columns else ()
     drawn = {name: np.broadcast_to(column, shape).ravel() for name, column in columns.items()}
     variants = scene.loop.vary(drawn or {"mass": np.full(1, float(scene.device.mass))})
-    walls = _convert(variants, *variants.find_ridges(allows_negative(scene, negative)))
+    walls = _convert(variants, *variants.find_ridges(allows_negative(scene, negative))[:2])
     return StiffestWalls(*(column.reshape(shape) for column in walls))
 
 
@@ -152,7 +152,7 @@ def _solve_group(scenes: list[SceneOptima], negative: bool) -> StiffestWalls:
     if not scenes[0].nonrigid_parts and negative:
         point = alpha_max(*(np.array([float(getattr(scene, name)) for scene in scenes]) for name in ("delta", "d")))
         return _convert(variants, RidgePoint(*map(np.asarray, point)), np.zeros(len(scenes), bool))
-    return _convert(variants, *variants.find_ridges(negative))
+    return _convert(variants, *variants.find_ridges(negative)[:2])
 
 
 def _convert(variants: Variants, point: RidgePoint, searched: np.ndarray) -> StiffestWalls:

@@ -59,6 +59,7 @@ class BatchRidge(NamedTuple):
 
     point: RidgePoint
     searched: np.ndarray  # True for variants that were searched one by one
+    angles: np.ndarray  # angles w of the two active constraints, shape (2, variants); NaN where ``searched``
 
 
 class Variants:
@@ -188,7 +189,7 @@ class Variants:
         """Return the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
         columns = [np.full(self.count, np.nan) for _ in range(3)]
         kind, status = np.full(self.count, int(RidgeKind.NONE), np.int32), np.zeros(self.count, np.int32)
-        left = np.full(self.count, True)
+        left, angles = np.full(self.count, True), np.full((2, self.count), np.nan)
         for density in DENSITIES:
             selected = np.flatnonzero(left & self.normalized.usable)
             if self.count < LEAST_BATCH or not selected.size:
@@ -200,18 +201,18 @@ class Variants:
                 if states is not None:
                     for w in found.angles:
                         confirmed = confirmed & compare_responses(form, loop, states, w)
-                return (*found[:3], found.kind, confirmed)
+                return (*found[:3], found.kind, found.angles, confirmed)
 
-            *found, kinds, confirmed = self._map(solve, selected)
+            *found, kinds, both, confirmed = self._map(solve, selected)
             done = selected[confirmed]
             for column, part in zip(columns, found, strict=True):
                 column[done] = part[confirmed]
-            kind[done], left[done] = kinds[confirmed], False
+            kind[done], angles[:, done], left[done] = kinds[confirmed], both[:, confirmed], False
         for k in np.flatnonzero(left).tolist():
             *numbers, kind[k], status[k] = self._search_ridge(k, negative)
             for column, number in zip(columns, numbers, strict=True):
                 column[k] = number
-        return BatchRidge(RidgePoint._make([*columns, kind, status]), left)
+        return BatchRidge(RidgePoint._make([*columns, kind, status]), left, angles)
 
     def _search_ridge(self, k: int, negative: bool) -> tuple[float, ...]:
         """Return the stiffest wall of the variant with index k, computed by itself."""
@@ -279,7 +280,8 @@ class RigidVariants(Variants):
         numbers = [np.where(valid, column, np.nan) for column in numbers]
         kind = np.where(valid, kind, int(RidgeKind.NONE)).astype(np.int32)
         status = np.where(valid, status, int(Status.INVALID_INPUT)).astype(np.int32)
-        return BatchRidge(RidgePoint._make([*numbers, kind, status]), np.full(self.count, False))
+        point = RidgePoint._make([*numbers, kind, status])
+        return BatchRidge(point, np.full(self.count, False), np.stack([point.omega, point.omega]))
 
     @staticmethod
     def evaluate(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:

@@ -14,11 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.analysis.ensemble import Variants
+from zwidth.analysis.ensemble import LEAST_BATCH, BatchRidge, Variants
+from zwidth.analysis.traced_answers import Derivatives, fill_rows, no_derivatives
 from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError, ZwidthError
+from zwidth.core.status import RidgeKind, Status
 from zwidth.model.wall import NoWall
-from zwidth.stability.linear.derivatives import index_parameters
+from zwidth.stability.linear.derivatives import differentiate_ridge, index_parameters
+from zwidth.stability.linear.ridge import Condition, RidgeSolution
 from zwidth.units.quantities import WALL
 
 # Largest number of walls per scene for which labels are computed for all scenes at once. For more walls, the labels are
@@ -76,20 +79,45 @@ def _find_valid(build: Callable[[tuple[float, ...]], Any], leaves: np.ndarray) -
     raise InputError("scene: no scene of the batch is valid")
 
 
-def find_stiffest_of_many(variants: LeafVariants, points: np.ndarray, negative: bool | None) -> np.ndarray:
-    """Return alpha, beta, angular frequency, kind and status of the stiffest wall of each scene, shape (scenes, 5)."""
-    return np.stack(variants.find_ridges(allows_negative(variants.scene, negative)).point, -1)
+def find_stiffest_of_many(
+    variants: LeafVariants, points: np.ndarray, order: int, negative_damping: bool | None
+) -> Derivatives:
+    """Return the results of `traced_answers.find_stiffest`, one row per scene."""
+    negative = allows_negative(variants.scene, negative_damping)
+    top = variants.find_ridges(negative)
+    results = no_derivatives(np.stack(top.point, -1), variants.leaves.shape[1], order)
+    for result in results[1:]:
+        result[:, :3] = np.nan
+    for k in np.flatnonzero(top.point.status == Status.OK).tolist() if order else ():
+        scene = variants.build(k)
+        ridge = scene.loop.ridge(negative)[0] if top.searched[k] else _describe_maximum(top, k)
+        if ridge is not None:
+            fill_rows(results, k, range(3), differentiate_ridge(scene, ridge, order))
+    return results
 
 
-def label_many(variants: LeafVariants, points: np.ndarray) -> np.ndarray:
-    """Return 1 if the wall (alpha, beta) in the row of a scene is stable, otherwise 0, shape (scenes, 1)."""
-    return variants.label_normalized(*points.T)[:, None].astype(float)
+def _describe_maximum(top: BatchRidge, k: int) -> RidgeSolution:
+    """Return the stiffest wall of the scene with the index k, with its active constraints."""
+    angles, kind = top.angles[:, k].tolist(), int(top.point.kind[k])
+    # Poles on the unit circle are a pair, or one pole at z = -1.
+    first, second = (Condition.MINUS_ONE if w == np.pi else Condition.PAIR for w in angles)
+    second = {RidgeKind.SMOOTH: Condition.STATIONARY, RidgeKind.NO_DAMPING: Condition.NO_DAMPING}.get(
+        RidgeKind(kind), second
+    )
+    return RidgeSolution(float(top.point.alpha[k]), float(top.point.beta[k]), *angles, first, second)
 
 
-BATCHES: dict[str, Callable[..., np.ndarray]] = {"stiffest": find_stiffest_of_many, "labels": label_many}
+def label_many(variants: LeafVariants, points: np.ndarray, order: int) -> Derivatives:
+    """Return the results of `traced_answers.label_walls`, one row per scene and wall."""
+    labels = variants.label_normalized(*points.T)[:, None].astype(float)
+    return no_derivatives(labels, variants.leaves.shape[1] + points.shape[1], order)
+
+
+BATCHES: dict[str, Callable[..., Derivatives]] = {"stiffest": find_stiffest_of_many, "labels": label_many}
 """Function that computes results for many scenes at once, for some methods of `zwidth.analysis.traced_answers`.
 
-Its arguments are `LeafVariants`, the rows of further arguments of the method, one per scene, and the options.
+Its arguments are `LeafVariants`, the rows of further arguments of the method, one per scene, the order of the highest
+derivative, and the options of the method.
 """
 
 
@@ -98,21 +126,23 @@ def evaluate_batch(
     build: Callable[[tuple[float, ...]], Any],
     rows: np.ndarray,
     count: int,
+    order: int,
     options: Iterable[Any],
-) -> np.ndarray | None:
-    """Return the values of a method for many scenes, or None if the scenes are to be evaluated one by one.
+) -> Derivatives | None:
+    """Return values and derivatives of a method for many scenes; None if they are to be evaluated one by one.
 
     Args:
         method: name of the method.
         build: function that returns the scene with the given leaves.
         rows: leaves of a scene, followed by the further arguments of the method, shape (rows, leaves + arguments).
         count: number of leaves of a scene.
+        order: order of the highest derivative.
         options: options of the method.
 
     Returns:
-        Array of shape (rows, results).
+        Arrays as those of the functions in `traced_answers.ANSWERS`, with one row per row of ``rows``.
     """
-    if method not in BATCHES or len(rows) < 2:
+    if method not in BATCHES or len(rows) < LEAST_BATCH:
         return None
     different, groups = np.unique(rows, axis=0, return_inverse=True, equal_nan=True)
     if len(different) > MAX_WALLS * len(np.unique(different[:, :count], axis=0, equal_nan=True)):
@@ -121,4 +151,5 @@ def evaluate_batch(
         variants = LeafVariants(build, different[:, :count])
     except InputError:
         return None
-    return BATCHES[method](variants, different[:, count:], *options)[groups.reshape(-1)]
+    results = BATCHES[method](variants, different[:, count:], order, *options)
+    return [result[groups.reshape(-1)] for result in results]

@@ -51,11 +51,10 @@ class Question:
     def __call__(self, order: int, points: np.ndarray) -> list[np.ndarray]:
         """Return values and derivatives; a row of ``points`` contains a scene's numbers and the further arguments."""
         count, size = self.structure.num_leaves, points.shape[1]
-        if not order:
-            build = partial(_build_scene, self.structure)
-            values = evaluate_batch(self.method, build, points, count, self.options)
-            if values is not None:
-                return [values]
+        build = partial(_build_scene, self.structure)
+        batch = evaluate_batch(self.method, build, points, count, order, self.options)
+        if batch is not None:
+            return batch
         results = [np.full((len(points), ANSWERS[self.method][1], *[size] * k), np.nan) for k in range(order + 1)]
         results[0][:] = INVALID.get(self.method, np.nan)
         scenes, groups = np.unique(points[:, :count], axis=0, return_inverse=True, equal_nan=True)

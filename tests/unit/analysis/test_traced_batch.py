@@ -105,3 +105,25 @@ def test_springs_to_ground_may_be_0_in_some_scenes(x64):
     for k in (0, COUNT - 1):
         top = scene.replace(**{"operator.stiffness": values[k]}).max_stiffness()
         np.testing.assert_allclose(walls.stiffness[k], top.stiffness, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_derivatives_equal_those_of_single_scenes(name, x64):
+    many, singles = vary(SCENES[name])
+
+    def maximum(scene):
+        wall = scene.max_stiffness()
+        return wall.stiffness + 10.0 * wall.virtual_damping
+
+    slopes = jax.vmap(jax.grad(maximum))(many)
+    for k in range(0, COUNT, 8):
+        expected = jax.grad(maximum)(singles[k])
+        sizes = [abs(leaf) for leaf in jax.tree.leaves(singles[k])]
+        for got, wanted, size in zip(jax.tree.leaves(slopes), jax.tree.leaves(expected), sizes, strict=True):
+            np.testing.assert_allclose(got[k] * size, wanted * size, rtol=1e-6, atol=1e-4)
+
+
+def test_second_derivatives_of_a_batch_equal_those_of_single_scenes(x64):
+    masses = jnp.linspace(0.08, 0.12, 8)
+    curvature = jax.grad(jax.grad(lambda mass: FILTERED.replace(mass=mass).max_stiffness().stiffness))
+    np.testing.assert_allclose(jax.vmap(curvature)(masses), [curvature(mass) for mass in masses], rtol=1e-6)
