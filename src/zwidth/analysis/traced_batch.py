@@ -98,13 +98,14 @@ def find_stiffest_of_many(
 
 def _describe_maximum(top: BatchRidge, k: int) -> RidgeSolution:
     """Return the stiffest wall of the scene with the index k, with its active constraints."""
-    angles, kind = top.angles[:, k].tolist(), int(top.point.kind[k])
+    alpha, beta, (w1, w2) = float(top.point.alpha[k]), float(top.point.beta[k]), top.angles[:, k].tolist()
     # Poles on the unit circle are a pair, or one pole at z = -1.
-    first, second = (Condition.MINUS_ONE if w == np.pi else Condition.PAIR for w in angles)
-    second = {RidgeKind.SMOOTH: Condition.STATIONARY, RidgeKind.NO_DAMPING: Condition.NO_DAMPING}.get(
-        RidgeKind(kind), second
-    )
-    return RidgeSolution(float(top.point.alpha[k]), float(top.point.beta[k]), *angles, first, second)
+    first, second = (Condition.MINUS_ONE if w == np.pi else Condition.PAIR for w in (w1, w2))
+    if top.point.kind[k] == RidgeKind.SMOOTH:
+        second = Condition.STATIONARY
+    elif top.point.kind[k] == RidgeKind.NO_DAMPING:
+        second = Condition.NO_DAMPING
+    return RidgeSolution(alpha, beta, w1, w2, first, second)
 
 
 def label_many(variants: LeafVariants, points: np.ndarray, order: int) -> Derivatives:
