@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.analysis.base import check_scene
-from zwidth.analysis.ensemble import Variants
+from zwidth.analysis.ensemble import Variants, list_further_parts
 from zwidth.analysis.optimization import SceneOptima
 from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError, describe_choice
@@ -166,7 +166,7 @@ def _convert(variants: Variants, point: RidgePoint, searched: np.ndarray) -> Sti
 
 def _describe_structure(scene: SceneOptima) -> tuple[Any, ...]:
     """Return a hashable description of the structure of a scene: everything except its continuous parameters."""
-    if isinstance(scene.device, MeasuredDevice):
+    if isinstance(scene.device, MeasuredDevice) or list_further_parts(scene):
         return (id(scene),)
     parts = {"device": scene.device, **find_parts(scene)}
     described: list[Any] = []

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import fields
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -39,6 +40,8 @@ from zwidth.units.quantities import FIELDS, WALL, WALL_RANGE
 RIGID_PARAMETERS = ("mass", "damping", "period", "delay")
 MAX_PIECES = 6  # largest number of pieces of arrays that NumPy evaluates faster than a function compiled by JAX
 LEAST_BATCH = 6  # smallest number of variants that are faster to evaluate at once than one by one
+# Fields of a scene that are evaluated for all variants at once. A scene with a further part is evaluated by itself.
+EVALUATED = ("device", "timing", "wall", "velocity", "operator", "safe_limit")
 LONGEST_WINDOW = 64  # longest velocity window, in periods, of variants evaluated at once; longer windows take too long
 # Densities of the frequency grid. The higher one is used for variants that are not confirmed with the lower one.
 DENSITIES = (1, 2)
@@ -60,6 +63,12 @@ class BatchRidge(NamedTuple):
     point: RidgePoint
     searched: np.ndarray  # True for variants that were searched one by one
     angles: np.ndarray  # angles w of the two active constraints, shape (2, variants); NaN where ``searched``
+
+
+def list_further_parts(scene: Any) -> tuple[Any, ...]:
+    """Return the parts of a scene that are not evaluated for many variants at once."""
+    parts = (getattr(scene, item.name) for item in fields(scene) if item.name not in EVALUATED)
+    return tuple(part for part in parts if part is not None)
 
 
 class Variants:
@@ -111,6 +120,7 @@ class Variants:
         scene, nominal = self.scene, self.scene.parameters()
         device, velocity = scene.device, scene.velocity
         known = type(device) in (Device, LinearDevice) and type(velocity) in ESTIMATES.values()
+        known = known and not list_further_parts(scene)
         sampled = getattr(device, "dt", None) is not None
         whole = any(isinstance(nominal.get(name), int) for name in values)
         # Without a spring to ground a model has a different structure, so its stiffness must not be 0 in any variant.

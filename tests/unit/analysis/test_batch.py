@@ -24,6 +24,7 @@ from zwidth import (
     WindowedDifference,
     stiffest_walls,
 )
+from zwidth.analysis import ensemble
 
 TIMING = Timing(1e-3, 1.5e-3)
 FILTER = LowPass(cutoff=100)
@@ -203,3 +204,13 @@ def test_rigid_devices_have_a_closed_form():
     rates = stiffest_walls(scene, {"rate": [1000, 2000, 0]})
     np.testing.assert_allclose(rates.stiffness[1], scene.replace(rate=2000).max_stiffness().stiffness, rtol=1e-14)
     assert rates.status[2] == Status.INVALID_INPUT
+
+
+def test_scenes_with_a_part_that_batches_do_not_know_are_searched_one_by_one(monkeypatch):
+    monkeypatch.setattr(ensemble, "EVALUATED", tuple(name for name in ensemble.EVALUATED if name != "operator"))
+    scene = SCENES["rigid hand"]
+    for walls in (
+        stiffest_walls(scene, {"mass": np.linspace(0.1, 0.2, 8)}),
+        stiffest_walls([SCENES["low-pass"], *[scene.replace(mass=mass) for mass in np.linspace(0.1, 0.2, 8)]]),
+    ):
+        assert walls.searched.all()
