@@ -96,6 +96,17 @@ def test_walls_of_a_scene_do_not_depend_on_the_other_scenes():
         np.testing.assert_array_equal(one, np.concatenate(parts))
 
 
+def test_a_stable_interval_between_two_neighboring_nodes_is_not_missed():
+    # Above a corner, the line of constant K has a stable interval of B whose two crossings lie between two nodes. There
+    # k has an inflection, so that the tangents at both nodes do not meet below 0.
+    tip = Coupling(mass=0.013077892958936166, stiffness=15491.16384893111, damping=4.604129519090308)
+    device = Device(mass=0.03209467560615074, damping=14.731931522678714, coupling=tip)
+    scene = Scene(device, Timing(period=0.0005848654306631077, delay=0.0002189259337193867))
+    walls = stiffest_walls(scene, {"mass": device.mass * np.linspace(0.999, 1.001, 9)})
+    np.testing.assert_allclose(walls.stiffness[4], scene.max_stiffness().stiffness, rtol=1e-9)
+    assert np.ptp(walls.stiffness) < 0.01 * walls.stiffness[4]
+
+
 def test_few_scenes_are_searched_one_by_one():
     scene, values = SCENES["low-pass"], {"mass": [0.1, 0.2, 0.3]}
     walls = stiffest_walls(scene, values)
