@@ -1,4 +1,4 @@
-"""Coefficients and roots of the sections of a velocity filter.
+"""Coefficients and roots of the sections of a filter.
 
 Numerator and denominator of a filter are products of *sections*, polynomials in z with the highest power first. Roots
 are returned as *offsets* ``1 - root``, which are accurate for roots near z = 1.
@@ -29,7 +29,7 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
     """Return the sections of a numerator or denominator, each a tuple of coefficients without leading zeros.
 
     Args:
-        name: "numerator" or "denominator", for messages.
+        name: path of the parameter for messages, such as "velocity.numerator".
         given: coefficients of one polynomial, or a list of sections with their coefficients.
 
     Raises:
@@ -48,11 +48,11 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
         try:
             values = np.atleast_1d(np.asarray(row, float))
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"velocity.{name}: got {given!r}; it must be a list of real coefficients") from error
+            raise InputError(f"{name}: got {given!r}; it must be a list of real coefficients") from error
         values = np.trim_zeros(values, "f") if values.ndim == 1 else values
         if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
             raise InputError(
-                f"velocity.{name}: got {given!r}; it must be a list of finite coefficients, highest power first, not "
+                f"{name}: got {given!r}; it must be a list of finite coefficients, highest power first, not "
                 "all of them 0"
             )
         sections.append(tuple(values.tolist()))
