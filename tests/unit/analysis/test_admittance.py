@@ -54,6 +54,7 @@ def compose(display, robot, stiffness, damper):
         block = linalg.expm(np.block([[A, B], [np.zeros((1, size + 1))]]) * time)
         return block[:size, :size], block[:size, size:]
 
+    (phi1, gamma1), (phi2, gamma2) = move(f * T), move((1 - f) * T)
     columns = []
     for unit in np.eye(size + lag + 3):
         x, (commands, (v, a, reference)) = unit[:size], np.split(unit[size:], [lag])
@@ -70,7 +71,6 @@ def compose(display, robot, stiffness, damper):
             new_v = v + T * new_a
             new_reference = reference + T * new_v
         sent = np.append(new_v if display.command == "velocity" else new_reference, commands)
-        (phi1, gamma1), (phi2, gamma2) = move(f * T), move((1 - f) * T)
         x = phi2 @ (phi1 @ x + gamma1[:, 0] * sent[n + 1]) + gamma2[:, 0] * sent[n]
         columns.append(np.concatenate([x, sent[:lag], [new_v, new_a, new_reference]]))
     matrix = np.array(columns).T
