@@ -1,5 +1,8 @@
 """Every public name, once: what loads it on first use, and what type checkers read."""
 
+from .analysis.admittance import AdmittanceDisplay as AdmittanceDisplay
+from .analysis.admittance import EnvironmentLimit as EnvironmentLimit
+from .analysis.admittance import VirtualMassLimit as VirtualMassLimit
 from .analysis.assessment import Assessment as Assessment
 from .analysis.assessment import Limit as Limit
 from .analysis.assessment import assess as assess
