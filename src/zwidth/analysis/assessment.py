@@ -407,8 +407,8 @@ def _double_rate(scene: SceneOptima) -> SceneOptima:
         changes["velocity.samples"] = scene.velocity.samples * 2
     if not isinstance(scene.velocity, VelocityFilter | FOAW) and scene.velocity.coded_period is not None:
         changes["velocity.coded_period"] = scene.velocity.coded_period / 2
-    if getattr(scene.position, "coded_period", None) is not None:
-        changes["position.coded_period"] = scene.position.coded_period / 2
+    if (coded_period := getattr(scene.position, "coded_period", None)) is not None:
+        changes["position.coded_period"] = coded_period / 2
     return scene.replace(**changes)
 
 

@@ -36,17 +36,16 @@ def plain():
 @pytest.mark.parametrize("method", METHODS)
 def test_no_method_ignores_a_part(method, parts, plain):
     scene, arguments = zwidth.Scene(DEVICE, TIMING, WALL, **parts), ARGUMENTS.get(method, ())
+    message, result = "", None
     try:
         result = getattr(scene, method)(*arguments)
     except InputError as error:
         message = str(error)
-    else:
-        message = ""
     if message:
         assert "position" in message or "feedback" in message
     elif method == "damper_range" and parts is PARTS["measured"]:
         # With K = 0 the position estimate has no effect, because the velocity is computed from the measured position.
-        np.testing.assert_allclose(result, plain.damper_range(), rtol=1e-12)
+        np.testing.assert_allclose(np.asarray(result), plain.damper_range(), rtol=1e-12)
     elif method not in EQUAL:
         assert repr(result) != repr(getattr(plain, method)(*arguments))
 
@@ -54,13 +53,13 @@ def test_no_method_ignores_a_part(method, parts, plain):
 def test_measured_devices_refuse_them():
     frequency = np.geomspace(1, 500, 60)
     response = 1 / (-0.1 * (2 * np.pi * frequency) ** 2 + 10j * 2 * np.pi * frequency)
-    device = zwidth.MeasuredDevice(frequency, response, mass=0.1)
+    device = zwidth.MeasuredDevice(frequency, response)
     with pytest.raises(InputError, match="position: needs a model of the device"):
         zwidth.Scene(device, zwidth.Timing(1e-3), position=zwidth.ExponentialFilter(0.4))
 
 
 @pytest.mark.parametrize("name", ["filter", "pll", "cascade"])
-def test_a_traced_scene(name):
+def test_a_traced_scene(name, x64):
     scene = zwidth.Scene(DEVICE, TIMING, **PARTS[name])
     top = scene.max_stiffness()
     traced = jax.jit(lambda scene: scene.max_stiffness())(scene)
@@ -80,7 +79,7 @@ def test_a_traced_scene(name):
         assert sensitivities.per[path] == pytest.approx(float(slopes[path]), rel=1e-10)
 
 
-def test_derivatives_of_margins_include_the_feedback():
+def test_derivatives_of_margins_include_the_feedback(x64):
     scene = zwidth.Scene(DEVICE, TIMING, **PARTS["cascade"])
     for name in ("gain_margin", "phase_margin", "delay_margin", "modulus_margin"):
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from program_loop import Pll, find_filter
@@ -13,6 +15,7 @@ from zwidth.model.position import estimate_position
 
 DEVICE, TIMING = zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3)
 T = 1e-3
+untyped: Any = zwidth  # for arguments of wrong types
 ANGLES = np.array([0.05, 0.7, 2.9])
 
 
@@ -64,20 +67,20 @@ def test_the_response_of_a_pll_is_that_of_its_statements():
         (lambda: zwidth.ExponentialFilter(), "got none of coefficient, time_constant, cutoff"),
         (lambda: zwidth.ExponentialFilter(0.3, cutoff=50), "got coefficient and cutoff"),
         (lambda: zwidth.ExponentialFilter(1.5), "position.coefficient: got 1.5"),
-        (lambda: zwidth.ExponentialFilter(0.3, velocity_from="sensor"), "position.velocity_from"),
+        (lambda: untyped.ExponentialFilter(0.3, velocity_from="sensor"), "position.velocity_from"),
         (lambda: zwidth.PositionFilter([1, 0], [1]), "position.numerator: got degree 1"),
         (lambda: zwidth.PositionFilter([1], [1, -1]), "position.denominator: got a pole of magnitude 1;"),
         (lambda: zwidth.Feedback([1, 2], [1]), "feedback.numerator: got degree 1"),
-        (lambda: zwidth.IntegralFeedback(1, rule="euler"), "feedback.rule"),
-        (lambda: zwidth.Scene(DEVICE, TIMING, position=zwidth.BackwardDifference()), "position: got"),
-        (lambda: zwidth.Scene(DEVICE, TIMING, feedback=zwidth.LowPass(cutoff=50)), "feedback: got"),
+        (lambda: untyped.IntegralFeedback(1, rule="euler"), "feedback.rule"),
+        (lambda: untyped.Scene(DEVICE, TIMING, position=zwidth.BackwardDifference()), "position: got"),
+        (lambda: untyped.Scene(DEVICE, TIMING, feedback=zwidth.LowPass(cutoff=50)), "feedback: got"),
         (
             lambda: zwidth.Scene(DEVICE, TIMING, velocity=zwidth.LowPass(cutoff=50), position=zwidth.Pll(300)),
             "has its own velocity estimate; omit velocity",
         ),
         (lambda: zwidth.cascade(20, 1, position=zwidth.Pll(300), velocity=zwidth.LowPass(cutoff=50)), "omit velocity"),
         (lambda: zwidth.cascade_gains(10, 0), "virtual_damping: got 0"),
-        (lambda: zwidth.pid(1, units="inches"), "units"),
+        (lambda: untyped.pid(1, units="inches"), "units"),
         (
             lambda: zwidth.Scene(DEVICE, TIMING, position=zwidth.Pll(900)).is_stable(1, 1),
             "position.bandwidth: got 900 rad/s; the PLL is unstable from 828.427 rad/s on",
@@ -108,7 +111,7 @@ def test_a_scene_lists_and_replaces_the_parameters_of_its_estimates():
     assert (parameters["position.cutoff"], parameters["feedback.gain"]) == (100.0, 500.0)
     changed = scene.replace(**{"position.cutoff": 50, "feedback.gain": 0})
     assert changed.position == zwidth.ExponentialFilter(cutoff=50)
-    assert eval(repr(changed), vars(zwidth)) == changed
+    assert eval(repr(changed), dict(vars(zwidth))) == changed
 
 
 def test_a_cascade_converts_to_a_wall_and_back():
@@ -127,6 +130,7 @@ def test_a_pid_controller_converts_to_a_wall_and_back(units):
     controller = zwidth.pid(3, 4, 0.5, units=units, output_unit=0.05, derivative_filter=1e-3)
     assert controller.velocity == zwidth.LowPass(time_constant=1e-3)
     wall, feedback = controller.wall, controller.feedback
+    assert feedback is not None
     gains = zwidth.pid_gains(wall.stiffness, wall.virtual_damping, feedback.gain, units=units, output_unit=0.05)
     assert gains == pytest.approx((3, 4, 0.5))
 
