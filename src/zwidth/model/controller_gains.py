@@ -107,6 +107,9 @@ def pid(
     Returns:
         A `Controller`; use it as ``zwidth.Scene(device, timing, **controller)``.
 
+    References:
+        Astrom, Hagglund 2006, Advanced PID Control.
+
     Example:
         >>> import zwidth
         >>> controller = zwidth.pid(kp=1000, ki=2000, kd=10)
@@ -142,6 +145,9 @@ def pid_gains(
 
     Returns:
         The gains in the units of the controller.
+
+    References:
+        Astrom, Hagglund 2006, Advanced PID Control.
 
     Example:
         >>> import zwidth
@@ -187,8 +193,8 @@ def cascade(
         InputError: if ``velocity`` is given together with an observer or PLL.
 
     References:
-        odriverobotics/ODrive ``Firmware/MotorControl/controller.cpp``; simplefoc/Arduino-FOC
-        ``src/common/pid.cpp``.
+        Ellis 2012, Control System Design Guide, 4th ed. (position loop with an inner velocity loop);
+        odriverobotics/ODrive ``Firmware/MotorControl/controller.cpp``; simplefoc/Arduino-FOC ``src/common/pid.cpp``.
 
     Example:
         >>> import zwidth
@@ -224,6 +230,9 @@ def cascade_gains(
 
     Raises:
         InputError: if the damping is 0, because a cascade renders a spring only together with a damper.
+
+    References:
+        Ellis 2012, Control System Design Guide, 4th ed. (position loop with an inner velocity loop).
 
     Example:
         >>> import zwidth
