@@ -21,11 +21,14 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal, NamedTuple
 
 from zwidth.core.errors import InputError, check_choice
+from zwidth.core.xp import is_traced
+from zwidth.model.checks import check_number
 from zwidth.model.feedback import IntegralFeedback, IntegrationRule
 from zwidth.model.position import Position, has_velocity
 from zwidth.model.velocity import BackwardDifference, LowPass, Velocity
 from zwidth.model.wall import VirtualWall
 from zwidth.units.display import compact_repr
+from zwidth.units.quantities import ANY
 
 PositionUnit = Literal["m", "rad", "turns", "degrees"]
 _UNITS = {"m": 1.0, "rad": 1.0, "turns": 2.0 * math.pi, "degrees": math.pi / 180.0}  # in m or rad
@@ -77,7 +80,12 @@ class CascadeGains(NamedTuple):
 def _find_scale(units: PositionUnit, output_unit: float) -> float:
     """Return the stiffness in SI units of a controller whose output is 1 per position unit."""
     check_choice("units", units, tuple(_UNITS))
-    return output_unit / _UNITS[units]
+    return check_number("output_unit", output_unit, "1", ANY) / _UNITS[units]
+
+
+def _read_gain(name: str, gain: Any) -> Any:
+    """Convert a gain to a float; raise `InputError` for a text with a unit or a value that is not finite."""
+    return check_number(name, gain, "1", ANY)
 
 
 def pid(
@@ -118,11 +126,12 @@ def pid(
         0.99796
     """
     scale = _find_scale(units, output_unit)
+    kp, ki, kd = (_read_gain(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
     velocity: Any = BackwardDifference() if derivative_filter is None else derivative_filter
     if isinstance(velocity, int | float):
         velocity = LowPass(time_constant=velocity)
     weight = None if position is None else 1.0
-    feedback = IntegralFeedback(ki * scale, rule, weight) if ki else None
+    feedback = IntegralFeedback(ki * scale, rule, weight) if is_traced(ki) or ki else None
     return Controller(VirtualWall(kp * scale, kd * scale), velocity, position, feedback)
 
 
@@ -172,8 +181,8 @@ def cascade(
     """Return the parts of a scene for a position loop with an inner velocity loop, as in ODrive, VESC and SimpleFOC.
 
     The wall is K = pos_gain vel_gain and B = vel_gain. The integrator of the velocity loop is further feedback, whose
-    gain does not change if an analysis varies K and B. A maximum stiffness is therefore that of a controller with this
-    fixed integrator; `cascade_gains` converts its K and B to gains.
+    gain does not change if an analysis varies K and B. The maximum stiffness of the scene is therefore that of a
+    controller with this fixed integrator. The gain margin of the scene scales all gains of the controller together.
 
     Args:
         pos_gain: gain of the position loop in 1/s.
@@ -194,7 +203,8 @@ def cascade(
 
     References:
         Ellis 2012, Control System Design Guide, 4th ed. (position loop with an inner velocity loop);
-        odriverobotics/ODrive ``Firmware/MotorControl/controller.cpp``; simplefoc/Arduino-FOC ``src/common/pid.cpp``.
+            odriverobotics/ODrive ``Firmware/MotorControl/controller.cpp``;
+            simplefoc/Arduino-FOC ``src/common/pid.cpp``.
 
     Example:
         >>> import zwidth
@@ -207,8 +217,10 @@ def cascade(
     if velocity is not None and has_velocity(position):
         raise InputError(f"velocity: got {velocity!r}, but {position!r} has its own velocity estimate; omit velocity")
     scale = _find_scale(units, output_unit)
+    pos_gain, vel_gain = _read_gain("pos_gain", pos_gain), _read_gain("vel_gain", vel_gain)
+    vel_integrator_gain = _read_gain("vel_integrator_gain", vel_integrator_gain)
     feedback = None
-    if vel_integrator_gain:
+    if is_traced(vel_integrator_gain) or vel_integrator_gain:
         feedback = IntegralFeedback(vel_integrator_gain * scale, rule, pos_gain, 1.0)
     wall = VirtualWall(pos_gain * vel_gain * scale, vel_gain * scale)
     return Controller(wall, velocity or BackwardDifference(), position, feedback)

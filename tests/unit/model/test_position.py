@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from program_loop import Pll, find_filter
@@ -81,6 +82,7 @@ def test_the_response_of_a_pll_is_that_of_its_statements():
         (lambda: zwidth.cascade(20, 1, position=zwidth.Pll(300), velocity=zwidth.LowPass(cutoff=50)), "omit velocity"),
         (lambda: zwidth.cascade_gains(10, 0), "virtual_damping: got 0"),
         (lambda: untyped.pid(1, units="inches"), "units"),
+        (lambda: untyped.pid("10 N/m"), "kp: got '10 N/m'"),
         (
             lambda: zwidth.Scene(DEVICE, TIMING, position=zwidth.Pll(900)).is_stable(1, 1),
             "position.bandwidth: got 900 rad/s; the PLL is unstable from 828.427 rad/s on",
@@ -133,6 +135,13 @@ def test_a_pid_controller_converts_to_a_wall_and_back(units):
     assert feedback is not None
     gains = zwidth.pid_gains(wall.stiffness, wall.virtual_damping, feedback.gain, units=units, output_unit=0.05)
     assert gains == pytest.approx((3, 4, 0.5))
+
+
+def test_a_pid_controller_inside_jit(x64):
+    def radius(ki):
+        return zwidth.Scene(zwidth.Device(0.1, 0), zwidth.Timing(1e-3), **zwidth.pid(1000, ki, 10)).spectral_radius()
+
+    assert float(jax.jit(radius)(2000.0)) == pytest.approx(radius(2000), rel=1e-12)
 
 
 def test_a_pid_controller_without_integral_has_no_feedback():
