@@ -35,7 +35,7 @@ _UNITS = {"m": 1.0, "rad": 1.0, "turns": 2.0 * math.pi, "degrees": math.pi / 180
 
 
 @dataclass(frozen=True)
-class Controller:
+class ControllerParts:
     """Parts of a scene that describe a controller; a mapping, so that ``Scene(device, timing, **controller)`` works.
 
     Args:
@@ -98,7 +98,7 @@ def pid(
     rule: IntegrationRule = "backward",
     units: PositionUnit = "rad",
     output_unit: float = 1.0,
-) -> Controller:
+) -> ControllerParts:
     """Return the parts of a scene for a PID controller.
 
     Args:
@@ -113,7 +113,7 @@ def pid(
         output_unit: force in N or torque in N m per unit of output, such as the torque constant in N m/A.
 
     Returns:
-        A `Controller`; use it as ``zwidth.Scene(device, timing, **controller)``.
+        A `ControllerParts`; use it as ``zwidth.Scene(device, timing, **controller)``.
 
     References:
         Astrom, Hagglund 2006, Advanced PID Control.
@@ -132,7 +132,7 @@ def pid(
         velocity = LowPass(time_constant=velocity)
     weight = None if position is None else 1.0
     feedback = IntegralFeedback(ki * scale, rule, weight) if is_traced(ki) or ki else None
-    return Controller(VirtualWall(kp * scale, kd * scale), velocity, position, feedback)
+    return ControllerParts(VirtualWall(kp * scale, kd * scale), velocity, position, feedback)
 
 
 def pid_gains(
@@ -177,7 +177,7 @@ def cascade(
     rule: IntegrationRule = "backward",
     units: PositionUnit = "turns",
     output_unit: float = 1.0,
-) -> Controller:
+) -> ControllerParts:
     """Return the parts of a scene for a position loop with an inner velocity loop, as in ODrive, VESC and SimpleFOC.
 
     The wall is K = pos_gain vel_gain and B = vel_gain. The integrator of the velocity loop is further feedback, whose
@@ -196,7 +196,7 @@ def cascade(
             current, the torque constant divided by the winding resistance for a voltage (SimpleFOC).
 
     Returns:
-        A `Controller`; use it as ``zwidth.Scene(device, timing, **controller)``.
+        A `ControllerParts`; use it as ``zwidth.Scene(device, timing, **controller)``.
 
     Raises:
         InputError: if ``velocity`` is given together with an observer or PLL.
@@ -223,7 +223,7 @@ def cascade(
     if is_traced(vel_integrator_gain) or vel_integrator_gain:
         feedback = IntegralFeedback(vel_integrator_gain * scale, rule, pos_gain, 1.0)
     wall = VirtualWall(pos_gain * vel_gain * scale, vel_gain * scale)
-    return Controller(wall, velocity or BackwardDifference(), position, feedback)
+    return ControllerParts(wall, velocity or BackwardDifference(), position, feedback)
 
 
 def cascade_gains(
