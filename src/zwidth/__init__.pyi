@@ -60,6 +60,7 @@ from .model.mode import Mode as Mode
 from .model.operator import Operator as Operator
 from .model.safe_limit import SafeLimit as SafeLimit
 from .model.timing import Timing as Timing
+from .model.tool import Tool as Tool
 from .model.velocity import FOAW as FOAW
 from .model.velocity import BackwardDifference as BackwardDifference
 from .model.velocity import Butterworth as Butterworth

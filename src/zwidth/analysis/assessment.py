@@ -40,7 +40,7 @@ _UNITS: dict[str, Any] = {
 }
 _MISSING = {
     "passivity_margin": "no condition is known for these parts",
-    "delay_margin": "not confirmed by the number of poles",
+    "delay_margin": "not confirmed by the number of poles, or not computed because of a tool",
     "phase_margin": "no gain crossover determines it",
     **dict.fromkeys(
         ("alpha_max", "beta_at_max", "stiffness_max", "virtual_damping_at_max", "ridge_frequency"), "no wall is stable"
@@ -124,7 +124,7 @@ def assess(scene: SceneOptima) -> Assessment:
     margins, best, has_condition = (
         scene.margins(),
         scene.max_stiffness(),
-        not find_unsupported_reason(**vars(scene.device)),
+        not find_unsupported_reason(scene.tool, **vars(scene.device)),
     )
     margin = float(scene.passivity_margin()) if has_condition else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)

@@ -20,6 +20,7 @@ from typing import Any, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 
+from zwidth.analysis.coupling_loop import CouplingLoop
 from zwidth.analysis.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.analysis.measured_loop import MeasuredLoop
 from zwidth.core.errors import InputError
@@ -34,6 +35,7 @@ from zwidth.model.operator import Operator
 from zwidth.model.parameter_paths import find_parts, list_parameters, replace_parameters
 from zwidth.model.safe_limit import SafeLimit
 from zwidth.model.timing import Timing
+from zwidth.model.tool import Tool
 from zwidth.model.velocity import BackwardDifference, Velocity, is_plain
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.stability.rigid.normalization import Normalized, Physical, denormalize, normalize
@@ -53,6 +55,7 @@ _KINDS = {
     "velocity": (Velocity, "zwidth.LowPass(cutoff=100)"),
     "operator": (Operator | None, "zwidth.Operator(mass=0.5)"),
     "safe_limit": (SafeLimit | None, "zwidth.SafeLimit(stiffness=500, virtual_damping=2)"),
+    "tool": (Tool | None, "zwidth.Tool(mass=0.1)"),
 }
 
 
@@ -74,6 +77,7 @@ class SceneParts(Part):
     velocity: Velocity = field(default_factory=BackwardDifference)
     operator: Operator | None = None
     safe_limit: SafeLimit | None = None
+    tool: Tool | None = None
 
     def __post_init__(self) -> None:
         """Raise `InputError` if a part has a wrong type or unit, or if the device does not allow an operator."""
@@ -83,12 +87,14 @@ class SceneParts(Part):
             part = getattr(self, name)
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; pass an object such as {example}")
-        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit")}
+        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit", "tool")}
         check_kind(self.unit_system.rotary, named)
         if self.operator is not None and not isinstance(self.device, Device):
             raise InputError(
                 "operator: allowed only with a zwidth.Device; include the hand in the model of this device"
             )
+        if self.tool is not None and isinstance(self.device, MeasuredDevice):
+            raise InputError("tool: not allowed with a measured response; use a model of the device")
 
     def _shift_parts(self) -> None:
         """Move velocity estimate and operator to their fields if the positional arguments omit the wall before them."""
@@ -120,6 +126,8 @@ class SceneParts(Part):
             return MeasuredLoop(self)
         if self.nonrigid_parts and self.traced_path is not None:
             return self.traced_loop
+        if self.tool is not None:
+            return CouplingLoop(make_plain(self))
         return LinearLoop(make_plain(self)) if self.nonrigid_parts else RigidLoop(self)
 
     @cached_property

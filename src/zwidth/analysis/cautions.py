@@ -70,7 +70,7 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
         cautions.append(f"{', '.join(thin)}{after}; {advice}")
     if unstable := [name for name, stable in recommendation.grasps.items() if not stable]:
         options = {"--grasps all": requirements._replace(grasps="all")}
-        if float(scene.device.damping) > 0 and not find_unsupported_reason(**vars(scene.device)):
+        if float(scene.device.damping) > 0 and not find_unsupported_reason(scene.tool, **vars(scene.device)):
             options["--passive"] = Requirements(passive=True, beyond_safe=requirements.beyond_safe)
         advice = _advise(
             recommendation,

@@ -90,17 +90,17 @@ def max_safe_coupling(scene: Scene) -> SafeCoupling:
 
 def _find_delay(scene: Scene) -> int:
     """Return the delay, an integer number of periods; raise `InputError` if no condition is known for the scene."""
-    # Ignore the operator of the scene, because the condition covers every passive operator.
-    unsupported = [part for part in scene.nonrigid_parts if not part.startswith("operator")]
+    # Ignore operator and tool of the scene, because the condition covers every passive operator and tool.
+    unsupported = [part for part in scene.nonrigid_parts if part not in ("operator", "tool")]
     if unsupported:
         raise InputError(
             f"{unsupported[0]}: the condition is known only for a rigid device with the backward difference; "
-            "use is_stable with the tool as part of the device"
+            "use is_stable of a scene with the tool"
         )
     delay = float(scene.timing.d)
     if delay != round(delay):
         raise InputError(
-            f"delay: got {delay:g} periods; the condition is known only for integer delays; use is_stable with the "
-            "tool as part of the device"
+            f"delay: got {delay:g} periods; the condition is known only for integer delays; use is_stable of a "
+            "scene with the tool"
         )
     return round(delay)

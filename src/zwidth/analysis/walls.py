@@ -295,7 +295,7 @@ class SceneAnalysis(SceneParts):
         actuator or modes (`InputError`). For K < 0 the margin is at most K T, because such a wall supplies energy
         without limit.
         """
-        if obstacle := find_unsupported_reason(**vars(self.device)):
+        if obstacle := find_unsupported_reason(self.tool, **vars(self.device)):
             raise InputError(f"passivity {obstacle}")
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         return self._loop_for(alpha, beta).passivity_margin(alpha, beta) * self.units.virtual_damping
@@ -333,11 +333,11 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
 
     By default they are included for a `zwidth.Device` whose velocity is a positive multiple of the difference of two
     samples. They are excluded for a device given as a whole system: its true damping is unknown, so a wall with B < 0
-    would cancel modeled damping that may not exist.
+    would cancel modeled damping that may not exist. They are also excluded for the coupling of a simulated tool.
     """
     if negative_damping is not None and not isinstance(negative_damping, bool | np.bool_):
         raise InputError(f"negative_damping: got {negative_damping!r}; pass True, False or None")
-    if negative_damping is None and not isinstance(scene.device, ResponseDevice):
+    if negative_damping is None and scene.tool is None and not isinstance(scene.device, ResponseDevice):
         if not scene.nonrigid_parts:
             return True
         estimate = scene.velocity.estimate(scene.timing.period)
@@ -355,6 +355,8 @@ def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, a
         alpha: normalized stiffness of the wall.
         beta: normalized damping of the wall.
     """
+    if scene.tool is not None:
+        raise InputError("tool: state-space models exclude a tool; use poles, frequency_response or is_stable")
     chain, period, mass = scene.loop.chain, scene.timing.period, float(scene.mass)
     loop = build(chain, *read_single_wall(alpha, beta))
     force = mass / period**2

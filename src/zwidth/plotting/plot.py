@@ -178,7 +178,7 @@ def recommendation(
         )
     panels = _choose_two_axes(axes, 1, 2, None)
     outlines, walls = tabulate_sets({"": scene})
-    if not find_unsupported_reason(**vars(scene.device)) and scene.device.damping > 0:
+    if not find_unsupported_reason(scene.tool, **vars(scene.device)) and scene.device.damping > 0:
         outlines = stack([outlines, _trace_passive(scene)])
     if verdict is None:
         return draw_stable_set(outlines, walls, panels[:1])

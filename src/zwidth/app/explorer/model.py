@@ -134,7 +134,7 @@ def compute_step_response(scene: Scene, periods: int) -> Curve:
 
 def find_passive_boundary(scene: Scene) -> Curve | None:
     """Return points on the boundary of the passive walls; None for a device without a passivity condition."""
-    if find_unsupported_reason(**vars(scene.device)):
+    if find_unsupported_reason(scene.tool, **vars(scene.device)):
         return None
     return trace_passivity_boundary(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
 

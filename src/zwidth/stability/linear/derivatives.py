@@ -78,7 +78,16 @@ class LoopTerms:
         x = solve(matrix, self.full + late - self.late)
         change = solve(matrix, late - x * z.map(lambda part: np.asarray(part)[None]))
         q = -(lam * self.lag).exp() / x[0]
-        return q, q * (self.one * self.lag - change[0] / x[0])
+        q_slope = q * (self.one * self.lag - change[0] / x[0])
+        if self.scene.tool is None:
+            return q, q_slope
+        # Add the response of the tool to G = -1/q: q becomes q/(1 - q G_t).
+        tool = self.varied.tool.respond(self.varied.mass, self.varied.timing.period)
+        denominator = (zeta * tool.a2 + tool.a1) * zeta + tool.a0
+        response = (lam * tool.power).exp() * tool.gain / denominator
+        slope = response * (tool.power - (zeta * (tool.a2 * 2.0) + tool.a1) * z / denominator)
+        share = 1.0 / (self.one - q * response)
+        return q * share, (q_slope + q * q * slope) * share * share
 
     def estimate(self, lam: Taylor) -> Pair:
         """Return the velocity estimate F and its derivative in lambda = log z."""

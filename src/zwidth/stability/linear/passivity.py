@@ -57,15 +57,18 @@ UNSUPPORTED = {
 }
 
 
-def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
-    """Return the reason why no passivity condition is available for a device; "" if a condition is available.
+def find_unsupported_reason(tool: Any = None, *, coupling: Any = None, **parts: Any) -> str:
+    """Return the reason why no passivity condition is available for a scene; "" if a condition is available.
 
     A condition is available only if the force acts on the point whose position is sensed.
 
     Args:
+        tool: simulated tool of the scene.
         coupling: coupling of the device.
         **parts: the other fields of the device.
     """
+    if tool is not None:
+        return "with a simulated tool: the wall is a coupling; use is_safe_for_every_world"
     for name, (description, reason) in UNSUPPORTED.items():
         part = parts.get(name)
         if part if isinstance(part, tuple | list) else part is not None:

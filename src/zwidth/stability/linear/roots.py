@@ -20,8 +20,10 @@ import numpy as np
 
 from zwidth.model.circle_functions import are_on_circle, circle_points, distances_inside
 from zwidth.model.mechanism import AnyChain
+from zwidth.model.tool import ToolResponse
 from zwidth.model.velocity import Estimate
 from zwidth.numerics.polynomials import Affine
+from zwidth.plant.composed_plant import add_plants, factor_tool
 from zwidth.plant.factored_plant import FactoredPlant, factor_chain
 
 # Coefficients below this fraction of the largest one are regarded as rounding errors of 0.
@@ -97,9 +99,11 @@ class LoopRoots(FactoredPlant):
         return by_roots + self.lag + self.estimate.window + abs(self.estimate.lag) + 1.0
 
 
-def find_roots(chain: AnyChain) -> LoopRoots:
-    """Return the zeros, poles and gain of the loop of a chain, without a wall."""
-    return LoopRoots(**vars(factor_chain(chain)), estimate=chain.estimate)
+def find_roots(chain: AnyChain, tool: ToolResponse | None = None) -> LoopRoots:
+    """Return the zeros, poles and gain of the loop of a chain, without a wall; ``tool`` is added to the device."""
+    plant = factor_chain(chain)
+    plant = plant if tool is None else add_plants(plant, factor_tool(tool))
+    return LoopRoots(**vars(plant), estimate=chain.estimate)
 
 
 def _expand(*offsets: np.ndarray) -> np.ndarray:
