@@ -34,10 +34,12 @@ def is_safe_for_every_world(scene: Scene, stiffness: Walls = None, virtual_dampi
     """Return whether virtual couplings are stable with every passive tool, virtual world and operator.
 
     The condition is ``b (B + KT/2) >= sin^2((n+1)w/2) [(B + KT/2)^2 + (KT/2)^2 cot^2(w/2)]`` at all frequencies w
-    (rad per period), with the damping b of the device, the period T and a delay of n periods; the mass has no effect. A
-    simulated world is passive if its integration method preserves passivity, as the implicit Euler and the trapezoidal
-    method do. **The semi-implicit Euler method, which most physics
-    engines use, does not**: with a light tool, a coupling can be unstable although this function returns True.
+    (rad per period), with the damping b of the device, the period T and a delay of n periods; the mass has no effect.
+    The velocity of a tool is the backward difference ``(y_k - y_(k-1))/T`` of its position. A simulated tool is passive
+    if its impedance at this velocity has no negative real part. The implicit Euler method preserves passivity. The
+    trapezoidal rule preserves it if the position follows from the new velocity, ``y += T v``. **The semi-implicit Euler
+    method, which most physics engines use, does not preserve it**, nor does a trapezoidal rule for velocity and
+    position. With a light tool of these methods, a coupling can be unstable although this function returns True.
 
     Args:
         stiffness: K in N/m, >= 0; default: the stiffness of the scene's wall.

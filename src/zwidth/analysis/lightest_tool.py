@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from zwidth.analysis.walls import read_single_wall
-from zwidth.core.errors import InputError, check_choice
+from zwidth.core.errors import check_choice
 from zwidth.core.status import Status
 from zwidth.model.circle_functions import circle_points
 from zwidth.model.tool import Integrator, Tool
@@ -131,8 +131,8 @@ def _find_critical_masses(scene: Scene, tool: Tool, alpha: float, beta: float) -
 
     nodes = place_nodes(loop)
     w = np.unique(np.interp(np.arange(REFINEMENT * (nodes.size - 1) + 1) / REFINEMENT, np.arange(nodes.size), nodes))
-    values = find_mass(w).imag
+    values = np.imag(find_mass(w))
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
-    angles = np.concatenate([find_zeros_between(lambda w: find_mass(w).imag, w, values, k), [w[0], np.pi]])
-    masses = np.unique(find_mass(angles).real) * mass
+    angles = np.concatenate([find_zeros_between(lambda w: np.imag(find_mass(w)), w, values, k), [w[0], np.pi]])
+    masses = np.unique(np.real(find_mass(angles))) * mass
     return masses[(masses > SI_RANGE[0] * OUTSIDE) & (masses < SI_RANGE[1] / OUTSIDE)]
