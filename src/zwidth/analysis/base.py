@@ -29,10 +29,12 @@ from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced
 from zwidth.model.checks import Part, check_kind
 from zwidth.model.device import Device
+from zwidth.model.feedback import Feedback, IntegralFeedback
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.operator import Operator
 from zwidth.model.parameter_paths import find_parts, list_parameters, replace_parameters
+from zwidth.model.position import Position, has_velocity
 from zwidth.model.safe_limit import SafeLimit
 from zwidth.model.timing import Timing
 from zwidth.model.tool import Tool
@@ -55,6 +57,8 @@ _KINDS = {
     "velocity": (Velocity, "zwidth.LowPass(cutoff=100)"),
     "operator": (Operator | None, "zwidth.Operator(mass=0.5)"),
     "safe_limit": (SafeLimit | None, "zwidth.SafeLimit(stiffness=500, virtual_damping=2)"),
+    "position": (Position | None, "zwidth.ExponentialFilter(cutoff=100)"),
+    "feedback": (Feedback | IntegralFeedback | None, "zwidth.IntegralFeedback(1000)"),
     "tool": (Tool | None, "zwidth.Tool(mass=0.1)"),
 }
 
@@ -77,6 +81,8 @@ class SceneParts(Part):
     velocity: Velocity = field(default_factory=BackwardDifference)
     operator: Operator | None = None
     safe_limit: SafeLimit | None = None
+    position: Position | None = None
+    feedback: Feedback | IntegralFeedback | None = None
     tool: Tool | None = None
 
     def __post_init__(self) -> None:
@@ -93,8 +99,17 @@ class SceneParts(Part):
             raise InputError(
                 "operator: allowed only with a zwidth.Device; include the hand in the model of this device"
             )
+        if isinstance(self.device, MeasuredDevice) and (self.position is not None or self.feedback is not None):
+            name = "feedback" if self.position is None else "position"
+            raise InputError(f"{name}: needs a model of the device; fit one to the measured response, or omit {name}")
+        if has_velocity(self.position) and self.velocity != BackwardDifference():
+            raise InputError(
+                f"velocity: got {self.velocity!r}, but {self.position!r} has its own velocity estimate; omit velocity"
+            )
         if self.tool is not None and isinstance(self.device, MeasuredDevice):
             raise InputError("tool: not allowed with a measured response; use a model of the device")
+        if self.tool is not None and (self.position is not None or self.feedback is not None):
+            raise InputError("tool: not allowed together with position or feedback; omit the tool, or omit these parts")
 
     def _shift_parts(self) -> None:
         """Move velocity estimate and operator to their fields if the positional arguments omit the wall before them."""

@@ -16,9 +16,10 @@ import numpy as np
 from zwidth.analysis.loop import LinearLoop
 from zwidth.core.errors import InputError
 from zwidth.core.status import RidgeKind, Status
+from zwidth.plant.composed_plant import add_plants, factor_tool
 from zwidth.stability.linear.regions import StableSet
 from zwidth.stability.linear.ridge import RidgeSolution
-from zwidth.stability.linear.roots import LoopRoots, find_roots
+from zwidth.stability.linear.roots import LoopRoots
 from zwidth.stability.linear.rows import CONNECTED_START, Island, find_stable_intervals
 from zwidth.stability.results import Margins, RidgePoint
 
@@ -31,8 +32,9 @@ class CouplingLoop(LinearLoop):
 
     @cached_property
     def roots(self) -> LoopRoots:
-        scene = self.scene
-        return find_roots(self.chain, scene.tool.respond(scene.mass, scene.timing.period))
+        device, scene = super().roots, self.scene
+        plant = add_plants(device, factor_tool(scene.tool.respond(scene.mass, scene.timing.period)))
+        return LoopRoots(**vars(plant), estimate=device.estimate)
 
     @cached_property
     def unbounded(self) -> bool:

@@ -20,8 +20,8 @@ from zwidth.core.status import Status
 from zwidth.model.circle_functions import circle_points
 from zwidth.model.tool import Integrator, Tool
 from zwidth.numerics.root_finding import find_zeros_between
+from zwidth.stability.linear.composition import find_roots
 from zwidth.stability.linear.curve import place_nodes
-from zwidth.stability.linear.roots import find_roots
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import CHOICES, SI_RANGE
 

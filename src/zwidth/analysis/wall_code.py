@@ -23,7 +23,8 @@ import numpy as np
 
 from zwidth.analysis.base import SceneParts
 from zwidth.core.errors import InputError, check_choice
-from zwidth.model.velocity import Estimate
+from zwidth.model.estimate import Estimate
+from zwidth.model.loop_estimates import refuse_estimates
 from zwidth.units.formatting import format_wall, with_unit
 from zwidth.units.unit_system import UnitSystem
 
@@ -131,6 +132,7 @@ def write_wall(
 
 def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: float = math.inf) -> WallProgram:
     """Build the program, as statements for either language, that computes the force of the wall of a scene."""
+    refuse_estimates(scene, "wall_code")
     period = float(scene.timing.period)
     estimate = scene.velocity.estimate(period)
     count, gain = estimate.window, float(estimate.gain) / period

@@ -30,7 +30,7 @@ from zwidth.app.printing import (
 from zwidth.core.errors import InputError
 from zwidth.model.device import Device
 from zwidth.model.safe_limit import reserve_damping
-from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.units.display import find_unit
 from zwidth.units.formatting import (
     format_interval,
@@ -216,7 +216,7 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
     if scene.tool is not None:
         return _spell_worlds(scene)
     if verdict.passive is None:
-        return f"not known {find_unsupported_reason(scene.tool, **vars(scene.device)).partition(':')[0]}"
+        return f"not known {find_obstacle(scene).partition(':')[0]}"
     if stiffness < 0:
         return "no: no damping makes a negative stiffness passive"
     dampings = scene.device.damping + abs(scene.wall.virtual_damping) + stiffness * scene.timing.period

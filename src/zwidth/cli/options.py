@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import MISSING, fields, replace
+from dataclasses import fields, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -20,13 +20,15 @@ import click
 from zwidth.app.printing import format_row
 from zwidth.cli.help import OF_SCENE as OF_SCENE
 from zwidth.cli.help import show_example as show_example
+from zwidth.cli.velocity import FILTER_HELP, list_needed, make_velocity, name_option
 from zwidth.core.errors import InputError
 from zwidth.model.checks import Span, find_kind, read_span
 from zwidth.model.device import Device
+from zwidth.model.linear_device import LinearDevice
 from zwidth.model.mode import Mode
 from zwidth.model.parameter_paths import PARTS, find_parts, spell_part
 from zwidth.model.timing import Timing
-from zwidth.model.velocity import ESTIMATES, name_estimate
+from zwidth.model.velocity import name_estimate
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.units.parsing import DIMENSIONS, detect_kind, looks_like_number, read_quantity, read_share
 from zwidth.units.plausibility import list_implausible
@@ -136,20 +138,21 @@ def _read_figure(text: str) -> Path:
     return file
 
 
-def name_option(path: str) -> str:
-    """Return the name of the option for a parameter, ``--velocity-cutoff`` for ``velocity.cutoff``."""
-    return "--" + path.replace(".", "-").replace("_", "-")
-
-
 def _add_option(command: Command, path: str) -> Command:
     """Return a command with the option of one parameter added; ``path`` is the path of the parameter in a scene."""
     if path == "device":
         words = (
             "A published device of `zwidth devices`, with its period and delay; other options add or replace "
             "parameters. Or, in place of mass, damping and all parts: a transfer function 'NUM / DEN' by its "
-            "coefficients in s, such as '1 / 0.1 10 0', or a measured response FILE.csv (.npz, .mat)."
+            "coefficients in s, such as '1 / 0.1 10 0', by its roots, 'zpk: ZEROS / POLES / GAIN', or by sections, "
+            "'sos: b0 b1 b2 a0 a1 a2; ..'; or a measured response FILE.csv (.npz, .mat)."
         )
         return click.option("--device", metavar="NAME", help=words)(command)
+    if path == "sampled":
+        words = "The transfer function of --device is in z, at the period of the loop, and includes hold and delay."
+        return click.option("--sampled", is_flag=True, default=None, help=words)(command)
+    if path == "velocity.filter":
+        return click.option("--velocity-filter", "velocity__filter", metavar="FILTER", help=FILTER_HELP)(command)
     if path in CHOICES:
         kind, text = click.Choice(CHOICES[path].names), CHOICES[path].sentence
     else:
@@ -166,14 +169,22 @@ def _add_option(command: Command, path: str) -> Command:
     return click.option(name_option(path), path.replace(".", "__"), type=kind, help=f"{text}.")(command)
 
 
+# Paths of the parameters of a rigid device and of its timing.
+_TIMED = ("mass", "damping", "period", "rate", "delay")
+
+
 def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
     """Return a decorator that adds the options of a scene, with or without wall, and the argument of a scene file.
 
     The command receives a `zwidth.Scene` as ``scene``, or None if ``instead`` names alternative options and no scene
     option is given.
     """
-    bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
-    take = take_options("scene", (*bare, *_PARTS), lambda given, system: build_scene(given, system, instead, wall=wall))
+    bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "sampled", *_TIMED)
+    take = take_options(
+        "scene",
+        (*bare, "velocity.filter", *_PARTS),
+        lambda given, system: build_scene(given, system, instead, wall=wall),
+    )
     file = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=click.Path(path_type=Path))
     return lambda command: file(take(command))
 
@@ -197,10 +208,12 @@ def take_options(
                 if (file := given.pop("scene_file", None)) is not None:
                     values["scene"] = read_scene_file(file)
                     with_kind = {file.name: values["scene"].device, **with_kind}
+                if values.get("sampled") and "device" not in values:
+                    raise click.UsageError("--sampled: give --device 'NUM / DEN' with coefficients in z")
                 if "device" in values:
                     from zwidth.model.devices import read_device
 
-                    values["device"] = read_device(values["device"])
+                    values["device"] = read_device(values["device"], _find_sampled_period(values))
                     # Ignore the unit system and the hardware of the scene file, because the option --device replaces
                     # the device of the file.
                     context.meta.pop(_HARDWARE, None)
@@ -219,6 +232,17 @@ def take_options(
         return command
 
     return decorate
+
+
+def _find_sampled_period(values: dict[str, Any]) -> float | None:
+    """Return the period of the loop in s if the option --sampled is given, otherwise None; remove this option."""
+    if not values.pop("sampled", False):
+        return None
+    if "rate" in values or "period" in values:
+        return values["period"] if "period" in values else 1.0 / values["rate"]
+    if "scene" not in values:
+        raise click.UsageError("--sampled: also give --rate or --period")
+    return float(values["scene"].timing.period)
 
 
 def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
@@ -260,6 +284,8 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
     warn_implausible(numbers, system)
     scene = _make_scene(given, system, instead) if base is None else change_scene(base, given)
     scene.check_parts()
+    if isinstance(scene.device, LinearDevice) and (warning := scene.device.warn_of_variable(scene.timing.period)):
+        click.echo(f"zwidth: --device: {warning} add --sampled", err=True)
     return scene
 
 
@@ -353,14 +379,9 @@ def _check_published(device: PublishedDevice, given: dict[str, Any], more: Seque
         raise click.UsageError(f"--device {device.name}: also give {', '.join(flags)}; not published for this device")
 
 
-def _list_needed(kind: Any) -> list[str]:
-    """Return the names of the fields without default value of the class ``kind`` of a part."""
-    return [item.name for item in fields(kind) if item.default is MISSING]
-
-
 def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
     """Return a part of class ``kind`` with the given fields; raise `click.UsageError` if a field is missing."""
-    needed = _list_needed(kind)
+    needed = list_needed(kind)
     for key in needed:
         if key not in given:
             fields_needed = " and ".join(f"a {each}" for each in needed)
@@ -371,24 +392,6 @@ def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
 def _select_part(given: dict[str, Any], name: str) -> dict[str, Any]:
     """Return the parameters of one part from the options, as a dict by field name."""
     return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
-
-
-def make_velocity(given: dict[str, Any]) -> Any:
-    """Return the velocity estimate built from the parameters ``given``, a dict by field name."""
-    kind = given.pop("kind", None)
-    if kind is None:
-        low = {"cutoff", "time_constant"} & set(given)
-        kind = "windowed_difference" if "samples" in given else "low_pass" if low else "backward_difference"
-    part = ESTIMATES[kind]
-    needed = ["cutoff"] if kind == "low_pass" and "time_constant" not in given else _list_needed(part)
-    for name in needed:
-        if name not in given:
-            raise click.UsageError(f"a velocity estimate of kind {kind} requires {name_option(f'velocity.{name}')}")
-    for name in sorted(set(given) - set(part.__dataclass_fields__)):
-        raise click.UsageError(
-            f"{name_option(f'velocity.{name}')} does not belong to a velocity estimate of kind {kind}"
-        )
-    return part(**given)
 
 
 figure_option = click.option(
@@ -405,7 +408,8 @@ def find_omitted() -> frozenset[str]:
     Friction is included only if the command simulates an encoder.
     """
     given, hardware = click.get_current_context().params, get_hardware()
-    named = () if given.get("scene_file") is not None else ("damping", "delay")
+    # A sampled device includes its delay.
+    named = () if given.get("scene_file") is not None else ("damping", *(() if given.get("sampled") else ("delay",)))
     omitted = {name for name in named if given.get(name) is None}
     values = {name: hardware.get(name) if given[name] is None else given[name] for name in HARDWARE if name in given}
     simulated = values.get("resolution") and "coulomb" in values

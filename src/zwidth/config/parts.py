@@ -8,11 +8,13 @@ itself validates combinations of values.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import MISSING, fields
 from functools import cached_property
 from math import isfinite
 from typing import Annotated, Any, ClassVar, Literal, Union
 
+import numpy as np
 from pydantic import (
     BeforeValidator,
     Field,
@@ -78,6 +80,32 @@ class PartSection(Strict):
             yield path if path[0] in type(self).model_fields else path[1:], fault
 
 
+def to_array(raw: Any) -> np.ndarray:
+    """Return a number or a list as an array, complex if an entry is a text such as "-3+40j".
+
+    Raises:
+        ValueError: if an entry is not a number.
+    """
+    array = np.array([] if raw is None else raw)
+    if array.dtype.kind == "U":
+        array = np.array([complex(text.replace(" ", "")) for text in array.ravel()]).reshape(array.shape)
+    if array.dtype.kind not in "iufc":
+        raise ValueError("no numbers")
+    return array
+
+
+def _check_numbers(raw: Any) -> Any:
+    """Return the value unchanged; raise a problem if it is not a number or a list of finite numbers."""
+    with suppress(ValueError):
+        if np.all(np.isfinite(to_array(raw))):
+            return raw
+    remedy = "write [1, 0.5], or '-3+40j' for a complex root"
+    raise problem(f"got {describe(raw)}", "it must be a list of finite numbers", remedy)
+
+
+Numbers = Annotated[Any, BeforeValidator(_check_numbers), WithJsonSchema({"type": ["array", "number"]})]
+
+
 def _read_coefficients(raw: Any) -> tuple[Any, ...]:
     """Validate the coefficients of a polynomial, or a list of such lists for sections in series; return tuples."""
     if not isinstance(raw, list | tuple):
@@ -120,6 +148,15 @@ def _head(part: Any) -> str:
     return part.__doc__.partition("\n")[0]
 
 
+# Descriptions of the keys of a velocity filter that is given by its roots or by second-order sections.
+_ROOTS = {
+    "velocity.sos": "Second-order sections of the filter, rows of the coefficients b0 b1 b2 a0 a1 a2.",
+    "velocity.zeros": "Zeros of the filter in the z plane; complex zeros as text such as '0.9+0.1j', with conjugates.",
+    "velocity.poles": "Poles of the filter, in the same form as the zeros.",
+    "velocity.gain": "Ratio of the leading coefficients; required with poles.",
+}
+
+
 def _describe(path: str, item: Any) -> tuple[Any, str]:
     """Return the type annotation of a key, and its description for the schema.
 
@@ -127,6 +164,8 @@ def _describe(path: str, item: Any) -> tuple[Any, str]:
     """
     if path in CHOICES:
         return Literal[CHOICES[path].names], f"{CHOICES[path].sentence}."
+    if path in _ROOTS:
+        return Numbers, _ROOTS[path]
     if path not in FIELDS:
         description = f"Coefficients of the {path.rpartition('.')[2]}, highest power of z first"
         return Coefficients, f"{description}, or a list of sections in series."

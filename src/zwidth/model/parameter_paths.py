@@ -16,9 +16,12 @@ from zwidth.core.errors import InputError, describe_choice
 from zwidth.core.xp import is_jax
 from zwidth.model.actuator import Actuator
 from zwidth.model.device import Coupling, Device
+from zwidth.model.feedback import Feedback, IntegralFeedback
 from zwidth.model.linear_device import LinearDevice
+from zwidth.model.loop_estimates import refuse_estimates
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.operator import Operator
+from zwidth.model.position import Position
 from zwidth.model.timing import Timing
 from zwidth.model.tool import Tool
 from zwidth.model.velocity import BackwardDifference, Velocity, name_estimate
@@ -42,6 +45,10 @@ class Parts(Protocol):
     def operator(self) -> Operator | None: ...
     @property
     def tool(self) -> Tool | None: ...
+    @property
+    def position(self) -> Position | None: ...
+    @property
+    def feedback(self) -> Feedback | IntegralFeedback | None: ...
     def _rebuild(self) -> Self: ...
 
 
@@ -53,7 +60,7 @@ PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator, "tool
 """Classes of the optional parts of a scene, by name, in the order in which descriptions list these parts."""
 _OF_DEVICE = ("coupling", "actuator")  # optional parts that are fields of the device
 # Fields of the scene with whose names the paths of their parameters begin.
-_NAMED = ("velocity", *(name for name in PARTS if name not in _OF_DEVICE))
+_NAMED = ("velocity", "position", "feedback", *(name for name in PARTS if name not in _OF_DEVICE))
 
 
 def find_parts(scene: Parts) -> dict[str, Any]:
@@ -133,6 +140,7 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 
 def spell_scene(scene: Any) -> dict[str, Any]:
     """Return the section ``scene`` of a configuration as a dictionary, without keys that have their default values."""
+    refuse_estimates(scene, "a configuration")
     parts: dict[str, Any] = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
     if scene.safe_limit is not None:
         parts["safe_limit"] = spell_part(scene.safe_limit)

@@ -15,6 +15,7 @@ import numpy as np
 
 from zwidth.core.xp import compute_concretely
 from zwidth.model.device import Device
+from zwidth.model.loop_estimates import refuse_estimates
 from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import Parts, replace_parameters
 from zwidth.model.velocity import FOAW, BackwardDifference
@@ -69,6 +70,7 @@ class Model(NamedTuple):
 
 def build_model(scene: Any) -> Model:
     """Build the simulation model of a scene, with its chain, delay and velocity estimate."""
+    refuse_estimates(scene, "simulate")
     estimate, period, mass = scene.velocity, float(scene.timing.period), float(scene.mass)
     # For FOAW, build the chain with another velocity estimate and keep the FOAW parameters separately, because FOAW is
     # not a linear filter.

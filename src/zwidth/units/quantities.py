@@ -250,6 +250,21 @@ VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}  # para
 _NOISE = Parameter(
     "velocity.noise", "largest error of the measured position", "", POSITIVE, "m", note="one count of an encoder"
 )
+# Parameters of the position estimate and of the further feedback.
+_OF_ESTIMATES = (
+    Parameter(
+        "position.coefficient", "coefficient a of the exponential filter", "a", Range(0.0, 1.0, low_open=True),
+        note="instead of the cut-off frequency",
+    ),
+    Parameter("position.cutoff", "cut-off frequency of the position filter", "f_p", POSITIVE, "Hz"),
+    Parameter("position.time_constant", "time constant of the position filter", r"\tau_p", POSITIVE, "s"),
+    Parameter("position.order", "order of the position filter", "n_p", Range(1, 8), whole=True),
+    Parameter("position.coded_period", "sampling period in the formula of the position filter", "T_p", POSITIVE, "s"),
+    Parameter("position.bandwidth", "bandwidth of the phase-locked loop, in rad/s", r"\omega_p", POSITIVE),
+    Parameter("feedback.gain", "integral gain, in N/(m s)", "k_i", ANY),
+    Parameter("feedback.position", "weight of the position estimate in the input of the feedback", "w_p", ANY),
+    Parameter("feedback.velocity", "weight of the velocity estimate in the input of the feedback", "w_v", ANY),
+)  # fmt: skip
 # Parameters of simulations.
 _OF_MOTIONS = (
     Parameter(
@@ -279,7 +294,9 @@ OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
 # Names of the parameters of encoder, friction and motor, which are arguments of `zwidth.diagnose` and
 # `zwidth.simulate`.
 HARDWARE = ("resolution", "coulomb", "static", "max_force", "max_rate")
-FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
+FIELDS = PARAMETERS | {
+    each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_ESTIMATES, *_OF_MOTIONS)
+}
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 
 
