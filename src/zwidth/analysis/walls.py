@@ -9,6 +9,7 @@ results back. K and B are the stiffness and damping of the wall, F(z) is the vel
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -159,10 +160,14 @@ class SceneAnalysis(SceneParts):
         the delayed forces. The result has A, B, C, D and the period dt.
         """
         compliance = self.timing.period**2 / float(self.mass)
-        return _realize(self, realize_closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
+        tool = self.tool and self.tool.respond(float(self.mass), self.timing.period)
+        build = partial(realize_closed_loop, tool=tool)
+        return _realize(self, build, compliance, *self.normalize_walls(stiffness, virtual_damping))
 
     def open_loop(self, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
         """Return a state-space model of the open loop L with one wall; negative feedback closes the loop."""
+        if self.tool is not None:
+            raise InputError("tool: the state-space model of the open loop excludes a tool; use frequency_response")
         return _realize(self, realize_open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
 
     def frequency_response(
@@ -358,8 +363,6 @@ def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, a
         alpha: normalized stiffness of the wall.
         beta: normalized damping of the wall.
     """
-    if scene.tool is not None:
-        raise InputError("tool: state-space models exclude a tool; use poles, frequency_response or is_stable")
     chain, period, mass = scene.loop.chain, scene.timing.period, float(scene.mass)
     loop = build(chain, *read_single_wall(alpha, beta))
     force = mass / period**2

@@ -14,7 +14,7 @@ with zeta = z - 1, p = c T/M and q = k T^2/M.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 from zwidth.model.checks import Part
 
@@ -65,6 +65,10 @@ class Tool(Part):
     """
 
     _owner = "tool"
+    # Presets of this part in the page of ``zwidth explore``: arguments of the constructor, by name of the preset.
+    usual: ClassVar[dict[str, dict[str, Any]]] = {
+        name: {"mass": 0.3, "damping": 0.0, "stiffness": 0.0, "integrator": name} for name in get_args(Integrator)
+    }
 
     mass: Any
     damping: Any = 0.0

@@ -205,7 +205,7 @@ def test_rotary_tool():
         (lambda scene: zwidth.Tool(0), "tool.mass"),
         (lambda scene: zwidth.Tool(1, integrator="verlet"), "tool.integrator"),
         (lambda scene: scene.simulate(5e3, 5), "exclude a tool"),
-        (lambda scene: scene.state_space(5e3, 5), "exclude a tool"),
+        (lambda scene: scene.open_loop(5e3, 5), "excludes a tool"),
         (lambda scene: scene.recommend().code(), "code is written for walls only"),
         (lambda scene: scene.is_passive(5e3, 5), "is_safe_for_every_world"),
         (lambda scene: scene.recommend(passive=True), "is_safe_for_every_world"),
@@ -226,3 +226,18 @@ def test_assessment_and_tolerances():
     assert verdict.stiffness_max == pytest.approx(22_200.57, abs=0.1)
     walls = zwidth.stiffest_walls(make_scene(0.3), {"tool.mass": [1, 0.3, 0.1]})
     np.testing.assert_allclose(walls.stiffness, [20_461.8, 22_200.6, 30_831.9], atol=0.1)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_state_space(integrator):
+    tool = zwidth.Tool(0.3, 1, 0, integrator)
+    scene = make_scene(None, 1.3, velocity=zwidth.LowPass(cutoff=100)).replace(tool=tool)
+    model = scene.state_space(5e3, 20)
+    eigenvalues = np.linalg.eigvals(model.A)
+    # The state-space model includes the common drift of device and tool, a pole at z = 1.
+    others = np.delete(eigenvalues, np.argmin(np.abs(eigenvalues - 1)))
+    poles = scene.poles(5e3, 20)
+    assert max(np.min(np.abs(others - pole)) for pole in poles) < 1e-9
+    # A force of 1 N moves device and tool together against both dampers.
+    response = model.step(20_000)
+    assert (response[-1] - response[-2]) / PERIOD == pytest.approx(1 / 11, rel=1e-9)
