@@ -241,3 +241,17 @@ def test_state_space(integrator):
     # A force of 1 N moves device and tool together against both dampers.
     response = model.step(20_000)
     assert (response[-1] - response[-2]) / PERIOD == pytest.approx(1 / 11, rel=1e-9)
+
+
+@pytest.mark.parametrize("n_delay", [0, 1, 2])
+def test_safe_couplings_are_stable_with_implicit_tools(n_delay):
+    rng = np.random.default_rng(n_delay)
+    stiffest = make_scene(None, n_delay).max_safe_coupling()
+    for _ in range(25):
+        mass, damping, stiffness = (10 ** rng.uniform(*ends) for ends in ((-4, 1), (-2, 1), (0, 4)))
+        hand = zwidth.Operator(*(10 ** rng.uniform(*ends) for ends in ((-1, 0), (0, 1.5), (1, 3))))
+        tool = zwidth.Tool(mass, damping, stiffness, "implicit")
+        scene = make_scene(None, n_delay, operator=hand).replace(tool=tool)
+        share = rng.uniform(0.1, 0.999)
+        assert scene.is_safe_for_every_world(share * stiffest.stiffness, share * stiffest.virtual_damping)
+        assert scene.spectral_radius(share * stiffest.stiffness, share * stiffest.virtual_damping) < 1

@@ -2,7 +2,7 @@
 
 In normalized units, a wall (alpha, beta) acts on the sampled position y through the velocity estimate F with the force
 ``u = -(alpha + beta F) y``. With a position estimate P, a velocity estimate V and further feedback R, the force is ``u
-= -(alpha P + beta V + R) y``. With a simulated tool of the response G_t, the wall is a coupling C, and the controller is
+= -(alpha P + beta V + R) y``. With a tool of the response G_t, the wall is a coupling C, and the controller is
 ``C/(1 + C G_t)``. An external force, held constant over each period, acts on the first body without delay.
 """
 
