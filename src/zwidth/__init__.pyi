@@ -76,6 +76,7 @@ from .model.position import Pll as Pll
 from .model.position import PositionFilter as PositionFilter
 from .model.safe_limit import SafeLimit as SafeLimit
 from .model.timing import Timing as Timing
+from .model.tool import Tool as Tool
 from .model.velocity import FOAW as FOAW
 from .model.velocity import BackwardDifference as BackwardDifference
 from .model.velocity import Butterworth as Butterworth

@@ -19,6 +19,7 @@ GROUPS = {
     "Velocity estimate": ("--velocity-",),
     "Encoder, friction and motor": ("--resolution", "--friction", "--static-friction", "--max-force", "--max-rate"),
     "Hand": ("--operator-",),
+    "Simulated tool": ("--tool-",),
     "Further parts of the device": ("--coupling-", "--actuator-", "--modes-"),
     "Output": ("--figure", "--code", "--verbose", "--json", "--help"),
 }

@@ -24,7 +24,8 @@ from zwidth.cli.options import (
     take_options,
 )
 from zwidth.model.checks import find_kind
-from zwidth.units.quantities import CHOICES, OF_LOGS, OF_PARTS
+from zwidth.units.log_columns import OF_LOGS
+from zwidth.units.quantities import CHOICES, OF_PARTS
 from zwidth.units.unit_system import UnitSystem
 
 if TYPE_CHECKING:

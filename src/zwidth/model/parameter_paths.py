@@ -23,6 +23,7 @@ from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.operator import Operator
 from zwidth.model.position import Position
 from zwidth.model.timing import Timing
+from zwidth.model.tool import Tool
 from zwidth.model.velocity import BackwardDifference, Velocity, name_estimate
 from zwidth.model.wall import NoWall, VirtualWall
 
@@ -43,6 +44,8 @@ class Parts(Protocol):
     @property
     def operator(self) -> Operator | None: ...
     @property
+    def tool(self) -> Tool | None: ...
+    @property
     def position(self) -> Position | None: ...
     @property
     def feedback(self) -> Feedback | IntegralFeedback | None: ...
@@ -53,7 +56,7 @@ AnyScene = TypeVar("AnyScene", bound=Parts)
 
 _BARE = ("device", "timing", "wall")  # parts whose parameters have paths without prefix
 _WHOLE = ("safe_limit",)  # parts that can only be replaced as a whole, because their parameters have no paths
-PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator}
+PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator, "tool": Tool}
 """Classes of the optional parts of a scene, by name, in the order in which descriptions list these parts."""
 _OF_DEVICE = ("coupling", "actuator")  # optional parts that are fields of the device
 # Fields of the scene with whose names the paths of their parameters begin.

@@ -279,12 +279,10 @@ def compute_details(
         x, y = compute_ridge(scene) if bodies else (np.empty(0), np.empty(0))
         yield {"ridge": {"x": x, "y": y}}
         yield {"slopes": "\n".join([] if normalized else [slope.line() for slope in list_slopes(scene)])}
-    if contact and not bodies:
+    if contact and (not bodies or scene.tool is not None):
+        reason = "a hit needs a wall, not a simulated tool" if bodies else "a linear system has no body with a velocity"
         empty = {"x": [], "position": [], "force": []}
-        yield {
-            "contact": empty,
-            "contact_words": "(not available: a linear system has no body with a velocity)",
-        }
+        yield {"contact": empty, "contact_words": f"(not available: {reason})"}
     elif contact:
         with IMPORTING:
             import jax  # noqa: F401
