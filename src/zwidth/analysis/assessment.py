@@ -22,7 +22,7 @@ from zwidth.core.errors import InputError
 from zwidth.core.status import RidgeKind, Status
 from zwidth.model.checks import Span
 from zwidth.model.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
-from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.results import Margins
 from zwidth.units.display import ResultList, compact_repr, find_unit, with_units
 from zwidth.units.formatting import format_interval, plain, round_conservatively, to_json, with_unit
@@ -124,7 +124,7 @@ def assess(scene: SceneOptima) -> Assessment:
     margins, best, has_condition = (
         scene.margins(),
         scene.max_stiffness(),
-        not find_unsupported_reason(**vars(scene.device)),
+        not find_obstacle(scene),
     )
     margin = float(scene.passivity_margin()) if has_condition else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)

@@ -95,6 +95,9 @@ class SceneParts(Part):
             raise InputError(
                 "operator: allowed only with a zwidth.Device; include the hand in the model of this device"
             )
+        if isinstance(self.device, MeasuredDevice) and (self.position is not None or self.feedback is not None):
+            name = "feedback" if self.position is None else "position"
+            raise InputError(f"{name}: needs a model of the device; fit one to the measured response, or omit {name}")
         if has_velocity(self.position) and self.velocity != BackwardDifference():
             raise InputError(
                 f"velocity: got {self.velocity!r}, but {self.position!r} has its own velocity estimate; omit velocity"
@@ -126,8 +129,6 @@ class SceneParts(Part):
         shape = next((np.shape(leaf) for leaf in list_leaves(self) if np.ndim(leaf)), ())
         if shape:
             raise InputError(f"scene: got numbers of shape {shape}; map over scenes with jax.vmap")
-        if self.position is not None or self.feedback is not None:
-            raise InputError("position: not analyzed yet; omit position and feedback")
         if isinstance(self.device, MeasuredDevice):
             return MeasuredLoop(self)
         if self.nonrigid_parts and self.traced_path is not None:

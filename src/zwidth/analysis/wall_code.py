@@ -191,7 +191,7 @@ def _omit_output(start: list[str]) -> list[str]:
 def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: float = math.inf) -> WallProgram:
     """Build the program, as statements for either language, that computes the force of the wall of a scene."""
     period, position, further = float(scene.timing.period), scene.position, scene.feedback
-    estimates = build_estimates(scene, 1.0) or LoopEstimates(velocity=scene.velocity.estimate(period))
+    estimates = build_estimates(scene) or LoopEstimates(velocity=scene.velocity.estimate(period))
     states, begin, force = [], [], []
     depth = "x" if position is None else "y"
     memory = depth if estimates.structure == "series" else "x"

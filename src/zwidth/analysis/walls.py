@@ -20,12 +20,13 @@ from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced, namespace
 from zwidth.model.checks import read_texts
 from zwidth.model.linear_device import ResponseDevice
+from zwidth.model.position import has_velocity
 from zwidth.model.state_space import StateSpace
 from zwidth.model.wall import resolve_wall
 from zwidth.numerics.evaluate import are_numbers, as_float64, broadcast_traced, join_shapes
 from zwidth.plant.sampled_states import sample_states
 from zwidth.stability.linear.closed_loop import realize_closed_loop, realize_open_loop
-from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.linear.rows import Island
 from zwidth.stability.results import Margins, Stability
 from zwidth.stability.rigid.verdict import STABILITY_METHODS, StabilityMethod
@@ -295,7 +296,7 @@ class SceneAnalysis(SceneParts):
         actuator or modes (`InputError`). For K < 0 the margin is at most K T, because such a wall supplies energy
         without limit.
         """
-        if obstacle := find_unsupported_reason(**vars(self.device)):
+        if obstacle := find_obstacle(self):
             raise InputError(f"passivity {obstacle}")
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         return self._loop_for(alpha, beta).passivity_margin(alpha, beta) * self.units.virtual_damping
@@ -340,6 +341,8 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     if negative_damping is None and not isinstance(scene.device, ResponseDevice):
         if not scene.nonrigid_parts:
             return True
+        if has_velocity(scene.position):
+            return False
         estimate = scene.velocity.estimate(scene.timing.period)
         return bool(estimate.is_difference and estimate.gain > 0)
     return bool(negative_damping)

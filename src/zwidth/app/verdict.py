@@ -29,7 +29,7 @@ from zwidth.app.printing import (
 )
 from zwidth.model.device import Device
 from zwidth.model.safe_limit import reserve_damping
-from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.units.display import find_unit
 from zwidth.units.formatting import (
     format_interval,
@@ -210,7 +210,7 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
     """Return a phrase on the passivity of a wall; with a coupling the condition is sufficient but not necessary."""
     stiffness, margin = scene.wall.stiffness, verdict.passivity_margin
     if verdict.passive is None:
-        return f"not known {find_unsupported_reason(**vars(scene.device)).partition(':')[0]}"
+        return f"not known {find_obstacle(scene).partition(':')[0]}"
     if stiffness < 0:
         return "no: no damping makes a negative stiffness passive"
     dampings = scene.device.damping + abs(scene.wall.virtual_damping) + stiffness * scene.timing.period

@@ -16,6 +16,7 @@ import numpy as np
 
 from zwidth.core.errors import InputError
 from zwidth.model.linear_device import LinearDevice
+from zwidth.model.loop_estimates import LoopEstimates
 from zwidth.model.velocity import Estimate
 
 # Beyond these limits, the matrix exponential of the state equation cannot be computed accurately.
@@ -43,7 +44,8 @@ class System:
     mass: Any  # unit of mass in kg
     d: Any  # delay in periods
     n_delay: int  # integer part of d
-    estimate: Estimate
+    estimate: Estimate  # as in `zwidth.model.mechanism.Chain`
+    estimates: LoopEstimates | None = None
 
     @property
     def sampled(self) -> bool:

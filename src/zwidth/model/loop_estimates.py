@@ -12,16 +12,20 @@ follow from the *structure* of V:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
 from zwidth.core.errors import InputError
-from zwidth.model.circle_functions import are_on_circle
+from zwidth.model.circle_functions import CirclePoints, Jet, are_on_circle
 from zwidth.model.feedback import Weights
 from zwidth.model.position import estimate_position, has_velocity
 from zwidth.model.velocity import Estimate
+
+# Type of a function that returns a frequency response on the unit circle, and its derivative in w.
+Response = Callable[[CirclePoints], Jet]
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,26 @@ class LoopEstimates:
     velocity: Estimate = field(default_factory=Estimate)  # F for the structure "series", otherwise V
     structure: Literal["series", "separate", "common"] = "series"
     feedback: FurtherFeedback | None = None
+
+    def respond(self) -> tuple[Response, ...]:
+        """Return the responses P and V and, with further feedback, R, as functions of points of the unit circle."""
+        if self.feedback is None:
+            return self.position.jet, self._respond_velocity
+        return self.position.jet, self._respond_velocity, self._respond_feedback
+
+    def _respond_velocity(self, points: CirclePoints) -> Jet:
+        """Return V and its derivative in w."""
+        V = self.velocity.jet(points)
+        return V.times(self.position.jet(points)) if self.structure == "series" else V
+
+    def _respond_feedback(self, points: CirclePoints) -> Jet:
+        """Return R and its derivative in w."""
+        assert self.feedback is not None
+        filtered, weights = self.feedback.filter.jet(points), self.feedback.weights
+        if weights is None:
+            return filtered
+        P, V = self.position.jet(points), self._respond_velocity(points)
+        return filtered.times(Jet(*(weights.position * p + weights.velocity * v for p, v in zip(P, V, strict=True))))
 
     def divide(self) -> tuple[Estimate, int]:
         """Return the ratio F = V/P, and the number of its poles, the last ones, that are zeros of P.
@@ -66,13 +90,18 @@ class LoopEstimates:
         return ratio, zeros.size
 
 
-def build_estimates(scene: Any, unit: Any) -> LoopEstimates | None:
-    """Return P, V and R of a scene; None if it has neither a position estimate nor further feedback.
+def refuse_estimates(scene: Any, method: str) -> None:
+    """Raise `InputError` if a scene has a position estimate or further feedback, which a method does not support."""
+    for name in ("position", "feedback"):
+        part = getattr(scene, name)
+        if part is not None:
+            raise InputError(
+                f"{name}: got {part!r}, which {method} does not support; omit it, or use max_stiffness and is_stable"
+            )
 
-    Args:
-        scene: the scene.
-        unit: mass in kg by which the loop is normalized.
-    """
+
+def build_estimates(scene: Any) -> LoopEstimates | None:
+    """Return P, V and R of a scene; None if it has neither a position estimate nor further feedback."""
     position, feedback, period = scene.position, scene.feedback, scene.timing.period
     if position is None and feedback is None:
         return None
@@ -83,6 +112,6 @@ def build_estimates(scene: Any, unit: Any) -> LoopEstimates | None:
         structure = "separate" if getattr(position, "velocity_from", "") == "measured" else "series"
     further = None
     if feedback is not None:
-        filtered = feedback.estimate(period * period / unit, period)
+        filtered = feedback.estimate(period * period / scene.mass, period)
         further = FurtherFeedback(filtered, feedback.weights(period))
     return LoopEstimates(estimate_position(position, period), velocity, structure, further)

@@ -18,6 +18,7 @@ from zwidth.model.actuator import Actuator
 from zwidth.model.device import Coupling, Device
 from zwidth.model.feedback import Feedback, IntegralFeedback
 from zwidth.model.linear_device import LinearDevice
+from zwidth.model.loop_estimates import refuse_estimates
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.operator import Operator
 from zwidth.model.position import Position
@@ -136,6 +137,7 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 
 def spell_scene(scene: Any) -> dict[str, Any]:
     """Return the section ``scene`` of a configuration as a dictionary, without keys that have their default values."""
+    refuse_estimates(scene, "a configuration")
     parts: dict[str, Any] = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
     if scene.safe_limit is not None:
         parts["safe_limit"] = spell_part(scene.safe_limit)

@@ -79,7 +79,7 @@ def build_model(scene: Any) -> Model:
     # is not a linear filter.
     velocity, adapts = scene.velocity, isinstance(scene.velocity, FOAW)
     linear = replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene
-    program = build_estimates(linear, mass) or LoopEstimates(velocity=linear.velocity.estimate(period))
+    program = build_estimates(linear) or LoopEstimates(velocity=linear.velocity.estimate(period))
     estimate, window = (velocity, velocity.samples) if adapts else (program.velocity, program.velocity.window)
     return Model(chain, program, estimate, chain.n_delay, fraction, window, period, mass)
 

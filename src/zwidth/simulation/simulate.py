@@ -76,9 +76,9 @@ def simulate(
         virtual_damping: B in N s/m. If both are left out, each scene uses its own wall.
         force: force law in place of the wall's spring and damper: a function of the position (m; estimated if the scene
             has a position estimate, otherwise measured), the estimated velocity (m/s) and the time of the sample (s,
-            without jitter), arrays with one value per simulation. It returns the force on the device in N and is written with `jax.numpy`. The law is compiled
-            once, so it must not keep values between calls and must use ``jnp.where`` in place of ``if``. Its force is
-            sampled, held and delayed like that of a wall.
+            without jitter), arrays with one value per simulation. It returns the force on the device in N and is
+            written with `jax.numpy`. The law is compiled once, so it must not keep values between calls and must use
+            ``jnp.where`` in place of ``if``. Its force is sampled, held and delayed like that of a wall.
         periods: number of sampling periods, >= 1.
         substeps: recorded instants per period, >= 1.
         start_position: in m; one value for all bodies, or a mapping by their names in `Motion`, as ``{"position": 0,

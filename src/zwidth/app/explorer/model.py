@@ -28,7 +28,7 @@ from zwidth.app.printing import format_row, list_slopes, name_verdict, spell_dec
 from zwidth.app.verdict import write_check
 from zwidth.model.device import Device
 from zwidth.simulation.behavior import describe_ending
-from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.units.formatting import format_interval, plain, round_conservatively
 
 Curve = tuple[np.ndarray, np.ndarray]
@@ -134,7 +134,7 @@ def compute_step_response(scene: Scene, periods: int) -> Curve:
 
 def find_passive_boundary(scene: Scene) -> Curve | None:
     """Return points on the boundary of the passive walls; None for a device without a passivity condition."""
-    if find_unsupported_reason(**vars(scene.device)):
+    if find_obstacle(scene):
         return None
     return trace_passivity_boundary(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
 

@@ -26,6 +26,7 @@ import numpy as np
 from zwidth.core.errors import InputError, format_install_command
 from zwidth.core.status import Status
 from zwidth.model.linear_device import LinearDevice
+from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.mechanism import AnyChain, build_chain
 from zwidth.model.velocity import Estimate
 from zwidth.numerics.balls import BITS, available
@@ -110,11 +111,15 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
     period = exact.timing.period
     chain = build_chain(exact, (scene.d, int(scene.d)), NO_ESTIMATE)
     numerator, denominator = _expand_response(chain)
-    estimate = _exact_estimate(exact, scene.velocity, scene.timing.period)
-    f_numerator, f_denominator = _expand_estimate(estimate)
     unit = period * period / exact.mass
     lag = chain.n_delay + (1 if chain.d > chain.n_delay else 0)
     delayed = flint.arb_poly([0] * lag + denominator.coeffs())
+    estimates = build_estimates(exact)
+    if estimates is not None:
+        D, N1, N2 = _expand_estimates(estimates, numerator, delayed)
+        return D, N1 * unit, N2 * (unit / period), False
+    estimate = _exact_estimate(exact, scene.velocity, scene.timing.period)
+    f_numerator, f_denominator = _expand_estimate(estimate)
     # F(1) is exactly 0 if F is a windowed difference, or if one of its zeros is exactly z = 1.
     has_rest = chain.has_integrator and (
         estimate.window > 0 or any(offset == 0 for offset in np.asarray(estimate.zeros).tolist())
@@ -125,6 +130,33 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
         numerator * f_numerator * (unit / period),
         has_rest,
     )
+
+
+def _expand_estimates(
+    estimates: LoopEstimates, numerator: flint.arb_poly, denominator: flint.arb_poly
+) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly]:
+    """Return the polynomials D, N1 and N2 of a loop with estimates P and V and further feedback R, normalized.
+
+    Common poles of P and V are not canceled, because they are inside the unit circle and do not change the result.
+
+    Args:
+        estimates: P, V and R.
+        numerator: numerator of the plant.
+        denominator: denominator of the plant, with the delay.
+    """
+    p_numerator, p_denominator = _expand_estimate(estimates.position)
+    v_numerator, v_denominator = _expand_estimate(estimates.velocity)
+    velocity = (p_numerator if estimates.structure == "series" else p_denominator) * v_numerator
+    D = denominator * p_denominator * v_denominator
+    N1, N2 = numerator * p_numerator * v_denominator, numerator * velocity
+    if estimates.feedback is None:
+        return D, N1, N2
+    r_numerator, r_denominator = _expand_estimate(estimates.feedback.filter)
+    weights = estimates.feedback.weights
+    source = numerator * p_denominator * v_denominator
+    if weights is not None:
+        source = N1 * weights.position + N2 * weights.velocity
+    return D * r_denominator + source * r_numerator, N1 * r_denominator, N2 * r_denominator
 
 
 def _convert_exactly(part: Any) -> Any:

@@ -1,7 +1,8 @@
 """Realize the open and the closed loop of a wall in state space.
 
 In normalized units, a wall (alpha, beta) acts on the sampled position y through the velocity estimate F with the force
-``u = -(alpha + beta F) y``. An external force, held constant over each period, acts on the first body without delay.
+``u = -(alpha + beta F) y``. With a position estimate P, a velocity estimate V and further feedback R, the force is ``u
+= -(alpha P + beta V + R) y``. An external force, held constant over each period, acts on the first body without delay.
 """
 
 from __future__ import annotations
@@ -9,20 +10,28 @@ from __future__ import annotations
 import numpy as np
 
 from zwidth.model.mechanism import AnyChain
-from zwidth.model.state_space import StateSpace, connect_in_series, realize_estimate
+from zwidth.model.state_space import StateSpace, connect_in_series, realize_estimate, realize_estimates
 from zwidth.plant.sampled_states import integrate_chain, sample_states
 
 
 def realize_open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
     """Return the open loop ``L = (alpha + beta F) G`` in state space, from the input of the wall to the position."""
+    return connect_in_series(_realize_controller(chain, alpha, beta), sample_states(chain).realize())
+
+
+def _realize_controller(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
+    """Return the controller ``alpha + beta F`` in state space; with estimates P, V and R, ``alpha P + beta V + R``."""
+    if chain.estimates is not None:
+        program = realize_estimates(chain.estimates)
+        gains = np.array([[alpha, beta, 1.0]])
+        return StateSpace(program.A, program.B, gains @ program.C, gains @ program.D)
     f = realize_estimate(chain.estimate)
-    wall = StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D)
-    return connect_in_series(wall, sample_states(chain).realize())
+    return StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D)
 
 
 def realize_closed_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
     """Return the closed loop with a wall in state space, from a held external force to the sampled position."""
-    loop, filter_order = realize_open_loop(chain, alpha, beta), len(realize_estimate(chain.estimate).A)
+    loop, filter_order = realize_open_loop(chain, alpha, beta), len(_realize_controller(chain, alpha, beta).A)
     A, _, external = chain.realize()
     B = np.zeros((len(loop.A), 1))
     B[filter_order : filter_order + len(external), 0] = integrate_chain(chain, A, external, 1.0)[1]

@@ -54,6 +54,14 @@ UNSUPPORTED = {
         "modes",
         "because the sensor moves relative to the hand; use is_stable with the hand as operator, or omit the modes",
     ),
+    "position": (
+        "a position estimate",
+        "for a filtered position; use is_stable with the hand as operator, or omit the position estimate",
+    ),
+    "feedback": (
+        "further feedback",
+        "for it; use is_stable with the hand as operator, or omit the feedback",
+    ),
 }
 
 
@@ -64,7 +72,7 @@ def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
 
     Args:
         coupling: coupling of the device.
-        **parts: the other fields of the device.
+        **parts: the other fields of the device, and parts of the scene.
     """
     for name, (description, reason) in UNSUPPORTED.items():
         part = parts.get(name)
@@ -76,6 +84,11 @@ def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
             "energy; use is_stable with the hand as operator"
         )
     return ""
+
+
+def find_obstacle(scene: Any) -> str:
+    """Return the reason why no passivity condition is available for a scene; "" if a condition is available."""
+    return find_unsupported_reason(**vars(scene.device), position=scene.position, feedback=scene.feedback)
 
 
 @dataclass(frozen=True)
