@@ -1,4 +1,4 @@
-"""Models of the optional parts of a scene: velocity estimate, operator, coupling, actuator, modes and safe limit.
+"""Models of the optional parts of a scene, such as estimates, further feedback, operator, coupling and modes.
 
 Parts are those in addition to the device and its timing. The model of a section is generated from the dataclass of
 the part in `zwidth.model`: its fields are the keys, and `units.quantities` declares their units and ranges. The part
@@ -7,7 +7,7 @@ itself validates combinations of values.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import MISSING, fields
 from functools import cached_property
 from math import isfinite
@@ -28,13 +28,13 @@ from zwidth.config.values import Quantity, read_entries
 from zwidth.core.errors import InputError
 from zwidth.model.checks import find_range
 from zwidth.model.mode import Mode
-from zwidth.model.parameter_paths import PARTS
+from zwidth.model.parameter_paths import PARTS, WITH_KIND
 from zwidth.model.safe_limit import SafeLimit
 from zwidth.model.velocity import ESTIMATES, FOAW
 from zwidth.units.formatting import describe
 from zwidth.units.quantities import CHOICES, FIELDS, NOT_NEGATIVE
 
-PART_NAMES = ("velocity", *PARTS, "modes")
+PART_NAMES = ("velocity", *WITH_KIND, *PARTS, "modes")
 
 # Texts that are reported if FOAW, an adaptive velocity estimate, is given but a linear estimate is required: reason and
 # remedy.
@@ -155,15 +155,43 @@ def read_velocity(raw: Any, sections: dict[str, type[PartSection]] = _LINEAR) ->
     return section.model_validate(raw)
 
 
-def _make_one_of(sections: dict[str, type[PartSection]]) -> GetPydanticSchema:
-    """Return the annotation of a field that accepts each velocity estimate in ``sections``, by its key ``kind``."""
+def _make_one_of(
+    sections: dict[str, type[PartSection]], read: Callable[[Any, dict[str, type[PartSection]]], Any]
+) -> Any:
+    """Return the type of a field that accepts each of ``sections``, selected by its key ``kind``.
+
+    ``read`` returns the model of the section for the value of the configuration and ``sections``.
+    """
     every = Annotated[Union[tuple(sections.values())], Field(discriminator="kind")]  # noqa: UP007
-    read = Annotated[every, WrapValidator(lambda raw, _: read_velocity(raw, sections))]
-    return GetPydanticSchema(lambda _, handler: handler.generate_schema(read))
+    validated = Annotated[every, WrapValidator(lambda raw, _: read(raw, sections))]
+    return Annotated[PartSection, GetPydanticSchema(lambda _, handler: handler.generate_schema(validated))]
 
 
-VelocityField = Annotated[PartSection, _make_one_of(_LINEAR)]
-SimulatedVelocityField = Annotated[PartSection, _make_one_of(_ESTIMATES)]
+VelocityField: Any = _make_one_of(_LINEAR, read_velocity)
+SimulatedVelocityField: Any = _make_one_of(_ESTIMATES, read_velocity)
+# Description and noun of the parts that have several kinds, and an example for messages.
+_OF_KIND = {
+    "position": ("Position estimate", "a position estimate", "{kind: exponential, coefficient: 0.3}"),
+    "feedback": ("Further feedback", "further feedback", "{kind: integral, gain: 1000}"),
+}
+
+
+def _make_kinds(name: str) -> Any:
+    """Return the type of the field of a part with several kinds."""
+    _, noun, example = _OF_KIND[name]
+    sections = {
+        kind: make_section(part, name, f"{noun} of kind {kind}", kind) for kind, part in WITH_KIND[name].items()
+    }
+
+    def read(raw: Any, sections: dict[str, type[PartSection]]) -> Any:
+        if isinstance(raw, PartSection):
+            return raw
+        return find_kind(raw, sections, noun, example).model_validate(raw)
+
+    return _make_one_of(sections, read)
+
+
+_KIND_FIELDS = {name: _make_kinds(name) for name in WITH_KIND}
 _SECTIONS: Any = {
     name: make_section(part, name, f"{'an' if name[0] in 'aeiou' else 'a'} {name}") for name, part in PARTS.items()
 }
@@ -200,6 +228,7 @@ def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Stri
         more: sentence to append to the descriptions.
     """
     parts: dict[str, Any] = {"velocity": ("Velocity estimate", VelocityField, no_estimate)}
+    parts |= {name: (_OF_KIND[name][0], form, no_part) for name, form in _KIND_FIELDS.items()}
     parts |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
     parts["modes"] = "Resonances in the measured position", list[ModeSection], no_part
     keys: Any = {

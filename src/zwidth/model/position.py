@@ -247,6 +247,17 @@ class Observer(Part):
 Position: TypeAlias = ExponentialFilter | PositionFilter | LowPass | Butterworth | Pll | Observer
 
 
+POSITIONS = {
+    "exponential": ExponentialFilter,
+    "low_pass": LowPass,
+    "butterworth": Butterworth,
+    "filter": PositionFilter,
+    "pll": Pll,
+    "observer": Observer,
+}
+"""Classes of position estimates by the name of their kind in configurations and on the command line."""
+
+
 def estimate_position(position: Position | None, period: Any) -> Estimate:
     """Return the position estimate P of a part; 1 for None, and the filter without the difference for a `LowPass`."""
     if position is None:
