@@ -157,18 +157,18 @@ def read_velocity(raw: Any, sections: dict[str, type[PartSection]] = _LINEAR) ->
 
 def _make_one_of(
     sections: dict[str, type[PartSection]], read: Callable[[Any, dict[str, type[PartSection]]], Any]
-) -> Any:
-    """Return the type of a field that accepts each of ``sections``, selected by its key ``kind``.
+) -> GetPydanticSchema:
+    """Return the annotation of a field that accepts each of ``sections``, selected by its key ``kind``.
 
     ``read`` returns the model of the section for the value of the configuration and ``sections``.
     """
     every = Annotated[Union[tuple(sections.values())], Field(discriminator="kind")]  # noqa: UP007
     validated = Annotated[every, WrapValidator(lambda raw, _: read(raw, sections))]
-    return Annotated[PartSection, GetPydanticSchema(lambda _, handler: handler.generate_schema(validated))]
+    return GetPydanticSchema(lambda _, handler: handler.generate_schema(validated))
 
 
-VelocityField: Any = _make_one_of(_LINEAR, read_velocity)
-SimulatedVelocityField: Any = _make_one_of(_ESTIMATES, read_velocity)
+VelocityField = Annotated[PartSection, _make_one_of(_LINEAR, read_velocity)]
+SimulatedVelocityField = Annotated[PartSection, _make_one_of(_ESTIMATES, read_velocity)]
 # Description and noun of the parts that have several kinds, and an example for messages.
 _OF_KIND = {
     "position": ("Position estimate", "a position estimate", "{kind: exponential, coefficient: 0.3}"),
@@ -177,7 +177,7 @@ _OF_KIND = {
 
 
 def _make_kinds(name: str) -> Any:
-    """Return the type of the field of a part with several kinds."""
+    """Return the type of the field of a part with several kinds, such as "position"."""
     _, noun, example = _OF_KIND[name]
     sections = {
         kind: make_section(part, name, f"{noun} of kind {kind}", kind) for kind, part in WITH_KIND[name].items()
@@ -188,7 +188,7 @@ def _make_kinds(name: str) -> Any:
             return raw
         return find_kind(raw, sections, noun, example).model_validate(raw)
 
-    return _make_one_of(sections, read)
+    return Annotated[PartSection, _make_one_of(sections, read)]
 
 
 _KIND_FIELDS = {name: _make_kinds(name) for name in WITH_KIND}
