@@ -110,7 +110,13 @@ def make_section(part: Any, owner: str, noun: str, kind: str = "") -> type[PartS
         form, description = _describe(f"{owner}.{item.name}", item)
         default: Any = ... if item.default is MISSING else item.default
         keys[item.name] = (form | None if default is None else form, Field(default, description=description))
-    section = create_model(f"{part.__name__}Section", __base__=PartSection, __doc__=_head(part), **keys)
+    prefix, description = "", _head(part)
+    if owner == "position" and part in ESTIMATES.values():
+        # Name and describe a velocity filter differently as a position estimate, which has no difference. The names of
+        # the models in a schema are unique.
+        prefix, description = "Position", description.removeprefix("The backward difference, followed by ")
+        description = description[0].upper() + description[1:]
+    section = create_model(f"{prefix}{part.__name__}Section", __base__=PartSection, __doc__=description, **keys)
     section.noun, section.part = noun, part
     return section
 
@@ -132,8 +138,8 @@ def _describe(path: str, item: Any) -> tuple[Any, str]:
         return Coefficients, f"{description}, or a list of sections in series."
     parameter, allowed = FIELDS[path], find_range(item, path)
     low, high, low_open, _ = allowed
-    bounds = f"{low:g} to {high:g}" if isfinite(high) else f"{'>' if low_open else '>='} {low:g}"
-    description = f"{describe_parameter(parameter, f', {bounds}')}."
+    bounds = f", {low:g} to {high:g}" if isfinite(high) else f", {'>' if low_open else '>='} {low:g}"
+    description = f"{describe_parameter(parameter, bounds if isfinite(low) else '')}."
     return Annotated[int if parameter.whole else float, Quantity(parameter.unit, allowed, parameter.whole)], description
 
 
