@@ -28,9 +28,9 @@ import numpy as np
 
 from zwidth.analysis.base import SceneParts
 from zwidth.core.errors import check_choice
+from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.position import has_velocity
-from zwidth.model.velocity import Estimate
 from zwidth.units.formatting import format_wall, with_unit
 from zwidth.units.unit_system import UnitSystem
 

@@ -13,7 +13,7 @@ OWN = "This command"  # heading of the options that belong to no other group
 # Groups of options in the help: the heading of each group, and the prefixes of the options in it.
 GROUPS = {
     "Wall": ("--stiffness", "--virtual-damping"),
-    "Device": ("--device", "--mass", "--damping"),
+    "Device": ("--device", "--sampled", "--mass", "--damping"),
     "Timing": ("--period", "--rate", "--delay"),
     OWN: (),
     "Velocity estimate": ("--velocity-",),

@@ -20,10 +20,11 @@ import click
 from zwidth.app.printing import format_row
 from zwidth.cli.help import OF_SCENE as OF_SCENE
 from zwidth.cli.help import show_example as show_example
-from zwidth.cli.parts import change_kind, make_kind, make_part, name_option, select_part
+from zwidth.cli.parts import FILTER_HELP, change_kind, make_kind, make_part, name_option, select_part
 from zwidth.core.errors import InputError
 from zwidth.model.checks import Span, find_kind, read_span
 from zwidth.model.device import Device
+from zwidth.model.linear_device import LinearDevice
 from zwidth.model.mode import Mode
 from zwidth.model.parameter_paths import PARTS, WITH_KIND, find_parts
 from zwidth.model.timing import Timing
@@ -140,9 +141,15 @@ def _add_option(command: Command, path: str) -> Command:
         words = (
             "A published device of `zwidth devices`, with its period and delay; other options add or replace "
             "parameters. Or, in place of mass, damping and all parts: a transfer function 'NUM / DEN' by its "
-            "coefficients in s, such as '1 / 0.1 10 0', or a measured response FILE.csv (.npz, .mat)."
+            "coefficients in s, such as '1 / 0.1 10 0', by its roots, 'zpk: ZEROS / POLES / GAIN', or by sections, "
+            "'sos: b0 b1 b2 a0 a1 a2; ..'; or a measured response FILE.csv (.npz, .mat)."
         )
         return click.option("--device", metavar="NAME", help=words)(command)
+    if path == "sampled":
+        words = "The transfer function of --device is in z, at the period of the loop, and includes hold and delay."
+        return click.option("--sampled", is_flag=True, default=None, help=words)(command)
+    if path == "velocity.filter":
+        return click.option("--velocity-filter", "velocity__filter", metavar="FILTER", help=FILTER_HELP)(command)
     if path in CHOICES:
         kind, text = click.Choice(CHOICES[path].names), CHOICES[path].sentence
     else:
@@ -159,14 +166,22 @@ def _add_option(command: Command, path: str) -> Command:
     return click.option(name_option(path), path.replace(".", "__"), type=kind, help=f"{text}.")(command)
 
 
+# Paths of the parameters of a rigid device and of its timing.
+_TIMED = ("mass", "damping", "period", "rate", "delay")
+
+
 def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
     """Return a decorator that adds the options of a scene, with or without wall, and the argument of a scene file.
 
     The command receives a `zwidth.Scene` as ``scene``, or None if ``instead`` names alternative options and no scene
     option is given.
     """
-    bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
-    take = take_options("scene", (*bare, *_PARTS), lambda given, system: build_scene(given, system, instead, wall=wall))
+    bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "sampled", *_TIMED)
+    take = take_options(
+        "scene",
+        (*bare, "velocity.filter", *_PARTS),
+        lambda given, system: build_scene(given, system, instead, wall=wall),
+    )
     file = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=click.Path(path_type=Path))
     return lambda command: file(take(command))
 
@@ -190,10 +205,12 @@ def take_options(
                 if (file := given.pop("scene_file", None)) is not None:
                     values["scene"] = read_scene_file(file)
                     with_kind = {file.name: values["scene"].device, **with_kind}
+                if values.get("sampled") and "device" not in values:
+                    raise click.UsageError("--sampled: give --device 'NUM / DEN' with coefficients in z")
                 if "device" in values:
                     from zwidth.model.devices import read_device
 
-                    values["device"] = read_device(values["device"])
+                    values["device"] = read_device(values["device"], _find_sampled_period(values))
                     # Ignore the unit system and the hardware of the scene file, because the option --device replaces
                     # the device of the file.
                     context.meta.pop(_HARDWARE, None)
@@ -212,6 +229,17 @@ def take_options(
         return command
 
     return decorate
+
+
+def _find_sampled_period(values: dict[str, Any]) -> float | None:
+    """Return the period of the loop in s if the option --sampled is given, otherwise None; remove this option."""
+    if not values.pop("sampled", False):
+        return None
+    if "rate" in values or "period" in values:
+        return values["period"] if "period" in values else 1.0 / values["rate"]
+    if "scene" not in values:
+        raise click.UsageError("--sampled: also give --rate or --period")
+    return float(values["scene"].timing.period)
 
 
 def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
@@ -253,6 +281,8 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
     warn_implausible(numbers, system)
     scene = _make_scene(given, system, instead) if base is None else change_scene(base, given)
     scene.check_parts()
+    if isinstance(scene.device, LinearDevice) and (warning := scene.device.warn_of_variable(scene.timing.period)):
+        click.echo(f"zwidth: --device: {warning} add --sampled", err=True)
     return scene
 
 
@@ -356,7 +386,8 @@ def find_omitted() -> frozenset[str]:
     Friction is included only if the command simulates an encoder.
     """
     given, hardware = click.get_current_context().params, get_hardware()
-    named = () if given.get("scene_file") is not None else ("damping", "delay")
+    # A sampled device includes its delay.
+    named = () if given.get("scene_file") is not None else ("damping", *(() if given.get("sampled") else ("delay",)))
     omitted = {name for name in named if given.get(name) is None}
     values = {name: hardware.get(name) if given[name] is None else given[name] for name in HARDWARE if name in given}
     simulated = values.get("resolution") and "coulomb" in values

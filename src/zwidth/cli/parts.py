@@ -14,8 +14,13 @@ import click
 
 from zwidth.core.errors import InputError
 from zwidth.model.parameter_paths import WITH_KIND, spell_kind
-from zwidth.model.velocity import ESTIMATES
+from zwidth.model.system_forms import parse_system
+from zwidth.model.velocity import ESTIMATES, VelocityFilter
 
+FILTER_HELP = (
+    "Velocity estimate as a transfer function in z from position to velocity: 'NUM / DEN', such as '1000 -1000 / 1 0', "
+    "'zpk: ZEROS / POLES / GAIN' or 'sos: b0 b1 b2 a0 a1 a2; ..'."
+)
 # Parameters of a low-pass filter that exclude each other; one of them must be given.
 _ONE_OF = {"cutoff", "time_constant", "coefficient"}
 _KINDS: dict[str, dict[str, Any]] = {"velocity": ESTIMATES, **WITH_KIND}  # classes by owner and kind
@@ -71,6 +76,11 @@ def make_kind(owner: str, given: dict[str, Any]) -> Any:
         given: parameters by field name, and optionally ``kind``.
     """
     given = dict(given)
+    if owner == "velocity" and "filter" in given:
+        text = given.pop("filter")
+        if others := sorted(given):
+            raise click.UsageError(f"--velocity-filter: got {name_option(f'velocity.{others[0]}')} too; give only one")
+        return VelocityFilter(**parse_system("velocity.filter", text, "z"))
     kind = given.pop("kind", None) or imply_kind(owner, given)
     part = _KINDS[owner][kind]
     needed = _list_needed(part)

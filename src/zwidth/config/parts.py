@@ -8,11 +8,13 @@ itself validates combinations of values.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import MISSING, fields
 from functools import cached_property
 from math import isfinite
 from typing import Annotated, Any, ClassVar, Literal, Union
 
+import numpy as np
 from pydantic import (
     BeforeValidator,
     Field,
@@ -29,6 +31,7 @@ from zwidth.core.errors import InputError
 from zwidth.model.checks import find_range
 from zwidth.model.mode import Mode
 from zwidth.model.parameter_paths import PARTS, WITH_KIND
+from zwidth.model.rational_filter import RationalFilter
 from zwidth.model.safe_limit import SafeLimit
 from zwidth.model.velocity import ESTIMATES, FOAW
 from zwidth.units.formatting import describe
@@ -78,6 +81,32 @@ class PartSection(Strict):
             yield path if path[0] in type(self).model_fields else path[1:], fault
 
 
+def to_array(raw: Any) -> np.ndarray:
+    """Return a number or a list as an array, complex if an entry is a text such as "-3+40j".
+
+    Raises:
+        ValueError: if an entry is not a number.
+    """
+    array = np.array([] if raw is None else raw)
+    if array.dtype.kind == "U":
+        array = np.array([complex(text.replace(" ", "")) for text in array.ravel()]).reshape(array.shape)
+    if array.dtype.kind not in "iufc":
+        raise ValueError("no numbers")
+    return array
+
+
+def _check_numbers(raw: Any) -> Any:
+    """Return the value unchanged; raise a problem if it is not a number or a list of finite numbers."""
+    with suppress(ValueError):
+        if np.all(np.isfinite(to_array(raw))):
+            return raw
+    remedy = "write [1, 0.5], or '-3+40j' for a complex root"
+    raise problem(f"got {describe(raw)}", "it must be a list of finite numbers", remedy)
+
+
+Numbers = Annotated[Any, BeforeValidator(_check_numbers), WithJsonSchema({"type": ["array", "number"]})]
+
+
 def _read_coefficients(raw: Any) -> tuple[Any, ...]:
     """Validate the coefficients of a polynomial, or a list of such lists for sections in series; return tuples."""
     if not isinstance(raw, list | tuple):
@@ -107,7 +136,7 @@ def make_section(part: Any, owner: str, noun: str, kind: str = "") -> type[PartS
     """
     keys: Any = {"kind": (Literal[kind], ...)} if kind else {}  # pyright: ignore[reportInvalidTypeForm]
     for item in fields(part):
-        form, description = _describe(f"{owner}.{item.name}", item)
+        form, description = _describe(f"{owner}.{item.name}", item, part)
         default: Any = ... if item.default is MISSING else item.default
         keys[item.name] = (form | None if default is None else form, Field(default, description=description))
     prefix, description = "", _head(part)
@@ -126,13 +155,24 @@ def _head(part: Any) -> str:
     return part.__doc__.partition("\n")[0]
 
 
-def _describe(path: str, item: Any) -> tuple[Any, str]:
+# Descriptions of the keys of a filter that is given by its roots or by second-order sections.
+_ROOTS = {
+    "sos": "Second-order sections of the filter, rows of the coefficients b0 b1 b2 a0 a1 a2.",
+    "zeros": "Zeros of the filter in the z plane; complex zeros as text such as '0.9+0.1j', with conjugates.",
+    "poles": "Poles of the filter, in the same form as the zeros.",
+    "gain": "Ratio of the leading coefficients; required with poles.",
+}
+
+
+def _describe(path: str, item: Any, part: Any) -> tuple[Any, str]:
     """Return the type annotation of a key, and its description for the schema.
 
-    ``path`` is the name of the key in `units.quantities`, ``item`` the field of the dataclass.
+    ``path`` is the name of the key in `units.quantities`, ``item`` the field of the dataclass ``part``.
     """
     if path in CHOICES:
         return Literal[CHOICES[path].names], f"{CHOICES[path].sentence}."
+    if issubclass(part, RationalFilter) and item.name in _ROOTS:
+        return Numbers, _ROOTS[item.name]
     if path not in FIELDS:
         description = f"Coefficients of the {path.rpartition('.')[2]}, highest power of z first"
         return Coefficients, f"{description}, or a list of sections in series."
@@ -238,7 +278,10 @@ def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Stri
     parts |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
     parts["modes"] = "Resonances in the measured position", list[ModeSection], no_part
     keys: Any = {
-        name: (form | None, Field(default=None, description=f"{description}. Default: {absent}.{more}"))
+        name: (
+            form | None,
+            Field(default=None, description=f"{description}. Default: {absent}.{'' if name in WITH_KIND else more}"),
+        )
         for name, (description, form, absent) in parts.items()
     }
     return create_model("Parts", __base__=Strict, **keys)

@@ -195,8 +195,8 @@ def cascade(
         >>> controller = zwidth.cascade(pos_gain=20, vel_gain=0.16, position=zwidth.Pll(bandwidth=1000))
         >>> device = zwidth.Device("1e-4 kg m^2", "1e-4 N m s/rad")
         >>> scene = zwidth.Scene(device, zwidth.Timing(rate=8e3, delay="1.5 periods"), **controller)
-        >>> print(f"{scene.spectral_radius():.10f}")
-        0.9974119767
+        >>> print(f"{scene.spectral_radius():.9f}")
+        0.997411977
     """
     if velocity is not None and has_velocity(position):
         raise InputError(f"velocity: got {velocity!r}, but {position!r} has its own velocity estimate; omit velocity")

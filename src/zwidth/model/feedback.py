@@ -15,7 +15,8 @@ import numpy as np
 
 from zwidth.core.errors import check_choice
 from zwidth.model.checks import Part, check_number
-from zwidth.model.velocity import Estimate, RationalFilter
+from zwidth.model.estimate import Estimate
+from zwidth.model.rational_filter import RationalFilter
 from zwidth.units.quantities import ANY
 
 IntegrationRule = Literal["backward", "forward", "trapezoidal"]
@@ -57,6 +58,7 @@ class Feedback(RationalFilter):
         numerator: coefficients in N/m, highest power of z first; or a list of sections in series, each a list of
             coefficients.
         denominator: coefficients or sections, of at least the degree of the numerator; all poles are allowed.
+        sos, zeros, poles, gain: second-order sections, or roots, as for `VelocityFilter`.
         position: weight of the position estimate in the input of R0.
         velocity: weight of the velocity estimate in the input of R0, in s. If neither weight is given, the input is
             the measured position.

@@ -62,14 +62,24 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
 def is_rounding(coefficients: tuple[float, ...]) -> bool:
     """Return whether all roots of a section on or outside the unit circle may be artifacts of rounded coefficients.
 
-    The result is False if there is no such root.
+    The result is False if there is no such root. Coefficients with few decimals, such as those copied from a printed
+    table, are taken as rounded to this number of decimals, all others as rounded to float64.
     """
     roots = 1.0 - offsets(np.trim_zeros(np.array(coefficients), "b"))
     points = np.exp(1j * np.angle(roots[np.abs(roots) >= 1.0]))
     # If the value at a point of the unit circle is within this bound, a polynomial whose coefficients differ only by
     # rounding errors has a root at this point.
     bound = 4.0 * len(coefficients) * np.finfo(float).eps * np.abs(coefficients).sum()
+    bound += 0.5 * len(coefficients) * _find_last_decimal(coefficients)
     return bool(points.size and len(coefficients) > 2 and np.all(np.abs(np.polyval(coefficients, points)) <= bound))
+
+
+def _find_last_decimal(coefficients: tuple[float, ...]) -> float:
+    """Return 10^-k, with the smallest number k of decimals with which all coefficients are written; 0 if k > 12.
+
+    The result is at most 10^-3, because coefficients with fewer decimals are usually exact.
+    """
+    return next((10.0**-k for k in range(3, 13) if all(round(value, k) == value for value in coefficients)), 0.0)
 
 
 def count_trailing_zeros(polynomial: np.ndarray) -> int:

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.core.errors import InputError
+from zwidth.model.estimate import Estimate
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.loop_estimates import LoopEstimates
-from zwidth.model.velocity import Estimate
 
 # Beyond these limits, the matrix exponential of the state equation cannot be computed accurately.
 FASTEST = 1e4  # largest magnitude of a pole in rad per period

@@ -20,9 +20,9 @@ import numpy as np
 
 from zwidth.core.errors import InputError
 from zwidth.model.circle_functions import CirclePoints, Jet, are_on_circle
+from zwidth.model.estimate import Estimate
 from zwidth.model.feedback import Weights
 from zwidth.model.position import estimate_position, has_velocity
-from zwidth.model.velocity import Estimate
 
 # Type of a function that returns a frequency response on the unit circle, and its derivative in w.
 Response = Callable[[CirclePoints], Jet]

@@ -23,11 +23,11 @@ import numpy as np
 
 from zwidth.core.errors import InputError
 from zwidth.core.xp import namespace
+from zwidth.model.estimate import Estimate
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.linear_plant import FASTEST, STRONGEST, Realization, System
 from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.parameter_paths import Parts
-from zwidth.model.velocity import Estimate
 
 
 class Body(NamedTuple):

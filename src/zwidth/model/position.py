@@ -20,16 +20,9 @@ import numpy as np
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.xp import is_traced, namespace
 from zwidth.model.checks import Part
-from zwidth.model.velocity import (
-    Butterworth,
-    Estimate,
-    LowPass,
-    RationalFilter,
-    as_complex,
-    check_cutoff,
-    get_coded_ratio,
-    get_pi,
-)
+from zwidth.model.estimate import Estimate
+from zwidth.model.rational_filter import RationalFilter
+from zwidth.model.velocity import Butterworth, LowPass, as_complex, check_cutoff, get_coded_ratio, get_pi
 
 VelocitySource = Literal["position", "measured"]
 SOURCES = ("position", "measured")
@@ -116,6 +109,7 @@ class PositionFilter(RationalFilter):
         numerator: coefficients, highest power of z first; or a list of sections in series, each a list of coefficients.
         denominator: coefficients or sections, of at least the degree of the numerator, with all roots inside the unit
             circle.
+        sos, zeros, poles, gain: second-order sections, or roots, as for `VelocityFilter`.
         velocity_from: input of the velocity estimate: "position" (the filtered position) or "measured".
 
     Example:

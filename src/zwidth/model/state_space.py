@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates
-from zwidth.model.velocity import Estimate
 from zwidth.units.display import compact_repr
 
 

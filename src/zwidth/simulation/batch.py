@@ -15,10 +15,11 @@ import numpy as np
 
 from zwidth.core.xp import compute_concretely
 from zwidth.model.device import Device
+from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import Parts, replace_parameters
-from zwidth.model.velocity import FOAW, BackwardDifference, Estimate
+from zwidth.model.velocity import FOAW, BackwardDifference
 from zwidth.numerics.threads import run_in_threads
 from zwidth.simulation.mechanics import build_mechanics
 from zwidth.simulation.parameters import (

@@ -20,9 +20,10 @@ import numpy as np
 
 from zwidth.core.errors import InputError
 from zwidth.core.types import Array
+from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates
 from zwidth.model.state_space import realize_estimate
-from zwidth.model.velocity import FOAW, Estimate
+from zwidth.model.velocity import FOAW
 from zwidth.plant.transition import Transition, compute_transition
 from zwidth.simulation.mechanics import Mechanics
 

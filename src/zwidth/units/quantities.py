@@ -388,11 +388,13 @@ _OUTPUTS = (
         center=1.0, below=True,
     ),
     Output(
-        "margin", "1 - spectral radius, positive for a stable wall", r"1 - \rho", "diverging", source="spectral_radius"
+        "margin", "1 - spectral radius, positive for a stable wall", r"1 - \rho", "diverging", with_parts=True,
+        source="spectral_radius",
     ),
     Output(
         "decay_rate", "decay rate of the dominant pole, -ln(spectral radius); negative for an unstable wall",
-        r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", source="spectral_radius",
+        r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", with_parts=True,
+        source="spectral_radius",
     ),
     Output(
         "pole_angle", "angle of the dominant pole, from 0 to pi", r"\omega T", "sequential", units="rad/period",
@@ -405,18 +407,19 @@ _OUTPUTS = (
     ),
     Output(
         "gain_margin", "common factor of stiffness and damping at the limit of stability; below 1 for an unstable wall",
-        "g_m", "logarithmic", rates=(2e5, 0.0),
+        "g_m", "logarithmic", with_parts=True, rates=(2e5, 300.0),
     ),
     Output(
         "phase_margin", "phase of the open loop above -180 degrees at the gain crossover", r"\varphi_m", "diverging",
-        units="degree", source="gain_margin",
+        units="degree", with_parts=True, source="gain_margin",
     ),
     Output(
         "delay_margin", "largest additional delay with which the wall is stable; 0 for an unstable wall", r"\tau_m",
-        "logarithmic", units="sampling periods", physical_units="s", rates=(2e4, 0.0),
+        "logarithmic", units="sampling periods", physical_units="s", with_parts=True, rates=(2e4, 100.0),
     ),
     Output(
-        "modulus_margin", "smallest distance of the open loop from -1", "s_m", "sequential", rates=(2e4, 0.0)
+        "modulus_margin", "smallest distance of the open loop from -1", "s_m", "sequential", with_parts=True,
+        rates=(2e4, 300.0),
     ),
     Output(
         "passive", "true if the wall is passive", dtype="bool", with_parts=True, rates=(4e6, 100.0),
@@ -429,7 +432,8 @@ _OUTPUTS = (
     Output(
         "settling_time",
         "time in which the dominant pole decays to 2 %, ln(50)/decay_rate; infinite for an unstable wall", r"t_{2\%}",
-        "steep", units="sampling periods", physical_units="s", source="spectral_radius", label="decay time to 2 %",
+        "steep", units="sampling periods", physical_units="s", with_parts=True, source="spectral_radius",
+        label="decay time to 2 %",
     ),
     Output(
         "alpha_max", "largest normalized stiffness of a stable wall, with the best virtual damping", r"\alpha_{\max}",

@@ -376,8 +376,7 @@ def to_python(controls: Controls) -> str:
 def _spell(value: Any, path: str, system: UnitSystem | None) -> str:
     """Return the Python expression of a part or a number; numbers have units if a unit system is given."""
     if isinstance(value, LinearDevice):
-        form = tuple([float(c) for c in part] for part in value.system[:2])
-        return f"zwidth.LinearDevice({form})"
+        return f"zwidth.{value!r}"
     if hasattr(value, "__dataclass_fields__"):
         given = spell_part(value).items()
         words = (f"{name}={_spell(item, f'{path}.{name}'.lstrip('.'), system)}" for name, item in given)

@@ -25,10 +25,10 @@ import numpy as np
 
 from zwidth.core.errors import InputError, format_install_command
 from zwidth.core.status import Status
+from zwidth.model.estimate import Estimate
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.mechanism import AnyChain, build_chain
-from zwidth.model.velocity import Estimate
 from zwidth.numerics.balls import BITS, available
 
 if TYPE_CHECKING:

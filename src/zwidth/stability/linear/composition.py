@@ -17,10 +17,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from zwidth.model.estimate import Estimate
 from zwidth.model.feedback import Weights
 from zwidth.model.loop_estimates import LoopEstimates
 from zwidth.model.mechanism import AnyChain
-from zwidth.model.velocity import Estimate
 from zwidth.plant.factored_plant import FactoredPlant, factor_chain
 from zwidth.stability.linear.poles import find_poles
 from zwidth.stability.linear.roots import LoopRoots

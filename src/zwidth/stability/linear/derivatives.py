@@ -23,10 +23,10 @@ from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import Status
 from zwidth.core.types import Array
 from zwidth.model.circle_functions import circle_points
+from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import build_estimates
 from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import list_parameters
-from zwidth.model.velocity import Estimate
 from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, flow, seed, solve, stack
 from zwidth.stability.linear.ridge import Condition, RidgeSolution
 from zwidth.units.display import compact_repr

@@ -16,7 +16,7 @@ import numpy as np
 from zwidth.core.types import Array
 from zwidth.core.xp import namespace
 from zwidth.model.circle_functions import CirclePoints, Jet, circle_points, distances_inside
-from zwidth.model.velocity import Estimate
+from zwidth.model.estimate import Estimate
 
 # Nodes, as angles w in rad. They are geometrically spaced towards w = 0 and w = pi, equidistant between these ranges,
 # and condensed near zeros of G and poles of F that are close to the unit circle, where q or F changes fast.

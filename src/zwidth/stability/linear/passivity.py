@@ -22,7 +22,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.model.circle_functions import circle_points
-from zwidth.model.velocity import Estimate
+from zwidth.model.estimate import Estimate
 from zwidth.numerics.polynomials import abs2
 from zwidth.stability.passivity import limit_margin, solve_larger_root
 

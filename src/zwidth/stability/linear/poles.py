@@ -23,7 +23,7 @@ from zwidth.core.errors import InputError
 from zwidth.core.types import Array
 from zwidth.core.xp import within
 from zwidth.model.circle_functions import Jet
-from zwidth.model.velocity import Estimate
+from zwidth.model.estimate import Estimate
 from zwidth.numerics.pole_counting import count_poles
 from zwidth.numerics.polynomials import abs2, companion, compute_aberth_step
 from zwidth.stability.linear.roots import LoopRoots, affine_polynomial, factor_open_loop

@@ -20,9 +20,9 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.model.circle_functions import CirclePoints, Jet, are_on_circle, circle_points, distances_inside
+from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates, Response
 from zwidth.model.mechanism import AnyChain
-from zwidth.model.velocity import Estimate
 from zwidth.numerics.polynomials import Affine
 from zwidth.plant.factored_plant import FactoredPlant
 
