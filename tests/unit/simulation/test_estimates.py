@@ -194,3 +194,76 @@ def test_simulation_agrees_with_the_difference_equations(seed, motions):
     expected = simulate_directly(scene, program, *start)
     scale = np.abs(expected).max(1, keepdims=True)
     np.testing.assert_allclose(simulated / scale, expected / scale, rtol=0, atol=TOLERANCE)
+
+
+def test_contact_depends_on_the_estimated_position():
+    """The filtered position of a device that enters the wall becomes positive later than the measured one."""
+    scene = zwidth.Scene(zwidth.Device(1, 1), zwidth.Timing("1 ms"), position=zwidth.ExponentialFilter(0.1))
+    motion = scene.simulate(1000, 5, start_position="-5 mm", start_velocity=1, contact="unilateral", periods=40)
+    first = np.argmax(motion.contact)
+    assert motion.measured[first - 1] > 0
+    # For a ramp, the filter lags by (1 - a)/a = 9 samples.
+    assert first - np.argmax(motion.measured > 0) == 9
+    assert np.all(motion.command[:first] == 0)
+
+
+def test_integral_is_zero_outside_of_contact():
+    """Each contact starts with the force of the spring and one summand of the integral."""
+    hand = zwidth.Operator(stiffness=100)
+    feedback = zwidth.IntegralFeedback(20_000)
+    scene = zwidth.Scene(zwidth.Device(0.1, 1), zwidth.Timing(1e-3), operator=hand, feedback=feedback)
+    force = 2 * np.sin(np.arange(1000) / 25)
+    motion = scene.simulate(
+        2000, periods=1000, start_position=-0.01, external_force_history=force, contact="unilateral"
+    )
+    starts = np.flatnonzero(motion.contact[1:] & ~motion.contact[:-1]) + 1
+    assert starts.size >= 2
+    x = motion.measured[starts]
+    np.testing.assert_allclose(motion.command[starts], -(2000 + 20_000 * T) * x, rtol=1e-12)
+    following = motion.measured[starts + 1]
+    np.testing.assert_allclose(
+        motion.command[starts + 1], -(2000 * following + 20_000 * T * (x + following)), rtol=1e-12
+    )
+
+
+def test_integral_removes_the_static_error():
+    """A constant external force deflects a wall with an integral only for some time."""
+    device, timing = zwidth.Device("0.1 kg", "10 N s/m"), zwidth.Timing(rate="1 kHz")
+    wall = zwidth.VirtualWall("2 N/mm", 20)
+    plain, integral = zwidth.simulate(
+        [zwidth.Scene(device, timing, wall), zwidth.Scene(device, timing, wall, feedback=zwidth.IntegralFeedback(2e4))],
+        external_force=1,
+        periods=3000,
+    ).position[:, -1]
+    assert plain == pytest.approx(1 / 2000, rel=1e-9)
+    assert abs(integral) < 1e-9 * plain
+
+
+def test_law_receives_the_estimated_position():
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3), position=zwidth.Pll(500))
+    options: Any = {"start_position": 1e-3, "start_velocity": 0.01, "periods": 200}
+    law = scene.simulate(force=lambda position, velocity, time: -(1000 * position + 10 * velocity), **options)
+    np.testing.assert_allclose(law.position, scene.simulate(1000, 10, **options).position, rtol=0, atol=1e-15)
+
+
+def test_adaptive_estimate_uses_the_filtered_position():
+    """FOAW with a large noise bound is the difference over its longest window, of the filtered position."""
+    parts: Any = {"wall": zwidth.VirtualWall(1000, 10), "position": zwidth.ExponentialFilter(0.3)}
+    scenes = [
+        zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3), velocity=velocity, **parts)
+        for velocity in (zwidth.FOAW(1, 8), zwidth.WindowedDifference(8))
+    ]
+    adaptive, window = (scene.simulate(start_position=1e-3, periods=100).position for scene in scenes)
+    np.testing.assert_allclose(adaptive, window, rtol=0, atol=1e-15)
+
+
+def test_motion_decays_at_the_rate_of_the_dominant_pole():
+    scene = zwidth.Scene(
+        zwidth.Device(0.1, 2),
+        zwidth.Timing(1e-3, "1.5 periods"),
+        **zwidth.pid(1000, 2e4, 12, units="m", position=zwidth.Pll(600)),
+    )
+    x = scene.simulate(start_position=1e-3, periods=500).position
+    # The second largest pole is 0.936, so after 400 periods only the motion of the dominant, real pole remains.
+    assert x[-1] / x[-2] == pytest.approx(float(scene.spectral_radius()), rel=1e-5)
+    assert x[-1] / x[-101] == pytest.approx(float(scene.spectral_radius()) ** 100, rel=1e-4)
