@@ -111,8 +111,11 @@ def change_kind(owner: str, part: Any, given: dict[str, Any]) -> Any:
             part is replaced.
     """
     kept: dict[str, Any] = {}
-    if part is not None and "kind" not in given and given.keys() <= {item.name for item in fields(part)}:
-        kept = spell_kind(part, _KINDS[owner])
+    if part is not None and "kind" not in given:
+        spelled = spell_kind(part, _KINDS[owner])
+        # The gain of a filter is that of its roots, but the option --feedback-gain is the integral gain.
+        names = {item.name for item in fields(part)} - ({"gain"} if spelled["kind"] == "filter" else set())
+        kept = spelled if given.keys() <= names else {}
     if given.keys() & _ONE_OF:
         # If an option gives one of the parameters that exclude each other, drop all of these values of the file.
         kept = {name: value for name, value in kept.items() if name not in _ONE_OF}

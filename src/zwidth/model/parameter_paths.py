@@ -168,7 +168,11 @@ def spell_estimate(velocity: Velocity, *, every: bool = False) -> dict[str, Any]
 
 def spell_kind(part: Any, kinds: dict[str, Any]) -> dict[str, Any]:
     """Return a dictionary with the key ``kind`` and the fields of a part; ``kinds`` has the classes by kind."""
-    return {"kind": next(kind for kind, each in kinds.items() if type(part) is each), **spell_part(part)}
+    for kind, each in kinds.items():
+        if type(part) is each:
+            return {"kind": kind, **spell_part(part)}
+    names = ", ".join(each.__name__ for each in kinds.values())
+    raise InputError(f"part: got {type(part).__name__}, which is not available in configurations; use one of {names}")
 
 
 def spell_part(part: Any, *, every: bool = False) -> dict[str, Any]:
