@@ -50,7 +50,7 @@ from .identification.safe_wall import SafeWall as SafeWall
 from .model import devices as devices
 from .model.actuator import Actuator as Actuator
 from .model.controller_gains import CascadeGains as CascadeGains
-from .model.controller_gains import Controller as Controller
+from .model.controller_gains import ControllerParts as ControllerParts
 from .model.controller_gains import PidGains as PidGains
 from .model.controller_gains import cascade as cascade
 from .model.controller_gains import cascade_gains as cascade_gains

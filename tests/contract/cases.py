@@ -214,6 +214,8 @@ SCENE_CASES = [
 OTHERS = {
     "assess": "one scene: tests/unit/studies/test_published.py, tests/properties/test_consistency.py",
     "assess_many": "scenes by name: tests/unit/analysis/test_assessment.py",
+    "cascade": "one controller: tests/unit/model/test_position.py",
+    "cascade_gains": "one controller: tests/unit/model/test_position.py",
     "diagnose": "one scene and wall: tests/unit/analysis/test_diagnosis.py",
     "excite": "one signal: tests/unit/identification/test_response_estimate.py",
     "fit_buzz": "one device: tests/unit/identification/test_onset_fit.py",
@@ -224,6 +226,8 @@ OTHERS = {
     "load_config": "a file: tests/unit/config/test_reader.py",
     "load_scene": "a file: tests/unit/cli/test_scene_file.py",
     "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",
+    "pid": "one controller: tests/unit/model/test_position.py",
+    "pid_gains": "one controller: tests/unit/model/test_position.py",
     "reference_grasps": "one radius: tests/unit/analysis/test_recommendation.py",
     "respond": "one record: tests/unit/identification/test_response_estimate.py",
     "robust_max_stiffness": "boxes of devices: tests/unit/analysis/test_robust.py",

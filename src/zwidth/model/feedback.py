@@ -112,7 +112,7 @@ class IntegralFeedback(Part):
             the measured position.
 
     References:
-        Astrom, Hagglund 2006, Advanced PID Control, section 13.3 (discretization of the integral).
+        Astrom, Hagglund 2006, Advanced PID Control (discretization of the integral).
 
     Example:
         >>> import zwidth

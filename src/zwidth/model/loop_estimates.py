@@ -22,7 +22,7 @@ from zwidth.core.errors import InputError
 from zwidth.model.circle_functions import CirclePoints, Jet, are_on_circle
 from zwidth.model.estimate import Estimate
 from zwidth.model.feedback import Weights
-from zwidth.model.position import estimate_position, has_velocity
+from zwidth.model.position import Observer, Pll, estimate_position
 
 # Type of a function that returns a frequency response on the unit circle, and its derivative in w.
 Response = Callable[[CirclePoints], Jet]
@@ -95,7 +95,7 @@ def build_estimates(scene: Any) -> LoopEstimates | None:
     position, feedback, period = scene.position, scene.feedback, scene.timing.period
     if position is None and feedback is None:
         return None
-    if has_velocity(position):
+    if isinstance(position, Pll | Observer):
         velocity, structure = position.estimate_velocity(period), "common"
     else:
         velocity = scene.velocity.estimate(period)

@@ -200,7 +200,7 @@ class Observer(Part):
         denominator: coefficients of D, with all roots inside the unit circle.
 
     References:
-        Franklin, Powell, Workman 1998, Digital Control of Dynamic Systems, 3rd ed., section 8.2 (current estimator).
+        Franklin, Powell, Workman 1998, Digital Control of Dynamic Systems, 3rd ed. (current estimator).
 
     Example:
         An alpha-beta filter, ``p <- p + T v; e = x - p; p <- p + a e; v <- v + (b/T) e`` with a = 0.5, b = 0.1:
