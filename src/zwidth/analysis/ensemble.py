@@ -120,7 +120,7 @@ class Variants:
         scene, nominal = self.scene, self.scene.parameters()
         device, velocity = scene.device, scene.velocity
         known = type(device) in (Device, LinearDevice) and type(velocity) in ESTIMATES.values()
-        known = known and not list_further_parts(scene) and scene.tool is None
+        known = known and not list_further_parts(scene)
         sampled = getattr(device, "dt", None) is not None
         whole = any(isinstance(nominal.get(name), int) for name in values)
         # Without a spring to ground a model has a different structure, so its stiffness must not be 0 in any variant.

@@ -21,10 +21,10 @@ from zwidth.cli.options import (
     Parsed,
     find_omitted,
     json_option,
-    name_option,
     read_pairs,
     scene_options,
 )
+from zwidth.cli.parts import name_option
 from zwidth.core.status import Status
 from zwidth.units.formatting import (
     count_digits,

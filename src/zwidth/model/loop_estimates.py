@@ -90,16 +90,6 @@ class LoopEstimates:
         return ratio, zeros.size
 
 
-def refuse_estimates(scene: Any, method: str) -> None:
-    """Raise `InputError` if a scene has a position estimate or further feedback, which a method does not support."""
-    for name in ("position", "feedback"):
-        part = getattr(scene, name)
-        if part is not None:
-            raise InputError(
-                f"{name}: got {part!r}, which {method} does not support; omit it, or use max_stiffness and is_stable"
-            )
-
-
 def build_estimates(scene: Any) -> LoopEstimates | None:
     """Return P, V and R of a scene; None if it has neither a position estimate nor further feedback."""
     position, feedback, period = scene.position, scene.feedback, scene.timing.period
