@@ -1,5 +1,8 @@
 """Every public name, once: what loads it on first use, and what type checkers read."""
 
+from .analysis.admittance import AdmittanceDisplay as AdmittanceDisplay
+from .analysis.admittance import EnvironmentLimit as EnvironmentLimit
+from .analysis.admittance import VirtualMassLimit as VirtualMassLimit
 from .analysis.assessment import Assessment as Assessment
 from .analysis.assessment import Limit as Limit
 from .analysis.assessment import assess as assess
@@ -49,8 +52,17 @@ from .identification.response_estimate import respond as respond
 from .identification.safe_wall import SafeWall as SafeWall
 from .model import devices as devices
 from .model.actuator import Actuator as Actuator
+from .model.controller_gains import CascadeGains as CascadeGains
+from .model.controller_gains import ControllerParts as ControllerParts
+from .model.controller_gains import PidGains as PidGains
+from .model.controller_gains import cascade as cascade
+from .model.controller_gains import cascade_gains as cascade_gains
+from .model.controller_gains import pid as pid
+from .model.controller_gains import pid_gains as pid_gains
 from .model.device import Coupling as Coupling
 from .model.device import Device as Device
+from .model.feedback import Feedback as Feedback
+from .model.feedback import IntegralFeedback as IntegralFeedback
 from .model.grasps import reference_grasps as reference_grasps
 from .model.joint_space import from_mass_matrix as from_mass_matrix
 from .model.joint_space import from_mujoco as from_mujoco
@@ -58,8 +70,13 @@ from .model.linear_device import LinearDevice as LinearDevice
 from .model.measured_device import MeasuredDevice as MeasuredDevice
 from .model.mode import Mode as Mode
 from .model.operator import Operator as Operator
+from .model.position import ExponentialFilter as ExponentialFilter
+from .model.position import Observer as Observer
+from .model.position import Pll as Pll
+from .model.position import PositionFilter as PositionFilter
 from .model.safe_limit import SafeLimit as SafeLimit
 from .model.timing import Timing as Timing
+from .model.tool import Tool as Tool
 from .model.velocity import FOAW as FOAW
 from .model.velocity import BackwardDifference as BackwardDifference
 from .model.velocity import Butterworth as Butterworth

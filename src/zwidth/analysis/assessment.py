@@ -21,8 +21,10 @@ from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError
 from zwidth.core.status import RidgeKind, Status
 from zwidth.model.checks import Span
+from zwidth.model.feedback import Feedback
+from zwidth.model.position import Observer, PositionFilter
 from zwidth.model.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
-from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.results import Margins
 from zwidth.units.display import ResultList, compact_repr, find_unit, with_units
 from zwidth.units.formatting import format_interval, plain, round_conservatively, to_json, with_unit
@@ -40,7 +42,7 @@ _UNITS: dict[str, Any] = {
 }
 _MISSING = {
     "passivity_margin": "no condition is known for these parts",
-    "delay_margin": "not confirmed by the number of poles",
+    "delay_margin": "not confirmed by the number of poles, or not computed because of a tool",
     "phase_margin": "no gain crossover determines it",
     **dict.fromkeys(
         ("alpha_max", "beta_at_max", "stiffness_max", "virtual_damping_at_max", "ridge_frequency"), "no wall is stable"
@@ -124,7 +126,7 @@ def assess(scene: SceneOptima) -> Assessment:
     margins, best, has_condition = (
         scene.margins(),
         scene.max_stiffness(),
-        not find_unsupported_reason(**vars(scene.device)),
+        not find_obstacle(scene),
     )
     margin = float(scene.passivity_margin()) if has_condition else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
@@ -386,6 +388,10 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
     """
     if isinstance(scene.velocity, VelocityFilter) or getattr(scene.device, "dt", None) is not None:
         return False
+    if isinstance(scene.feedback, Feedback) or isinstance(scene.position, PositionFilter | Observer):
+        return False
+    if getattr(scene.position, "coefficient", None) is not None:
+        return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
     later = scene.d if scene.timing.in_periods else 2 * scene.d
     return 2 * window + later <= scene.loop.most_periods
@@ -401,6 +407,8 @@ def _double_rate(scene: SceneOptima) -> SceneOptima:
         changes["velocity.samples"] = scene.velocity.samples * 2
     if not isinstance(scene.velocity, VelocityFilter | FOAW) and scene.velocity.coded_period is not None:
         changes["velocity.coded_period"] = scene.velocity.coded_period / 2
+    if (coded_period := getattr(scene.position, "coded_period", None)) is not None:
+        changes["position.coded_period"] = coded_period / 2
     return scene.replace(**changes)
 
 

@@ -22,7 +22,7 @@ from zwidth.analysis.wall_search import (
 from zwidth.core.status import Status
 from zwidth.model.device import Device
 from zwidth.model.grasps import list_grasps
-from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.units.formatting import format_wall, plain, with_unit
 
 # Limits of acceptable walls. A recommended wall that violates one of these limits has a caution.
@@ -70,7 +70,7 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
         cautions.append(f"{', '.join(thin)}{after}; {advice}")
     if unstable := [name for name, stable in recommendation.grasps.items() if not stable]:
         options = {"--grasps all": requirements._replace(grasps="all")}
-        if float(scene.device.damping) > 0 and not find_unsupported_reason(**vars(scene.device)):
+        if float(scene.device.damping) > 0 and not find_obstacle(scene):
             options["--passive"] = Requirements(passive=True, beyond_safe=requirements.beyond_safe)
         advice = _advise(
             recommendation,

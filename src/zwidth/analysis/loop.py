@@ -33,6 +33,7 @@ from zwidth.model.parameter_paths import AnyScene, list_parameters
 from zwidth.numerics.evaluate import as_float64, check_scalars, evaluate
 from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.linear.boundary import Boundary
+from zwidth.stability.linear.composition import find_roots
 from zwidth.stability.linear.curve import evaluate_curve
 from zwidth.stability.linear.derivatives import SceneSensitivities, compute_sensitivities
 from zwidth.stability.linear.margins import compute_margins, evaluate_walls
@@ -47,7 +48,7 @@ from zwidth.stability.linear.poles import (
 from zwidth.stability.linear.poles import spectral_radius as linear_radius
 from zwidth.stability.linear.regions import Outline, StableSet
 from zwidth.stability.linear.ridge import RidgeSolution, find_ridge
-from zwidth.stability.linear.roots import LoopRoots, find_roots
+from zwidth.stability.linear.roots import LoopRoots
 from zwidth.stability.linear.rows import Island, find_stable_dampings, find_stable_intervals, label_walls
 from zwidth.stability.results import DominantPole, Margins, RidgePoint, Stability
 from zwidth.stability.rigid.boundary import boundary, boundary_point, stable_region
@@ -400,6 +401,10 @@ class RigidLoop(LinearLoop):
         return passivity_margin(alpha, beta, self.scene.device_delta, self.scene.d)
 
     def vary(self, drawn: dict[str, np.ndarray]) -> Variants:
+        if "rate" in drawn:
+            with np.errstate(divide="ignore"):
+                period = 1.0 / drawn["rate"]
+            drawn = {"period": period} | {name: column for name, column in drawn.items() if name != "rate"}
         return RigidVariants(self.scene, drawn) if set(drawn) <= set(RIGID_PARAMETERS) else super().vary(drawn)
 
 

@@ -32,7 +32,7 @@ import numpy as np
 
 from zwidth.core.errors import InputError
 from zwidth.model.circle_functions import circle_points
-from zwidth.model.velocity import Estimate
+from zwidth.model.estimate import Estimate
 from zwidth.stability.linear.rows import arrange_by_line, collect_by_line
 
 # Constants of the interpolation between adjacent lines (docs/theory/measured.md, M5 and M6).

@@ -36,7 +36,7 @@ from zwidth.model.device import Device
 from zwidth.model.grasps import RADII
 from zwidth.model.safe_limit import SafeLimit, reserve_damping
 from zwidth.model.wall import NoWall, VirtualWall
-from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.rigid.step_response import decay_time
 from zwidth.units.display import compact_repr
 from zwidth.units.formatting import (
@@ -263,7 +263,7 @@ class Recommendation:
         passive = None if self.verdict is None else self.verdict.passive
         if passive and self.verdict is not None and self.verdict.passivity_margin < reserve_damping(self.scene):
             return "uncertain, because the fitted damping is"
-        obstacle = find_unsupported_reason(**vars(self.scene.device)).partition(":")[0]
+        obstacle = find_obstacle(self.scene).partition(":")[0]
         return {True: "yes", False: "no", None: f"not known {obstacle}".rstrip()}[passive]
 
     def as_dict(self) -> dict[str, Any]:
@@ -376,7 +376,7 @@ class SceneAdvice(SceneOptima):
             'phase_margin'
         """
         requirements = Requirements.check(stiffness_fraction, gain_margin, phase_margin, passive, beyond_safe, grasps)
-        if requirements.passive and (obstacle := find_unsupported_reason(**vars(self.device))):
+        if requirements.passive and (obstacle := find_obstacle(self)):
             raise InputError(f"passive: got True {obstacle}")
         if not isinstance(self.device, Device) and requirements.grasps != "none" and grasps is not None:
             raise InputError(f"grasps: got {grasps!r}, but the device is no Device with a mass; only 'none' is allowed")
@@ -384,6 +384,8 @@ class SceneAdvice(SceneOptima):
             requirements = requirements._replace(grasps="none")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)
+        if np.isinf(top.stiffness):
+            raise InputError("tool: the coupling is stable with every stiffness; choose K and B by assess or margins")
         choice = choose_wall(bare, requirements, top)
         notes += [choice.note] if choice.note else []
         notes += _describe_limit(self.safe_limit, beyond_safe, self.unit_system)

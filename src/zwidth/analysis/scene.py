@@ -14,6 +14,7 @@ import numpy as np
 
 from zwidth.analysis.base import WallSI, wrap_methods
 from zwidth.analysis.coupling import is_safe_for_every_world, max_safe_coupling
+from zwidth.analysis.lightest_tool import lightest_tool
 from zwidth.analysis.recommendation import SceneAdvice
 from zwidth.core.errors import InputError
 from zwidth.core.types import ArrayLike
@@ -38,6 +39,12 @@ class Scene(SceneAdvice):
         operator: the hand that holds the device; None for a released device.
         safe_limit: stiffest wall that measurements of the device support, usually set by a fit. `recommend` respects
             it; stability and maximum stiffness do not depend on it.
+        position: position estimate from which the spring force is computed, such as a filter, an observer or a PLL;
+            None for the measured position. The velocity is estimated from the filtered position, unless the part says
+            otherwise. An observer or PLL has its own velocity estimate and excludes ``velocity``.
+        feedback: fixed further feedback, such as an integral gain; None without one.
+        tool: simulated tool. The stiffness and the damping of the wall are then those of the virtual coupling between
+            the device and this tool; None for a fixed wall.
 
     Numerics:
         A scene is a JAX pytree whose leaves are its numbers, so that it can be an argument of functions inside ``jit``,
@@ -92,6 +99,7 @@ class Scene(SceneAdvice):
         )
 
     is_safe_for_every_world = is_safe_for_every_world
+    lightest_tool = lightest_tool
     max_safe_coupling = max_safe_coupling
     simulate = simulate
     """Method that calls `zwidth.simulate` with this scene and all other arguments."""

@@ -9,6 +9,7 @@ results back. K and B are the stiffness and damping of the wall, F(z) is the vel
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -20,12 +21,13 @@ from zwidth.core.types import Array, ArrayLike
 from zwidth.core.xp import is_traced, namespace
 from zwidth.model.checks import read_texts
 from zwidth.model.linear_device import ResponseDevice
+from zwidth.model.position import has_velocity
 from zwidth.model.state_space import StateSpace
 from zwidth.model.wall import resolve_wall
 from zwidth.numerics.evaluate import are_numbers, as_float64, broadcast_traced, join_shapes
 from zwidth.plant.sampled_states import sample_states
 from zwidth.stability.linear.closed_loop import realize_closed_loop, realize_open_loop
-from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.linear.rows import Island
 from zwidth.stability.results import Margins, Stability
 from zwidth.stability.rigid.verdict import STABILITY_METHODS, StabilityMethod
@@ -158,10 +160,14 @@ class SceneAnalysis(SceneParts):
         the delayed forces. The result has A, B, C, D and the period dt.
         """
         compliance = self.timing.period**2 / float(self.mass)
-        return _realize(self, realize_closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
+        tool = self.tool and self.tool.respond(float(self.mass), self.timing.period)
+        build = partial(realize_closed_loop, tool=tool)
+        return _realize(self, build, compliance, *self.normalize_walls(stiffness, virtual_damping))
 
     def open_loop(self, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
         """Return a state-space model of the open loop L with one wall; negative feedback closes the loop."""
+        if self.tool is not None:
+            raise InputError("tool: the state-space model of the open loop excludes a tool; use frequency_response")
         return _realize(self, realize_open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
 
     def frequency_response(
@@ -295,7 +301,7 @@ class SceneAnalysis(SceneParts):
         actuator or modes (`InputError`). For K < 0 the margin is at most K T, because such a wall supplies energy
         without limit.
         """
-        if obstacle := find_unsupported_reason(**vars(self.device)):
+        if obstacle := find_obstacle(self):
             raise InputError(f"passivity {obstacle}")
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         return self._loop_for(alpha, beta).passivity_margin(alpha, beta) * self.units.virtual_damping
@@ -311,11 +317,12 @@ class SceneAnalysis(SceneParts):
         With several crossovers, the nearest counts, as in python-control. ``gain_margin`` is the factor nearest to 1 on
         K and B together, ``phase_margin`` the smallest change of phase in degrees, and ``delay_margin`` the smallest
         additional delay in s that moves a pole onto the unit circle. ``modulus_margin`` is the smallest distance of L
-        from -1. The phase margin of an unstable wall is negative, its delay margin 0. The delay margin is computed with
-        the exact discretization of every fractional delay, and is NaN if counts of poles below and above it do not
-        confirm it. If no factor, phase or delay moves a pole onto the unit circle, the first three margins are infinite
-        for a stable wall, and 0, NaN and 0 for an unstable one. Walls out of range are NaN. A rigid scene uses
-        `zwidth.margins`. For other scenes, one wall takes about 0.1 s, and many walls in one call some ms per wall.
+        from -1. Further feedback of the scene changes together with K and B. The phase margin of an unstable wall is
+        negative, its delay margin 0. The delay margin is computed with the exact discretization of every fractional
+        delay, and is NaN if counts of poles below and above it do not confirm it. If no factor, phase or delay moves a
+        pole onto the unit circle, the first three margins are infinite for a stable wall, and 0, NaN and 0 for an
+        unstable one. Walls out of range are NaN. A rigid scene uses `zwidth.margins`. For other scenes, one wall takes
+        about 0.1 s, and many walls in one call some ms per wall.
         """
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
@@ -333,13 +340,15 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
 
     By default they are included for a `zwidth.Device` whose velocity is a positive multiple of the difference of two
     samples. They are excluded for a device given as a whole system: its true damping is unknown, so a wall with B < 0
-    would cancel modeled damping that may not exist.
+    would cancel modeled damping that may not exist. They are also excluded for the coupling of a simulated tool.
     """
     if negative_damping is not None and not isinstance(negative_damping, bool | np.bool_):
         raise InputError(f"negative_damping: got {negative_damping!r}; pass True, False or None")
-    if negative_damping is None and not isinstance(scene.device, ResponseDevice):
+    if negative_damping is None and scene.tool is None and not isinstance(scene.device, ResponseDevice):
         if not scene.nonrigid_parts:
             return True
+        if has_velocity(scene.position):
+            return False
         estimate = scene.velocity.estimate(scene.timing.period)
         return bool(estimate.is_difference and estimate.gain > 0)
     return bool(negative_damping)

@@ -13,12 +13,14 @@ OWN = "This command"  # heading of the options that belong to no other group
 # Groups of options in the help: the heading of each group, and the prefixes of the options in it.
 GROUPS = {
     "Wall": ("--stiffness", "--virtual-damping"),
-    "Device": ("--device", "--mass", "--damping"),
+    "Device": ("--device", "--sampled", "--mass", "--damping"),
     "Timing": ("--period", "--rate", "--delay"),
     OWN: (),
     "Velocity estimate": ("--velocity-",),
+    "Position estimate and further feedback": ("--position-", "--feedback-"),
     "Encoder, friction and motor": ("--resolution", "--friction", "--static-friction", "--max-force", "--max-rate"),
     "Hand": ("--operator-",),
+    "Simulated tool": ("--tool-",),
     "Further parts of the device": ("--coupling-", "--actuator-", "--modes-"),
     "Output": ("--figure", "--code", "--verbose", "--json", "--help"),
 }

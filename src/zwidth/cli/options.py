@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -20,17 +20,18 @@ import click
 from zwidth.app.printing import format_row
 from zwidth.cli.help import OF_SCENE as OF_SCENE
 from zwidth.cli.help import show_example as show_example
+from zwidth.cli.parts import FILTER_HELP, change_kind, make_kind, make_part, name_option, select_part
 from zwidth.core.errors import InputError
 from zwidth.model.checks import Span, find_kind, read_span
 from zwidth.model.device import Device
+from zwidth.model.linear_device import LinearDevice
 from zwidth.model.mode import Mode
-from zwidth.model.parameter_paths import PARTS, find_parts, spell_part
+from zwidth.model.parameter_paths import PARTS, WITH_KIND, find_parts
 from zwidth.model.timing import Timing
-from zwidth.model.velocity import ESTIMATES, name_estimate
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.units.parsing import DIMENSIONS, detect_kind, looks_like_number, read_quantity, read_share
 from zwidth.units.plausibility import list_implausible
-from zwidth.units.quantities import ANY, CHOICES, HARDWARE, OF_PARTS, PARAMETERS, Range
+from zwidth.units.quantities import ANY, CHOICES, FIELDS, HARDWARE, OF_ESTIMATES, OF_PARTS, PARAMETERS, Range
 from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 if TYPE_CHECKING:
@@ -45,15 +46,13 @@ BOTH_PERIODS = "--period and --rate are both given; give only one of them"
 Command: TypeAlias = Callable[..., Any]
 
 # Names of the parts of a scene; and the paths of the parameters of all parts, sorted by part.
-_PART_NAMES = tuple(dict.fromkeys(path.rpartition(".")[0] for path in OF_PARTS))
-_PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
+_PART_NAMES = tuple(dict.fromkeys(("velocity", *WITH_KIND, *(path.rpartition(".")[0] for path in OF_PARTS))))
+_PARTS = sorted((*CHOICES, *OF_PARTS, *OF_ESTIMATES), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
 # Parts that cannot be added to a linear system or a measured response, because such a device includes them.
 _CONTAINED = ("operator", "coupling", "actuator", "modes")
 # Names of the structural modes among the parts: "modes.0", "modes.1" and so on.
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
 _BARE = {"mass", "damping"}  # parameters of a rigid device
-# Parameters of a low-pass filter that exclude each other; one of them must be given.
-_ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
 class Parsed(click.ParamType):
@@ -136,26 +135,27 @@ def _read_figure(text: str) -> Path:
     return file
 
 
-def name_option(path: str) -> str:
-    """Return the name of the option for a parameter, ``--velocity-cutoff`` for ``velocity.cutoff``."""
-    return "--" + path.replace(".", "-").replace("_", "-")
-
-
 def _add_option(command: Command, path: str) -> Command:
     """Return a command with the option of one parameter added; ``path`` is the path of the parameter in a scene."""
     if path == "device":
         words = (
             "A published device of `zwidth devices`, with its period and delay; other options add or replace "
             "parameters. Or, in place of mass, damping and all parts: a transfer function 'NUM / DEN' by its "
-            "coefficients in s, such as '1 / 0.1 10 0', or a measured response FILE.csv (.npz, .mat)."
+            "coefficients in s, such as '1 / 0.1 10 0', by its roots, 'zpk: ZEROS / POLES / GAIN', or by sections, "
+            "'sos: b0 b1 b2 a0 a1 a2; ..'; or a measured response FILE.csv (.npz, .mat)."
         )
         return click.option("--device", metavar="NAME", help=words)(command)
+    if path == "sampled":
+        words = "The transfer function of --device is in z, at the period of the loop, and includes hold and delay."
+        return click.option("--sampled", is_flag=True, default=None, help=words)(command)
+    if path == "velocity.filter":
+        return click.option("--velocity-filter", "velocity__filter", metavar="FILTER", help=FILTER_HELP)(command)
     if path in CHOICES:
         kind, text = click.Choice(CHOICES[path].names), CHOICES[path].sentence
     else:
-        parameter = PARAMETERS[path]
+        parameter = FIELDS[path]
         # Skip the range check of parameters of parts, because the constructors of the parts check them.
-        allowed = ANY if path in OF_PARTS else parameter.allowed
+        allowed = ANY if "." in path else parameter.allowed
         kind = click.INT if parameter.whole else quantity_type(parameter.unit, allowed)
         kind = Parsed("quantity", _read_delay) if path == "delay" else kind
         unit, note = (
@@ -166,14 +166,22 @@ def _add_option(command: Command, path: str) -> Command:
     return click.option(name_option(path), path.replace(".", "__"), type=kind, help=f"{text}.")(command)
 
 
+# Paths of the parameters of a rigid device and of its timing.
+_TIMED = ("mass", "damping", "period", "rate", "delay")
+
+
 def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
     """Return a decorator that adds the options of a scene, with or without wall, and the argument of a scene file.
 
     The command receives a `zwidth.Scene` as ``scene``, or None if ``instead`` names alternative options and no scene
     option is given.
     """
-    bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
-    take = take_options("scene", (*bare, *_PARTS), lambda given, system: build_scene(given, system, instead, wall=wall))
+    bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "sampled", *_TIMED)
+    take = take_options(
+        "scene",
+        (*bare, "velocity.filter", *_PARTS),
+        lambda given, system: build_scene(given, system, instead, wall=wall),
+    )
     file = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=click.Path(path_type=Path))
     return lambda command: file(take(command))
 
@@ -197,10 +205,12 @@ def take_options(
                 if (file := given.pop("scene_file", None)) is not None:
                     values["scene"] = read_scene_file(file)
                     with_kind = {file.name: values["scene"].device, **with_kind}
+                if values.get("sampled") and "device" not in values:
+                    raise click.UsageError("--sampled: give --device 'NUM / DEN' with coefficients in z")
                 if "device" in values:
                     from zwidth.model.devices import read_device
 
-                    values["device"] = read_device(values["device"])
+                    values["device"] = read_device(values["device"], _find_sampled_period(values))
                     # Ignore the unit system and the hardware of the scene file, because the option --device replaces
                     # the device of the file.
                     context.meta.pop(_HARDWARE, None)
@@ -219,6 +229,17 @@ def take_options(
         return command
 
     return decorate
+
+
+def _find_sampled_period(values: dict[str, Any]) -> float | None:
+    """Return the period of the loop in s if the option --sampled is given, otherwise None; remove this option."""
+    if not values.pop("sampled", False):
+        return None
+    if "rate" in values or "period" in values:
+        return values["period"] if "period" in values else 1.0 / values["rate"]
+    if "scene" not in values:
+        raise click.UsageError("--sampled: also give --rate or --period")
+    return float(values["scene"].timing.period)
 
 
 def warn_implausible(given: dict[str, Any], system: UnitSystem) -> None:
@@ -260,6 +281,8 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
     warn_implausible(numbers, system)
     scene = _make_scene(given, system, instead) if base is None else change_scene(base, given)
     scene.check_parts()
+    if isinstance(scene.device, LinearDevice) and (warning := scene.device.warn_of_variable(scene.timing.period)):
+        click.echo(f"zwidth: --device: {warning} add --sampled", err=True)
     return scene
 
 
@@ -272,19 +295,14 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
     if isinstance(device, PublishedDevice):
         _check_published(device, given)
         changes["device"] = device.to_device(**{name: changes.pop(name) for name in _BARE & changes.keys()})
-    if part_values := _select_part(given, "velocity"):
-        same = "kind" not in part_values and part_values.keys() <= {item.name for item in fields(scene.velocity)}
-        kept = {"kind": name_estimate(scene.velocity), **spell_part(scene.velocity)} if same else {}
-        if part_values.keys() & _ONE_OF_TWO:
-            # A low-pass has either a cutoff or a time constant. If an option gives one of the two, drop both values of
-            # the file.
-            kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
-        changes["velocity"] = make_velocity({**kept, **part_values})
+    for owner in ("velocity", *WITH_KIND):
+        if part_values := select_part(given, owner):
+            changes[owner] = change_kind(owner, getattr(scene, owner), part_values)
     parts = {} if device else find_parts(scene)
     modes = list(() if device else scene.device.modes)
     for name, kind in {**PARTS, **dict.fromkeys(_MODES, Mode)}.items():
-        if part_values := _select_part(given, name):
-            part = replace(parts[name], **part_values) if name in parts else _make_part(name, kind, part_values)
+        if part_values := select_part(given, name):
+            part = replace(parts[name], **part_values) if name in parts else make_part(name, kind, part_values)
             if kind is not Mode:
                 changes[name] = part
             elif name in parts:
@@ -324,11 +342,12 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
         return {name: given[name] for name in names if name in given}
 
     parts: dict[str, Any] = {
-        name: _make_part(name, kind, part_values)
+        name: make_part(name, kind, part_values)
         for name, kind in PARTS.items()
-        if (part_values := _select_part(given, name))
+        if (part_values := select_part(given, name))
     }
-    modes = [_make_part(name, Mode, part_values) for name in _MODES if (part_values := _select_part(given, name))]
+    parts |= {name: make_kind(name, part_values) for name in WITH_KIND if (part_values := select_part(given, name))}
+    modes = [make_part(name, Mode, part_values) for name in _MODES if (part_values := select_part(given, name))]
     parts |= {"modes": modes} if modes else {}
     timing = Timing
     if device is None:
@@ -341,7 +360,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
                 f"{name_option(path)}: the given --device already contains it; give only one of the two"
             )
     wall = VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0))
-    velocity = make_velocity(_select_part(given, "velocity"))
+    velocity = make_kind("velocity", select_part(given, "velocity"))
     return Scene(device, timing(**select("period", "rate", "delay")), wall, velocity).replace(**parts)
 
 
@@ -351,44 +370,6 @@ def _check_published(device: PublishedDevice, given: dict[str, Any], more: Seque
     flags = [*(remedies[name] for name in device.list_missing(given)), *more]
     if flags:
         raise click.UsageError(f"--device {device.name}: also give {', '.join(flags)}; not published for this device")
-
-
-def _list_needed(kind: Any) -> list[str]:
-    """Return the names of the fields without default value of the class ``kind`` of a part."""
-    return [item.name for item in fields(kind) if item.default is MISSING]
-
-
-def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
-    """Return a part of class ``kind`` with the given fields; raise `click.UsageError` if a field is missing."""
-    needed = _list_needed(kind)
-    for key in needed:
-        if key not in given:
-            fields_needed = " and ".join(f"a {each}" for each in needed)
-            raise click.UsageError(f"a {name} requires {fields_needed}; give {name_option(f'{name}.{key}')}")
-    return kind(**given)
-
-
-def _select_part(given: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the parameters of one part from the options, as a dict by field name."""
-    return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
-
-
-def make_velocity(given: dict[str, Any]) -> Any:
-    """Return the velocity estimate built from the parameters ``given``, a dict by field name."""
-    kind = given.pop("kind", None)
-    if kind is None:
-        low = {"cutoff", "time_constant"} & set(given)
-        kind = "windowed_difference" if "samples" in given else "low_pass" if low else "backward_difference"
-    part = ESTIMATES[kind]
-    needed = ["cutoff"] if kind == "low_pass" and "time_constant" not in given else _list_needed(part)
-    for name in needed:
-        if name not in given:
-            raise click.UsageError(f"a velocity estimate of kind {kind} requires {name_option(f'velocity.{name}')}")
-    for name in sorted(set(given) - set(part.__dataclass_fields__)):
-        raise click.UsageError(
-            f"{name_option(f'velocity.{name}')} does not belong to a velocity estimate of kind {kind}"
-        )
-    return part(**given)
 
 
 figure_option = click.option(
@@ -405,7 +386,8 @@ def find_omitted() -> frozenset[str]:
     Friction is included only if the command simulates an encoder.
     """
     given, hardware = click.get_current_context().params, get_hardware()
-    named = () if given.get("scene_file") is not None else ("damping", "delay")
+    # A sampled device includes its delay.
+    named = () if given.get("scene_file") is not None else ("damping", *(() if given.get("sampled") else ("delay",)))
     omitted = {name for name in named if given.get(name) is None}
     values = {name: hardware.get(name) if given[name] is None else given[name] for name in HARDWARE if name in given}
     simulated = values.get("resolution") and "coulomb" in values

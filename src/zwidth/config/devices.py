@@ -2,91 +2,67 @@
 
 Sections are either in SI units ("physical") or normalized; `OneKind` reports keys of the other kind. A linear system
 or a measured response replaces mass, damping and mechanical parts. Its forms are: numerator and denominator, zeros,
-poles and gain, or the matrices A, B and C.
+poles and gain, the matrices A, B and C, or second-order sections.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from functools import cached_property
-from types import SimpleNamespace
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema, WrapValidator
+from pydantic import ConfigDict, Field, PlainValidator, ValidationInfo, WrapValidator
 
 from zwidth.config.device_table import find_file
 from zwidth.config.fields import LocatedProblem, Strict, combine_problems, problem, quote_names
-from zwidth.config.parts import PART_NAMES, PartSection, parse_message
+from zwidth.config.parts import PART_NAMES, Numbers, PartSection, parse_message, to_array
 from zwidth.config.values import Delay, Quantity, get_system, quantity_of
 from zwidth.core.errors import InputError
 from zwidth.model.checks import Span
 from zwidth.model.devices import DEVICES
-from zwidth.model.linear_device import LinearDevice, parse_fraction
+from zwidth.model.linear_device import LinearDevice
 from zwidth.model.measured_device import SUFFIXES, MeasuredDevice
 from zwidth.model.parameter_paths import PARTS
+from zwidth.model.system_forms import parse_system
 from zwidth.units.formatting import describe, suggestion
 from zwidth.units.quantities import HARDWARE, POSITIVE
 
 FORMS = "a published name, 'NUMERATOR / DENOMINATOR' in s, a table FILE.csv of a response, or a mapping"
 # Keys of each form of a linear system. The last key identifies the form, because it is required and in no other form.
-_SYSTEM_FORMS = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"))
-
-
-def _to_array(raw: Any) -> np.ndarray:
-    """Return a number or a list as an array, complex if an entry is a text such as "-3+40j".
-
-    Raises:
-        ValueError: if an entry is not a number.
-    """
-    array = np.array([] if raw is None else raw)
-    if array.dtype.kind == "U":
-        array = np.array([complex(text.replace(" ", "")) for text in array.ravel()]).reshape(array.shape)
-    if array.dtype.kind not in "iufc":
-        raise ValueError("no numbers")
-    return array
-
-
-def _check_numbers(raw: Any) -> Any:
-    """Return the value unchanged; raise a problem if it is not a number or a list of finite numbers."""
-    with suppress(ValueError):
-        if np.all(np.isfinite(_to_array(raw))):
-            return raw
-    remedy = "write [1, 0.5], or '-3+40j' for a complex root"
-    raise problem(f"got {describe(raw)}", "it must be a list of finite numbers", remedy)
-
-
-_Numbers = Annotated[Any, BeforeValidator(_check_numbers), WithJsonSchema({"type": ["array", "number"]})]
+_SYSTEM_FORMS = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"), ("sos",))
 
 
 class SystemSection(PartSection, noun="a linear system"):
     """A device as a linear system, from the commanded force in N to the measured position in m."""
 
-    numerator: _Numbers | None = None
+    numerator: Numbers | None = None
     """Numerator coefficients in powers of s, or of z for a sampled system; highest power first."""
 
-    denominator: _Numbers | None = None
+    denominator: Numbers | None = None
     """Denominator coefficients, highest power first; the degree must exceed that of the numerator."""
 
-    zeros: _Numbers | None = None
+    zeros: Numbers | None = None
     """Finite zeros in rad/s, or in the z plane for a sampled system; complex zeros as text such as '-3+40j', together
     with their conjugates. Default: none."""
 
-    poles: _Numbers | None = None
+    poles: Numbers | None = None
     """Poles, in the same form as the zeros."""
 
-    gain: _Numbers | None = None
+    gain: Numbers | None = None
     """Ratio of the leading coefficients of numerator and denominator; required with zeros and poles."""
 
-    A: _Numbers | None = None
+    A: Numbers | None = None
     """State matrix, a list of rows."""
 
-    B: _Numbers | None = None
+    B: Numbers | None = None
     """Input vector, for the force."""
 
-    C: _Numbers | None = None
+    C: Numbers | None = None
     """Output vector, for the position."""
+
+    sos: Numbers | None = None
+    """Second-order sections, rows of the coefficients b0 b1 b2 a0 a1 a2, whose product is the system."""
 
     sampled: Annotated[float, Quantity("s", POSITIVE)] | None = None
     """Sampling period of a discrete-time system, in s or with a unit; must equal the period of the loop. Default: the
@@ -96,13 +72,10 @@ class SystemSection(PartSection, noun="a linear system"):
     def instance(self) -> LinearDevice:
         """The linear system as an object of `zwidth.model`, built from the keys of the given form."""
         form = next(form for form in _SYSTEM_FORMS if getattr(self, form[-1]) is not None)
-        names = {"numerator": "num", "denominator": "den"}
-        arguments: dict[str, Any] = {names.get(name, name): _to_array(getattr(self, name)) for name in form}
-        if form != ("A", "B", "C"):
-            arguments = {
-                name: values if name == "gain" else np.atleast_1d(values) for name, values in arguments.items()
-            }
-        return LinearDevice(SimpleNamespace(**arguments, D=0.0, dt=self.sampled))
+        values = {name: to_array(getattr(self, name)) for name in form}
+        vectors = ("numerator", "denominator", "zeros", "poles")
+        system = {name: np.atleast_1d(value) if name in vectors else value for name, value in values.items()}
+        return LinearDevice(system, self.sampled)
 
     @classmethod
     def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
@@ -129,16 +102,16 @@ def _is_complete(given: Iterable[str]) -> bool:
 class ResponseSection(PartSection, noun="a response"):
     """A device given by its measured frequency response from force to position, as lists of equal length."""
 
-    frequency: _Numbers
+    frequency: Numbers
     """Frequencies in Hz."""
 
-    real: _Numbers
+    real: Numbers
     """Real part of the response at each frequency, in m/N."""
 
-    imag: _Numbers
+    imag: Numbers
     """Imaginary part of the response at each frequency, in m/N."""
 
-    deviation: _Numbers | None = None
+    deviation: Numbers | None = None
     """Radius around each value that contains the true response, in m/N. Default: the values are exact."""
 
     rotary: bool = False
@@ -159,7 +132,7 @@ class ResponseSection(PartSection, noun="a response"):
     @cached_property
     def instance(self) -> MeasuredDevice:
         """The measured response as an object of `zwidth.model`."""
-        real, imag = (_to_array(part) for part in (self.real, self.imag))
+        real, imag = (to_array(part) for part in (self.real, self.imag))
         if real.shape != imag.shape:
             raise InputError(f"imag: got {imag.size} numbers and {real.size} of real; give one per frequency")
         return MeasuredDevice(self.frequency, real + 1j * imag, self.deviation, self.rotary)
@@ -172,8 +145,8 @@ def _read_form(raw: Any) -> SystemSection | ResponseSection:
     try:
         if isinstance(raw, str) and raw.endswith(SUFFIXES):
             return ResponseSection.read(raw)
-        if isinstance(raw, str) and "/" in raw:
-            raw = dict(zip(_SYSTEM_FORMS[0], parse_fraction(raw), strict=True))
+        if isinstance(raw, str) and ("/" in raw or raw.startswith("sos:")):
+            raw = parse_system("device", raw, "s")
     except InputError as error:
         # Remove the prefix "device: ", because the location is reported separately.
         raise parse_message(str(error).removeprefix("device: ")) from None

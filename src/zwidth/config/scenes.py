@@ -31,6 +31,7 @@ from zwidth.config.values import NonNegative, Number, quantity_of
 from zwidth.core.errors import InputError
 from zwidth.core.xp import within
 from zwidth.model.device import Device
+from zwidth.model.linear_device import LinearDevice
 from zwidth.model.parameter_paths import PARTS, replace_parameters
 from zwidth.model.timing import Timing
 from zwidth.model.velocity import FOAW
@@ -220,10 +221,11 @@ class PhysicalScene(_PhysicalPlant, noun="a scene"):
             path: value for path, value in self.to_scene().parameters().items() if path not in ("period", "rate")
         }
         parameters |= {"period": self.period} if self.rate is None else {"rate": self.rate}
-        system = self.to_scene().unit_system
+        system, device = self.to_scene().unit_system, self.to_scene().device
+        warning = device.warn_of_variable(self.period) if isinstance(device, LinearDevice) else ""
         return list_implausible(
             parameters, lambda path, value: f"'{path}: {value}'" if value else f"scene.{path}", system
-        )
+        ) + ([f"scene.device: {warning} write a mapping with 'sampled'"] if warning else [])
 
     @property
     def wall(self) -> PhysicalWall | None:

@@ -21,7 +21,8 @@ import numpy as np
 
 from zwidth.identification.device_estimate import DimensionlessDevice
 from zwidth.model.circle_functions import CirclePoints, circle_points
-from zwidth.model.velocity import Estimate, Velocity
+from zwidth.model.estimate import Estimate
+from zwidth.model.velocity import Velocity
 from zwidth.plant.rigid_mass import differentiate_mass
 from zwidth.plant.sampled_plant import SampledPlant, evaluate_numerator, sample_parts
 from zwidth.units.unit_system import LINEAR, UnitSystem

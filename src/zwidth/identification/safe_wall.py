@@ -25,9 +25,10 @@ from zwidth.core.status import Status
 from zwidth.identification.device_estimate import DeviceEstimate, DimensionlessDevice
 from zwidth.identification.grid_limits import GridLimits, find_highest
 from zwidth.model.circle_functions import circle_points
+from zwidth.model.estimate import Estimate
 from zwidth.model.mechanism import Body, Chain, Resonance
 from zwidth.model.state_space import StateSpace, connect_in_series, realize_estimate
-from zwidth.model.velocity import BackwardDifference, Estimate
+from zwidth.model.velocity import BackwardDifference
 from zwidth.plant.sampled_plant import sample_parts
 from zwidth.plant.sampled_states import SampledStates, sample_states
 from zwidth.stability.rigid.normalization import device_status

@@ -230,16 +230,19 @@ def find_device(name: str) -> PublishedDevice:
     raise InputError(f"device: {describe_choice(name, tuple(device.name for device in DEVICES))}")
 
 
-def read_device(text: str) -> PublishedDevice | LinearDevice | MeasuredDevice:
+def read_device(text: str, sampled: Any = None) -> PublishedDevice | LinearDevice | MeasuredDevice:
     """Return the device that the text of an option ``--device`` describes by name, transfer function or file.
 
     Args:
-        text: the name of a device for `find_device`; a transfer function ``"NUMERATOR / DENOMINATOR"`` with the
-            coefficients in s, highest power first; or the name of a file for `zwidth.MeasuredDevice.read`.
+        text: the name of a device for `find_device`; a transfer function, "NUMERATOR / DENOMINATOR" or another text
+            that `LinearDevice` accepts; or the name of a file for `zwidth.MeasuredDevice.read`.
+        sampled: sampling period in s of a transfer function in z; None for one in s.
 
     Raises:
-        InputError: the text is none of these.
+        InputError: the text is none of these, or ``sampled`` is given for a device that is not a transfer function.
     """
-    if text.endswith(SUFFIXES):
-        return MeasuredDevice.read(text)
-    return LinearDevice(text) if "/" in text else find_device(text)
+    if text.endswith(SUFFIXES) or not ("/" in text or text.startswith("sos:")):
+        if sampled is not None:
+            raise InputError(f"device: got {text!r} as a sampled system; write 'NUM / DEN' with coefficients in z")
+        return MeasuredDevice.read(text) if text.endswith(SUFFIXES) else find_device(text)
+    return LinearDevice(text, sampled)

@@ -1,4 +1,4 @@
-"""Coefficients and roots of the sections of a velocity filter.
+"""Coefficients and roots of the sections of a filter.
 
 Numerator and denominator of a filter are products of *sections*, polynomials in z with the highest power first. Roots
 are returned as *offsets* ``1 - root``, which are accurate for roots near z = 1.
@@ -29,7 +29,7 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
     """Return the sections of a numerator or denominator, each a tuple of coefficients without leading zeros.
 
     Args:
-        name: "numerator" or "denominator", for messages.
+        name: path of the parameter for messages, such as "velocity.numerator".
         given: coefficients of one polynomial, or a list of sections with their coefficients.
 
     Raises:
@@ -48,11 +48,11 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
         try:
             values = np.atleast_1d(np.asarray(row, float))
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"velocity.{name}: got {given!r}; it must be a list of real coefficients") from error
+            raise InputError(f"{name}: got {given!r}; it must be a list of real coefficients") from error
         values = np.trim_zeros(values, "f") if values.ndim == 1 else values
         if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
             raise InputError(
-                f"velocity.{name}: got {given!r}; it must be a list of finite coefficients, highest power first, not "
+                f"{name}: got {given!r}; it must be a list of finite coefficients, highest power first, not "
                 "all of them 0"
             )
         sections.append(tuple(values.tolist()))
@@ -62,14 +62,24 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
 def is_rounding(coefficients: tuple[float, ...]) -> bool:
     """Return whether all roots of a section on or outside the unit circle may be artifacts of rounded coefficients.
 
-    The result is False if there is no such root.
+    The result is False if there is no such root. Coefficients with few decimals, such as those copied from a printed
+    table, are taken as rounded to this number of decimals, all others as rounded to float64.
     """
     roots = 1.0 - offsets(np.trim_zeros(np.array(coefficients), "b"))
     points = np.exp(1j * np.angle(roots[np.abs(roots) >= 1.0]))
     # If the value at a point of the unit circle is within this bound, a polynomial whose coefficients differ only by
     # rounding errors has a root at this point.
     bound = 4.0 * len(coefficients) * np.finfo(float).eps * np.abs(coefficients).sum()
+    bound += 0.5 * len(coefficients) * _find_last_decimal(coefficients)
     return bool(points.size and len(coefficients) > 2 and np.all(np.abs(np.polyval(coefficients, points)) <= bound))
+
+
+def _find_last_decimal(coefficients: tuple[float, ...]) -> float:
+    """Return 10^-k, with the smallest number k of decimals with which all coefficients are written; 0 if k > 12.
+
+    The result is at most 10^-3, because coefficients with fewer decimals are usually exact.
+    """
+    return next((10.0**-k for k in range(3, 13) if all(round(value, k) == value for value in coefficients)), 0.0)
 
 
 def count_trailing_zeros(polynomial: np.ndarray) -> int:

@@ -6,15 +6,16 @@ stored as a rational function with exact coefficients, from which poles and zero
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from zwidth.core.errors import InputError
 from zwidth.core.pytrees import register
+from zwidth.model.checks import check_number
 from zwidth.model.exact_polynomials import (
     Polynomial,
     characteristic_polynomial,
@@ -25,14 +26,21 @@ from zwidth.model.exact_polynomials import (
     subtract,
     trim,
 )
+from zwidth.model.system_forms import pair_roots, parse_system, read_roots, read_sos
 from zwidth.units.formatting import short
+from zwidth.units.quantities import POSITIVE
 from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 # Accepted forms of a system, for messages.
 _FORMS = (
-    "(A, B, C), (numerator, denominator), (zeros, poles, gain), or a model of scipy.signal or python-control with one "
-    "input and one output"
+    "(A, B, C), (numerator, denominator), (zeros, poles, gain), {'sos': sections}, or a model of scipy.signal or "
+    "python-control with one input and one output"
 )
+# In this distance from the unit circle, in rad/s, all poles of a device given in s lie if its coefficients are probably
+# meant in z. A sampled device with a mass has a pole near z = 1.
+NEAR_CIRCLE = 0.05
+NEAR_ONE = 0.1  # distance of at least one of these poles from 1
+SLOWEST_PERIOD = 0.05  # s; at shorter periods, poles of 1 rad/s are too slow for the device of a control loop
 
 
 class RationalResponse(NamedTuple):
@@ -82,10 +90,13 @@ class LinearDevice(ResponseDevice):
     have; `Scene.max_stiffness` includes B < 0 with ``negative_damping=True``.
 
     Args:
-        system: matrices ``(A, B, C)``; coefficients ``(numerator, denominator)`` with the highest power first, or as
-            text, "1 / 0.1 10 0"; roots ``(zeros, poles, gain)``; or a model of scipy.signal (lti, dlti) or
-            python-control (TransferFunction, StateSpace). A discrete-time system must include hold and delay, and its
-            ``dt`` must equal the period of the loop.
+        system: matrices ``(A, B, C)``; coefficients ``(numerator, denominator)`` with the highest power first; roots
+            ``(zeros, poles, gain)``; a dict with the keys of a configuration, such as ``{"sos": sections}`` for
+            second-order sections; a text, "1 / 0.1 10 0", "zpk: / 0 -100 / 10" or "sos: b0 b1 b2 a0 a1 a2; ..."; or a
+            model of scipy.signal (lti, dlti) or python-control (TransferFunction, StateSpace).
+        sampled: sampling period of a discrete-time system in s, which must equal the period of the loop. A
+            discrete-time system must include hold and delay. Default: the period of ``system``, if it has one;
+            otherwise the system is continuous-time.
 
     Raises:
         InputError: the system has none of these forms, or it is not strictly proper.
@@ -96,13 +107,16 @@ class LinearDevice(ResponseDevice):
         >>> scene = zwidth.Scene(device, zwidth.Timing(period=1e-3, delay=1e-3))
         >>> print(f"{scene.max_stiffness().stiffness:.0f} N/m")
         19865 N/m
+        >>> zwidth.LinearDevice("25e-5 0 / 1 -2 1", sampled="5 ms").poles.real
+        array([1., 1.])
     """
 
     system: Any
+    sampled: InitVar[Any] = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, sampled: Any) -> None:
         if not isinstance(self.system, RationalResponse):
-            object.__setattr__(self, "system", _read(self.system))
+            object.__setattr__(self, "system", _read(self.system, sampled))
 
     def __repr__(self) -> str:
         """Return the expression that creates the device."""
@@ -159,27 +173,40 @@ class LinearDevice(ResponseDevice):
         size = abs(self.gain) * np.prod(np.abs(point - self.zeros)) / np.prod(np.abs(point - self.poles))
         return float(1.0 / (size * unit * unit))
 
+    def warn_of_variable(self, period: float) -> str:
+        """Return a warning if the coefficients are in s, but probably meant in z; "" otherwise.
 
-def parse_fraction(text: str) -> tuple[list[float], list[float]]:
-    """Return the coefficients of numerator and denominator from a text such as "1 / 0.1 10 0", highest power first."""
-    try:
-        numerator, denominator = ([float(c) for c in side.replace(",", " ").split()] for side in text.split("/"))
-    except ValueError:
-        raise InputError(
-            f"device: got {text!r}; it must be 'NUMERATOR / DENOMINATOR', coefficients in s, highest power first; "
-            "write '1 / 0.1 10 0'"
-        ) from None
-    return numerator, denominator
+        The condition is that all poles are on or near the unit circle or inside it, at least one of them is near 1, and
+        the sampling period is so short that such poles are too slow for a device.
+        """
+        size, distance = np.abs(self.poles).max(), np.abs(self.poles - 1.0).min()
+        if self.dt or size > 1.0 + NEAR_CIRCLE or distance > NEAR_ONE or period > SLOWEST_PERIOD:
+            return ""
+        return f"got poles of at most {size:.3g} rad/s, near the unit circle; if the coefficients are in z,"
 
 
-def _read(given: Any) -> RationalResponse:
-    """Convert a system in any accepted form to an exact transfer function; raise `InputError` for other values."""
-    given = parse_fraction(given) if isinstance(given, str) else given
+def _read(given: Any, sampled: Any) -> RationalResponse:
+    """Convert a system in any accepted form to an exact transfer function; raise `InputError` for other values.
+
+    ``sampled`` is the sampling period of a discrete-time system; None if the system has its own or is continuous-time.
+    """
+    given = parse_system("device", given, "s" if sampled is None else "z") if isinstance(given, str) else given
     dt = getattr(given, "dt", None)
+    if isinstance(given, dict):
+        given, dt = dict(given), given.get("sampled")
+        given.pop("sampled", None)
+    if sampled is not None:
+        period = check_number("sampled", sampled, "s", POSITIVE)
+        if dt and dt is not True and dt != period:
+            raise InputError(f"sampled: got {period:g} s for a system with dt = {dt:g} s; remove one of them")
+        dt = period
     if dt is True:
         raise InputError("device: got a sampled system without its period; set dt to the period of the loop in s")
+    dt = None if dt is None or dt == 0 else check_number("sampled", dt, "s", POSITIVE)
     try:
         numerator, denominator = _read_form(given)
+    except InputError:
+        raise
     except (TypeError, ValueError, OverflowError, LookupError) as error:
         raise InputError(f"device: got {str(given)[:60]!r}; it must be finite numbers as {_FORMS}") from error
     if not numerator or len(denominator) < 2:
@@ -190,7 +217,7 @@ def _read(given: Any) -> RationalResponse:
             "the denominator must have the higher degree; add the missing dynamics"
         )
     _reject_unstable_hidden_modes(find_roots(find_common_factor(numerator, denominator)), "z" if dt else "s")
-    return RationalResponse(numerator, denominator, float(dt) if dt else None)
+    return RationalResponse(numerator, denominator, dt)
 
 
 def _reject_unstable_hidden_modes(roots: np.ndarray, letter: str) -> None:
@@ -210,17 +237,24 @@ def _reject_unstable_hidden_modes(roots: np.ndarray, letter: str) -> None:
 
 def _read_form(given: Any) -> tuple[Polynomial, Polynomial]:
     """Return the exact numerator and denominator of a system that is given by matrices, coefficients or roots."""
-    if hasattr(given, "A") and hasattr(given, "C"):
+    if isinstance(given, dict):
+        given = _read_keys(given)
+    elif hasattr(given, "A") and hasattr(given, "C"):
         given = (given.A, given.B, given.C, given.D)
     elif hasattr(given, "num") and hasattr(given, "den"):
         given = tuple(_take_channel(part) for part in (given.num, given.den))
     elif hasattr(given, "zeros") and hasattr(given, "gain"):
         given = (given.zeros, given.poles, given.gain)
+    if isinstance(given, np.ndarray) and given.shape == (2, 6):
+        raise InputError(
+            "device: got an array of shape (2, 6), which may be two sections or two polynomials; write {'sos': array} "
+            "or (numerator, denominator)"
+        )
     if len(given) == 2:
         return _reduce(*(trim(np.ravel(part)) for part in given))
     if np.ndim(given[0]) < 2:
         zeros, poles, gain = given
-        return _reduce(multiply(_expand(zeros), trim([gain])), _expand(poles))
+        return _reduce(multiply(_expand(zeros), trim(np.ravel(gain))), _expand(poles))
     A, B, C, *D = given
     size = len(A)
     if np.shape(A) != (size, size) or np.size(B) != size or np.size(C) != size or np.any(D):
@@ -232,6 +266,20 @@ def _read_form(given: Any) -> tuple[Polynomial, Polynomial]:
     return numerator, denominator
 
 
+def _read_keys(given: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the system given by the keys of a configuration as a tuple in one of the other forms."""
+    keys = set(given)
+    if keys == {"sos"}:
+        # Exact products, because rounding errors would move the roots.
+        rows = read_sos("device.sos", given["sos"])
+        numerator, denominator = (reduce(multiply, map(trim, rows[:, part])) for part in (slice(3), slice(3, 6)))
+        return numerator, denominator
+    for form in (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C")):
+        if set(form) - {"zeros"} <= keys <= set(form):
+            return tuple(given.get(name, ()) for name in form)
+    raise ValueError("unknown keys")
+
+
 def _as_fractions(values: Any) -> np.ndarray:
     """Convert an array of floats to exact fractions."""
     floats = np.asarray(values, float)
@@ -240,17 +288,7 @@ def _as_fractions(values: Any) -> np.ndarray:
 
 def _expand(roots: Any) -> Polynomial:
     """Return the monic polynomial with the given roots; raise `ValueError` if a complex root has no conjugate."""
-    values: Any = np.asarray(roots, complex).ravel()
-    product: Polynomial = (Fraction(1),)
-    for root in values[values.imag >= 0].tolist():
-        real, imag = Fraction(root.real), Fraction(root.imag)
-        if root.imag and np.sum(values == root.conjugate()) != np.sum(values == root):
-            raise ValueError("a root without its conjugate")
-        factor = (Fraction(1), -2 * real, real * real + imag * imag) if root.imag else (Fraction(1), -real)
-        product = multiply(product, factor)
-    if len(product) - 1 != values.size:
-        raise ValueError("a root without its conjugate")
-    return product
+    return reduce(multiply, pair_roots(read_roots(roots)), (Fraction(1),))
 
 
 def _reduce(numerator: Polynomial, denominator: Polynomial) -> tuple[Polynomial, Polynomial]:

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.core.errors import InputError
+from zwidth.model.estimate import Estimate
 from zwidth.model.linear_device import LinearDevice
-from zwidth.model.velocity import Estimate
+from zwidth.model.loop_estimates import LoopEstimates
 
 # Beyond these limits, the matrix exponential of the state equation cannot be computed accurately.
 FASTEST = 1e4  # largest magnitude of a pole in rad per period
@@ -43,7 +44,8 @@ class System:
     mass: Any  # unit of mass in kg
     d: Any  # delay in periods
     n_delay: int  # integer part of d
-    estimate: Estimate
+    estimate: Estimate  # as in `zwidth.model.mechanism.Chain`
+    estimates: LoopEstimates | None = None
 
     @property
     def sampled(self) -> bool:

@@ -23,10 +23,11 @@ import numpy as np
 
 from zwidth.core.errors import InputError
 from zwidth.core.xp import namespace
+from zwidth.model.estimate import Estimate
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.linear_plant import FASTEST, STRONGEST, Realization, System
+from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.parameter_paths import Parts
-from zwidth.model.velocity import Estimate
 
 
 class Body(NamedTuple):
@@ -75,7 +76,8 @@ class Chain:
     sensor: int  # index of the body whose position is measured
     d: Any  # delay in periods
     n_delay: int  # integer part of d
-    estimate: Estimate
+    estimate: Estimate  # velocity estimate F, or its ratio to the position estimate if ``estimates`` is not None
+    estimates: LoopEstimates | None = None
 
     sampled: ClassVar[bool] = False
 
@@ -206,12 +208,15 @@ def build_chain(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Es
     device, timing, hand = scene.device, scene.timing, scene.operator
     period = timing.period
     d, n_delay = delay or (timing.d, int(np.floor(timing.d)))
-    estimate = estimate or scene.velocity.estimate(period)
+    estimates = None
+    if estimate is None:
+        estimates = build_estimates(scene)
+        estimate = scene.velocity.estimate(period) if estimates is None else estimates.divide()[0]
     if isinstance(device, LinearDevice):
         # If the period is a ball (interval), convert the mass to a ball of radius 0, because `System` then uses ball
         # arithmetic.
         mass = type(period)(device.mass) if hasattr(period, "mid") else device.mass
-        return System(device, period, mass, d, n_delay, estimate)
+        return System(device, period, mass, d, n_delay, estimate, estimates)
     masses = [(device.mass, device.damping, 0.0)]
     links = []
     if device.coupling is not None:
@@ -238,7 +243,7 @@ def build_chain(scene: Parts, delay: tuple[Any, int] | None = None, estimate: Es
     actuator: Any = None if lag is None else lag.rate * period
     if lag is not None and lag.order == 2:
         actuator = Resonance(actuator, lag.damping_ratio, 1.0 / (actuator * actuator))
-    return Chain(bodies, normalized_links, modes, actuator, sensor, d, n_delay, estimate)
+    return Chain(bodies, normalized_links, modes, actuator, sensor, d, n_delay, estimate, estimates)
 
 
 def is_zero(value: Any) -> bool:

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.model.velocity import Estimate
+from zwidth.model.estimate import Estimate
+from zwidth.model.loop_estimates import LoopEstimates
 from zwidth.units.display import compact_repr
 
 
@@ -68,6 +69,47 @@ def connect_in_series(first: StateSpace, second: StateSpace) -> StateSpace:
     A[..., :n, :n], A[..., n:, :n], A[..., n:, n:] = first.A, second.B @ first.C, second.A
     B[..., :n, :], B[..., n:, :] = first.B, second.B @ first.D
     return StateSpace(A, B, np.concatenate([second.D @ first.C, second.C], -1), second.D @ first.D)
+
+
+def _append(first: StateSpace, second: StateSpace) -> StateSpace:
+    """Return two systems with the same input as one system, whose outputs are those of both."""
+    n, m = len(first.A), len(second.A)
+    A = np.block([[first.A, np.zeros((n, m))], [np.zeros((m, n)), second.A]])
+    C = np.block([[first.C, np.zeros((len(first.C), m))], [np.zeros((len(second.C), n)), second.C]])
+    return StateSpace(A, np.concatenate([first.B, second.B]), C, np.concatenate([first.D, second.D]))
+
+
+def realize_estimates(estimates: LoopEstimates) -> StateSpace:
+    """Return the state-space model with the measured position as input and the outputs of P, V and R, for T = 1.
+
+    The output of R is 0 without further feedback.
+    """
+    wire = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)))
+    P, V = _realize_filter(estimates.position), realize_estimate(estimates.velocity)
+    if estimates.structure == "series":
+        both = connect_in_series(P, _append(wire, V))
+    elif estimates.structure == "separate":
+        both = _append(P, V)
+    else:
+        # Give both filters equal poles at z = 0, so that they share their states.
+        at_zero = max(estimates.position.lag, estimates.velocity.lag, 0)
+        poles = np.concatenate([estimates.position.poles, np.ones(at_zero)])
+        P, V = (
+            _realize_filter(Estimate(0, each.gain, 0, np.concatenate([each.zeros, np.ones(at_zero - each.lag)]), poles))
+            for each in (estimates.position, estimates.velocity)
+        )
+        both = StateSpace(P.A, P.B, np.concatenate([P.C, V.C]), np.concatenate([P.D, V.D]))
+    # Outputs: position estimate, velocity estimate, measured position.
+    signals = _append(both, wire)
+    if estimates.feedback is None:
+        kept = np.diag([1.0, 1.0, 0.0])
+        return StateSpace(signals.A, signals.B, kept @ signals.C, kept @ signals.D)
+    R, weights = _realize_filter(estimates.feedback.filter), estimates.feedback.weights
+    mixed = np.array([[0.0, 0.0, 1.0] if weights is None else [float(weight) for weight in (*weights, 0.0)]])
+    source = StateSpace(signals.A, signals.B, mixed @ signals.C, mixed @ signals.D)
+    full = connect_in_series(source, R)
+    C = np.concatenate([np.pad(signals.C[:2], ((0, 0), (0, len(R.A)))), full.C])
+    return StateSpace(full.A, full.B, C, np.concatenate([signals.D[:2], full.D]))
 
 
 def realize_estimate(estimate: Estimate) -> StateSpace:

@@ -13,7 +13,6 @@ with Taylor objects (numbers with exact derivatives, `zwidth.numerics.taylor`). 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -21,60 +20,9 @@ import numpy as np
 from zwidth.core.errors import InputError
 from zwidth.core.xp import is_jax, is_traced, namespace
 from zwidth.model.checks import Part
-from zwidth.model.circle_functions import CirclePoints, Jet, power_jet, product_jet
-from zwidth.model.filter_sections import (
-    NEXT_TO_ONE,
-    ball_offsets,
-    count_trailing_zeros,
-    is_rounding,
-    offsets,
-    read_sections,
-)
+from zwidth.model.estimate import Estimate
+from zwidth.model.rational_filter import RationalFilter
 from zwidth.units.quantities import Range
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A velocity estimate F for T = 1: a difference over ``window`` periods, followed by a filter.
-
-    ``F(z) = gain prod(z - z_i)/(z^lag prod(z - p_i)) (1 - z^-window)/window`` with zeros z_i and poles p_i. The last
-    factor is omitted for a window of 0.
-    """
-
-    window: int = 1
-    gain: Any = 1.0
-    lag: int = 0
-    zeros: Any = field(default_factory=lambda: np.zeros(0, complex))  # offsets 1 - z_i of the zeros
-    poles: Any = field(default_factory=lambda: np.zeros(0, complex))  # offsets 1 - p_i of the poles
-
-    def jet(self, points: CirclePoints) -> Jet:
-        """Return F and its derivative with respect to w at points e^(jw) of the unit circle."""
-        xp = namespace(points.w)
-        product = product_jet(points, self.zeros, self.gain)
-        if self.poles.size:
-            product = product.over(product_jet(points, self.poles, 1.0))
-        if self.lag:
-            product = product.times(power_jet(points, -self.lag))
-        if self.window:
-            delayed = power_jet(points, -self.window)
-            n = self.window
-            s = xp.sin(0.5 * n * points.w)
-            # Replace 1 - cos(n w) by 2 sin^2(n w/2), because the difference would cancel at low frequencies.
-            value = xp.where(points.w >= np.pi, 1.0 - delayed.value, 2.0 * s * s - 1j * delayed.value.imag) / n
-            product = product.times(Jet(value, -delayed.slope / n))
-        return product
-
-    @property
-    def is_difference(self) -> bool:
-        """True if the estimate is the difference of two successive samples, multiplied by a gain."""
-        window = self.window == 1 and not self.lag and not np.size(self.zeros) and not np.size(self.poles)
-        coefficients = not self.window and self.lag == 1 and not np.size(self.poles)
-        return window or (coefficients and np.size(self.zeros) == 1 and bool(np.all(np.equal(self.zeros, 0))))
-
-    @property
-    def degree(self) -> int:
-        """Order of F: window + abs(lag) + number of zeros and poles; larger than ``window`` if F has a filter."""
-        return self.window + abs(self.lag) + self.zeros.size + self.poles.size
 
 
 class _Checked(Part):
@@ -98,7 +46,7 @@ class BackwardDifference(_Checked):
 
     def estimate(self, period: Any) -> Estimate:
         """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
-        return Estimate(window=1, gain=_ratio(period, self.coded_period))
+        return Estimate(window=1, gain=get_coded_ratio(period, self.coded_period))
 
 
 @dataclass(frozen=True, repr=False)
@@ -118,7 +66,7 @@ class WindowedDifference(_Checked):
 
     def estimate(self, period: Any) -> Estimate:
         """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
-        return Estimate(window=self.samples, gain=_ratio(period, self.coded_period))
+        return Estimate(window=self.samples, gain=get_coded_ratio(period, self.coded_period))
 
 
 @dataclass(frozen=True, repr=False)
@@ -158,13 +106,13 @@ class LowPass(_Checked):
         coded = period if self.coded_period is None else self.coded_period
         if self.time_constant is None:
             check_cutoff(self.cutoff, coded)
-            decay = 2.0 * _pi(coded) * self.cutoff * coded
+            decay = 2.0 * get_pi(coded) * self.cutoff * coded
         else:
             decay = coded / self.time_constant
         xp = namespace(decay)
         offset = -xp.expm1(-decay)
-        poles = xp.stack([_as_complex(xp.asarray(offset))] * self.order)
-        gain = offset**self.order * _ratio(period, self.coded_period)
+        poles = xp.stack([as_complex(xp.asarray(offset))] * self.order)
+        gain = offset**self.order * get_coded_ratio(period, self.coded_period)
         return Estimate(1, gain, -self.order, poles=poles)
 
 
@@ -192,100 +140,45 @@ class Butterworth(_Checked):
         # The analog poles are on a circle, whose radius is prewarped so that the bilinear transform s = (z - 1)/(z + 1)
         # yields the cut-off frequency.
         xp = namespace(self.cutoff, coded)
-        size = xp.tan(_pi(coded) * self.cutoff * coded)
-        angles = _pi(coded) * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
+        size = xp.tan(get_pi(coded) * self.cutoff * coded)
+        angles = get_pi(coded) * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
         analog = size * xp.asarray(_unit_vectors(angles)).reshape(-1, *[1] * np.ndim(size))
         offsets = -2.0 * analog / (1.0 - analog)
-        gain = xp.prod(offsets, 0).real * 0.5**self.order * _ratio(period, self.coded_period)
+        gain = xp.prod(offsets, 0).real * 0.5**self.order * get_coded_ratio(period, self.coded_period)
         return Estimate(1, gain, zeros=np.full(self.order, 2.0 + 0j), poles=offsets)
 
 
 @dataclass(frozen=True, repr=False)
-class VelocityFilter(Part):
-    """Any linear estimate ``F(z) = numerator/denominator``, from position in m to velocity in m/s.
+class VelocityFilter(RationalFilter):
+    """Any linear estimate F(z) from position in m to velocity in m/s, by coefficients, sections or roots.
+
+    F is the product of all given forms: numerator/denominator, second-order sections, and zeros, poles and gain. For
+    example, a difference as numerator and denominator, and the sections of a low-pass.
 
     Args:
         numerator: coefficients in 1/s, highest power of z first; or a list of sections in series, each a list of
             coefficients.
-        denominator: coefficients or sections, as for the numerator. The degree must be at least that of the numerator
-            (a causal filter), and all roots must be inside the unit circle. Use sections for a filter of high order,
-            because rounding errors in the coefficients of a single polynomial move its poles.
+        denominator: coefficients or sections, as for the numerator. The degree of F's denominator must be at least that
+            of its numerator (a causal filter), and all poles must be inside the unit circle. Use sections or roots for
+            a filter of high order, because rounding errors in the coefficients of a single polynomial move its poles.
+        sos: second-order sections, rows of the coefficients b0 b1 b2 a0 a1 a2, as of scipy.signal with
+            ``output="sos"``.
+        zeros: zeros of F; complex zeros together with their conjugates. Default: none, if ``poles`` is given.
+        poles: poles of F, as the zeros; requires ``gain``.
+        gain: ratio of the leading coefficients; requires ``poles``.
 
     Example:
         >>> import zwidth
         >>> zwidth.VelocityFilter([1000, -1000], [1, 0]).estimate(1e-3).gain
         1.0
         >>> from scipy import signal
-        >>> sos = signal.butter(8, 2, fs=1000, output="sos")
-        >>> velocity = zwidth.VelocityFilter([[1000, -1000], *sos[:, :3]], [[1, 0], *sos[:, 3:]])
+        >>> low_pass = signal.butter(8, 2, fs=1000, output="sos")
+        >>> velocity = zwidth.VelocityFilter([1000, -1000], [1, 0], sos=low_pass)
     """
-
-    numerator: Any
-    denominator: Any
-
-    def __post_init__(self) -> None:
-        for name in ("numerator", "denominator"):
-            sections: tuple[Any, ...] = read_sections(name, getattr(self, name))
-            (first, *others) = sections
-            object.__setattr__(self, name, sections if others else first)
-        top, bottom = (sum(len(section) - 1 for section in part) for part in self._sections)
-        if top > bottom:
-            raise InputError(
-                f"velocity.numerator: got degree {top} over a denominator of degree {bottom}, so the filter needs "
-                "future samples; multiply the denominator by z"
-            )
-        self._check_poles()
-
-    def _check_poles(self) -> None:
-        """Raise `InputError` with the likely cause if a pole is on or outside the unit circle."""
-        poles = self._roots[1]
-        largest = np.max(np.abs(1.0 - poles), initial=0.0)
-        if largest < 1.0:
-            return
-        got = f"velocity.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
-        # Report rounding errors of the coefficients as the cause only if several poles are near z = 1, because they
-        # hardly move a single pole; a single pole at z = 1 is probably an intended integrator.
-        slow = np.abs(poles) < NEXT_TO_ONE
-        if np.sum(slow) != 1 and any(is_rounding(section) for section in self._sections[1]):
-            cause = "Cause: rounding errors of the coefficients; use sections in series (scipy.signal: output='sos')"
-        elif np.any(poles[slow] == 0):
-            cause = "Integral action: model controller and sampled device in series as one LinearDevice (K = 1)"
-        else:
-            cause = "Check the coefficients: highest power first"
-        raise InputError(got + cause)
-
-    @property
-    def _sections(self) -> tuple[Any, Any]:
-        """The sections of numerator and denominator; each section is a tuple of coefficients."""
-        both: Any = self.numerator, self.denominator
-        top, bottom = (part if isinstance(part[0], tuple) else (part,) for part in both)
-        return top, bottom
-
-    @cached_property
-    def _roots(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """The offsets of all zeros and of all poles except at z = 0, and the excess of poles over zeros at z = 0."""
-        roots, trailing = [], []
-        for part in self._sections:
-            sections = [np.array(section) for section in part]
-            trailing.append(sum(map(count_trailing_zeros, sections)))
-            roots.append(np.concatenate([offsets(np.trim_zeros(section, "b")) for section in sections]))
-        return roots[0], roots[1], trailing[1] - trailing[0]
 
     def estimate(self, period: Any) -> Estimate:
         """Return F for a loop with sampling period ``period`` in s, normalized to T = 1."""
-        tops, bottoms = self._sections
-        gain = period
-        for section in tops:
-            gain = section[0] * gain
-        for section in bottoms:
-            gain = gain / section[0]
-        if hasattr(period, "mid"):
-            # If the period is a ball, compute the roots as balls from the exact coefficients, because zeros at z = 1
-            # must be exact.
-            exact = (np.concatenate([ball_offsets(section) for section in part]) for part in (tops, bottoms))
-            return Estimate(0, gain, 0, *exact)
-        zeros, poles, lag = self._roots
-        return Estimate(0, gain, lag, zeros, poles)
+        return self.factor(period)
 
 
 @dataclass(frozen=True, repr=False)
@@ -348,18 +241,18 @@ def is_plain(velocity: Velocity, period: Any) -> bool:
     return estimate.window == 1 and estimate.is_difference and isinstance(estimate.gain, float) and estimate.gain == 1.0
 
 
-def check_cutoff(cutoff: Any, period: Any) -> None:
+def check_cutoff(cutoff: Any, period: Any, owner: str = "velocity") -> None:
     """Raise `InputError` if a cut-off frequency is not below the Nyquist frequency."""
     if is_jax(cutoff) or is_jax(period):
         return
     if np.any(cutoff * period >= 0.5):
         raise InputError(
-            f"velocity.cutoff: got {cutoff:g} Hz; it must be below half the sampling rate, {0.5 / period:g} Hz; "
+            f"{owner}.cutoff: got {cutoff:g} Hz; it must be below half the sampling rate, {0.5 / period:g} Hz; "
             "lower it, or remove the filter"
         )
 
 
-def _ratio(period: Any, coded: Any) -> Any:
+def get_coded_ratio(period: Any, coded: Any) -> Any:
     """Return the period of the loop divided by the coded period; 1 if the coded period is None."""
     return 1.0 if coded is None else period / coded
 
@@ -367,12 +260,12 @@ def _ratio(period: Any, coded: Any) -> Any:
 # The functions below implement operations that differ between floats, JAX arrays and balls.
 
 
-def _pi(like: Any) -> Any:
+def get_pi(like: Any) -> Any:
     """Return pi as a ball if the argument is a ball, otherwise as a float."""
     return like.pi() if hasattr(like, "pi") else np.pi
 
 
-def _as_complex(value: Any) -> Any:
+def as_complex(value: Any) -> Any:
     """Convert an array to complex dtype; return an array of balls unchanged, because balls need no conversion."""
     return value if value.dtype == object else value + 0j
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.model.estimate import Estimate
 from zwidth.model.state_space import realize_estimate
-from zwidth.model.velocity import Estimate, Velocity
+from zwidth.model.velocity import Velocity
 
 DOUBLINGS = 60  # largest number of doublings of the number of terms; 2^60 terms suffice for time constants of 1e15 T
 

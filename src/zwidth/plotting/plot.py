@@ -43,7 +43,7 @@ from zwidth.plotting.motion import draw_motion, draw_positions, draw_step
 from zwidth.plotting.stable_set import draw_stable_set, scale_walls, tabulate_sets, tabulate_walls
 from zwidth.plotting.table import Parameters, Result, Table, name_as_linear, stack
 from zwidth.simulation.result import Motion
-from zwidth.stability.linear.passivity import find_unsupported_reason
+from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.rigid.step_response import settling_time
 from zwidth.units.formatting import format_wall
 from zwidth.units.quantities import PARAMETERS
@@ -178,7 +178,7 @@ def recommendation(
         )
     panels = _choose_two_axes(axes, 1, 2, None)
     outlines, walls = tabulate_sets({"": scene})
-    if not find_unsupported_reason(**vars(scene.device)) and scene.device.damping > 0:
+    if not find_obstacle(scene) and scene.device.damping > 0:
         outlines = stack([outlines, _trace_passive(scene)])
     if verdict is None:
         return draw_stable_set(outlines, walls, panels[:1])

@@ -29,11 +29,12 @@ from zwidth.config.sweep import SweepStudy
 from zwidth.core.errors import InputError, ZwidthError
 from zwidth.core.status import Status
 from zwidth.stability.rigid.normalization import wall_status
+from zwidth.stability.rigid.step_response import decay_time
 from zwidth.sweep.files import is_fatal, read_or_empty
 from zwidth.sweep.grid import SceneBlock
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store
-from zwidth.units.quantities import OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
+from zwidth.units.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 # Function that computes and writes one chunk, given the path of the store, the family and the index of the chunk. It is
 # `perform`, or a failing replacement in tests.
@@ -325,10 +326,17 @@ def _compute_walls(
     if wanted - {"spectral_radius"}:
         pole = scene.dominant_pole(stiffness, virtual_damping)
         results |= {"spectral_radius": pole.radius, "pole_angle": pole.angle, "frequency": pole.frequency}
+        # Compute these outputs from the decay rate, because the spectral radius rounds to 1 for slow decay.
+        margin, settling_time = -np.expm1(-pole.decay_rate * scene.timing.period), decay_time(pole.decay_rate)
+        results |= {"decay_rate": pole.decay_rate, "margin": margin, "settling_time": settling_time}
     elif wanted:
         results["spectral_radius"] = np.asarray(scene.spectral_radius(stiffness, virtual_damping))
     for name in wanted:
         unknown |= np.isnan(results[name])
+    if MARGIN_OUTPUTS & set(outputs):
+        # Do not derive the status from the stability margins, because a wall without such a margin has NaN.
+        margins = scene.margins(stiffness, virtual_damping)
+        results |= {name: np.asarray(getattr(margins, name)) for name in MARGIN_OUTPUTS}
     if "passive" in outputs:
         margin = np.asarray(scene.passivity_margin(stiffness, virtual_damping))
         results["passive"] = margin > 0

@@ -225,6 +225,9 @@ _PARAMETERS = (
         note="for order 2 only, default: sqrt(1/2)",
     ),
     *(each for k in range(MOST_MODES) for each in _describe_mode(f"modes.{k}", f"mode {k}", str(k))),
+    Parameter("tool.mass", "mass of the simulated tool", "M", POSITIVE, "kg", (1e-3, 2.0), "", "mass of the tool"),
+    Parameter("tool.damping", "damping of the simulated tool", "c_t", NOT_NEGATIVE, "N s/m", (0.0, 9.0), "default 0"),
+    Parameter("tool.stiffness", "stiffness of the simulated tool", "k_t", NOT_NEGATIVE, "N/m", (0.0, 1e3), "default 0"),
     Parameter("stiffness", "stiffness K of the virtual wall", "K", ANY, "N/m", (0.0, 50e3), short_name="stiffness"),
     Parameter(
         "alpha", "normalized stiffness of the virtual wall, K T^2/m", r"\alpha", ANY, slider=(0.0, 1.0),
@@ -247,6 +250,22 @@ VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}  # para
 _NOISE = Parameter(
     "velocity.noise", "largest error of the measured position", "", POSITIVE, "m", note="one count of an encoder"
 )
+# Parameters of the position estimate and of the further feedback.
+_OF_ESTIMATES = (
+    Parameter(
+        "position.coefficient", "coefficient a of the exponential filter", "a", Range(0.0, 1.0, low_open=True),
+        note="instead of the cut-off frequency",
+    ),
+    Parameter("position.cutoff", "cut-off frequency of the position filter", "f_p", POSITIVE, "Hz"),
+    Parameter("position.time_constant", "time constant of the position filter", r"\tau_p", POSITIVE, "s"),
+    Parameter("position.order", "order of the position filter", "n_p", Range(1, 8), whole=True),
+    Parameter("position.coded_period", "sampling period in the formula of the position filter", "T_p", POSITIVE, "s"),
+    Parameter("position.bandwidth", "bandwidth of the phase-locked loop, in rad/s", r"\omega_p", POSITIVE),
+    Parameter("feedback.gain", "integral gain, in N/(m s)", "k_i", ANY),
+    Parameter("feedback.position", "weight of the position estimate in the input of the feedback", "w_p", ANY),
+    Parameter("feedback.velocity", "weight of the velocity estimate in the input of the feedback", "w_v", ANY),
+)  # fmt: skip
+OF_ESTIMATES = tuple(parameter.name for parameter in _OF_ESTIMATES)
 # Parameters of simulations.
 _OF_MOTIONS = (
     Parameter(
@@ -276,7 +295,9 @@ OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
 # Names of the parameters of encoder, friction and motor, which are arguments of `zwidth.diagnose` and
 # `zwidth.simulate`.
 HARDWARE = ("resolution", "coulomb", "static", "max_force", "max_rate")
-FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
+FIELDS = PARAMETERS | {
+    each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_ESTIMATES, *_OF_MOTIONS)
+}
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 
 
@@ -290,16 +311,17 @@ class Choice(NamedTuple):
 _KINDS = ("backward_difference", "windowed_difference", "low_pass", "butterworth")
 CHOICES = {
     "velocity.kind": Choice(_KINDS, "Velocity estimate; default: implied by the options below"),
+    "position.kind": Choice(
+        ("exponential", "low_pass", "butterworth", "pll"), "Position estimate; default: implied by the options below"
+    ),
+    "position.velocity_from": Choice(
+        ("position", "measured"), "Input of the velocity estimate: filtered or measured position; default: position"
+    ),
+    "feedback.rule": Choice(
+        ("backward", "forward", "trapezoidal"), "Rule of integration of the integral gain; default: backward"
+    ),
     "coupling.sensor": Choice(("motor", "tip"), "Location of the position sensor; default: motor"),
-}
-
-# Help texts of the options that describe the columns of a log file, by name of the option.
-OF_LOGS = {
-    "time": "Time column: HEADER, HEADER:ms, or HEADER:s+HEADER:ns for two columns. Default: recognized by its header.",
-    "position": "Position column: HEADER, or with a unit HEADER:mm, HEADER:counts or HEADER:deg.",
-    "force": "Column of the commanded force: HEADER, or with a unit HEADER:mN; for a torque HEADER:'mN m'.",
-    "resolution": "Encoder resolution, e.g. 0.03mm, 0.09deg or '4000 counts/rev'.",
-    "motor_constant": "Motor constant, i.e. force per ampere, e.g. 5N/A, if the force column is a current in A.",
+    "tool.integrator": Choice(("semi-implicit", "implicit"), "Euler method of the tool; default: semi-implicit"),
 }
 
 Family: TypeAlias = Literal["wall", "device"]  # an output has one value per wall, or one value per device and delay
@@ -361,11 +383,13 @@ _OUTPUTS = (
         center=1.0, below=True,
     ),
     Output(
-        "margin", "1 - spectral radius, positive for a stable wall", r"1 - \rho", "diverging", source="spectral_radius"
+        "margin", "1 - spectral radius, positive for a stable wall", r"1 - \rho", "diverging", with_parts=True,
+        source="spectral_radius",
     ),
     Output(
         "decay_rate", "decay rate of the dominant pole, -ln(spectral radius); negative for an unstable wall",
-        r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", source="spectral_radius",
+        r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", with_parts=True,
+        source="spectral_radius",
     ),
     Output(
         "pole_angle", "angle of the dominant pole, from 0 to pi", r"\omega T", "sequential", units="rad/period",
@@ -378,18 +402,19 @@ _OUTPUTS = (
     ),
     Output(
         "gain_margin", "common factor of stiffness and damping at the limit of stability; below 1 for an unstable wall",
-        "g_m", "logarithmic", rates=(2e5, 0.0),
+        "g_m", "logarithmic", with_parts=True, rates=(2e5, 300.0),
     ),
     Output(
         "phase_margin", "phase of the open loop above -180 degrees at the gain crossover", r"\varphi_m", "diverging",
-        units="degree", source="gain_margin",
+        units="degree", with_parts=True, source="gain_margin",
     ),
     Output(
         "delay_margin", "largest additional delay with which the wall is stable; 0 for an unstable wall", r"\tau_m",
-        "logarithmic", units="sampling periods", physical_units="s", rates=(2e4, 0.0),
+        "logarithmic", units="sampling periods", physical_units="s", with_parts=True, rates=(2e4, 100.0),
     ),
     Output(
-        "modulus_margin", "smallest distance of the open loop from -1", "s_m", "sequential", rates=(2e4, 0.0)
+        "modulus_margin", "smallest distance of the open loop from -1", "s_m", "sequential", with_parts=True,
+        rates=(2e4, 300.0),
     ),
     Output(
         "passive", "true if the wall is passive", dtype="bool", with_parts=True, rates=(4e6, 100.0),
@@ -402,7 +427,8 @@ _OUTPUTS = (
     Output(
         "settling_time",
         "time in which the dominant pole decays to 2 %, ln(50)/decay_rate; infinite for an unstable wall", r"t_{2\%}",
-        "steep", units="sampling periods", physical_units="s", source="spectral_radius", label="decay time to 2 %",
+        "steep", units="sampling periods", physical_units="s", with_parts=True, source="spectral_radius",
+        label="decay time to 2 %",
     ),
     Output(
         "alpha_max", "largest normalized stiffness of a stable wall, with the best virtual damping", r"\alpha_{\max}",

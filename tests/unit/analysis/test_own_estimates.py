@@ -11,7 +11,7 @@ import pytest
 import zwidth
 from zwidth.core.errors import InputError
 from zwidth.core.status import Status
-from zwidth.model.velocity import Estimate
+from zwidth.model.estimate import Estimate
 
 MASS, DAMPING, PERIOD = 0.1, 10.0, 1e-3
 

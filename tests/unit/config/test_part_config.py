@@ -167,7 +167,7 @@ def test_kinds_without_filters_name_suitable_kinds(load, kind):
         ),
         ("kind: sweep, name: s, axes: {alpha: 1}", "studies[0]", "its parts are in SI units"),
         (
-            "kind: sweep, name: s, axes: {stiffness: 1}, outputs: [margin]",
+            "kind: sweep, name: s, axes: {stiffness: 1}, outputs: [passivity_margin]",
             "studies[0].outputs[0]",
             "parts are 'stable'",
         ),

@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 import zwidth
-from zwidth.model.velocity import Estimate
+from zwidth.model.estimate import Estimate
 from zwidth.model.velocity_noise import find_velocity_noise
 
 PERIOD, COUNT = 1e-3, 20e-6

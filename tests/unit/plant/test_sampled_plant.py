@@ -12,8 +12,8 @@ import pytest
 import zwidth
 from zwidth.identification.device_estimate import DimensionlessDevice
 from zwidth.model.circle_functions import circle_points
+from zwidth.model.estimate import Estimate
 from zwidth.model.mechanism import Body, Chain, Resonance
-from zwidth.model.velocity import Estimate
 from zwidth.plant.factored_plant import factor_chain
 from zwidth.plant.sampled_plant import integrate_pole, sample_parts
 from zwidth.plant.sampled_states import SampledStates, sample_chain, sample_states

@@ -91,6 +91,38 @@ def test_radii_and_passivity_agree_with_single_scenes(tmp_path):
     assert 0 < data.passive.mean() < 1
 
 
+def test_decay_and_stability_margins_of_a_filtered_device_from_a_yaml_file(tmp_path):
+    """Compare with the poles and margins of single scenes; one wall of the grid is unstable."""
+    text = """
+version: 1
+name: margins
+studies:
+  - kind: sweep
+    name: margins
+    outputs: [decay_rate, settling_time, margin, gain_margin, phase_margin, delay_margin, modulus_margin]
+    velocity: {kind: low_pass, cutoff: 100 Hz}
+    axes: {mass: 100 g, damping: 10, rate: 1 kHz, delay: 1 ms, stiffness: [500, 2 kN/m, 2e4], virtual_damping: [5, 30]}
+"""
+    path = tmp_path / "margins.yaml"
+    path.write_text(text)
+    assert zwidth.run(path, out=tmp_path / "out").ok
+    data = open_dataset(tmp_path / "out").load().squeeze()
+    assert (data.status == Status.OK).all()
+    scene = scene_of(100, 10)
+    for k, stiffness in enumerate([500, 2000, 20000]):
+        for j, virtual_damping in enumerate([5, 30]):
+            point = data.isel(stiffness=k, virtual_damping=j)
+            radius = np.abs(scene.poles(stiffness, virtual_damping)).max()
+            assert point.decay_rate == pytest.approx(-np.log(radius) / 1e-3, rel=1e-7, abs=1e-6)
+            assert point.margin == pytest.approx(1.0 - radius, rel=1e-7, abs=1e-9)
+            decay = np.log(50) / -np.log(radius) * 1e-3 if radius < 1 else np.inf
+            assert point.settling_time == pytest.approx(decay, rel=1e-7)
+            margins = scene.margins(stiffness, virtual_damping)
+            for name in ("gain_margin", "phase_margin", "delay_margin", "modulus_margin"):
+                assert float(point[name]) == pytest.approx(float(getattr(margins, name)), rel=1e-9, nan_ok=True), name
+    assert (data.decay_rate < 0).any()
+
+
 @pytest.mark.parametrize("parts", ["", "velocity: {kind: low_pass, cutoff: 100 Hz}"])
 def test_frequency_of_the_dominant_pole_from_a_yaml_file(parts, tmp_path):
     """As a user types it: integers, units, and few or many walls."""

@@ -25,9 +25,11 @@ import numpy as np
 
 from zwidth.core.errors import InputError, format_install_command
 from zwidth.core.status import Status
+from zwidth.model.estimate import Estimate
 from zwidth.model.linear_device import LinearDevice
+from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.mechanism import AnyChain, build_chain
-from zwidth.model.velocity import Estimate
+from zwidth.model.tool import ToolResponse
 from zwidth.numerics.balls import BITS, available
 
 if TYPE_CHECKING:
@@ -110,13 +112,23 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
     period = exact.timing.period
     chain = build_chain(exact, (scene.d, int(scene.d)), NO_ESTIMATE)
     numerator, denominator = _expand_response(chain)
-    estimate = _exact_estimate(exact, scene.velocity, scene.timing.period)
-    f_numerator, f_denominator = _expand_estimate(estimate)
     unit = period * period / exact.mass
     lag = chain.n_delay + (1 if chain.d > chain.n_delay else 0)
     delayed = flint.arb_poly([0] * lag + denominator.coeffs())
+    estimates = build_estimates(exact)
+    if estimates is not None:
+        D, N1, N2 = _expand_estimates(estimates, numerator, delayed)
+        return D, N1 * unit, N2 * (unit / period), False
+    estimate = _exact_estimate(exact, scene.velocity, scene.timing.period)
+    f_numerator, f_denominator = _expand_estimate(estimate)
+    has_integrator = chain.has_integrator
+    if exact.tool is not None:
+        free = scene.tool.stiffness == 0
+        response = exact.tool.respond(exact.mass, period)
+        numerator, delayed = _add_tool(numerator, delayed, response, int(free and has_integrator))
+        has_integrator = has_integrator or free
     # F(1) is exactly 0 if F is a windowed difference, or if one of its zeros is exactly z = 1.
-    has_rest = chain.has_integrator and (
+    has_rest = has_integrator and (
         estimate.window > 0 or any(offset == 0 for offset in np.asarray(estimate.zeros).tolist())
     )
     return (
@@ -125,6 +137,54 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
         numerator * f_numerator * (unit / period),
         has_rest,
     )
+
+
+def _add_tool(
+    numerator: flint.arb_poly, denominator: flint.arb_poly, response: ToolResponse, common: int
+) -> tuple[flint.arb_poly, flint.arb_poly]:
+    """Return numerator and denominator of the plant plus the response of a tool.
+
+    Args:
+        numerator: numerator of the plant.
+        denominator: denominator of the plant, with its poles at z = 0.
+        response: response of the tool.
+        common: 1 if plant and tool have a common pole at exactly z = 1, which is divided out; otherwise 0.
+    """
+    import flint
+
+    gain, power, a2, a1, a0 = response
+    zeta = flint.arb_poly([-1, 1])
+    # A tool without spring has a0 = 0, so that its denominator is zeta (a2 zeta + a1).
+    tool = zeta * a2 + flint.arb_poly([a1]) if common else zeta * zeta * a2 + zeta * a1 + flint.arb_poly([a0])
+    rest = denominator // zeta if common else denominator
+    return numerator * tool + rest * flint.arb_poly([0] * power + [1]) * gain, denominator * tool
+
+
+def _expand_estimates(
+    estimates: LoopEstimates, numerator: flint.arb_poly, denominator: flint.arb_poly
+) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly]:
+    """Return the polynomials D, N1 and N2 of a loop with estimates P and V and further feedback R, normalized.
+
+    Common poles of P and V are not canceled, because they are inside the unit circle and do not change the result.
+
+    Args:
+        estimates: P, V and R.
+        numerator: numerator of the plant.
+        denominator: denominator of the plant, with the delay.
+    """
+    p_numerator, p_denominator = _expand_estimate(estimates.position)
+    v_numerator, v_denominator = _expand_estimate(estimates.velocity)
+    velocity = (p_numerator if estimates.structure == "series" else p_denominator) * v_numerator
+    D = denominator * p_denominator * v_denominator
+    N1, N2 = numerator * p_numerator * v_denominator, numerator * velocity
+    if estimates.feedback is None:
+        return D, N1, N2
+    r_numerator, r_denominator = _expand_estimate(estimates.feedback.filter)
+    weights = estimates.feedback.weights
+    source = numerator * p_denominator * v_denominator
+    if weights is not None:
+        source = N1 * weights.position + N2 * weights.velocity
+    return D * r_denominator + source * r_numerator, N1 * r_denominator, N2 * r_denominator
 
 
 def _convert_exactly(part: Any) -> Any:

@@ -28,11 +28,11 @@ import numpy as np
 
 from zwidth.model.circle_functions import Jet, are_on_circle, circle_points, distances_inside
 from zwidth.model.mechanism import AnyChain
-from zwidth.model.velocity import Estimate
 from zwidth.numerics.root_finding import find_zeros_in_brackets
 from zwidth.plant.sampled_states import integrate_chain
+from zwidth.stability.linear.composition import find_roots
 from zwidth.stability.linear.curve import place_nodes
-from zwidth.stability.linear.roots import POLE_AT_ONE, LoopRoots, find_roots
+from zwidth.stability.linear.roots import POLE_AT_ONE, LoopRoots, Terms, evaluate_controller, list_terms
 from zwidth.stability.open_loop import OpenLoop, find_gain_crossovers
 
 N_PARTS = 8  # number of delays per period at which the gain crossovers are tabulated
@@ -144,16 +144,15 @@ def count_outside(
     w, L = wall.w, wall.L.value
     step = np.angle(L[:, 1:] / L[:, :-1])
     # At a pole of L on the unit circle, the phase of L changes by -pi, because the path passes the pole on the outside.
-    poles = loop.poles[are_on_circle(loop.poles)]
+    poles = loop.open_poles[are_on_circle(loop.open_poles)]
     angles = np.angle(1.0 - poles)
     jumps = np.searchsorted(w, angles[(angles > 0) & (angles < np.pi)]) - 1
     step[:, jumps] -= np.where(step[:, jumps] > 0, 2.0 * np.pi, 0.0)
     # Start at a real z slightly above 1, where L is real. From there, the path around n poles at z = 1 changes the
     # phase of L by -n pi/2.
-    is_integrator = np.abs(loop.poles) <= POLE_AT_ONE
+    is_integrator = np.abs(loop.open_poles) <= POLE_AT_ONE
     n = np.count_nonzero(is_integrator)
-    spring = alpha + beta * loop.estimate.jet(circle_points(np.zeros(1))).value[0].real
-    sign = np.sign(spring * loop.gain * (np.prod(loop.zeros) / np.prod(loop.poles[~is_integrator])).real)
+    sign = _find_sign(loop, is_integrator, alpha, beta)
     start = np.where(sign < 0, np.pi, 0.0)
     first = start - 0.5 * np.pi * n + np.angle(L[:, 0] * sign * 1j**n)
     phase = first[:, None] + np.pad(np.cumsum(step, -1), ((0, 0), (1, 0)))
@@ -167,9 +166,37 @@ def count_outside(
     side = np.where((np.arange(crossovers.shape[1]) % 2 == 0) == starts_above[:, None], 1.0, -1.0)
     turns = 2.0 * np.pi * np.where(exists, side * np.round(at_crossover / (2.0 * np.pi)), 0.0).sum(-1)
     change = turns - np.where(starts_above, start, 0.0) + np.where(ends_above, phase[:, -1], 0.0)
-    unstable = np.count_nonzero((distances_inside(loop.poles) < 0) & ~are_on_circle(loop.poles) & ~is_integrator)
+    is_outside = (distances_inside(loop.open_poles) < 0) & ~are_on_circle(loop.open_poles)
+    unstable = np.count_nonzero(is_outside & ~is_integrator)
     matches = (exists.sum(-1) % 2 == 1) == (starts_above != ends_above)
     return np.where(matches, np.round(unstable - change / np.pi), np.nan)
+
+
+def _find_sign(loop: LoopRoots, is_integrator: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+    """Return the sign of the open loop of each wall at a real z slightly above 1.
+
+    Args:
+        loop: the loop.
+        is_integrator: mask of the poles of the open loop at z = 1.
+        alpha: normalized stiffness, shape (walls,).
+        beta: normalized damping, shape (walls,).
+    """
+    plant, terms = loop.terms
+    product = plant.gain * (np.prod(plant.zeros) / np.prod(loop.open_poles[~is_integrator])).real
+    if loop.inner is None:
+        spring = alpha + beta * loop.estimate.jet(circle_points(np.zeros(1))).value[0].real
+        return np.sign(spring * product)
+    feedback = loop.inner[1].feedback
+    assert feedback is not None
+    R0, weights = feedback.filter, feedback.weights
+    at_one = circle_points(np.zeros(1))
+    P, V = (term(at_one).value[0].real for term in terms[:2])
+    filtered = 1.0 if weights is None else weights.position * P + weights.velocity * V
+    # Multiply by the poles of R0 except those at z = 1. With such poles, R dominates the controller near z = 1.
+    poles = R0.poles[np.abs(R0.poles) > POLE_AT_ONE]
+    further = float(R0.gain) * (np.prod(R0.zeros)).real * filtered
+    spring = 0.0 * alpha if poles.size < R0.poles.size else (alpha * P + beta * V) * np.prod(poles).real
+    return np.sign((spring + further) * product)
 
 
 class DelayedPlant:
@@ -244,15 +271,15 @@ def _find_first_losses(
     chain: AnyChain, tabulated: list[TabulatedDelay], alpha: np.ndarray, beta: np.ndarray
 ) -> np.ndarray:
     """Return the delay margins of one batch of walls in periods, as in `find_delay_margins`, from tabulated delays."""
-    d, plant, estimate = float(chain.d), DelayedPlant(chain), chain.estimate
+    d, plant, terms = float(chain.d), DelayedPlant(chain), list_terms(chain)
     with np.errstate(all="ignore"):
         starts = _list_starts(tabulated)
         earliest = np.full(alpha.shape, np.inf)
         np.minimum.at(earliest, starts.wall, starts.delay)
         starts = StartingPoints(*(part[starts.delay <= earliest[starts.wall] + MAX_STARTS] for part in starts))
         walls = alpha[starts.wall], beta[starts.wall]
-        pairs = starts.wall, _solve_delays(plant, estimate, *walls, starts.w, starts.delay)
-        real = _find_real_losses(plant, estimate, tabulated, alpha, beta)
+        pairs = starts.wall, _solve_delays(plant, terms, *walls, starts.w, starts.delay)
+        real = _find_real_losses(plant, terms, tabulated, alpha, beta)
         margins = np.full(alpha.shape, np.inf)
         for wall, limit in (pairs, real):
             np.fmin.at(margins, wall, np.where(limit > d, limit - d, np.nan))
@@ -266,13 +293,13 @@ def _find_first_losses(
 
 
 def _find_real_losses(
-    plant: DelayedPlant, estimate: Estimate, tabulated: list[TabulatedDelay], alpha: np.ndarray, beta: np.ndarray
+    plant: DelayedPlant, terms: Terms, tabulated: list[TabulatedDelay], alpha: np.ndarray, beta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the delays at which a real pole leaves the unit circle at z = -1, after the indices of their walls."""
     L = np.array([each.at_nyquist for each in tabulated])
     above, delays = np.abs(L) - 1.0, np.array([each.delay for each in tabulated])
     k, wall = np.nonzero((above[1:] > 0) & (above[:-1] <= 0))
-    controller = alpha + beta * estimate.jet(circle_points(np.full(1, np.pi))).value.real
+    controller = evaluate_controller(terms, circle_points(np.full(1, np.pi)), alpha, beta).value.real
 
     def evaluate(delay: np.ndarray) -> np.ndarray:
         """Return |L(-1)| - 1 for delays in periods."""
@@ -284,13 +311,13 @@ def _find_real_losses(
 
 
 def _solve_delays(
-    plant: DelayedPlant, estimate: Estimate, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray, delay: np.ndarray
+    plant: DelayedPlant, terms: Terms, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray, delay: np.ndarray
 ) -> np.ndarray:
     """Return the delays at which a pole leaves the unit circle, by Newton's method on log(-L); NaN if it fails.
 
     Args:
         plant: the plant for any delay.
-        estimate: the velocity estimate.
+        terms: responses of the controller.
         alpha: normalized stiffness, one value for each starting value.
         beta: normalized damping.
         w: starting values of the angle.
@@ -304,8 +331,7 @@ def _solve_delays(
         if not active.size:
             break
         G, by_delay = plant.evaluate(w[active], delay[active])
-        F = estimate.jet(circle_points(w[active]))
-        L = Jet(alpha[active] + beta[active] * F.value, beta[active] * F.slope).times(G)
+        L = evaluate_controller(terms, circle_points(w[active]), alpha[active], beta[active]).times(G)
         residual, d_w, d_delay = np.log(-L.value), L.slope / L.value, by_delay / G.value
         # If the device comes to rest within a period, L does not depend on the delay, and both steps are NaN. A
         # positive determinant means that the pole moves outward as the delay increases.

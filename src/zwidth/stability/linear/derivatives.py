@@ -23,9 +23,10 @@ from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import Status
 from zwidth.core.types import Array
 from zwidth.model.circle_functions import circle_points
+from zwidth.model.estimate import Estimate
+from zwidth.model.loop_estimates import build_estimates
 from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import list_parameters
-from zwidth.model.velocity import Estimate
 from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, flow, seed, solve, stack
 from zwidth.stability.linear.ridge import Condition, RidgeSolution
 from zwidth.units.display import compact_repr
@@ -41,7 +42,10 @@ Pair = tuple[Taylor, Taylor]  # a function of lambda and its derivative
 
 
 class LoopTerms:
-    """Taylor expansions of q = -1/G and the velocity estimate F in the numbers of a scene and in further variables."""
+    """Taylor expansions of q = -1/G and F in the numbers of a scene and in further variables.
+
+    F is the velocity estimate or, in a scene with a position estimate, its ratio V/P to the position estimate.
+    """
 
     def __init__(self, scene: Any, variables: Sequence[Taylor], n: int, more_delay: Taylor | None = None) -> None:
         """Discretize the device.
@@ -60,6 +64,7 @@ class LoopTerms:
         self.d = Taylor(np.float64(scene.d), d.first, d.second)
         delay = self.d if more_delay is None else self.d + more_delay
         chain = build_chain(self.varied, (self.d, n), Estimate())
+        self.estimates = build_estimates(self.varied)
         A, B = (stack(part, self.one) for part in chain.realize()[:2])
         self.lag = n + 1
         if chain.sampled:
@@ -78,10 +83,65 @@ class LoopTerms:
         x = solve(matrix, self.full + late - self.late)
         change = solve(matrix, late - x * z.map(lambda part: np.asarray(part)[None]))
         q = -(lam * self.lag).exp() / x[0]
-        return q, q * (self.one * self.lag - change[0] / x[0])
+        q_slope = q * (self.one * self.lag - change[0] / x[0])
+        if self.scene.tool is not None:
+            return self._add_tool(q, q_slope, lam)
+        if self.estimates is None:
+            return q, q_slope
+        # With the position estimate P and the further feedback R, q = (-1/H - R)/P for the plant H (V25).
+        P, R = self._evaluate_position(lam), self._evaluate_feedback(lam)
+        return _divide((q - R[0], q_slope - R[1]), P)
+
+    def feedback(self, lam: Taylor) -> Pair:
+        """Return the ratio R/P of the further feedback to the position estimate, and its derivative in lambda.
+
+        The open loop at the plant input is ``L = -(alpha + beta F + R/P)/(q + R/P)``.
+        """
+        if self.estimates is None or self.estimates.feedback is None:
+            return self.one * 0.0, self.one * 0.0
+        return _divide(self._evaluate_feedback(lam), self._evaluate_position(lam))
+
+    def _add_tool(self, q: Taylor, q_slope: Taylor, lam: Taylor) -> Pair:
+        """Add the response G_t of the tool to G = -1/q: return q/(1 - q G_t) and its derivative in lambda."""
+        z, zeta = lam.exp(), lam.expm1()
+        tool = self.varied.tool.respond(self.varied.mass, self.varied.timing.period)
+        denominator = (zeta * tool.a2 + tool.a1) * zeta + tool.a0
+        response = (lam * tool.power).exp() * tool.gain / denominator
+        slope = response * (tool.power - (zeta * (tool.a2 * 2.0) + tool.a1) * z / denominator)
+        share = 1.0 / (self.one - q * response)
+        return q * share, (q_slope + q * q * slope) * share * share
+
+    def _evaluate_position(self, lam: Taylor) -> Pair:
+        """Return the position estimate P and its derivative in lambda."""
+        assert self.estimates is not None
+        return evaluate_estimate(self.estimates.position, lam, self.one)
+
+    def _evaluate_velocity(self, lam: Taylor) -> Pair:
+        """Return the velocity estimate V and its derivative in lambda."""
+        assert self.estimates is not None
+        V = evaluate_estimate(self.estimates.velocity, lam, self.one)
+        return _multiply(V, self._evaluate_position(lam)) if self.estimates.structure == "series" else V
+
+    def _evaluate_feedback(self, lam: Taylor) -> Pair:
+        """Return the further feedback R and its derivative in lambda."""
+        assert self.estimates is not None
+        feedback = self.estimates.feedback
+        if feedback is None:
+            return self.one * 0.0, self.one * 0.0
+        filtered = evaluate_estimate(feedback.filter, lam, self.one)
+        if feedback.weights is None:
+            return filtered
+        P, V = self._evaluate_position(lam), self._evaluate_velocity(lam)
+        position, velocity = (self.one * weight for weight in feedback.weights)
+        total = (position * P[0] + velocity * V[0], position * P[1] + velocity * V[1])
+        return _multiply(filtered, total)
 
     def estimate(self, lam: Taylor) -> Pair:
         """Return the velocity estimate F and its derivative in lambda = log z."""
+        if self.estimates is not None:
+            if self.estimates.structure == "series":
+                return evaluate_estimate(self.estimates.velocity, lam, self.one)
+            return _divide(self._evaluate_velocity(lam), self._evaluate_position(lam))
         velocity, period = self.varied.velocity, self.varied.timing.period
         try:
             return evaluate_estimate(velocity.estimate(period), lam, self.one)
@@ -117,6 +177,17 @@ class LoopTerms:
         (q, q_slope), (f, f_slope) = self.controller(lam), self.estimate(lam)
         scale = 1.0 / (abs(q.v) or 1.0)
         return (alpha + beta * f - q) * scale, (beta * f_slope - q_slope) * scale, f
+
+
+def _multiply(first: Pair, second: Pair) -> Pair:
+    """Return the product of two functions and its derivative."""
+    return first[0] * second[0], first[1] * second[0] + first[0] * second[1]
+
+
+def _divide(first: Pair, second: Pair) -> Pair:
+    """Return the quotient of two functions and its derivative."""
+    value = first[0] / second[0]
+    return value, (first[1] - value * second[1]) / second[0]
 
 
 def evaluate_estimate(estimate: Estimate, lam: Taylor, one: Taylor) -> Pair:

@@ -9,7 +9,8 @@ F`` and gain crossovers at low frequencies. A *chain* is the plant of a scene wi
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -41,38 +42,40 @@ MAX_HALVINGS = 40
 MAX_CONTROLLER_CHANGE = 0.25  # largest relative change of the controller between neighboring nodes
 
 
-def respond_to_position(points: CirclePoints) -> Jet:
-    """Return the constant 1: the spring force of the wall is proportional to the sampled position itself."""
-    return Jet(np.ones(()), np.zeros(()))
+def list_gains(terms: Sequence[Any], alpha: Array, beta: Array) -> list[Array]:
+    """Return the gain of each term of the controller: alpha, beta and, for further feedback, 1."""
+    return [alpha, beta, *(np.ones_like(alpha) for _ in terms[2:])]
 
 
 def evaluate_walls(loop: LoopRoots, alpha: Array, beta: Array, points: CirclePoints) -> Jet:
     """Return L of walls and its derivative in w at points of the unit circle; walls and points broadcast."""
-    return evaluate_open_loop(points, loop.evaluate_response, (respond_to_position, loop.estimate.jet), (alpha, beta))
+    plant, terms = loop.terms
+    return evaluate_open_loop(points, plant.evaluate_response, terms, list_gains(terms, alpha, beta))
 
 
 def tabulate(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, nodes: np.ndarray) -> OpenLoop:
     """Return L of each wall, tabulated at the nodes of the loop and at further nodes that the walls need."""
-    w = np.append(nodes[nodes < np.pi], np.pi)
-    n_integrators = int(np.count_nonzero(np.abs(loop.poles) <= POLE_AT_ONE))
+    (plant, terms), w = loop.terms, np.append(nodes[nodes < np.pi], np.pi)
+    n_integrators = int(np.count_nonzero(np.abs(loop.open_poles) <= POLE_AT_ONE))
     if n_integrators:
         # If the device has poles at z = 1, |L| grows without limit as w -> 0. With a small stiffness, the gain
         # crossover may lie below all nodes, so add nodes at lower angles.
-        gains = np.abs(alpha * loop.evaluate_response(circle_points(w[:1])).value[0])
+        gains = np.abs(evaluate_walls(loop, alpha, beta if len(terms) > 2 else 0.0 * beta, circle_points(w[:1])).value)
         gains = gains[(gains > 0) & (gains < 1)]
         octaves = 1.0 - np.log2(gains.min(initial=1.0)) / n_integrators if gains.size else 0.0
         w = np.concatenate([w[0] * np.exp2(-np.linspace(octaves, 1.0, int(np.ceil(octaves)))), w])
     columns = alpha[:, None], beta[:, None]
     for _ in range(MAX_HALVINGS):
-        f = loop.estimate.jet(circle_points(w)).value
-        controller, step = np.abs(columns[0] + columns[1] * f), np.diff(w)
-        change = np.abs(columns[1] * np.diff(f))
+        values = [np.broadcast_to(term(circle_points(w)).value, w.shape) for term in terms]
+        parts = [gain * value for gain, value in zip(list_gains(terms, *columns), values, strict=True)]
+        controller, step = np.abs(sum(parts)), np.diff(w)
+        change = sum(np.abs(np.diff(part)) for part in parts)
         wide = change > MAX_CONTROLLER_CHANGE * np.maximum(controller[:, :-1], controller[:, 1:])
         wide = wide.any(0) & (step > 1e-9 * w[1:])
         if not wide.any():
             break
         w = np.sort(np.concatenate([w, w[:-1][wide] + 0.5 * step[wide]]))
-    return tabulate_open_loop(w, loop.evaluate_response, (respond_to_position, loop.estimate.jet), (alpha, beta))
+    return tabulate_open_loop(w, plant.evaluate_response, terms, list_gains(terms, alpha, beta))
 
 
 def find_modulus_margins(wall: OpenLoop) -> tuple[np.ndarray, np.ndarray]:

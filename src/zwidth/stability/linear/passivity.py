@@ -22,7 +22,7 @@ import numpy as np
 
 from zwidth.core.types import Array
 from zwidth.model.circle_functions import circle_points
-from zwidth.model.velocity import Estimate
+from zwidth.model.estimate import Estimate
 from zwidth.numerics.polynomials import abs2
 from zwidth.stability.passivity import limit_margin, solve_larger_root
 
@@ -54,18 +54,29 @@ UNSUPPORTED = {
         "modes",
         "because the sensor moves relative to the hand; use is_stable with the hand as operator, or omit the modes",
     ),
+    "position": (
+        "a position estimate",
+        "for a filtered position; use is_stable with the hand as operator, or omit the position estimate",
+    ),
+    "feedback": (
+        "further feedback",
+        "for it; use is_stable with the hand as operator, or omit the feedback",
+    ),
 }
 
 
-def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
-    """Return the reason why no passivity condition is available for a device; "" if a condition is available.
+def find_unsupported_reason(tool: Any = None, *, coupling: Any = None, **parts: Any) -> str:
+    """Return the reason why no passivity condition is available for a scene; "" if a condition is available.
 
     A condition is available only if the force acts on the point whose position is sensed.
 
     Args:
+        tool: simulated tool of the scene.
         coupling: coupling of the device.
-        **parts: the other fields of the device.
+        **parts: the other fields of the device, and parts of the scene.
     """
+    if tool is not None:
+        return "with a simulated tool: the wall is a coupling; use is_safe_for_every_world"
     for name, (description, reason) in UNSUPPORTED.items():
         part = parts.get(name)
         if part if isinstance(part, tuple | list) else part is not None:
@@ -76,6 +87,11 @@ def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
             "energy; use is_stable with the hand as operator"
         )
     return ""
+
+
+def find_obstacle(scene: Any) -> str:
+    """Return the reason why no passivity condition is available for a scene; "" if a condition is available."""
+    return find_unsupported_reason(scene.tool, **vars(scene.device), position=scene.position, feedback=scene.feedback)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from zwidth.core.errors import InputError
 from zwidth.core.types import Array
 from zwidth.core.xp import within
 from zwidth.model.circle_functions import Jet
-from zwidth.model.velocity import Estimate
+from zwidth.model.estimate import Estimate
 from zwidth.numerics.pole_counting import count_poles
 from zwidth.numerics.polynomials import abs2, companion, compute_aberth_step
 from zwidth.stability.linear.roots import LoopRoots, affine_polynomial, factor_open_loop
@@ -87,22 +87,26 @@ def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array)
     f = loop.estimate
     delay = f.window + f.lag
     g_denominator = _product(zeta, loop.poles).times(_power(zeta, loop.lag))
-    g_numerator = _product(zeta, loop.zeros, loop.gain)
-    Q = _product(zeta, f.poles).times(_power(zeta, max(delay, 0)))
+    g_numerator = _product(zeta, loop.free_zeros, loop.gain)
+    at_zero = _power(zeta, max(delay, 0))
+    Q = _product(zeta, f.poles).times(at_zero)
     R = _product(zeta, f.zeros, float(f.gain))
     if f.window:
         R = R.times(_difference(zeta, f.window))
     R = R.times(_power(zeta, max(-delay, 0)))
     wall = Jet(alpha * Q.value + beta * R.value, alpha * Q.slope + beta * R.slope)
-    first, second = g_denominator.times(Q), g_numerator.times(wall)
+    free = _product(zeta, loop.free_poles).times(at_zero) if loop.shared else Q
+    first, second = g_denominator.times(free), g_numerator.times(wall)
     size = np.abs(first.value) + np.abs(g_numerator.value) * (np.abs(alpha * Q.value) + np.abs(beta * R.value))
     return FactoredValue(first.value + second.value, first.slope + second.slope, size)
 
 
-def _find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
+def find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
     """Return zeta of all poles of each wall by Aberth's method, as an array of shape (walls, order)."""
     D, N1, N2 = affine_polynomial(loop)
-    monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
+    # The leading coefficient is D[0], except if G has a direct feedthrough, as with a tool in implicit Euler.
+    polynomials = D + alpha[:, None] * N1 + beta[:, None] * N2
+    monic = polynomials / polynomials[:, :1]
     zeta = np.linalg.eigvals(companion(monic)) - 1.0 + 0j
     _refine_poles(loop, alpha, beta, zeta, np.arange(len(zeta)))
     # Aberth's steps keep real approximations real and complex pairs complex. They do not converge if rounding errors
@@ -166,7 +170,7 @@ def compute_poles_minus_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array
         walls = in_range[(beta[in_range] != 0) == damped]
         for k in range(0, walls.size, block):
             part = walls[k : k + block]
-            out[part] = _find_poles(loop, alpha[part], beta[part]) if damped else _find_spring_poles(loop, alpha[part])
+            out[part] = find_poles(loop, alpha[part], beta[part]) if damped else _find_spring_poles(loop, alpha[part])
     # Set imaginary parts to 0 if they are rounding errors of real poles. Complex pairs are not affected, because the
     # imaginary part of a pair is at least about 1e-8, even close to a double real pole.
     out = np.where(np.abs(np.imag(out)) <= REAL_TOLERANCE * np.abs(out), np.real(out) + 0j, out)
@@ -179,8 +183,8 @@ def _find_spring_poles(loop: LoopRoots, alpha: Array) -> Array:
     The velocity estimate then has no effect on the force, and its own poles are poles of the closed loop.
     """
     f = loop.estimate
-    filter_poles = np.concatenate([-f.poles, -np.ones(max(f.window + f.lag, 0))])
-    zeta = _find_poles(replace(loop, estimate=Estimate(0)), alpha, np.zeros_like(alpha))
+    filter_poles = np.concatenate([-loop.free_poles, -np.ones(max(f.window + f.lag, 0))])
+    zeta = find_poles(replace(loop, estimate=Estimate(0), shared=0), alpha, np.zeros_like(alpha))
     return np.concatenate([zeta, np.broadcast_to(filter_poles, (alpha.size, filter_poles.size))], 1)
 
 

@@ -18,28 +18,85 @@ from math import gcd
 
 import numpy as np
 
-from zwidth.model.circle_functions import are_on_circle, circle_points, distances_inside
+from zwidth.core.types import Array
+from zwidth.model.circle_functions import CirclePoints, Jet, are_on_circle, circle_points, distances_inside
+from zwidth.model.estimate import Estimate
+from zwidth.model.loop_estimates import LoopEstimates, Response
 from zwidth.model.mechanism import AnyChain
-from zwidth.model.velocity import Estimate
 from zwidth.numerics.polynomials import Affine
-from zwidth.plant.factored_plant import FactoredPlant, factor_chain
+from zwidth.plant.factored_plant import FactoredPlant
 
 # Coefficients below this fraction of the largest one are regarded as rounding errors of 0.
 NEGLIGIBLE_COEFFICIENT = 1e-12
 POLE_AT_ONE = 1e-13  # distance from z = 1 below which a pole counts as a pole at z = 1
 
+Terms = tuple[Response, ...]  # responses of the controller: P, V and, with further feedback, R
+
+
+def respond_to_position(points: CirclePoints) -> Jet:
+    """Return the constant 1: the spring force of the wall is proportional to the sampled position itself."""
+    return Jet(np.ones(()), np.zeros(()))
+
+
+def list_terms(chain: AnyChain) -> Terms:
+    """Return the responses P and V of the estimates of a chain and, with further feedback, R."""
+    return (respond_to_position, chain.estimate.jet) if chain.estimates is None else chain.estimates.respond()
+
+
+def evaluate_controller(terms: Terms, points: CirclePoints, alpha: Array, beta: Array) -> Jet:
+    """Return the controller ``alpha P + beta V + R`` and its derivative in w; walls and points broadcast."""
+    P, V, *R = (term(points) for term in terms)
+    parts = (
+        alpha * first + beta * second + sum(rest)
+        for first, second, rest in zip(P, V, zip(*R, strict=True) if R else ((), ()), strict=True)
+    )
+    return Jet(*parts)
+
 
 @dataclass(frozen=True)
 class LoopRoots(FactoredPlant):
-    """The loop without a wall: the sampled plant G and the velocity estimate F."""
+    """The loop without a wall: the sampled plant G and the velocity estimate F.
+
+    The last ``shared`` zeros of G are also the last poles of F. They cancel in the open loop ``G (alpha + beta F)``,
+    and are no closed-loop poles (V26).
+    """
 
     estimate: Estimate
+    shared: int = 0
+    # Sampled plant, position estimate P, velocity estimate V and further feedback R, if the loop has an R. G is then
+    # the closed loop of this plant with R, in series with P, and F is V/P (V25).
+    inner: tuple[FactoredPlant, LoopEstimates] | None = None
+
+    @property
+    def terms(self) -> tuple[FactoredPlant, Terms]:
+        """The sampled plant H, and the responses whose sum, weighted by alpha, beta and 1, is the controller."""
+        if self.inner is None:
+            return self, (respond_to_position, self.estimate.jet)
+        return self.inner[0], self.inner[1].respond()
+
+    @property
+    def open_poles(self) -> np.ndarray:
+        """The offsets of the poles of the open loop at the plant input, except those of stable filters."""
+        if self.inner is None:
+            return self.poles
+        feedback = self.inner[1].feedback
+        return np.concatenate([self.inner[0].poles, np.zeros(0) if feedback is None else feedback.filter.poles])
+
+    @property
+    def free_zeros(self) -> np.ndarray:
+        """The offsets of the zeros of G that are not poles of F."""
+        return self.zeros[: self.zeros.size - self.shared]
+
+    @property
+    def free_poles(self) -> np.ndarray:
+        """The offsets of the poles of F that are not zeros of G."""
+        return self.estimate.poles[: self.estimate.poles.size - self.shared]
 
     @property
     def order(self) -> int:
         """The number of closed-loop poles with a damped wall (beta != 0)."""
         f = self.estimate
-        return self.poles.size + self.lag + f.poles.size + max(f.window + f.lag, 0)
+        return self.poles.size + self.lag + self.free_poles.size + max(f.window + f.lag, 0)
 
     @property
     def device_is_unstable(self) -> bool:
@@ -63,8 +120,8 @@ class LoopRoots(FactoredPlant):
         window = np.where(angles == np.pi, 2.0, -2j * np.sin(0.5 * angles) * np.exp(0.5j * angles))
         lag = self.lag + f.lag + f.window
         velocity = f.zeros if f.window else np.delete(f.zeros, estimate_zeros[0])
-        zeros = np.concatenate([self.zeros, velocity, window, np.ones(max(-lag, 0))])
-        poles = np.concatenate([np.delete(self.poles, device_poles[0]), f.poles])
+        zeros = np.concatenate([self.free_zeros, velocity, window, np.ones(max(-lag, 0))])
+        poles = np.concatenate([np.delete(self.poles, device_poles[0]), self.free_poles])
         return LoopRoots(self.gain * float(f.gain) / max(f.window, 1), max(lag, 0), zeros, poles, Estimate())
 
     def contract_powers(self) -> tuple[LoopRoots, int]:
@@ -74,6 +131,8 @@ class LoopRoots(FactoredPlant):
             The loop whose poles are the k-th powers of the poles of this loop, and k. For most loops k is 1.
         """
         f = self.estimate
+        if self.shared:
+            return self, 1
         parts = [_expand(each) for each in (self.zeros, self.poles, f.zeros, f.poles)]
         delays = [self.lag + parts[1].size - parts[0].size, f.lag + parts[3].size - parts[2].size]
         powers = [np.flatnonzero(np.abs(part) > NEGLIGIBLE_COEFFICIENT * np.abs(part).max()).tolist() for part in parts]
@@ -83,7 +142,7 @@ class LoopRoots(FactoredPlant):
         roots = [1.0 - np.roots(part[: each[-1] + 1 : k]) for part, each in zip(parts, powers, strict=True)]
         lags = [delay // k - roots[j + 1].size + roots[j].size for delay, j in zip(delays, (0, 2), strict=True)]
         slow = replace(f, window=f.window // k, gain=f.gain / k, lag=lags[1], zeros=roots[2], poles=roots[3])
-        return replace(self, lag=lags[0], zeros=roots[0], poles=roots[1], estimate=slow), k
+        return replace(self, lag=lags[0], zeros=roots[0], poles=roots[1], estimate=slow, inner=None), k
 
     def bound_variation(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return a bound of the relative derivatives of q = -1/G and F in w, over all angles within ``reach`` of w."""
@@ -95,11 +154,6 @@ class LoopRoots(FactoredPlant):
         floor = np.where(are_on_circle(roots), np.where(roots == 0, 1e-9, 1e-5), 0.5 * np.abs(distances_inside(roots)))
         by_roots = (1.0 / np.maximum(distance, floor)).sum(-1)
         return by_roots + self.lag + self.estimate.window + abs(self.estimate.lag) + 1.0
-
-
-def find_roots(chain: AnyChain) -> LoopRoots:
-    """Return the zeros, poles and gain of the loop of a chain, without a wall."""
-    return LoopRoots(**vars(factor_chain(chain)), estimate=chain.estimate)
 
 
 def _expand(*offsets: np.ndarray) -> np.ndarray:
@@ -121,10 +175,10 @@ def expand_estimate(loop: LoopRoots) -> tuple[np.ndarray, np.ndarray]:
 
 def affine_polynomial(loop: LoopRoots) -> Affine:
     """Return the coefficients of D, N1 and N2 in the characteristic polynomial ``D + alpha N1 + beta N2``."""
-    f_numerator, f_denominator = expand_estimate(loop)
-    denominator, numerator = np.pad(_expand(loop.poles), (0, loop.lag)), loop.gain * _expand(loop.zeros)
+    f, (f_numerator, f_denominator) = loop.estimate, expand_estimate(loop)
+    denominator, numerator = np.pad(_expand(loop.poles), (0, loop.lag)), loop.gain * _expand(loop.free_zeros)
     parts = [
-        np.convolve(denominator, f_denominator),
+        np.convolve(denominator, np.pad(_expand(loop.free_poles), (0, max(f.window + f.lag, 0)))),
         np.convolve(numerator, f_denominator),
         np.convolve(numerator, f_numerator),
     ]
@@ -137,6 +191,6 @@ def factor_open_loop(loop: LoopRoots, alpha: float, beta: float) -> tuple[np.nda
     f, (numerator, denominator) = loop.estimate, expand_estimate(loop)
     wall = np.trim_zeros(np.polyadd(alpha * denominator, beta * numerator), "f")
     lag = loop.lag + max(f.window + f.lag, 0)
-    zeros = np.concatenate([1.0 - loop.zeros, np.roots(wall)])
-    poles = 1.0 - np.concatenate([loop.poles, f.poles])
+    zeros = np.concatenate([1.0 - loop.free_zeros, np.roots(wall)])
+    poles = 1.0 - np.concatenate([loop.poles, loop.free_poles])
     return zeros, poles, loop.gain * float(wall[0] if wall.size else 0.0), lag

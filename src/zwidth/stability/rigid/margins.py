@@ -31,6 +31,7 @@ from zwidth.numerics.evaluate import evaluate
 from zwidth.numerics.root_finding import attach_root_derivatives, false_position, minimize_golden_section
 from zwidth.plant.rigid_mass import ANY, DiscretePlant, discretize_plant, split_delay
 from zwidth.stability.results import Margins
+from zwidth.stability.rigid.characteristic_polynomial import evaluate_at_nyquist
 from zwidth.stability.rigid.crossover import decide_in_floats, expand_short_delay_curve
 from zwidth.stability.rigid.modulus import (
     SAMPLES_WEIGHT,
@@ -128,7 +129,7 @@ def margins_kernel(
     delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), NEGLIGIBLE_DAMPING)), 0.0, delta)
     plant = materialize(discretize_plant(delta, d), delta)
     w, phase, crosses = evaluate_at_crossover(alpha, beta, plant)
-    stable = materialize(decide_in_floats(*stop_gradient((alpha, beta, plant), xp), ANY), delta)
+    stable = decide_in_floats(*stop_gradient((alpha, beta, plant), xp), ANY)
     gain, phase_crossover = _find_gain_margin(alpha, beta, plant, xp)
     delay = distance = closest = xp.nan * alpha
     if with_delay:
@@ -205,8 +206,9 @@ def _find_gain_margin(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) 
     log_w = false_position(lambda x: evaluate_phase(x, *wall), *bracket, FALSE_POSITION_STEPS, 1e-15)
     w = xp.minimum(xp.exp(attach_root_derivatives(evaluate_phase, log_w, _is_falling, alpha, beta, plant)), np.pi)
     gain_at_zero = 1.0 / evaluate_gain_and_phase(w, alpha, beta, plant)[0]
-    wall_at_nyquist = xp.abs(plant.gap * (alpha + 2.0 * beta))
-    gain_at_nyquist = 2.0 * (1.0 + plant.c) / xp.where(wall_at_nyquist > 0, wall_at_nyquist, 1.0)
+    wall_at_nyquist, device_at_nyquist = evaluate_at_nyquist(alpha, beta, plant)
+    wall_at_nyquist = xp.abs(wall_at_nyquist)
+    gain_at_nyquist = device_at_nyquist / xp.where(wall_at_nyquist > 0, wall_at_nyquist, 1.0)
     # Require n = 0, because for d >= 1 the phase has a zero below w = pi, although rounding errors may hide it.
     ends_at_nyquist = (n == 0) & (wall_at_nyquist > 0) & (end > 0)
     gain = xp.where(never_stable, 0.0, xp.where(ends_at_nyquist, gain_at_nyquist, gain_at_zero))
@@ -290,4 +292,4 @@ def _limit_delay(w: Array, phase: Array, exists: Array) -> Array:
 
 def _evaluate_fraction(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
     """Return the gain crossover, the phase there, and whether the crossover exists, for a delay f < 1."""
-    return evaluate_at_crossover(alpha, beta, materialize(discretize_plant(delta, f), f))
+    return evaluate_at_crossover(alpha, beta, discretize_plant(delta, f))

@@ -1,0 +1,257 @@
+"""Conversion between the gains of usual controllers and the wall, estimates and feedback of a scene.
+
+A PID controller computes the force ``kp e + ki T sum(e) - kd v`` from the position error e = -x, so that K = kp and
+B = kd, and ki is further feedback. A *cascade* of a position loop and a velocity loop computes
+
+    e_v = pos_gain e - v        force = vel_gain e_v + vel_integrator_gain T sum(e_v)
+
+so that B = vel_gain and K = pos_gain vel_gain. Its integrator is further feedback with the weights ``pos_gain`` of the
+position estimate and 1 of the velocity estimate.
+
+Motor controllers measure angles in turns or degrees, and their output may be a current or a voltage. The *output unit*
+is the force or torque per unit of output: the torque constant in N m/A, or the torque constant divided by the winding
+resistance in N m/V.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any, Literal, NamedTuple
+
+from zwidth.core.errors import InputError, check_choice
+from zwidth.core.xp import is_traced
+from zwidth.model.checks import check_number
+from zwidth.model.feedback import IntegralFeedback, IntegrationRule
+from zwidth.model.position import Position, has_velocity
+from zwidth.model.velocity import BackwardDifference, LowPass, Velocity
+from zwidth.model.wall import VirtualWall
+from zwidth.units.display import compact_repr
+from zwidth.units.quantities import ANY
+
+PositionUnit = Literal["m", "rad", "turns", "degrees"]
+_UNITS = {"m": 1.0, "rad": 1.0, "turns": 2.0 * math.pi, "degrees": math.pi / 180.0}  # in m or rad
+
+
+@dataclass(frozen=True)
+class ControllerParts:
+    """Parts of a scene that describe a controller; a mapping, so that ``Scene(device, timing, **controller)`` works.
+
+    Args:
+        wall: stiffness K and damping B of the controller.
+        velocity: velocity estimate.
+        position: position estimate; None for the measured position.
+        feedback: integral part; None without one.
+    """
+
+    wall: VirtualWall
+    velocity: Velocity
+    position: Position | None = None
+    feedback: IntegralFeedback | None = None
+
+    def keys(self) -> Iterator[str]:
+        """Return the names of the parts, for ``**controller``."""
+        return (item.name for item in fields(self))
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the part with a given name."""
+        return getattr(self, name)
+
+
+@compact_repr()
+class PidGains(NamedTuple):
+    """Gains of a PID controller, in its own units."""
+
+    kp: float  # output per position unit
+    ki: float  # output per position unit and second
+    kd: float  # output per position unit per second
+
+
+@compact_repr()
+class CascadeGains(NamedTuple):
+    """Gains of a position loop with an inner velocity loop, in the units of the controller."""
+
+    pos_gain: float  # 1/s
+    vel_gain: float  # output per velocity unit
+    vel_integrator_gain: float  # output per velocity unit and second
+
+
+def _find_scale(units: PositionUnit, output_unit: float) -> float:
+    """Return the stiffness in SI units of a controller whose output is 1 per position unit."""
+    check_choice("units", units, tuple(_UNITS))
+    return check_number("output_unit", output_unit, "1", ANY) / _UNITS[units]
+
+
+def _read_gain(name: str, gain: Any) -> Any:
+    """Convert a gain to a float; raise `InputError` for a text with a unit or a value that is not finite."""
+    return check_number(name, gain, "1", ANY)
+
+
+def pid(
+    kp: float,
+    ki: float = 0.0,
+    kd: float = 0.0,
+    *,
+    derivative_filter: float | Velocity | None = None,
+    position: Position | None = None,
+    rule: IntegrationRule = "backward",
+    units: PositionUnit = "rad",
+    output_unit: float = 1.0,
+) -> ControllerParts:
+    """Return the parts of a scene for a PID controller.
+
+    Args:
+        kp: output per position unit; K = kp in SI units.
+        ki: output per position unit and second.
+        kd: output per position unit per second; B = kd in SI units.
+        derivative_filter: time constant in s of a first-order low-pass of the derivative; or a velocity estimate; None
+            for the backward difference.
+        position: filter of the position that all three terms use; None for the measured position.
+        rule: rule of integration, see `IntegralFeedback`.
+        units: position unit of the gains: "m", "rad", "turns" (moteus) or "degrees".
+        output_unit: force in N or torque in N m per unit of output, such as the torque constant in N m/A.
+
+    Returns:
+        A `ControllerParts`; use it as ``zwidth.Scene(device, timing, **controller)``.
+
+    References:
+        Astrom, Hagglund 2006, Advanced PID Control.
+
+    Example:
+        >>> import zwidth
+        >>> controller = zwidth.pid(kp=1000, ki=2000, kd=10)
+        >>> scene = zwidth.Scene(zwidth.Device(0.1, 0), zwidth.Timing(1e-3), **controller)
+        >>> print(f"{scene.spectral_radius():.5f}")
+        0.99796
+    """
+    scale = _find_scale(units, output_unit)
+    kp, ki, kd = (_read_gain(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
+    velocity: Any = BackwardDifference() if derivative_filter is None else derivative_filter
+    if isinstance(velocity, int | float):
+        velocity = LowPass(time_constant=velocity)
+    weight = None if position is None else 1.0
+    feedback = IntegralFeedback(ki * scale, rule, weight) if is_traced(ki) or ki else None
+    return ControllerParts(VirtualWall(kp * scale, kd * scale), velocity, position, feedback)
+
+
+def pid_gains(
+    stiffness: float,
+    virtual_damping: float,
+    integral_gain: float = 0.0,
+    *,
+    units: PositionUnit = "rad",
+    output_unit: float = 1.0,
+) -> PidGains:
+    """Return the gains of a PID controller that renders a wall: the inverse of `pid`.
+
+    Args:
+        stiffness: K in N/m or N m/rad.
+        virtual_damping: B in N s/m or N m s/rad.
+        integral_gain: gain of the integral feedback in N/(m s) or N m/(rad s).
+        units: position unit of the gains, see `pid`.
+        output_unit: force or torque per unit of output, see `pid`.
+
+    Returns:
+        The gains in the units of the controller.
+
+    References:
+        Astrom, Hagglund 2006, Advanced PID Control.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.pid_gains(2.0, 0.05, units='turns').kp:.3f} N m/turn")
+        12.566 N m/turn
+    """
+    scale = _find_scale(units, output_unit)
+    return PidGains(stiffness / scale, integral_gain / scale, virtual_damping / scale)
+
+
+def cascade(
+    pos_gain: float,
+    vel_gain: float,
+    vel_integrator_gain: float = 0.0,
+    *,
+    position: Position | None = None,
+    velocity: Velocity | None = None,
+    rule: IntegrationRule = "backward",
+    units: PositionUnit = "turns",
+    output_unit: float = 1.0,
+) -> ControllerParts:
+    """Return the parts of a scene for a position loop with an inner velocity loop, as in ODrive, VESC and SimpleFOC.
+
+    The wall is K = pos_gain vel_gain and B = vel_gain. The integrator of the velocity loop is further feedback, whose
+    gain does not change if an analysis varies K and B. The maximum stiffness of the scene is therefore that of a
+    controller with this fixed integrator. The gain margin of the scene scales all gains of the controller together.
+
+    Args:
+        pos_gain: gain of the position loop in 1/s.
+        vel_gain: output per velocity unit, in N m/(turn/s) for ODrive.
+        vel_integrator_gain: output per velocity unit and second, in N m/turn for ODrive.
+        position: position estimate, such as ``zwidth.Pll(1000)``; None for the measured position.
+        velocity: velocity estimate; None for the backward difference, or for that of the observer or PLL.
+        rule: rule of integration, see `IntegralFeedback`: "backward", "forward" (ODrive), "trapezoidal" (SimpleFOC).
+        units: position unit: "turns" (ODrive, moteus), "degrees", "rad" (SimpleFOC) or "m".
+        output_unit: torque in N m per unit of output: 1 for a torque (ODrive), the torque constant in N m/A for a
+            current, the torque constant divided by the winding resistance for a voltage (SimpleFOC).
+
+    Returns:
+        A `ControllerParts`; use it as ``zwidth.Scene(device, timing, **controller)``.
+
+    Raises:
+        InputError: if ``velocity`` is given together with an observer or PLL.
+
+    References:
+        Ellis 2012, Control System Design Guide, 4th ed. (position loop with an inner velocity loop);
+            odriverobotics/ODrive ``Firmware/MotorControl/controller.cpp``;
+            simplefoc/Arduino-FOC ``src/common/pid.cpp``.
+
+    Example:
+        >>> import zwidth
+        >>> controller = zwidth.cascade(pos_gain=20, vel_gain=0.16, position=zwidth.Pll(bandwidth=1000))
+        >>> device = zwidth.Device("1e-4 kg m^2", "1e-4 N m s/rad")
+        >>> scene = zwidth.Scene(device, zwidth.Timing(rate=8e3, delay="1.5 periods"), **controller)
+        >>> print(f"{scene.spectral_radius():.9f}")
+        0.997411977
+    """
+    if velocity is not None and has_velocity(position):
+        raise InputError(f"velocity: got {velocity!r}, but {position!r} has its own velocity estimate; omit velocity")
+    scale = _find_scale(units, output_unit)
+    pos_gain, vel_gain = _read_gain("pos_gain", pos_gain), _read_gain("vel_gain", vel_gain)
+    vel_integrator_gain = _read_gain("vel_integrator_gain", vel_integrator_gain)
+    feedback = None
+    if is_traced(vel_integrator_gain) or vel_integrator_gain:
+        feedback = IntegralFeedback(vel_integrator_gain * scale, rule, pos_gain, 1.0)
+    wall = VirtualWall(pos_gain * vel_gain * scale, vel_gain * scale)
+    return ControllerParts(wall, velocity or BackwardDifference(), position, feedback)
+
+
+def cascade_gains(
+    stiffness: float, virtual_damping: float, *, units: PositionUnit = "turns", output_unit: float = 1.0
+) -> CascadeGains:
+    """Return the gains of a position loop with an inner velocity loop that renders a wall: the inverse of `cascade`.
+
+    Args:
+        stiffness: K in N/m or N m/rad.
+        virtual_damping: B in N s/m or N m s/rad, not 0.
+        units: position unit of the gains, see `cascade`.
+        output_unit: force or torque per unit of output, see `cascade`.
+
+    Returns:
+        ``pos_gain = K/B`` and ``vel_gain = B`` in the units of the controller; ``vel_integrator_gain`` is 0.
+
+    Raises:
+        InputError: if the damping is 0, because a cascade renders a spring only together with a damper.
+
+    References:
+        Ellis 2012, Control System Design Guide, 4th ed. (position loop with an inner velocity loop).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.cascade_gains(0.509, 0.0255).pos_gain:.2f} 1/s")
+        19.96 1/s
+    """
+    if not virtual_damping:
+        raise InputError("virtual_damping: got 0; a cascade needs damping, K = pos_gain B; pass a value other than 0")
+    scale = _find_scale(units, output_unit)
+    return CascadeGains(stiffness / virtual_damping, virtual_damping / scale, 0.0)

@@ -1,0 +1,149 @@
+"""Compose the loop of a scene from its sampled plant, its estimates and its further feedback.
+
+With the sampled plant H, the position estimate P, the velocity estimate V and the further feedback R
+(`model.loop_estimates`), the closed loop has poles where ``1 + H (alpha P + beta V + R) = 0``. This is the equation
+``1 + G (alpha + beta F) = 0`` of `stability.linear.roots` for
+
+    G = H P/(1 + H R)      F = V/P
+
+(docs/theory/scenes.md, V25). The zeros of 1 + H R are computed like closed-loop poles, by Aberth's method in z - 1, and
+are poles of G. Common poles of P, V and R cancel by construction, never by a comparison of rounded roots. Roots are
+stored as offsets 1 - root.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from zwidth.model.estimate import Estimate
+from zwidth.model.feedback import Weights
+from zwidth.model.loop_estimates import LoopEstimates
+from zwidth.model.mechanism import AnyChain
+from zwidth.plant.factored_plant import FactoredPlant, factor_chain
+from zwidth.stability.linear.poles import find_poles
+from zwidth.stability.linear.roots import LoopRoots
+
+
+def find_roots(chain: AnyChain) -> LoopRoots:
+    """Return the zeros, poles and gain of the loop of a chain, without a wall."""
+    plant = factor_chain(chain)
+    if chain.estimates is None:
+        return LoopRoots(**vars(plant), estimate=chain.estimate)
+    return compose_loop(plant, chain.estimates)
+
+
+def compose_loop(plant: FactoredPlant, estimates: LoopEstimates) -> LoopRoots:
+    """Return the loop of a sampled plant with a position estimate, a velocity estimate and further feedback."""
+    P, feedback, (ratio, shared) = estimates.position, estimates.feedback, estimates.divide()
+    inner = plant
+    if feedback is not None and feedback.weights is None:
+        inner = _close_measured(plant, feedback.filter)
+    loop = _build_loop(
+        float(inner.gain * P.gain),
+        inner.lag + P.lag,
+        np.concatenate([inner.zeros, P.zeros]),
+        np.concatenate([inner.poles, P.poles]),
+        ratio,
+        shared,
+    )
+    if feedback is not None and feedback.weights is not None:
+        loop = _close_estimated(loop, feedback.filter, feedback.weights)
+    return loop if feedback is None else replace(loop, inner=(plant, estimates))
+
+
+def _build_loop(
+    gain: float, lag: int, zeros: np.ndarray, poles: np.ndarray, estimate: Estimate, shared: int
+) -> LoopRoots:
+    """Return a loop with a nonnegative lag; see `LoopRoots` for the arguments.
+
+    A negative lag becomes zeros at z = 0. If F has poles at z = 0, as many of these zeros as possible are shared.
+    """
+    zeros, poles = np.asarray(zeros, complex), np.asarray(poles, complex)
+    estimate = replace(
+        estimate,
+        gain=float(estimate.gain),
+        zeros=np.asarray(estimate.zeros, complex),
+        poles=np.asarray(estimate.poles, complex),
+    )
+    at_zero = max(-lag, 0)
+    moved = min(at_zero, max(estimate.window + estimate.lag, 0))
+    first = zeros.size - shared
+    zeros = np.concatenate([zeros[:first], np.ones(at_zero - moved), zeros[first:], np.ones(moved)])
+    estimate = replace(
+        estimate, lag=estimate.lag - moved, poles=np.concatenate([estimate.poles, np.ones(moved, complex)])
+    )
+    return LoopRoots(gain, max(lag, 0), zeros, poles, estimate, shared + moved)
+
+
+def _close_measured(plant: FactoredPlant, feedback: Estimate) -> FactoredPlant:
+    """Return the closed loop ``H/(1 + H R)`` of a plant H with the feedback R; its lag may be negative."""
+    opened = _connect(plant.gain, plant.lag, plant.zeros, plant.poles, feedback)
+    poles, lag = _close_at(opened, 1.0, 0.0), plant.lag + feedback.lag
+    zeros = np.concatenate([plant.zeros, feedback.poles])
+    return FactoredPlant(plant.gain, -feedback.lag if lag >= 0 else plant.lag, zeros, poles)
+
+
+def _close_estimated(loop: LoopRoots, feedback: Estimate, weights: Weights) -> LoopRoots:
+    """Return a loop after closing the feedback ``R0 (w_p P + w_v V)`` around it.
+
+    Args:
+        loop: the loop with ``G = H P`` and ``F = V/P``.
+        feedback: R0.
+        weights: w_p and w_v.
+    """
+    F, lag = loop.estimate, loop.lag + feedback.lag
+    if weights.velocity == 0:
+        opened = _connect(loop.gain * float(weights.position), loop.lag, loop.zeros, loop.poles, feedback)
+        poles, shared, released, delay = _close_at(opened, 1.0, 0.0), loop.shared, np.zeros(0, complex), 0
+    else:
+        opened = _connect(loop.gain, loop.lag, loop.zeros, loop.poles, feedback, F, loop.shared)
+        poles = _close_at(opened, float(weights.position), float(weights.velocity))
+        # The denominator of F is a factor of the closed loop's numerator, because R contains F.
+        shared, released, delay = F.poles.size, loop.free_poles, max(F.window + F.lag, 0)
+    ends = loop.zeros[loop.zeros.size - loop.shared :]
+    zeros = np.concatenate([loop.free_zeros, feedback.poles, released, ends])
+    # If R0 has more zeros than G has poles at z = 0, some of them cancel poles of F at z = 0.
+    net = -feedback.lag - delay if lag >= 0 else loop.lag - max(delay + lag, 0)
+    return _build_loop(loop.gain, net, zeros, poles, F, shared)
+
+
+def _connect(
+    gain: float,
+    lag: int,
+    zeros: np.ndarray,
+    poles: np.ndarray,
+    feedback: Estimate,
+    estimate: Estimate | None = None,
+    shared: int = 0,
+) -> LoopRoots:
+    """Return the loop of a plant in series with the feedback filter R0; see `LoopRoots` for the other arguments."""
+    first = zeros.size - shared
+    return _build_loop(
+        gain * float(feedback.gain),
+        lag + feedback.lag,
+        np.concatenate([zeros[:first], feedback.zeros, zeros[first:]]),
+        np.concatenate([poles, feedback.poles]),
+        Estimate(0) if estimate is None else estimate,
+        shared,
+    )
+
+
+def _close_at(loop: LoopRoots, alpha: float, beta: float) -> np.ndarray:
+    """Return the offsets of the closed-loop poles with one wall; poles at exactly z = 1 stay exact.
+
+    A pole at z = 1 that is also a zero stays a pole of the closed loop. It is removed before the other poles are
+    computed.
+    """
+    zeros, poles = np.flatnonzero(loop.free_zeros == 0), np.flatnonzero(loop.poles == 0)
+    count = min(zeros.size, poles.size)
+    loop = replace(loop, zeros=np.delete(loop.zeros, zeros[:count]), poles=np.delete(loop.poles, poles[:count]))
+    if alpha == 0 and beta != 0 and loop.estimate.window + loop.estimate.lag >= 0:
+        damper = loop.as_damper()
+        if damper is not None:
+            loop, alpha, beta, count = damper, beta, 0.0, count + 1
+    if beta == 0:
+        loop = replace(loop, estimate=Estimate(0), shared=0)
+    zeta = find_poles(loop, np.full(1, alpha), np.full(1, beta))[0] if loop.order else np.zeros(0, complex)
+    return np.concatenate([np.zeros(count, complex), -zeta])
