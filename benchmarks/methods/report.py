@@ -62,6 +62,7 @@ def markdown(rows: Sequence[Row]) -> str:
         "|---|---|",
         "| layout | map: a grid of alpha and beta; scattered: each point has its own device; one: a single point |",
         "| times faster | points per second, divided by those of batched `np.linalg.eigvals` at the same delay |",
+        "| method jit P | the default method inside `jit` in the precision P, for JAX arrays |",
         "| first call | additional time of the first call, mainly for compilation |",
         "| worst error | defined below; `none of N`: no error among N tested points |",
         "",

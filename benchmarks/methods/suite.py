@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from methods import problems
+from methods import precisions, problems
 from methods.baselines import available
 from methods.clock import time_calls
 from methods.problems import Walls
@@ -45,7 +45,7 @@ class Row:
     first_seconds: float  # additional time of the first call: compilation with a cold cache
     rate: float  # points per second, median of later calls
     error: float
-    wrong: int  # number of wrong labels; 0 for other quantities
+    wrong: int  # number of wrong labels, or of radii that are NaN; 0 for other quantities
     checked: int  # number of points at which the error was measured, in extended precision
     baseline: bool = False  # whether the method is an alternative tool
 
@@ -91,6 +91,8 @@ def measure(sizes: Sizes, tell: Callable[[str], None] = lambda _: None) -> list[
         rows += _passive(d, sizes)
         tell(f"d = {d:g}: stiffest wall")
         rows += _ridges(d, sizes)
+        tell(f"d = {d:g}: float32 and mixed precision")
+        rows += _precisions(d, sizes)
     tell("size of the map")
     rows += _growing_maps(sizes)
     return rows
@@ -113,9 +115,11 @@ def label_error(classify: Callable[[Walls], Any], d: float, points: int) -> Erro
 
 
 def radius_error(radius: Callable[[Walls], Any], d: float, points: int) -> Error:
-    """Return the largest relative error of spectral radii."""
+    """Return the largest relative error of spectral radii, and the number of radii that are NaN."""
     walls, exact = problems.with_radius(d, points)
-    return float(np.max(np.abs(np.asarray(radius(walls)) - exact) / exact)), 0, exact.size
+    error = np.abs(np.asarray(radius(walls)) - exact) / exact
+    known = ~np.isnan(error)
+    return float(np.max(error, initial=0.0, where=known)), int((~known).sum()), exact.size
 
 
 def map_error(radius: Any, walls: Walls, checked: int = 2_000) -> Error:
@@ -206,18 +210,21 @@ def _passive(d: float, sizes: Sizes) -> Iterator[Row]:
     yield from _time_layouts("passive", "worst frequency", d, error, lambda walls: is_passive(*walls), points)
 
 
-def ridge_error(d: float, method: RidgeMethod = "newton") -> Error:
+def ridge_error(d: float, find_maximum: Callable[[np.ndarray, float], Any]) -> Error:
     """Return the smallest relative distance at which walls before and beyond alpha_max are proved stable and unstable.
 
     The walls lie on the line from the start of the boundary, (0, -delta), through the maximum, because walls of the
     same beta just below a corner may be unstable.
+
+    Args:
+        d: delay in periods.
+        find_maximum: function of delta and d that returns alpha and beta of the maximum; delta is a float32 number.
     """
     # For stronger damping, the stable range of beta below the corner is narrower than the float64 spacing.
-    delta = np.concatenate([[0.0], 10.0 ** np.linspace(-8, 1, 37)])
-    top = alpha_max(delta, d, method=method)
-    alpha, beta = np.asarray(top.alpha), np.asarray(top.beta)
+    delta = np.float32(np.concatenate([[0.0], 10.0 ** np.linspace(-8, 1, 37)])).astype(float)
+    alpha, beta = (np.asarray(part, float) for part in find_maximum(delta, d)[:2])
     error = np.full(delta.size, np.inf)
-    for distance in (1e-6, 1e-9, 1e-11, 1e-12, 1e-13, 1e-14, 4e-15, 1e-15):
+    for distance in (1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7, 1e-7, 1e-9, 1e-11, 1e-12, 1e-13, 1e-14, 4e-15, 1e-15):
         below, above = (
             decide_stability(scale * alpha, scale * (beta + delta) - delta, delta, d, method="certified")
             for scale in (1 - distance, 1 + distance)
@@ -231,11 +238,33 @@ def _ridges(d: float, sizes: Sizes) -> Iterator[Row]:
     for method, points in cases:
         if not _possible(method, d):
             continue
-        error = ridge_error(d, method)
+        error = ridge_error(d, partial(alpha_max, method=method))
         for layout, count in (("scattered", points), ("one", 1))[: 2 if method == "newton" else 1]:
             delta: Any = 10.0 ** np.linspace(-4, 2, count) if count > 1 else problems.MAP_DELTA
             first, warm = clock(partial(alpha_max, delta, d, method=method))
             yield Row("alpha_max", method, layout, d, count, first, count / warm, *error)
+
+
+def _precisions(d: float, sizes: Sizes) -> Iterator[Row]:
+    """Return one row per question and precision, inside `jit`, for JAX arrays of scattered walls."""
+    walls = problems.scattered(d, sizes.map_points // 4)
+
+    def measured(quantity: str, precision: str, function: Any, dtype: str, points: int, error: Error) -> Row:
+        first, warm = clock(precisions.prepare(function, [part[:points] for part in walls], dtype))
+        return Row(quantity, f"jit {precision}", "scattered", d, points, first, points / warm, *error)
+
+    for precision, (labels, dtype) in precisions.LABELS.items():
+        error = label_error(lambda some, f=labels, t=dtype: precisions.evaluate_walls(f, some, t), d, sizes.checked)
+        yield measured("stable", precision, labels, dtype, walls.points, error)
+    for dtype in ("float64", "float32"):
+        error = radius_error(lambda some, t=dtype: precisions.evaluate_walls(spectral_radius, some, t), d, sizes.roots)
+        yield measured("spectral_radius", dtype, spectral_radius, dtype, walls.points // 16, error)
+
+        def find_maximum(delta: Any, d: Any, dtype: str = dtype) -> Any:
+            return precisions.prepare(alpha_max, (delta, d), dtype)()
+
+        error = ridge_error(d, find_maximum)
+        yield measured("alpha_max", dtype, precisions.find_alpha, dtype, walls.points // 4, error)
 
 
 def _growing_maps(sizes: Sizes) -> Iterator[Row]:

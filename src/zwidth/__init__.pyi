@@ -1,5 +1,8 @@
 """Every public name, once: what loads it on first use, and what type checkers read."""
 
+from .analysis.admittance import AdmittanceDisplay as AdmittanceDisplay
+from .analysis.admittance import EnvironmentLimit as EnvironmentLimit
+from .analysis.admittance import VirtualMassLimit as VirtualMassLimit
 from .analysis.assessment import Assessment as Assessment
 from .analysis.assessment import Limit as Limit
 from .analysis.assessment import assess as assess
@@ -50,7 +53,7 @@ from .identification.safe_wall import SafeWall as SafeWall
 from .model import devices as devices
 from .model.actuator import Actuator as Actuator
 from .model.controller_gains import CascadeGains as CascadeGains
-from .model.controller_gains import Controller as Controller
+from .model.controller_gains import ControllerParts as ControllerParts
 from .model.controller_gains import PidGains as PidGains
 from .model.controller_gains import cascade as cascade
 from .model.controller_gains import cascade_gains as cascade_gains

@@ -63,6 +63,12 @@ def test_small_run_measures_every_method(rows):
         *(("spectral_radius", f"map to {accuracy}") for accuracy in ("0.01", "0.0001", "1e-06", "1e-09")),
         ("passive", "worst frequency"),
         ("alpha_max", "newton"),
+        *(("stable", f"jit {precision}") for precision in ("float64", "float32", "mixed")),
+        *(
+            (quantity, f"jit {dtype}")
+            for quantity in ("spectral_radius", "alpha_max")
+            for dtype in ("float64", "float32")
+        ),
     }
     assert {row.method for row in rows if row.baseline} == set(available())
     for row in rows:

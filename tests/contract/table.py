@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contract.cases import CASES, DOMAINS, OTHERS, Case
+from contract.cases import CASES, DOMAINS, OTHERS, SINGLE_ERROR, Case
 from contract.matrix import EVERY_CASE, combinations
 
 _HEAD = """# Contract of the public functions
@@ -30,14 +30,15 @@ and which derivatives it has. `scripts/refresh_contract.py` writes the page from
   raise this error as well.
 - **Inside `jit`, `vmap` and `grad`, with x64 enabled.** Values and statuses agree with those of direct calls to 1e-11.
   Bad points have the results described above.
-- **Inside `jit`, without x64.** Float32 values agree with those of direct calls to 2e-3 at moderate points, and the
-  statuses are the same. Results outside the domain are NaN.
+- **Inside `jit`, without x64.** At the valid points of the tests, float32 values agree with those of direct calls to
+  {single:.1e}, relative and absolute, and the statuses are the same. Results outside the domain are NaN. The page [how
+  to choose](how-to-choose.md#precision) lists the errors near and far from the stability boundary. For walls near
+  the boundary, `tests/contract/test_float32.py` compares these errors with bounds.
 - **Derivatives** are finite at good points and NaN at bad points. The tests of the contract cover the first
   derivatives. The tests of each function cover the second derivatives, and the first derivatives of {elsewhere}.
 - **On devices of JAX.** Direct calls with JAX arrays are computed by compiled code on the devices of these arrays, and
   their results stay there, also if an array is distributed over several devices (`tests/contract/test_devices.py`).
-  The exceptions compute on the host: `count_poles`, `decay_rate`, `decide_stability`, `dominant_pole`,
-  `spectral_radius`, and `is_stable` with `method="certified"`.
+  The method "certified" of `is_stable` and `decide_stability` computes on the host.
 
 The domains of finite arguments are:
 
@@ -55,7 +56,7 @@ def build_page() -> str:
     elsewhere = ", ".join(f"`{case.name}`" for case in CASES if case.gradient_in)
     domains = "".join(f"| {name} | {description} |\n" for name, description in DOMAINS.items())
     number = sum(1 for case in EVERY_CASE for _ in combinations(case))
-    head = _HEAD.format(elsewhere=elsewhere, domains=domains, combinations=number)
+    head = _HEAD.format(elsewhere=elsewhere, domains=domains, combinations=number, single=SINGLE_ERROR)
     others = "".join(f"| `{name}` | {tests} |\n" for name, tests in sorted(OTHERS.items()))
     others_heading = (
         "The following functions are not covered by the tests above, because they do not compute their results\n"

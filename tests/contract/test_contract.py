@@ -13,7 +13,7 @@ from mpmath import mpf
 
 import oracles
 import zwidth
-from contract.cases import CASES, OTHERS
+from contract.cases import CASES, OTHERS, SINGLE_ERROR
 from contract.traced import (
     ROWS,
     compile_case,
@@ -283,7 +283,7 @@ def test_without_x64_results_are_float32_with_equal_statuses(case):
     for name, value in compute_float32(find_family(case.name))[case.name].items():
         assert value.dtype in (jnp.float32, jnp.complex64, jnp.bool_, jnp.int32), name
         if value.dtype.kind in "fc":
-            np.testing.assert_allclose(value, direct[name], rtol=case.single, atol=case.single, err_msg=name)
+            np.testing.assert_allclose(value, direct[name], rtol=SINGLE_ERROR, atol=SINGLE_ERROR, err_msg=name)
         else:
             np.testing.assert_array_equal(value, direct[name], err_msg=name)
 

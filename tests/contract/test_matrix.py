@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import zwidth
+from contract.cases import SINGLE_ERROR
 from contract.matrix import (
     ALL,
     DIFFERENTIATED,
@@ -43,7 +44,7 @@ def test_every_argument_type_in_every_transformation(case):
             if expected.dtype.kind == "c":
                 # The order of the poles is unspecified.
                 leaves[name], expected = np.sort_complex(leaves[name]), np.sort_complex(expected)
-            tolerance = 1e-11 if exact else case.single
+            tolerance = 1e-11 if exact else SINGLE_ERROR
             np.testing.assert_allclose(
                 *np.broadcast_arrays(leaves[name], expected), rtol=tolerance, atol=tolerance, err_msg=f"{name}: {entry}"
             )

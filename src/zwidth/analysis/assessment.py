@@ -21,6 +21,8 @@ from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError
 from zwidth.core.status import RidgeKind, Status
 from zwidth.model.checks import Span
+from zwidth.model.feedback import Feedback
+from zwidth.model.position import Observer, PositionFilter
 from zwidth.model.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
 from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.results import Margins
@@ -386,6 +388,10 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
     """
     if isinstance(scene.velocity, VelocityFilter) or getattr(scene.device, "dt", None) is not None:
         return False
+    if isinstance(scene.feedback, Feedback) or isinstance(scene.position, PositionFilter | Observer):
+        return False
+    if getattr(scene.position, "coefficient", None) is not None:
+        return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
     later = scene.d if scene.timing.in_periods else 2 * scene.d
     return 2 * window + later <= scene.loop.most_periods
@@ -401,6 +407,8 @@ def _double_rate(scene: SceneOptima) -> SceneOptima:
         changes["velocity.samples"] = scene.velocity.samples * 2
     if not isinstance(scene.velocity, VelocityFilter | FOAW) and scene.velocity.coded_period is not None:
         changes["velocity.coded_period"] = scene.velocity.coded_period / 2
+    if (coded_period := getattr(scene.position, "coded_period", None)) is not None:
+        changes["position.coded_period"] = coded_period / 2
     return scene.replace(**changes)
 
 

@@ -171,14 +171,16 @@ def _at_angle(meet: Callable[..., list[Taylor]], unknowns: list[float], w: float
 
 
 def _meet_gain(terms: LoopTerms, alpha: Taylor, beta: Taylor, gain: Taylor, w: Taylor) -> list[Taylor]:
-    """Return the equations for a pole on the unit circle, at the angle w, if K and B are multiplied by ``gain``."""
-    return split(terms.residual(alpha * gain, beta * gain, w * 1j)[0])
+    """Return the equations for a pole on the unit circle, at the angle w, if all gains are multiplied by ``gain``."""
+    r, _, _ = terms.residual(alpha * gain, beta * gain, w * 1j)
+    scale = abs(terms.controller(w * 1j)[0].v)
+    return split(r + terms.feedback(w * 1j)[0] * (gain - 1.0) / scale)
 
 
 def _meet_phase(terms: LoopTerms, alpha: Taylor, beta: Taylor, angle: Taylor, w: Taylor) -> list[Taylor]:
     """Return the equations for a gain crossover (|L| = 1) at the angle w, where -L has the phase ``angle``."""
-    q, f = terms.controller(w * 1j)[0], terms.estimate(w * 1j)[0]
-    return split(((alpha + beta * f) * (angle * -1j).exp() - q) / abs(q.v))
+    q, f, rest = terms.controller(w * 1j)[0], terms.estimate(w * 1j)[0], terms.feedback(w * 1j)[0]
+    return split(((alpha + beta * f + rest) * (angle * -1j).exp() - q - rest) / abs(q.v))
 
 
 def _meet_delay(terms: LoopTerms, alpha: Taylor, beta: Taylor, delay: Taylor, w: Taylor) -> list[Taylor]:
@@ -189,8 +191,10 @@ def _meet_delay(terms: LoopTerms, alpha: Taylor, beta: Taylor, delay: Taylor, w:
 def _meet_distance(terms: LoopTerms, alpha: Taylor, beta: Taylor, distance: Taylor, w: Taylor) -> list[Taylor]:
     """Return the equations for the smallest distance of L from -1, which is attained at the angle w."""
     (q, q_slope), (f, f_slope) = terms.controller(w * 1j), terms.estimate(w * 1j)
-    L = -(alpha + beta * f) / q
-    slope = (-(beta * f_slope) - L * q_slope) / q
+    rest, rest_slope = terms.feedback(w * 1j)
+    q, q_slope = q + rest, q_slope + rest_slope
+    L = -(alpha + beta * f + rest) / q
+    slope = (-(beta * f_slope) - rest_slope - L * q_slope) / q
     difference = L + 1.0
     square = difference.real * difference.real + difference.imag * difference.imag
     return [distance - square.sqrt(), (difference.conjugate() * slope * 1j).real]

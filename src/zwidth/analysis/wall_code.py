@@ -1,8 +1,13 @@
-"""Source code of a wall with its velocity estimate for a control loop, in C or in Python.
+"""Source code of a wall with its estimates and further feedback for a control loop, in C or in Python.
 
-The velocity estimate is a difference over a window, followed by sections of first and second order in powers of
-``zeta = z - 1``. A filter that is slow compared with the sampling rate has poles close to z = 1, so coefficients in
-powers of z would lose digits. A second-order section
+From the measured position x, the program computes the position estimate y and the velocity estimate v. Inside of the
+wall, y > 0, it computes the force ``-(K y + B v + r)`` with the force r of the further feedback (`model.feedback`).
+Outside of the wall the force is 0, and the states of the further feedback are set to 0.
+
+The velocity estimate is a difference over a window, followed by a filter. The position estimate and the further
+feedback are filters. A filter consists of sections of first and second order in powers of ``zeta = z - 1``. A filter
+that is slow compared with the sampling rate has poles close to z = 1, so coefficients in powers of z would lose digits.
+A second-order section
 
     (b2 zeta^2 + b1 zeta + b0)/(zeta^2 + a1 zeta + a0)
 
@@ -24,7 +29,8 @@ import numpy as np
 from zwidth.analysis.base import SceneParts
 from zwidth.core.errors import InputError, check_choice
 from zwidth.model.estimate import Estimate
-from zwidth.model.loop_estimates import refuse_estimates
+from zwidth.model.loop_estimates import LoopEstimates, build_estimates
+from zwidth.model.position import has_velocity
 from zwidth.units.formatting import format_wall, with_unit
 from zwidth.units.unit_system import UnitSystem
 
@@ -57,7 +63,7 @@ def _describe_cautions(scene: SceneParts, cautions: Sequence[str]) -> list[str]:
 
 
 def find_sections(estimate: Estimate) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Return the sections of a velocity estimate, which follow its difference over a window.
+    """Return the sections of the filter of an estimate; they follow its difference over a window.
 
     Returns:
         Numerator and denominator of each section in powers of zeta, highest power first, both of the same length 2
@@ -104,10 +110,15 @@ class WallProgram(NamedTuple):
 
     head: str  # comment at the head of the program
     window: int  # length of the difference in periods; 0 for none
-    states: list[str]  # names of the states of the sections
-    start: list[str]  # statements that set the states to those at rest
-    force: list[str]  # statements that compute the velocity v from the position x
+    memory: str  # variable of the positions from which the velocity is estimated: "x", or "y" for the estimate
+    states: list[str]  # names of the states of the sections, and of the last position
+    begin: list[str]  # statements that set the states of the position estimate to those at rest
+    start: list[str]  # statements that set all other states to those at rest
+    force: list[str]  # statements that compute position and velocity estimate from the position x
+    reset: list[str]  # statements that set the states of the further feedback to 0
+    feedback: list[str]  # statements that compute the force r of the further feedback
     law: str  # expression of the force
+    depth: str  # variable of the position estimate: "x" or "y"
     max_force: float  # largest force; infinite for none
     system: UnitSystem  # units of the device
 
@@ -130,59 +141,126 @@ def write_wall(
     return _write_c(program) if language == "c" else _write_python(program)
 
 
-def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: float = math.inf) -> WallProgram:
-    """Build the program, as statements for either language, that computes the force of the wall of a scene."""
-    refuse_estimates(scene, "wall_code")
-    period = float(scene.timing.period)
-    estimate = scene.velocity.estimate(period)
-    count, gain = estimate.window, float(estimate.gain) / period
-    if count > 1:
-        force = [f"u = (x - @past[@next]) / {count}", "@past[@next] = x", f"@next = (@next + 1) % {count}"]
-    else:
-        force = ["u = x - @x" if count else "u = x", "@x = x"]
-    # Start at rest. The output of a difference is then 0, and so are the states of all sections after it. Without a
-    # difference the first section has the constant input u = x.
-    sections = find_sections(estimate)
-    start, states = [] if count or not sections else ["u = x"], []
-    for number, (numerator, denominator) in enumerate(sections):
-        *inner, last = names = [f"@{name}{number}" for name in "pq"[3 - len(denominator) :]]
+class FilterCode(NamedTuple):
+    """Statements of a filter, whose input and output are the variable u."""
+
+    states: list[str]  # names of the states
+    start: list[str]  # statements that set the states to those for a constant input u, and u to the constant output
+    update: list[str]  # statements that compute the output from the input
+    gain: float  # factor by which the output still has to be multiplied
+
+
+def write_filter(estimate: Estimate, prefix: str = "") -> FilterCode:
+    """Return the statements of the filter of an estimate, without its difference over a window.
+
+    Args:
+        estimate: the estimate.
+        prefix: first part of the names of the states.
+    """
+    states, start, update, gain = [], [], [], float(estimate.gain)
+    for number, (numerator, denominator) in enumerate(find_sections(estimate)):
+        *inner, last = names = [f"@{prefix}{name}{number}" for name in "pq"[3 - len(denominator) :]]
         states += [name[1:] for name in names]
-        start += [f"{name} = 0.0" for name in inner] + [f"{last} = " + ("0.0" if count else f"u / {denominator[-1]!r}")]
-        start += [] if count or number == len(sections) - 1 else [f"u = {numerator[-1]!r} * {last}"]
+        start += [f"{name} = 0.0" for name in inner]
         if numerator == (1.0, 1.0) and denominator[-1] != 0:
             # Write a section with a zero at z = 0 as q += a0 (u - q), the usual form of a first-order low-pass filter.
-            force += [f"{last} += {denominator[-1]!r} * (u - {last})", f"u = {last}"]
-            start = [line if line != f"{last} = u / {denominator[-1]!r}" else f"{last} = u" for line in start]
+            update += [f"{last} += {denominator[-1]!r} * (u - {last})", f"u = {last}"]
+            start.append(f"{last} = u")
             gain /= denominator[-1]
             continue
-        feedback = "".join(f" - {factor!r} * {name}" for factor, name in zip(denominator[1:], names, strict=True))
+        # A pole at z = 1 has no constant output for a constant input; its states start at 0.
+        start += [f"{last} = u / {denominator[-1]!r}", f"u = {numerator[-1]!r} * {last}"] if denominator[-1] else []
+        pairs = zip(denominator[1:], names, strict=True)
+        feedback = "".join(f" - {factor!r} * {name}" for factor, name in pairs if factor)
         terms = [f"{factor!r} * {name}" for factor, name in zip(numerator, ("w", *names), strict=True) if factor]
-        force += [f"w = u{feedback}", f"u = {' + '.join(terms)}", *(f"{last} += {name}" for name in inner)]
-        force.append(f"{names[0]} += w")
+        update += [f"w = u{feedback}", f"u = {' + '.join(terms)}", *(f"{last} += {name}" for name in inner)]
+        update.append(f"{names[0]} += w")
+    return FilterCode(states, start, update, gain)
+
+
+def _reset(states: Sequence[str]) -> list[str]:
+    """Return the statements that set states to 0."""
+    return [f"@{name} = 0.0" for name in states]
+
+
+def _omit_output(start: list[str]) -> list[str]:
+    """Return statements without those at the end that only compute u."""
+    while start and start[-1].startswith("u = "):
+        start = start[:-1]
+    return start
+
+
+def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: float = math.inf) -> WallProgram:
+    """Build the program, as statements for either language, that computes the force of the wall of a scene."""
+    period, position, further = float(scene.timing.period), scene.position, scene.feedback
+    estimates = build_estimates(scene) or LoopEstimates(velocity=scene.velocity.estimate(period))
+    states, begin, force = [], [], []
+    depth = "x" if position is None else "y"
+    memory = depth if estimates.structure == "series" else "x"
+    if position is not None:
+        code = write_filter(estimates.position, "position_")
+        states, output = code.states, f"y = {code.gain!r} * u"
+        force = ["u = x", *code.update, output]
+        begin = ["u = x", *code.start, output] if memory == "y" else _omit_output(["u = x", *code.start])
+    count, code = estimates.velocity.window, write_filter(estimates.velocity)
+    if count > 1:
+        force += [f"u = ({memory} - @past[@next]) / {count}", f"@past[@next] = {memory}"]
+        force.append(f"@next = (@next + 1) % {count}")
+    else:
+        force += [f"u = {memory} - @{memory}" if count else f"u = {memory}", f"@{memory} = {memory}"]
+    # Start at rest. The output of a difference is then 0, and so are the states of all sections after it. Without a
+    # difference the first section has the constant input.
+    start = _reset(code.states) if count else _omit_output([f"u = {memory}", *code.start])
+    states = code.states + states
+    force += [*code.update, f"v = {code.gain / period!r} * u"]
     K, B, system = float(scene.wall.stiffness), float(scene.wall.virtual_damping), scene.unit_system
-    estimator = f"velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}"
-    limited = f" {'Torque' if system.rotary else 'Force'} limited to {with_unit(max_force, system['N'])}."
-    wall = f"Virtual wall: {format_wall(K, B, system)}, {estimator}.{limited if max_force < math.inf else ''}"
-    head, law = "\n".join([wall, *_describe_cautions(scene, cautions)]), f"-({K!r} * x + {B!r} * v)"
-    return WallProgram(head, count, states, start, [*force, f"v = {gain!r} * u"], law, float(max_force), system)
+    law, reset, feedback = f"{K!r} * {depth} + {B!r} * v", [], []
+    if further is not None:
+        code = write_filter(further.estimate(1.0, period), "feedback_")
+        states, reset = states + code.states, _reset(code.states)
+        pairs = (further.position, depth), (further.velocity, "v")
+        terms = [f"{weight!r} * {name}" for weight, name in pairs if weight is not None]
+        feedback = [f"u = {' + '.join(terms) or 'x'}", *code.update, f"r = {code.gain!r} * u"]
+        start += reset
+        law += " + r"
+    estimator = f"velocity by {type(position if has_velocity(position) else scene.velocity).__name__}"
+    force_name = "torque" if system.rotary else "force"
+    limited = f" {force_name.capitalize()} limited to {with_unit(max_force, system['N'])}."
+    wall = f"Virtual wall: {format_wall(K, B, system)}, {estimator}, {with_unit(1.0 / period, 'Hz')}."
+    lines = [wall + (limited if max_force < math.inf else "")]
+    if position is not None:
+        lines.append(f"The position estimate y is computed by {type(position).__name__}; the wall is touched if y > 0.")
+    if further is not None:
+        name = type(further).__name__
+        lines.append(f"The {force_name} r of {name} is added inside of the wall; its states are 0 outside of the wall.")
+    head = "\n".join([*lines, *_describe_cautions(scene, cautions)])
+    return WallProgram(
+        head, count, memory, states, begin, start, force, reset, feedback, f"-({law})", depth, float(max_force), system
+    )
 
 
 def _write_c(program: WallProgram) -> str:
     """Return the source code of a program in C99, with a struct for its states and two functions."""
-    count = program.window
-    members = [f"double past[{count}]", "int next"] if count > 1 else ["double x"]
-    begin = [f"for (int k = 0; k < {count}; k++) wall->past[k] = x", "wall->next = 0"] if count > 1 else ["wall->x = x"]
-    limit, law = program.max_force, [f"return x > 0.0 ? {program.law} : 0.0"]
+    count, memory = program.window, program.memory
+    members = [f"double past[{count}]", "int next"] if count > 1 else [f"double {memory}"]
+    fill = [f"for (int k = 0; k < {count}; k++) @past[k] = {memory}", "@next = 0"]
+    start = [*program.begin, *(fill if count > 1 else [f"@{memory} = {memory}"]), *program.start]
+    limit, law, inside = program.max_force, program.law, f"{program.depth} > 0.0"
+    lines = program.force
+    if program.feedback:
+        outside = "".join(f"        {line};\n" for line in [*program.reset, "return 0.0"])
+        lines = [*lines, f"if (!({inside})) {{\n{outside}    }}", *program.feedback]
+    else:
+        law = f"{inside} ? {law} : 0.0"
     if limit < math.inf:
-        law = [
-            f"f = x > 0.0 ? {program.law} : 0.0",
-            f"return f > {limit!r} ? {limit!r} : f < -{limit!r} ? -{limit!r} : f",
-        ]
-    lines = [*program.force, *law]
-    names = [name for name in "uvwf" if any(line.startswith(f"{name} =") for line in lines)]
-    start = [*(["double u"] if "u = x" in program.start else []), *begin, *program.start]
-    force = [f"double {', '.join(names)}", *lines]
-    blocks = ["\n".join(f"    {line.replace('@', 'wall->')};" for line in lines) for lines in (start, force)]
+        law = f"f > {limit!r} ? {limit!r} : f < -{limit!r} ? -{limit!r} : f"
+        lines = [*lines, f"f = {program.law if program.feedback else f'{inside} ? {program.law} : 0.0'}"]
+    blocks = []
+    for block in (start, [*lines, f"return {law}"]):
+        names = [name for name in "uvwfyr" if any(line.startswith(f"{name} =") for line in block)]
+        declared = [f"double {', '.join(names)}", *block] if names else block
+        text = "\n".join(f"    {line}" + ("" if line.endswith("}") else ";") for line in declared)
+        blocks.append(text.replace("@", "wall->"))
     members_text = "\n".join(f"    {line};" for line in (*members, *(f"double {name}" for name in program.states)))
     comment = "\n   ".join(
         [
@@ -198,11 +276,16 @@ def _write_c(program: WallProgram) -> str:
 
 def _write_python(program: WallProgram) -> str:
     """Return the source code of a program as a Python class with the method ``force``."""
-    count = program.window
-    begin = [f"@past = [x] * {count}", "@next = 0"] if count > 1 else ["@x = x"]
-    limit, law = program.max_force, program.law
+    count, memory = program.window, program.memory
+    fill = [f"@past = [{memory}] * {count}", "@next = 0"] if count > 1 else [f"@{memory} = {memory}"]
+    limit, law, inside = program.max_force, program.law, f"{program.depth} > 0.0"
     law = law if limit == math.inf else f"max(-{limit!r}, min({limit!r}, {law}))"
-    force = [*program.force, f"return {law} if x > 0.0 else 0.0"]
+    force = program.force
+    if program.feedback:
+        outside = [f"    {line}" for line in [*program.reset, "return 0.0"]]
+        force = [*force, f"if not {inside}:", *outside, *program.feedback, f"return {law}"]
+    else:
+        force = [*force, f"return {law} if {inside} else 0.0"]
     docstring = "\n    ".join(
         [
             '    """' + program.head.replace("\n", "\n    ") + "\n",
@@ -212,6 +295,8 @@ def _write_python(program: WallProgram) -> str:
         ]
     )
     heads = "    def __init__(self, x=0.0):", "    def force(self, x):"
-    blocks = ["\n".join(f"        {line}" for line in lines) for lines in ([*begin, *program.start], force)]
+    blocks = [
+        "\n".join(f"        {line}" for line in lines) for lines in ([*program.begin, *fill, *program.start], force)
+    ]
     functions = [f"{head}\n{block}\n".replace("@", "self.") for head, block in zip(heads, blocks, strict=True)]
     return "\n".join([f"class Wall:\n{docstring}\n", *functions])

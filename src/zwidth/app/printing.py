@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from zwidth.model.measured_device import MeasuredDevice
-from zwidth.model.parameter_paths import find_parts
+from zwidth.model.parameter_paths import WITH_KIND, find_parts
 from zwidth.model.wall import NoWall
 from zwidth.units.formatting import plain, short, to_json, with_unit
-from zwidth.units.quantities import PARAMETERS
+from zwidth.units.quantities import FIELDS
 
 if TYPE_CHECKING:
     from zwidth.analysis.assessment import Assessment
@@ -91,8 +91,9 @@ def format_parts(scene: Scene) -> list[str]:
     """Return a printed line for each part of a scene except the rigid device, in order from the motor to the hand."""
     lines = []
     velocity = type(scene.velocity).__name__
+    with_kind = ("velocity", *WITH_KIND)
     parts, values = find_parts(scene), scene.parameters()
-    for name in (name for name in dict.fromkeys(("velocity", "actuator", "coupling", *parts)) if name in parts):
+    for name in (name for name in dict.fromkeys((*with_kind, "actuator", "coupling", *parts)) if name in parts):
         part_values = {path: value for path, value in values.items() if path.startswith(f"{name}.")}
         if name == "velocity" and velocity == "BackwardDifference" and not part_values:
             continue
@@ -106,14 +107,14 @@ def format_parts(scene: Scene) -> list[str]:
             words.append(f"sensor at the {parts[name].sensor}")
         if name == "tool":
             words.append(f"{parts[name].integrator} Euler")
-        words = [velocity, *words] if name == "velocity" else words
+        words = [type(parts[name]).__name__, *words] if name in with_kind else words
         lines.append(format_line(name.replace("modes.", "mode "), ", ".join(words)))
     return lines
 
 
 def get_unit(path: str) -> str:
     """Return the SI unit of a parameter of a linear device by its path; "" for numbers without a unit."""
-    return PARAMETERS[path].unit.removeprefix("1") if path in PARAMETERS else ""
+    return FIELDS[path].unit.removeprefix("1") if path in FIELDS else ""
 
 
 def name_verdict(verdict: Assessment) -> str:

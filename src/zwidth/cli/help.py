@@ -17,6 +17,7 @@ GROUPS = {
     "Timing": ("--period", "--rate", "--delay"),
     OWN: (),
     "Velocity estimate": ("--velocity-",),
+    "Position estimate and further feedback": ("--position-", "--feedback-"),
     "Encoder, friction and motor": ("--resolution", "--friction", "--static-friction", "--max-force", "--max-rate"),
     "Hand": ("--operator-",),
     "Simulated tool": ("--tool-",),

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -20,19 +20,18 @@ import click
 from zwidth.app.printing import format_row
 from zwidth.cli.help import OF_SCENE as OF_SCENE
 from zwidth.cli.help import show_example as show_example
-from zwidth.cli.velocity import FILTER_HELP, list_needed, make_velocity, name_option
+from zwidth.cli.parts import FILTER_HELP, change_kind, make_kind, make_part, name_option, select_part
 from zwidth.core.errors import InputError
 from zwidth.model.checks import Span, find_kind, read_span
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.mode import Mode
-from zwidth.model.parameter_paths import PARTS, find_parts, spell_part
+from zwidth.model.parameter_paths import PARTS, WITH_KIND, find_parts
 from zwidth.model.timing import Timing
-from zwidth.model.velocity import name_estimate
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.units.parsing import DIMENSIONS, detect_kind, looks_like_number, read_quantity, read_share
 from zwidth.units.plausibility import list_implausible
-from zwidth.units.quantities import ANY, CHOICES, HARDWARE, OF_PARTS, PARAMETERS, Range
+from zwidth.units.quantities import ANY, CHOICES, FIELDS, HARDWARE, OF_ESTIMATES, OF_PARTS, PARAMETERS, Range
 from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 if TYPE_CHECKING:
@@ -47,15 +46,13 @@ BOTH_PERIODS = "--period and --rate are both given; give only one of them"
 Command: TypeAlias = Callable[..., Any]
 
 # Names of the parts of a scene; and the paths of the parameters of all parts, sorted by part.
-_PART_NAMES = tuple(dict.fromkeys(path.rpartition(".")[0] for path in OF_PARTS))
-_PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
+_PART_NAMES = tuple(dict.fromkeys(("velocity", *WITH_KIND, *(path.rpartition(".")[0] for path in OF_PARTS))))
+_PARTS = sorted((*CHOICES, *OF_PARTS, *OF_ESTIMATES), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
 # Parts that cannot be added to a linear system or a measured response, because such a device includes them.
 _CONTAINED = ("operator", "coupling", "actuator", "modes")
 # Names of the structural modes among the parts: "modes.0", "modes.1" and so on.
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
 _BARE = {"mass", "damping"}  # parameters of a rigid device
-# Parameters of a low-pass filter that exclude each other; one of them must be given.
-_ONE_OF_TWO = {"cutoff", "time_constant"}
 
 
 class Parsed(click.ParamType):
@@ -156,9 +153,9 @@ def _add_option(command: Command, path: str) -> Command:
     if path in CHOICES:
         kind, text = click.Choice(CHOICES[path].names), CHOICES[path].sentence
     else:
-        parameter = PARAMETERS[path]
+        parameter = FIELDS[path]
         # Skip the range check of parameters of parts, because the constructors of the parts check them.
-        allowed = ANY if path in OF_PARTS else parameter.allowed
+        allowed = ANY if "." in path else parameter.allowed
         kind = click.INT if parameter.whole else quantity_type(parameter.unit, allowed)
         kind = Parsed("quantity", _read_delay) if path == "delay" else kind
         unit, note = (
@@ -298,19 +295,14 @@ def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
     if isinstance(device, PublishedDevice):
         _check_published(device, given)
         changes["device"] = device.to_device(**{name: changes.pop(name) for name in _BARE & changes.keys()})
-    if part_values := _select_part(given, "velocity"):
-        same = "kind" not in part_values and part_values.keys() <= {item.name for item in fields(scene.velocity)}
-        kept = {"kind": name_estimate(scene.velocity), **spell_part(scene.velocity)} if same else {}
-        if part_values.keys() & _ONE_OF_TWO:
-            # A low-pass has either a cutoff or a time constant. If an option gives one of the two, drop both values of
-            # the file.
-            kept = {name: value for name, value in kept.items() if name not in _ONE_OF_TWO}
-        changes["velocity"] = make_velocity({**kept, **part_values})
+    for owner in ("velocity", *WITH_KIND):
+        if part_values := select_part(given, owner):
+            changes[owner] = change_kind(owner, getattr(scene, owner), part_values)
     parts = {} if device else find_parts(scene)
     modes = list(() if device else scene.device.modes)
     for name, kind in {**PARTS, **dict.fromkeys(_MODES, Mode)}.items():
-        if part_values := _select_part(given, name):
-            part = replace(parts[name], **part_values) if name in parts else _make_part(name, kind, part_values)
+        if part_values := select_part(given, name):
+            part = replace(parts[name], **part_values) if name in parts else make_part(name, kind, part_values)
             if kind is not Mode:
                 changes[name] = part
             elif name in parts:
@@ -350,11 +342,12 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
         return {name: given[name] for name in names if name in given}
 
     parts: dict[str, Any] = {
-        name: _make_part(name, kind, part_values)
+        name: make_part(name, kind, part_values)
         for name, kind in PARTS.items()
-        if (part_values := _select_part(given, name))
+        if (part_values := select_part(given, name))
     }
-    modes = [_make_part(name, Mode, part_values) for name in _MODES if (part_values := _select_part(given, name))]
+    parts |= {name: make_kind(name, part_values) for name in WITH_KIND if (part_values := select_part(given, name))}
+    modes = [make_part(name, Mode, part_values) for name in _MODES if (part_values := select_part(given, name))]
     parts |= {"modes": modes} if modes else {}
     timing = Timing
     if device is None:
@@ -367,7 +360,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
                 f"{name_option(path)}: the given --device already contains it; give only one of the two"
             )
     wall = VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0))
-    velocity = make_velocity(_select_part(given, "velocity"))
+    velocity = make_kind("velocity", select_part(given, "velocity"))
     return Scene(device, timing(**select("period", "rate", "delay")), wall, velocity).replace(**parts)
 
 
@@ -377,21 +370,6 @@ def _check_published(device: PublishedDevice, given: dict[str, Any], more: Seque
     flags = [*(remedies[name] for name in device.list_missing(given)), *more]
     if flags:
         raise click.UsageError(f"--device {device.name}: also give {', '.join(flags)}; not published for this device")
-
-
-def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
-    """Return a part of class ``kind`` with the given fields; raise `click.UsageError` if a field is missing."""
-    needed = list_needed(kind)
-    for key in needed:
-        if key not in given:
-            fields_needed = " and ".join(f"a {each}" for each in needed)
-            raise click.UsageError(f"a {name} requires {fields_needed}; give {name_option(f'{name}.{key}')}")
-    return kind(**given)
-
-
-def _select_part(given: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the parameters of one part from the options, as a dict by field name."""
-    return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
 
 
 figure_option = click.option(

@@ -19,10 +19,9 @@ from zwidth.cli.options import (
     change_scene,
     get_hardware,
     get_options_with_kind,
-    make_velocity,
-    name_option,
     take_options,
 )
+from zwidth.cli.parts import make_kind, name_option, select_part
 from zwidth.model.checks import find_kind
 from zwidth.units.log_columns import OF_LOGS
 from zwidth.units.quantities import CHOICES, OF_PARTS
@@ -66,11 +65,7 @@ def _make_loop(given: dict[str, Any], _: UnitSystem) -> RecordLoop:
     changes = {path: value for path, value in given.items() if path.startswith("velocity.")}
     if scene is not None:
         return RecordLoop(period, change_scene(scene, changes).velocity, scene)
-    return RecordLoop(
-        period,
-        make_velocity({path.removeprefix("velocity."): value for path, value in changes.items()}) if changes else None,
-        None,
-    )
+    return RecordLoop(period, make_kind("velocity", select_part(changes, "velocity")) if changes else None, None)
 
 
 def _is_scene(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Models of the optional parts of a scene: velocity estimate, operator, coupling, actuator, modes and safe limit.
+"""Models of the optional parts of a scene, such as estimates, further feedback, operator, coupling and modes.
 
 Parts are those in addition to the device and its timing. The model of a section is generated from the dataclass of
 the part in `zwidth.model`: its fields are the keys, and `units.quantities` declares their units and ranges. The part
@@ -7,7 +7,7 @@ itself validates combinations of values.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import MISSING, fields
 from functools import cached_property
@@ -30,13 +30,14 @@ from zwidth.config.values import Quantity, read_entries
 from zwidth.core.errors import InputError
 from zwidth.model.checks import find_range
 from zwidth.model.mode import Mode
-from zwidth.model.parameter_paths import PARTS
+from zwidth.model.parameter_paths import PARTS, WITH_KIND
+from zwidth.model.rational_filter import RationalFilter
 from zwidth.model.safe_limit import SafeLimit
 from zwidth.model.velocity import ESTIMATES, FOAW
 from zwidth.units.formatting import describe
 from zwidth.units.quantities import CHOICES, FIELDS, NOT_NEGATIVE
 
-PART_NAMES = ("velocity", *PARTS, "modes")
+PART_NAMES = ("velocity", *WITH_KIND, *PARTS, "modes")
 
 # Texts that are reported if FOAW, an adaptive velocity estimate, is given but a linear estimate is required: reason and
 # remedy.
@@ -135,10 +136,16 @@ def make_section(part: Any, owner: str, noun: str, kind: str = "") -> type[PartS
     """
     keys: Any = {"kind": (Literal[kind], ...)} if kind else {}  # pyright: ignore[reportInvalidTypeForm]
     for item in fields(part):
-        form, description = _describe(f"{owner}.{item.name}", item)
+        form, description = _describe(f"{owner}.{item.name}", item, part)
         default: Any = ... if item.default is MISSING else item.default
         keys[item.name] = (form | None if default is None else form, Field(default, description=description))
-    section = create_model(f"{part.__name__}Section", __base__=PartSection, __doc__=_head(part), **keys)
+    prefix, description = "", _head(part)
+    if owner == "position" and part in ESTIMATES.values():
+        # Name and describe a velocity filter differently as a position estimate, which has no difference. The names of
+        # the models in a schema are unique.
+        prefix, description = "Position", description.removeprefix("The backward difference, followed by ")
+        description = description[0].upper() + description[1:]
+    section = create_model(f"{prefix}{part.__name__}Section", __base__=PartSection, __doc__=description, **keys)
     section.noun, section.part = noun, part
     return section
 
@@ -148,31 +155,31 @@ def _head(part: Any) -> str:
     return part.__doc__.partition("\n")[0]
 
 
-# Descriptions of the keys of a velocity filter that is given by its roots or by second-order sections.
+# Descriptions of the keys of a filter that is given by its roots or by second-order sections.
 _ROOTS = {
-    "velocity.sos": "Second-order sections of the filter, rows of the coefficients b0 b1 b2 a0 a1 a2.",
-    "velocity.zeros": "Zeros of the filter in the z plane; complex zeros as text such as '0.9+0.1j', with conjugates.",
-    "velocity.poles": "Poles of the filter, in the same form as the zeros.",
-    "velocity.gain": "Ratio of the leading coefficients; required with poles.",
+    "sos": "Second-order sections of the filter, rows of the coefficients b0 b1 b2 a0 a1 a2.",
+    "zeros": "Zeros of the filter in the z plane; complex zeros as text such as '0.9+0.1j', with conjugates.",
+    "poles": "Poles of the filter, in the same form as the zeros.",
+    "gain": "Ratio of the leading coefficients; required with poles.",
 }
 
 
-def _describe(path: str, item: Any) -> tuple[Any, str]:
+def _describe(path: str, item: Any, part: Any) -> tuple[Any, str]:
     """Return the type annotation of a key, and its description for the schema.
 
-    ``path`` is the name of the key in `units.quantities`, ``item`` the field of the dataclass.
+    ``path`` is the name of the key in `units.quantities`, ``item`` the field of the dataclass ``part``.
     """
     if path in CHOICES:
         return Literal[CHOICES[path].names], f"{CHOICES[path].sentence}."
-    if path in _ROOTS:
-        return Numbers, _ROOTS[path]
+    if issubclass(part, RationalFilter) and item.name in _ROOTS:
+        return Numbers, _ROOTS[item.name]
     if path not in FIELDS:
         description = f"Coefficients of the {path.rpartition('.')[2]}, highest power of z first"
         return Coefficients, f"{description}, or a list of sections in series."
     parameter, allowed = FIELDS[path], find_range(item, path)
     low, high, low_open, _ = allowed
-    bounds = f"{low:g} to {high:g}" if isfinite(high) else f"{'>' if low_open else '>='} {low:g}"
-    description = f"{describe_parameter(parameter, f', {bounds}')}."
+    bounds = f", {low:g} to {high:g}" if isfinite(high) else f", {'>' if low_open else '>='} {low:g}"
+    description = f"{describe_parameter(parameter, bounds if isfinite(low) else '')}."
     return Annotated[int if parameter.whole else float, Quantity(parameter.unit, allowed, parameter.whole)], description
 
 
@@ -194,15 +201,43 @@ def read_velocity(raw: Any, sections: dict[str, type[PartSection]] = _LINEAR) ->
     return section.model_validate(raw)
 
 
-def _make_one_of(sections: dict[str, type[PartSection]]) -> GetPydanticSchema:
-    """Return the annotation of a field that accepts each velocity estimate in ``sections``, by its key ``kind``."""
+def _make_one_of(
+    sections: dict[str, type[PartSection]], read: Callable[[Any, dict[str, type[PartSection]]], Any]
+) -> GetPydanticSchema:
+    """Return the annotation of a field that accepts each of ``sections``, selected by its key ``kind``.
+
+    ``read`` returns the model of the section for the value of the configuration and ``sections``.
+    """
     every = Annotated[Union[tuple(sections.values())], Field(discriminator="kind")]  # noqa: UP007
-    read = Annotated[every, WrapValidator(lambda raw, _: read_velocity(raw, sections))]
-    return GetPydanticSchema(lambda _, handler: handler.generate_schema(read))
+    validated = Annotated[every, WrapValidator(lambda raw, _: read(raw, sections))]
+    return GetPydanticSchema(lambda _, handler: handler.generate_schema(validated))
 
 
-VelocityField = Annotated[PartSection, _make_one_of(_LINEAR)]
-SimulatedVelocityField = Annotated[PartSection, _make_one_of(_ESTIMATES)]
+VelocityField = Annotated[PartSection, _make_one_of(_LINEAR, read_velocity)]
+SimulatedVelocityField = Annotated[PartSection, _make_one_of(_ESTIMATES, read_velocity)]
+# Description and noun of the parts that have several kinds, and an example for messages.
+_OF_KIND = {
+    "position": ("Position estimate", "a position estimate", "{kind: exponential, coefficient: 0.3}"),
+    "feedback": ("Further feedback", "further feedback", "{kind: integral, gain: 1000}"),
+}
+
+
+def _make_kinds(name: str) -> Any:
+    """Return the type of the field of a part with several kinds, such as "position"."""
+    _, noun, example = _OF_KIND[name]
+    sections = {
+        kind: make_section(part, name, f"{noun} of kind {kind}", kind) for kind, part in WITH_KIND[name].items()
+    }
+
+    def read(raw: Any, sections: dict[str, type[PartSection]]) -> Any:
+        if isinstance(raw, PartSection):
+            return raw
+        return find_kind(raw, sections, noun, example).model_validate(raw)
+
+    return Annotated[PartSection, _make_one_of(sections, read)]
+
+
+_KIND_FIELDS = {name: _make_kinds(name) for name in WITH_KIND}
 _SECTIONS: Any = {
     name: make_section(part, name, f"{'an' if name[0] in 'aeiou' else 'a'} {name}") for name, part in PARTS.items()
 }
@@ -239,10 +274,14 @@ def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Stri
         more: sentence to append to the descriptions.
     """
     parts: dict[str, Any] = {"velocity": ("Velocity estimate", VelocityField, no_estimate)}
+    parts |= {name: (_OF_KIND[name][0], form, no_part) for name, form in _KIND_FIELDS.items()}
     parts |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
     parts["modes"] = "Resonances in the measured position", list[ModeSection], no_part
     keys: Any = {
-        name: (form | None, Field(default=None, description=f"{description}. Default: {absent}.{more}"))
+        name: (
+            form | None,
+            Field(default=None, description=f"{description}. Default: {absent}.{'' if name in WITH_KIND else more}"),
+        )
         for name, (description, form, absent) in parts.items()
     }
     return create_model("Parts", __base__=Strict, **keys)

@@ -21,18 +21,21 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal, NamedTuple
 
 from zwidth.core.errors import InputError, check_choice
+from zwidth.core.xp import is_traced
+from zwidth.model.checks import check_number
 from zwidth.model.feedback import IntegralFeedback, IntegrationRule
 from zwidth.model.position import Position, has_velocity
 from zwidth.model.velocity import BackwardDifference, LowPass, Velocity
 from zwidth.model.wall import VirtualWall
 from zwidth.units.display import compact_repr
+from zwidth.units.quantities import ANY
 
 PositionUnit = Literal["m", "rad", "turns", "degrees"]
 _UNITS = {"m": 1.0, "rad": 1.0, "turns": 2.0 * math.pi, "degrees": math.pi / 180.0}  # in m or rad
 
 
 @dataclass(frozen=True)
-class Controller:
+class ControllerParts:
     """Parts of a scene that describe a controller; a mapping, so that ``Scene(device, timing, **controller)`` works.
 
     Args:
@@ -77,7 +80,12 @@ class CascadeGains(NamedTuple):
 def _find_scale(units: PositionUnit, output_unit: float) -> float:
     """Return the stiffness in SI units of a controller whose output is 1 per position unit."""
     check_choice("units", units, tuple(_UNITS))
-    return output_unit / _UNITS[units]
+    return check_number("output_unit", output_unit, "1", ANY) / _UNITS[units]
+
+
+def _read_gain(name: str, gain: Any) -> Any:
+    """Convert a gain to a float; raise `InputError` for a text with a unit or a value that is not finite."""
+    return check_number(name, gain, "1", ANY)
 
 
 def pid(
@@ -90,7 +98,7 @@ def pid(
     rule: IntegrationRule = "backward",
     units: PositionUnit = "rad",
     output_unit: float = 1.0,
-) -> Controller:
+) -> ControllerParts:
     """Return the parts of a scene for a PID controller.
 
     Args:
@@ -105,7 +113,10 @@ def pid(
         output_unit: force in N or torque in N m per unit of output, such as the torque constant in N m/A.
 
     Returns:
-        A `Controller`; use it as ``zwidth.Scene(device, timing, **controller)``.
+        A `ControllerParts`; use it as ``zwidth.Scene(device, timing, **controller)``.
+
+    References:
+        Astrom, Hagglund 2006, Advanced PID Control.
 
     Example:
         >>> import zwidth
@@ -115,12 +126,13 @@ def pid(
         0.99796
     """
     scale = _find_scale(units, output_unit)
+    kp, ki, kd = (_read_gain(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
     velocity: Any = BackwardDifference() if derivative_filter is None else derivative_filter
     if isinstance(velocity, int | float):
         velocity = LowPass(time_constant=velocity)
     weight = None if position is None else 1.0
-    feedback = IntegralFeedback(ki * scale, rule, weight) if ki else None
-    return Controller(VirtualWall(kp * scale, kd * scale), velocity, position, feedback)
+    feedback = IntegralFeedback(ki * scale, rule, weight) if is_traced(ki) or ki else None
+    return ControllerParts(VirtualWall(kp * scale, kd * scale), velocity, position, feedback)
 
 
 def pid_gains(
@@ -143,6 +155,9 @@ def pid_gains(
     Returns:
         The gains in the units of the controller.
 
+    References:
+        Astrom, Hagglund 2006, Advanced PID Control.
+
     Example:
         >>> import zwidth
         >>> print(f"{zwidth.pid_gains(2.0, 0.05, units='turns').kp:.3f} N m/turn")
@@ -162,12 +177,12 @@ def cascade(
     rule: IntegrationRule = "backward",
     units: PositionUnit = "turns",
     output_unit: float = 1.0,
-) -> Controller:
+) -> ControllerParts:
     """Return the parts of a scene for a position loop with an inner velocity loop, as in ODrive, VESC and SimpleFOC.
 
     The wall is K = pos_gain vel_gain and B = vel_gain. The integrator of the velocity loop is further feedback, whose
-    gain does not change if an analysis varies K and B. A maximum stiffness is therefore that of a controller with this
-    fixed integrator; `cascade_gains` converts its K and B to gains.
+    gain does not change if an analysis varies K and B. The maximum stiffness of the scene is therefore that of a
+    controller with this fixed integrator. The gain margin of the scene scales all gains of the controller together.
 
     Args:
         pos_gain: gain of the position loop in 1/s.
@@ -181,14 +196,15 @@ def cascade(
             current, the torque constant divided by the winding resistance for a voltage (SimpleFOC).
 
     Returns:
-        A `Controller`; use it as ``zwidth.Scene(device, timing, **controller)``.
+        A `ControllerParts`; use it as ``zwidth.Scene(device, timing, **controller)``.
 
     Raises:
         InputError: if ``velocity`` is given together with an observer or PLL.
 
     References:
-        odriverobotics/ODrive ``Firmware/MotorControl/controller.cpp``; simplefoc/Arduino-FOC
-        ``src/common/pid.cpp``.
+        Ellis 2012, Control System Design Guide, 4th ed. (position loop with an inner velocity loop);
+            odriverobotics/ODrive ``Firmware/MotorControl/controller.cpp``;
+            simplefoc/Arduino-FOC ``src/common/pid.cpp``.
 
     Example:
         >>> import zwidth
@@ -201,11 +217,13 @@ def cascade(
     if velocity is not None and has_velocity(position):
         raise InputError(f"velocity: got {velocity!r}, but {position!r} has its own velocity estimate; omit velocity")
     scale = _find_scale(units, output_unit)
+    pos_gain, vel_gain = _read_gain("pos_gain", pos_gain), _read_gain("vel_gain", vel_gain)
+    vel_integrator_gain = _read_gain("vel_integrator_gain", vel_integrator_gain)
     feedback = None
-    if vel_integrator_gain:
+    if is_traced(vel_integrator_gain) or vel_integrator_gain:
         feedback = IntegralFeedback(vel_integrator_gain * scale, rule, pos_gain, 1.0)
     wall = VirtualWall(pos_gain * vel_gain * scale, vel_gain * scale)
-    return Controller(wall, velocity or BackwardDifference(), position, feedback)
+    return ControllerParts(wall, velocity or BackwardDifference(), position, feedback)
 
 
 def cascade_gains(
@@ -224,6 +242,9 @@ def cascade_gains(
 
     Raises:
         InputError: if the damping is 0, because a cascade renders a spring only together with a damper.
+
+    References:
+        Ellis 2012, Control System Design Guide, 4th ed. (position loop with an inner velocity loop).
 
     Example:
         >>> import zwidth

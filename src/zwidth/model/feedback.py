@@ -112,7 +112,7 @@ class IntegralFeedback(Part):
             the measured position.
 
     References:
-        Astrom, Hagglund 2006, Advanced PID Control, section 13.3 (discretization of the integral).
+        Astrom, Hagglund 2006, Advanced PID Control (discretization of the integral).
 
     Example:
         >>> import zwidth
@@ -144,3 +144,7 @@ class IntegralFeedback(Part):
     def weights(self, period: Any) -> Weights | None:
         """Return the weights of both estimates in the input; None if the input is the measured position."""
         return _normalize_weights(self, period)
+
+
+FEEDBACKS = {"integral": IntegralFeedback, "filter": Feedback}
+"""Classes of further feedback by the name of their kind in configurations."""

@@ -22,7 +22,7 @@ from zwidth.core.errors import InputError
 from zwidth.model.circle_functions import CirclePoints, Jet, are_on_circle
 from zwidth.model.estimate import Estimate
 from zwidth.model.feedback import Weights
-from zwidth.model.position import estimate_position, has_velocity
+from zwidth.model.position import Observer, Pll, estimate_position
 
 # Type of a function that returns a frequency response on the unit circle, and its derivative in w.
 Response = Callable[[CirclePoints], Jet]
@@ -90,22 +90,12 @@ class LoopEstimates:
         return ratio, zeros.size
 
 
-def refuse_estimates(scene: Any, method: str) -> None:
-    """Raise `InputError` if a scene has a position estimate or further feedback, which a method does not support."""
-    for name in ("position", "feedback"):
-        part = getattr(scene, name)
-        if part is not None:
-            raise InputError(
-                f"{name}: got {part!r}, which {method} does not support; omit it, or use max_stiffness and is_stable"
-            )
-
-
 def build_estimates(scene: Any) -> LoopEstimates | None:
     """Return P, V and R of a scene; None if it has neither a position estimate nor further feedback."""
     position, feedback, period = scene.position, scene.feedback, scene.timing.period
     if position is None and feedback is None:
         return None
-    if has_velocity(position):
+    if isinstance(position, Pll | Observer):
         velocity, structure = position.estimate_velocity(period), "common"
     else:
         velocity = scene.velocity.estimate(period)

@@ -16,12 +16,11 @@ from zwidth.core.errors import InputError, describe_choice
 from zwidth.core.xp import is_jax
 from zwidth.model.actuator import Actuator
 from zwidth.model.device import Coupling, Device
-from zwidth.model.feedback import Feedback, IntegralFeedback
+from zwidth.model.feedback import FEEDBACKS, Feedback, IntegralFeedback
 from zwidth.model.linear_device import LinearDevice
-from zwidth.model.loop_estimates import refuse_estimates
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.operator import Operator
-from zwidth.model.position import Position
+from zwidth.model.position import POSITIONS, Position
 from zwidth.model.timing import Timing
 from zwidth.model.tool import Tool
 from zwidth.model.velocity import BackwardDifference, Velocity, name_estimate
@@ -58,9 +57,11 @@ _BARE = ("device", "timing", "wall")  # parts whose parameters have paths withou
 _WHOLE = ("safe_limit",)  # parts that can only be replaced as a whole, because their parameters have no paths
 PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator, "tool": Tool}
 """Classes of the optional parts of a scene, by name, in the order in which descriptions list these parts."""
+WITH_KIND: dict[str, dict[str, Any]] = {"position": POSITIONS, "feedback": FEEDBACKS}
+"""Classes of the optional parts that have several kinds, by the name of the part and of the kind."""
 _OF_DEVICE = ("coupling", "actuator")  # optional parts that are fields of the device
 # Fields of the scene with whose names the paths of their parameters begin.
-_NAMED = ("velocity", "position", "feedback", *(name for name in PARTS if name not in _OF_DEVICE))
+_NAMED = ("velocity", *WITH_KIND, *(name for name in PARTS if name not in _OF_DEVICE))
 
 
 def find_parts(scene: Parts) -> dict[str, Any]:
@@ -140,8 +141,11 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 
 def spell_scene(scene: Any) -> dict[str, Any]:
     """Return the section ``scene`` of a configuration as a dictionary, without keys that have their default values."""
-    refuse_estimates(scene, "a configuration")
     parts: dict[str, Any] = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
+    for name, kinds in WITH_KIND.items():
+        part = getattr(scene, name)
+        if part is not None:
+            parts[name] = spell_kind(part, kinds)
     if scene.safe_limit is not None:
         parts["safe_limit"] = spell_part(scene.safe_limit)
     if scene.device.modes:
@@ -163,6 +167,15 @@ def spell_estimate(velocity: Velocity, *, every: bool = False) -> dict[str, Any]
     """
     given = {"kind": name_estimate(velocity), **spell_part(velocity, every=every)}
     return {} if velocity == BackwardDifference() else {"velocity": given}
+
+
+def spell_kind(part: Any, kinds: dict[str, Any]) -> dict[str, Any]:
+    """Return a dictionary with the key ``kind`` and the fields of a part; ``kinds`` has the classes by kind."""
+    for kind, each in kinds.items():
+        if type(part) is each:
+            return {"kind": kind, **spell_part(part)}
+    names = ", ".join(each.__name__ for each in kinds.values())
+    raise InputError(f"part: got {type(part).__name__}, which is not available in configurations; use one of {names}")
 
 
 def spell_part(part: Any, *, every: bool = False) -> dict[str, Any]:

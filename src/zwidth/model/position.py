@@ -200,7 +200,7 @@ class Observer(Part):
         denominator: coefficients of D, with all roots inside the unit circle.
 
     References:
-        Franklin, Powell, Workman 1998, Digital Control of Dynamic Systems, 3rd ed., section 8.2 (current estimator).
+        Franklin, Powell, Workman 1998, Digital Control of Dynamic Systems, 3rd ed. (current estimator).
 
     Example:
         An alpha-beta filter, ``p <- p + T v; e = x - p; p <- p + a e; v <- v + (b/T) e`` with a = 0.5, b = 0.1:
@@ -241,14 +241,28 @@ class Observer(Part):
 Position: TypeAlias = ExponentialFilter | PositionFilter | LowPass | Butterworth | Pll | Observer
 
 
+POSITIONS = {
+    "exponential": ExponentialFilter,
+    "low_pass": LowPass,
+    "butterworth": Butterworth,
+    "filter": PositionFilter,
+    "pll": Pll,
+    "observer": Observer,
+}
+"""Classes of position estimates by the name of their kind in configurations and on the command line."""
+
+
 def estimate_position(position: Position | None, period: Any) -> Estimate:
     """Return the position estimate P of a part; 1 for None, and the filter without the difference for a `LowPass`."""
     if position is None:
         return Estimate(0)
-    estimate = position.estimate(period)
-    if isinstance(position, LowPass | Butterworth):
-        return replace(estimate, window=0, gain=estimate.gain / get_coded_ratio(period, position.coded_period))
-    return estimate
+    if not isinstance(position, LowPass | Butterworth):
+        return position.estimate(period)
+    try:
+        estimate = position.estimate(period)
+    except InputError as error:
+        raise InputError(str(error).replace("velocity", "position", 1)) from None
+    return replace(estimate, window=0, gain=estimate.gain / get_coded_ratio(period, position.coded_period))
 
 
 def has_velocity(position: Position | None) -> bool:

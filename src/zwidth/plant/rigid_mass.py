@@ -92,7 +92,12 @@ class Plant(NamedTuple):
 
 
 def discretize_mass(
-    delta: Any, fraction: Any = None, functions: Functions = phi_functions, phi: Any = None, phi_t: Any = None
+    delta: Any,
+    fraction: Any = None,
+    functions: Functions = phi_functions,
+    phi: Any = None,
+    phi_t: Any = None,
+    remainder: Any = None,
 ) -> Plant:
     """Compute the discrete transfer function of a damped mass with a fractional delay, for floats, JAX arrays or balls.
 
@@ -102,12 +107,13 @@ def discretize_mass(
         functions: function that evaluates the phi-functions in the arithmetic of ``delta``.
         phi: phi-functions at delta, if already computed.
         phi_t: phi-functions at delta (1 - f), if already computed.
+        remainder: 1 - f, if already computed.
     """
     phi = functions(delta) if phi is None else phi
     if fraction is None:
         return Plant(phi.c, delta * phi.phi1, phi.phi2, phi.psi, 0.0 * phi.gap, phi.gap)
     f = fraction
-    t = 1.0 - f
+    t = 1.0 - f if remainder is None else remainder
     phi_t, phi_f = functions(delta * t) if phi_t is None else phi_t, functions(delta * f)
     e_t = phi_t.c
     a2 = t * t * phi_t.phi2
@@ -235,9 +241,22 @@ def discretize_plant(delta: Array, d: Array, kind: DelayClasses = ANY) -> Discre
     """
     delta, d = nan_unless(is_valid_device(delta, d), delta, d)
     whole, f = split_delay(d)
+    return discretize_split_delay(delta, whole, f, 1.0 - f, kind)
+
+
+def discretize_split_delay(delta: Array, whole: Array, f: Array, remainder: Array, kind: DelayClasses) -> DiscretePlant:
+    """Compute `discretize_plant` from the two parts of the delay d = n + f.
+
+    Args:
+        delta: normalized damping.
+        whole: integer delay n.
+        f: fractional delay, 0 <= f < 1.
+        remainder: 1 - f. In float32, a difference computed from the rounded f would lose digits near f = 1.
+        kind: classes of the delays.
+    """
     phi = phi_functions(delta)
-    phi_t = phi_functions(delta * (1.0 - f)) if kind.fractional else phi
-    plant = discretize_mass(delta, f if kind.fractional else None, phi=phi, phi_t=phi_t)
+    phi_t = phi_functions(delta * remainder) if kind.fractional else phi
+    plant = discretize_mass(delta, f if kind.fractional else None, phi=phi, phi_t=phi_t, remainder=remainder)
     # With a wall (alpha, beta), the characteristic polynomial P of a stable loop satisfies
     # (-1)^n P(-1) = 2 (1 + c) - (-1)^n N(-1) (alpha + 2 beta) > 0.
     minus_one_coefficient = (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)

@@ -15,7 +15,8 @@ import numpy as np
 
 from zwidth.core.xp import compute_concretely
 from zwidth.model.device import Device
-from zwidth.model.loop_estimates import refuse_estimates
+from zwidth.model.estimate import Estimate
+from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import Parts, replace_parameters
 from zwidth.model.velocity import FOAW, BackwardDifference
@@ -27,7 +28,7 @@ from zwidth.simulation.parameters import (
     Options,
     Parameters,
     Settings,
-    build_estimators,
+    build_program,
     build_transitions,
     cut_period,
     round_up,
@@ -46,7 +47,8 @@ def find_structure(scene: Parts) -> tuple[Any, ...]:
     # combination of both needs a separate program.
     system = None if isinstance(scene.device, Device) else (scene.device, scene.timing.period)
     longest = scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
-    return *name_bodies(scene), sensor, *orders, longest, system
+    program = scene.position is not None, scene.feedback is not None
+    return *name_bodies(scene), sensor, *orders, longest, *program, system
 
 
 def name_bodies(scene: Parts) -> tuple[str, ...]:
@@ -57,9 +59,10 @@ def name_bodies(scene: Parts) -> tuple[str, ...]:
 
 
 class Model(NamedTuple):
-    """Simulation model of one scene: its chain, velocity estimate, delay, and units."""
+    """Simulation model of one scene: its chain, estimates, delay, and units."""
 
-    chain: Any  # without the estimate if that is FOAW
+    chain: Any  # only its plant and its delay are used
+    program: LoopEstimates  # estimates and further feedback; with another velocity estimate in place of FOAW
     estimate: Any  # velocity estimate
     late: int  # integer delay, in periods
     fraction: float  # fractional delay, in periods
@@ -70,16 +73,16 @@ class Model(NamedTuple):
 
 def build_model(scene: Any) -> Model:
     """Build the simulation model of a scene, with its chain, delay and velocity estimate."""
-    refuse_estimates(scene, "simulate")
-    estimate, period, mass = scene.velocity, float(scene.timing.period), float(scene.mass)
-    # For FOAW, build the chain with another velocity estimate and keep the FOAW parameters separately, because FOAW is
-    # not a linear filter.
-    adapts = isinstance(estimate, FOAW)
-    chain: Any = build_chain(replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene)
+    period, mass = float(scene.timing.period), float(scene.mass)
+    chain: Any = build_chain(scene, estimate=Estimate())
     fraction = float(chain.d - chain.n_delay)
-    if adapts:
-        return Model(chain, estimate, chain.n_delay, fraction, estimate.samples, period, mass)
-    return Model(chain, chain.estimate, chain.n_delay, fraction, chain.estimate.window, period, mass)
+    # For FOAW, build the program with another velocity estimate and keep the FOAW parameters separately, because FOAW
+    # is not a linear filter.
+    velocity, adapts = scene.velocity, isinstance(scene.velocity, FOAW)
+    linear = replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene
+    program = build_estimates(linear) or LoopEstimates(velocity=linear.velocity.estimate(period))
+    estimate, window = (velocity, velocity.samples) if adapts else (program.velocity, program.velocity.window)
+    return Model(chain, program, estimate, chain.n_delay, fraction, window, period, mass)
 
 
 def run_scenes(
@@ -104,6 +107,8 @@ def run_scenes(
         friction=friction,
         jitter=jitter,
         foaw=scenes[0].velocity.samples if isinstance(scenes[0].velocity, FOAW) else 0,
+        position=scenes[0].position is not None,
+        feedback=scenes[0].feedback is not None,
         record=settings.record,
         law=settings.law,
     )
@@ -157,7 +162,7 @@ def build_batch(
         options: structure of the compiled program.
         names: fields of `Motion` with the positions of the bodies.
     """
-    chains, estimates, late, fractions, _, periods, masses = zip(*models, strict=True)
+    chains, programs, estimates, late, fractions, _, periods, masses = zip(*models, strict=True)
     period, mass = np.array(periods)[which], np.array(masses)[which]
     force = period * period / mass
     durations = cut_period(np.ones(len(models)), [np.array(fractions)][: options.pieces - 1], settings.substeps)
@@ -178,7 +183,7 @@ def build_batch(
             numbers["coulomb"] * force,
             numbers["static"] * force,
         ),
-        estimator=build_estimators(estimates, which),
+        **build_program(programs, estimates, which),
         **build_transitions(build_mechanics(chains), np.moveaxis(durations, -1, 0), which, options),
     )
     instants = durations = None

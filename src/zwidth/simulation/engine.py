@@ -22,14 +22,12 @@ import numpy as np
 from zwidth.core.types import Array
 from zwidth.core.xp import compile_with_options
 from zwidth.plant.transition import Transition
+from zwidth.simulation.controller import Controller, Reading, control, look_back, start_controller, write
 from zwidth.simulation.parameters import ExternalInputs, Options, Parameters, Settings
 from zwidth.simulation.propagation import BodyState, advance, dot, propagate_with_friction, read, times
 
 BLOCK = 128  # number of sampling periods that one call of the compiled program simulates
 SEGMENTS = 6  # number of equal segments of the tail; even, because the trend compares the two halves of the tail
-# Factor on the noise bound of FOAW, slightly above 1, so that deviations of exactly one encoder count are admissible in
-# spite of rounding errors.
-SLACK = 1.0 + 1e-9
 # Use XLA's older loop emitters, and generate the code of a program in one part, because this halves the compile time
 # and does not change the run time. Require full optimization even if XLA_FLAGS sets a lower level, because a simulation
 # runs for thousands of periods.
@@ -38,24 +36,6 @@ COMPILER_OPTIONS = {
     "xla_cpu_parallel_codegen_split_count": 1,
     "xla_backend_optimization_level": 3,
 }
-
-
-class Controller(NamedTuple):
-    """State of the control program between two samples: previous measurements, commands and filter state."""
-
-    positions: Array  # ring of measured positions, (length, batch)
-    filtered: Array  # state of the velocity filter, (order, batch)
-    commands: Array  # ring of commands, (length, batch)
-    touching: Array  # True if the last sample was in contact with the wall, (batch,)
-
-
-class Reading(NamedTuple):
-    """Result of the control program at one sample; each array has the shape (batch,)."""
-
-    measured: Array  # measured position
-    velocity: Array  # estimated velocity
-    command: Array  # commanded force
-    touching: Array  # True if in contact with the wall
 
 
 class Summary(NamedTuple):
@@ -88,97 +68,6 @@ class PeriodInputs(NamedTuple):
     noise: Array  # error of the measured position
     external_force: Array  # external force on the device
     durations: Array  # durations of constant force, (substeps, pieces, batch); used with jitter only
-
-
-def _write(rows: Array, row: Array, index: Array) -> Array:
-    """Return a copy of the array ``rows`` in which ``row`` replaces the entry at ``index`` along the first axis."""
-    return jax.lax.dynamic_update_index_in_dim(rows, row, index, 0, allow_negative_indices=False)
-
-
-def look_back(ring: Array, k: Array, back: Array) -> Array:
-    """Return the entry of a ring that was written ``back`` samples before sample k.
-
-    ``back`` has the shape (batch,), or (1,) if it is equal for all simulations. The length of a ring is a power of 2.
-    """
-    index = (k - back) & (len(ring) - 1)
-    if back.shape[-1] == 1:
-        return read(ring, index[0])
-    return jnp.take_along_axis(ring, index[None], 0)[0]
-
-
-@np.errstate(all="ignore")
-def quantize(quantum: Any, position: Any) -> Any:
-    """Round a position to multiples of ``quantum``; return it unchanged if the quantum is 0 or rounding overflows."""
-    xp = np if isinstance(position, np.ndarray) else jnp
-    rounded = quantum * xp.floor(position / quantum + 0.5)
-    return xp.where(xp.isfinite(rounded), rounded, position)
-
-
-def control(
-    params: Parameters, options: Options, controller: Controller, k: Array, sensed: Array
-) -> tuple[Controller, Reading]:
-    """Run the control program at one sample: measure, estimate the velocity and compute the command (T2).
-
-    Args:
-        params: parameters of the simulations.
-        options: structure of the compiled program.
-        controller: state of the control program before the sample.
-        k: index of the sample.
-        sensed: position at the sensor, including noise, before quantization.
-
-    Returns:
-        The state of the control program after the sample, and the reading.
-    """
-    measured = quantize(params.resolution, sensed)
-    positions = _write(controller.positions, measured, k & (len(controller.positions) - 1))
-    estimator, filtered = params.estimator, controller.filtered
-    if options.foaw:
-        velocity = _adapt_window(positions, k, measured, estimator.bound, options.foaw)
-    else:
-        window = estimator.window
-        difference = (measured - look_back(positions, k, window)) / jnp.maximum(window, 1)
-        entering = jnp.where(window > 0, difference, measured)
-        velocity = estimator.D * entering
-        if len(filtered):
-            velocity = velocity + dot(estimator.C, filtered)
-            filtered = times(estimator.A, filtered) + estimator.B * entering
-    touching = params.bilateral | (measured > 0)
-    if options.law is None:
-        force = -(params.alpha * measured + params.beta * velocity)
-    else:
-        force = options.law(measured, velocity / params.period, k * params.period) / params.force
-        # With a force law, count a nonzero force as contact, because a force law defines no surface of the wall.
-        touching &= force != 0
-    force = jnp.where(touching, force, 0.0)
-    force = jnp.where(params.pulling, force, jnp.minimum(force, 0.0))
-    ring, motor = controller.commands, params.motor
-    last = read(ring, (k - 1) & (len(ring) - 1))
-    force = jnp.clip(force, -motor.max_force, motor.max_force)
-    command = jnp.clip(force, last - motor.max_rate, last + motor.max_rate)
-    commands = _write(ring, command, k & (len(ring) - 1))
-    return Controller(positions, filtered, commands, touching), Reading(measured, velocity, command, touching)
-
-
-def _adapt_window(ring: Array, k: Array, newest: Array, bound: Array, longest: int) -> Array:
-    """Return the FOAW velocity estimate: the slope between both ends of the longest admissible window.
-
-    A window of past samples is admissible if the positions in it deviate by at most ``bound`` from the straight line
-    between its ends, and if all shorter windows are admissible, too.
-
-    Args:
-        ring: ring of measured positions.
-        k: index of the current sample.
-        newest: measured position at the current sample.
-        bound: noise bound of the positions.
-        longest: largest length of the window, in samples.
-    """
-    past = ring[(k - np.arange(longest + 1)) & (len(ring) - 1)]
-    back = np.arange(1, longest + 1)[:, None]
-    slopes = (newest - past[1:]) / back
-    missed = jnp.abs(past[1:] - (newest - slopes[:, None] * back))  # of shape (window, sample, batch)
-    within = jnp.all((missed <= bound * SLACK) | (back > back[:, None]), axis=1)
-    length = jnp.sum(jnp.cumprod(within, 0), 0)
-    return jnp.take_along_axis(slopes, jnp.maximum(length - 1, 0)[None], 0)[0]
 
 
 def stored_energy(params: Parameters, x: Array) -> Array:
@@ -235,7 +124,7 @@ def propagate(
     return after, work + jnp.stack([given, pushed, lost, rubbed])
 
 
-def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, int]) -> State:
+def initial_state(params: Parameters, options: Options, inputs: ExternalInputs, rings: tuple[int, int]) -> State:
     """Return the state before the first sample, after uniform motion without commands and with modes at rest (T2).
 
     ``rings`` contains the lengths of the rings of positions and of commands.
@@ -247,27 +136,10 @@ def initial_state(params: Parameters, inputs: ExternalInputs, rings: tuple[int, 
     inverse, first = np.linalg.inv(params.place[:, :count, 0]), np.argmax(params.motion[0, :, 0])
     body[:count], body[first : first + count] = inverse @ inputs.positions, inverse @ inputs.velocities
     x, v = body[0], body[first]
-    back = np.mod(-np.arange(rings[0]), rings[0])
-    measured = quantize(params.resolution, x - back[:, None] * v)
-    zero = np.zeros(x.size)
-    controller = Controller(
-        measured, _settle(params.estimator, measured[0], v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool)
-    )
+    controller, zero = start_controller(params, options, (x, v), rings), np.zeros(x.size)
     far, turns = np.full((1 + SEGMENTS, 2, count, x.size), -np.inf), np.zeros((1 + SEGMENTS, x.size))
     summary = Summary(zero, zero + np.nan, zero, far, turns, np.full((2, x.size), np.nan))
     return State(BodyState(body, np.sign(inputs.velocities[0])), controller, np.zeros((4, x.size)), summary)
-
-
-def _settle(estimator: Any, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return the stationary state of the velocity filter for uniform motion at position x, with velocity v per period.
-
-    If the filter follows a position difference over a window, its input is constant; otherwise the input is a ramp.
-    """
-    A, B, window = (np.asarray(part) for part in (estimator.A, estimator.B, estimator.window))
-    level, slope = np.where(window > 0, v, x), np.where(window > 0, 0.0, v)
-    left = np.eye(len(B)) - np.moveaxis(A, -1, 0)
-    gain = np.linalg.solve(left, np.moveaxis(B, -1, 0)[..., None])
-    return gain[..., 0].T * level - np.linalg.solve(left, gain)[..., 0].T * slope
 
 
 def _simulate_period(
@@ -356,8 +228,8 @@ def _summarize(
         summary.exits + (before & ~reading.touching),
         jnp.where(hits, v, summary.impact),
         jnp.fmax(summary.given, work[0]),
-        _write(summary.far, jnp.fmax(read(summary.far, segment), jnp.stack([-places, places])), segment),
-        _write(summary.turns, read(summary.turns, segment) + turning, segment),
+        write(summary.far, jnp.fmax(read(summary.far, segment), jnp.stack([-places, places])), segment),
+        write(summary.turns, read(summary.turns, segment) + turning, segment),
         jnp.where(turning & (segment > 0), turned, summary.turned),
     )
 
@@ -375,7 +247,7 @@ def compile_block(options: Options) -> Any:
             state, kept = carry
             period = jax.tree.map(lambda part: read(part, j), inputs)
             state, record = _simulate_period(params, options, ends, state, period)
-            return state, jax.tree.map(lambda rows, row: _write(rows, row, j), kept, record)
+            return state, jax.tree.map(lambda rows, row: write(rows, row, j), kept, record)
 
         return jax.lax.fori_loop(0, jnp.minimum(BLOCK, ends[-1] - inputs.k[0]), one, (state, rows))
 
@@ -400,7 +272,7 @@ def run_batch(
     """
     edges = settings.periods - settings.tail * np.arange(SEGMENTS, -1, -1) // SEGMENTS
     # Transfer all arrays to JAX in one call, because separate transfers would take as long as the simulation itself.
-    start: Any = initial_state(params, inputs, rings)
+    start: Any = initial_state(params, options, inputs, rings)
     state, placed, ends = jax.device_put((start, params, edges))
     recorded: Any = []
     for first in range(0, settings.periods, BLOCK):

@@ -4,6 +4,10 @@ Units are the sampling period, the mass that the force of the wall acts on, and 
 over the batch. A period is divided into equal *substeps*, and a substep into *pieces* with constant force. n is the
 length of the state x of the bodies (`simulation.mechanics`). The first body *slips*, or friction *holds* it. FOAW is
 the adaptive velocity estimate of Janabi-Sharifi et al. 2000. T1 to T7 are steps of docs/theory/simulation.md.
+
+In every period the control program computes the position estimate p from the measured position, the velocity estimate
+v from p or from the measured position, and the force r of the further feedback (`model.feedback`) from the measured
+position, p and v.
 """
 
 from __future__ import annotations
@@ -16,6 +20,8 @@ import numpy as np
 
 from zwidth.core.errors import InputError
 from zwidth.core.types import Array
+from zwidth.model.estimate import Estimate
+from zwidth.model.loop_estimates import LoopEstimates
 from zwidth.model.state_space import realize_estimate
 from zwidth.model.velocity import FOAW
 from zwidth.plant.transition import Transition, compute_transition
@@ -51,6 +57,8 @@ class Options(NamedTuple):
     friction: bool  # some simulation has dry friction
     jitter: bool  # some simulation has timestamp jitter
     foaw: int  # longest window of FOAW in samples; 0 for a linear velocity estimate
+    position: bool  # the scenes have a position estimate
+    feedback: bool  # the scenes have further feedback
     record: bool  # readings and frames are recorded
     law: TracedLaw | None  # force law in place of the wall's spring and damper
 
@@ -88,15 +96,28 @@ class Motor(NamedTuple):
     static: Array  # static friction while the first body is held
 
 
-class Estimator(NamedTuple):
-    """Velocity estimate: a position difference over a window, followed by a filter in state space; or FOAW."""
+class Filter(NamedTuple):
+    """A filter in state space, of order q."""
 
-    A: Array  # filter matrix of order p, (p, p, batch)
-    B: Array  # input vector of the filter, (p, batch)
-    C: Array  # output vector of the filter, (p, batch)
-    D: Array  # direct feedthrough of the filter, (batch,)
+    A: Array  # filter matrix, (q, q, batch)
+    B: Array  # input vector, (q, batch)
+    C: Array  # output vector, (q, batch)
+    D: Array  # direct feedthrough, (batch,)
+
+
+class Estimator(NamedTuple):
+    """Velocity estimate: a position difference over a window, followed by a filter; or FOAW."""
+
+    filter: Filter
     window: Array  # length of the window in samples; 0 if the input of the filter is the position
     bound: Array  # noise bound of FOAW, in m
+
+
+class FeedbackLoop(NamedTuple):
+    """Further feedback: a filter whose input is a weighted sum of measured position, position and velocity estimate."""
+
+    filter: Filter
+    weights: Array  # weights of the measured position, of p and of v, (3, batch)
 
 
 class Parameters(NamedTuple):
@@ -112,7 +133,10 @@ class Parameters(NamedTuple):
     pulling: Array  # True if the wall may pull the device
     late: Array  # integer delay, in periods
     motor: Motor  # limits of the motor and friction
+    position: Filter  # position estimate
+    filtered_input: Array  # True if the velocity estimate is computed from the position estimate
     estimator: Estimator  # velocity estimate
+    feedback: FeedbackLoop  # further feedback
     rate: Array  # matrix of x' = rate @ (x, u), (n, n + forces, batch)
     place: Array  # rows of the positions of the bodies, (bodies, n, batch)
     motion: Array  # rows of the velocities of the bodies, (bodies, n, batch)
@@ -148,29 +172,50 @@ def round_up(size: int) -> int:
     return 0 if size == 0 else max(2, 1 << (size - 1).bit_length())
 
 
-def build_estimators(estimates: Sequence[Any], which: np.ndarray) -> Estimator:
-    """Return the velocity estimate of each simulation, with all filters padded to the largest order.
-
-    ``estimates`` contains the estimate of each scene, ``which`` the index of the scene of each simulation.
-    """
-    count, adapts = len(estimates), isinstance(estimates[0], FOAW)
-    # Realize the velocity filter without the difference over a window, because the engine computes this difference from
-    # a ring of the last measured positions.
+def _build_filters(estimates: Sequence[Estimate]) -> Filter:
+    """Return the filters of all scenes, padded to the largest order, with the scene as the first axis."""
+    count = len(estimates)
+    # Realize the filter without the difference over a window, because the engine computes this difference from a ring
+    # of the last positions.
     filters = {
-        k: realize_estimate(replace(each, window=0))
-        for k, each in enumerate(estimates)
-        if not adapts and each.degree > each.window
+        k: realize_estimate(replace(each, window=0)) for k, each in enumerate(estimates) if each.degree > each.window
     }
     order = round_up(max((matrices.A.shape[0] for matrices in filters.values()), default=0))
     A, B, C = np.zeros((count, order, order)), np.zeros((count, order)), np.zeros((count, order))
-    D = np.array([0.0 if adapts else each.gain for each in estimates])
+    D = np.array([float(each.gain) for each in estimates])
     for k, matrices in filters.items():
         size = matrices.A.shape[0]
         A[k, :size, :size], B[k, :size], C[k, :size] = matrices.A, matrices.B[:, 0], matrices.C[0]
         D[k] = matrices.D[0, 0]
-    window = np.array([each.samples if adapts else each.window for each in estimates])
-    bound = np.array([each.noise if adapts else 0.0 for each in estimates])
-    return spread_scenes(Estimator(A, B, C, D, window, bound), which)
+    return Filter(A, B, C, D)
+
+
+def build_program(programs: Sequence[LoopEstimates], velocities: Sequence[Any], which: np.ndarray) -> dict[str, Any]:
+    """Return the estimates and the further feedback of all simulations, keyed by the fields of `Parameters`.
+
+    Args:
+        programs: position estimate, velocity estimate and further feedback of each scene.
+        velocities: velocity estimate of each scene; different from that in ``programs`` for FOAW.
+        which: index of the scene of each simulation.
+    """
+    none = Estimate(0, 0.0)
+    feedbacks = [each.feedback for each in programs]
+    weights = np.zeros((len(programs), 3))
+    for k, feedback in enumerate(feedbacks):
+        weights[k] = (1.0, 0.0, 0.0) if feedback is None or feedback.weights is None else (0.0, *feedback.weights)
+    adapts = isinstance(velocities[0], FOAW)
+    estimator = Estimator(
+        _build_filters([none if adapts else each for each in velocities]),
+        np.array([each.samples if adapts else each.window for each in velocities]),
+        np.array([each.noise if adapts else 0.0 for each in velocities]),
+    )
+    further = _build_filters([none if each is None else each.filter for each in feedbacks])
+    return {
+        "position": spread_scenes(_build_filters([each.position for each in programs]), which),
+        "filtered_input": spread_scenes(np.array([each.structure == "series" for each in programs]), which),
+        "estimator": spread_scenes(estimator, which),
+        "feedback": spread_scenes(FeedbackLoop(further, weights), which),
+    }
 
 
 def cut_period(lengths: np.ndarray, effective: Sequence[np.ndarray], substeps: int) -> np.ndarray:

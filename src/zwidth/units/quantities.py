@@ -265,6 +265,7 @@ _OF_ESTIMATES = (
     Parameter("feedback.position", "weight of the position estimate in the input of the feedback", "w_p", ANY),
     Parameter("feedback.velocity", "weight of the velocity estimate in the input of the feedback", "w_v", ANY),
 )  # fmt: skip
+OF_ESTIMATES = tuple(parameter.name for parameter in _OF_ESTIMATES)
 # Parameters of simulations.
 _OF_MOTIONS = (
     Parameter(
@@ -310,6 +311,15 @@ class Choice(NamedTuple):
 _KINDS = ("backward_difference", "windowed_difference", "low_pass", "butterworth")
 CHOICES = {
     "velocity.kind": Choice(_KINDS, "Velocity estimate; default: implied by the options below"),
+    "position.kind": Choice(
+        ("exponential", "low_pass", "butterworth", "pll"), "Position estimate; default: implied by the options below"
+    ),
+    "position.velocity_from": Choice(
+        ("position", "measured"), "Input of the velocity estimate: filtered or measured position; default: position"
+    ),
+    "feedback.rule": Choice(
+        ("backward", "forward", "trapezoidal"), "Rule of integration of the integral gain; default: backward"
+    ),
     "coupling.sensor": Choice(("motor", "tip"), "Location of the position sensor; default: motor"),
     "tool.integrator": Choice(("semi-implicit", "implicit"), "Euler method of the tool; default: semi-implicit"),
 }

@@ -32,24 +32,47 @@ ESTIMATES = {
     "number": zwidth.VelocityFilter([7.0], [1.0]),
     "late difference": zwidth.VelocityFilter([1000.0, -1000.0], [1.0, 0.0, 0.0, 0.0]),
 }
+AVERAGE = zwidth.ExponentialFilter(0.3)
+CONTROLLERS: dict[str, dict[str, Any]] = {
+    "average": {"position": AVERAGE},
+    "average without effect": {"position": zwidth.ExponentialFilter(1)},
+    "average and window": {"position": AVERAGE, "velocity": zwidth.WindowedDifference(7)},
+    "average and low-pass": {"position": AVERAGE, "velocity": zwidth.LowPass(cutoff=100, order=2)},
+    "average and filter": {"position": AVERAGE, "velocity": ESTIMATES["filter without a difference"]},
+    "average of the position only": {"position": zwidth.ExponentialFilter(0.3, velocity_from="measured")},
+    "low-pass of the position": {"position": zwidth.LowPass(cutoff="80 Hz")},
+    "butterworth of the position": {"position": zwidth.Butterworth(100, 5)},
+    "mean": {"position": zwidth.PositionFilter([0.25] * 4, [1, 0, 0, 0])},
+    "pll": {"position": zwidth.Pll(300)},
+    "slow pll": {"position": zwidth.Pll(5)},
+    "observer": {"position": zwidth.Observer([0.5, -0.4, 0], [100, -100, 0], [1, -1.4, 0.5])},
+    "integrals": {"feedback": zwidth.IntegralFeedback(2000)},
+    "forward integral": {"feedback": zwidth.IntegralFeedback(2000, "forward")},
+    "cascade": dict(zwidth.cascade(200, 10, 40, units="m", position=zwidth.Pll(500))),
+    "pid": dict(zwidth.pid(2e3, 3e3, 3, units="m", derivative_filter=2e-3)),
+    "inner loop": {"feedback": zwidth.Feedback([5e3, -5e3], [1, 0])},
+    "feed-through": {"feedback": zwidth.Feedback([500], [1])},
+    "two integrators": {"feedback": zwidth.Feedback([0.1, 0.1, 0], [1, -2, 1], position=1, velocity=0.01)},
+}
+PARTS: dict[str, dict[str, Any]] = {name: {"velocity": each} for name, each in ESTIMATES.items()} | CONTROLLERS
 # Relative to the largest force: rounding errors of both programs and of the coefficients.
 TOLERANCE = 1e-12
 PERIODS = 400
 
 
-def make_scene(velocity):
+def make_scene(name):
     device, timing = zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1.5e-3)
-    return zwidth.Scene(device, timing, zwidth.VirtualWall(2e3, 3.0), velocity)
+    return zwidth.Scene(device, timing, **{"wall": zwidth.VirtualWall(2e3, 3.0), **PARTS[name]})
 
 
 @pytest.fixture(scope="module")
 def trajectories():
     """Simulate motions that enter and leave the wall several times under a sinusoidal external force."""
     force = 3.0 * np.sin(np.arange(PERIODS) / 20.0) + 1.0
-    scenes = [make_scene(velocity) for velocity in ESTIMATES.values()]
+    scenes = [make_scene(name) for name in PARTS]
     options = {"periods": PERIODS, "start_position": -1e-3, "external_force_history": force, "contact": "unilateral"}
     motions = zwidth.simulate(scenes, **options)
-    return {name: (motions.measured[k], motions.command[k]) for k, name in enumerate(ESTIMATES)}
+    return {name: (motions.measured[k], motions.command[k]) for k, name in enumerate(PARTS)}
 
 
 def drive_c(source, positions, folder):
@@ -73,9 +96,9 @@ def drive_python(source, positions):
     return np.array([wall.force(x) for x in positions.tolist()])
 
 
-@pytest.mark.parametrize("name", ESTIMATES)
+@pytest.mark.parametrize("name", PARTS)
 def test_programs_return_forces_of_the_simulation(name, trajectories, tmp_path):
-    scene, (positions, expected) = make_scene(ESTIMATES[name]), trajectories[name]
+    scene, (positions, expected) = make_scene(name), trajectories[name]
     # The motion enters and leaves the wall several times.
     assert np.count_nonzero(np.diff((positions > 0).astype(int))) >= 3
     scale = np.abs(expected).max()
@@ -87,7 +110,7 @@ def test_programs_return_forces_of_the_simulation(name, trajectories, tmp_path):
 
 
 def test_programs_limit_force_like_the_simulation(trajectories, tmp_path):
-    scene, (positions, expected) = make_scene(ESTIMATES["difference"]), trajectories["difference"]
+    scene, (positions, expected) = make_scene("difference"), trajectories["difference"]
     limit = 0.3 * np.abs(expected).max()
     for forces in (
         drive_c(write_wall(scene, "c", max_force=limit), positions, tmp_path),
@@ -102,7 +125,7 @@ def test_programs_limit_force_like_the_simulation(trajectories, tmp_path):
 
 
 def test_code_of_recommendation_returns_its_stiffness():
-    recommendation = make_scene(zwidth.LowPass(cutoff=100)).recommend(stiffness_fraction=0.5)
+    recommendation = make_scene("low-pass").recommend(stiffness_fraction=0.5)
     text = recommendation.code("python")
     force = drive_python(text, np.array([1e-3]))
     assert force[0] == pytest.approx(-recommendation.stiffness * 1e-3, rel=1e-14)

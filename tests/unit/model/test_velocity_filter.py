@@ -47,7 +47,7 @@ def test_integral_action_is_rejected_with_an_alternative():
     period = 1e-3
     # F = (1 - 1/z)/T + 200 T/(1 - 1/z), with the denominator z (z - 1).
     numerator = np.polyadd(np.array([1.0, -2.0, 1.0]) / period, 200.0 * period * np.array([1.0, 0.0, 0.0]))
-    with pytest.raises(InputError, match="For an integral gain, pass feedback=zwidth.Feedback.integral"):
+    with pytest.raises(InputError, match=r"For an integral gain, pass feedback=zwidth\.Feedback\.integral"):
         zwidth.VelocityFilter(numerator, [1.0, -1.0, 0.0])
     device = period**2 / 0.2 * np.array([1.0, 1.0]), np.array([1.0, -2.0, 1.0])
     controller = np.polyadd(1e3 * np.array([1.0, -1.0, 0.0]), 10.0 * numerator), np.array([1.0, -1.0, 0.0])

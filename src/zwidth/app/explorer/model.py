@@ -143,7 +143,7 @@ def compute_ridge(scene: Scene) -> Curve:
     """Return the stiffest stable walls as the damping of the device rises from 0 to four times its current value."""
     most = _MOST_DAMPING * (float(scene.device.damping) or 0.25 * scene.units.virtual_damping)
     dampings = np.linspace(0.0, most, min(_RIDGE_POINTS, 1 + scene.loop.draws // 25))
-    return scene.loop.vary({"damping": dampings}).stiffest(allows_negative(scene, None))
+    return scene.loop.vary({"damping": dampings}).stiffest(allows_negative(scene, None))[:2]
 
 
 def simulate_hit(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:

@@ -92,6 +92,15 @@ class LoopTerms:
         P, R = self._evaluate_position(lam), self._evaluate_feedback(lam)
         return _divide((q - R[0], q_slope - R[1]), P)
 
+    def feedback(self, lam: Taylor) -> Pair:
+        """Return the ratio R/P of the further feedback to the position estimate, and its derivative in lambda.
+
+        The open loop at the plant input is ``L = -(alpha + beta F + R/P)/(q + R/P)``.
+        """
+        if self.estimates is None or self.estimates.feedback is None:
+            return self.one * 0.0, self.one * 0.0
+        return _divide(self._evaluate_feedback(lam), self._evaluate_position(lam))
+
     def _add_tool(self, q: Taylor, q_slope: Taylor, lam: Taylor) -> Pair:
         """Add the response G_t of the tool to G = -1/q: return q/(1 - q G_t) and its derivative in lambda."""
         z, zeta = lam.exp(), lam.expm1()

@@ -28,7 +28,7 @@ import numpy as np
 
 from zwidth.core.status import Status
 from zwidth.core.types import Array
-from zwidth.core.xp import horner, materialize, namespace, nan_beyond, square_roots
+from zwidth.core.xp import horner, namespace, nan_beyond, square_roots
 from zwidth.numerics.balls import BITS, available
 from zwidth.numerics.evaluate import evaluate_columns
 from zwidth.plant.rigid_mass import DelayClasses, DiscretePlant, PhiFunctions, classify_delays, discretize_mass
@@ -37,6 +37,8 @@ from zwidth.stability.rigid.broadcasting import Points
 from zwidth.stability.rigid.characteristic_polynomial import expand_wall
 from zwidth.stability.rigid.crossover import (
     DelayPhase,
+    DelayPhaseFunction,
+    RootFinder,
     Verdict,
     decide_long_delay,
     decide_short_delay,
@@ -122,28 +124,47 @@ class Sized:
 
 def compute_wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
     """Return UNSTABLE, STABLE, OPEN or EDGE for each wall, elementwise."""
-    xp, plant = namespace(alpha, beta, delta), size_device(delta, d, kind)
-    wall, verdicts = expand_wall(Sized(alpha), Sized(beta))[:2], []
+    return decide_wall_codes(Sized(alpha), Sized(beta), size_device(delta, d, kind), kind, enclose_root, size_phase)
+
+
+def decide_wall_codes(
+    alpha: Any,
+    beta: Any,
+    plant: DiscretePlant,
+    kind: DelayClasses,
+    find_root: RootFinder,
+    evaluate_phase: DelayPhaseFunction,
+) -> Array:
+    """Return UNSTABLE, STABLE, OPEN or EDGE for each wall, elementwise, in any arithmetic with error bounds.
+
+    Args:
+        alpha: normalized stiffness, `Sized` or of another class with the same operators and the attribute ``value``.
+        beta: normalized damping.
+        plant: discretized device, of the same class.
+        kind: classes of the delays.
+        find_root: encloses the gain crossover.
+        evaluate_phase: encloses the phase lag at the gain crossover.
+    """
+    wall, verdicts = expand_wall(alpha, beta)[:2], []
+    xp = namespace(alpha.value, beta.value, plant.whole)
     if kind.short:
         verdicts.append(decide_short_delay(*wall, plant))
     if kind.long:
-        verdicts.append(decide_long_delay(*wall, plant.whole, plant, enclose_root, size_phase))
+        verdicts.append(decide_long_delay(*wall, plant.whole, plant, find_root, evaluate_phase))
     stable, unstable = (xp.where(plant.whole < 1, *pair) for pair in zip(verdicts[0], verdicts[-1], strict=True))
     # For alpha = 0 the verdict applies to the poles other than z = 1 and requires beta > delta (S15b of
     # one-crossover.md). For alpha > 0 no wall with beta <= -delta is stable (L16 of one-lobe.md). For alpha < 0 all
     # walls are unstable: P(1) = phi1 alpha < 0, so a real pole is above 1.
-    b, edge = wall[1] + plant.delta, alpha == 0
-    valid = (edge & (wall[1].value > delta)) | ((alpha > 0) & (b > 0))
+    b, edge, positive = beta + plant.delta, alpha.value == 0, alpha.value > 0
+    valid = (edge & (beta.value > plant.delta.value)) | (positive & (b > 0))
     code = xp.where(stable & valid, xp.where(edge, EDGE, STABLE), OPEN)
-    code = xp.where((unstable & valid) | (alpha < 0) | ((alpha > 0) & (b < 0)), UNSTABLE, code)
+    code = xp.where((unstable & valid) | (alpha.value < 0) | (positive & (b < 0)), UNSTABLE, code)
     return code.astype(xp.uint8)
 
 
 def size_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
     """Return the discretized device of exact delta and d as `Sized` numbers, NaN if out of range."""
     plant = discretize(delta, d, kind)
-    if kind.fractional and kind.long:
-        plant = materialize(plant, delta)  # compute it once, although several loops of the program use it
     sized = DiscretePlant(*(Sized(value, abs(value) + TINY) for value in plant))
     sized = sized._replace(delta=Sized(plant.delta), f=Sized(plant.f), whole=plant.whole, a0=None)
     if kind.fractional:

@@ -220,7 +220,9 @@ def label_grid(points: Points) -> np.ndarray:
     return _compare_with_limits(alpha, row_limits(beta, points.delta, points.d))
 
 
-def label_jax_arrays(arguments: Mapping[str, ArrayLike], kind: DelayClasses) -> Array:
+def label_jax_arrays(
+    arguments: Mapping[str, ArrayLike], kind: DelayClasses, kernel: Callable[..., Array] = stable_kernel
+) -> Array:
     """Return whether each wall is stable, in code compiled by JAX.
 
     If the shapes of the arguments form a grid, alpha is compared with the limit of its line of constant beta, as in
@@ -229,6 +231,7 @@ def label_jax_arrays(arguments: Mapping[str, ArrayLike], kind: DelayClasses) -> 
     Args:
         arguments: alpha, beta, delta and d by name, at least one of them a JAX array; their shapes broadcast.
         kind: `DelayClasses` that occur in d.
+        kernel: function that tests each wall separately.
     """
     values = arguments.values()
     with precision(values):
@@ -236,7 +239,7 @@ def label_jax_arrays(arguments: Mapping[str, ArrayLike], kind: DelayClasses) -> 
         shape, rows = (np.broadcast_shapes(*map(np.shape, parts)) for parts in (arrays, arrays[1:]))
         if np.prod(shape) >= MIN_DENSE_SIZE and MIN_ROW_LENGTH * np.prod(rows) <= np.prod(shape):
             return _compile_labels(kind)(*arrays)
-        return compile_kernel(stable_kernel, (kind,))(*arrays)
+        return compile_kernel(kernel, (kind,))(*arrays)
 
 
 @cache

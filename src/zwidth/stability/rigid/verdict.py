@@ -5,21 +5,24 @@ methods:
 
 - "crossover": the closed form at the gain crossover (`stability.rigid.crossover`). On a large grid, alpha is compared
   with the stability limit of its line of constant beta, by the same closed form (`stability.rigid.stiffness_limit`).
+  With the precision "mixed", most walls that form no grid are decided in float32 (`stability.rigid.mixed_precision`).
 - "companion": the spectral radius from all eigenvalues of the companion matrix (`stability.rigid.poles`).
 - "certified": the closed form with error bounds, then ball arithmetic (`stability.rigid.certified`).
 """
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias, get_args
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.status import Method, Status
 from zwidth.core.types import Array, ArrayLike
-from zwidth.core.xp import is_jax, is_traced
-from zwidth.numerics.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, precision, to_caller
+from zwidth.core.xp import epsilon, is_jax, is_traced, namespace
+from zwidth.numerics.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
+from zwidth.numerics.evaluate import precision as choose_precision
 from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.results import Stability
 from zwidth.stability.rigid.broadcasting import NAMES, Points, fold_arguments, restore_shape
@@ -30,6 +33,7 @@ from zwidth.stability.rigid.stiffness_limit import label_grid, label_jax_arrays
 
 StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
 STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
+Precision: TypeAlias = Literal["auto", "mixed"]
 
 # Error of computed eigenvalues at a double pole, about the square root of the rounding unit. The companion method
 # reports a wall as UNDECIDED if its spectral radius is closer to 1.
@@ -37,7 +41,13 @@ DOUBLE_POLE_ERROR = 2e-8
 
 
 def is_stable(
-    alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, method: StabilityMethod = "auto"
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    method: StabilityMethod = "auto",
+    precision: Precision = "auto",
 ) -> Array:
     """Return whether each wall is stable: all poles are strictly inside the unit circle.
 
@@ -51,8 +61,13 @@ def is_stable(
             an argument is constant cost nothing: for a grid pass alpha of shape (1, N) and beta of shape (M, 1).
         method: "crossover" evaluates the phase at the gain crossover, in closed form; "companion" computes all poles;
             "certified" returns True only with a certificate (`zwidth.decide_stability` returns the status of undecided
-            points). "auto" is "crossover". On a grid of one device it compares alpha with the stability limit at each
-            beta, by the same closed form.
+            points), and computes on the host, also for JAX arrays. "auto" is "crossover". On a grid of one device it
+            compares alpha with the stability limit at each beta, by the same closed form.
+        precision: number type of the closed form. "auto" is float64 in a direct call, and inside `jit` JAX's default
+            type. "mixed" computes each wall in float32 with an error bound. If the bound does not decide the label, as
+            for fewer than 1 in 1,000 random walls, "mixed" computes the wall again in float64. All its labels are those
+            of float64. On a CPU, "mixed" is slower than "auto"; it is meant for processors with slow float64
+            arithmetic, such as many GPUs. Large grids are computed as by "auto", with one comparison per wall.
 
     Returns:
         Boolean array of the broadcast shape, possibly read-only. False for unstable walls and for invalid input (NaN,
@@ -60,14 +75,14 @@ def is_stable(
         `zwidth.decide_stability` returns.
 
     Raises:
-        InputError: an argument is no real number, a scalar is out of range, shapes do not broadcast, or a name is
-            unknown.
+        InputError: an argument is no real number, a scalar is out of range, shapes do not broadcast, a name is unknown,
+            or the precision is "mixed" with another method than the closed form, or inside `jit` without x64.
         TracedDelayError: d is traced with method "companion".
 
     Numerics:
-        The cost does not depend on d. Float64 when called directly, the ambient precision inside `jit`. The label of
-        the closed form is right if alpha is more than some rounding errors away from the boundary; no faster, less
-        accurate method exists. Times per point: benchmarks/results/bench.md.
+        The cost does not depend on d. The label of the closed form is right if alpha is more than some rounding errors
+        away from the boundary. Times per point: benchmarks/results/bench.md. Errors of float32:
+        benchmarks/results/precision.md.
 
     References:
         docs/theory/one-crossover.md; Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
@@ -81,20 +96,49 @@ def is_stable(
     arguments, numbers = dict(zip(NAMES, values, strict=True)), are_numbers(*values)
     if method != "auto":
         check_choice("method", method, STABILITY_METHODS)
-    if method in ("auto", "crossover") and (numbers or any(map(is_jax, values))):
-        kind = classify_delays(d)
-        return evaluate(stable_kernel, arguments, kind) if numbers else label_jax_arrays(arguments, kind)
+    kernel = stable_kernel if precision == "auto" else _select_kernel(precision, method, values)
+    if method in ("auto", "crossover"):
+        if numbers and kernel is stable_kernel:
+            return evaluate(kernel, arguments, classify_delays(d))
+        if not numbers and any(map(is_jax, values)):
+            return label_jax_arrays(arguments, classify_delays(d), kernel)
     check_scalars(arguments)
     if method == "companion" and any(map(is_jax, values)):
-        with precision(values):
+        with choose_precision(values):
             return radius_by_companion(*values) < 1.0
+    _refuse_traced(values)
+    points, shape = fold_arguments(values)
+    return to_caller(restore_shape(_decide(points, method, kernel)[0], shape), values)
+
+
+def _refuse_traced(values: tuple[ArrayLike, ...]) -> None:
+    """Raise `InputError` if JAX traces any argument of the method "certified"."""
     if is_traced(*values):
         raise InputError(
             "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
             "'auto', 'crossover' or 'companion'"
         )
-    points, shape = fold_arguments(values)
-    return to_caller(restore_shape(_decide(points, method)[0], shape), values)
+
+
+def _select_kernel(precision: str, method: str, values: tuple[ArrayLike, ...]) -> Callable[..., Any]:
+    """Return the kernel that tests each wall separately in a precision; raise `InputError` if it is not possible."""
+    check_choice("precision", precision, get_args(Precision))
+    if precision == "auto":
+        return stable_kernel
+    if method not in ("auto", "crossover"):
+        raise InputError(f"precision: got 'mixed' with method {method!r}; use method 'auto' or 'crossover'")
+    if is_traced(*values):
+        import jax
+
+        if jax.numpy.result_type(float) != np.float64:
+            raise InputError(
+                "precision: got 'mixed' inside a JAX transformation without float64; call "
+                "jax.config.update('jax_enable_x64', True) first"
+            )
+    # Import the module only if the precision is requested, because most programs use float64.
+    from zwidth.stability.rigid.mixed_precision import label_in_mixed_precision
+
+    return label_in_mixed_precision
 
 
 def decide_stability(
@@ -112,7 +156,10 @@ def decide_stability(
         double pole; ``method``, the `Method` that decided. Arrays may be read-only.
 
     Raises:
-        InputError: as for `zwidth.is_stable`, and for traced values.
+        InputError, TracedDelayError: as for `zwidth.is_stable`.
+
+    Numerics:
+        As for `zwidth.is_stable`. JAX arrays are computed on their devices, with method "certified" on the host.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
@@ -124,9 +171,11 @@ def decide_stability(
     """
     values = (alpha, beta, delta, d)
     check_choice("method", method, STABILITY_METHODS)
-    check_scalars(dict(zip(NAMES, values, strict=True)))
-    if is_traced(*values):
-        raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
+    arguments = dict(zip(NAMES, values, strict=True))
+    check_scalars(arguments)
+    if method != "certified" and any(map(is_jax, values)):
+        return _decide_jax_arrays(arguments, method)
+    _refuse_traced(values)
     points, shape = fold_arguments(values)
     stable, deciding_method, status = _decide(points, method)
     input_status = wall_status(*points)
@@ -135,8 +184,40 @@ def decide_stability(
     return to_caller(Stability(*(restore_shape(leaf, shape) for leaf in (stable, *codes))), values)
 
 
-def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
-    """Return labels, the code of the method that decided them, and their statuses (None if all are OK)."""
+def _decide_jax_arrays(arguments: dict[str, ArrayLike], method: str) -> Stability:
+    """Return the stability of walls, at least one of whose arguments is a JAX array, by code that JAX compiles."""
+    values = tuple(arguments.values())
+    if method != "companion":
+        stable = label_jax_arrays(arguments, classify_delays(values[3]))
+        return Stability(stable, *evaluate(_status_kernel, arguments, Method.CROSSOVER))
+    radius = radius_by_companion(*values)
+    with choose_precision(values):
+        stable = radius < 1.0
+    return Stability(stable, *evaluate(_status_kernel, arguments | {"radius": radius}, Method.COMPANION))
+
+
+def _status_kernel(alpha: Array, beta: Array, delta: Array, d: Array, *others: Any) -> tuple[Array, Array]:
+    """Return the status of each wall and the code of the method; ``others`` are radii of method "companion", code."""
+    *radius, code = others
+    status = wall_status(alpha, beta, delta, d)
+    xp = namespace(status)
+    if radius:
+        error = max(DOUBLE_POLE_ERROR, epsilon(alpha) ** 0.5)
+        inconclusive = (xp.abs(radius[0] - 1.0) < error) & (alpha != 0) & (status == Status.OK)
+        status = xp.where(inconclusive, int(Status.UNDECIDED), status)
+    return status, xp.full_like(status, int(code))
+
+
+def _decide(
+    points: Points, method: str, kernel: Callable[..., Any] = stable_kernel
+) -> tuple[np.ndarray, Method, np.ndarray | None]:
+    """Return labels, the code of the method that decided them, and their statuses (None if all are OK).
+
+    Args:
+        points: walls.
+        method: name of the method.
+        kernel: function that tests each wall separately by the closed form, if the walls form no grid.
+    """
     if method == "companion":
         radius = np.asarray(radius_by_companion(*points))
         inconclusive = (np.abs(radius - 1.0) < DOUBLE_POLE_ERROR) & (np.asarray(points[0]) != 0)
@@ -149,5 +230,6 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
         return stable, Method.CERTIFIED, status
     if points.is_dense:
         return label_grid(points), Method.CROSSOVER, None
-    stable = evaluate_columns(stable_kernel, points.columns(), classify_delays(points.d))
+    route = "auto" if kernel is stable_kernel else "jax"
+    stable = evaluate_columns(kernel, points.columns(), classify_delays(points.d), route=route)
     return stable.reshape(points.shape), Method.CROSSOVER, None

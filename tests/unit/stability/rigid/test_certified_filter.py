@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from certified_labels import certified_stable
+from exact_differences import draw_walls, exact_differences, pick
 from mpmath import mp
 
 import oracles
@@ -29,11 +30,6 @@ BITS = 400
 UNIT = 2.0**-53
 DELTAS = np.array([0.0, 5e-324, 1e-300, 1e-16, 1e-8, 1e-3, 0.3, 1.0, 1.4999, 1.5, 1.51, 7.0, 50.0, 699.0, 750.0, 1e12])
 DELAYS = [1.0, 2.0, 7.0, 500.0, 1.5, 3.25, 60.7, np.nextafter(2.0, 1.0), 1.0 + 1e-12, 99999.5]
-
-
-def pick(value, index):
-    """Return one entry of an array; a number stands for all entries."""
-    return float(np.broadcast_to(value, index + 1 if np.ndim(value) == 0 else value.shape)[index])
 
 
 def errors(computed, exact, index, precision=BITS):
@@ -61,63 +57,6 @@ def collect_terms(plant, exact):
     return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
 
 
-def walls(count, seed, d):
-    """Return walls in and around the stable sets of many devices."""
-    rng = np.random.default_rng(seed)
-    delta = np.where(rng.random(count) < 0.5, rng.exponential(1.0, count), 10.0 ** rng.uniform(-9, 9, count))
-    d = np.full(count, float(d)) if np.ndim(d) == 0 else rng.choice(d, count)
-    scale = (1 + delta) / (1 + d)
-    return rng.uniform(0, 2, count) * scale, rng.uniform(-1, 2, count) * (delta + 1 / (1 + d)), delta, d
-
-
-class Exact:
-    """A ball that records every difference whose sign is tested."""
-
-    def __init__(self, ball, differences):
-        self.ball, self.differences = ball, differences
-
-    def new(self, ball):
-        return Exact(ball, self.differences)
-
-    def __add__(self, other):
-        return self.new(self.ball + getattr(other, "ball", other))
-
-    def __mul__(self, other):
-        return self.new(self.ball * getattr(other, "ball", other))
-
-    __radd__, __rmul__ = __add__, __mul__
-
-    def __neg__(self):
-        return self.new(-self.ball)
-
-    def __sub__(self, other):
-        return self + -other
-
-    def __rsub__(self, other):
-        return -self + other
-
-    def __truediv__(self, other):
-        return self.new(self.ball / other.ball)
-
-    def sqrt(self):
-        return self.new(self.ball.sqrt())
-
-    def __gt__(self, other):
-        self.differences.append((self - other).ball)
-        return bool(self.differences[-1] > 0)
-
-    def __lt__(self, other):
-        return -self > -other
-
-
-def exact_differences(verdict, wall, plant, *more):
-    """Return the differences whose signs a verdict tests, in balls."""
-    differences = []
-    terms = plant._replace(**{k: Exact(v, differences) for k, v in plant._asdict().items() if isinstance(v, flint.arb)})
-    verdict(*(Exact(value, differences) for value in wall), *more, terms)
-    return differences
-
-
 def computed_differences(monkeypatch, operation):
     """Return the differences whose signs ``operation`` tests, with their sizes."""
     differences = []
@@ -134,7 +73,7 @@ def computed_differences(monkeypatch, operation):
 
 @pytest.mark.parametrize("d", DELAYS)
 def test_error_bounds_of_the_crossover_hold(d, monkeypatch):
-    alpha, beta, delta, d = walls(60, 11, d)
+    alpha, beta, delta, d = draw_walls(60, 11, d)
     wall = Sized(alpha), Sized(beta)
     with np.errstate(all="ignore"):
         plant = size_device(delta, d, classify_delays(d))
@@ -185,7 +124,7 @@ def test_error_bounds_of_plants_with_short_delay_hold(d):
 
 @pytest.mark.parametrize("d", [0.0, 0.3, 0.93])
 def test_error_bounds_of_verdicts_with_short_delay_hold(d, monkeypatch):
-    alpha, beta, delta, _ = walls(80, 13, d)
+    alpha, beta, delta, _ = draw_walls(80, 13, d)
     plant = size_device(delta, np.full(80, d), classify_delays(d))
     differences = computed_differences(monkeypatch, lambda: decide_short_delay(Sized(alpha), Sized(beta), plant))
     compared = 0
@@ -202,7 +141,7 @@ def test_error_bounds_of_verdicts_with_short_delay_hold(d, monkeypatch):
 
 
 def test_error_bound_of_half_an_ulp_is_exceeded():
-    _, _, delta, d = walls(60, 11, [1.5, 4.2, 2.5])
+    _, _, delta, d = draw_walls(60, 11, [1.5, 4.2, 2.5])
     plant = size_device(delta, d, classify_delays(d))
     worst = [max(errors(*collect_terms(plant, certified.device(delta[i], d[i], BITS)), i)) for i in range(60)]
     assert max(worst) > UNIT / 2
@@ -227,7 +166,7 @@ def test_phi_functions_satisfy_the_assumed_error_bounds():
 
 @pytest.mark.parametrize("d", [0.0, 0.4, 1.0, 3.0, 1.7, 40.0])
 def test_filter_labels_agree_with_balls(d):
-    alpha, beta, delta, _ = walls(4000, 19, d)
+    alpha, beta, delta, _ = draw_walls(4000, 19, d)
     truth = certified_stable(alpha, beta, delta, d)
     code = certified.filter_walls(alpha, beta, delta, np.full(1, d))
     assert (code != certified.OPEN).mean() > 0.999

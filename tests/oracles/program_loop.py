@@ -23,7 +23,7 @@ class Filter:
         self.b = np.concatenate([np.zeros(self.a.size - self.b.size), self.b])
         self.size = self.a.size - 1
 
-    def step(self, state: np.ndarray, x: float) -> tuple[np.ndarray, float]:
+    def step(self, state: Any, x: Any) -> tuple[Any, Any]:
         """Return the next state and the output (transposed direct form II)."""
         b, a = self.b / self.a[0], self.a / self.a[0]
         y = b[0] * x + (state[0] if self.size else 0.0)
@@ -40,7 +40,7 @@ class Pll:
         self.kp, self.T = 2 * bandwidth, T
         self.ki = self.kp**2 / 4
 
-    def step(self, state: np.ndarray, x: float) -> tuple[np.ndarray, tuple[float, float]]:
+    def step(self, state: Any, x: Any) -> tuple[Any, tuple[Any, Any]]:
         """Return the next state, and position and velocity."""
         p, v = state
         p = p + self.T * v
@@ -112,9 +112,10 @@ class Program:
                 self.parts["r"] = Filter(feedback.numerator, feedback.denominator)
         self.size = sum(part.size for part in self.parts.values())
 
-    def step(self, state: np.ndarray, y: float) -> tuple[np.ndarray, float]:
+    def step(self, state: Any, y: Any) -> tuple[Any, Any]:
         """Return the next state, and the force."""
-        states, start = {}, 0
+        states: dict[str, Any] = {}
+        start = 0
         for name, part in self.parts.items():
             states[name] = state[start : start + part.size]
             start += part.size
@@ -144,10 +145,10 @@ class Program:
 
 def find_plant(scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return A, B and C of the device, in SI units."""
-    device = scene.device
-    if isinstance(device, zwidth.Device) and device.coupling is None:
+    device: Any = scene.device
+    if isinstance(scene.device, zwidth.Device) and device.coupling is None:
         return np.array([[0, 1], [0, -device.damping / device.mass]]), np.array([0, 1 / device.mass]), np.array([1, 0])
-    if isinstance(device, zwidth.Device):
+    if isinstance(scene.device, zwidth.Device):
         tip, m, b = device.coupling, device.mass, device.damping
         k, c, m2 = tip.stiffness, tip.damping, tip.mass
         rows = [-k / m, k / m, -(b + c) / m, c / m], [k / m2, -k / m2, c / m2, -c / m2]

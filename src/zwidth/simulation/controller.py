@@ -1,0 +1,204 @@
+"""Control program of a simulation at one sample: measure, estimate position and velocity, compute the command (T2).
+
+All functions are pure functions of arrays whose last axis is the batch. k is the index of a sample. A *ring* is a
+circular buffer of positions or commands, indexed by k modulo its length, a power of 2. FOAW is the adaptive velocity
+estimate of Janabi-Sharifi et al. 2000. The estimates and the further feedback are described in
+`simulation.parameters`; T2 is a step of docs/theory/simulation.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zwidth.core.types import Array
+from zwidth.simulation.parameters import Filter, Options, Parameters
+from zwidth.simulation.propagation import dot, read, times
+
+# Factor on the noise bound of FOAW, slightly above 1, so that deviations of exactly one encoder count are admissible in
+# spite of rounding errors.
+SLACK = 1.0 + 1e-9
+
+
+class FilterStates(NamedTuple):
+    """States of the filters of the control program, each of shape (order, batch)."""
+
+    position: Array  # of the position estimate
+    velocity: Array  # of the velocity estimate
+    feedback: Array  # of the further feedback
+
+
+class Controller(NamedTuple):
+    """State of the control program between two samples: previous measurements, commands and filter state."""
+
+    positions: Array  # ring of the positions from which the velocity is estimated, (length, batch)
+    filters: FilterStates
+    commands: Array  # ring of commands, (length, batch)
+    touching: Array  # True if the last sample was in contact with the wall, (batch,)
+
+
+class Reading(NamedTuple):
+    """Result of the control program at one sample; each array has the shape (batch,)."""
+
+    measured: Array  # measured position
+    velocity: Array  # estimated velocity
+    command: Array  # commanded force
+    touching: Array  # True if in contact with the wall
+
+
+def write(rows: Array, row: Array, index: Array) -> Array:
+    """Return a copy of the array ``rows`` in which ``row`` replaces the entry at ``index`` along the first axis."""
+    return jax.lax.dynamic_update_index_in_dim(rows, row, index, 0, allow_negative_indices=False)
+
+
+def look_back(ring: Array, k: Array, back: Array) -> Array:
+    """Return the entry of a ring that was written ``back`` samples before sample k.
+
+    ``back`` has the shape (batch,), or (1,) if it is equal for all simulations. The length of a ring is a power of 2.
+    """
+    index = (k - back) & (len(ring) - 1)
+    if back.shape[-1] == 1:
+        return read(ring, index[0])
+    return jnp.take_along_axis(ring, index[None], 0)[0]
+
+
+@np.errstate(all="ignore")
+def quantize(quantum: Any, position: Any) -> Any:
+    """Round a position to multiples of ``quantum``; return it unchanged if the quantum is 0 or rounding overflows."""
+    xp = np if isinstance(position, np.ndarray) else jnp
+    rounded = quantum * xp.floor(position / quantum + 0.5)
+    return xp.where(xp.isfinite(rounded), rounded, position)
+
+
+def control(
+    params: Parameters, options: Options, controller: Controller, k: Array, sensed: Array
+) -> tuple[Controller, Reading]:
+    """Run the control program at one sample: measure, estimate the velocity and compute the command (T2).
+
+    Args:
+        params: parameters of the simulations.
+        options: structure of the compiled program.
+        controller: state of the control program before the sample.
+        k: index of the sample.
+        sensed: position at the sensor, including noise, before quantization.
+
+    Returns:
+        The state of the control program after the sample, and the reading.
+    """
+    measured = quantize(params.resolution, sensed)
+    states, estimator = controller.filters, params.estimator
+    position = estimated_from = measured
+    if options.position:
+        position, filtered = _filter(params.position, states.position, measured)
+        states = states._replace(position=filtered)
+        estimated_from = jnp.where(params.filtered_input, position, measured)
+    positions = write(controller.positions, estimated_from, k & (len(controller.positions) - 1))
+    if options.foaw:
+        velocity = _adapt_window(positions, k, estimated_from, estimator.bound, options.foaw)
+    else:
+        window = estimator.window
+        difference = (estimated_from - look_back(positions, k, window)) / jnp.maximum(window, 1)
+        entering = jnp.where(window > 0, difference, estimated_from)
+        velocity, filtered = _filter(estimator.filter, states.velocity, entering)
+        states = states._replace(velocity=filtered)
+    touching = params.bilateral | (position > 0)
+    if options.law is None:
+        force = -(params.alpha * position + params.beta * velocity)
+    else:
+        force = options.law(position, velocity / params.period, k * params.period) / params.force
+        # With a force law, count a nonzero force as contact, because a force law defines no surface of the wall.
+        touching &= force != 0
+    if options.feedback:
+        entering = dot(params.feedback.weights, jnp.stack([measured, position, velocity]))
+        further, filtered = _filter(params.feedback.filter, states.feedback, entering)
+        # Reset the state outside of contact, so that an integrator does not integrate the distance from the wall.
+        states = states._replace(feedback=jnp.where(touching, filtered, 0.0))
+        force = force - further
+    force = jnp.where(touching, force, 0.0)
+    force = jnp.where(params.pulling, force, jnp.minimum(force, 0.0))
+    ring, motor = controller.commands, params.motor
+    last = read(ring, (k - 1) & (len(ring) - 1))
+    force = jnp.clip(force, -motor.max_force, motor.max_force)
+    command = jnp.clip(force, last - motor.max_rate, last + motor.max_rate)
+    commands = write(ring, command, k & (len(ring) - 1))
+    return Controller(positions, states, commands, touching), Reading(measured, velocity, command, touching)
+
+
+def _filter(part: Filter, state: Array, entering: Array) -> tuple[Array, Array]:
+    """Return the output of a filter for the input ``entering``, and its next state."""
+    output = part.D * entering
+    if not len(state):
+        return output, state
+    return output + dot(part.C, state), times(part.A, state) + part.B * entering
+
+
+def _adapt_window(ring: Array, k: Array, newest: Array, bound: Array, longest: int) -> Array:
+    """Return the FOAW velocity estimate: the slope between both ends of the longest admissible window.
+
+    A window of past samples is admissible if the positions in it deviate by at most ``bound`` from the straight line
+    between its ends, and if all shorter windows are admissible, too.
+
+    Args:
+        ring: ring of positions.
+        k: index of the current sample.
+        newest: position at the current sample.
+        bound: noise bound of the positions.
+        longest: largest length of the window, in samples.
+    """
+    past = ring[(k - np.arange(longest + 1)) & (len(ring) - 1)]
+    back = np.arange(1, longest + 1)[:, None]
+    slopes = (newest - past[1:]) / back
+    missed = jnp.abs(past[1:] - (newest - slopes[:, None] * back))  # of shape (window, sample, batch)
+    within = jnp.all((missed <= bound * SLACK) | (back > back[:, None]), axis=1)
+    length = jnp.sum(jnp.cumprod(within, 0), 0)
+    return jnp.take_along_axis(slopes, jnp.maximum(length - 1, 0)[None], 0)[0]
+
+
+def start_controller(
+    params: Parameters, options: Options, motion: tuple[np.ndarray, np.ndarray], rings: tuple[int, int]
+) -> Controller:
+    """Return the state of the control program before the first sample, after uniform motion without commands.
+
+    The estimates are stationary, and the state of the further feedback is 0.
+
+    Args:
+        params: parameters of the simulations.
+        options: structure of the compiled program.
+        motion: position of the sensor at sample 0, and its change per period.
+        rings: lengths of the rings of positions and of commands.
+    """
+    x, v = motion
+    back = np.mod(-np.arange(rings[0]), rings[0])
+    past, speed = quantize(params.resolution, x - back[:, None] * v), v
+    filtered, position, change = _settle(params.position, past[0], v)
+    if options.position:
+        past = np.where(params.filtered_input, position - back[:, None] * change, past)
+        speed = np.where(params.filtered_input, change, speed)
+    # The input of the velocity filter is constant if the filter follows a position difference over a window.
+    differs = params.estimator.window > 0
+    settled, _, _ = _settle(params.estimator.filter, np.where(differs, speed, past[0]), np.where(differs, 0.0, speed))
+    feedback = np.zeros((len(params.feedback.filter.B), x.size))
+    states = FilterStates(filtered, settled, feedback)
+    return Controller(past, states, np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
+
+
+def _settle(part: Filter, x: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the stationary state of a filter for the input ``x + k v``, and the value and change of its output.
+
+    Args:
+        part: the filter.
+        x: input at sample 0.
+        v: change of the input per period.
+
+    Returns:
+        The state before sample 0, the output at sample 0, and the change of the output per period.
+    """
+    A, B, C, D = (np.asarray(matrix) for matrix in part)
+    left = np.eye(len(B)) - np.moveaxis(A, -1, 0)
+    gain = np.linalg.solve(left, np.moveaxis(B, -1, 0)[..., None])
+    ramp, gain = np.linalg.solve(left, gain)[..., 0].T, gain[..., 0].T
+    state = gain * x - ramp * v
+    return state, np.sum(C * state, 0) + D * x, (np.sum(C * gain, 0) + D) * v
