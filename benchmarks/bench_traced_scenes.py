@@ -24,7 +24,11 @@ FUNCTIONS = {
     "`jit(grad)`": "jax.jit(jax.grad(K))",
     "`jit(hessian)`": "jax.jit(jax.hessian(K))",
     "`jit(vmap)`, 64 scenes": "jax.jit(jax.vmap(K))",
+    "`jit(vmap(grad))`, 64 scenes": "jax.jit(jax.vmap(jax.grad(K)))",
+    "`jit(vmap)`, 100,000 scenes": "jax.jit(jax.vmap(K))",
 }
+SECONDS = 10.0  # times from this one on are printed in seconds
+MANY = 10_000  # number of scenes from which only one call with other numbers is measured
 SCENES = {
     "low-pass": "Scene(Device(0.1, 10), Timing(1e-3, 1e-3), velocity=LowPass(cutoff=100))",
     "low-pass, coupling and hand": (
@@ -40,9 +44,9 @@ jax.block_until_ready(jax.jit(lambda x: x + 1)(1.0))
 def K(scene): return scene.max_stiffness().stiffness
 scene, function = {scene}, {function}
 def numbers(k):
-    factors = 1.0 + 0.01 * k + jax.numpy.linspace(0.0, 0.1, 64) if {many} else 1.0 + 0.01 * k
+    factors = 1.0 + 0.01 * k + jax.numpy.linspace(0.0, 0.1, {count}) if {count} else 1.0 + 0.01 * k
     return jax.block_until_ready(jax.tree.map(lambda x: x * factors, scene))
-scenes, times = [numbers(k) for k in range(6)], []
+scenes, times = [numbers(k) for k in range({calls})], []
 for each in scenes:
     start = time.process_time()
     jax.block_until_ready(function(each))
@@ -51,9 +55,12 @@ print(times[0], min(times[1:]))
 """
 
 
-def measure(scene: str, function: str) -> tuple[float, float]:
+def measure(scene: str, transformation: str) -> tuple[float, float]:
     """Return the CPU times in s of the first call, and of the fastest call with other numbers."""
-    program = PROGRAM.format(scene=scene, function=function, many="vmap" in function)
+    scenes = transformation.partition(", ")[2].removesuffix(" scenes").replace(",", "")
+    count = int(scenes or 0)
+    function, calls = FUNCTIONS[transformation], 2 if count >= MANY else 6
+    program = PROGRAM.format(scene=scene, function=function, count=count, calls=calls)
     output = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
     first, later = map(float, output.split())
     return first, later
@@ -73,9 +80,10 @@ def measure_all() -> str:
         "|---|---|--:|--:|",
     ]
     for name, scene in SCENES.items():
-        for transformation, function in FUNCTIONS.items():
-            first, later = measure(scene, function)
-            lines.append(f"| {name} | {transformation} | {first:.2f} s | {1e3 * later:.0f} ms |")
+        for transformation in FUNCTIONS:
+            first, later = measure(scene, transformation)
+            spelled = f"{1e3 * later:.0f} ms" if later < SECONDS else f"{later:.1f} s"
+            lines.append(f"| {name} | {transformation} | {first:.2f} s | {spelled} |")
     return "\n".join(lines) + "\n"
 
 

@@ -22,7 +22,7 @@ from methods.clock import time_calls
 from zwidth.core import xp
 from zwidth.numerics import blocks, evaluate
 from zwidth.plant.rigid_mass import ANY
-from zwidth.stability.rigid import crossover, ridge, ridge_newton
+from zwidth.stability.rigid import crossover, margins, ridge, ridge_newton, stiffness_limit
 from zwidth.stability.rigid.dominant import pole_count as circle
 from zwidth.stability.rigid.dominant import search as radius
 from zwidth.stability.rigid.dominant import steps as pole_step
@@ -64,7 +64,7 @@ def compiled(kernel: Callable[..., Any], options: dict[str, Any] | None = None, 
 @contextmanager
 def replaced(names: dict[str, Any]) -> Iterator[None]:
     """Replace functions of modules temporarily, while a kernel is traced."""
-    modules = {"crossover": crossover, "newton": ridge_newton}
+    modules = {"crossover": crossover, "newton": ridge_newton, "margins": margins, "limit": stiffness_limit}
     modules |= {"circle": circle, "radius": radius, "step": pole_step}
     patches = [patch.object(modules[name.split("__")[0]], name.split("__")[1], value) for name, value in names.items()]
     for each in patches:
@@ -109,6 +109,23 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     yield "WIDE, radius", compiled(quick, wide), compiled(quick), columns
     yield "WIDE, verdict", compiled(stable, wide), compiled(stable), columns
     yield "materialize, ridge", compiled(top), compiled(top, newton__materialize=same), (delta, d)
+    yield "materialize, radius", compiled(quick, wide), compiled(quick, wide, radius__materialize=same), columns
+
+    def phase_margin(*walls: Any) -> Any:
+        return margins.margins_kernel(*walls)[1]
+
+    yield (
+        "materialize, phase margin",
+        compiled(phase_margin),
+        compiled(phase_margin, margins__materialize=same),
+        columns,
+    )
+
+    def label(a: Any, b: Any) -> Any:
+        return stiffness_limit._compile_labels.__wrapped__(ANY)(a, b, 0.1, 1.0)
+
+    grid = jnp.linspace(0.001, 0.9, 2000)[:, None], jnp.linspace(0.0, 0.9, 2000)
+    yield "materialize, labels of a grid", compiled(label), compiled(label, limit__materialize=same), grid
     yield "angle, alone", compiled(xp.angle), compiled(their_angle), (alpha - 1.0, beta)
     other = {"circle__angle": their_angle, "circle__invert_haversine": their_turn, "radius__angle": their_angle}
     yield "angle and invert_haversine, radius", compiled(quick, wide), compiled(quick, wide, **other), columns

@@ -1,5 +1,8 @@
 """Every public name, once: what loads it on first use, and what type checkers read."""
 
+from .analysis.admittance import AdmittanceDisplay as AdmittanceDisplay
+from .analysis.admittance import EnvironmentLimit as EnvironmentLimit
+from .analysis.admittance import VirtualMassLimit as VirtualMassLimit
 from .analysis.assessment import Assessment as Assessment
 from .analysis.assessment import Limit as Limit
 from .analysis.assessment import assess as assess
@@ -73,6 +76,7 @@ from .model.position import Pll as Pll
 from .model.position import PositionFilter as PositionFilter
 from .model.safe_limit import SafeLimit as SafeLimit
 from .model.timing import Timing as Timing
+from .model.tool import Tool as Tool
 from .model.velocity import FOAW as FOAW
 from .model.velocity import BackwardDifference as BackwardDifference
 from .model.velocity import Butterworth as Butterworth

@@ -140,7 +140,7 @@ CASES = [
     make_wall_case(zwidth.decay_rate),
     make_wall_case(zwidth.dominant_pole),
     make_wall_case(zwidth.is_stable, derivatives=None, value="False"),
-    make_wall_case(zwidth.decide_stability, derivatives=None, value="False, with a status", refuses_tracing=True),
+    make_wall_case(zwidth.decide_stability, derivatives=None, value="False, with a status"),
     make_wall_case(zwidth.is_passive, derivatives=None, value="False"),
     make_wall_case(zwidth.passivity_margin),
     make_wall_case(

@@ -38,8 +38,7 @@ and which derivatives it has. `scripts/refresh_contract.py` writes the page from
   derivatives. The tests of each function cover the second derivatives, and the first derivatives of {elsewhere}.
 - **On devices of JAX.** Direct calls with JAX arrays are computed by compiled code on the devices of these arrays, and
   their results stay there, also if an array is distributed over several devices (`tests/contract/test_devices.py`).
-  The exceptions compute on the host: `count_poles`, `decay_rate`, `decide_stability`, `dominant_pole`,
-  `spectral_radius`, and `is_stable` with `method="certified"`.
+  The method "certified" of `is_stable` and `decide_stability` computes on the host.
 
 The domains of finite arguments are:
 

@@ -17,6 +17,16 @@ CALLS = {
     "passivity_margin": zwidth.passivity_margin,
     "alpha_max": lambda alpha, beta, delta, d: zwidth.alpha_max(delta, d),
     "boundary_point": lambda alpha, beta, delta, d: zwidth.boundary_point(delta, d, beta=beta),
+    "spectral_radius": zwidth.spectral_radius,
+    "decay_rate": zwidth.decay_rate,
+    "dominant_pole": zwidth.dominant_pole,
+    "decide_stability": zwidth.decide_stability,
+    "decide_stability companion": lambda alpha, beta, delta, d: zwidth.decide_stability(
+        alpha, beta, delta, 1.0, method="companion"
+    ),
+    "char_poly": lambda alpha, beta, delta, d: zwidth.char_poly(alpha, beta, delta, 1.5),
+    "poles": lambda alpha, beta, delta, d: zwidth.poles(alpha, beta, delta, 1),
+    "count_poles": lambda alpha, beta, delta, d: zwidth.count_poles([0.8], [1.0, 0.9], alpha, 3, beta + 0.5),
     "max_stiffness": lambda alpha, beta, delta, d: zwidth.max_stiffness(mass=beta, damping=delta, period=1, delay=d),
 }
 
@@ -24,22 +34,45 @@ CALLS = {
 PROGRAM = """
 import jax
 import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
+import zwidth
 from contract.test_devices import CALLS, WALLS
 
 first, second = jax.devices()
+kinds = AxisType.Explicit, AxisType.Auto
+explicit, automatic = (jax.make_mesh((2,), ("walls",), axis_types=(kind,)) for kind in kinds)
+
+
+def check(name, columns, mesh):
+    # Results are distributed over the first axis, as the arguments, and equal those of NumPy.
+    spread = NamedSharding(mesh, PartitionSpec("walls"))
+    with jax.enable_x64(True):
+        sharded = [jax.device_put(column, spread) for column in columns]
+    expected, results = (jax.tree.leaves(CALLS[name](*arrays)) for arrays in (columns, sharded))
+    for values, on_both in zip(expected, results, strict=True):
+        assert on_both.sharding.is_equivalent_to(spread, on_both.ndim), (name, on_both.sharding)
+        if name != "poles":
+            np.testing.assert_allclose(on_both, values, rtol=1e-11, atol=1e-14, err_msg=name)
+
+
 with jax.enable_x64(True):
     placed = [jax.device_put(column, second) for column in WALLS]
-    spread = NamedSharding(jax.make_mesh((2,), ("walls",)), PartitionSpec("walls"))
-    sharded = [jax.device_put(column, spread) for column in WALLS]
 for name, call in CALLS.items():
-    expected, one, two = (jax.tree.leaves(call(*columns)) for columns in (WALLS, placed, sharded))
-    for values, on_second, on_both in zip(expected, one, two, strict=True):
+    for values, on_second in zip(*(jax.tree.leaves(call(*columns)) for columns in (WALLS, placed)), strict=True):
         assert on_second.devices() == {second}, name
-        assert on_both.sharding.is_equivalent_to(spread, 1), (name, on_both.sharding)
-        np.testing.assert_allclose(on_second, values, rtol=1e-11, atol=1e-14, err_msg=name)
-        np.testing.assert_allclose(on_both, values, rtol=1e-11, atol=1e-14, err_msg=name)
+        if name != "poles":
+            np.testing.assert_allclose(on_second, values, rtol=1e-11, atol=1e-14, err_msg=name)
+    check(name, WALLS, explicit)
+for name in ("spectral_radius", "poles", "is_stable"):
+    check(name, WALLS, automatic)
+    # A grid of 64 x 8 walls, distributed by its rows.
+    check(name, [np.tile(column[:, None], (1, 8)) for column in WALLS], explicit)
+with jax.enable_x64(True):
+    walls = [jax.device_put(column, NamedSharding(explicit, PartitionSpec("walls"))) for column in WALLS]
+    inside = jax.jit(zwidth.spectral_radius)(*walls)
+    assert not inside.sharding.is_fully_replicated
+    np.testing.assert_allclose(inside, zwidth.spectral_radius(*WALLS), rtol=1e-11)
 """
 
 

@@ -20,6 +20,7 @@ from typing import Any, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 
+from zwidth.analysis.coupling_loop import CouplingLoop
 from zwidth.analysis.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.analysis.measured_loop import MeasuredLoop
 from zwidth.core.errors import InputError
@@ -36,6 +37,7 @@ from zwidth.model.parameter_paths import find_parts, list_parameters, replace_pa
 from zwidth.model.position import Position, has_velocity
 from zwidth.model.safe_limit import SafeLimit
 from zwidth.model.timing import Timing
+from zwidth.model.tool import Tool
 from zwidth.model.velocity import BackwardDifference, Velocity, is_plain
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.stability.rigid.normalization import Normalized, Physical, denormalize, normalize
@@ -57,6 +59,7 @@ _KINDS = {
     "safe_limit": (SafeLimit | None, "zwidth.SafeLimit(stiffness=500, virtual_damping=2)"),
     "position": (Position | None, "zwidth.ExponentialFilter(cutoff=100)"),
     "feedback": (Feedback | IntegralFeedback | None, "zwidth.IntegralFeedback(1000)"),
+    "tool": (Tool | None, "zwidth.Tool(mass=0.1)"),
 }
 
 
@@ -80,6 +83,7 @@ class SceneParts(Part):
     safe_limit: SafeLimit | None = None
     position: Position | None = None
     feedback: Feedback | IntegralFeedback | None = None
+    tool: Tool | None = None
 
     def __post_init__(self) -> None:
         """Raise `InputError` if a part has a wrong type or unit, or if the device does not allow an operator."""
@@ -89,7 +93,7 @@ class SceneParts(Part):
             part = getattr(self, name)
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; pass an object such as {example}")
-        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit")}
+        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit", "tool")}
         check_kind(self.unit_system.rotary, named)
         if self.operator is not None and not isinstance(self.device, Device):
             raise InputError(
@@ -102,6 +106,10 @@ class SceneParts(Part):
             raise InputError(
                 f"velocity: got {self.velocity!r}, but {self.position!r} has its own velocity estimate; omit velocity"
             )
+        if self.tool is not None and isinstance(self.device, MeasuredDevice):
+            raise InputError("tool: not allowed with a measured response; use a model of the device")
+        if self.tool is not None and (self.position is not None or self.feedback is not None):
+            raise InputError("tool: not allowed together with position or feedback; omit the tool, or omit these parts")
 
     def _shift_parts(self) -> None:
         """Move velocity estimate and operator to their fields if the positional arguments omit the wall before them."""
@@ -133,6 +141,8 @@ class SceneParts(Part):
             return MeasuredLoop(self)
         if self.nonrigid_parts and self.traced_path is not None:
             return self.traced_loop
+        if self.tool is not None:
+            return CouplingLoop(make_plain(self))
         return LinearLoop(make_plain(self)) if self.nonrigid_parts else RigidLoop(self)
 
     @cached_property

@@ -34,10 +34,12 @@ def is_safe_for_every_world(scene: Scene, stiffness: Walls = None, virtual_dampi
     """Return whether virtual couplings are stable with every passive tool, virtual world and operator.
 
     The condition is ``b (B + KT/2) >= sin^2((n+1)w/2) [(B + KT/2)^2 + (KT/2)^2 cot^2(w/2)]`` at all frequencies w
-    (rad per period), with the damping b of the device, the period T and a delay of n periods; the mass has no effect. A
-    simulated world is passive if its integration method preserves passivity, as the implicit Euler and the trapezoidal
-    method do. **The semi-implicit Euler method, which most physics
-    engines use, does not**: with a light tool, a coupling can be unstable although this function returns True.
+    (rad per period), with the damping b of the device, the period T and a delay of n periods; the mass has no effect.
+    The velocity of a tool is the backward difference ``(y_k - y_(k-1))/T`` of its position. A simulated tool is passive
+    if its impedance at this velocity has no negative real part. The implicit Euler method preserves passivity. The
+    trapezoidal rule preserves it if the position follows from the new velocity, ``y += T v``. **The semi-implicit Euler
+    method, which most physics engines use, does not preserve it**, nor does a trapezoidal rule for velocity and
+    position. With a light tool of these methods, a coupling can be unstable although this function returns True.
 
     Args:
         stiffness: K in N/m, >= 0; default: the stiffness of the scene's wall.
@@ -90,17 +92,17 @@ def max_safe_coupling(scene: Scene) -> SafeCoupling:
 
 def _find_delay(scene: Scene) -> int:
     """Return the delay, an integer number of periods; raise `InputError` if no condition is known for the scene."""
-    # Ignore the operator of the scene, because the condition covers every passive operator.
-    unsupported = [part for part in scene.nonrigid_parts if not part.startswith("operator")]
+    # Ignore operator and tool of the scene, because the condition covers every passive operator and tool.
+    unsupported = [part for part in scene.nonrigid_parts if part not in ("operator", "tool")]
     if unsupported:
         raise InputError(
             f"{unsupported[0]}: the condition is known only for a rigid device with the backward difference; "
-            "use is_stable with the tool as part of the device"
+            "use is_stable of a scene with the tool"
         )
     delay = float(scene.timing.d)
     if delay != round(delay):
         raise InputError(
-            f"delay: got {delay:g} periods; the condition is known only for integer delays; use is_stable with the "
-            "tool as part of the device"
+            f"delay: got {delay:g} periods; the condition is known only for integer delays; use is_stable of a "
+            "scene with the tool"
         )
     return round(delay)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import fields
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ import numpy as np
 
 from zwidth.core.errors import InputError, ZwidthError
 from zwidth.core.status import RidgeKind, Status
+from zwidth.core.xp import within
 from zwidth.model.checks import to_periods
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
@@ -30,13 +32,16 @@ from zwidth.stability.linear.loop_batch import sample
 from zwidth.stability.linear.rows import are_connected
 from zwidth.stability.results import RidgePoint
 from zwidth.stability.rigid.boundary import boundary_point
+from zwidth.stability.rigid.normalization import quantity_status
 from zwidth.stability.rigid.ridge import alpha_max
 from zwidth.stability.rigid.verdict import is_stable
-from zwidth.units.quantities import FIELDS, WALL
+from zwidth.units.quantities import FIELDS, WALL, WALL_RANGE
 
 RIGID_PARAMETERS = ("mass", "damping", "period", "delay")
 MAX_PIECES = 6  # largest number of pieces of arrays that NumPy evaluates faster than a function compiled by JAX
-LEAST_BATCH = 16  # smallest number of variants that are faster to evaluate at once than one by one
+LEAST_BATCH = 6  # smallest number of variants that are faster to evaluate at once than one by one
+# Fields of a scene that are evaluated for all variants at once. A scene with a further part is evaluated by itself.
+EVALUATED = ("device", "timing", "wall", "velocity", "operator", "safe_limit")
 LONGEST_WINDOW = 64  # longest velocity window, in periods, of variants evaluated at once; longer windows take too long
 # Densities of the frequency grid. The higher one is used for variants that are not confirmed with the lower one.
 DENSITIES = (1, 2)
@@ -57,6 +62,13 @@ class BatchRidge(NamedTuple):
 
     point: RidgePoint
     searched: np.ndarray  # True for variants that were searched one by one
+    angles: np.ndarray  # angles w of the two active constraints, shape (2, variants); NaN where ``searched``
+
+
+def list_further_parts(scene: Any) -> tuple[Any, ...]:
+    """Return the parts of a scene that are not evaluated for many variants at once."""
+    parts = (getattr(scene, item.name) for item in fields(scene) if item.name not in EVALUATED)
+    return tuple(part for part in parts if part is not None)
 
 
 class Variants:
@@ -81,7 +93,8 @@ class Variants:
         scene, nominal = self.scene, self.scene.parameters()
         values = {name: np.asarray(column, float) for name, column in self.drawn.items() if name not in WALL}
         if "rate" in values:
-            values["period"] = 1.0 / values.pop("rate")
+            with np.errstate(divide="ignore"):
+                values["period"] = 1.0 / values.pop("rate")
         period = values.get("period", np.full(self.count, float(scene.timing.period)))
         with np.errstate(all="ignore"):
             if "delay" in values or not scene.timing.in_periods:
@@ -89,7 +102,8 @@ class Variants:
             else:
                 d = np.full(self.count, float(scene.d))
             usable = np.full(self.count, self._is_supported(values)) & (d >= 0) & (d <= LONGEST_DELAY) & (period > 0)
-            for name, column in values.items():
+            walls = {name: self.drawn[name] for name in WALL if name in self.drawn}
+            for name, column in (values | walls).items():
                 key = f"mode.{name.rpartition('.')[2]}" if name.startswith("modes.") else name
                 usable &= np.isfinite(column) & (FIELDS[key].allowed.holds(column) if key in FIELDS else False)
             every: dict[str, Any] = {path: values.get(path, value) for path, value in nominal.items()}
@@ -101,11 +115,12 @@ class Variants:
         mass = every.get("mass", float(scene.mass)) + (every["operator.mass"] if rigid else 0.0)
         return _NormalizedVariants(values, d, period, np.broadcast_to(mass, period.shape), usable)
 
-    def _is_supported(self, values: dict[str, np.ndarray]) -> bool:
-        """Return whether all variants of the scene have the same structure, and one that can be evaluated at once."""
+    def _is_supported(self, values: dict[str, np.ndarray]) -> bool | np.ndarray:
+        """Return whether variants have the structure of the scene, and one that can be evaluated at once."""
         scene, nominal = self.scene, self.scene.parameters()
         device, velocity = scene.device, scene.velocity
         known = type(device) in (Device, LinearDevice) and type(velocity) in ESTIMATES.values()
+        known = known and not list_further_parts(scene)
         sampled = getattr(device, "dt", None) is not None
         whole = any(isinstance(nominal.get(name), int) for name in values)
         # Without a spring to ground a model has a different structure, so its stiffness must not be 0 in any variant.
@@ -122,22 +137,32 @@ class Variants:
 
     def labels(self, stiffness: float, damping: float) -> np.ndarray:
         """Return a boolean array with one entry per variant: True if the wall is stable on this variant."""
-        mass, period, usable = self.normalized.mass, self.normalized.period, self.normalized.usable
+        mass, period = self.normalized.mass, self.normalized.period
+        with np.errstate(all="ignore"):
+            rate = mass / period
+            return self.label_normalized(stiffness * period / rate, damping / rate)
+
+    def label_normalized(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """Return a boolean array: True if the wall (alpha, beta) with the index of a variant is stable on it."""
         stable, left = np.zeros(self.count, bool), np.full(self.count, True)
-        selected = np.flatnonzero(usable & (stiffness > 0) & (self.count >= LEAST_BATCH))
-        if selected.size:
+        inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE) & (alpha > 0)
+        selected = np.flatnonzero(self.normalized.usable & inside)
+        if selected.size >= LEAST_BATCH:
 
             def label(form, loop, sizes, states, index) -> tuple[np.ndarray, ...]:
-                rate = mass[selected[index]] / period[selected[index]]
                 loops = sample(form, loop, sizes)
-                outside, doubtful = count_outside(loops, stiffness * period[selected[index]] / rate, damping / rate)
+                outside, doubtful = count_outside(loops, alpha[selected[index]], beta[selected[index]])
                 return outside, np.asarray(doubtful)
 
             outside, doubtful = self._map(label, selected)
             stable[selected], left[selected] = outside == 0, doubtful
         for k in np.flatnonzero(left).tolist():
-            stable[k] = bool(self.build(k).is_stable(stiffness, damping))
+            stable[k] = self._label(k, alpha[k : k + 1], beta[k : k + 1])
         return stable
+
+    def _label(self, k: int, alpha: np.ndarray, beta: np.ndarray) -> bool:
+        """Return whether one wall is stable on the variant with the index k."""
+        return bool(self.build(k).loop.labels(alpha, beta)[0])
 
     def find_stiffness_limits(self, damping: np.ndarray) -> np.ndarray:
         """Return the upper end of the lowest stable interval of K for each variant and each B; 0 if no wall is stable.
@@ -171,19 +196,14 @@ class Variants:
             return np.where(np.isfinite(ends), ends, 0.0)
         return np.where(are_connected(low, high), high, 0.0).max(-1, initial=0.0)
 
-    def find_ridges(self, negative: bool, least_batch: int = LEAST_BATCH) -> BatchRidge:
-        """Return the stiffest stable wall of each variant, with B >= 0 unless ``negative``.
-
-        Args:
-            negative: True to allow B < 0.
-            least_batch: smallest number of variants that are evaluated at once.
-        """
+    def find_ridges(self, negative: bool) -> BatchRidge:
+        """Return the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
         columns = [np.full(self.count, np.nan) for _ in range(3)]
         kind, status = np.full(self.count, int(RidgeKind.NONE), np.int32), np.zeros(self.count, np.int32)
-        left = np.full(self.count, True)
+        left, angles = np.full(self.count, True), np.full((2, self.count), np.nan)
         for density in DENSITIES:
             selected = np.flatnonzero(left & self.normalized.usable)
-            if self.count < least_batch or not selected.size:
+            if self.count < LEAST_BATCH or not selected.size:
                 break
 
             def solve(form, loop, sizes, states, index, density=density) -> tuple[np.ndarray, ...]:
@@ -192,18 +212,18 @@ class Variants:
                 if states is not None:
                     for w in found.angles:
                         confirmed = confirmed & compare_responses(form, loop, states, w)
-                return (*found[:3], found.kind, confirmed)
+                return (*found[:3], found.kind, found.angles, confirmed)
 
-            *found, kinds, confirmed = self._map(solve, selected)
+            *found, kinds, both, confirmed = self._map(solve, selected)
             done = selected[confirmed]
             for column, part in zip(columns, found, strict=True):
                 column[done] = part[confirmed]
-            kind[done], left[done] = kinds[confirmed], False
+            kind[done], angles[:, done], left[done] = kinds[confirmed], both[:, confirmed], False
         for k in np.flatnonzero(left).tolist():
             *numbers, kind[k], status[k] = self._search_ridge(k, negative)
             for column, number in zip(columns, numbers, strict=True):
                 column[k] = number
-        return BatchRidge(RidgePoint._make([*columns, kind, status]), left)
+        return BatchRidge(RidgePoint._make([*columns, kind, status]), left, angles)
 
     def _search_ridge(self, k: int, negative: bool) -> tuple[float, ...]:
         """Return the stiffest wall of the variant with index k, computed by itself."""
@@ -214,10 +234,12 @@ class Variants:
         except (ArithmeticError, ZwidthError):
             return math.nan, math.nan, math.nan, int(RidgeKind.NONE), int(Status.NOT_CONVERGED)
 
-    def stiffest(self, negative: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return K and B of the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
-        point, rate = self.find_ridges(negative).point, self.normalized.mass / self.normalized.period
-        return point.alpha * rate / self.normalized.period, point.beta * rate
+    def stiffest(self, negative: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return K, B and `Status` of the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
+        point, period = self.find_ridges(negative).point, self.normalized.period
+        with np.errstate(all="ignore"):
+            rate = self.normalized.mass / period
+            return point.alpha * rate / period, point.beta * rate, point.status
 
 
 class RigidVariants(Variants):
@@ -261,9 +283,16 @@ class RigidVariants(Variants):
         return point * self.rate
 
     @np.errstate(all="ignore")
-    def stiffest(self, negative: bool) -> tuple[np.ndarray, np.ndarray]:
-        alpha, beta = self.evaluate(lambda *args: np.stack(alpha_max(*args)[:2]), self.delta, self.d)
-        return alpha * self.rate / self.period, beta * self.rate
+    def find_ridges(self, negative: bool) -> BatchRidge:
+        if not negative:
+            return super().find_ridges(negative)
+        *numbers, kind, status = self.evaluate(lambda *args: np.stack(alpha_max(*args)), self.delta, self.d)
+        valid = quantity_status(**self.drawn) == Status.OK
+        numbers = [np.where(valid, column, np.nan) for column in numbers]
+        kind = np.where(valid, kind, int(RidgeKind.NONE)).astype(np.int32)
+        status = np.where(valid, status, int(Status.INVALID_INPUT)).astype(np.int32)
+        point = RidgePoint._make([*numbers, kind, status])
+        return BatchRidge(point, np.full(self.count, False), np.stack([point.omega, point.omega]))
 
     @staticmethod
     def evaluate(function: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:

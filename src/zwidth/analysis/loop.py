@@ -401,6 +401,10 @@ class RigidLoop(LinearLoop):
         return passivity_margin(alpha, beta, self.scene.device_delta, self.scene.d)
 
     def vary(self, drawn: dict[str, np.ndarray]) -> Variants:
+        if "rate" in drawn:
+            with np.errstate(divide="ignore"):
+                period = 1.0 / drawn["rate"]
+            drawn = {"period": period} | {name: column for name, column in drawn.items() if name != "rate"}
         return RigidVariants(self.scene, drawn) if set(drawn) <= set(RIGID_PARAMETERS) else super().vary(drawn)
 
 

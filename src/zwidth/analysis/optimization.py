@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
@@ -337,20 +336,27 @@ class SceneOptima(SceneAnalysis):
         now = _get_present_value(self, parameter)
         low, high = _choose_range(self, parameter, now, within)
 
-        def surplus(value: float) -> float:
-            """Return the logarithm of the ratio of K_max to the required stiffness; NaN if K_max cannot be computed."""
-            wall = self.replace(**{parameter: value}).max_stiffness(negative_damping=negative_damping)
-            if wall.status == Status.NO_BOUNDARY:
+        def compare(K: float, status: int) -> float:
+            """Return the logarithm of the ratio of K to the required stiffness; NaN if K_max cannot be computed."""
+            if status == Status.NO_BOUNDARY:
                 return -NO_STIFFNESS
-            return math.log(wall.stiffness / stiffness) if wall.status == Status.OK else math.nan
+            return math.log(K / stiffness) if status == Status.OK else math.nan
 
-        tried, surpluses = np.geomspace(low, high, N_POINTS), {}
+        def surplus(value: float) -> float:
+            """Return the result of ``compare`` for the K_max at one value of the parameter."""
+            wall = self.replace(**{parameter: value}).max_stiffness(negative_damping=negative_damping)
+            return compare(wall.stiffness, wall.status)
+
+        tried = np.geomspace(low, high, N_POINTS)
         if low <= now <= high:
             tried = np.append(tried[np.abs(tried / now - 1.0) > SAME_VALUE], now)
-        for value in tried.tolist():
-            # Skip values that are not allowed, such as a cutoff above the Nyquist frequency.
-            with suppress(InputError):
-                surpluses[value] = surplus(value)
+        maxima, _, statuses = self.loop.vary({parameter: tried}).stiffest(allows_negative(self, negative_damping))
+        # Skip values that are not allowed, such as a cutoff above the Nyquist frequency.
+        surpluses = {
+            value: compare(K, status)
+            for value, K, status in zip(tried.tolist(), maxima, statuses, strict=True)
+            if status != Status.INVALID_INPUT
+        }
         if not surpluses:
             raise InputError(f"within: {parameter} has no allowed value from {low:g} to {high:g}")
         grid = sorted(surpluses)

@@ -384,6 +384,8 @@ class SceneAdvice(SceneOptima):
             requirements = requirements._replace(grasps="none")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)
+        if np.isinf(top.stiffness):
+            raise InputError("tool: the coupling is stable with every stiffness; choose K and B by assess or margins")
         choice = choose_wall(bare, requirements, top)
         notes += [choice.note] if choice.note else []
         notes += _describe_limit(self.safe_limit, beyond_safe, self.unit_system)

@@ -14,6 +14,7 @@ import numpy as np
 
 from zwidth.analysis.base import WallSI, wrap_methods
 from zwidth.analysis.coupling import is_safe_for_every_world, max_safe_coupling
+from zwidth.analysis.lightest_tool import lightest_tool
 from zwidth.analysis.recommendation import SceneAdvice
 from zwidth.core.errors import InputError
 from zwidth.core.types import ArrayLike
@@ -42,6 +43,8 @@ class Scene(SceneAdvice):
             None for the measured position. The velocity is estimated from the filtered position, unless the part says
             otherwise. An observer or PLL has its own velocity estimate and excludes ``velocity``.
         feedback: fixed further feedback, such as an integral gain; None without one.
+        tool: simulated tool. The stiffness and the damping of the wall are then those of the virtual coupling between
+            the device and this tool; None for a fixed wall.
 
     Numerics:
         A scene is a JAX pytree whose leaves are its numbers, so that it can be an argument of functions inside ``jit``,
@@ -96,6 +99,7 @@ class Scene(SceneAdvice):
         )
 
     is_safe_for_every_world = is_safe_for_every_world
+    lightest_tool = lightest_tool
     max_safe_coupling = max_safe_coupling
     simulate = simulate
     """Method that calls `zwidth.simulate` with this scene and all other arguments."""

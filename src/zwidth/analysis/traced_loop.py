@@ -20,6 +20,7 @@ import numpy as np
 
 from zwidth.analysis.loop import LinearLoop
 from zwidth.analysis.traced_answers import ANSWERS, INVALID
+from zwidth.analysis.traced_batch import evaluate_batch
 from zwidth.core.errors import InputError, ZwidthError
 from zwidth.core.status import Status
 from zwidth.core.types import Array
@@ -50,6 +51,10 @@ class Question:
     def __call__(self, order: int, points: np.ndarray) -> list[np.ndarray]:
         """Return values and derivatives; a row of ``points`` contains a scene's numbers and the further arguments."""
         count, size = self.structure.num_leaves, points.shape[1]
+        build = partial(_build_scene, self.structure)
+        batch = evaluate_batch(self.method, build, points, count, order, self.options)
+        if batch is not None:
+            return batch
         results = [np.full((len(points), ANSWERS[self.method][1], *[size] * k), np.nan) for k in range(order + 1)]
         results[0][:] = INVALID.get(self.method, np.nan)
         scenes, groups = np.unique(points[:, :count], axis=0, return_inverse=True, equal_nan=True)

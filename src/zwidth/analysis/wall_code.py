@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.analysis.base import SceneParts
-from zwidth.core.errors import check_choice
+from zwidth.core.errors import InputError, check_choice
 from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.position import has_velocity
@@ -135,6 +135,8 @@ def write_wall(
         max_force: largest force of the motor in N, to which the code limits the force.
     """
     check_choice("language", language, ("c", "python"))
+    if scene.tool is not None:
+        raise InputError("tool: code is written for walls only; write the coupling with the update of zwidth.Tool")
     program = build_program(scene, cautions, max_force)
     return _write_c(program) if language == "c" else _write_python(program)
 

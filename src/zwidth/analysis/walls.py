@@ -9,6 +9,7 @@ results back. K and B are the stiffness and damping of the wall, F(z) is the vel
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -159,10 +160,14 @@ class SceneAnalysis(SceneParts):
         the delayed forces. The result has A, B, C, D and the period dt.
         """
         compliance = self.timing.period**2 / float(self.mass)
-        return _realize(self, realize_closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
+        tool = self.tool and self.tool.respond(float(self.mass), self.timing.period)
+        build = partial(realize_closed_loop, tool=tool)
+        return _realize(self, build, compliance, *self.normalize_walls(stiffness, virtual_damping))
 
     def open_loop(self, stiffness: Wall = None, virtual_damping: Wall = None) -> StateSpace:
         """Return a state-space model of the open loop L with one wall; negative feedback closes the loop."""
+        if self.tool is not None:
+            raise InputError("tool: the state-space model of the open loop excludes a tool; use frequency_response")
         return _realize(self, realize_open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
 
     def frequency_response(
@@ -335,11 +340,11 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
 
     By default they are included for a `zwidth.Device` whose velocity is a positive multiple of the difference of two
     samples. They are excluded for a device given as a whole system: its true damping is unknown, so a wall with B < 0
-    would cancel modeled damping that may not exist.
+    would cancel modeled damping that may not exist. They are also excluded for the coupling of a simulated tool.
     """
     if negative_damping is not None and not isinstance(negative_damping, bool | np.bool_):
         raise InputError(f"negative_damping: got {negative_damping!r}; pass True, False or None")
-    if negative_damping is None and not isinstance(scene.device, ResponseDevice):
+    if negative_damping is None and scene.tool is None and not isinstance(scene.device, ResponseDevice):
         if not scene.nonrigid_parts:
             return True
         if has_velocity(scene.position):

@@ -105,6 +105,8 @@ def format_parts(scene: Scene) -> list[str]:
             words.append(f"{key} {spelled}")
         if name == "coupling":
             words.append(f"sensor at the {parts[name].sensor}")
+        if name == "tool":
+            words.append(f"{parts[name].integrator} Euler")
         words = [type(parts[name]).__name__, *words] if name in with_kind else words
         lines.append(format_line(name.replace("modes.", "mode "), ", ".join(words)))
     return lines
@@ -159,7 +161,20 @@ def list_notes(scene: Scene) -> list[str]:
     from zwidth.analysis.assessment import describe_islands
 
     undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
-    return [*undecided, *list_period_notes(scene), *describe_islands(scene), *compare_with_limit(scene)]
+    notes = [*undecided, *list_period_notes(scene), *list_tool_notes(scene), *describe_islands(scene)]
+    return [*notes, *compare_with_limit(scene)]
+
+
+def list_tool_notes(scene: Scene) -> list[str]:
+    """Return a list with a note on worlds and tools other than the tool of the scene; empty without a tool."""
+    if scene.tool is None:
+        return []
+    if scene.tool.integrator == "semi-implicit":
+        return [
+            "K and B are those of a virtual coupling; its tool, in semi-implicit Euler, is not passive, so a coupling "
+            "that is safe for every passive world may be unstable with it; lightest_tool returns the smallest mass"
+        ]
+    return ["K and B are those of a virtual coupling; is_safe_for_every_world includes every tool in implicit Euler"]
 
 
 def compare_with_limit(scene: Scene) -> list[str]:

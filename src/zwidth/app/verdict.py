@@ -8,7 +8,7 @@ device. A `Limit` is an improvement of the device with the K_max that it yields.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from math import isfinite, isnan
+from math import isfinite, isinf, isnan
 from typing import TYPE_CHECKING
 
 from zwidth.analysis.assessment import round_margin
@@ -27,6 +27,7 @@ from zwidth.app.printing import (
     spell_radius,
     wrap_lines,
 )
+from zwidth.core.errors import InputError
 from zwidth.model.device import Device
 from zwidth.model.safe_limit import reserve_damping
 from zwidth.stability.linear.passivity import find_obstacle
@@ -160,6 +161,9 @@ def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> 
 
 def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]:
     """Return printed lines with K_max and its wall, and the percentage of K_max that the wall of the scene uses."""
+    if isinf(verdict.stiffness_max):
+        damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
+        return [format_line("K_max", f"none: every K > 0 is stable at B = {damping} with this tool")]
     if not isfinite(verdict.stiffness_max):
         none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
         return [format_line("K_max", none)]
@@ -209,6 +213,8 @@ def format_decay(verdict: Assessment) -> list[str]:
 def spell_passivity(scene: Scene, verdict: Assessment) -> str:
     """Return a phrase on the passivity of a wall; with a coupling the condition is sufficient but not necessary."""
     stiffness, margin = scene.wall.stiffness, verdict.passivity_margin
+    if scene.tool is not None:
+        return _spell_worlds(scene)
     if verdict.passive is None:
         return f"not known {find_obstacle(scene).partition(':')[0]}"
     if stiffness < 0:
@@ -223,6 +229,20 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
     if verdict.passive:
         return f"yes: {size} of physical damping to spare"
     return f"{'no' if scene.device.coupling is None else 'not certified'}: {size} more physical damping needed"
+
+
+def _spell_worlds(scene: Scene) -> str:
+    """Return a phrase that states whether the coupling of a scene with a tool is stable with every passive world."""
+    try:
+        safe = bool(scene.is_safe_for_every_world())
+    except InputError:
+        return "not known for a virtual coupling with these parts"
+    if safe:
+        return "a virtual coupling, stable with every passive world, such as tools in implicit Euler"
+    K, B = scene.max_safe_coupling()
+    units = scene.unit_system
+    limit = f"K = {format_stiffness(K, units)}, B = {with_unit(B, units['N s/m'])}"
+    return f"a virtual coupling, not stable with every passive world; the stiffest that is: {limit}"
 
 
 def format_gains(heading: str, limits: Iterable[Limit], verbose: bool = False) -> list[str]:

@@ -6,13 +6,13 @@ for JSON, and printed lines.
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
 import click
 import numpy as np
 
+from zwidth.analysis.batch import stiffest_walls
 from zwidth.app.printing import LABEL, format_line, format_notes, format_parts, print_result
 from zwidth.app.verdict import spell_device
 from zwidth.cli.commands import EXIT_FAILED, cli
@@ -25,7 +25,6 @@ from zwidth.cli.options import (
     scene_options,
 )
 from zwidth.cli.parts import name_option
-from zwidth.core.errors import InputError
 from zwidth.core.status import Status
 from zwidth.units.formatting import (
     count_digits,
@@ -163,13 +162,10 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
 
 def _find_best(scene: Any, path: str, ends: tuple[float, float]) -> dict[str, float]:
     """Return the value in a range at which K_max is largest, and this K_max; both 0 if no wall is stable."""
-    maxima = {}
-    for value in [*([0.0] if path == "delay" else []), *np.geomspace(*ends, _TRIED).tolist()]:
-        with suppress(InputError):
-            top = scene.replace(**{path: value}).max_stiffness()
-            maxima[value] = float(top.stiffness) if top.status == Status.OK else 0.0
-    value = max(maxima, key=lambda value: maxima[value], default=0.0)
-    return {"value": value, "stiffness": maxima.get(value, 0.0)}
+    values = np.array([*([0.0] if path == "delay" else []), *np.geomspace(*ends, _TRIED)])
+    stiffness = np.nan_to_num(stiffest_walls(scene, {path: values}).stiffness)
+    k = int(np.argmax(stiffness))
+    return {"value": float(values[k]) if stiffness[k] else 0.0, "stiffness": float(stiffness[k])}
 
 
 def _choose_damping(scene: Any) -> tuple[dict[str, Any], list[str]]:

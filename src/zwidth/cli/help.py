@@ -20,6 +20,7 @@ GROUPS = {
     "Position estimate and further feedback": ("--position-", "--feedback-"),
     "Encoder, friction and motor": ("--resolution", "--friction", "--static-friction", "--max-force", "--max-rate"),
     "Hand": ("--operator-",),
+    "Simulated tool": ("--tool-",),
     "Further parts of the device": ("--coupling-", "--actuator-", "--modes-"),
     "Output": ("--figure", "--code", "--verbose", "--json", "--help"),
 }

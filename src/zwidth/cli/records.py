@@ -23,7 +23,8 @@ from zwidth.cli.options import (
 )
 from zwidth.cli.parts import make_kind, name_option, select_part
 from zwidth.model.checks import find_kind
-from zwidth.units.quantities import CHOICES, OF_LOGS, OF_PARTS
+from zwidth.units.log_columns import OF_LOGS
+from zwidth.units.quantities import CHOICES, OF_PARTS
 from zwidth.units.unit_system import UnitSystem
 
 if TYPE_CHECKING:

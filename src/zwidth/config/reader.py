@@ -105,7 +105,9 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
     # One rotary value makes all devices of a file rotary. Skip fit studies, because the units in their logs
     # determine whether their devices are rotary.
     if isinstance(data, Mapping):
-        return data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
+        # The positions of joints may be angles, whatever the units of the wall.
+        items = ((str(name), each) for name, each in data.items() if name != "joints")
+        return data.get("kind") != "fit" and any(has_rotary_devices(each, name) for name, each in items)
     if isinstance(data, list):
         return any(has_rotary_devices(each, key) for each in data)
     if key == "device" and isinstance(data, str):

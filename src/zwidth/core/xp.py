@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache, reduce
+from functools import lru_cache, reduce
 from math import factorial
 from typing import Any, TypeVar
 
@@ -171,7 +171,7 @@ def horner(x: Any, coefficients: Sequence[Any]) -> Any:
     return total
 
 
-@cache
+@lru_cache(256)
 def _polynomial(coefficients: tuple[float, ...]) -> Callable[[Any], Any]:
     """Return a polynomial with constant coefficients as a JAX function that is traced once.
 
@@ -269,8 +269,9 @@ def materialize(values: Values, witness: Array) -> Values:
         witness: any array whose values are unknown at compile time.
     """
     # XLA repeats cheap operations in every fused loop that uses their result, but it does not repeat a division.
-    # Therefore divide by 1, which is computed from ``witness`` so that the compiler cannot remove the division. For the
-    # maximum stiffness of rigid loops, this makes compilation 1.3 times and computation 1.3 to 1.5 times as fast.
+    # Therefore divide by 1, which is computed from ``witness`` so that the compiler cannot remove the division. In CPU
+    # time, the maximum stiffness and the spectral radius for mixed delays are computed 1.1 to 1.2 times as fast, phase
+    # margins 1.15 times, and labels of grids 2 to 4 times. Other kernels would gain less than 5 %.
     if not is_jax(witness):
         return values
     import jax

@@ -28,8 +28,11 @@ from typing import Any
 import numpy as np
 
 from zwidth.core.errors import InputError, check_choice, format_install_command
+from zwidth.model.checks import check_number
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
+from zwidth.units.parsing import looks_like_number
+from zwidth.units.quantities import ANY
 
 # Relative size below which a component of a vector, or an eigenvalue, is treated as a rounding error.
 NEGLIGIBLE = 1e-11
@@ -122,7 +125,9 @@ def from_mujoco(
         site: name of the site, the point on which the wall acts. For a model without sites, such as one from URDF, the
             name of a body, whose origin is the point.
         direction: "x", "y", "z" or a vector of three components in world coordinates.
-        pose: joint positions (``qpos``), name of a keyframe of the model, or None for the reference pose ``qpos0``.
+        pose: joint positions (``qpos``) in rad and m, or texts such as "30 deg"; a dict of positions by the name of
+            the joint, in which other joints keep their reference positions; the name of a keyframe of the model; or
+            None for the reference pose ``qpos0``.
         rotary: True for a wall that acts on the rotation about ``direction``, such as a knob or a steering wheel.
 
     Returns:
@@ -142,13 +147,7 @@ def from_mujoco(
         >>> zwidth.from_mujoco(model, "hub", "z", rotary=True)
         Device(mass=0.04, damping=0.3, rotary=True)
     """
-    try:
-        # Declare it as Any, because the type stubs of MuJoCo lack most functions.
-        mujoco: Any = import_module("mujoco")
-    except ImportError:
-        command = format_install_command("mujoco")
-        raise InputError(f"from_mujoco: MuJoCo is not installed; it is needed to read models; run {command}") from None
-    model = _load(mujoco, model)
+    mujoco, model = _import_mujoco(), load_model(model)
     _reject_constraints(model)
     data = mujoco.MjData(model)
     data.qpos[:] = _read_pose(model, pose)
@@ -307,8 +306,30 @@ def _realize(w: np.ndarray, D: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, n
     return A, B, C
 
 
-def _load(mujoco: Any, model: Any) -> Any:
+def _import_mujoco() -> Any:
+    """Return the package mujoco, as Any because its type stubs lack most functions; `InputError` if not installed."""
+    try:
+        return import_module("mujoco")
+    except ImportError:
+        command = format_install_command("mujoco")
+        raise InputError(f"from_mujoco: MuJoCo is not installed; it is needed to read models; run {command}") from None
+
+
+def list_joints(model: Any) -> dict[str, str]:
+    """Return the kind ("hinge" or "slide") of each named joint with one coordinate of a MuJoCo model, by its name."""
+    kinds = {int(getattr(_import_mujoco().mjtJoint, f"mjJNT_{kind.upper()}")): kind for kind in ("hinge", "slide")}
+    joints = (model.joint(index) for index in range(model.njnt))
+    return {joint.name: kinds[int(joint.type[0])] for joint in joints if joint.name and int(joint.type[0]) in kinds}
+
+
+def check_point(model: Any, site: str) -> None:
+    """Raise `InputError` if a MuJoCo model has no site, or without sites no body, with the given name."""
+    _find_point(_import_mujoco(), model, site)
+
+
+def load_model(model: Any) -> Any:
     """Return the MuJoCo model in the file with the given path; return a loaded model unchanged."""
+    mujoco = _import_mujoco()
     if isinstance(model, mujoco.MjModel):
         return model
     if not isinstance(model, str | Path):
@@ -347,13 +368,35 @@ def _read_pose(model: Any, pose: Any) -> np.ndarray:
     if isinstance(pose, str):
         check_choice("pose", pose, tuple(model.key(index).name for index in range(model.nkey)))
         return np.array(model.key(pose).qpos)
+    if isinstance(pose, dict):
+        positions, kinds = np.array(model.qpos0), list_joints(model)
+        for name, value in pose.items():
+            check_choice("pose", name, tuple(kinds))
+            unit = "rad" if kinds[name] == "hinge" else "m"
+            positions[int(model.joint(name).qposadr[0])] = check_number(f"pose.{name}", value, unit, ANY)
+        return positions
     try:
-        values = np.array(pose, float)
+        values = np.array(pose)
+        if values.dtype.kind in "US" and values.shape == (model.nq,):
+            values = [_read_position(model, index, text) for index, text in enumerate(pose)]
+        values = np.array(values, float)
+    except InputError:
+        raise
     except (TypeError, ValueError):
         values = np.array(np.nan)
     if values.shape != (model.nq,) or not np.isfinite(values).all():
         raise InputError(f"pose: got {pose!r}; it must be {model.nq} joint positions or the name of a keyframe")
     return values
+
+
+def _read_position(model: Any, index: int, value: Any) -> float:
+    """Return one entry of ``qpos``, given as a number or a text with a unit, in rad (hinges) or m (slides)."""
+    (joint,) = np.flatnonzero(np.asarray(model.jnt_qposadr) == index)
+    name = model.joint(int(joint)).name
+    # The numbers of a list with texts are texts as well; a number without a unit is in rad or m.
+    value = float(value) if isinstance(value, str) and looks_like_number(value) else value
+    unit = "m" if list_joints(model).get(name) == "slide" else "rad"
+    return check_number(f"pose.{name}", value, unit, ANY)
 
 
 def _find_point(mujoco: Any, model: Any, name: str) -> tuple[str, int]:

@@ -22,6 +22,7 @@ from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.operator import Operator
 from zwidth.model.position import POSITIONS, Position
 from zwidth.model.timing import Timing
+from zwidth.model.tool import Tool
 from zwidth.model.velocity import BackwardDifference, Velocity, name_estimate
 from zwidth.model.wall import NoWall, VirtualWall
 
@@ -42,6 +43,8 @@ class Parts(Protocol):
     @property
     def operator(self) -> Operator | None: ...
     @property
+    def tool(self) -> Tool | None: ...
+    @property
     def position(self) -> Position | None: ...
     @property
     def feedback(self) -> Feedback | IntegralFeedback | None: ...
@@ -52,7 +55,7 @@ AnyScene = TypeVar("AnyScene", bound=Parts)
 
 _BARE = ("device", "timing", "wall")  # parts whose parameters have paths without prefix
 _WHOLE = ("safe_limit",)  # parts that can only be replaced as a whole, because their parameters have no paths
-PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator}
+PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator, "tool": Tool}
 """Classes of the optional parts of a scene, by name, in the order in which descriptions list these parts."""
 WITH_KIND: dict[str, dict[str, Any]] = {"position": POSITIONS, "feedback": FEEDBACKS}
 """Classes of the optional parts that have several kinds, by the name of the part and of the kind."""

@@ -351,13 +351,19 @@ def _map_in_blocks(function: Callable[..., Any], arrays: Sequence[Any], block: i
     shape, size = arrays[0].shape, arrays[0].size
     # Use blocks on a CPU, because the intermediate results of a block fit in the cache: with 2^16 points per block, a
     # million stability tests take 40 % of the time without blocks, and a million maxima of the stiffness take 50 %.
-    # With several JAX devices, use no blocks, because a block of a distributed array would not lie on one device.
-    if size <= block or jax.default_backend() != "cpu" or jax.device_count() > 1:
+    if size <= block or not computes_on_one_cpu():
         return function(*arrays)
     count = -(-size // block)
     columns = [jnp.pad(a.reshape(-1), (0, count * block - size), mode="edge").reshape(count, block) for a in arrays]
     results = jax.lax.map(lambda parts: function(*parts), columns)
     return jax.tree.map(lambda leaf: leaf.reshape(-1)[:size].reshape(shape), results)
+
+
+def computes_on_one_cpu() -> bool:
+    """Return whether JAX computes on one CPU device only, so that no array is distributed over several devices."""
+    import jax
+
+    return jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
 @lru_cache(CACHED_KERNELS)

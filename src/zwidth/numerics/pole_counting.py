@@ -23,8 +23,9 @@ import numpy as np
 
 from zwidth.core.errors import InputError
 from zwidth.core.types import Array, ArrayLike, Counts, RootsLike
-from zwidth.core.xp import is_traced, namespace
-from zwidth.numerics.evaluate import join_shapes, to_caller
+from zwidth.core.xp import is_jax
+from zwidth.numerics.devices import map_on_devices
+from zwidth.numerics.evaluate import join_shapes, precision
 
 # Number of loops that one NumPy call evaluates, chosen so that the intermediate arrays fit in the cache.
 BLOCK_SIZE = 1 << 9
@@ -72,8 +73,8 @@ def count_poles(zeros: RootsLike, poles: RootsLike, gain: ArrayLike, lag: ArrayL
         differs from its argument by at most pi/2. The count is that of the larger part at z = -r, plus m at each
         crossover to B, minus m at each crossover to T, with m = round((arg T - arg B)/(2 pi)) and arguments that are
         continuous in w. The result is -1 unless m is constant on a disk; then nearly coincident crossovers have no net
-        effect. Direct calls compute with NumPy in float64; under jit or vmap the function is traced in the precision
-        of its arguments, and float32 returns -1 more often. A count has no derivative.
+        effect. Direct calls compute in float64, JAX arrays on their devices. Under jit or vmap the function is traced
+        in JAX's default float type, and float32 returns -1 more often. A count has no derivative.
 
     References:
         Walton, Marshall 1987, IEE Proc. D 134 (crossovers of loops with delay), Nyquist 1932, Bell Syst. Tech. J. 11.
@@ -88,10 +89,8 @@ def count_poles(zeros: RootsLike, poles: RootsLike, gain: ArrayLike, lag: ArrayL
     """
     values = {"zeros": zeros, "poles": poles, "gain": gain, "lag": lag, "radius": radius}
     members = list(_iterate_members(list(values.values())))
-    if is_traced(*members):
-        xp = namespace(*members)
-        traced = [xp.asarray(value, dtype=_get_type(name)) for name, value in values.items()]
-        return _compile_count()(_align_coefficients(traced, xp))
+    if any(map(is_jax, members)):
+        return _count_jax_arrays(values, members)
     columns = _align_coefficients([_check_coefficients(name, value) for name, value in values.items()], np)
     shape = columns[2].shape
     size = math.prod(shape)
@@ -101,8 +100,24 @@ def count_poles(zeros: RootsLike, poles: RootsLike, gain: ArrayLike, lag: ArrayL
         for start in range(0, size, BLOCK_SIZE):
             block = slice(start, start + BLOCK_SIZE)
             counts[block] = _count([column[block] for column in columns], np)
-    counts = counts.reshape(shape)
-    return to_caller(counts, tuple(members))
+    return counts.reshape(shape)[()]
+
+
+def _count_jax_arrays(values: dict[str, Any], members: list[Any]) -> Counts:
+    """Return the counts for arguments with JAX arrays among them, by code that JAX compiles, on their devices."""
+    import jax.numpy as jnp
+
+    arrays = []
+    for name, value in values.items():
+        kind = _get_type(name)
+        if not any(map(is_jax, _iterate_members(value))):
+            value = _check_coefficients(name, value)
+        elif kind is float and any(jnp.iscomplexobj(member) for member in _iterate_members(value)):
+            raise InputError(f"{name}: got complex numbers; real numbers are needed")
+        arrays.append((value, kind))
+    with precision(members):
+        columns = [jnp.asarray(value, dtype=jnp.result_type(kind)) for value, kind in arrays]
+        return map_on_devices(_compile_count(), _align_coefficients(columns, jnp))
 
 
 @cache
@@ -110,7 +125,7 @@ def _compile_count() -> Any:
     """Return `_count`, compiled by JAX as one program: outside jit, each of its 700 operations would be a program."""
     import jax
 
-    return jax.jit(lambda columns: _count(columns, jax.numpy))
+    return jax.jit(lambda *columns: _count(list(columns), jax.numpy))
 
 
 def _iterate_members(value: ArrayLike) -> Iterator[Any]:

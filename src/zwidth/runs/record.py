@@ -46,7 +46,7 @@ _PACKAGES = ("scipy", "matplotlib", "optimistix", "jaxopt")  # further packages 
 _TEMPORARY = re.compile(
     r"\..+\.[0-9a-f]{8}\.partial"
 )  # names of unfinished files and folders, from `temporary_sibling`
-_KEYS = ("csv", "device")  # keys of the configuration whose value may be the name of a file
+_KEYS = ("csv", "device", "model")  # keys of the configuration whose value may be the name of a file
 
 
 class Record:
@@ -326,7 +326,8 @@ def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[
     """
     files: dict[str, bytes] = {}
     names: dict[str, str] = {}
-    spans = find_values(text, "csv") + [span for span in find_values(text, "device") if span[0].endswith(SUFFIXES)]
+    spans = [*find_values(text, "csv"), *find_values(text, "model")]
+    spans += [span for span in find_values(text, "device") if span[0].endswith(SUFFIXES)]
     spans.sort(key=lambda span: span[1])
     for name, _, _ in spans:
         if name not in names and (folder / name).is_file():

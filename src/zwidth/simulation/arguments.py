@@ -57,6 +57,8 @@ def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
             raise InputError(
                 "scenes: got a measured response, which has no model to simulate; fit one to a log (zwidth.fit_log)"
             )
+        if scene.tool is not None:
+            raise InputError(f"scenes: got {scene.tool!r}, but simulations exclude a tool; use poles or dominant_pole")
         if scene.traced_path is not None:
             raise InputError("scenes: got values traced by JAX; call simulate outside of jit, vmap and grad")
         which[index] = numbers.setdefault(id(scene), len(numbers))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import groupby, product
@@ -20,7 +19,8 @@ import numpy as np
 from pydantic import BeforeValidator, GetPydanticSchema, ValidationInfo, WithJsonSchema
 
 from zwidth import plotting
-from zwidth.analysis.optimization import RequiredValue
+from zwidth.analysis.batch import stiffest_walls
+from zwidth.analysis.optimization import RequiredValue, StiffestWall
 from zwidth.analysis.scene import Scene
 from zwidth.analysis.tolerances import Tolerance, simulate_tolerances
 from zwidth.config.fields import LocatedProblem, problem, quote_names
@@ -34,7 +34,7 @@ from zwidth.model.velocity import BackwardDifference, LowPass, Velocity, Windowe
 from zwidth.model.velocity_noise import find_velocity_noise
 from zwidth.model.wall import VirtualWall
 from zwidth.plotting.table import SI_COLUMNS, stack
-from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiffest, summarize_stiffest, track_progress
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, spell_stiffest, summarize_stiffest
 from zwidth.units.formatting import describe, format_sufficient, header, short, with_unit
 from zwidth.units.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
 from zwidth.units.unit_system import UnitSystem
@@ -264,15 +264,10 @@ class DesignStudy(ComputedStudy):
             Columns with the values of the parameter, K_max and virtual damping. The latter two are NaN where the value
             is invalid or no wall is stable.
         """
-        rows = []
-        for value in np.geomspace(low, high, self.num).tolist():
-            wall = (math.nan, math.nan)
-            with suppress(InputError):
-                top = nominal.replace(**{self.find: value}).max_stiffness()
-                wall = (float(top.stiffness), float(top.virtual_damping)) if top.status == Status.OK else wall
-            named = {"parameter": self.find, header("value", PARAMETERS[self.find].unit): value}
-            rows.append({**named, **dict(zip(SI_COLUMNS, wall, strict=True))})
-        return stack(rows)
+        values = np.geomspace(low, high, self.num)
+        walls = stiffest_walls(nominal, {self.find: values})
+        columns = {header("value", PARAMETERS[self.find].unit): values, **dict(zip(SI_COLUMNS, walls, strict=False))}
+        return {"parameter": np.full(values.size, self.find), **columns}
 
 
 @register
@@ -351,10 +346,11 @@ class FiltersStudy(ComputedStudy):
             yield named, WindowedDifference(int(samples))
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        rows = []
-        bare = self.device.to_scene()
-        for damping, (named, velocity) in track_progress(list(product(self.dampings.tolist(), self.estimates()))):
-            top = bare.replace(damping=damping, velocity=velocity).max_stiffness()
+        rows, bare = [], self.device.to_scene()
+        cases = [(damping, *estimate) for damping, estimate in product(self.dampings.tolist(), self.estimates())]
+        walls = stiffest_walls(bare.replace(damping=damping, velocity=velocity) for damping, _, velocity in cases)
+        for (damping, named, velocity), *numbers in zip(cases, *walls[:5], strict=True):
+            top = StiffestWall(*numbers)
             row = {"damping_N_s_per_m": damping, **named, **summarize_stiffest(top)}
             if self.resolution is not None:
                 noise = find_velocity_noise(velocity, self.device.period, self.resolution)

@@ -35,7 +35,8 @@ from zwidth.model.velocity import BackwardDifference
 from zwidth.plotting.table import stack
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
 from zwidth.units.formatting import describe, header, plain, with_unit
-from zwidth.units.quantities import OF_LOGS, POSITIVE
+from zwidth.units.log_columns import OF_LOGS
+from zwidth.units.quantities import POSITIVE
 from zwidth.units.unit_system import LINEAR, UnitSystem
 
 _CHI_SQUARED_95 = 7.815  # 95 % quantile of chi-squared with three degrees of freedom

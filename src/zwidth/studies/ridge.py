@@ -37,6 +37,7 @@ from zwidth.plotting.table import SI_COLUMNS
 from zwidth.stability.rigid.passivity import passive_stiffness_slope
 from zwidth.stability.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.stability.rigid.verdict import is_stable
+from zwidth.studies.arm import Arm, compute_arm
 from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, find_device_share
 from zwidth.units.formatting import describe, format_wall, header, plain, round_conservatively, suggestion, with_unit
 from zwidth.units.parsing import split_head
@@ -214,15 +215,18 @@ class Poses(Strict, noun="a table of poses"):
 
 @register
 class WorkspaceStudy(ComputedStudy):
-    """The maximum stable stiffness over the workspace of a device, from its mass and damping in each pose."""
+    """The maximum stable stiffness over the workspace of a device, from a table of poses or a model of an arm."""
 
-    method = "Maximum stable stiffness of a rigid device per pose, to some rounding errors."
+    method = "Maximum stable stiffness of the device in each pose; for an arm, along each direction."
     from_scene = ("period", "delay")
 
     kind: Literal["workspace"]
 
-    poses: Poses
-    """Table file with mass, damping and two coordinates of each pose."""
+    poses: Poses | None = None
+    """Table file with mass, damping and two coordinates of each pose. Either poses or arm is required."""
+
+    arm: Arm | None = None
+    """MuJoCo model of an arm, with the positions of its joints and the directions of the wall."""
 
     rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
     period: Annotated[float, quantity_of("period"), WrapValidator(read_period)] = Field(
@@ -234,17 +238,25 @@ class WorkspaceStudy(ComputedStudy):
     def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         yield from find_second_period(raw)
         yield from super().find_conflicts(raw)
+        if ("poses" in raw) == ("arm" in raw):
+            got = "poses and arm are both given" if "arm" in raw else "poses or arm is missing"
+            yield (), problem(got, _FORM, "give {csv: arm.csv, across: shoulder, up: elbow} as poses, or an arm")
 
     @property
     def sizes(self) -> dict[str, int]:
-        return {"poses": self.poses.table.size}
+        if self.arm is not None:
+            return {"poses": len(self.arm.poses), "directions": len(self.arm.directions)}
+        return {"poses": self.poses.table.size if self.poses else 0}
 
     def find_faults(self) -> Iterable[LocatedProblem]:
         yield from super().find_faults()
-        if self.poses.table.size < 2:
+        if self.poses is not None and self.poses.table.size < 2:
             yield ("poses",), problem("got one pose", "at least two are needed", "use the kind 'recommend' instead")
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        if self.arm is not None:
+            return compute_arm(self.arm, Timing(self.period, self.delay), self.unit_system)
+        assert self.poses is not None, "a study without an arm has poses"
         mass, damping = (self.poses.table.values(name) for name in ("mass", "damping"))
         rate = mass / self.period
         d, delta = self.delay.periods(self.period), damping / rate

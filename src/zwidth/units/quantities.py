@@ -225,6 +225,9 @@ _PARAMETERS = (
         note="for order 2 only, default: sqrt(1/2)",
     ),
     *(each for k in range(MOST_MODES) for each in _describe_mode(f"modes.{k}", f"mode {k}", str(k))),
+    Parameter("tool.mass", "mass of the simulated tool", "M", POSITIVE, "kg", (1e-3, 2.0), "", "mass of the tool"),
+    Parameter("tool.damping", "damping of the simulated tool", "c_t", NOT_NEGATIVE, "N s/m", (0.0, 9.0), "default 0"),
+    Parameter("tool.stiffness", "stiffness of the simulated tool", "k_t", NOT_NEGATIVE, "N/m", (0.0, 1e3), "default 0"),
     Parameter("stiffness", "stiffness K of the virtual wall", "K", ANY, "N/m", (0.0, 50e3), short_name="stiffness"),
     Parameter(
         "alpha", "normalized stiffness of the virtual wall, K T^2/m", r"\alpha", ANY, slider=(0.0, 1.0),
@@ -318,15 +321,7 @@ CHOICES = {
         ("backward", "forward", "trapezoidal"), "Rule of integration of the integral gain; default: backward"
     ),
     "coupling.sensor": Choice(("motor", "tip"), "Location of the position sensor; default: motor"),
-}
-
-# Help texts of the options that describe the columns of a log file, by name of the option.
-OF_LOGS = {
-    "time": "Time column: HEADER, HEADER:ms, or HEADER:s+HEADER:ns for two columns. Default: recognized by its header.",
-    "position": "Position column: HEADER, or with a unit HEADER:mm, HEADER:counts or HEADER:deg.",
-    "force": "Column of the commanded force: HEADER, or with a unit HEADER:mN; for a torque HEADER:'mN m'.",
-    "resolution": "Encoder resolution, e.g. 0.03mm, 0.09deg or '4000 counts/rev'.",
-    "motor_constant": "Motor constant, i.e. force per ampere, e.g. 5N/A, if the force column is a current in A.",
+    "tool.integrator": Choice(("semi-implicit", "implicit"), "Euler method of the tool; default: semi-implicit"),
 }
 
 Family: TypeAlias = Literal["wall", "device"]  # an output has one value per wall, or one value per device and delay

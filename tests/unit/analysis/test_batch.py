@@ -24,6 +24,7 @@ from zwidth import (
     WindowedDifference,
     stiffest_walls,
 )
+from zwidth.analysis import ensemble
 
 TIMING = Timing(1e-3, 1.5e-3)
 FILTER = LowPass(cutoff=100)
@@ -93,6 +94,34 @@ def test_walls_of_a_scene_do_not_depend_on_the_other_scenes():
     for one, other, *parts in zip(together, listed, *halves, strict=True):
         np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(one, np.concatenate(parts))
+
+
+def test_a_stable_interval_between_two_neighboring_nodes_is_not_missed():
+    # Above a corner, the line of constant K has a stable interval of B whose two crossings lie between two nodes. There
+    # k has an inflection, so that the tangents at both nodes do not meet below 0.
+    tip = Coupling(mass=0.013077892958936166, stiffness=15491.16384893111, damping=4.604129519090308)
+    device = Device(mass=0.03209467560615074, damping=14.731931522678714, coupling=tip)
+    scene = Scene(device, Timing(period=0.0005848654306631077, delay=0.0002189259337193867))
+    walls = stiffest_walls(scene, {"mass": device.mass * np.linspace(0.999, 1.001, 9)})
+    np.testing.assert_allclose(walls.stiffness[4], scene.max_stiffness().stiffness, rtol=1e-9)
+    assert np.ptp(walls.stiffness) < 0.01 * walls.stiffness[4]
+
+
+def test_few_scenes_are_searched_one_by_one():
+    scene, values = SCENES["low-pass"], {"mass": [0.1, 0.2, 0.3]}
+    walls = stiffest_walls(scene, values)
+    assert walls.searched.all()
+    expected = [scene.replace(mass=mass).max_stiffness().stiffness for mass in values["mass"]]
+    np.testing.assert_array_equal(walls.stiffness, expected)
+
+
+def test_a_wall_that_only_a_bent_path_connects_to_zero_stiffness_is_confirmed():
+    # Just below this maximum, no wall with the same B is stable, and the ray from K = B = 0 leaves the stable set.
+    device = Device(0.137, 0.497, coupling=Coupling(0.617, 30300.0, 83.9))
+    scene = Scene(device, Timing("1.8 ms", "2.89 ms"))
+    walls = stiffest_walls(scene, {"mass": np.linspace(0.135, 0.139, 9)})
+    assert not walls.searched.any()
+    np.testing.assert_allclose(walls.stiffness[4], scene.max_stiffness().stiffness, rtol=1e-9)
 
 
 def test_scenes_of_different_structures_may_be_mixed():
@@ -173,3 +202,26 @@ def test_values_may_be_texts_with_units():
     walls = stiffest_walls(SCENES["low-pass"], {"mass": ["100 g", "0.2 kg"], "delay": ["1 ms", "2 ms"]})
     numbers = stiffest_walls(SCENES["low-pass"], {"mass": [0.1, 0.2], "delay": [1e-3, 2e-3]})
     np.testing.assert_array_equal(walls.stiffness, numbers.stiffness)
+
+
+def test_rigid_devices_have_a_closed_form():
+    scene = Scene(Device(0.1, 10), Timing("1 ms", "1 ms"))
+    values = {"mass": [0.1, 0.2, -1, 0.3], "damping": [10, 0, -5, np.nan]}
+    walls = stiffest_walls(scene, values)
+    np.testing.assert_array_equal(walls.status == Status.OK, [True, True, False, False])
+    assert not walls.searched.any()
+    expected = [float(scene.replace(mass=m, damping=b).max_stiffness().stiffness) for m, b in ((0.1, 10), (0.2, 0))]
+    np.testing.assert_allclose(walls.stiffness, [*expected, np.nan, np.nan], rtol=1e-14)
+    rates = stiffest_walls(scene, {"rate": [1000, 2000, 0]})
+    np.testing.assert_allclose(rates.stiffness[1], scene.replace(rate=2000).max_stiffness().stiffness, rtol=1e-14)
+    assert rates.status[2] == Status.INVALID_INPUT
+
+
+def test_scenes_with_a_part_that_batches_do_not_know_are_searched_one_by_one(monkeypatch):
+    monkeypatch.setattr(ensemble, "EVALUATED", tuple(name for name in ensemble.EVALUATED if name != "operator"))
+    scene = SCENES["rigid hand"]
+    for walls in (
+        stiffest_walls(scene, {"mass": np.linspace(0.1, 0.2, 8)}),
+        stiffest_walls([SCENES["low-pass"], *[scene.replace(mass=mass) for mass in np.linspace(0.1, 0.2, 8)]]),
+    ):
+        assert walls.searched.all()

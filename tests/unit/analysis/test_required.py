@@ -8,6 +8,7 @@ import pytest
 from required_values import find_required
 
 from zwidth import Device, LowPass, Scene, Status, Timing
+from zwidth.analysis.ensemble import Variants
 from zwidth.analysis.optimization import Crossing, _find_crossing
 from zwidth.core.errors import InputError
 
@@ -77,15 +78,21 @@ def test_unreachable_stiffness_and_stiffness_reached_everywhere():
 
 @pytest.mark.parametrize("failing, status", [((11, 15), Status.NOT_CONVERGED), ((60, 80), Status.OK)])
 def test_required_is_nan_if_a_nearer_crossing_cannot_be_excluded(failing, status, monkeypatch):
-    original = Scene.max_stiffness
+    single, many = Scene.max_stiffness, Variants.stiffest
+
+    def fail(damping, statuses):
+        return np.where((failing[0] < damping) & (damping < failing[1]), Status.NOT_CONVERGED, statuses)
 
     def fail_in_interval(scene, **options):
-        maximum = original(scene, **options)
-        return (
-            maximum._replace(status=Status.NOT_CONVERGED) if failing[0] < scene.device.damping < failing[1] else maximum
-        )
+        maximum = single(scene, **options)
+        return maximum._replace(status=fail(scene.device.damping, maximum.status))
+
+    def fail_in_interval_of_many(variants, negative):
+        stiffness, damping, statuses = many(variants, negative)
+        return stiffness, damping, fail(variants.drawn["damping"], statuses)
 
     monkeypatch.setattr(Scene, "max_stiffness", fail_in_interval)
+    monkeypatch.setattr(Variants, "stiffest", fail_in_interval_of_many)
     result = RIGID.required("damping", 25e3)
     assert (result.status, np.isnan(result.value)) == (status, status != Status.OK)
     assert [crossing.sufficient_side for crossing in result.crossings] == ["above"]

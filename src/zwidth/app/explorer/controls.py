@@ -184,7 +184,7 @@ class Controls:
         return new.check()
 
     def check(self) -> Controls:
-        """Return the controls unchanged; raise `InputError` if the loop has too many poles for the page."""
+        """Return the controls unchanged; raise `InputError` if the page cannot show the poles or the stable set."""
         # Build the loop, because this also checks combinations of parts, such as a cutoff above the Nyquist frequency.
         order = self.scene.loop.roots.order
         if order > _MOST_POLES:
@@ -192,6 +192,8 @@ class Controls:
                 f"delay: the loop has {order} poles, but the page allows {_MOST_POLES}; "
                 "shorten the delay or the window, or use zwidth check"
             )
+        if self.scene.tool is not None:
+            _ = self.scene.loop.stable_set  # raises an error if the set of stable couplings is unbounded
         return self
 
     def _refuse_change(self, name: str) -> None:

@@ -143,7 +143,7 @@ def compute_ridge(scene: Scene) -> Curve:
     """Return the stiffest stable walls as the damping of the device rises from 0 to four times its current value."""
     most = _MOST_DAMPING * (float(scene.device.damping) or 0.25 * scene.units.virtual_damping)
     dampings = np.linspace(0.0, most, min(_RIDGE_POINTS, 1 + scene.loop.draws // 25))
-    return scene.loop.vary({"damping": dampings}).stiffest(allows_negative(scene, None))
+    return scene.loop.vary({"damping": dampings}).stiffest(allows_negative(scene, None))[:2]
 
 
 def simulate_hit(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
@@ -279,12 +279,10 @@ def compute_details(
         x, y = compute_ridge(scene) if bodies else (np.empty(0), np.empty(0))
         yield {"ridge": {"x": x, "y": y}}
         yield {"slopes": "\n".join([] if normalized else [slope.line() for slope in list_slopes(scene)])}
-    if contact and not bodies:
+    if contact and (not bodies or scene.tool is not None):
+        reason = "a hit needs a wall, not a simulated tool" if bodies else "a linear system has no body with a velocity"
         empty = {"x": [], "position": [], "force": []}
-        yield {
-            "contact": empty,
-            "contact_words": "(not available: a linear system has no body with a velocity)",
-        }
+        yield {"contact": empty, "contact_words": f"(not available: {reason})"}
     elif contact:
         with IMPORTING:
             import jax  # noqa: F401

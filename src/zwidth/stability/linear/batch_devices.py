@@ -24,7 +24,7 @@ from zwidth.model.parameter_paths import Parts, fill_parameters
 from zwidth.numerics.threads import run_in_threads
 from zwidth.plant.rigid_mass import discretize_mass, factor_numerator
 from zwidth.plant.sampled_states import SampledStates, integrate_chain
-from zwidth.stability.linear.batch_lines import VECTOR_SIZE
+from zwidth.stability.linear.batch_lines import pad_index
 from zwidth.stability.linear.loop_batch import Form, LoopBatch, Sizes, count_nodes, evaluate
 
 # Angles in rad per sample at which q = -1/G from polynomials and q from matrices are compared, and the largest relative
@@ -199,7 +199,7 @@ def map_loops(
     """
     whole, tasks = np.floor(d), []
     for n in np.unique(whole).astype(int).tolist():
-        index = _pad(np.flatnonzero(whole == n))
+        index = pad_index(np.flatnonzero(whole == n))
         filled = fill_parameters(scene, {path: column[index] for path, column in values.items()})
         fraction = d[index] if np.any(d[index] != n) else np.float64(n)
         batch = build_loops(build_chain(filled, (fraction, n)), index.size)
@@ -213,7 +213,7 @@ def map_loops(
 
     def run(task: tuple[DeviceBatch, Sizes, np.ndarray, np.ndarray]) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
         batch, sizes, index, members = task
-        padded = _pad(members)
+        padded = pad_index(members)
         states = batch.states
         if states is not None:
             states = SampledStates(states.psi[padded], states.full[padded], states.late[padded], states.n_delay)
@@ -227,8 +227,3 @@ def map_loops(
         for to, part in zip(whole_results, results, strict=True):
             to[..., index] = part
     return whole_results
-
-
-def _pad(index: np.ndarray) -> np.ndarray:
-    """Return an array of indices, padded with copies of its last entry to a multiple of `VECTOR_SIZE`."""
-    return np.pad(index, (0, -index.size % VECTOR_SIZE), mode="edge")

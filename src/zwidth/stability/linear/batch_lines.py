@@ -64,6 +64,11 @@ def find_position(line: Line, values: Values) -> Array:
     return (distance * xp.conj(direction)).real / (direction.real**2 + direction.imag**2)
 
 
+def pad_index(index: np.ndarray) -> np.ndarray:
+    """Return an array of indices, padded with copies of its last entry to a multiple of `VECTOR_SIZE`."""
+    return np.concatenate([index, np.repeat(index[-1:], -index.size % VECTOR_SIZE)])
+
+
 class NodeCells(NamedTuple):
     """Selected intervals between neighboring nodes, listed one after the other for all loops."""
 
@@ -82,9 +87,9 @@ def list_cells(selected: Array, most: int) -> NodeCells:
         cell, loop = np.nonzero(selected)
         slot = np.cumsum(selected, 0, dtype=np.int32)[cell, loop] - 1
         crowded = np.bincount(loop, minlength=n) > most
-        padding = (0, -cell.size % VECTOR_SIZE)
-        columns = (np.pad(part, padding) for part in (cell, loop, slot, slot < most))
-        return NodeCells._make([*columns, crowded, most])
+        padding = np.zeros(-cell.size % VECTOR_SIZE, int)
+        cell, loop, slot, valid = (np.concatenate([part, padding]) for part in (cell, loop, slot, slot < most))
+        return NodeCells(cell, loop, slot, valid > 0, crowded, most)
     first = xp.sort(xp.where(selected, xp.arange(count)[:, None], count), 0)[:most]
     slot, loop = xp.meshgrid(xp.arange(most), xp.arange(n), indexing="ij")
     valid = first < count
@@ -118,6 +123,10 @@ class LineCrossings(NamedTuple):
     cell: Array  # index of the node below the angle of the crossing; -1 for a pole at z = -1
     doubtful: Array  # True for loops whose nodes do not resolve k, shape (loops,)
 
+    def take(self, index: Array) -> LineCrossings:
+        """Return the crossings of the loops with the given indices."""
+        return LineCrossings(*(part[..., index] for part in self))
+
     def count_gaps(self, outside: Array, origin: Array | float = 0.0) -> Array:
         """Return the number of poles outside the unit circle between crossings, shape (crossings + 1, loops).
 
@@ -150,14 +159,8 @@ def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
     k, slope = combine(line, loops.parts), combine(line, loops.slopes)
     positive = k > 0
     cells = list_changes(loops, positive)
-    # If k has the same sign at two neighboring nodes and an extremum between them, it may have two zeros there.
-    # Tangents at both nodes bound k if k is convex or concave between them. Search for the extremum if the tangents
-    # meet beyond 0.
-    sign = xp.where(positive[:-1], 1.0, -1.0)
-    before, falls, rises = k[:-1] * sign, slope[:-1] * sign, slope[1:] * sign
-    turning = (k[1:] * sign > 0) & (falls < 0) & (rises > 0)
-    lowest = before + falls * (k[1:] * sign - rises * (w[1:] - w[:-1]) - before) / xp.where(turning, falls - rises, 1.0)
-    turns = list_cells(turning & (lowest <= 0), MOST_TURNS)
+    turns, wavy = _select_turns(w[1:] - w[:-1], k, slope)
+    turns = list_cells(turns, MOST_TURNS)
     middle, unclear = _find_turns(loops, line, turns, k, slope)
     # Search for zeros of k in three lists of brackets: between nodes with opposite signs of k, from a node to an
     # extremum of k, and from an extremum to the next node.
@@ -206,11 +209,39 @@ def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
     # and z = -1.
     end, end_slope = cross_end(loops, line)
     turned = (end_slope != 0) & xp.isfinite(end_slope) & ((k[-1] > 0) != (end_slope < 0))
-    doubtful = unclear | cells.crowded | turns.crowded | xp.any(columns[4], 0) | turned
+    doubtful = unclear | wavy | cells.crowded | turns.crowded | xp.any(columns[4], 0) | turned
     doubtful = doubtful | xp.any(~xp.isfinite(k), 0)
     last_row = end[None], xp.sign(end_slope)[None], xp.full((1, n), np.pi), xp.full((1, n), -1)
     t, leaving, angle, cell = (xp.concatenate(both) for both in zip(columns[:4], last_row, strict=True))
     return sort_crossings(t, leaving, angle, cell, doubtful)
+
+
+def _select_turns(step: Array, k: Array, slope: Array) -> tuple[Array, Array]:
+    """Select the node intervals in which k may have two zeros next to an extremum, from values and slopes at the nodes.
+
+    Args:
+        step: lengths of the node intervals.
+        k: values at the nodes.
+        slope: derivatives at the nodes.
+
+    Returns:
+        A mask of these intervals; and for each loop, if an interval may have more zeros than the code searches for.
+    """
+    # Let p be the cubic polynomial with the values and slopes of k at both nodes, and b0 .. b3 its Bernstein
+    # coefficients, multiplied by the sign of k at the lower node. They bound p, and their differences bound p'. The
+    # difference between k and p is estimated from the cubic term c of p: where the nodes resolve k, the term of fourth
+    # order is not larger than c. It changes k between the nodes by at most c/16, and p' by less than 3 c/4.
+    xp = namespace(k)
+    sign = xp.where(k[:-1] > 0, 1.0, -1.0)
+    b0, b3, falls, rises = k[:-1] * sign, k[1:] * sign, slope[:-1] * sign < 0, slope[1:] * sign > 0
+    b1, b2 = b0 + step * slope[:-1] * sign / 3.0, b3 - step * slope[1:] * sign / 3.0
+    c = xp.abs(b3 - b0 + 3.0 * (b1 - b2))
+    low, changes = xp.minimum(b1, b2) <= c / 16.0, b3 <= 0
+    # With one sign at both nodes, k may have two zeros if it has a minimum, or a minimum and a maximum. With different
+    # signs, k may have three zeros if p has a minimum below 0 and a maximum above 0.
+    monotone = xp.where(falls, b1 - b2, b2 - b1) > c / 4.0
+    wavy = xp.where(changes, (b1 <= c / 16.0) & (b2 >= -c / 16.0), low & (falls != rises) & ~monotone)
+    return ~changes & low & falls & rises, xp.any(wavy, 0)
 
 
 def _take_line(line: Line, index: Array, n: int) -> Line:
@@ -250,7 +281,7 @@ def _find_turns(
     low, high = w[turns.cell, turns.loop], w[turns.cell + 1, turns.loop]
     first, last = slope[turns.cell, turns.loop], slope[turns.cell + 1, turns.loop]
     begin = low, high, first, last, 0.5 * (low + high), 0.0 * low
-    x = iterate(TURN_STEPS, bisect, begin, xp)[4]
+    x = iterate(TURN_STEPS if turns.cell.size else 0, bisect, begin, xp)[4]
     parts = split_values(evaluate(loops.form, part, x))[0]
     value, node = combine(each, parts), k[turns.cell, turns.loop]
     size = sum(

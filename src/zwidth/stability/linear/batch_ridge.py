@@ -13,7 +13,8 @@ A wall has the normalized stiffness alpha and damping beta. On the *boundary cur
     the line beta = 0            has no stable wall above the line of constant K; needed if only beta >= 0 is allowed
                                  and the line of constant K has a stable wall with beta < 0
 
-The alpha of a confirmed wall is within `MARGIN` of that of the stiffest wall. Symbols and shapes are those of
+If the ray has a crossing below the wall, a path of straight sections between stable walls replaces the ray. The alpha
+of a confirmed wall is within `MARGIN` of that of the stiffest wall. Symbols and shapes are those of
 `stability.linear.batch_lines`.
 """
 
@@ -31,10 +32,10 @@ from zwidth.stability.linear.batch_lines import (
     LineCrossings,
     combine,
     count_far,
-    count_outside,
     cross_end,
     find_crossings,
     list_changes,
+    pad_index,
     sort_crossings,
     tabulate,
 )
@@ -45,7 +46,7 @@ LOG_RANGE = (-9.0, 2.0)  # log10 alpha of the first bracket of the maximum
 BISECTIONS = 20  # steps of the bisection for the largest alpha
 CLOSE_CELLS = 4  # largest number of nodes between two crossings that may enclose a smooth maximum of alpha
 NEWTON_STEPS = 8  # for the angles of a corner
-SECANT_STEPS = 14  # for the angle of a smooth maximum of alpha
+SECANT_STEPS = 24  # for the angle of a smooth maximum of alpha; 10 to 15 suffice in most cases
 # Largest last step of the angle w of a smooth maximum, relative to w. An error of w changes the maximum of alpha only
 # by its square, because alpha is stationary there.
 CONVERGED_PEAK = 1e-7
@@ -107,7 +108,7 @@ def find_stiffest(form: Form, loop: LoopBatch, sizes: Sizes, negative: bool) -> 
     low, _, left, right = iterate(BISECTIONS, halve, begin, xp)
     alpha, beta, angles, kind = _solve(loops, axis, 10.0**low, left, right)
     omega = xp.where(kind == RidgeKind.CORNER, xp.max(angles, 0), angles[0])
-    confirmed = _confirm(loops, axis, start, (alpha, beta, sizes.density > 1), negative)
+    confirmed = _confirm(loops, axis, start, alpha, beta, negative)
     return Stiffest(alpha, beta, omega, kind, confirmed, angles)
 
 
@@ -285,7 +286,7 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
         return _trace(evaluate(form, loop, w)).alpha_slope
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        low, high, first, last, x, side, _ = state
+        low, high, first, last, x, side, move = state
         value = slope(x)
         before = value > 0
         last = xp.where(before, xp.where(side > 0, 0.5 * last, last), value)
@@ -293,7 +294,9 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
         low, high = xp.where(before, x, low), xp.where(before, high, x)
         new = high - last * (high - low) / (last - first)
         new = xp.where((new > low) & (new < high), new, 0.5 * (low + high))
-        return low, high, first, last, new, xp.where(before, 1.0, -1.0), xp.abs(new - x)
+        done = move <= CONVERGED_STEP * x
+        move = xp.where(done, move, xp.abs(new - x))
+        return low, high, first, last, xp.where(done, x, new), xp.where(before, 1.0, -1.0), move
 
     # Use the narrowest bracket over which the derivative of alpha changes from positive to negative.
     low, high = brackets[-1]
@@ -304,13 +307,12 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
         pairs = zip((*bracket, *ends), (low, high, first, last), strict=True)
         low, high, first, last = (xp.where(better, new, old) for new, old in pairs)
     begin = low, high, first, last, 0.5 * (low + high), 0.0 * low, high - low
-    *_, x, _, move = iterate(SECANT_STEPS, step, begin, xp)
+    *_, x, _, move = iterate(SECANT_STEPS, step, begin, xp, lambda old, new: bool(np.all(old[4] == new[4])))
     return x, (first > 0) & (last < 0) & (move <= CONVERGED_PEAK * x)
 
 
-def _confirm(loops: Sampled, axis: LineCrossings, start: Array, found: tuple[Array, ...], negative: bool) -> Array:
+def _confirm(loops: Sampled, axis: LineCrossings, start: Array, alpha: Array, beta: Array, negative: bool) -> Array:
     """Return whether pole counts confirm that each wall is the stiffest one within `MARGIN` (docs/theory, V24)."""
-    alpha, beta, accurate = found
     xp, above = namespace(loops.w), alpha * (1.0 + MARGIN)
     level = find_crossings(loops, Line(a0=above, b1=1.0))
     outside = axis.count_at(start, above)
@@ -321,42 +323,60 @@ def _confirm(loops: Sampled, axis: LineCrossings, start: Array, found: tuple[Arr
         right = xp.all((counts > 0) | (xp.concatenate([level.t, infinite]) < 0), 0)
         beyond = xp.concatenate([axis.t, infinite]) > above
         bounded = bounded | (right & xp.all((axis_counts > 0) | ~beyond, 0))
-    direction = Line(a1=alpha, b1=beta)
-    ray = find_crossings(loops, direction)
-    first = loops.count_start(combine(direction, tuple(part[:1] for part in loops.parts))[0])
-    connected = (first == 0) & ~xp.any((ray.t > 0) & (ray.t < 1.0 - MARGIN), 0)
-    if accurate:
-        connected = connected | _are_connected(loops, axis, start, alpha, beta)
     far = count_far(loops)
     consistent = (axis_counts[-1] >= far[0]) & (axis_counts[-1] <= far[1]) & xp.all(counts >= 0, 0)
     # Reject a loop in which two crossings are so close that rounding errors may exchange their order.
     clear = xp.all(level.t[1:] - level.t[:-1] > CLEAR * xp.abs(level.t[1:]), 0, where=xp.isfinite(level.t[1:]))
-    certain = ~axis.doubtful & ~level.doubtful & ~ray.doubtful
-    return loops.resolved & certain & consistent & clear & bounded & connected & (alpha > 0)
+    highest = loops.resolved & ~axis.doubtful & ~level.doubtful & consistent & clear & bounded & (alpha > 0)
+    direction = Line(a1=alpha, b1=beta)
+    ray = find_crossings(loops, direction)
+    first = loops.count_start(combine(direction, tuple(part[:1] for part in loops.parts))[0])
+    connected = (first == 0) & ~xp.any((ray.t > 0) & (ray.t < 1.0 - MARGIN), 0) & ~ray.doubtful
+    if xp is not np:
+        return highest & (connected | _are_connected(loops, axis, start, alpha, beta))
+    # Search for another path only for the few loops whose ray is not stable.
+    index = pad_index(np.flatnonzero(highest & ~connected))
+    if index.size:
+        few = loops.take(index), axis.take(index), start[index], alpha[index], beta[index]
+        connected[index] = _are_connected(*few)
+    return highest & connected
 
 
 def _are_connected(loops: Sampled, axis: LineCrossings, start: Array, alpha: Array, beta: Array) -> Array:
     """Return whether a path of stable walls leads from the wall just below each maximum to K = 0.
 
-    The path follows lines of constant B from each of the `LEVELS` of alpha to the next lower one. From the lowest level
-    it follows a straight line to K = B = 0.
+    The path descends from each of the `LEVELS` of alpha to the next lower one, to the stable interval of beta that
+    overlaps most with the interval at the upper level, or is nearest to this interval. From the lowest level the path
+    follows a straight line to K = B = 0.
     """
-    xp, connected, low, high = namespace(alpha), True, beta, beta
-    infinite, below = xp.full((1, alpha.size), np.inf), alpha
-    for share in LEVELS:
-        above, below = below, share * alpha
-        level = find_crossings(loops, Line(a0=below, b1=1.0))
-        stable = level.count_gaps(axis.count_at(start, below)) == 0
-        ends = xp.concatenate([-infinite, level.t]), xp.concatenate([level.t, infinite])
-        overlap = xp.minimum(ends[1], high) - xp.maximum(ends[0], low)
-        best = xp.argmax(xp.where(stable & xp.isfinite(overlap), overlap, -1.0), 0)[None]
-        reached, new_low, new_high = (xp.take_along_axis(part, best, 0)[0] for part in (stable & (overlap >= 0), *ends))
-        middle = 0.5 * (xp.maximum(new_low, low) + xp.minimum(new_high, high))
-        path = find_crossings(loops, Line(b0=middle, a1=1.0))
-        free = ~xp.any((path.t > below) & (path.t < above * (1.0 - MARGIN)), 0)
-        connected = connected & reached & free & ~level.doubtful & ~path.doubtful
-        low, high = new_low, new_high
-    ray = Line(a1=below, b1=0.5 * (low + high))
-    path = find_crossings(loops, ray)
-    outside, _ = count_outside(loops, ray.a1, ray.b1)
-    return connected & ~xp.any((path.t > 0) & (path.t < 1.0), 0) & (outside == 0) & ~path.doubtful
+    xp, n, count = namespace(alpha), alpha.size, len(LEVELS)
+    # Evaluate the lines of all levels in one call, then the sections of the path, as lines of repeated loops.
+    each = xp.tile(xp.arange(n), count)
+    below = xp.asarray(LEVELS)[:, None] * alpha
+    level = find_crossings(loops.take(each), Line(a0=below.reshape(-1), b1=1.0))
+    stable = level.count_gaps(axis.take(each).count_at(start[each], below.reshape(-1))) == 0
+    infinite = xp.full((1, each.size), np.inf)
+    ends = xp.concatenate([-infinite, level.t]), xp.concatenate([level.t, infinite])
+    stable, *ends = (part.reshape(-1, count, n) for part in (stable & xp.isfinite(ends[0] - ends[1]), *ends))
+    connected, low, high, sections = xp.all(~level.doubtful.reshape(count, n), 0), beta, beta, []
+    for k in range(count):
+        overlap = xp.minimum(ends[1][:, k], high) - xp.maximum(ends[0][:, k], low)
+        best = xp.argmax(xp.where(stable[:, k], overlap, -np.inf), 0)[None]
+        reached, shared, new_low, new_high = (
+            xp.take_along_axis(part, best, 0)[0] for part in (stable[:, k], overlap, ends[0][:, k], ends[1][:, k])
+        )
+        # If both intervals overlap, descend at constant B, otherwise along a straight line between their centers.
+        middle, center = 0.5 * (xp.maximum(new_low, low) + xp.minimum(new_high, high)), 0.5 * (new_low + new_high)
+        sections.append([xp.where(shared >= 0, middle, other) for other in (0.5 * (low + high), center)])
+        connected, low, high = connected & reached, new_low, new_high
+    # The last section leads from K = B = 0 to the lowest level.
+    above, zero = xp.concatenate([alpha[None], below[:-1], 0.0 * alpha[None]]), 0.0 * alpha
+    below = xp.concatenate([below, below[-1:]])
+    first, last = (xp.stack(column) for column in zip(*sections, (zero, 0.5 * (low + high)), strict=True))
+    line = Line(*(part.reshape(-1) for part in (above, first, below - above, last - first)))
+    path = find_crossings(loops.take(xp.tile(xp.arange(n), count + 1)), line)
+    # The first section starts at the maximum, i.e. at a crossing.
+    origin = xp.concatenate([MARGIN * alpha / (alpha - below[0]), xp.tile(zero, count)])
+    free = ~xp.any((path.t > origin) & (path.t < 1.0), 0) & ~path.doubtful
+    softest = combine(Line(a1=below[-1], b1=last[-1]), tuple(part[:1] for part in loops.parts))[0]
+    return connected & xp.all(free.reshape(count + 1, n), 0) & (loops.count_start(softest) == 0)

@@ -29,6 +29,7 @@ from zwidth.model.estimate import Estimate
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.mechanism import AnyChain, build_chain
+from zwidth.model.tool import ToolResponse
 from zwidth.numerics.balls import BITS, available
 
 if TYPE_CHECKING:
@@ -120,8 +121,14 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
         return D, N1 * unit, N2 * (unit / period), False
     estimate = _exact_estimate(exact, scene.velocity, scene.timing.period)
     f_numerator, f_denominator = _expand_estimate(estimate)
+    has_integrator = chain.has_integrator
+    if exact.tool is not None:
+        free = scene.tool.stiffness == 0
+        response = exact.tool.respond(exact.mass, period)
+        numerator, delayed = _add_tool(numerator, delayed, response, int(free and has_integrator))
+        has_integrator = has_integrator or free
     # F(1) is exactly 0 if F is a windowed difference, or if one of its zeros is exactly z = 1.
-    has_rest = chain.has_integrator and (
+    has_rest = has_integrator and (
         estimate.window > 0 or any(offset == 0 for offset in np.asarray(estimate.zeros).tolist())
     )
     return (
@@ -130,6 +137,27 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
         numerator * f_numerator * (unit / period),
         has_rest,
     )
+
+
+def _add_tool(
+    numerator: flint.arb_poly, denominator: flint.arb_poly, response: ToolResponse, common: int
+) -> tuple[flint.arb_poly, flint.arb_poly]:
+    """Return numerator and denominator of the plant plus the response of a tool.
+
+    Args:
+        numerator: numerator of the plant.
+        denominator: denominator of the plant, with its poles at z = 0.
+        response: response of the tool.
+        common: 1 if plant and tool have a common pole at exactly z = 1, which is divided out; otherwise 0.
+    """
+    import flint
+
+    gain, power, a2, a1, a0 = response
+    zeta = flint.arb_poly([-1, 1])
+    # A tool without spring has a0 = 0, so that its denominator is zeta (a2 zeta + a1).
+    tool = zeta * a2 + flint.arb_poly([a1]) if common else zeta * zeta * a2 + zeta * a1 + flint.arb_poly([a0])
+    rest = denominator // zeta if common else denominator
+    return numerator * tool + rest * flint.arb_poly([0] * power + [1]) * gain, denominator * tool
 
 
 def _expand_estimates(

@@ -2,15 +2,19 @@
 
 In normalized units, a wall (alpha, beta) acts on the sampled position y through the velocity estimate F with the force
 ``u = -(alpha + beta F) y``. With a position estimate P, a velocity estimate V and further feedback R, the force is ``u
-= -(alpha P + beta V + R) y``. An external force, held constant over each period, acts on the first body without delay.
+= -(alpha P + beta V + R) y``. With a tool of the response G_t, the wall is a coupling C, and the controller is
+``C/(1 + C G_t)``. An external force, held constant over each period, acts on the first body without delay.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from zwidth.model.estimate import Estimate
 from zwidth.model.mechanism import AnyChain
 from zwidth.model.state_space import StateSpace, connect_in_series, realize_estimate, realize_estimates
+from zwidth.model.tool import ToolResponse
+from zwidth.plant.composed_plant import factor_tool
 from zwidth.plant.sampled_states import integrate_chain, sample_states
 
 
@@ -29,9 +33,24 @@ def _realize_controller(chain: AnyChain, alpha: float, beta: float) -> StateSpac
     return StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D)
 
 
-def realize_closed_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
+def _couple_tool(coupling: StateSpace, tool: ToolResponse) -> StateSpace:
+    """Return the response of a coupling and its tool from the position of the device to the force of the coupling."""
+    plant = factor_tool(tool)
+    y = realize_estimate(Estimate(0, plant.gain, 0, plant.zeros, plant.poles))
+    # Distance between device and tool, as coefficients of both states and of the position of the device.
+    share = 1.0 / (1.0 + float(y.D[0, 0] * coupling.D[0, 0]))
+    states = -share * np.concatenate([y.D @ coupling.C, y.C], 1)
+    C = np.pad(coupling.C, ((0, 0), (0, len(y.A)))) + coupling.D @ states
+    A = np.block([[coupling.A, np.zeros((len(coupling.A), 2))], [np.zeros((2, len(coupling.A))), y.A]])
+    A += np.concatenate([coupling.B @ states, y.B @ C])
+    return StateSpace(A, share * np.concatenate([coupling.B, y.B @ coupling.D]), C, share * coupling.D)
+
+
+def realize_closed_loop(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse | None = None) -> StateSpace:
     """Return the closed loop with a wall in state space, from a held external force to the sampled position."""
-    loop, filter_order = realize_open_loop(chain, alpha, beta), len(_realize_controller(chain, alpha, beta).A)
+    controller = _realize_controller(chain, alpha, beta)
+    controller = controller if tool is None else _couple_tool(controller, tool)
+    loop, filter_order = connect_in_series(controller, sample_states(chain).realize()), len(controller.A)
     A, _, external = chain.realize()
     B = np.zeros((len(loop.A), 1))
     B[filter_order : filter_order + len(external), 0] = integrate_chain(chain, A, external, 1.0)[1]

@@ -84,6 +84,8 @@ class LoopTerms:
         change = solve(matrix, late - x * z.map(lambda part: np.asarray(part)[None]))
         q = -(lam * self.lag).exp() / x[0]
         q_slope = q * (self.one * self.lag - change[0] / x[0])
+        if self.scene.tool is not None:
+            return self._add_tool(q, q_slope, lam)
         if self.estimates is None:
             return q, q_slope
         # With the position estimate P and the further feedback R, q = (-1/H - R)/P for the plant H (V25).
@@ -98,6 +100,16 @@ class LoopTerms:
         if self.estimates is None or self.estimates.feedback is None:
             return self.one * 0.0, self.one * 0.0
         return _divide(self._evaluate_feedback(lam), self._evaluate_position(lam))
+
+    def _add_tool(self, q: Taylor, q_slope: Taylor, lam: Taylor) -> Pair:
+        """Add the response G_t of the tool to G = -1/q: return q/(1 - q G_t) and its derivative in lambda."""
+        z, zeta = lam.exp(), lam.expm1()
+        tool = self.varied.tool.respond(self.varied.mass, self.varied.timing.period)
+        denominator = (zeta * tool.a2 + tool.a1) * zeta + tool.a0
+        response = (lam * tool.power).exp() * tool.gain / denominator
+        slope = response * (tool.power - (zeta * (tool.a2 * 2.0) + tool.a1) * z / denominator)
+        share = 1.0 / (self.one - q * response)
+        return q * share, (q_slope + q * q * slope) * share * share
 
     def _evaluate_position(self, lam: Taylor) -> Pair:
         """Return the position estimate P and its derivative in lambda."""

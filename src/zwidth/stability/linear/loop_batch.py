@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.core.types import Array
-from zwidth.core.xp import namespace
+from zwidth.core.xp import namespace, tree_map
 from zwidth.model.circle_functions import CirclePoints, Jet, circle_points, distances_inside
 from zwidth.model.estimate import Estimate
 
@@ -188,6 +188,10 @@ class Sampled(NamedTuple):
     levels: tuple[Array, Array]  # Re(q conj F)/|F|^2 and Re F/|F|^2: the first minus alpha times the second is beta
     ends: Values  # q and F at z = -1
     resolved: Array  # for each loop: True if the nodes resolve q and F
+
+    def take(self, index: Array) -> Sampled:
+        """Return the loops with the given indices."""
+        return Sampled(self.form, *tree_map(lambda part: part[..., index], tuple(self[1:])))
 
     def count_start(self, k_first: Array) -> Array:
         """Return the number of poles outside the unit circle for the softest walls of a ray, from k at the first node.

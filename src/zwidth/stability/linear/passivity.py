@@ -65,15 +65,18 @@ UNSUPPORTED = {
 }
 
 
-def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
-    """Return the reason why no passivity condition is available for a device; "" if a condition is available.
+def find_unsupported_reason(tool: Any = None, *, coupling: Any = None, **parts: Any) -> str:
+    """Return the reason why no passivity condition is available for a scene; "" if a condition is available.
 
     A condition is available only if the force acts on the point whose position is sensed.
 
     Args:
+        tool: simulated tool of the scene.
         coupling: coupling of the device.
         **parts: the other fields of the device, and parts of the scene.
     """
+    if tool is not None:
+        return "with a simulated tool: the wall is a coupling; use is_safe_for_every_world"
     for name, (description, reason) in UNSUPPORTED.items():
         part = parts.get(name)
         if part if isinstance(part, tuple | list) else part is not None:
@@ -88,7 +91,7 @@ def find_unsupported_reason(*, coupling: Any = None, **parts: Any) -> str:
 
 def find_obstacle(scene: Any) -> str:
     """Return the reason why no passivity condition is available for a scene; "" if a condition is available."""
-    return find_unsupported_reason(**vars(scene.device), position=scene.position, feedback=scene.feedback)
+    return find_unsupported_reason(scene.tool, **vars(scene.device), position=scene.position, feedback=scene.feedback)
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,9 @@ def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array)
 def find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
     """Return zeta of all poles of each wall by Aberth's method, as an array of shape (walls, order)."""
     D, N1, N2 = affine_polynomial(loop)
-    monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
+    # The leading coefficient is D[0], except if G has a direct feedthrough, as with a tool in implicit Euler.
+    polynomials = D + alpha[:, None] * N1 + beta[:, None] * N2
+    monic = polynomials / polynomials[:, :1]
     zeta = np.linalg.eigvals(companion(monic)) - 1.0 + 0j
     _refine_poles(loop, alpha, beta, zeta, np.arange(len(zeta)))
     # Aberth's steps keep real approximations real and complex pairs complex. They do not converge if rounding errors

@@ -21,7 +21,7 @@ import numpy as np
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.status import Status
 from zwidth.core.types import Array, ArrayLike, Vertices
-from zwidth.core.xp import materialize, namespace, nan_with_nan_derivatives, stop_gradient, tree_map
+from zwidth.core.xp import namespace, nan_with_nan_derivatives, stop_gradient, tree_map
 from zwidth.model.checks import check_integer
 from zwidth.numerics.evaluate import as_number, check_scalars, evaluate
 from zwidth.numerics.root_finding import attach_root_derivatives, integrate
@@ -184,7 +184,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
     curve = build_lobe(delta, d, kind)
     frozen_curve, frozen_number = stop_gradient((curve, number), xp)
     if is_row:
-        limit = materialize(find_row_end(frozen_number, frozen_curve), delta)
+        limit = find_row_end(frozen_number, frozen_curve)
         s, on_lobe, exists = limit.s, limit.meets_lobe, (limit.meets_lobe | limit.beyond) & (limit.alpha > 0)
         s = attach_root_derivatives(
             lambda s, curve, b: evaluate_lobe(s, curve).b - b, s, lambda *_: True, curve, compute_offset(number, curve)
@@ -200,7 +200,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, kind: Any) -
         top = find_peak(frozen_curve, kind)
         exists = (frozen_number > 0) & (frozen_number < top.alpha)
         target = xp.where(exists, frozen_number, 0.5 * top.alpha)
-        s, on_line = materialize(find_column_end(target, top, frozen_curve, line == "upper"), delta)
+        s, on_line = find_column_end(target, top, frozen_curve, line == "upper")
         on_lobe = ~on_line
         s = attach_root_derivatives(
             lambda s, curve, alpha: evaluate_lobe(s, curve).alpha - alpha, s, lambda *_: True, curve, number

@@ -13,14 +13,17 @@ P, points are grouped by this degree, so that no array is padded before the comp
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth.core.errors import TracedDelayError
 from zwidth.core.types import ArrayLike
-from zwidth.core.xp import is_jax, is_traced, lazy_jax, namespace
+from zwidth.core.xp import is_jax, is_traced, namespace
+from zwidth.numerics.devices import map_on_devices
 from zwidth.numerics.evaluate import (
+    CACHED_KERNELS,
     FEW,
     Route,
     as_float64,
@@ -72,26 +75,48 @@ def map_by_degree(
                 "for example through jit's static_argnums or a closure"
             )
         with precision(values):
-            return _join_degrees(kernel, broadcast_traced(arguments), as_float64("d", values[-1]), static, lead)
+            arrays, delays = broadcast_traced(arguments), as_float64("d", values[-1])
+            degrees = _group_delays(delays)
+            distinct = np.unique(degrees)
+            if distinct.size == 1:
+                return map_on_devices(compile_by_degree(kernel, find_degree(distinct[0]), *static), arrays)
+            return _join_degrees(kernel, arrays, degrees, static, lead)
     arrays = broadcast(arguments)
-    return _join_degrees(kernel, arrays, arrays[-1], static, lead, route)
+    return _join_degrees(kernel, arrays, _group_delays(arrays[-1]), static, lead, route)
+
+
+@lru_cache(CACHED_KERNELS)
+def compile_by_degree(kernel: Callable[..., Any], degree: Degree, *static: Any) -> Callable[..., Any]:
+    """Return a kernel, compiled by JAX for one degree, as a function of JAX arrays of one shape."""
+    import jax
+
+    def compute(*arrays: Any) -> Any:
+        results = kernel(*(array.reshape(-1) for array in arrays), degree, *static)
+        return jax.tree.map(lambda leaf: leaf.reshape(*arrays[0].shape, *leaf.shape[1:]), results)
+
+    return jax.jit(compute)
+
+
+def _group_delays(delays: np.ndarray) -> np.ndarray:
+    """Return a number per delay that is the same for all delays whose polynomials P have the same degree."""
+    # Replace delays out of range by 0, so that they do not affect the length of the result.
+    defined = np.where((delays >= 0) & (delays <= LONGEST_DELAY), delays, 0.0)
+    return 0.5 * (np.floor(defined) + np.ceil(defined))
 
 
 def _join_degrees(
-    kernel: Callable[..., Any], arrays: list[Any], delays: np.ndarray, static: tuple, lead: bool, route: Route = "auto"
+    kernel: Callable[..., Any], arrays: list[Any], degrees: np.ndarray, static: tuple, lead: bool, route: Route = "auto"
 ) -> Any:
-    """Return the vectors of all points for arrays of one shape; ``delays`` are the values of d, in NumPy."""
+    """Return the vectors of all points for arrays of one shape; ``degrees`` are the numbers of `_group_delays`."""
     xp = namespace(*arrays)
     shape = np.shape(arrays[0])
     columns: list[Any] = [xp.reshape(array, -1) for array in arrays]
-    # Replace delays out of range by 0, so that they do not affect the length of the result.
-    defined = np.broadcast_to(np.where((delays >= 0) & (delays <= LONGEST_DELAY), delays, 0.0), shape).reshape(-1)
+    key = np.broadcast_to(degrees, shape).reshape(-1)
     vectors, indices = [], []
-    for delay, group, index in group_by_value(tuple(columns), 0.5 * (np.floor(defined) + np.ceil(defined))):
+    for delay, group, index in group_by_value(tuple(columns), key):
         degree = find_degree(delay)
         if xp is not np:
-            constants = range(len(group), len(group) + 1 + len(static))
-            vectors.append(lazy_jax.jit(kernel, static_argnums=constants)(*group, degree, *static))
+            vectors.append(compile_by_degree(kernel, degree, *static)(*group))
         elif route == "numpy":
             with np.errstate(all="ignore"):
                 vectors.append(kernel(*group, degree, *static))

@@ -28,7 +28,7 @@ import numpy as np
 
 from zwidth.core.status import Status
 from zwidth.core.types import Array
-from zwidth.core.xp import horner, materialize, namespace, nan_beyond, square_roots
+from zwidth.core.xp import horner, namespace, nan_beyond, square_roots
 from zwidth.numerics.balls import BITS, available
 from zwidth.numerics.evaluate import evaluate_columns
 from zwidth.plant.rigid_mass import DelayClasses, DiscretePlant, PhiFunctions, classify_delays, discretize_mass
@@ -165,8 +165,6 @@ def decide_wall_codes(
 def size_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
     """Return the discretized device of exact delta and d as `Sized` numbers, NaN if out of range."""
     plant = discretize(delta, d, kind)
-    if kind.fractional and kind.long:
-        plant = materialize(plant, delta)  # compute it once, although several loops of the program use it
     sized = DiscretePlant(*(Sized(value, abs(value) + TINY) for value in plant))
     sized = sized._replace(delta=Sized(plant.delta), f=Sized(plant.f), whole=plant.whole, a0=None)
     if kind.fractional:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.core.types import Array
-from zwidth.core.xp import iterate, materialize, namespace, stop_gradient
+from zwidth.core.xp import iterate, namespace, stop_gradient
 from zwidth.plant.rigid_mass import DelayClasses, DiscretePlant, discretize_plant
 from zwidth.stability.rigid.boundary_curve import (
     CurvePoint,
@@ -63,7 +63,7 @@ class Peak(NamedTuple):
 def build_lobe(delta: Array, d: Array, kind: DelayClasses) -> Lobe:
     """Return the lobe of each device; ``kind`` states if delays d < 1, delays d >= 1 and fractional delays occur."""
     xp = namespace(delta, d)
-    plant = materialize(discretize_plant(delta, d, kind), delta)
+    plant = discretize_plant(delta, d, kind)
     is_short = plant.whole < 1
     short_curve, long_lobe, ends = None, None, []
     to_corner = plant.delta < 0

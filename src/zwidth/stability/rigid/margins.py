@@ -129,7 +129,7 @@ def margins_kernel(
     delta = xp.where((delta > 0) & (delta < max(float(xp.finfo(delta.dtype).tiny), NEGLIGIBLE_DAMPING)), 0.0, delta)
     plant = materialize(discretize_plant(delta, d), delta)
     w, phase, crosses = evaluate_at_crossover(alpha, beta, plant)
-    stable = materialize(decide_in_floats(*stop_gradient((alpha, beta, plant), xp), ANY), delta)
+    stable = decide_in_floats(*stop_gradient((alpha, beta, plant), xp), ANY)
     gain, phase_crossover = _find_gain_margin(alpha, beta, plant, xp)
     delay = distance = closest = xp.nan * alpha
     if with_delay:
@@ -292,4 +292,4 @@ def _limit_delay(w: Array, phase: Array, exists: Array) -> Array:
 
 def _evaluate_fraction(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
     """Return the gain crossover, the phase there, and whether the crossover exists, for a delay f < 1."""
-    return evaluate_at_crossover(alpha, beta, materialize(discretize_plant(delta, f), f))
+    return evaluate_at_crossover(alpha, beta, discretize_plant(delta, f))

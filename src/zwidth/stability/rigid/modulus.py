@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.core.types import Array
-from zwidth.core.xp import apply_each, expand_along, materialize, namespace, stop_gradient
+from zwidth.core.xp import apply_each, expand_along, namespace, stop_gradient
 from zwidth.numerics.root_finding import attach_root_derivatives
 from zwidth.plant.rigid_mass import DiscretePlant
 from zwidth.stability.open_loop import find_nearest_angle
@@ -49,7 +49,7 @@ def evaluate_at_crossover(alpha: Array, beta: Array, plant: DiscretePlant) -> tu
     """Return the gain crossover w, the phase of L plus pi there, and whether w exists; otherwise w is arbitrary."""
     xp = namespace(alpha, plant.delta)
     w, exists = find_gain_crossover(alpha, beta, plant)
-    w, exists = materialize((xp.where(exists, w, 1.0), exists), alpha)
+    w = xp.where(exists, w, 1.0)
     return w, evaluate_gain_and_phase(w, alpha, beta, plant)[1], exists
 
 
@@ -102,8 +102,7 @@ def _find_lowest(alpha: Array, beta: Array, plant: DiscretePlant, xp: Any) -> Ar
     def find_frequency_of_gain(level: Array) -> Array:
         """Return the frequency at which |L| equals ``level``; pi if |L| is larger at all frequencies."""
         w, exists = find_gain_crossover(alpha / level, beta / level, plant)
-        w = xp.where(exists, w, np.pi)
-        return materialize(w, w)
+        return xp.where(exists, w, np.pi)
 
     alpha, beta = xp.asarray(alpha), xp.asarray(beta)
     plant = DiscretePlant(*(xp.asarray(field) for field in plant))

@@ -19,8 +19,6 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import lru_cache
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -34,16 +32,15 @@ from zwidth.core.xp import (
     is_traced,
     iterate,
     lazy_jax,
-    materialize,
     namespace,
     nan_with_nan_derivatives,
 )
 from zwidth.numerics.blocks import map_blocks
 from zwidth.numerics.complex_pairs import Pair, make_complex
-from zwidth.numerics.evaluate import CACHED_KERNELS, as_float64, precision, to_caller
+from zwidth.numerics.evaluate import as_float64, precision, to_caller
 from zwidth.numerics.polynomials import abs2, companion
 from zwidth.stability.reference import Degree, compute_poles, expand_loop
-from zwidth.stability.rigid.broadcasting import count_uncompiled_points, find_degree, map_by_degree
+from zwidth.stability.rigid.broadcasting import compile_by_degree, count_uncompiled_points, find_degree, map_by_degree
 from zwidth.stability.rigid.characteristic_polynomial import (
     LoopFactors,
     bound_wall_part,
@@ -73,7 +70,7 @@ BLOCK_SIZE = 1 << 15
 def factor_with_pole_axis(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> LoopFactors:
     """Return the factors of P of each wall, with a new first axis for its poles; NaN if the wall is out of range."""
     xp = namespace(alpha, beta, delta, d)
-    loop = materialize(factor_loop(alpha, beta, delta, d, degree.fractional), delta)
+    loop = factor_loop(alpha, beta, delta, d, degree.fractional)
     return LoopFactors(*(xp.asarray(part)[None] for part in loop))
 
 
@@ -260,27 +257,17 @@ def _compute_by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, deg
     """Return the poles of columns of one degree by eigenvalues; concrete matrices go to LAPACK on all processors."""
     columns = alpha, beta, delta, d
     if is_jax(alpha):
-        # Compile a single program, because JAX would otherwise compile every operation separately when it
-        # differentiates outside `jit`.
-        return _compile_by_degree(pole_kernel, degree)(*columns)
+        return pole_kernel(*columns, degree)
     few = alpha.size <= count_uncompiled_points(degree)
 
     # Do not compile for few walls, or for large matrices, whose eigenvalues take most of the time.
-    compiled = None if few or degree.poles > MAX_ABERTH_POLES else _compile_by_degree(pole_kernel, degree)
+    compiled = None if few or degree.poles > MAX_ABERTH_POLES else compile_by_degree(pole_kernel, degree)
 
     def compute_block(*walls: Any) -> np.ndarray:
         with np.errstate(all="ignore"):
             return np.asarray(compiled(*walls) if compiled else pole_kernel(*walls, degree=degree))
 
     return compute_block(*columns) if few else map_blocks(compute_block, columns, max(1, BLOCK_SIZE // degree.poles**2))
-
-
-@lru_cache(CACHED_KERNELS)
-def _compile_by_degree(kernel: Callable[..., Any], degree: Degree) -> Any:
-    """Return the compiled kernel for one degree, cached."""
-    import jax
-
-    return jax.jit(lambda *arrays: kernel(*arrays, degree))
 
 
 def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Coefficients:
@@ -385,7 +372,7 @@ def _find_poles(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degre
     if few:
         z, _, certified = aberth_kernel(*columns, degree)
     else:
-        compiled = _compile_by_degree(aberth_kernel, degree)
+        compiled = compile_by_degree(aberth_kernel, degree)
         z, _, certified = map_blocks(compiled, columns, max(1, BLOCK_SIZE // degree.poles))
     open_walls = np.flatnonzero(~certified & (wall_status(*columns) == Status.OK))
     if open_walls.size:

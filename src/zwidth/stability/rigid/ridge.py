@@ -20,7 +20,7 @@ import numpy as np
 from zwidth.core.errors import check_choice
 from zwidth.core.status import RidgeKind, Status
 from zwidth.core.types import Array, ArrayLike
-from zwidth.core.xp import differentiate_along, epsilon, materialize, namespace, nan_unless
+from zwidth.core.xp import differentiate_along, epsilon, namespace, nan_unless
 from zwidth.numerics.evaluate import evaluate
 from zwidth.numerics.root_finding import attach_root_derivatives
 from zwidth.plant.rigid_mass import (
@@ -165,7 +165,7 @@ def slopes_kernel(delta: Array, d: Array, kind: DelayClasses = ANY) -> RidgeSlop
     def differentiate(change: Plant) -> Array:
         return differentiate_along(lambda plant: evaluate_wall(wave, expand_curve(plant))[0], (plant,), (change,), xp)
 
-    slopes = map(differentiate, materialize(differentiate_mass(delta, f), ridge.s))
+    slopes = map(differentiate, differentiate_mass(delta, f))
     by_delta, by_d = nan_unless(converged(ridge), *slopes)
     return RidgeSlopes(_make_point(ridge, status), by_delta, by_d)
 
@@ -194,7 +194,7 @@ def _solve_point(delta: Array, d: Array, kind: DelayClasses) -> tuple[Ridge, Arr
         plant = (discretize_mass if namespace(delta, f) is np else get_differentiable_mass())(delta, f)
     else:
         plant = discretize_mass(delta)
-    ridge = materialize(differentiable_ridge(plant, n, start, kind), delta)
+    ridge = differentiable_ridge(plant, n, start, kind)
     return ridge, status, plant, n, (delta, f)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.status import Method, Status
 from zwidth.core.types import Array, ArrayLike
-from zwidth.core.xp import is_jax, is_traced
+from zwidth.core.xp import epsilon, is_jax, is_traced, namespace
 from zwidth.numerics.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.numerics.evaluate import precision as choose_precision
 from zwidth.plant.rigid_mass import classify_delays
@@ -61,8 +61,8 @@ def is_stable(
             an argument is constant cost nothing: for a grid pass alpha of shape (1, N) and beta of shape (M, 1).
         method: "crossover" evaluates the phase at the gain crossover, in closed form; "companion" computes all poles;
             "certified" returns True only with a certificate (`zwidth.decide_stability` returns the status of undecided
-            points). "auto" is "crossover". On a grid of one device it compares alpha with the stability limit at each
-            beta, by the same closed form.
+            points), and computes on the host, also for JAX arrays. "auto" is "crossover". On a grid of one device it
+            compares alpha with the stability limit at each beta, by the same closed form.
         precision: number type of the closed form. "auto" is float64 in a direct call, and inside `jit` JAX's default
             type. "mixed" computes each wall in float32 with an error bound. If the bound does not decide the label, as
             for fewer than 1 in 1,000 random walls, "mixed" computes the wall again in float64. All its labels are those
@@ -106,13 +106,18 @@ def is_stable(
     if method == "companion" and any(map(is_jax, values)):
         with choose_precision(values):
             return radius_by_companion(*values) < 1.0
+    _refuse_traced(values)
+    points, shape = fold_arguments(values)
+    return to_caller(restore_shape(_decide(points, method, kernel)[0], shape), values)
+
+
+def _refuse_traced(values: tuple[ArrayLike, ...]) -> None:
+    """Raise `InputError` if JAX traces any argument of the method "certified"."""
     if is_traced(*values):
         raise InputError(
             "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
             "'auto', 'crossover' or 'companion'"
         )
-    points, shape = fold_arguments(values)
-    return to_caller(restore_shape(_decide(points, method, kernel)[0], shape), values)
 
 
 def _select_kernel(precision: str, method: str, values: tuple[ArrayLike, ...]) -> Callable[..., Any]:
@@ -151,7 +156,10 @@ def decide_stability(
         double pole; ``method``, the `Method` that decided. Arrays may be read-only.
 
     Raises:
-        InputError: as for `zwidth.is_stable`, and for traced values.
+        InputError, TracedDelayError: as for `zwidth.is_stable`.
+
+    Numerics:
+        As for `zwidth.is_stable`. JAX arrays are computed on their devices, with method "certified" on the host.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
@@ -163,15 +171,41 @@ def decide_stability(
     """
     values = (alpha, beta, delta, d)
     check_choice("method", method, STABILITY_METHODS)
-    check_scalars(dict(zip(NAMES, values, strict=True)))
-    if is_traced(*values):
-        raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
+    arguments = dict(zip(NAMES, values, strict=True))
+    check_scalars(arguments)
+    if method != "certified" and any(map(is_jax, values)):
+        return _decide_jax_arrays(arguments, method)
+    _refuse_traced(values)
     points, shape = fold_arguments(values)
     stable, deciding_method, status = _decide(points, method)
     input_status = wall_status(*points)
     status = input_status if status is None else np.where(input_status == Status.OK, status, input_status)
     codes = np.broadcast_to(status, points.shape).astype(np.int32), np.asarray(deciding_method, np.int32)
     return to_caller(Stability(*(restore_shape(leaf, shape) for leaf in (stable, *codes))), values)
+
+
+def _decide_jax_arrays(arguments: dict[str, ArrayLike], method: str) -> Stability:
+    """Return the stability of walls, at least one of whose arguments is a JAX array, by code that JAX compiles."""
+    values = tuple(arguments.values())
+    if method != "companion":
+        stable = label_jax_arrays(arguments, classify_delays(values[3]))
+        return Stability(stable, *evaluate(_status_kernel, arguments, Method.CROSSOVER))
+    radius = radius_by_companion(*values)
+    with choose_precision(values):
+        stable = radius < 1.0
+    return Stability(stable, *evaluate(_status_kernel, arguments | {"radius": radius}, Method.COMPANION))
+
+
+def _status_kernel(alpha: Array, beta: Array, delta: Array, d: Array, *others: Any) -> tuple[Array, Array]:
+    """Return the status of each wall and the code of the method; ``others`` are radii of method "companion", code."""
+    *radius, code = others
+    status = wall_status(alpha, beta, delta, d)
+    xp = namespace(status)
+    if radius:
+        error = max(DOUBLE_POLE_ERROR, epsilon(alpha) ** 0.5)
+        inconclusive = (xp.abs(radius[0] - 1.0) < error) & (alpha != 0) & (status == Status.OK)
+        status = xp.where(inconclusive, int(Status.UNDECIDED), status)
+    return status, xp.full_like(status, int(code))
 
 
 def _decide(

@@ -12,17 +12,20 @@ slower methods in NumPy. On grids of alpha and beta, one Taylor series serves a 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth.core.status import Status
+from zwidth.core.types import Array
+from zwidth.core.xp import epsilon, namespace
 from zwidth.numerics.blocks import map_blocks
 from zwidth.numerics.evaluate import BLOCK, FEW, Route, compile_columns
 from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.rigid.broadcasting import Points, fold
-from zwidth.stability.rigid.characteristic_polynomial import factor_loop
+from zwidth.stability.rigid.characteristic_polynomial import LoopFactors, factor_loop
 from zwidth.stability.rigid.crossover import stable_kernel
 from zwidth.stability.rigid.dominant.grid import Area, compute_grid_poles, pad_to_16
 from zwidth.stability.rigid.dominant.pole_count import count_poles
@@ -41,8 +44,6 @@ from zwidth.stability.rigid.normalization import wall_status
 # accuracy times these factors, up to `MAX_ERROR`.
 ERROR_FACTORS = 10.0 ** np.arange(12)
 MAX_ERROR = 0.1  # largest relative error of a radius that is certified
-# Largest float64 below 1: radius of stable walls whose computed radius rounds to 1.
-BELOW_ONE = 1.0 - 2.0**-53
 # Bound of the rounding error of a computed radius. For alpha = 0, a radius below 1 + RADIUS_ROUNDING is set to 1,
 # because one pole is exactly 1.
 RADIUS_ROUNDING = 1e-13
@@ -154,24 +155,30 @@ def _map_in_batches(
         return [function([column[start : start + size] for column in columns]) for start in starts]
 
 
+def find_wall_axes(shapes: Sequence[tuple[int, ...]]) -> list[int] | None:
+    """Return the axes of beta and of alpha in a grid, given the shapes of alpha, beta, delta and d, of equal rank.
+
+    Return None if the shapes form no large grid. In a grid, alpha and beta each vary along one axis, along which no
+    other argument varies. If alpha or beta is constant, the first axis serves as its axis; it must then have length 1.
+    """
+    wall_axes = []
+    for k in (1, 0):
+        varying = [axis for axis, length in enumerate(shapes[k]) if length > 1] or [0]
+        if len(varying) > 1 or any(shape[varying[0]] > 1 for shape in (*shapes[:k], *shapes[k + 1 :])):
+            return None
+        wall_axes.append(varying[0])
+    too_small = math.prod(np.broadcast_shapes(*shapes)) <= FEW_FOR_CELLS
+    return None if too_small or math.prod(shapes[0] + shapes[1]) < SMALLEST_MAP else wall_axes
+
+
 def arrange_as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
     """Return points arranged as a grid over alpha and beta for one or more devices; None if they form no large grid.
-
-    A line of walls is a grid, too. The first axis of ``points``, which must then have length 1, serves as the axis that
-    the line lacks.
 
     Returns:
         The grid; the axes of ``points`` in the order of the grid (devices, beta, alpha); and the lengths of these axes.
     """
-    shape, wall_axes = points.shape, []
-    for name in ("beta", "alpha"):
-        varying = [axis for axis, length in enumerate(getattr(points, name).shape) if length > 1] or [0]
-        # Compare the arguments by name and not by identity, because the same array may be passed for two arguments.
-        others = [array for other, array in points._asdict().items() if other != name]
-        if len(varying) > 1 or any(other.shape[varying[0]] > 1 for other in others):
-            return None
-        wall_axes.append(varying[0])
-    if points.alpha.size * points.beta.size < SMALLEST_MAP:
+    shape, wall_axes = points.shape, find_wall_axes([array.shape for array in points])
+    if wall_axes is None:
         return None
     others = tuple(axis for axis in range(len(shape)) if axis not in wall_axes)
     order = (*others, *wall_axes)
@@ -207,7 +214,7 @@ def area_poles(area: Area, accuracy: float, with_rate: bool = False, with_angle:
     is_open, columns = np.isnan(re[special]), area.walls(special)
     poles = WallPoles(radius, np.ones(re.shape, bool), rate, angle)
     near_one, open_walls = (tuple(index[mask] for index in special) for mask in (~is_open, is_open))
-    poles.radius[near_one] = _place_by_verdict(poles.radius[near_one], [column[~is_open] for column in columns])
+    poles.radius[near_one] = _correct_by_verdict(poles.radius[near_one], [column[~is_open] for column in columns])
     if open_walls[0].size:
         single_poles = list_poles([column[is_open] for column in columns], accuracy, with_rate, with_angle, "numpy")
         for array, leaf in zip(poles, single_poles, strict=True):
@@ -232,7 +239,7 @@ def list_poles(
     rate = compute_rates(dominant, columns, accuracy) if with_rate else NOT_REQUESTED
     radius = np.exp(np.where(dominant.certified, re, np.nan))
     near_one = np.flatnonzero(np.abs(re) <= np.maximum(VERDICT_WIDTH, np.where(dominant.certified, error, 0.0)))
-    radius[near_one] = _place_by_verdict(radius[near_one], [column[near_one] for column in columns])
+    radius[near_one] = _correct_by_verdict(radius[near_one], [column[near_one] for column in columns])
     angle = NOT_REQUESTED
     if with_angle:
         angle = np.where(dominant.certified & np.isfinite(dominant.pole_error), round_to_real(dominant), np.nan)
@@ -240,7 +247,11 @@ def list_poles(
 
 
 def find_poles(
-    arrays: list[np.ndarray], accuracy: float, with_rate: bool = False, with_angle: bool = False
+    arrays: list[np.ndarray],
+    accuracy: float,
+    with_rate: bool = False,
+    with_angle: bool = False,
+    route: Route = "auto",
 ) -> WallPoles:
     """Compute the dominant poles of walls given by arrays of equal shape; by cells if the walls form a grid."""
     shape = arrays[0].shape
@@ -250,7 +261,7 @@ def find_poles(
     )
     if arranged is None:
         columns = [array.reshape(-1) for array in arrays]
-        return list_poles(columns, accuracy, with_rate, with_angle).map(lambda leaf: leaf.reshape(shape))
+        return list_poles(columns, accuracy, with_rate, with_angle, route).map(lambda leaf: leaf.reshape(shape))
     area, order, area_shape = arranged
 
     def restore_layout(leaf: np.ndarray) -> np.ndarray:
@@ -275,24 +286,34 @@ def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: flo
             if not index.size:
                 continue
             loop = factor_loop(*(column[index] for column in columns), fractional=fractional)
-            # Count the poles outside a slightly smaller circle. If only the dominant pole (or conjugate pair) is
-            # outside, no other pole can be larger, and the error of the rate is the error of this pole.
-            poles_outside = count_poles(poles.re[index] - width[index], loop, fractional)
-            is_only = poles_outside.certain & (
-                poles_outside.outside == np.where(np.sin(poles.im[index]) < REAL_AXIS_WIDTH, 1, 2)
-            )
+            is_only = is_only_pole_outside(poles.re[index], poles.im[index], width[index], loop, fractional)
             error[index] = np.where(is_only, poles.pole_error[index], error[index])
     return np.where(error <= allowed, rate, np.nan)
 
 
-def _place_by_verdict(radius: np.ndarray, columns: list[np.ndarray]) -> np.ndarray:
-    """Replace radii close to 1 by values below 1 for stable walls and by values of at least 1 for unstable walls."""
+def is_only_pole_outside(re: Array, im: Array, width: Array, loop: LoopFactors, fractional: bool) -> Array:
+    """Return whether provably no other pole is outside a circle that is smaller by ``width`` in log |z| than e^re.
+
+    The dominant pole ``e^(re + j im)`` (or conjugate pair) is then the only one outside this circle. No other pole can
+    be larger, and the error of the decay rate is the error of this pole.
+    """
+    xp, poles_outside = namespace(re), count_poles(re - width, loop, fractional)
+    return poles_outside.certain & (poles_outside.outside == xp.where(xp.sin(im) < REAL_AXIS_WIDTH, 1, 2))
+
+
+def _correct_by_verdict(radius: np.ndarray, columns: list[np.ndarray]) -> np.ndarray:
+    """Return radii close to 1, changed such that they are below 1 if and only if the wall is stable."""
     if not radius.size:
         return radius
-    alpha, beta, delta, d = columns
     with np.errstate(all="ignore"):
-        stable = np.asarray(stable_kernel(alpha, beta, delta, d, classify_delays(d)))
+        alpha, beta, delta, d = columns
+        return place_by_verdict(radius, alpha, stable_kernel(alpha, beta, delta, d, classify_delays(d)))
+
+
+def place_by_verdict(radius: Array, alpha: Array, stable: Array) -> Array:
+    """Return radii close to 1, replaced by values below 1 for stable walls and of at least 1 for unstable walls."""
+    xp = namespace(radius)
     # For alpha = 0, set the radius to 1 if it is 1 up to rounding errors, because one pole is exactly 1. Limit the
-    # radius of a stable wall to the largest float64 below 1.
-    outside = np.where((alpha == 0) & (radius < 1.0 + RADIUS_ROUNDING), 1.0, np.maximum(radius, 1.0))
-    return np.where(stable, np.minimum(radius, BELOW_ONE), outside)
+    # radius of a stable wall to the largest number below 1.
+    outside = xp.where((alpha == 0) & (radius < 1.0 + RADIUS_ROUNDING), 1.0, xp.maximum(radius, 1.0))
+    return xp.where(stable, xp.minimum(radius, 1.0 - 0.5 * epsilon(radius)), outside)

@@ -11,7 +11,7 @@ finally the radius is bisected by counts of poles.
 
 P = T + B has the factors of `stability.rigid.characteristic_polynomial`; a *crossover* is a point with |T| = |B| on a
 circle. Poles are given by their logarithms: a pole is ``e^(re + j im)`` with 0 <= im <= pi. The same source code serves
-NumPy and JAX. `stability.rigid.dominant.arrays` applies it to arrays; `traced_kernel` is for JAX transformations.
+NumPy and JAX. `stability.rigid.dominant.arrays` applies it to NumPy arrays, `compiled` to JAX arrays.
 """
 
 from __future__ import annotations
@@ -28,12 +28,7 @@ from zwidth.core.xp import (
     iterate,
     materialize,
     namespace,
-    nan_unless,
-    nan_with_nan_derivatives,
-    stop_gradient,
 )
-from zwidth.numerics.complex_pairs import make_complex
-from zwidth.numerics.root_finding import attach_root_derivatives
 from zwidth.stability.rigid.characteristic_polynomial import (
     LoopFactors,
     bound_wall_part,
@@ -43,12 +38,10 @@ from zwidth.stability.rigid.characteristic_polynomial import (
 )
 from zwidth.stability.rigid.dominant.pole_count import count_poles
 from zwidth.stability.rigid.dominant.steps import (
-    evaluate_polynomial,
     halley_step,
     newton_step,
     shift_pole,
 )
-from zwidth.stability.rigid.normalization import valid_wall
 
 # Numbers of Halley steps.
 STEPS_ON_BOTH = 2  # from both starting points (slow pole and first pair)
@@ -73,11 +66,6 @@ MIN_LOG_RADIUS = -690.0  # e^-690 = 2e-300 is close to the smallest float64
 BISECTIONS = 62
 POLISHING_STEPS = 6  # Halley steps after the bisection
 BISECTIONS_PER_COUNT = 3  # per call in NumPy, by counts on 7 circles, which for few walls take as long as on one
-# Largest number of circles that are tried for the certificate after a bisection. Each circle is ten times as far from
-# the pole as the previous one, because the rounding error of the count may be too large on a closer circle.
-MAX_TRIALS = 6
-
-RESCUE_SIZE = 1 << 9  # number of walls that a JAX program computes at once by bisection
 # Angles of the third and of the fourth starting point (`list_starts`), relative to the angle of the first pair.
 OFF_AXIS_RATIO = 0.1  # close to the real axis, but not on it
 BETWEEN_RATIO = 0.5  # near a third pole that exists for short delays
@@ -280,64 +268,3 @@ def bisect_radius(_: DominantPoles, tolerance: float, loop: LoopFactors, fractio
     # Keep the bisected radius if the pole is not certified; near multiple poles the Halley steps usually do not
     # converge.
     return poles._replace(re=np.where(poles.certified, poles.re, radius))
-
-
-def _find_traced(loop: LoopFactors, fractional: bool) -> DominantPoles:
-    """Return the dominant poles under JAX transformations: by `find_candidate`, or else by `find_by_bisection`."""
-    import jax.numpy as xp
-    from jax.lax import fori_loop, while_loop
-
-    tolerance, shape, size = epsilon(loop.c) ** 0.58, loop.alpha.shape, loop.alpha.size
-    columns = LoopFactors(*(xp.broadcast_to(column, shape).reshape(-1) for column in loop))
-    poles = certify_pole(*find_candidate(columns, fractional), tolerance, columns, fractional, fractional)
-    length = min(size, RESCUE_SIZE)
-
-    def rescue(state: tuple[DominantPoles, Array]) -> tuple[DominantPoles, Array]:
-        """Compute the dominant poles of some of the open (not certified) walls by bisection."""
-        results, is_open = state
-        index = xp.nonzero(is_open, size=length, fill_value=size)[0]
-        part = LoopFactors(*(column.at[index].get(mode="clip") for column in columns))
-        _, re, im = find_by_bisection(part, fractional)
-
-        def certify(k: Any, best: DominantPoles) -> DominantPoles:
-            trial = certify_pole(best.re, best.im, tolerance, part, fractional, False, 10.0**k)
-            return DominantPoles(*(xp.where(best.certified, *pair) for pair in zip(best, trial, strict=True)))
-
-        # Try to certify the poles on up to MAX_TRIALS circles. Each call of `certify_pole` also takes a Newton step.
-        none = xp.full_like(re, np.inf)
-        found = fori_loop(0, MAX_TRIALS, certify, DominantPoles(re, im, none, none))
-        results = DominantPoles(
-            *(leaf.at[index].set(new, mode="drop") for leaf, new in zip(results, found, strict=True))
-        )
-        return results, is_open.at[index].set(False, mode="drop")
-
-    is_open = ~(poles.certified | xp.isnan(columns.alpha))
-    poles, _ = while_loop(lambda state: state[1].any(), rescue, (poles, is_open))
-    return DominantPoles(*(leaf.reshape(shape) for leaf in poles))
-
-
-def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> tuple[Array, Array]:
-    """Return re and im of the dominant pole, with their derivatives, under JAX transformations.
-
-    The values are NaN if the pole could not be certified or is a multiple pole.
-    """
-    xp = namespace(alpha, beta, delta, d)
-    loop = materialize(factor_loop(alpha, beta, delta, d, fractional), delta)
-    poles = _find_traced(stop_gradient(loop, xp), fractional)
-
-    def evaluate(log_pole: Array, loop: LoopFactors) -> list[Array]:
-        return [
-            make_complex(part.real, part.imag)
-            for part in evaluate_polynomial(log_pole.real, log_pole.imag, loop, fractional)[:2]
-        ]
-
-    log_pole = attach_root_derivatives(
-        lambda *x: evaluate(*x)[0],
-        make_complex(poles.re, round_to_real(poles)),
-        lambda *_: True,
-        loop,
-        slope=lambda *x: evaluate(*x)[1],
-    )
-    valid = nan_with_nan_derivatives(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
-    re, im = nan_unless(poles.certified, log_pole.real, log_pole.imag)
-    return re + valid, im + valid

@@ -13,13 +13,12 @@ import numpy as np
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.status import Status
 from zwidth.core.types import Array, ArrayLike
-from zwidth.core.xp import is_traced, namespace
-from zwidth.numerics.evaluate import broadcast, broadcast_traced, check_scalars, evaluate, to_caller
-from zwidth.plant.rigid_mass import classify_delays
+from zwidth.core.xp import is_jax, namespace
+from zwidth.numerics.evaluate import broadcast, check_scalars, evaluate
 from zwidth.stability.results import DominantPole
 from zwidth.stability.rigid.broadcasting import NAMES
 from zwidth.stability.rigid.dominant.arrays import ACCURACY, find_poles
-from zwidth.stability.rigid.dominant.search import traced_kernel
+from zwidth.stability.rigid.dominant.compiled import compute_jax_poles
 from zwidth.stability.rigid.normalization import status_of_results, wall_status
 from zwidth.stability.rigid.poles import radius_by_companion
 
@@ -66,10 +65,11 @@ def spectral_radius(
         TracedDelayError: d is traced with method "companion".
 
     Numerics:
-        Direct calls compute in float64; grids and up to 262,144 other walls are computed without JAX. Inside `jit` the
-        function computes in JAX's default float type, d may be traced, and a radius within rounding error of 1 may be
-        on either side of 1. On grids, one Taylor series with a certified bound serves a cell of walls
-        (`stability.rigid.dominant.grid`). Derivatives are those of the dominant pole, up to the second order; they are
+        Direct calls compute in float64; grids and up to 262,144 other walls are computed without JAX. JAX arrays stay
+        on their devices. Inside `jit` the function computes in JAX's default float type, in which the default of
+        ``accuracy`` is 1e-4 for float32, and d may be traced. On grids, one Taylor series with a certified bound serves
+        a cell of walls (`stability.rigid.dominant.grid`); if JAX computes on a single CPU, also inside `jit`.
+        Derivatives are those of the dominant pole, up to the second order; they are
         NaN if this pole is a multiple pole. Near a k-fold pole the error of the radius is about 1e-16^(1/k), whatever
         the accuracy. If the radius is within 1e-16 of 1, use `decay_rate`.
 
@@ -87,10 +87,9 @@ def spectral_radius(
     check_scalars(arguments)
     if method == "companion":
         return radius_by_companion(*values)
-    if is_traced(*values):
-        log_radius, _ = evaluate(traced_kernel, arguments, classify_delays(d).fractional)
-        return namespace(log_radius).exp(log_radius)
-    return to_caller(find_poles(broadcast(arguments), required).radius, values)
+    if any(map(is_jax, values)):
+        return compute_jax_poles(arguments, accuracy, with_rate=False)[0]
+    return np.asarray(find_poles(broadcast(arguments), required).radius)[()]
 
 
 def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -118,8 +117,8 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         The rate is computed from z - 1, for the dominant pole z of `zwidth.spectral_radius`. For soft walls the rate
         has at least 11 digits, however small it is; for a pole pair near the unit circle its absolute error is about
         1e-16. If the certified error bound is not below a thousandth of the rate, the rate is NaN. If the magnitudes of
-        some poles agree within 1e-12, the rate is that of any of them. Inside `jit` it has the ambient precision and no
-        error bound.
+        some poles agree within 1e-12, the rate is that of any of them. JAX arrays stay on
+        their devices. Inside `jit` the rate has JAX's default float type; in float32 it has no error bound.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
@@ -132,9 +131,9 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     values = (alpha, beta, delta, d)
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
-    if is_traced(*values):
-        return -evaluate(traced_kernel, arguments, classify_delays(d).fractional)[0]
-    return to_caller(find_poles(broadcast(arguments), ACCURACY, with_rate=True).rate, values)
+    if any(map(is_jax, values)):
+        return compute_jax_poles(arguments, None, with_rate=True)[1]
+    return np.asarray(find_poles(broadcast(arguments), ACCURACY, with_rate=True).rate)[()]
 
 
 def dominant_pole(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> DominantPole:
@@ -175,16 +174,20 @@ def dominant_pole(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayL
     values = (alpha, beta, delta, d)
     arguments = dict(zip(NAMES, values, strict=True))
     check_scalars(arguments)
-    if is_traced(*values):
-        re, im = evaluate(traced_kernel, arguments, classify_delays(d).fractional)
-        xp, status = namespace(re), wall_status(*broadcast_traced(arguments))
-        status = xp.where((status == Status.OK) & xp.isnan(re), int(Status.NOT_CONVERGED), status)
-        return DominantPole(xp.exp(re), im, -re, status)
+    if any(map(is_jax, values)):
+        radius, rate, angle = compute_jax_poles(arguments, None, with_rate=True)
+        return DominantPole(radius, angle, rate, evaluate(_status_kernel, arguments | {"rate": rate}))
     arrays = broadcast(arguments)
     radius, certified, rate, angle = find_poles(arrays, ACCURACY, with_rate=True, with_angle=True)
     status = status_of_results(radius.shape, (radius, rate, angle), tuple(arrays[:2]), tuple(arrays[2:]))
     status = np.where((status == Status.OK) & ~certified, Status.NOT_CONVERGED, status).astype(np.int32)
-    return to_caller(DominantPole(radius, angle, rate, status), values)
+    return DominantPole(*(np.asarray(leaf)[()] for leaf in (radius, angle, rate, status)))
+
+
+def _status_kernel(alpha: Array, beta: Array, delta: Array, d: Array, rate: Array) -> Array:
+    """Return the status of dominant poles, given the decay rates, which are NaN without a certificate."""
+    xp, status = namespace(rate), wall_status(alpha, beta, delta, d)
+    return xp.where((status == Status.OK) & xp.isnan(rate), int(Status.NOT_CONVERGED), status)
 
 
 def _check_accuracy(method: str, accuracy: float | None) -> float:

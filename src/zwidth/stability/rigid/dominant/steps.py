@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.core.types import Array
-from zwidth.core.xp import COSINE, SINE, epsilon, horner, materialize, namespace
+from zwidth.core.xp import COSINE, SINE, epsilon, horner, namespace
 from zwidth.numerics.complex_pairs import Pair, make_complex
 from zwidth.numerics.polynomials import abs2
 from zwidth.stability.rigid.characteristic_polynomial import LoopFactors, bound_wall_part, evaluate_factors
@@ -49,13 +49,6 @@ def _sine_and_cosine(x: Array, xp: Any) -> tuple[Array, Array]:
     return x * horner(square, SINE), horner(square, COSINE)
 
 
-def _store_pair(value: Any, witness: Array) -> Any:
-    """Return a `Pair` (real and imaginary part) unchanged, but make XLA compute it once and store it."""
-    # Without `materialize`, each of five loops of the compiled program would evaluate the sine and cosine series of the
-    # pair again, and a step would take 1.4 times as long.
-    return Pair(*materialize((value.real, value.imag), witness))
-
-
 def evaluate_polynomial(re: Array, im: Array, loop: LoopFactors, fractional: bool) -> PolynomialValue:
     """Evaluate P and its derivatives at ``z = e^(re + j im)``, |im| <= pi; for fractional delays, those of z P."""
     xp = namespace(re, loop.alpha)
@@ -80,8 +73,6 @@ def evaluate_polynomial(re: Array, im: Array, loop: LoopFactors, fractional: boo
     phase = phase - 2.0 * np.pi * full_turns
     half_sine, half_cosine = _sine_and_cosine(0.5 * phase, xp)
     delay = number(device_scale * (1.0 - 2.0 * half_sine * half_sine), 2.0 * device_scale * half_sine * half_cosine)
-    if number is Pair:
-        z_minus_1, delay = _store_pair(z_minus_1, re), _store_pair(delay, re)
     z = z_minus_1 + 1.0
     A, dA, N, dN, ddN, W = evaluate_factors(z, z_minus_1, loop, fractional)
     N, dN, device_slope, z_squared = N * wall_scale, dN * wall_scale, z * dA, z * z

@@ -1,0 +1,95 @@
+"""Loop of a scene with a simulated tool, in which the wall is the virtual coupling between device and tool.
+
+The coupling C = alpha + beta F and the responses G of the device and G_t of the tool yield the closed loop ``1 + C (G +
+G_t) = 0`` (docs/theory/passivity.md, U5), so the analyses of `LinearLoop` are valid with G + G_t in place of G. A tool
+in implicit Euler follows the coupling force without delay. Then the set of stable couplings may be *unbounded*: with a
+light tool, a coupling is stable with every stiffness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from functools import cached_property
+
+import numpy as np
+
+from zwidth.analysis.loop import LinearLoop
+from zwidth.core.errors import InputError
+from zwidth.core.status import RidgeKind, Status
+from zwidth.plant.composed_plant import add_plants, factor_tool
+from zwidth.stability.linear.regions import StableSet
+from zwidth.stability.linear.ridge import RidgeSolution
+from zwidth.stability.linear.roots import LoopRoots
+from zwidth.stability.linear.rows import CONNECTED_START, Island, find_stable_intervals
+from zwidth.stability.results import Margins, RidgePoint
+
+# Dampings beta at which an unbounded set of stable couplings is searched for one that is stable with every alpha > 0.
+TESTED_DAMPINGS = np.concatenate([[0.0], np.geomspace(1e-6, 1e3, 91)])
+
+
+class CouplingLoop(LinearLoop):
+    """Loop of a scene with a tool. Methods without docstring are described in `LinearLoop`."""
+
+    @cached_property
+    def roots(self) -> LoopRoots:
+        device, scene = super().roots, self.scene
+        plant = add_plants(device, factor_tool(scene.tool.respond(scene.mass, scene.timing.period)))
+        return LoopRoots(**vars(plant), estimate=device.estimate)
+
+    @cached_property
+    def unbounded(self) -> bool:
+        """True if couplings are stable as alpha -> inf, whatever their damping."""
+        return not self.boundary.count_above(np.zeros(1))
+
+    @cached_property
+    def free_damping(self) -> float:
+        """The smallest tested beta >= 0 with which every alpha > 0 is stable; NaN if no such damping is found."""
+        if not self.unbounded:
+            return np.nan
+        intervals = find_stable_intervals(self.boundary, TESTED_DAMPINGS)
+        scale = CONNECTED_START * np.abs(self.boundary.ends[0][np.isfinite(self.boundary.ends[0])]).max(initial=1e-60)
+        free = ((intervals.low <= scale) & (intervals.high == np.inf)).any(-1)
+        return float(TESTED_DAMPINGS[free.argmax()]) if free.any() else np.nan
+
+    @cached_property
+    def stable_set(self) -> StableSet:
+        if self.unbounded:
+            raise InputError(
+                "tool: the set of stable couplings has no boundary at high stiffness; use is_stable or stable_stiffness"
+            )
+        return super().stable_set
+
+    def ridge(self, negative: bool) -> tuple[RidgeSolution | None, Status]:
+        return (None, Status.NO_BOUNDARY) if self.unbounded else super().ridge(negative)
+
+    def stiffest(self, negative: bool) -> RidgePoint:
+        if not self.unbounded:
+            return super().stiffest(negative)
+        beta = np.float64(self.free_damping)
+        alpha = np.float64(np.nan if np.isnan(beta) else np.inf)
+        status = Status.NOT_CONVERGED if np.isnan(beta) else Status.OK
+        return RidgePoint(alpha, beta, np.float64(np.nan), np.int32(RidgeKind.NONE), np.int32(status))
+
+    def is_connected(self, alpha: float, beta: float) -> bool:
+        if not self.unbounded:
+            return super().is_connected(alpha, beta)
+        # All couplings of sufficient stiffness are connected, because the number of unstable poles at high stiffness
+        # does not depend on the damping.
+        intervals = find_stable_intervals(self.boundary, np.array([beta]))
+        inside = (intervals.low[0] < alpha) & (alpha < intervals.high[0])
+        from_zero = intervals.low[0] <= CONNECTED_START * alpha
+        return bool((inside & (from_zero | (np.isfinite(self.free_damping) & np.isinf(intervals.high[0])))).any())
+
+    def find_connected_beta(self, alpha: float, least: float) -> list[tuple[float, float]]:
+        if self.unbounded and np.isinf(self.find_stable_beta(alpha)).any():
+            raise InputError("tool: the coupling is stable with every larger damping; choose B by spectral_radius")
+        return super().find_connected_beta(alpha, least)
+
+    def islands(self, least: float) -> list[Island]:
+        return [] if self.unbounded else super().islands(least)
+
+    def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
+        # Leave the delay margin NaN, because additional delay changes G but not G_t.
+        return super().margins(
+            alpha, beta, [name for name in Margins._fields if name in wanted and name != "delay_margin"]
+        )

@@ -1,0 +1,89 @@
+"""Model of a simulated tool: a mass with a damper and a spring to its rest position, integrated by the control program.
+
+A *virtual coupling*, a spring K and a damper B, connects the tool to the device. Each period, the program samples the
+position x of the device, computes the force f of the coupling from x and the position y of the tool, commands -f to the
+device, and integrates the tool by one step of length T. With the mass M, the damping c and the stiffness k of the tool,
+the response G_t = y/f of the tool is (docs/theory/passivity.md, U4)
+
+    semi-implicit Euler   G_t = (T^2/M) z/(zeta^2 + (p + q) zeta + q)
+    implicit Euler        G_t = (T^2/M) z^2/((1 + p + q) zeta^2 + (p + 2 q) zeta + q)
+
+with zeta = z - 1, p = c T/M and q = k T^2/M.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
+
+from zwidth.model.checks import Part
+
+Integrator = Literal["semi-implicit", "implicit"]
+
+
+class ToolResponse(NamedTuple):
+    """The response ``gain z^power/(a2 zeta^2 + a1 zeta + a0)`` from the coupling force to the position of the tool."""
+
+    gain: Any
+    power: int
+    a2: Any
+    a1: Any
+    a0: Any
+
+
+@dataclass(frozen=True, repr=False)
+class Tool(Part):
+    """A simulated tool (proxy, avatar) that a virtual coupling connects to the device.
+
+    In a scene with a tool, the stiffness K and the damping B of the wall are those of the coupling. Its force at sample
+    k is ``f = K (x - y) + B (v_x - v_y)`` with the sampled position x of the device and the position y of the tool. The
+    velocity estimate of the scene yields the velocity of x - y. The force acts on the tool at the same tick, without
+    delay, because program and tool run on the same computer. On the device it acts with the delay of the scene.
+
+    Args:
+        mass: mass M of the tool in kg, > 0.
+        damping: damping c between tool and ground in N s/m, >= 0.
+        stiffness: stiffness k between tool and ground in N/m, >= 0.
+        integrator: integration method, with one step per period. "semi-implicit" Euler, the usual method of physics
+            engines, computes ``v += T (f - c v - k y)/M; y += T v``, where f follows from the old y. "implicit" Euler
+            evaluates f, c v and k y at the new values, so it solves f and the new y together.
+
+    Numerics:
+        A tool in semi-implicit Euler is not passive: without damping, the real part of its impedance at the angular
+        frequency w is ``M (cos(w T) - 1)/T < 0``. `Scene.is_safe_for_every_world` does not cover it. A tool in implicit
+        Euler is passive.
+
+    References:
+        Colgate, Stanley, Brown 1995, Proc. IROS, vol. 3 (virtual coupling); Adams, Hannaford 1999, IEEE Trans. Robotics
+        and Automation 15 (coupling with a tool).
+
+    Example:
+        >>> import zwidth
+        >>> device, timing = zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3, delay=1e-3)
+        >>> print(f"{zwidth.Scene(device, timing, tool=zwidth.Tool(mass=0.3)).max_stiffness().stiffness:.0f} N/m")
+        22201 N/m
+    """
+
+    _owner = "tool"
+    # Presets of this part in the page of ``zwidth explore``: arguments of the constructor, by name of the preset.
+    usual: ClassVar[dict[str, dict[str, Any]]] = {
+        name: {"mass": 0.3, "damping": 0.0, "stiffness": 0.0, "integrator": name} for name in get_args(Integrator)
+    }
+
+    mass: Any
+    damping: Any = 0.0
+    stiffness: Any = 0.0
+    integrator: Integrator = "semi-implicit"
+
+    def respond(self, mass: Any, period: Any) -> ToolResponse:
+        """Return the response of the tool in units of T^2/m.
+
+        Args:
+            mass: unit of mass m in kg.
+            period: sampling period T in s.
+        """
+        rate = period / self.mass
+        p, q = self.damping * rate, self.stiffness * (rate * period)
+        if self.integrator == "implicit":
+            return ToolResponse(mass / self.mass, 2, p + q + 1.0, p + q + q, q)
+        return ToolResponse(mass / self.mass, 1, p * 0.0 + 1.0, p + q, q)

@@ -1,0 +1,222 @@
+"""Admittance displays against eigenvalues of a composed state space, a published program, and messages.
+
+The state space of the reference contains the program step by step, the commands on their way, and the robot, which is
+integrated by the matrix exponential of scipy.
+"""
+
+import numpy as np
+import pytest
+from scipy import linalg, signal
+
+import zwidth
+
+LAG = zwidth.Actuator(time_constant="20 ms")
+TIMING = zwidth.Timing(rate="500 Hz", delay="4 periods")
+PROGRAMS = [(command, method) for command in ("position", "velocity") for method in ("semi-implicit", "trapezoidal")]
+
+
+def make_display(rng):
+    """Return a random display and the state-space model of its robot from command to position."""
+    period = 10.0 ** rng.uniform(-3.3, -2)
+    tau = period * 10.0 ** rng.uniform(0.0, 1.5)
+    zeta = rng.uniform(0.3, 1.2)
+    kind = rng.integers(3)
+    if kind == 2:
+        # A robot with a zero: 1/tau^2 (1 + tau s/2)/(s^2 + 2 zeta s/tau + 1/tau^2).
+        poly = [0.5 / tau, 1 / tau**2], [1, 2 * zeta / tau, 1 / tau**2]
+        robot = zwidth.LinearDevice(poly)
+    elif kind == 1:
+        poly = [1 / tau**2], [1, 2 * zeta / tau, 1 / tau**2]
+        robot = zwidth.Actuator(time_constant=tau, order=2, damping_ratio=zeta)
+    else:
+        poly, robot = ([1 / tau], [1, 1 / tau]), zwidth.Actuator(time_constant=tau)
+    command, method = PROGRAMS[rng.integers(4)]
+    delay = float(rng.choice([float(rng.integers(5)), rng.uniform(0, 4)]))
+    mass = 10.0 ** rng.uniform(-0.5, 1.5)
+    # The damper of the program is explicit, so D T/M must be below 2.
+    damping = mass / period * 10.0 ** rng.uniform(-3, -0.5)
+    timing = zwidth.Timing(period, f"{delay!r} periods")
+    display = zwidth.AdmittanceDisplay(mass, damping, robot, timing, command, method)
+    A, B, C, _ = signal.tf2ss(poly[0], np.append(poly[1], 0.0) if command == "velocity" else poly[1])
+    return display, (A, B, C)
+
+
+def compose(display, robot, stiffness, damper):
+    """Return the matrix of one period: the states are those of the robot, the last commands, and v, a and x_ref."""
+    A, B, C = robot
+    T, M, D = (float(each) for each in (display.timing.period, display.virtual_mass, display.virtual_damping))
+    n = int(np.floor(display.timing.d))
+    f = float(display.timing.d) - n
+    size, lag = len(A), n + 1
+
+    def move(time):
+        """Return e^(A t) and the integral of e^(A s) B for s from 0 to t."""
+        block = linalg.expm(np.block([[A, B], [np.zeros((1, size + 1))]]) * time)
+        return block[:size, :size], block[:size, size:]
+
+    (phi1, gamma1), (phi2, gamma2) = move(f * T), move((1 - f) * T)
+    columns = []
+    for unit in np.eye(size + lag + 3):
+        x, (commands, (v, a, reference)) = unit[:size], np.split(unit[size:], [lag])
+        position = (C @ x).item()
+        # The command before the sample is the oldest stored one, u_(k-n-1).
+        velocity = (C @ (A @ x + B[:, 0] * commands[-1])).item()
+        force = -stiffness * position - damper * velocity
+        if display.integrator == "trapezoidal":
+            new_a = (force - D * v) / M
+            new_v = v + T * (new_a + a) / 2
+            new_reference = reference + T * (new_v + v) / 2
+        else:
+            new_a = (force - D * v) / M
+            new_v = v + T * new_a
+            new_reference = reference + T * new_v
+        sent = np.append(new_v if display.command == "velocity" else new_reference, commands)
+        x = phi2 @ (phi1 @ x + gamma1[:, 0] * sent[n + 1]) + gamma2[:, 0] * sent[n]
+        columns.append(np.concatenate([x, sent[:lag], [new_v, new_a, new_reference]]))
+    matrix = np.array(columns).T
+    if display.command == "velocity":
+        # The program does not integrate the position.
+        matrix = matrix[:-1, :-1]
+    return matrix
+
+
+def find_radius(*given):
+    return np.abs(np.linalg.eigvals(compose(*given))).max()
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_limits_of_random_displays_agree_with_eigenvalues(seed):
+    rng = np.random.default_rng(seed)
+    display, robot = make_display(rng)
+    damper = float(rng.choice([0.0, 10.0 ** rng.uniform(-1, 0.5) * display.virtual_damping]))
+    limit = display.max_environment_stiffness(damper)
+    if limit.status != zwidth.Status.OK:
+        # Even the softest environment is unstable, for example because its damper is too strong.
+        assert find_radius(display, robot, 1e-3 * display.virtual_damping, damper) > 1
+        return
+    K = float(limit.stiffness)
+    for share in (0.01, 0.1, 0.3, 0.6, 0.9, 0.999):
+        assert find_radius(display, robot, share * K, damper) < 1
+    assert find_radius(display, robot, 1.001 * K, damper) > 1
+    # Newton's method for the radius 1 in the logarithm of K, with a difference quotient.
+    radius, slope = (
+        find_radius(display, robot, K, damper),
+        (find_radius(display, robot, K * (1 + 1e-5), damper) - find_radius(display, robot, K * (1 - 1e-5), damper))
+        / 2e-5,
+    )
+    assert abs((radius - 1.0) / slope) < 1e-9
+    poles = np.sort(np.abs(display.scene(0.7 * K, damper).poles()))[-3:]
+    eigenvalues = np.sort(np.abs(np.linalg.eigvals(compose(display, robot, 0.7 * K, damper))))[-3:]
+    np.testing.assert_allclose(poles, eigenvalues, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_smallest_virtual_mass_agrees_with_eigenvalues(seed):
+    rng = np.random.default_rng(100 + seed)
+    display, robot = make_display(rng)
+    stiffness = float(display.max_environment_stiffness().stiffness) * rng.uniform(0.1, 1.0)
+    limit = display.min_virtual_mass(stiffness)
+    assert limit.status == zwidth.Status.OK
+
+    def find_radius_of(mass):
+        parts = display.robot, display.timing, display.command, display.integrator
+        changed = zwidth.AdmittanceDisplay(mass, display.virtual_damping, *parts)
+        return find_radius(changed, robot, stiffness, 0.0)
+
+    low, high = limit.virtual_mass, min(limit.largest, 1e3 * limit.virtual_mass)
+    assert low < display.virtual_mass < limit.largest
+    assert find_radius_of(0.999 * low) > 1
+    for mass in np.geomspace(1.001 * low, 0.999 * high, 5):
+        assert find_radius_of(mass) < 1
+    if limit.largest < np.inf:
+        assert find_radius_of(1.001 * limit.largest) > 1
+
+
+def test_program_of_universal_robots():
+    """Trapezoidal rule, velocity command, 500 Hz, robot with a lag of 20 ms and 4 periods; eigenvalues in 60 digits."""
+    display = zwidth.AdmittanceDisplay("20 kg", "60 N s/m", LAG, TIMING, "velocity", "trapezoidal")
+    limit = display.max_environment_stiffness()
+    assert limit.stiffness == pytest.approx(2160.09, abs=0.005)
+    assert display.is_stable(2150, 0)
+    assert not display.is_stable("2.17 kN/m", 0.0)
+    np.testing.assert_array_equal(display.is_stable([2150, 2170], [[0], [10]]), [[True, False], [True, True]])
+    scene = display.scene("1 kN/m")
+    assert scene.margins().gain_margin == pytest.approx(2.160088, rel=1e-6)
+    assert repr(limit) == "EnvironmentLimit(stiffness=2.16008 kN/m, frequency=1.60773 Hz, status=OK)"
+
+
+def test_first_order_robot_equals_a_scaled_backward_difference():
+    """Without fractional delay, the velocity of the lag is p (1 - 1/z)/(tau (1 - p)) times its position."""
+    display = zwidth.AdmittanceDisplay(20, 60, LAG, TIMING)
+    p, T, M, D = np.exp(-0.1), 2e-3, 20, 60
+    numerator = np.array([T * T / M * (1 - p), 0, 0])
+    denominator = np.polymul(np.polymul([1, -1], [1, -(1 - T * D / M)]), [1, -p, 0, 0, 0, 0])
+    velocity = zwidth.VelocityFilter(p / (0.02 * (1 - p)) * np.array([1, -1]), [1, 0])
+    loop = zwidth.Scene(zwidth.LinearDevice((numerator, denominator), sampled=T), zwidth.Timing(T), velocity=velocity)
+    for damper in (0, 5, 50):
+        expected = loop.stable_stiffness(damper)[-1, 1]
+        assert display.max_environment_stiffness(damper).stiffness == pytest.approx(expected, rel=1e-9)
+
+
+def test_arrays_of_dampings_and_rotary_units():
+    display = zwidth.AdmittanceDisplay("0.5 kg m^2", "2 N m s/rad", LAG, TIMING)
+    limits = display.max_environment_stiffness([0, 1])
+    assert limits.stiffness.shape == (2,)
+    assert limits.stiffness[0] < limits.stiffness[1]
+    assert "N m/rad" in repr(display.max_environment_stiffness("1 N m s/rad"))
+    assert "kg m^2" in repr(display.min_virtual_mass(hand_stiffness="10 N m/rad"))
+    assert display.scene("10 N m/rad").wall.stiffness == 10
+
+
+def test_sampled_robot_allows_only_a_spring():
+    T = 2e-3
+    sampled = zwidth.LinearDevice(([1 - np.exp(-0.1)], [1, -np.exp(-0.1)]), sampled=T)
+    by_model, by_samples = (
+        zwidth.AdmittanceDisplay(20, 60, robot, TIMING).max_environment_stiffness() for robot in (LAG, sampled)
+    )
+    assert by_samples.stiffness == pytest.approx(by_model.stiffness, rel=1e-12)
+    with pytest.raises(zwidth.InputError, match="environment_damping: got a damper with a sampled robot"):
+        zwidth.AdmittanceDisplay(20, 60, sampled, TIMING).max_environment_stiffness(1)
+
+
+def test_display_without_damping_is_unstable_in_any_spring():
+    display = zwidth.AdmittanceDisplay(20, 0, LAG, TIMING)
+    limit = display.max_environment_stiffness()
+    assert np.isnan(limit.stiffness)
+    assert limit.status == zwidth.Status.NO_BOUNDARY
+    assert np.isnan(display.min_virtual_mass(100).virtual_mass)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"virtual_mass": 0}, "virtual_mass: got 0"),
+        ({"virtual_mass": "20 N"}, "virtual_mass: got '20 N'"),
+        ({"virtual_damping": -1}, "virtual_damping: got -1"),
+        ({"virtual_mass": "1 kg", "virtual_damping": "1 N m s/rad"}, "together with"),
+        ({"robot": 3}, "robot: got 3; pass zwidth.Actuator"),
+        ({"robot": None}, "robot: got None"),
+        ({"timing": 1e-3}, "timing: got 0.001"),
+        ({"command": "force"}, "command: got 'force'"),
+        ({"integrator": "euler"}, "integrator: got 'euler'"),
+        ({"robot": zwidth.LinearDevice("1 / 1 -0.5", sampled=2e-3), "command": "velocity"}, "velocity command"),
+        ({"robot": zwidth.LinearDevice("1 / 1 -0.5", sampled=1e-3)}, "sampled at 0.001 s in a loop of 0.002 s"),
+    ],
+)
+def test_invalid_arguments_raise(changes, message):
+    given = {"virtual_mass": 20, "virtual_damping": 60, "robot": LAG, "timing": TIMING, **changes}
+    with pytest.raises(zwidth.InputError, match=message):
+        zwidth.AdmittanceDisplay(**given)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda display: display.max_environment_stiffness(-1), "environment_damping: got -1"),
+        (lambda display: display.scene(-1), "environment_stiffness: got -1"),
+        (lambda display: display.min_virtual_mass("1 kg"), "environment_stiffness: got '1 kg'"),
+    ],
+)
+def test_invalid_environments_raise(call, message):
+    with pytest.raises(zwidth.InputError, match=message):
+        call(zwidth.AdmittanceDisplay(20, 60, LAG, TIMING))
