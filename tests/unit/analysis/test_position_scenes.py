@@ -37,8 +37,7 @@ def plain():
 @pytest.mark.parametrize("method", METHODS)
 def test_no_method_ignores_a_part(method, parts, plain):
     scene, arguments = zwidth.Scene(DEVICE, TIMING, WALL, **parts), ARGUMENTS.get(method, ())
-    options = OPTIONS.get(method, {})
-    message, result = "", None
+    options, message, result = OPTIONS.get(method, {}), "", None
     try:
         result = getattr(scene, method)(*arguments, **options)
     except InputError as error:
