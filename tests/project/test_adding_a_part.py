@@ -43,7 +43,7 @@ EDITS = {
         )
     },
     "model/parameter_paths.py": {
-        '"actuator": Actuator}': '"actuator": Actuator, "mount": Mount}',
+        '"tool": Tool}': '"tool": Tool, "mount": Mount}',
         "from zwidth.model.operator": f"{IMPORT}from zwidth.model.operator",
     },
     "analysis/base.py": {

@@ -40,7 +40,7 @@ from zwidth.model.velocity import Estimate
 from zwidth.numerics.evaluate import as_float64
 from zwidth.plant.sampled_states import sample_states
 from zwidth.units.display import compact_repr
-from zwidth.units.quantities import NOT_NEGATIVE, POSITIVE
+from zwidth.units.quantities import NOT_NEGATIVE, POSITIVE, Range
 from zwidth.units.unit_system import SYSTEMS
 
 Command = Literal["position", "velocity"]
@@ -192,7 +192,7 @@ class AdmittanceDisplay:
         for damping in np.unique(B[np.isfinite(B)]).tolist():
             chosen = damping == B
             labels[chosen] = self.scene(0.0, damping).is_stable(K[chosen], 0.0)
-        return labels
+        return labels[()]
 
     def max_environment_stiffness(self, environment_damping: ArrayLike = 0.0) -> EnvironmentLimit:
         """Return the largest stiffness K of the environment such that the display is stable from 0 to K.
@@ -225,7 +225,7 @@ class AdmittanceDisplay:
             >>> display.min_virtual_mass(hand_stiffness=500)
             VirtualMassLimit(virtual_mass=10.0125 g, largest=inf kg, frequency=500 Hz, status=OK)
         """
-        K, B = self._read_environment(hand_stiffness, hand_damping)
+        K, B = self._read_environment(hand_stiffness, hand_damping, "hand", POSITIVE)
         gain, frequency, status, least = self._find_range("mass", {"stiffness": K, "environment_damping": B})
         largest = np.inf if least == 0 else 1.0 / least
         return self._label(VirtualMassLimit(1.0 / gain, largest, frequency, status))
@@ -235,11 +235,20 @@ class AdmittanceDisplay:
         result.unit_system = SYSTEMS[self.rotary]
         return result
 
-    def _read_environment(self, stiffness: Any, damping: Any) -> tuple[float, float]:
-        """Return stiffness and damping of one environment in SI units; raise `InputError` if one is out of range."""
+    def _read_environment(
+        self, stiffness: Any, damping: Any, name: str = "environment", allowed: Range = NOT_NEGATIVE
+    ) -> tuple[float, float]:
+        """Return stiffness and damping of one environment in SI units; raise `InputError` if one is out of range.
+
+        Args:
+            stiffness: K, a number or a text with a unit.
+            damping: B, a number or a text with a unit.
+            name: beginning of the names of both arguments, for messages.
+            allowed: allowed range of the stiffness.
+        """
         units = SYSTEMS[self.rotary]
-        K = check_number("environment_stiffness", stiffness, units["N/m"], NOT_NEGATIVE)
-        return K, check_number("environment_damping", damping, units["N s/m"], NOT_NEGATIVE)
+        K = check_number(f"{name}_stiffness", stiffness, units["N/m"], allowed)
+        return K, check_number(f"{name}_damping", damping, units["N s/m"], NOT_NEGATIVE)
 
     def _read_environments(self, stiffness: Any, damping: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return arrays of stiffness and damping in SI units; raise `InputError` if a damping is negative."""

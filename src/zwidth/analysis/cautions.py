@@ -65,7 +65,7 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
             recommendation,
             _list_margins(requirements),
             lambda improved: not find_thin(assess(improved), scene.timing.period),
-            "no other requirement avoids this; more damping of the device or less delay may",
+            "no other requirement avoids this; more damping of the device or less delay may avoid it",
         )
         cautions.append(f"{', '.join(thin)}{after}; {advice}")
     if unstable := [name for name, stable in recommendation.grasps.items() if not stable]:

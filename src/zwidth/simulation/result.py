@@ -104,7 +104,7 @@ def _draw(motion: Motion) -> str:
 
 
 @compact_repr(
-    ("outcome", "time", *OF_WHOLE),
+    tuple(dict.fromkeys(("outcome", "time", *OF_WHOLE))),
     _draw,
     {
         "frequency": "fewer than two oscillations in the tail",

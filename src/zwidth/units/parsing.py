@@ -281,9 +281,8 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool, counts: bool) -> 
     if looks_like_number(text) and not looks_like_number(str(value)):
         raise UnusableValueError(got, "numbers without a unit have no separators", f"write {text}")
     if looks_like_number(text):
-        raise UnusableValueError(
-            f"got the text {describe(value)}", allowed, f"drop the quotes (it is then in {dimension.base})"
-        )
+        note = f" (it is then in {dimension.base})" if dimension.base else ""
+        raise UnusableValueError(f"got the text {describe(value)}", allowed, f"drop the quotes{note}")
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise UnusableValueError(got, allowed, remedy)

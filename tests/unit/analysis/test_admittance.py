@@ -214,7 +214,9 @@ def test_invalid_arguments_raise(changes, message):
     [
         (lambda display: display.max_environment_stiffness(-1), "environment_damping: got -1"),
         (lambda display: display.scene(-1), "environment_stiffness: got -1"),
-        (lambda display: display.min_virtual_mass("1 kg"), "environment_stiffness: got '1 kg'"),
+        (lambda display: display.min_virtual_mass("1 kg"), "hand_stiffness: got '1 kg'"),
+        (lambda display: display.min_virtual_mass(0), "hand_stiffness: got 0"),
+        (lambda display: display.is_stable(100, [np.nan, 1]), "environment_damping: got nan"),
     ],
 )
 def test_invalid_environments_raise(call, message):

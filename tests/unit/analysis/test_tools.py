@@ -247,7 +247,7 @@ def test_state_space(integrator):
 def test_safe_couplings_are_stable_with_implicit_tools(n_delay):
     rng = np.random.default_rng(n_delay)
     stiffest = make_scene(None, n_delay).max_safe_coupling()
-    for _ in range(25):
+    for _ in range(8):
         mass, damping, stiffness = (10 ** rng.uniform(*ends) for ends in ((-4, 1), (-2, 1), (0, 4)))
         hand = zwidth.Operator(*(10 ** rng.uniform(*ends) for ends in ((-1, 0), (0, 1.5), (1, 3))))
         tool = zwidth.Tool(mass, damping, stiffness, "implicit")
