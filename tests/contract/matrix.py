@@ -90,7 +90,9 @@ def common_combinations(case: Case) -> Iterator[Combination]:
         yield Combination("float64 array", "vmap", first, True)
     elif not case.gradient_in:
         yield Combination("int", "jit(grad)", first, True)
-        if case.derivatives == 2:
+        # A method of a scene calls the function of arrays, whose second derivative is an entry, with parameters that
+        # the representative of the scenes converts with second derivatives.
+        if case.derivatives == 2 and not case.one_number:
             yield Combination("int", "hessian", first, True)
 
 
@@ -121,8 +123,9 @@ def all_combinations(case: Case) -> Iterator[Combination]:
             if case.derivatives is not None:
                 yield Combination(kind, "grad", first, x64)
                 yield Combination(kind, "jit(grad)", first, x64)
-            # The contract covers no second derivatives in single precision.
-            if case.derivatives == 2 and not case.gradient_in and x64:
+            # The contract covers no second derivatives in single precision. Those next to arrays would be compiled for
+            # another shape, although the first derivatives cover the conversion of arrays.
+            if case.derivatives == 2 and not case.gradient_in and x64 and kind in NUMBERS:
                 yield Combination(kind, "hessian", first, x64)
 
 

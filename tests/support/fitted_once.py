@@ -1,5 +1,6 @@
-"""A cache for fits, wall searches and diagnoses that commands, studies and reports repeat in one process, because each
-takes seconds.
+"""A cache for fits, wall searches, labels in the reference grasps and diagnoses, each of which takes up to seconds.
+
+Commands, studies and reports repeat them in one process.
 """
 
 from __future__ import annotations
@@ -7,12 +8,14 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import wraps
 from typing import Any
 from unittest.mock import patch
 
 from zwidth.analysis import cautions, diagnosis, recommendation
-from zwidth.identification import columns, onset_fit
+from zwidth.analysis.scene import Scene
+from zwidth.identification import columns, device_fit, onset_fit
 
 _results: dict[tuple[str, bytes], Any] = {}
 
@@ -23,7 +26,9 @@ def _once(function: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(function)
     def compute_once(*arguments: Any, **options: Any) -> Any:
         try:
-            key = function.__name__, pickle.dumps((arguments, sorted(options.items())))
+            # A copy of a scene has no cached properties, which would make the keys of equal scenes differ.
+            values = [replace(value) if isinstance(value, Scene) else value for value in arguments]
+            key = function.__name__, pickle.dumps((values, sorted(options.items())))
         except (pickle.PicklingError, TypeError, AttributeError):
             return function(*arguments, **options)
         if key not in _results:
@@ -34,12 +39,13 @@ def _once(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 _fit_log, _fit_buzz, _diagnose = _once(columns.fit_log), _once(onset_fit.fit_buzz), _once(diagnosis.diagnose)
-_choose_wall = _once(recommendation.choose_wall)
+_choose_wall, _judge_grasps = _once(recommendation.choose_wall), _once(cautions.judge_grasps)
+_find_safe_wall = _once(device_fit.find_safe_wall)
 
 
 @contextmanager
 def fitting_once() -> Iterator[None]:
-    """Make commands and studies fit equal logs and walls, choose equal walls and diagnose them only once.
+    """Make commands and studies fit equal logs and walls, and choose, label and diagnose equal walls, only once.
 
     `zwidth.fit_log` and any functions imported before are not cached.
     """
@@ -49,5 +55,8 @@ def fitting_once() -> Iterator[None]:
         patch.object(diagnosis, "diagnose", _diagnose),
         patch.object(recommendation, "choose_wall", _choose_wall),
         patch.object(cautions, "choose_wall", _choose_wall),
+        patch.object(recommendation, "judge_grasps", _judge_grasps),
+        patch.object(cautions, "judge_grasps", _judge_grasps),
+        patch.object(device_fit, "find_safe_wall", _find_safe_wall),
     ):
         yield

@@ -11,6 +11,7 @@ from zwidth.analysis.cautions import find_thin
 from zwidth.analysis.wall_search import Requirements
 from zwidth.core.status import Status
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
 TIMING = zwidth.Timing(1e-3, 1e-3)
 RIGID = zwidth.Scene(zwidth.Device(0.1, 10.0), TIMING)
 FILTERED = RIGID.replace(velocity=zwidth.LowPass(cutoff=100.0))

@@ -12,6 +12,7 @@ from zwidth.config.reader import read_mapping
 from zwidth.studies.document import Config, load_config
 
 SCENE: dict[str, Any] = {"mass": "12 g cm^2", "damping": "0.02 mN m s/rad", "rate": "1 kHz", "delay": "1 ms"}
+pytestmark = pytest.mark.usefixtures("fitted_once")
 WALL = {"stiffness": "2 mN m/deg", "virtual_damping": "0.4 mN m s/rad"}
 RECOMMEND = {"kind": "recommend", "name": "set"}
 

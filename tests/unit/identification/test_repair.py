@@ -17,6 +17,7 @@ from zwidth.identification.fit_report import summarize_fit
 from zwidth.identification.repair import find_glitches, repair_log
 from zwidth.units.unit_system import ROTARY
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
 KNOB = make_knob(3)
 ROWS = range(KNOB.reading.size)
 TIME = KNOB.period * np.arange(KNOB.reading.size)

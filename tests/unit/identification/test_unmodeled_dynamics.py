@@ -123,13 +123,13 @@ def test_filter_in_the_logger_leaves_no_wall(numerator, denominator):
 def test_rigid_devices_are_fitted_without_modes_and_keep_their_walls():
     scene = zwidth.Scene(zwidth.Device(MASS, DAMPING), zwidth.Timing(period=PERIOD, delay=DELAY))
     true = float(scene.max_stiffness().stiffness)
-    logs = [record_log(RIGID, seed) for seed in range(12)]
+    logs = [record_log(RIGID, seed) for seed in range(6)]
     fits = [zwidth.fit_log(PERIOD, position, force) for force, position in logs]
-    assert [(fit.status, fit.warnings, fit.is_structured) for fit in fits] == 12 * [(Status.OK, (), False)]
+    assert [(fit.status, fit.warnings, fit.is_structured) for fit in fits] == 6 * [(Status.OK, (), False)]
     assert all(fit.response is not None for fit in fits)
     covered = [fit.intervals["stiffness_max"].low <= true <= fit.intervals["stiffness_max"].high for fit in fits]
-    # With 12 intervals of 95 %, fewer than 9 cover the true value with a probability of 0.2 %.
-    assert sum(covered) >= 9
+    # With 6 intervals of 95 %, fewer than 4 cover the true value with a probability of 0.2 %.
+    assert sum(covered) >= 4
     # Possible hidden resonances cost a fifth of the maximum stiffness; with a device known to be rigid the cost is
     # small.
     shares = [[fit.safe_wall(rigid=rigid).stiffness / true for rigid in (False, True)] for fit in fits[:3]]

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from compiling import QUICKLY
 from scipy.linalg import expm
 
 from zwidth.numerics.taylor import differentiate_implicitly, flow, multiply, seed, solve, stack
@@ -12,10 +13,15 @@ POINT = [0.7, -0.4, 1.3]
 
 def assert_equal_derivatives(result, function):
     """Compare value, gradient and Hessian with those of a JAX function of three variables."""
-    x = jnp.array(POINT)
-    np.testing.assert_allclose(result.v, function(x), rtol=1e-13)
-    np.testing.assert_allclose(result.first, jax.jacfwd(function)(x), rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(result.second, jax.jacfwd(jax.jacfwd(function))(x), rtol=1e-11, atol=1e-12)
+
+    def differentiate(x):
+        return function(x), jax.jacfwd(function)(x), jax.jacfwd(jax.jacfwd(function))(x)
+
+    # One program, because every operation outside jit would be compiled separately.
+    value, first, second = jax.jit(differentiate, compiler_options=QUICKLY)(jnp.array(POINT))
+    np.testing.assert_allclose(result.v, value, rtol=1e-13)
+    np.testing.assert_allclose(result.first, first, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(result.second, second, rtol=1e-11, atol=1e-12)
 
 
 def compute(point, xp):

@@ -12,6 +12,7 @@ from zwidth.cli.commands import cli
 from zwidth.plotting import style
 from zwidth.studies.responses import draw
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
 SCENE = {"mass": 0.1, "damping": 10, "period": 1e-3, "delay": 1e-3}
 STUDIES = [
     {"kind": "recommend", "name": "best"},

@@ -1,9 +1,11 @@
 """Crossovers, pole counts and margins of many loops at once, against eigenvalues, single walls and JAX."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from any_loop import KINDS, closed_loop_matrix, random_scene
+from compiling import QUICKLY
 
 import zwidth
 from zwidth.core.xp import namespace
@@ -71,20 +73,30 @@ def test_crossovers_of_a_delayed_integrator(xp, x64):
     w = xp.asarray(
         np.broadcast_to(np.concatenate([np.geomspace(1e-3, 0.1, 60), np.linspace(0.1, np.pi, 90)[1:]]), (2, 149))
     )
-    loop = OpenLoop(evaluate_integrator, w, evaluate_integrator(w))
     most = None if xp is np else 4
-    gain, phase = find_gain_crossovers(loop, most), find_phase_crossovers(loop, most)
-    np.testing.assert_allclose(np.asarray(gain)[:, 0], [0.4, 0.01], rtol=1e-13)
-    assert np.isnan(np.asarray(gain)[:, 1:]).all()
+
+    def analyze(w):
+        loop = OpenLoop(evaluate_integrator, w, evaluate_integrator(w))
+        gain, phase = find_gain_crossovers(loop, most), find_phase_crossovers(loop, most)
+        at_gain, at_phase = (evaluate_integrator(w).value for w in (gain, phase))
+        return (
+            gain,
+            phase,
+            select_gain_margin(xp.asarray([True, True]), phase, abs(at_phase)),
+            select_phase_margin(xp.asarray([True, False]), gain, xp.angle(-at_gain)),
+            find_nearest_angle(evaluate_integrator, w, abs(1.0 + loop.L.value) ** 2),
+        )
+
+    # One program, because every operation outside jit would be compiled separately.
+    find = analyze if xp is np else jax.jit(analyze, compiler_options=QUICKLY)
+    gain, phase, (margin, crossover), (degrees, _), nearest = jax.tree.map(np.asarray, find(w))
+    np.testing.assert_allclose(gain[:, 0], [0.4, 0.01], rtol=1e-13)
+    assert np.isnan(gain[:, 1:]).all()
     # arg L = -pi/2 - 3 w is -pi at pi/6 and -3 pi at 5 pi/6.
-    np.testing.assert_allclose(np.asarray(phase)[:, :1], np.pi / 6, rtol=1e-12)
-    at_phase = abs(evaluate_integrator(phase).value)
-    margin, crossover = select_gain_margin(xp.asarray([True, True]), phase, at_phase)
+    np.testing.assert_allclose(phase[:, :1], np.pi / 6, rtol=1e-12)
     np.testing.assert_allclose(margin, np.pi / 6 / np.array([0.4, 0.01]), rtol=1e-12)
     np.testing.assert_allclose(crossover, np.pi / 6, rtol=1e-12)
-    degrees, _ = select_phase_margin(xp.asarray([True, False]), gain, xp.angle(-evaluate_integrator(gain).value))
     np.testing.assert_allclose(degrees, np.degrees([np.pi / 2 - 1.2, -(np.pi / 2 - 0.03)]), rtol=1e-12)
-    nearest = np.asarray(find_nearest_angle(evaluate_integrator, w, abs(1.0 + loop.L.value) ** 2))
     dense = np.linspace(1e-3, np.pi, 400_001)
     distance = abs(1.0 + evaluate_integrator(dense).value)
     np.testing.assert_allclose(nearest, dense[distance.argmin(1)], atol=1e-5)
