@@ -20,8 +20,8 @@ import yaml
 from zwidth.cli import cli
 from zwidth.cli.help import GROUPS, OWN, find_group
 from zwidth.core.status import Status
+from zwidth.units.outputs import OUTPUTS
 from zwidth.units.parsing import COUNTS, DIMENSIONS, PERIOD_WORDS
-from zwidth.units.quantities import OUTPUTS
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_NAMES = 8  # allowed values that a table lists; the description of the key names a longer set

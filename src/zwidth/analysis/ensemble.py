@@ -126,7 +126,6 @@ class Variants:
         # Without a spring to ground a model has a different structure, so its stiffness must not be 0 in any variant.
         changed = any(name.startswith("operator.stiffness") and np.any(column == 0) for name, column in values.items())
         window = getattr(velocity, "samples", 1)
-        known &= scene.position is None and scene.feedback is None
         return known and not (sampled or whole or changed or isinstance(velocity, FOAW) or window > LONGEST_WINDOW)
 
     def _map(self, function: Callable[..., tuple[np.ndarray, ...]], selected: np.ndarray) -> list[np.ndarray]:

@@ -79,7 +79,7 @@ def lightest_tool(
         >>> import zwidth
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
         >>> print(f"{1e3 * scene.lightest_tool(4900, 2).mass:.2f} g")
-        2.37 g
+        2.22 g
         >>> scene.lightest_tool(4900, 2, integrator="implicit").mass
         0.0
     """

@@ -38,19 +38,8 @@ from zwidth.model.timing import Timing
 from zwidth.model.velocity import BackwardDifference
 from zwidth.stability.linear.passivity import find_unsupported_reason
 from zwidth.units.formatting import describe
-from zwidth.units.quantities import (
-    MAX_DELAY_PERIODS,
-    NORMALIZED,
-    OF_PARTS,
-    OUTPUTS,
-    OUTPUTS_WITH_PARTS,
-    PARAMETERS,
-    PHYSICAL,
-    STATUS_OF,
-    WALL,
-    Family,
-    Range,
-)
+from zwidth.units.outputs import OUTPUTS, OUTPUTS_WITH_PARTS, STATUS_OF, Family
+from zwidth.units.quantities import MAX_DELAY_PERIODS, NORMALIZED, OF_PARTS, PARAMETERS, PHYSICAL, WALL, Range
 from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 MAX_SWEEP_POINTS = 10**12  # points per sweep

@@ -1,6 +1,6 @@
 """Color scales of outputs of sweeps, and the levels of their contours.
 
-The field ``color_scale`` of an output (`units.quantities`) determines the scale: "diverging" has a favorable and an
+The field ``color_scale`` of an output (`units.outputs`) determines the scale: "diverging" has a favorable and an
 unfavorable side of a center, such as a margin around 0; "steep" is logarithmic and grows without bound; others are
 linear or logarithmic.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize, TwoSlopeNorm
 from matplotlib.ticker import LogLocator, MaxNLocator
 
-from zwidth.units.quantities import Output
+from zwidth.units.outputs import Output
 
 LEAST_POSITIVE = 1e-300  # smallest value shown on a logarithmic scale
 _STEEP = 100.0  # ratio of last to first color value of outputs that grow without bound

@@ -14,7 +14,8 @@ from zwidth.core.errors import InputError
 from zwidth.plotting import grid, style
 from zwidth.plotting.plane import SMOOTH, Edges, draw_edge, panel_grid, read_panel
 from zwidth.plotting.table import draws_tables
-from zwidth.units.quantities import OUTPUTS, VARIABLES, WALL
+from zwidth.units.outputs import OUTPUTS
+from zwidth.units.quantities import VARIABLES, WALL
 
 if TYPE_CHECKING:
     import xarray

@@ -19,7 +19,8 @@ from matplotlib.contour import ContourSet
 from zwidth.core.status import Status
 from zwidth.plotting import style
 from zwidth.units.formatting import count_digits_apart
-from zwidth.units.quantities import NOT_COMPUTED, OF_PARTS, OUTPUTS, STATUS_OF, VARIABLES, WALL
+from zwidth.units.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF
+from zwidth.units.quantities import OF_PARTS, VARIABLES, WALL
 
 if TYPE_CHECKING:
     import xarray

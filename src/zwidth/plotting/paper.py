@@ -27,7 +27,7 @@ from zwidth.plotting.plane import Panel, draw_panels, panel_grid
 from zwidth.plotting.stable_set import Outlines, draw_zeros, mark_wall, shade_region
 from zwidth.plotting.table import Table, curves, draws_tables, grid_in_order, select, si_scale
 from zwidth.units.formatting import round_conservatively
-from zwidth.units.quantities import OUTPUTS
+from zwidth.units.outputs import OUTPUTS
 
 _ZOOM = 0.1  # fraction of the range of delta that the enlarged panel of Fig. 10 shows
 _MIN_DELTA = 0.1  # smallest delta for which alpha_max/delta is drawn; below, alpha_max itself is nearly constant

@@ -25,7 +25,7 @@ from zwidth.plotting.color_scale import choose_levels, choose_scale, find_colorm
 from zwidth.plotting.grid import MISSING, label_contours
 from zwidth.plotting.stable_set import SHADES
 from zwidth.plotting.table import Table, draws_tables
-from zwidth.units.quantities import OUTPUTS, Output
+from zwidth.units.outputs import OUTPUTS, Output
 
 if TYPE_CHECKING:
     import xarray

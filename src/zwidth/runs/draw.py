@@ -28,7 +28,8 @@ from zwidth.studies.ridge import find_edges
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.store import SUFFIX, Store, list_stores
 from zwidth.units.formatting import short
-from zwidth.units.quantities import ANY, OUTPUTS, VARIABLES
+from zwidth.units.outputs import OUTPUTS
+from zwidth.units.quantities import ANY, VARIABLES
 
 if TYPE_CHECKING:
     import xarray

@@ -44,7 +44,8 @@ from zwidth.studies.outcome import (
     summarize_stiffest,
 )
 from zwidth.studies.ridge import find_edges, passive_intervals, passive_outlines, ridge_table
-from zwidth.units.quantities import OUTPUTS, WALL_RANGE
+from zwidth.units.outputs import OUTPUTS
+from zwidth.units.quantities import WALL_RANGE
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 

@@ -33,7 +33,7 @@ from zwidth.stability.rigid.ridge import alpha_max
 from zwidth.stability.rigid.step_response import decay_time
 from zwidth.stability.rigid.stiffness_limit import row_limits
 from zwidth.sweep.grid import Block
-from zwidth.units.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
+from zwidth.units.outputs import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 Columns: TypeAlias = list[np.ndarray]
 Leaves: TypeAlias = Sequence[np.ndarray]

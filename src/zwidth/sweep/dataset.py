@@ -25,7 +25,8 @@ from zwidth.sweep.store import (
     silence_zarr,
 )
 from zwidth.units.formatting import header, to_cell
-from zwidth.units.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
+from zwidth.units.outputs import NOT_COMPUTED, OUTPUTS
+from zwidth.units.quantities import VARIABLES
 
 if TYPE_CHECKING:
     import xarray

@@ -19,7 +19,8 @@ import numpy as np
 from zwidth.config.device_table import LABEL
 from zwidth.config.sweep import SweepStudy
 from zwidth.stability.rigid.normalization import normalize
-from zwidth.units.quantities import PARAMETERS, WALL, Family
+from zwidth.units.outputs import Family
+from zwidth.units.quantities import PARAMETERS, WALL
 
 
 class Block(NamedTuple):

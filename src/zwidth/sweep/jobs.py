@@ -34,7 +34,7 @@ from zwidth.sweep.files import is_fatal, read_or_empty
 from zwidth.sweep.grid import SceneBlock
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store
-from zwidth.units.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
+from zwidth.units.outputs import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 # Function that computes and writes one chunk, given the path of the store, the family and the index of the chunk. It is
 # `perform`, or a failing replacement in tests.

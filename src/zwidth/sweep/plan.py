@@ -23,7 +23,7 @@ from zwidth.config.sweep import SweepStudy
 from zwidth.core.errors import ResourceError
 from zwidth.sweep.files import ELSEWHERE, check_folder, find_existing
 from zwidth.sweep.grid import Grid
-from zwidth.units.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
+from zwidth.units.outputs import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 MEMORY = 2**28  # default memory for the computation of one chunk, in bytes, in addition to `IDLE_MEMORY`
 IDLE_MEMORY = 500 * 2**20  # memory of a worker before its first chunk, in bytes: Python, JAX and compiled kernels
@@ -155,7 +155,7 @@ class Plan:
 def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     """Plan a sweep.
 
-    The size of chunks follows from the memory and from the computing speed of each output (`units.quantities.OUTPUTS`).
+    The size of chunks follows from the memory and from the computing speed of each output (`units.outputs.OUTPUTS`).
 
     Args:
         study: The sweep.

@@ -31,7 +31,7 @@ from zwidth.core.status import Status
 from zwidth.io.files import remove_quietly, temporary_sibling, write_atomically
 from zwidth.sweep.files import hash_json, read_or_empty
 from zwidth.sweep.plan import Plan, Task, restore_plan
-from zwidth.units.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
+from zwidth.units.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 
 SUFFIX = ".zarr"  # suffix of the name of a store, which is a folder
 FORMAT = 2  # format version of new stores

@@ -80,7 +80,9 @@ def test_replace_rejects_invalid_paths_and_values(changes, message):
 @pytest.mark.parametrize("name", ["actuator", "coupling", "modes"])
 def test_linear_device_has_no_replaceable_parts(name):
     scene = zwidth.Scene(zwidth.LinearDevice(([1], [0.1, 10, 0])), zwidth.Timing(1e-3))
-    with pytest.raises(InputError, match=f"parameter: got '{name}', allowed are 'system', .*'operator', 'safe_limit'$"):
+    with pytest.raises(
+        InputError, match=f"parameter: got '{name}', allowed are 'system', .*'operator', 'tool', 'safe_limit'$"
+    ):
         scene.replace(**{name: None})
 
 

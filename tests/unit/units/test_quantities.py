@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from zwidth.units.quantities import OUTPUTS, Range
+from zwidth.units.outputs import OUTPUTS
+from zwidth.units.quantities import Range
 
 
 @pytest.mark.parametrize("low_open", [False, True])

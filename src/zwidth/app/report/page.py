@@ -39,7 +39,8 @@ from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, hash_file
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.store import SUFFIX, Store
 from zwidth.units.formatting import format_interval
-from zwidth.units.quantities import OUTPUTS, STATUS_OF, VARIABLES
+from zwidth.units.outputs import OUTPUTS, STATUS_OF
+from zwidth.units.quantities import VARIABLES
 from zwidth.units.unit_system import SYSTEMS
 
 if TYPE_CHECKING:
