@@ -44,4 +44,6 @@ def describe_ending(motion: Motion, index: Any = ()) -> str:
         return f"{WORDS[kind]} at {with_unit(frequency, 'Hz', 3)}, amplitude {amplitude}, after {duration}"
     if kind is MotionKind.UNCLEAR:
         return f"undecided after {duration}: too few oscillations; simulate longer"
+    if kind is MotionKind.DECAYING:
+        return f"still decays after {duration}"
     return f"{WORDS[kind]} within {duration}"
