@@ -40,7 +40,7 @@ from zwidth.units.quantities import FIELDS, WALL, WALL_RANGE
 RIGID_PARAMETERS = ("mass", "damping", "period", "delay")
 MAX_PIECES = 6  # largest number of pieces of arrays that NumPy evaluates faster than a function compiled by JAX
 LEAST_BATCH = 6  # smallest number of variants that are faster to evaluate at once than one by one
-# Fields of a scene that are evaluated for all variants at once. A scene with a further part is evaluated by itself.
+# Parts of a scene that the batch computation supports. Variants of a scene with other parts are evaluated one by one.
 EVALUATED = ("device", "timing", "wall", "velocity", "operator", "safe_limit")
 LONGEST_WINDOW = 64  # longest velocity window, in periods, of variants evaluated at once; longer windows take too long
 # Densities of the frequency grid. The higher one is used for variants that are not confirmed with the lower one.
@@ -62,11 +62,13 @@ class BatchRidge(NamedTuple):
 
     point: RidgePoint
     searched: np.ndarray  # True for variants that were searched one by one
-    angles: np.ndarray  # angles w of the two active constraints, shape (2, variants); NaN where ``searched``
+    # Angles w, in rad per period, of the two poles on the unit circle that limit the stiffness, shape (2, variants);
+    # NaN where ``searched``.
+    angles: np.ndarray
 
 
 def list_further_parts(scene: Any) -> tuple[Any, ...]:
-    """Return the parts of a scene that are not evaluated for many variants at once."""
+    """Return the parts of a scene that the batch computation does not support."""
     parts = (getattr(scene, item.name) for item in fields(scene) if item.name not in EVALUATED)
     return tuple(part for part in parts if part is not None)
 
@@ -116,7 +118,7 @@ class Variants:
         return _NormalizedVariants(values, d, period, np.broadcast_to(mass, period.shape), usable)
 
     def _is_supported(self, values: dict[str, np.ndarray]) -> bool | np.ndarray:
-        """Return whether variants have the structure of the scene, and one that can be evaluated at once."""
+        """Return whether the batch computation supports the scene, and its variants have the same structure."""
         scene, nominal = self.scene, self.scene.parameters()
         device, velocity = scene.device, scene.velocity
         known = type(device) in (Device, LinearDevice) and type(velocity) in ESTIMATES.values()
@@ -142,7 +144,10 @@ class Variants:
             return self.label_normalized(stiffness * period / rate, damping / rate)
 
     def label_normalized(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return a boolean array: True if the wall (alpha, beta) with the index of a variant is stable on it."""
+        """Return a boolean array with one entry per variant k: True if (alpha[k], beta[k]) is stable on this variant.
+
+        ``alpha`` and ``beta`` are the stiffness and damping of the wall, normalized by mass and period of the variant.
+        """
         stable, left = np.zeros(self.count, bool), np.full(self.count, True)
         inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE) & (alpha > 0)
         selected = np.flatnonzero(self.normalized.usable & inside)
