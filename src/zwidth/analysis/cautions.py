@@ -61,11 +61,14 @@ def list_cautions(recommendation: Any) -> tuple[str, ...]:
     if thin := find_thin(verdict, scene.timing.period):
         rings = thin[0].startswith("phase") and verdict.frequency > 0 and math.isfinite(verdict.time_constant)
         after = f": rings for {with_unit(verdict.time_constant, 's', 2)}" if rings else ""
+        remedy = "more damping of the device or less delay"
+        if scene.feedback is not None:
+            remedy = "less further feedback, such as a smaller integral gain,"
         advice = _advise(
             recommendation,
             _list_margins(requirements),
             lambda improved: not find_thin(assess(improved), scene.timing.period),
-            "no other requirement avoids this; more damping of the device or less delay may avoid it",
+            f"no other requirement avoids this; {remedy} may avoid it",
         )
         cautions.append(f"{', '.join(thin)}{after}; {advice}")
     if unstable := [name for name, stable in recommendation.grasps.items() if not stable]:

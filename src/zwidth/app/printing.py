@@ -114,7 +114,8 @@ def format_parts(scene: Scene) -> list[str]:
 
 def get_unit(path: str) -> str:
     """Return the SI unit of a parameter of a linear device by its path; "" for numbers without a unit."""
-    return FIELDS[path].unit.removeprefix("1") if path in FIELDS else ""
+    unit = FIELDS[path].unit if path in FIELDS else ""
+    return {"1": "", "1/s": "rad/s"}.get(unit, unit)
 
 
 def name_verdict(verdict: Assessment) -> str:

@@ -31,7 +31,7 @@ from zwidth.model.timing import Timing
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.units.parsing import DIMENSIONS, detect_kind, looks_like_number, read_quantity, read_share
 from zwidth.units.plausibility import list_implausible
-from zwidth.units.quantities import ANY, CHOICES, FIELDS, HARDWARE, OF_ESTIMATES, OF_PARTS, PARAMETERS, Range
+from zwidth.units.quantities import ANY, CHOICES, FIELDS, HARDWARE, OF_PARTS, PARAMETERS, Range
 from zwidth.units.unit_system import SYSTEMS, UnitSystem
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ Command: TypeAlias = Callable[..., Any]
 
 # Names of the parts of a scene; and the paths of the parameters of all parts, sorted by part.
 _PART_NAMES = tuple(dict.fromkeys(("velocity", *WITH_KIND, *(path.rpartition(".")[0] for path in OF_PARTS))))
-_PARTS = sorted((*CHOICES, *OF_PARTS, *OF_ESTIMATES), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
+_PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
 # Parts that cannot be added to a linear system or a measured response, because such a device includes them.
 _CONTAINED = ("operator", "coupling", "actuator", "modes")
 # Names of the structural modes among the parts: "modes.0", "modes.1" and so on.
@@ -102,7 +102,8 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
         dimension = DIMENSIONS[SYSTEMS[bool(detect_kind(number))][unit]]
         return read_quantity(number, dimension, allowed, counts=counts)[0]
 
-    return Parsed("quantity", read)
+    # The unit rad/s of a bandwidth does not make a device rotary, so its type has another name.
+    return Parsed("bandwidth" if unit == "1/s" else "quantity", read)
 
 
 def _read_delay(text: str) -> Any:

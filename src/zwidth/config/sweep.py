@@ -266,7 +266,7 @@ class SweepStudy(_Parts, Study):
         if not isinstance(axes, dict) or not scene.nonrigid_parts:
             return
         given = _list_given(axes)
-        if not given & set(PHYSICAL) and not {"delta", "d"} <= given:
+        if given & set(NORMALIZED) and not given & set(PHYSICAL) and not {"delta", "d"} <= given:
             message = f"got normalized axes for a scene with {' and '.join(list_parts(scene))}"
             raise problem(message, "its parts are in SI units", "choose axes such as 'stiffness' and 'virtual_damping'")
 

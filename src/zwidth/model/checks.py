@@ -173,7 +173,7 @@ class Part:
         # Do not check the value None of a field whose default is None, because this field is optional. If a unit
         # determines the kind of device, store the kind in the attribute ``rotary``.
         items = {f"{self._owner}.{item.name}".lstrip("."): item for item in fields(self)}  # pyright: ignore[reportArgumentType]
-        kind = find_kind({path: getattr(self, item.name) for path, item in items.items()})
+        kind = find_kind({path: getattr(self, item.name) for path, item in items.items() if not _is_bandwidth(path)})
         if kind is not None:
             object.__setattr__(self, "rotary", kind)
         for path, item in items.items():
@@ -245,6 +245,11 @@ class Part:
             if text != repr(usual) and (text, usual) != ("False", None):
                 parts.append(f"{item.name}={text}")
         return f"{type(self).__name__}({', '.join(parts)})"
+
+
+def _is_bandwidth(path: str) -> bool:
+    """Return whether a parameter is a bandwidth, whose unit rad/s does not make a device rotary."""
+    return path in FIELDS and FIELDS[path].unit == "1/s"
 
 
 def _rebuild(value: Any) -> Any:

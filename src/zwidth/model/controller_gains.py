@@ -80,11 +80,16 @@ class CascadeGains(NamedTuple):
 def _find_scale(units: PositionUnit, output_unit: float) -> float:
     """Return the stiffness in SI units of a controller whose output is 1 per position unit."""
     check_choice("units", units, tuple(_UNITS))
-    return check_number("output_unit", output_unit, "1", ANY) / _UNITS[units]
+    return _read_gain("output_unit", output_unit) / _UNITS[units]
 
 
 def _read_gain(name: str, gain: Any) -> Any:
     """Convert a gain to a float; raise `InputError` for a text with a unit or a value that is not finite."""
+    if isinstance(gain, str):
+        raise InputError(
+            f"{name}: got the text {gain!r}; pass a number in the unit of your controller, which the arguments units "
+            "and output_unit state"
+        )
     return check_number(name, gain, "1", ANY)
 
 

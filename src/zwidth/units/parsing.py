@@ -83,6 +83,8 @@ class Dimension:
 MASS = Dimension("kg, g, mg", "0.1 kg")
 TIME = Dimension("s, ms, us, µs, ns", "1 ms")
 RATE = Dimension("Hz, kHz, MHz", "1 kHz")
+# The unit rad/s of a bandwidth does not make a device rotary.
+BANDWIDTH = Dimension("1/s", "1000 rad/s", {"rad/s": 1.0, "krad/s": 1e3, "Hz": 2.0 * math.pi, "kHz": 2e3 * math.pi})
 DAMPING = Dimension("N s/m, mN s/m, kN s/m, N s/mm, mN s/mm, N s/cm, kg/s", "10 N s/m")
 STIFFNESS = Dimension("N/m, mN/m, kN/m, MN/m, N/mm, kN/mm, N/cm", "10 kN/m")
 FORCE = Dimension("N, mN, kN", "0.2 N")
@@ -100,7 +102,7 @@ SPEED = Dimension("m/s, cm/s, mm/s, um/s", "1 mm/s")
 FORCE_RATE = Dimension("N/s, kN/s, N/ms", "500 N/s")
 RATIO = Dimension("", "0.02")
 _SCALES = (
-    *(MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED),
+    *(MASS, TIME, RATE, BANDWIDTH, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED),
     *(INERTIA, ANGULAR_DAMPING, ANGULAR_STIFFNESS, TORQUE, TORQUE_RATE, ANGLE, ANGULAR_SPEED),
 )
 DIMENSIONS = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}

@@ -224,6 +224,18 @@ _PARAMETERS = (
         note="for order 2 only, default: sqrt(1/2)",
     ),
     *(each for k in range(MOST_MODES) for each in _describe_mode(f"modes.{k}", f"mode {k}", str(k))),
+    Parameter(
+        "position.coefficient", "coefficient a of the exponential filter", "a", Range(0.0, 1.0, low_open=True),
+        note="instead of the cut-off frequency",
+    ),
+    Parameter("position.cutoff", "cut-off frequency of the position filter", "f_p", POSITIVE, "Hz"),
+    Parameter("position.time_constant", "time constant of the position filter", r"\tau_p", POSITIVE, "s"),
+    Parameter("position.order", "order of the position filter", "n_p", Range(1, 8), whole=True),
+    Parameter("position.coded_period", "sampling period in the formula of the position filter", "T_p", POSITIVE, "s"),
+    Parameter("position.bandwidth", "bandwidth of the phase-locked loop", r"\omega_p", POSITIVE, "1/s"),
+    Parameter("feedback.gain", "integral gain, in N/(m s); rotary: N m/(rad s)", "k_i", ANY),
+    Parameter("feedback.position", "weight of the position estimate in the input of the feedback", "w_p", ANY),
+    Parameter("feedback.velocity", "weight of the velocity estimate in the input of the feedback", "w_v", ANY),
     Parameter("tool.mass", "mass of the simulated tool", "M", POSITIVE, "kg", (1e-3, 2.0), "", "mass of the tool"),
     Parameter("tool.damping", "damping of the simulated tool", "c_t", NOT_NEGATIVE, "N s/m", (0.0, 9.0), "default 0"),
     Parameter("tool.stiffness", "stiffness of the simulated tool", "k_t", NOT_NEGATIVE, "N/m", (0.0, 1e3), "default 0"),
@@ -249,22 +261,6 @@ VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}  # para
 _NOISE = Parameter(
     "velocity.noise", "largest error of the measured position", "", POSITIVE, "m", note="one count of an encoder"
 )
-# Parameters of the position estimate and of the further feedback.
-_OF_ESTIMATES = (
-    Parameter(
-        "position.coefficient", "coefficient a of the exponential filter", "a", Range(0.0, 1.0, low_open=True),
-        note="instead of the cut-off frequency",
-    ),
-    Parameter("position.cutoff", "cut-off frequency of the position filter", "f_p", POSITIVE, "Hz"),
-    Parameter("position.time_constant", "time constant of the position filter", r"\tau_p", POSITIVE, "s"),
-    Parameter("position.order", "order of the position filter", "n_p", Range(1, 8), whole=True),
-    Parameter("position.coded_period", "sampling period in the formula of the position filter", "T_p", POSITIVE, "s"),
-    Parameter("position.bandwidth", "bandwidth of the phase-locked loop, in rad/s", r"\omega_p", POSITIVE),
-    Parameter("feedback.gain", "integral gain, in N/(m s)", "k_i", ANY),
-    Parameter("feedback.position", "weight of the position estimate in the input of the feedback", "w_p", ANY),
-    Parameter("feedback.velocity", "weight of the velocity estimate in the input of the feedback", "w_v", ANY),
-)  # fmt: skip
-OF_ESTIMATES = tuple(parameter.name for parameter in _OF_ESTIMATES)
 # Parameters of simulations.
 _OF_MOTIONS = (
     Parameter(
@@ -294,9 +290,7 @@ OF_MOTIONS = tuple(parameter.name for parameter in _OF_MOTIONS)
 # Names of the parameters of encoder, friction and motor, which are arguments of `zwidth.diagnose` and
 # `zwidth.simulate`.
 HARDWARE = ("resolution", "coulomb", "static", "max_force", "max_rate")
-FIELDS = PARAMETERS | {
-    each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_ESTIMATES, *_OF_MOTIONS)
-}
+FIELDS = PARAMETERS | {each.name: each for each in (_NOISE, *_describe_mode("mode", "a mode", "i"), *_OF_MOTIONS)}
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 
 
