@@ -36,12 +36,12 @@ from zwidth.plant.rigid_mass import ANY
 from zwidth.stability.rigid.mixed_precision import label_in_float32
 from zwidth.stability.rigid.verdict import is_stable
 
-# Quantities whose errors are listed by the distance of the wall from the boundary.
+# Quantities whose errors are listed by the distance of the wall from the stability boundary.
 OF_WALLS = ("spectral radius", "gain margin", "phase margin", "delay margin", "modulus margin")
 
 
 def draw_all(checked: int) -> tuple[Walls, np.ndarray]:
-    """Return test walls and their distances from the boundary, in arrays of shape (delays, deltas, walls)."""
+    """Return walls and their distances from the stability boundary, in arrays of shape (delays, dampings, walls)."""
     drawn = [[draw_rounded_walls(delta, d, checked) for delta in DELTAS] for d in DELAYS]
     columns = (np.array([[np.asarray(walls[k]) for walls, _ in row] for row in drawn]) for k in range(4))
     return Walls(*columns), np.array([[distance for _, distance in row] for row in drawn])
@@ -81,7 +81,7 @@ def largest(errors: np.ndarray, chosen: Any = True) -> str:
 
 
 def tabulate_labels(distance: np.ndarray, wrong: np.ndarray) -> list[str]:
-    """Return a table of the largest distance from the boundary at which a label is wrong, by delay and damping."""
+    """Return a table of the largest distance at which a stability label is wrong, by delay and damping."""
     lines = head_row("d", (f"delta = {delta:g}" for delta in DELTAS))
     for d, distances, is_wrong in zip(DELAYS, distance, wrong, strict=True):
         cells = (format_error(float(max(x[bad], default=0.0))) for x, bad in zip(distances, is_wrong, strict=True))
@@ -90,7 +90,7 @@ def tabulate_labels(distance: np.ndarray, wrong: np.ndarray) -> list[str]:
 
 
 def tabulate_distances(distance: np.ndarray, wrong: np.ndarray, errors: dict[str, np.ndarray]) -> list[str]:
-    """Return a table of wrong labels and largest errors, by decade of the distance from the boundary."""
+    """Return a table of wrong stability labels and largest errors, by decade of the distance from the boundary."""
     lines = head_row("distance", ["wrong labels", *errors], "---")
     for decade in range(NEAREST, FARTHEST + 1):
         chosen = (distance >= 10.0**decade) & (distance < 10.0 ** (decade + 1))

@@ -74,7 +74,7 @@ def prepare(function: Callable[..., Any], walls: Any, dtype: str) -> Callable[[]
 
 
 def evaluate_walls(function: Callable[..., Any], walls: Any, dtype: str) -> np.ndarray:
-    """Return the values of a function inside `jit` at all walls, as Boolean or float64 numbers."""
+    """Return the values of a function inside `jit` at all walls, as a Boolean or float64 array."""
     values = np.asarray(prepare(function, walls, dtype)())
     return values if values.dtype == bool else values.astype(float)
 

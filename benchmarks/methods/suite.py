@@ -211,10 +211,10 @@ def _passive(d: float, sizes: Sizes) -> Iterator[Row]:
 
 
 def ridge_error(d: float, find_maximum: Callable[[np.ndarray, float], Any]) -> Error:
-    """Return the smallest relative distance at which walls before and beyond alpha_max are proved stable and unstable.
+    """Return the smallest relative distance at which a wall below alpha_max is certified stable, one above unstable.
 
-    The walls lie on the line from the start of the boundary, (0, -delta), through the maximum, because walls of the
-    same beta just below a corner may be unstable.
+    Both walls lie on the line from the start of the stability boundary, (alpha, beta) = (0, -delta), through the
+    maximum, because walls of the same beta just below a corner of the boundary may be unstable.
 
     Args:
         d: delay in periods.

@@ -52,12 +52,12 @@ ONE: Polynomial = (Fraction(1),)
 
 
 class Coefficients(NamedTuple):
-    """Polynomials in z of the characteristic polynomial ``M p_M + D p_D + K p_K + B p_B``."""
+    """The four polynomials in z in the characteristic polynomial ``M p_M + D p_D + K p_K + B p_B``."""
 
-    mass: Polynomial  # p_M
-    damping: Polynomial  # p_D
-    stiffness: Polynomial  # p_K
-    environment_damping: Polynomial  # p_B
+    mass: Polynomial  # p_M, multiplied by the virtual mass M
+    damping: Polynomial  # p_D, multiplied by the virtual damping D
+    stiffness: Polynomial  # p_K, multiplied by the stiffness K of the environment
+    environment_damping: Polynomial  # p_B, multiplied by the damping B of the environment
 
 
 @compact_repr(frequency="Hz")
@@ -284,8 +284,8 @@ class AdmittanceDisplay:
         """The polynomials p_M, p_D, p_K and p_B, computed from floats without rounding errors."""
         period = Fraction(float(self.timing.period))
         position, velocity, denominator = self._sample_plant(period)
-        # The response from the force to the virtual velocity is top/(M mass + D damping), and the response from there
-        # to the position command is path/integral (docs/theory/admittance.md, W1).
+        # The response of the virtual velocity v to the force is top/(M mass + D damping), and the response of the
+        # command to v is path/integral (docs/theory/admittance.md, W1).
         top, mass, damping = (period,), ZETA, (period,)
         top = multiply(top, Z)
         path, integral = multiply((period,), Z), ZETA
@@ -303,9 +303,9 @@ class AdmittanceDisplay:
     def _sample_plant(self, period: Fraction) -> tuple[Polynomial, Polynomial, Polynomial]:
         """Return the numerators of P and V, and their common denominator, as polynomials in zeta.
 
-        P and V are the responses of position and velocity of the robot to its command; Psi and Gamma are its discrete
-        matrices (docs/theory/admittance.md, W2 and W3). For a sampled robot, whose model does not define the velocity,
-        the numerator of V is zero.
+        P and V are the responses of position and velocity of the robot to its command, computed from the matrices Psi
+        and Gamma of the sampled robot (docs/theory/admittance.md, W2 and W3). For a robot that is given as a sampled
+        system, the numerator of V is zero, because such a model does not define the velocity.
         """
         delays = reduce(multiply, [Z] * (self._n_delay + 1), ONE)
         if self._plant.dt:

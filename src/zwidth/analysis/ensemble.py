@@ -62,8 +62,8 @@ class BatchRidge(NamedTuple):
 
     point: RidgePoint
     searched: np.ndarray  # True for variants that were searched one by one
-    # Angles w, in rad per period, of the two poles on the unit circle that limit the stiffness, shape (2, variants);
-    # NaN where ``searched``.
+    # Angles w, in rad per period, of the poles on the unit circle of both active constraints, shape (2, variants). Both
+    # angles are equal if only one pole or pole pair is on the circle. They are NaN where ``searched``.
     angles: np.ndarray
 
 
@@ -201,7 +201,7 @@ class Variants:
         return np.where(are_connected(low, high), high, 0.0).max(-1, initial=0.0)
 
     def find_ridges(self, negative: bool) -> BatchRidge:
-        """Return the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
+        """Return the stiffest stable wall of each variant; include walls with B < 0 only if ``negative``."""
         columns = [np.full(self.count, np.nan) for _ in range(3)]
         kind, status = np.full(self.count, int(RidgeKind.NONE), np.int32), np.zeros(self.count, np.int32)
         left, angles = np.full(self.count, True), np.full((2, self.count), np.nan)
@@ -239,7 +239,7 @@ class Variants:
             return math.nan, math.nan, math.nan, int(RidgeKind.NONE), int(Status.NOT_CONVERGED)
 
     def stiffest(self, negative: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return K, B and `Status` of the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
+        """Return K, B and `Status` of the stiffest stable wall of each variant; see `find_ridges` for ``negative``."""
         point, period = self.find_ridges(negative).point, self.normalized.period
         with np.errstate(all="ignore"):
             rate = self.normalized.mass / period

@@ -337,13 +337,13 @@ class SceneOptima(SceneAnalysis):
         low, high = _choose_range(self, parameter, now, within)
 
         def compare(K: float, status: int) -> float:
-            """Return log(K/stiffness) for a computed K_max = K and its status; NaN if the computation failed."""
+            """Return log(K/stiffness) for K_max = K; -NO_STIFFNESS if no wall is stable, and NaN for other failures."""
             if status == Status.NO_BOUNDARY:
                 return -NO_STIFFNESS
             return math.log(K / stiffness) if status == Status.OK else math.nan
 
         def surplus(value: float) -> float:
-            """Return log(K_max/stiffness) for one value of the parameter; NaN if the computation of K_max failed."""
+            """Return log(K_max/stiffness) for one value of the parameter, with the special cases of ``compare``."""
             wall = self.replace(**{parameter: value}).max_stiffness(negative_damping=negative_damping)
             return compare(wall.stiffness, wall.status)
 

@@ -100,7 +100,7 @@ def find_stiffest_of_many(
 def _describe_maximum(top: BatchRidge, k: int) -> RidgeSolution:
     """Return the stiffest wall of the scene with the index k, with the two conditions that determine it."""
     alpha, beta, (w1, w2) = float(top.point.alpha[k]), float(top.point.beta[k]), top.angles[:, k].tolist()
-    # At an angle w on the unit circle, the poles are a complex pair or, at w = pi, one pole z = -1.
+    # A pole on the unit circle at the angle w belongs to a complex pair or, if w = pi, is the single pole z = -1.
     first, second = (Condition.MINUS_ONE if w == np.pi else Condition.PAIR for w in (w1, w2))
     if top.point.kind[k] == RidgeKind.SMOOTH:
         second = Condition.STATIONARY

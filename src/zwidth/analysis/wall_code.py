@@ -11,10 +11,10 @@ A second-order section
 
     (b2 zeta^2 + b1 zeta + b0)/(zeta^2 + a1 zeta + a0)
 
-with input u and output y has the states ``p = zeta W`` and ``q = W``, where W is u divided by the denominator. With
-``w = zeta^2 W = u - a1 p - a0 q``, the output is ``y = b2 w + b1 p + b0 q``. Since ``zeta W`` is the change of W until
-the next sample, the states are updated by ``q += p`` and ``p += w``. A first-order section has the state q only, with
-``w = zeta W = u - a0 q``.
+with input u has the states ``p = zeta W`` and ``q = W``, where W is u divided by the denominator. With
+``w = zeta^2 W = u - a1 p - a0 q``, the output of the section is ``b2 w + b1 p + b0 q``. Since ``zeta W`` is the change
+of W until the next sample, the states are updated by ``q += p`` and ``p += w``. A first-order section has the state q
+only, with ``w = zeta W = u - a0 q``.
 """
 
 from __future__ import annotations

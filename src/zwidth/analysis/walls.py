@@ -338,10 +338,10 @@ class SceneAnalysis(SceneParts):
 def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     """Return whether searches for the stiffest wall and for islands include walls with B < 0.
 
-    By default they are included for a `zwidth.Device` whose velocity is a positive multiple of the difference of two
-    samples. They are excluded for a device given as a whole system: its true damping is unknown, so a wall with B < 0
-    would cancel modeled damping that may not exist. They are also excluded if the wall is the virtual coupling to a
-    simulated tool.
+    By default such walls are included for a `zwidth.Device` whose velocity estimate is a positive multiple of the
+    difference of two samples. They are excluded for a device given as a whole system: its true damping is unknown, so a
+    wall with B < 0 would cancel modeled damping that may not exist. They are also excluded if the wall is the virtual
+    coupling to a simulated tool.
     """
     if negative_damping is not None and not isinstance(negative_damping, bool | np.bool_):
         raise InputError(f"negative_damping: got {negative_damping!r}; pass True, False or None")

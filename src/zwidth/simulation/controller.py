@@ -28,7 +28,7 @@ class FilterStates(NamedTuple):
 
     position: Array  # state of the position estimate
     velocity: Array  # state of the velocity estimate
-    feedback: Array  # state of the further feedback
+    feedback: Array  # state of the further feedback, such as an integral
 
 
 class Controller(NamedTuple):

@@ -58,7 +58,7 @@ class Options(NamedTuple):
     jitter: bool  # some simulation has timestamp jitter
     foaw: int  # longest window of FOAW in samples; 0 for a linear velocity estimate
     position: bool  # the scenes have a position estimate
-    feedback: bool  # the scenes have further feedback
+    feedback: bool  # the scenes have further feedback, such as an integral gain
     record: bool  # readings and frames are recorded
     law: TracedLaw | None  # force law in place of the wall's spring and damper
 
@@ -114,7 +114,7 @@ class Estimator(NamedTuple):
 
 
 class FeedbackLoop(NamedTuple):
-    """Further feedback: a filter whose input is a weighted sum of the measured position and of both estimates."""
+    """Further feedback force: a filter of a weighted sum of the measured position and the two estimates."""
 
     filter: Filter
     weights: Array  # weights of measured position, position estimate and velocity estimate, (3, batch)
@@ -136,7 +136,7 @@ class Parameters(NamedTuple):
     position: Filter  # position estimate
     filtered_input: Array  # True if the velocity estimate is computed from the position estimate, not the measurement
     estimator: Estimator  # velocity estimate
-    feedback: FeedbackLoop  # further feedback
+    feedback: FeedbackLoop  # feedback in addition to spring and damper, such as an integral gain
     rate: Array  # matrix of x' = rate @ (x, u), (n, n + forces, batch)
     place: Array  # rows of the positions of the bodies, (bodies, n, batch)
     motion: Array  # rows of the velocities of the bodies, (bodies, n, batch)

@@ -63,7 +63,7 @@ def _read_joints(raw: Any) -> dict[str, JointAxis]:
 
 
 def _list_texts(raw: Any) -> list[str]:
-    """Return all texts in a value, including those in nested lists and mappings."""
+    """Return all texts in a value of a configuration, including those in nested lists and mappings."""
     if isinstance(raw, str):
         return [raw]
     entries = raw.values() if isinstance(raw, dict) else raw if isinstance(raw, list | tuple) else ()

@@ -335,8 +335,8 @@ def _compute_walls(
     for name in wanted:
         unknown |= np.isnan(results[name])
     if MARGIN_OUTPUTS & set(outputs):
-        # Add the stability margins after the check for NaN, because NaN is a correct value of a margin: the wall has no
-        # such margin.
+        # Add the stability margins after the check for NaN, because NaN is also the correct value of a margin that does
+        # not exist.
         margins = scene.margins(stiffness, virtual_damping)
         results |= {name: np.asarray(getattr(margins, name)) for name in MARGIN_OUTPUTS}
     if "passive" in outputs:

@@ -193,7 +193,7 @@ class Controls:
                 "shorten the delay or the window, or use zwidth check"
             )
         if self.scene.tool is not None:
-            _ = self.scene.loop.stable_set  # raises `InputError` if couplings of every high stiffness are stable
+            _ = self.scene.loop.stable_set  # raises `InputError` if the stiffness of stable couplings has no limit
         return self
 
     def _refuse_change(self, name: str) -> None:
