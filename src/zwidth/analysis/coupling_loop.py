@@ -25,7 +25,7 @@ from zwidth.stability.linear.roots import LoopRoots
 from zwidth.stability.linear.rows import CONNECTED_START, Island, find_stable_intervals
 from zwidth.stability.results import Margins, RidgePoint
 
-# Values of beta at which `CouplingLoop.free_damping` tests whether the coupling is stable with every alpha > 0.
+# Values of the damping beta at which `CouplingLoop.free_damping` tests whether every alpha > 0 is stable.
 TESTED_DAMPINGS = np.concatenate([[0.0], np.geomspace(1e-6, 1e3, 91)])
 
 
