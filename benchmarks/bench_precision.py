@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
-"""Measure the errors of float32, and the speed and the labels of float32, mixed precision and float64.
+"""Measure errors and speed of zwidth's functions inside `jit` in float32, mixed precision and float64.
 
     python benchmarks/bench_precision.py [--points 1000000] [--checked 1000] [--runs 7]
                                          [--write benchmarks/results/precision.md]
 
-All functions are called inside `jit` with JAX arrays. Speeds are ratios of CPU times that are measured alternately.
+alpha and beta are the normalized stiffness and damping of a wall, delta is the damping of the device, and d the delay
+in periods. A wall is labeled stable or unstable by `is_stable`; its distance from the stability boundary is relative in
+alpha. Speeds are ratios of CPU times that are measured alternately.
 """
 
 from __future__ import annotations
@@ -34,21 +36,21 @@ from zwidth.plant.rigid_mass import ANY
 from zwidth.stability.rigid.mixed_precision import label_in_float32
 from zwidth.stability.rigid.verdict import is_stable
 
-# Quantities whose errors are listed by the distance of the wall from the boundary.
+# Quantities whose errors are listed by the distance of the wall from the stability boundary.
 OF_WALLS = ("spectral radius", "gain margin", "phase margin", "delay margin", "modulus margin")
 
 
 def draw_all(checked: int) -> tuple[Walls, np.ndarray]:
-    """Return walls of all devices and delays and their distances, in arrays of shape (delays, deltas, walls)."""
+    """Return walls and their distances from the stability boundary, in arrays of shape (delays, dampings, walls)."""
     drawn = [[draw_rounded_walls(delta, d, checked) for delta in DELTAS] for d in DELAYS]
     columns = (np.array([[np.asarray(walls[k]) for walls, _ in row] for row in drawn]) for k in range(4))
     return Walls(*columns), np.array([[distance for _, distance in row] for row in drawn])
 
 
 def find_errors(walls: Walls, name: str) -> np.ndarray:
-    """Return the error of a quantity in float32 at each wall, relative if its unit is 1.
+    """Return the error of a quantity in float32 at each wall, compared with float64; relative if its unit is "1".
 
-    The error is 0 if both values are infinite or NaN, and NaN if only the float32 value is.
+    The error is 0 if both values are NaN or the same infinity, and NaN if only the float32 value is NaN.
     """
     function, unit = QUANTITIES[name]
     exact, rounded = (
@@ -60,18 +62,18 @@ def find_errors(walls: Walls, name: str) -> np.ndarray:
 
 
 def head_row(first: str, cells: Iterable[str], align: str = "--:") -> list[str]:
-    """Return the two first lines of a table in Markdown; ``align`` is the alignment of the first column."""
+    """Return the first two lines of a Markdown table; ``align`` is the alignment of its first column."""
     cells = list(cells)
     return [f"| {first} | {' | '.join(cells)} |", f"|{align}|{'--:|' * len(cells)}"]
 
 
 def format_error(error: float) -> str:
-    """Return an error with one digit, or an empty text for an error that is NaN."""
+    """Return an error as text with one significant digit; empty for NaN."""
     return "" if np.isnan(error) else f"{error:.0e}" if error else "0"
 
 
 def largest(errors: np.ndarray, chosen: Any = True) -> str:
-    """Return the largest error of the chosen walls, with the number of walls without a value."""
+    """Return the largest error of the chosen walls as text, followed by the number of walls whose error is NaN."""
     errors = errors[np.broadcast_to(chosen, errors.shape)]
     missing = int(np.isnan(errors).sum())
     text = format_error(float(np.max(errors, initial=0.0, where=~np.isnan(errors)))) if errors.size else ""
@@ -79,7 +81,7 @@ def largest(errors: np.ndarray, chosen: Any = True) -> str:
 
 
 def tabulate_labels(distance: np.ndarray, wrong: np.ndarray) -> list[str]:
-    """Return the table of the largest distances of wrong labels, by delay and damping."""
+    """Return a table of the largest distance at which a stability label is wrong, by delay and damping."""
     lines = head_row("d", (f"delta = {delta:g}" for delta in DELTAS))
     for d, distances, is_wrong in zip(DELAYS, distance, wrong, strict=True):
         cells = (format_error(float(max(x[bad], default=0.0))) for x, bad in zip(distances, is_wrong, strict=True))
@@ -88,7 +90,7 @@ def tabulate_labels(distance: np.ndarray, wrong: np.ndarray) -> list[str]:
 
 
 def tabulate_distances(distance: np.ndarray, wrong: np.ndarray, errors: dict[str, np.ndarray]) -> list[str]:
-    """Return the table of the errors by the distance from the boundary."""
+    """Return a table of wrong stability labels and largest errors, by decade of the distance from the boundary."""
     lines = head_row("distance", ["wrong labels", *errors], "---")
     for decade in range(NEAREST, FARTHEST + 1):
         chosen = (distance >= 10.0**decade) & (distance < 10.0 ** (decade + 1))
@@ -98,14 +100,14 @@ def tabulate_distances(distance: np.ndarray, wrong: np.ndarray, errors: dict[str
 
 
 def tabulate_speeds(points: int, runs: int) -> tuple[list[str], dict[str, list[float]]]:
-    """Return the table of times and labels of float32 and mixed precision, and the times relative to float64."""
+    """Return a table of times and wrong labels of float32 and mixed precision, and the times relative to float64."""
     lines = head_row("d", ["float32: time", "mixed: time", "float32: wrong", "mixed: wrong", "mixed: in float64"])
     ratios: dict[str, list[float]] = {"float32": [], "mixed": []}
     for d in DELAYS:
         walls = scattered(d, points)
         calls = {name: prepare(function, walls, dtype) for name, (function, dtype) in LABELS.items()}
         labels = {name: np.asarray(call()) for name, call in calls.items()}
-        # Measure the three precisions alternately, so that other programs slow down all of them.
+        # Measure the three precisions alternately, so that other programs slow down all of them equally.
         seconds = dict.fromkeys(calls, np.inf)
         for _ in range(runs):
             for name, call in calls.items():

@@ -27,8 +27,8 @@ FUNCTIONS = {
     "`jit(vmap(grad))`, 64 scenes": "jax.jit(jax.vmap(jax.grad(K)))",
     "`jit(vmap)`, 100,000 scenes": "jax.jit(jax.vmap(K))",
 }
-SECONDS = 10.0  # times from this one on are printed in seconds
-MANY = 10_000  # number of scenes from which only one call with other numbers is measured
+SECONDS = 10.0  # times of at least 10 s are printed in s, shorter ones in ms
+MANY = 10_000  # batches of at least this many scenes are called only once with other numbers, to save time
 SCENES = {
     "low-pass": "Scene(Device(0.1, 10), Timing(1e-3, 1e-3), velocity=LowPass(cutoff=100))",
     "low-pass, coupling and hand": (

@@ -51,7 +51,7 @@ def draw_pareto(marks: Sequence[Mark], axes: style.AnyAxes | None = None) -> np.
     delays = sorted({mark.d for mark in marks})
     columns = min(3, len(delays))
     rates = min(mark.rate for mark in marks) / 3, max(mark.rate for mark in marks) * 5
-    # Choose the height of a panel such that its names do not overlap.
+    # Choose the height of a panel such that the names of its methods do not overlap.
     names = max(len({mark[:2] for mark in marks if mark.d == d}) for d in delays)
     height = max(3.6, 1.5 * names * _LETTERS / 72.0)
     size = (max(4.0 * columns, 5.0), height * -(-len(delays) // columns) + 0.5)

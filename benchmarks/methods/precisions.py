@@ -1,4 +1,8 @@
-"""Functions inside `jit` in float64, float32 and mixed precision, and walls at which their errors are measured."""
+"""Evaluate functions inside `jit` in float64, float32 and mixed precision, and draw walls to measure their errors.
+
+A wall has four numbers: its normalized stiffness alpha and damping beta, and the normalized damping delta and the delay
+d (in periods) of its device.
+"""
 
 from __future__ import annotations
 
@@ -24,22 +28,22 @@ from zwidth.stability.rigid.verdict import is_stable
 SEED = 20060901
 DELTAS = (0.0, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)
 DELAYS = (0.0, 0.5, 1.0, 2.0, 3.25, 8.0, 50.0, 500.0)
-# Decades of the relative distance in alpha from the boundary.
+# Smallest and largest decade (exponent of 10) of the relative distance in alpha between walls and stability boundary.
 NEAREST, FARTHEST = -7, -1
 
 
 def find_alpha(_alpha: Any, _beta: Any, delta: Any, d: Any) -> Any:
-    """Return the maximum stiffness of the device of each wall."""
+    """Return the maximum stable alpha of the device of each wall; alpha and beta of the wall have no effect."""
     return alpha_max(delta, d).alpha
 
 
-# Precisions of `is_stable` inside `jit`, with the number type of the arguments.
+# For each precision, the function that labels walls stable or unstable, and the number type of its arguments.
 LABELS: dict[str, tuple[Callable[..., Any], str]] = {
     "float64": (is_stable, "float64"),
     "float32": (is_stable, "float32"),
     "mixed": (partial(is_stable, precision="mixed"), "float64"),
 }
-# Quantities of walls, with their unit; those with the unit "1" have relative errors.
+# For each quantity, the function of walls that computes it, and the unit of its errors; "1" means relative errors.
 QUANTITIES: dict[str, tuple[Callable[..., Any], str]] = {
     "spectral radius": (spectral_radius, "1"),
     "`alpha_max`": (find_alpha, "1"),
@@ -56,7 +60,7 @@ QUANTITIES: dict[str, tuple[Callable[..., Any], str]] = {
 
 
 def prepare(function: Callable[..., Any], walls: Any, dtype: str) -> Callable[[], Any]:
-    """Return a function that evaluates ``function`` inside `jit` at all walls, with arguments of a number type."""
+    """Return a function that evaluates ``function`` inside `jit` at all walls, with arguments of the type ``dtype``."""
     enabled, columns = dtype == "float64", np.broadcast_arrays(*walls)
     with jax.enable_x64(enabled):
         program, arrays = jax.jit(function), [jnp.asarray(np.ravel(column), dtype) for column in columns]
@@ -70,16 +74,16 @@ def prepare(function: Callable[..., Any], walls: Any, dtype: str) -> Callable[[]
 
 
 def evaluate_walls(function: Callable[..., Any], walls: Any, dtype: str) -> np.ndarray:
-    """Return the values of a function inside `jit` at all walls, converted to float64 arrays or labels."""
+    """Return the values of a function inside `jit` at all walls, as a Boolean or float64 array."""
     values = np.asarray(prepare(function, walls, dtype)())
     return values if values.dtype == bool else values.astype(float)
 
 
 def draw_rounded_walls(delta: float, d: float, points: int) -> tuple[Walls, np.ndarray]:
-    """Return walls of one device that are float32 numbers, and their relative distances in alpha from the boundary.
+    """Return walls of one device, rounded to float32, and their relative distances in alpha from the boundary.
 
-    The walls lie next to random points of the lobe, between 2 and 99.5 % of its range of frequencies. The distances are
-    those of the rounded walls, from the limits that float64 computes.
+    The walls lie next to random points of the stability boundary, between 2 and 99.5 % of its range of frequencies. The
+    distances are computed in float64 from the rounded walls.
     """
     generator = np.random.default_rng([SEED, round(1e6 * delta), round(1e6 * d)])
     delta = float(np.float32(delta))

@@ -45,7 +45,7 @@ class Row:
     first_seconds: float  # additional time of the first call: compilation with a cold cache
     rate: float  # points per second, median of later calls
     error: float
-    wrong: int  # number of wrong labels, or of radii that are NaN; 0 for other quantities
+    wrong: int  # number of wrong labels, or of spectral radii that are NaN; 0 for other quantities
     checked: int  # number of points at which the error was measured, in extended precision
     baseline: bool = False  # whether the method is an alternative tool
 
@@ -211,14 +211,15 @@ def _passive(d: float, sizes: Sizes) -> Iterator[Row]:
 
 
 def ridge_error(d: float, find_maximum: Callable[[np.ndarray, float], Any]) -> Error:
-    """Return the smallest relative distance at which walls before and beyond alpha_max are proved stable and unstable.
+    """Return the smallest relative distance at which a wall below alpha_max is certified stable, one above unstable.
 
-    The walls lie on the line from the start of the boundary, (0, -delta), through the maximum, because walls of the
-    same beta just below a corner may be unstable.
+    Both walls lie on the line from the start of the stability boundary, (alpha, beta) = (0, -delta), through the
+    maximum, because walls of the same beta just below a corner of the boundary may be unstable.
 
     Args:
         d: delay in periods.
-        find_maximum: function of delta and d that returns alpha and beta of the maximum; delta is a float32 number.
+        find_maximum: function that returns alpha_max and its beta for an array delta, whose values are exact in
+            float32, and the delay d.
     """
     # For stronger damping, the stable range of beta below the corner is narrower than the float64 spacing.
     delta = np.float32(np.concatenate([[0.0], 10.0 ** np.linspace(-8, 1, 37)])).astype(float)
@@ -246,7 +247,7 @@ def _ridges(d: float, sizes: Sizes) -> Iterator[Row]:
 
 
 def _precisions(d: float, sizes: Sizes) -> Iterator[Row]:
-    """Return one row per question and precision, inside `jit`, for JAX arrays of scattered walls."""
+    """Return one row per quantity and precision, for functions inside `jit` and JAX arrays of scattered walls."""
     walls = problems.scattered(d, sizes.map_points // 4)
 
     def measured(quantity: str, precision: str, function: Any, dtype: str, points: int, error: Error) -> Row:

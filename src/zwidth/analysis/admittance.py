@@ -1,20 +1,19 @@
-"""Admittance displays: robots that measure a force and move as a virtual mass and damper would.
+"""Stability of robots that measure a force and move like a virtual mass M with damping D (admittance displays).
 
-A force sensor measures the contact force f between the robot and its environment (or the hand of a user). The program
-computes the velocity v of a virtual mass M with a virtual damping D, and the robot follows this motion with its own
-position or velocity controller. The environment is a spring K and a damper B between the robot and ground. The roles of
-device and wall are exchanged: the program displays a mass, and the environment is the spring.
+The environment, or the hand of a user, is a spring K and a damper B between the robot and ground. A sensor measures the
+contact force between robot and environment. In each period the program computes the velocity v of the virtual mass and
+commands it, or the position that follows from it, to the controller of the robot.
 
-Symbols: T is the sampling period, z = e^(sT), ``zeta = z - 1``, and n + f the delay of the command in periods, with the
-integer part n. With the position x and the velocity x' of the robot, the force at sample k is
-``f_k = -K x(kT) - B x'(kT)``. Let Y(z) be the response of the command to f, P(z) that of x to the command, and V(z)
-that of x' to the command. The loop is
+T is the sampling period, z = e^(sT) and ``zeta = z - 1``. The delay of the command is n + f periods, with the integer
+part n. With the position x and the velocity x' of the robot, the contact force at sample k is
+``f_k = -K x(kT) - B x'(kT)``. Three responses describe the loop: Y(z) from f_k to the command, P(z) from the command to
+x, and V(z) from the command to x'. The closed loop is
 
     1 + Y(z) (K P(z) + B V(z)) = 0
 
-Its characteristic polynomial is a sum of four polynomials with the factors M, D, K and B (docs/theory/admittance.md,
-W1 to W4). If three factors are given, the loop is that of a sampled linear device whose gain is the fourth: K for the
-stiffness of the environment, or 1/M for the virtual mass.
+and its characteristic polynomial is ``M p_M(z) + D p_D(z) + K p_K(z) + B p_B(z)`` (docs/theory/admittance.md, W1 to
+W4). Because this sum is linear in each factor, the stable values of one factor are the stable gains of a sampled linear
+device: the gain is K for the stiffness of the environment, and 1/M for the virtual mass.
 """
 
 from __future__ import annotations
@@ -45,6 +44,7 @@ from zwidth.units.unit_system import SYSTEMS
 
 Command = Literal["position", "velocity"]
 Integrator = Literal["semi-implicit", "trapezoidal"]
+# Polynomials in zeta = z - 1; the coefficient of the highest power is the first one.
 ZETA: Polynomial = (Fraction(1), Fraction(0))
 Z: Polynomial = (Fraction(1), Fraction(1))  # z = zeta + 1
 TWO: Polynomial = (Fraction(1), Fraction(2))  # z + 1 = zeta + 2
@@ -52,20 +52,20 @@ ONE: Polynomial = (Fraction(1),)
 
 
 class Coefficients(NamedTuple):
-    """The four polynomials in z whose sum, with the factors M, D, K and B, is the characteristic polynomial."""
+    """The four polynomials in z in the characteristic polynomial ``M p_M + D p_D + K p_K + B p_B``."""
 
-    mass: Polynomial
-    damping: Polynomial
-    stiffness: Polynomial
-    environment_damping: Polynomial
+    mass: Polynomial  # p_M, multiplied by the virtual mass M
+    damping: Polynomial  # p_D, multiplied by the virtual damping D
+    stiffness: Polynomial  # p_K, multiplied by the stiffness K of the environment
+    environment_damping: Polynomial  # p_B, multiplied by the damping B of the environment
 
 
 @compact_repr(frequency="Hz")
 class EnvironmentLimit(NamedTuple):
-    """The largest stiffness of the environment up to which an admittance display is stable.
+    """The largest stiffness K of the environment such that an admittance display is stable from 0 to K.
 
-    ``stiffness`` is in N/m, ``frequency`` that of the oscillation at this stiffness in Hz. Without a stable stiffness
-    both are NaN, and ``status`` is NO_BOUNDARY.
+    ``stiffness`` is K in N/m, and ``frequency`` is the frequency in Hz of the oscillation at K. If even soft
+    environments are unstable, both are NaN and ``status`` is NO_BOUNDARY.
     """
 
     stiffness: Array
@@ -77,8 +77,9 @@ class EnvironmentLimit(NamedTuple):
 class VirtualMassLimit(NamedTuple):
     """The smallest virtual mass with which an admittance display is stable.
 
-    All masses from ``virtual_mass`` to ``largest`` (in kg, or infinite) are stable; ``frequency`` is that of the
-    oscillation with the smallest one, in Hz. Without a stable mass, all three are NaN, and ``status`` is NO_BOUNDARY.
+    The display is stable with every mass from ``virtual_mass`` to ``largest``, both in kg; ``largest`` may be infinite.
+    ``frequency`` is the frequency in Hz of the oscillation with the smallest mass. If no mass is stable, all three are
+    NaN and ``status`` is NO_BOUNDARY.
     """
 
     virtual_mass: float
@@ -91,27 +92,27 @@ class VirtualMassLimit(NamedTuple):
 class AdmittanceDisplay:
     """A position- or velocity-controlled robot that displays a virtual mass and damping to a hand or an environment.
 
-    In each period T the program measures the contact force f and updates the velocity v of the virtual mass. With the
-    semi-implicit Euler method,
+    In each period T the program measures the contact force f. It updates the velocity v of the virtual mass and the
+    position command x_ref. With the semi-implicit Euler method,
 
         v += T (f - D v)/M;   x_ref += T v
 
-    and with the trapezoidal method, with the acceleration a computed from the last velocity,
+    and with the trapezoidal method, where the acceleration a_k is computed from the last velocity v_(k-1),
 
         a_k = (f_k - D v_(k-1))/M;   v_k = v_(k-1) + T (a_k + a_(k-1))/2;   x_ref += T (v_k + v_(k-1))/2
 
-    The robot follows x_ref, or v if it is commanded in velocity, exactly as its model states. The contact force does
-    not deflect the robot.
+    The command to the robot is x_ref or v. Its motion is the response of its model to this command; the contact force
+    does not deflect the robot.
 
     Args:
         virtual_mass: M in kg (kg m^2 for a rotary robot), > 0.
         virtual_damping: D in N s/m (N m s/rad), >= 0.
         robot: response of the controlled robot to its command, with gain 1 at frequency 0: a `zwidth.Actuator` for a
-            lag of first or second order, or a `zwidth.LinearDevice`. A sampled `LinearDevice` (position command only)
-            includes hold and delay, and allows an environment without damper only.
-        timing: sampling period, and delay from the force measurement to the change of the command that the robot
-            follows; the delay may be any number of periods.
-        command: "position" if the robot follows x_ref, "velocity" if it follows v.
+            lag of first or second order, or a `zwidth.LinearDevice`. A sampled `LinearDevice` includes the hold and the
+            delay; it requires position commands, and an environment without a damper.
+        timing: sampling period, and delay from the measurement of a force until the command computed from it acts on
+            the robot; the delay need not be an integer number of periods.
+        command: "position" if the command is x_ref, "velocity" if it is v.
         integrator: "semi-implicit" or "trapezoidal".
 
     Raises:
@@ -166,15 +167,16 @@ class AdmittanceDisplay:
     """True if virtual mass and damping have rotary units."""
 
     def scene(self, environment_stiffness: Any = 0.0, environment_damping: Any = 0.0) -> Scene:
-        """Return the loop with an environment as a `Scene`, whose wall is the spring of the environment.
+        """Return a `Scene` whose wall is the spring of an environment, and whose device is the rest of the loop.
 
-        The damper of the environment is part of the scene's device. All questions of a scene about walls without
-        damping are questions about the stiffness of the environment: poles, margins, and intervals of stable stiffness.
+        This device includes the robot, the program and the damper of the environment. For walls with damping 0, the
+        methods of the scene return the poles, the margins and the stable stiffnesses of the contact.
 
         Args:
             environment_stiffness: K in N/m, >= 0.
-            environment_damping: B in N s/m, >= 0, on the exact velocity of the robot at the sample. If the velocity
-                jumps at the sample, because a first-order robot follows a new position, it is that before the jump.
+            environment_damping: B in N s/m, >= 0. Its force is B times the exact velocity of the robot at the sample.
+                The velocity of a first-order robot jumps when its position command changes. If it jumps at the sample,
+                the velocity before the jump is used.
         """
         stiffness, damping = self._read_environment(environment_stiffness, environment_damping)
         scene = self._make_scene("stiffness", {"environment_damping": damping})
@@ -209,10 +211,10 @@ class AdmittanceDisplay:
         return self._label(EnvironmentLimit(*columns))
 
     def min_virtual_mass(self, hand_stiffness: Any, hand_damping: Any = 0.0) -> VirtualMassLimit:
-        """Return the smallest virtual mass that is stable in a hand, or an environment, of given stiffness.
+        """Return the smallest virtual mass with which the display is stable in a hand or environment.
 
-        The virtual damping is that of the display; its virtual mass has no effect. Masses that are too large may be
-        unstable as well.
+        The virtual damping is that of the display. The virtual mass of the display has no effect on the result. With
+        masses above ``largest`` of the result, the display may be unstable again.
 
         Args:
             hand_stiffness: K in N/m, > 0.
@@ -231,7 +233,7 @@ class AdmittanceDisplay:
         return self._label(VirtualMassLimit(1.0 / gain, largest, frequency, status))
 
     def _label(self, result: Any) -> Any:
-        """Return a result with the unit system of the display, for printing."""
+        """Store the unit system of the display in a result, for printing, and return the result."""
         result.unit_system = SYSTEMS[self.rotary]
         return result
 
@@ -261,12 +263,12 @@ class AdmittanceDisplay:
 
     @property
     def _n_delay(self) -> int:
-        """Integer part of the delay in periods."""
+        """Integer part n of the delay in periods."""
         return int(np.floor(self.timing.d))
 
     @cached_property
     def _plant(self) -> LinearDevice:
-        """Response of the position of the robot to its command."""
+        """Model of the robot, from its position or velocity command to its position."""
         device = self.robot
         if isinstance(device, Actuator):
             w = float(device.rate)
@@ -279,10 +281,11 @@ class AdmittanceDisplay:
 
     @cached_property
     def _coefficients(self) -> Coefficients:
-        """The polynomials of the mass, the damping, the spring and the damper, computed exactly from floats."""
+        """The polynomials p_M, p_D, p_K and p_B, computed from floats without rounding errors."""
         period = Fraction(float(self.timing.period))
         position, velocity, denominator = self._sample_plant(period)
-        # The virtual velocity is v = top/(M mass + D damping) f (docs/theory/admittance.md, W1).
+        # The response of the virtual velocity v to the force is top/(M mass + D damping), and the response of the
+        # command to v is path/integral (docs/theory/admittance.md, W1).
         top, mass, damping = (period,), ZETA, (period,)
         top = multiply(top, Z)
         path, integral = multiply((period,), Z), ZETA
@@ -298,9 +301,11 @@ class AdmittanceDisplay:
         return Coefficients(*map(_in_z, (*parts, multiply(forward, velocity))))
 
     def _sample_plant(self, period: Fraction) -> tuple[Polynomial, Polynomial, Polynomial]:
-        """Return P, V and their common denominator as polynomials in zeta (docs/theory/admittance.md, W2 and W3).
+        """Return the numerators of P and V, and their common denominator, as polynomials in zeta.
 
-        The polynomial of V is zero for a sampled robot, whose velocity is unknown.
+        P and V are the responses of position and velocity of the robot to its command, computed from the matrices Psi
+        and Gamma of the sampled robot (docs/theory/admittance.md, W2 and W3). For a robot that is given as a sampled
+        system, the numerator of V is zero, because such a model does not define the velocity.
         """
         delays = reduce(multiply, [Z] * (self._n_delay + 1), ONE)
         if self._plant.dt:
@@ -316,7 +321,10 @@ class AdmittanceDisplay:
         denominator = characteristic_polynomial(psi)
 
         def respond(output: np.ndarray) -> Polynomial:
-            """Return ``c adj(zeta - Psi) (zeta Gamma(1 - f) + Gamma(1))`` by the matrix determinant lemma."""
+            """Return ``c adj(zeta - Psi) (zeta Gamma(1 - f) + Gamma(1))`` for the row c = ``output``.
+
+            Both terms follow from determinants by the matrix determinant lemma.
+            """
             first, second = (
                 subtract(denominator, characteristic_polynomial(psi + np.outer(force, output)))
                 for force in (late, whole)
@@ -325,17 +333,18 @@ class AdmittanceDisplay:
 
         sensor = _to_fractions(np.eye(len(B))[0])
         velocity = _add(respond(_to_fractions(A[0])), multiply((Fraction(float(B[0])),), denominator))
-        # At z = 1 the velocity per command has no pole that the position lacks, so its constant coefficient is exactly
-        # 0 (W3); without rounding error, the drift of the virtual position cancels exactly.
+        # The numerator of V is zero at z = 1 (W3). Set its constant coefficient to exactly 0, because a rounding error
+        # would separate the pole at z = 1, a drift of the position, from the zero that cancels it.
         velocity = trim((*(value / period for value in velocity[:-1]), Fraction(0)))
         return respond(sensor), velocity, multiply(denominator, delays)
 
     def _make_scene(self, gain: str, factors: dict[str, float]) -> Scene:
-        """Return the scene in which the factor ``gain`` (or 1/M for "mass") is the stiffness of the wall.
+        """Return a scene in which one of the gains 1/M, D, K and B is the stiffness of the wall.
 
         Args:
-            gain: name of a field of `Coefficients`.
-            factors: values of the other factors that differ from those of the display; K and B are 0 by default.
+            gain: "mass" for 1/M; "damping", "stiffness" or "environment_damping" for D, K or B.
+            factors: values of the other factors by the same names. The default of M and D is the value of the display,
+                the default of K and B is 0.
         """
         if self._plant.dt and factors.get("environment_damping"):
             raise InputError(
@@ -347,17 +356,17 @@ class AdmittanceDisplay:
         rest = reduce(
             _add, (multiply((values[name],), part) for name, part in parts.items() if name != gain and values.get(name))
         )
-        # For the mass, divide the characteristic polynomial by M: its polynomial is then the denominator.
+        # With the gain 1/M, the characteristic polynomial divided by M is p_M + (1/M) rest, so p_M is the denominator.
         system = (rest, parts[gain]) if gain == "mass" else (parts[gain], rest)
         return Scene(LinearDevice(system, float(self.timing.period)), Timing(float(self.timing.period)))
 
     def _find_limit(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int]:
-        """Return the upper end of the stable interval of a gain from 0, its frequency in Hz, and a status."""
+        """Return the upper end of the stable interval of a gain that starts at 0, its frequency in Hz, and a status."""
         top, frequency, status, least = self._find_range(gain, factors)
         return (top, frequency, status) if least == 0 else (np.nan, np.nan, int(Status.NO_BOUNDARY))
 
     def _find_range(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int, float]:
-        """Return the first stable interval of a gain: upper end, frequency in Hz, status and lower end."""
+        """Return the lowest stable interval of a gain: upper end, frequency there in Hz, status, and lower end."""
         scene = self._make_scene(gain, factors)
         intervals = scene.stable_stiffness(0.0)
         intervals = intervals[intervals[:, 1] > 0]
@@ -390,7 +399,7 @@ def _in_zeta(polynomial: Polynomial) -> Polynomial:
 
 
 def _substitute(polynomial: Polynomial, offset: int) -> Polynomial:
-    """Return the coefficients of p(x + offset) by Horner's method."""
+    """Return the coefficients of the polynomial p(x + offset) in x, by Horner's method."""
     result: Polynomial = ()
     for value in polynomial:
         result = _add(multiply(result, (Fraction(1), Fraction(offset))), (value,)) if result else trim((value,))

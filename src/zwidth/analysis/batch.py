@@ -69,13 +69,15 @@ def stiffest_walls(
         The stability boundary of all scenes of one structure is evaluated together. Bisection for the largest K with a
         stable B, followed by Newton's method, yields the wall. Pole counts along lines of walls confirm that this wall
         is stable and connected to K = 0, and that no such wall is stiffer by more than a relative 4e-10
-        (docs/theory/scenes.md, V23, V24). Scenes without this confirmation, up to one percent in ordinary ranges of the
-        parameters, are searched one by one. The result for a scene does not depend on the other scenes, except that
-        fewer than 6 scenes of one structure are searched one by one, because this takes less time.
+        (docs/theory/scenes.md, V23, V24). Scenes without this confirmation are searched one by one; in ordinary ranges
+        of the parameters, these are up to one percent of the scenes. Fewer than 6 scenes of one structure are also
+        searched one by one, because this takes less time. The result for a scene does not depend on the other scenes,
+        apart from this choice of the method.
 
-        On one processor core, each of 20,000 scenes takes 0.2 ms with a filter, and 0.3 to 0.5 ms with a coupling, a
-        mode or an operator. Each of 64 scenes takes 0.3 ms if all have the same integer delay, otherwise up to 7 ms. A
-        search of one scene takes 10 to 25 ms.
+        The following times per scene are measured on one processor core. In a call with 20,000 scenes, a scene with a
+        velocity filter takes 0.2 ms, and a scene with a coupling, a mode or an operator 0.3 to 0.5 ms. In a call with
+        64 scenes, a scene takes 0.3 ms if all scenes have the same integer delay, otherwise up to 7 ms. A scene that is
+        searched by itself takes 10 to 25 ms.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII (rigid device).

@@ -36,10 +36,12 @@ def is_safe_for_every_world(scene: Scene, stiffness: Walls = None, virtual_dampi
     The condition is ``b (B + KT/2) >= sin^2((n+1)w/2) [(B + KT/2)^2 + (KT/2)^2 cot^2(w/2)]`` at all frequencies w
     (rad per period), with the damping b of the device, the period T and a delay of n periods; the mass has no effect.
     The velocity of a tool is the backward difference ``(y_k - y_(k-1))/T`` of its position. A simulated tool is passive
-    if its impedance at this velocity has no negative real part. The implicit Euler method preserves passivity. The
-    trapezoidal rule preserves it if the position follows from the new velocity, ``y += T v``. **The semi-implicit Euler
-    method, which most physics engines use, does not preserve it**, nor does a trapezoidal rule for velocity and
-    position. With a light tool of these methods, a coupling can be unstable although this function returns True.
+    if the real part of its impedance, i.e. of coupling force divided by this velocity, is negative at no frequency.
+    Tools that are integrated by the implicit Euler method are passive. Tools whose velocity v follows from the
+    trapezoidal rule are passive if the position follows from the new velocity, ``y += T v``. **Tools that are
+    integrated by the semi-implicit Euler method, which most physics engines use, are not passive.** Tools whose
+    velocity and position both follow from the trapezoidal rule are not passive, either. If a tool is light and not
+    passive, the coupling can be unstable although this function returns True.
 
     Args:
         stiffness: K in N/m, >= 0; default: the stiffness of the scene's wall.
@@ -92,7 +94,7 @@ def max_safe_coupling(scene: Scene) -> SafeCoupling:
 
 def _find_delay(scene: Scene) -> int:
     """Return the delay, an integer number of periods; raise `InputError` if no condition is known for the scene."""
-    # Ignore operator and tool of the scene, because the condition covers every passive operator and tool.
+    # Ignore the operator and the tool of the scene, because the condition holds for every passive operator and tool.
     unsupported = [part for part in scene.nonrigid_parts if part not in ("operator", "tool")]
     if unsupported:
         raise InputError(

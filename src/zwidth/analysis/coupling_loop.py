@@ -1,9 +1,11 @@
-"""Loop of a scene with a simulated tool, in which the wall is the virtual coupling between device and tool.
+"""Stability of the virtual coupling ``C = alpha + beta F`` between a device and a simulated tool.
 
-The coupling C = alpha + beta F and the responses G of the device and G_t of the tool yield the closed loop ``1 + C (G +
-G_t) = 0`` (docs/theory/passivity.md, U5), so the analyses of `LinearLoop` are valid with G + G_t in place of G. A tool
-in implicit Euler follows the coupling force without delay. Then the set of stable couplings may be *unbounded*: with a
-light tool, a coupling is stable with every stiffness.
+alpha and beta are the normalized stiffness and damping of the coupling, F is the velocity estimate. The closed loop is
+``1 + C (G + G_t) = 0`` with the responses G of the device and G_t of the tool (docs/theory/passivity.md, U5). The
+analyses of `LinearLoop` for a wall are therefore valid for the coupling, with G + G_t in place of G.
+
+A tool that is integrated by the implicit Euler method responds to the coupling force without delay. The set of stable
+couplings can then be *unbounded*: all couplings with sufficiently large alpha are stable.
 """
 
 from __future__ import annotations
@@ -23,12 +25,12 @@ from zwidth.stability.linear.roots import LoopRoots
 from zwidth.stability.linear.rows import CONNECTED_START, Island, find_stable_intervals
 from zwidth.stability.results import Margins, RidgePoint
 
-# Dampings beta at which an unbounded set of stable couplings is searched for one that is stable with every alpha > 0.
+# Values of the damping beta at which `CouplingLoop.free_damping` tests whether every alpha > 0 is stable.
 TESTED_DAMPINGS = np.concatenate([[0.0], np.geomspace(1e-6, 1e3, 91)])
 
 
 class CouplingLoop(LinearLoop):
-    """Loop of a scene with a tool. Methods without docstring are described in `LinearLoop`."""
+    """Loop of a scene with a tool; methods without a docstring are documented in `LinearLoop`."""
 
     @cached_property
     def roots(self) -> LoopRoots:
@@ -38,12 +40,15 @@ class CouplingLoop(LinearLoop):
 
     @cached_property
     def unbounded(self) -> bool:
-        """True if couplings are stable as alpha -> inf, whatever their damping."""
+        """True if all couplings with sufficiently large alpha are stable, whatever their beta."""
         return not self.boundary.count_above(np.zeros(1))
 
     @cached_property
     def free_damping(self) -> float:
-        """The smallest tested beta >= 0 with which every alpha > 0 is stable; NaN if no such damping is found."""
+        """The smallest beta in `TESTED_DAMPINGS` with which the coupling is stable for every alpha > 0; NaN if none is.
+
+        It is NaN, too, if the set of stable couplings is bounded.
+        """
         if not self.unbounded:
             return np.nan
         intervals = find_stable_intervals(self.boundary, TESTED_DAMPINGS)
@@ -73,8 +78,8 @@ class CouplingLoop(LinearLoop):
     def is_connected(self, alpha: float, beta: float) -> bool:
         if not self.unbounded:
             return super().is_connected(alpha, beta)
-        # All couplings of sufficient stiffness are connected, because the number of unstable poles at high stiffness
-        # does not depend on the damping.
+        # All couplings with sufficiently large alpha are stable, whatever their beta, so they are connected to each
+        # other. If one beta is stable for every alpha > 0, they are also connected to alpha = 0.
         intervals = find_stable_intervals(self.boundary, np.array([beta]))
         inside = (intervals.low[0] < alpha) & (alpha < intervals.high[0])
         from_zero = intervals.low[0] <= CONNECTED_START * alpha
@@ -89,7 +94,7 @@ class CouplingLoop(LinearLoop):
         return [] if self.unbounded else super().islands(least)
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
-        # Leave the delay margin NaN, because additional delay changes G but not G_t.
+        # Leave the delay margin NaN, because additional delay changes the response of the device, but not of the tool.
         return super().margins(
             alpha, beta, [name for name in Margins._fields if name in wanted and name != "delay_margin"]
         )

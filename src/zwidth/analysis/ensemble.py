@@ -40,7 +40,7 @@ from zwidth.units.quantities import FIELDS, WALL, WALL_RANGE
 RIGID_PARAMETERS = ("mass", "damping", "period", "delay")
 MAX_PIECES = 6  # largest number of pieces of arrays that NumPy evaluates faster than a function compiled by JAX
 LEAST_BATCH = 6  # smallest number of variants that are faster to evaluate at once than one by one
-# Fields of a scene that are evaluated for all variants at once. A scene with a further part is evaluated by itself.
+# Parts of a scene that the batch computation supports. Variants of a scene with other parts are evaluated one by one.
 EVALUATED = ("device", "timing", "wall", "velocity", "operator", "safe_limit")
 LONGEST_WINDOW = 64  # longest velocity window, in periods, of variants evaluated at once; longer windows take too long
 # Densities of the frequency grid. The higher one is used for variants that are not confirmed with the lower one.
@@ -62,11 +62,13 @@ class BatchRidge(NamedTuple):
 
     point: RidgePoint
     searched: np.ndarray  # True for variants that were searched one by one
-    angles: np.ndarray  # angles w of the two active constraints, shape (2, variants); NaN where ``searched``
+    # Angles w, in rad per period, of the poles on the unit circle of both active constraints, shape (2, variants). Both
+    # angles are equal if only one pole or pole pair is on the circle. They are NaN where ``searched``.
+    angles: np.ndarray
 
 
 def list_further_parts(scene: Any) -> tuple[Any, ...]:
-    """Return the parts of a scene that are not evaluated for many variants at once."""
+    """Return the parts of a scene that the batch computation does not support."""
     parts = (getattr(scene, item.name) for item in fields(scene) if item.name not in EVALUATED)
     return tuple(part for part in parts if part is not None)
 
@@ -116,7 +118,7 @@ class Variants:
         return _NormalizedVariants(values, d, period, np.broadcast_to(mass, period.shape), usable)
 
     def _is_supported(self, values: dict[str, np.ndarray]) -> bool | np.ndarray:
-        """Return whether variants have the structure of the scene, and one that can be evaluated at once."""
+        """Return whether the batch computation supports the scene, and its variants have the same structure."""
         scene, nominal = self.scene, self.scene.parameters()
         device, velocity = scene.device, scene.velocity
         known = type(device) in (Device, LinearDevice) and type(velocity) in ESTIMATES.values()
@@ -142,7 +144,10 @@ class Variants:
             return self.label_normalized(stiffness * period / rate, damping / rate)
 
     def label_normalized(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """Return a boolean array: True if the wall (alpha, beta) with the index of a variant is stable on it."""
+        """Return a boolean array with one entry per variant k: True if (alpha[k], beta[k]) is stable on this variant.
+
+        ``alpha`` and ``beta`` are the stiffness and damping of the wall, normalized by mass and period of the variant.
+        """
         stable, left = np.zeros(self.count, bool), np.full(self.count, True)
         inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE) & (alpha > 0)
         selected = np.flatnonzero(self.normalized.usable & inside)
@@ -196,7 +201,7 @@ class Variants:
         return np.where(are_connected(low, high), high, 0.0).max(-1, initial=0.0)
 
     def find_ridges(self, negative: bool) -> BatchRidge:
-        """Return the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
+        """Return the stiffest stable wall of each variant; include walls with B < 0 only if ``negative``."""
         columns = [np.full(self.count, np.nan) for _ in range(3)]
         kind, status = np.full(self.count, int(RidgeKind.NONE), np.int32), np.zeros(self.count, np.int32)
         left, angles = np.full(self.count, True), np.full((2, self.count), np.nan)
@@ -234,7 +239,7 @@ class Variants:
             return math.nan, math.nan, math.nan, int(RidgeKind.NONE), int(Status.NOT_CONVERGED)
 
     def stiffest(self, negative: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return K, B and `Status` of the stiffest stable wall of each variant, with B >= 0 unless ``negative``."""
+        """Return K, B and `Status` of the stiffest stable wall of each variant; see `find_ridges` for ``negative``."""
         point, period = self.find_ridges(negative).point, self.normalized.period
         with np.errstate(all="ignore"):
             rate = self.normalized.mass / period

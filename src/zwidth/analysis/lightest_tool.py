@@ -1,10 +1,10 @@
-"""Range of the masses of simulated tools with which a virtual coupling is stable.
+"""Compute the masses of a simulated tool with which a virtual coupling is stable.
 
-With the coupling C, the response G of the device and the response G_t of the tool, a pole is on the unit circle if
-``1/G_t = R`` with ``R = -1/(1/C + G)``. The reciprocal of G_t is affine in the mass M of the tool (`model.tool`), so R
-determines M at each angle w. A mass at which a pole is on the circle is a *critical mass*: there the imaginary part of
-M is 0. Between two neighboring critical masses, the coupling is stable with every mass or with none (docs/theory/
-passivity.md, U6).
+The *coupling* C is a spring K and a damper B between the device and the *tool*, a mass M that the computer simulates.
+The closed loop is ``1 + C (G + G_t) = 0`` with the responses G of the device and G_t of the tool. It has a pole at
+z = e^(jw) on the unit circle if ``1/G_t = R`` with ``R = -1/(1/C + G)``. Because 1/G_t is affine in M (`model.tool`),
+this equation yields one complex M at each angle w. If this M is real and positive, it is a *critical mass*. Between two
+neighboring critical masses, the coupling is stable with every mass or with none (docs/theory/passivity.md, U6).
 """
 
 from __future__ import annotations
@@ -29,17 +29,19 @@ if TYPE_CHECKING:
     from zwidth.analysis.scene import Scene
     from zwidth.analysis.walls import Wall
 
-REFINEMENT = 8  # intervals into which each step between two nodes of the loop is divided
-OUTSIDE = 4.0  # factor between an outermost critical mass and the mass that represents all masses beyond it
+REFINEMENT = 8  # steps of the angle w between two neighboring points of the loop's frequency grid
+# Factor between the largest (or smallest) critical mass and the mass that is tested in place of all larger (or smaller)
+# masses.
+OUTSIDE = 4.0
 
 
 @compact_repr(mass="kg", heaviest="kg", intervals="kg")
 class LightestTool(NamedTuple):
     """Range of tool masses in kg with which a virtual coupling is stable, from the lightest to the heaviest tool."""
 
-    mass: float  # mass of the lightest tool; 0 if every lighter tool is stable
-    heaviest: float  # mass up to which all heavier tools are stable; infinite if all of them are
-    intervals: tuple[tuple[float, float], ...]  # all stable intervals of the mass, ascending
+    mass: float  # lower end of the highest stable interval; 0 if it contains arbitrarily light tools
+    heaviest: float  # upper end of the highest stable interval; infinite if it contains arbitrarily heavy tools
+    intervals: tuple[tuple[float, float], ...]  # lower and upper end of each stable interval, ascending
     status: Status  # OK, or NO_BOUNDARY if no mass is stable
 
 
@@ -52,25 +54,26 @@ def lightest_tool(
 ) -> LightestTool:
     """Return the smallest mass of a simulated tool with which a virtual coupling is stable.
 
-    Each tool has the damping and the stiffness to ground of the tool of the scene; without a tool in the scene, both
-    are 0.
+    Only the mass of the tool varies. Its damping and its stiffness to ground are those of the scene's tool, or 0 if the
+    scene has no tool.
 
     Args:
-        stiffness: K of the coupling in N/m, one number; default: that of the scene's wall.
-        virtual_damping: B of the coupling in N s/m, one number; default: that of the scene's wall.
+        stiffness: K of the coupling in N/m, one number; default: the stiffness of the scene's wall.
+        virtual_damping: B of the coupling in N s/m, one number; default: the damping of the scene's wall.
         integrator: "semi-implicit" or "implicit"; default: the integrator of the scene's tool, or "semi-implicit".
 
     Returns:
-        ``intervals``, all intervals of masses in kg with which the coupling is stable. ``mass`` and ``heaviest`` are
-        the ends of the highest interval, so the coupling is stable with every tool between them. ``mass`` is 0 if the
-        interval contains arbitrarily light tools; ``heaviest`` is infinite if the coupling is also stable with a fixed
-        tool, i.e. as a wall. ``status`` is NO_BOUNDARY, with NaN, if the coupling is unstable with every tool.
+        ``intervals`` contains all intervals of masses in kg with which the coupling is stable. ``mass`` and
+        ``heaviest`` are the ends of the highest interval. ``mass`` is 0 if this interval contains arbitrarily light
+        tools. ``heaviest`` is infinite if the coupling is also stable with a fixed tool, i.e. as a wall. If the
+        coupling is unstable with every tool, both are NaN and ``status`` is NO_BOUNDARY.
 
     Raises:
         InputError: the device is given by a measured response, or the coupling is not one pair of finite numbers.
 
     Numerics:
-        All masses with a pole on the unit circle are computed. A pole count decides each interval between them.
+        The critical masses, at which a pole is on the unit circle, are computed. They divide all masses into intervals,
+        and a count of the unstable poles at one mass decides whether an interval is stable.
 
     References:
         Colgate, Stanley, Brown 1995, Proc. IROS, vol. 3 (smallest tool mass with a virtual coupling).
@@ -112,13 +115,16 @@ def lightest_tool(
 
 
 def _find_critical_masses(scene: Scene, tool: Tool, alpha: float, beta: float) -> np.ndarray:
-    """Return the masses of tools in kg, ascending, at which the coupling has a pole on the unit circle."""
+    """Return the masses of the tool in kg, ascending, at which the closed loop has a pole on the unit circle.
+
+    ``alpha`` and ``beta`` are the normalized K and B of the coupling; the mass of ``tool`` has no effect.
+    """
     loop = find_roots(scene.replace(tool=None).loop.chain)
     mass, period = float(scene.mass), float(scene.timing.period)
     one, three = (Tool(m * mass, tool.damping, tool.stiffness, tool.integrator).respond(mass, period) for m in (1, 3))
 
     def find_mass(w: np.ndarray) -> np.ndarray:
-        """Return the complex mass of the tool, in units of the device's mass, that yields 1/G_t = R at angles w."""
+        """Return the complex M that solves 1/G_t = R at each angle w, in units of the mass of the device."""
         points = circle_points(w)
         with np.errstate(all="ignore"):
             controller = alpha + beta * loop.estimate.jet(points).value

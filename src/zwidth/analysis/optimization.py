@@ -337,13 +337,13 @@ class SceneOptima(SceneAnalysis):
         low, high = _choose_range(self, parameter, now, within)
 
         def compare(K: float, status: int) -> float:
-            """Return the logarithm of the ratio of K to the required stiffness; NaN if K_max cannot be computed."""
+            """Return log(K/stiffness) for K_max = K; -NO_STIFFNESS if no wall is stable, and NaN for other failures."""
             if status == Status.NO_BOUNDARY:
                 return -NO_STIFFNESS
             return math.log(K / stiffness) if status == Status.OK else math.nan
 
         def surplus(value: float) -> float:
-            """Return the result of ``compare`` for the K_max at one value of the parameter."""
+            """Return log(K_max/stiffness) for one value of the parameter, with the special cases of ``compare``."""
             wall = self.replace(**{parameter: value}).max_stiffness(negative_damping=negative_damping)
             return compare(wall.stiffness, wall.status)
 

@@ -39,12 +39,14 @@ class Scene(SceneAdvice):
         operator: the hand that holds the device; None for a released device.
         safe_limit: stiffest wall that measurements of the device support, usually set by a fit. `recommend` respects
             it; stability and maximum stiffness do not depend on it.
-        position: position estimate from which the spring force is computed, such as a filter, an observer or a PLL;
-            None for the measured position. The velocity is estimated from the filtered position, unless the part says
-            otherwise. An observer or PLL has its own velocity estimate and excludes ``velocity``.
-        feedback: fixed further feedback, such as an integral gain; None without one.
-        tool: simulated tool. The stiffness and the damping of the wall are then those of the virtual coupling between
-            the device and this tool; None for a fixed wall.
+        position: position estimate from which the spring force is computed, such as a filter, an observer or a
+            phase-locked loop (PLL); None for the measured position. The velocity is estimated from this position, or
+            from the measured position with the argument ``velocity_from="measured"`` of the filter. An observer or PLL
+            has its own velocity estimate, so ``velocity`` must be omitted.
+        feedback: further force of the controller in addition to spring and damper, such as that of an integral gain;
+            None for no such force.
+        tool: simulated tool that a virtual coupling connects to the device. The stiffness and the damping of the wall
+            are then those of the coupling. None for a fixed wall.
 
     Numerics:
         A scene is a JAX pytree whose leaves are its numbers, so that it can be an argument of functions inside ``jit``,

@@ -171,7 +171,7 @@ def _at_angle(meet: Callable[..., list[Taylor]], unknowns: list[float], w: float
 
 
 def _meet_gain(terms: LoopTerms, alpha: Taylor, beta: Taylor, gain: Taylor, w: Taylor) -> list[Taylor]:
-    """Return the equations for a pole on the unit circle, at the angle w, if all gains are multiplied by ``gain``."""
+    """Return the equations for a pole at the angle w on the unit circle, with the open loop multiplied by ``gain``."""
     r, _, _ = terms.residual(alpha * gain, beta * gain, w * 1j)
     scale = abs(terms.controller(w * 1j)[0].v)
     return split(r + terms.feedback(w * 1j)[0] * (gain - 1.0) / scale)

@@ -1,9 +1,9 @@
-"""Evaluate many scenes at once in NumPy, for calls from JAX with a batch of scenes, e.g. under `jax.vmap`.
+"""Compute results for many scenes at once in NumPy, for calls from JAX with a batch of scenes (`jax.vmap`).
 
-All scenes of a batch have one structure. They are given by their *leaves*, the numbers of their JAX pytrees, in the
-order of `zwidth.core.pytrees.list_leaves`. `Variants` evaluates the scenes together, and confirms each result by pole
-counts. A scene without a confirmed result is evaluated by itself. A wall has the normalized stiffness alpha and damping
-beta.
+A scene is a JAX pytree; its *leaves* are its numbers, in the order of `zwidth.core.pytrees.list_leaves`. All scenes of
+a batch have the same structure and differ in their leaves. `Variants` evaluates them together, and confirms each result
+by pole counts. A scene without a confirmed result is evaluated by itself. A wall has the normalized stiffness alpha and
+damping beta.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from zwidth.stability.linear.derivatives import differentiate_ridge, index_param
 from zwidth.stability.linear.ridge import Condition, RidgeSolution
 from zwidth.units.quantities import WALL
 
-# Largest number of walls per scene for which labels are computed for all scenes at once. For more walls, the labels are
-# computed scene by scene, which requires one boundary curve per scene, but no count per wall.
+# Largest number of walls per scene whose labels (stable or unstable) are computed for all scenes at once, with one pole
+# count per wall. For more walls, one stability boundary per scene takes less time.
 MAX_WALLS = 8
 
 
 class LeafVariants(Variants):
-    """Scenes of one structure, given by their leaves.
+    """Scenes of the same structure, given by the leaves of each scene.
 
     Args:
         build: function that returns the scene with the given leaves; it raises `InputError` if a number is not allowed.
@@ -49,11 +49,12 @@ class LeafVariants(Variants):
         drawn = {path: leaves[:, each].copy() for path, each in index.items()}
         if scene.timing.in_periods:
             drawn["delay"] *= drawn["period"]
-        # Do not vary the stiffness of a spring to ground that is 0 in all scenes; see `Variants._is_supported`.
+        # If the hand's spring to ground has stiffness 0 in all scenes, do not list this stiffness as varied, because
+        # `Variants` does not support a varied stiffness of 0.
         if not drawn.get("operator.stiffness", np.ones(1)).any():
             del drawn["operator.stiffness"]
-        # Leaves that are no parameters of the scene, such as those of a safe limit, may have values that are not
-        # allowed. Evaluate scenes in which they differ by themselves.
+        # Some leaves, such as those of a safe limit, are not parameters of the scene, so `Variants` does not check
+        # their values. If these leaves differ from those of the first valid scene, evaluate the scene by itself.
         other = np.setdiff1d(np.arange(leaves.shape[1]), list(index.values()))
         self.similar = np.all(leaves[:, other] == leaves[k, other], 1)
         super().__init__(scene, drawn)
@@ -82,7 +83,7 @@ def _find_valid(build: Callable[[tuple[float, ...]], Any], leaves: np.ndarray) -
 def find_stiffest_of_many(
     variants: LeafVariants, points: np.ndarray, order: int, negative_damping: bool | None
 ) -> Derivatives:
-    """Return the results of `traced_answers.find_stiffest`, one row per scene."""
+    """Return the stiffest walls and their derivatives as `traced_answers.find_stiffest` does, one row per scene."""
     negative = allows_negative(variants.scene, negative_damping)
     top = variants.find_ridges(negative)
     results = no_derivatives(np.stack(top.point, -1), variants.leaves.shape[1], order)
@@ -97,9 +98,9 @@ def find_stiffest_of_many(
 
 
 def _describe_maximum(top: BatchRidge, k: int) -> RidgeSolution:
-    """Return the stiffest wall of the scene with the index k, with its active constraints."""
+    """Return the stiffest wall of the scene with the index k, with the two conditions that determine it."""
     alpha, beta, (w1, w2) = float(top.point.alpha[k]), float(top.point.beta[k]), top.angles[:, k].tolist()
-    # Poles on the unit circle are a pair, or one pole at z = -1.
+    # A pole on the unit circle at the angle w belongs to a complex pair or, if w = pi, is the single pole z = -1.
     first, second = (Condition.MINUS_ONE if w == np.pi else Condition.PAIR for w in (w1, w2))
     if top.point.kind[k] == RidgeKind.SMOOTH:
         second = Condition.STATIONARY
@@ -109,16 +110,16 @@ def _describe_maximum(top: BatchRidge, k: int) -> RidgeSolution:
 
 
 def label_many(variants: LeafVariants, points: np.ndarray, order: int) -> Derivatives:
-    """Return the results of `traced_answers.label_walls`, one row per scene and wall."""
+    """Return the labels of walls (1 stable, 0 unstable) as `traced_answers.label_walls` does, one row per wall."""
     labels = variants.label_normalized(*points.T)[:, None].astype(float)
     return no_derivatives(labels, variants.leaves.shape[1] + points.shape[1], order)
 
 
 BATCHES: dict[str, Callable[..., Derivatives]] = {"stiffest": find_stiffest_of_many, "labels": label_many}
-"""Function that computes results for many scenes at once, for some methods of `zwidth.analysis.traced_answers`.
+"""Functions that compute one method for many scenes at once, by the name of the method in `traced_answers.ANSWERS`.
 
-Its arguments are `LeafVariants`, the rows of further arguments of the method, one per scene, the order of the highest
-derivative, and the options of the method.
+The arguments of each function are the scenes, an array with the walls of the method (one row per scene), the order of
+the highest derivative, and the options of the method.
 """
 
 
@@ -130,12 +131,13 @@ def evaluate_batch(
     order: int,
     options: Iterable[Any],
 ) -> Derivatives | None:
-    """Return values and derivatives of a method for many scenes; None if they are to be evaluated one by one.
+    """Return values and derivatives of a method for many scenes, or None if the caller must evaluate each by itself.
 
     Args:
-        method: name of the method.
+        method: name of the method in `traced_answers.ANSWERS`.
         build: function that returns the scene with the given leaves.
-        rows: leaves of a scene, followed by the further arguments of the method, shape (rows, leaves + arguments).
+        rows: leaves of a scene, followed by the further arguments of the method, such as alpha and beta of a wall;
+            shape (rows, leaves + arguments).
         count: number of leaves of a scene.
         order: order of the highest derivative.
         options: options of the method.

@@ -11,10 +11,10 @@ A second-order section
 
     (b2 zeta^2 + b1 zeta + b0)/(zeta^2 + a1 zeta + a0)
 
-with input u and output y has the states ``p = zeta W`` and ``q = W``, where W is u divided by the denominator. With
-``w = zeta^2 W = u - a1 p - a0 q``, the output is ``y = b2 w + b1 p + b0 q``. Since ``zeta W`` is the change of W until
-the next sample, the states are updated by ``q += p`` and ``p += w``. A first-order section has the state q only, with
-``w = zeta W = u - a0 q``.
+with input u has the states ``p = zeta W`` and ``q = W``, where W is u divided by the denominator. With
+``w = zeta^2 W = u - a1 p - a0 q``, the output of the section is ``b2 w + b1 p + b0 q``. Since ``zeta W`` is the change
+of W until the next sample, the states are updated by ``q += p`` and ``p += w``. A first-order section has the state q
+only, with ``w = zeta W = u - a0 q``.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _describe_cautions(scene: SceneParts, cautions: Sequence[str]) -> list[str]:
 
 
 def find_sections(estimate: Estimate) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Return the sections of the filter of an estimate; they follow its difference over a window.
+    """Return the sections of the filter of an estimate, without the difference over a window that precedes them.
 
     Returns:
         Numerator and denominator of each section in powers of zeta, highest power first, both of the same length 2
@@ -110,15 +110,15 @@ class WallProgram(NamedTuple):
 
     head: str  # comment at the head of the program
     window: int  # length of the difference in periods; 0 for none
-    memory: str  # variable of the positions from which the velocity is estimated: "x", or "y" for the estimate
-    states: list[str]  # names of the states of the sections, and of the last position
-    begin: list[str]  # statements that set the states of the position estimate to those at rest
-    start: list[str]  # statements that set all other states to those at rest
-    force: list[str]  # statements that compute position and velocity estimate from the position x
+    memory: str  # input of the velocity estimate: "x" (measured position) or "y" (position estimate)
+    states: list[str]  # names of the states of all filters
+    begin: list[str]  # statements that set the states of the position estimate to their values at rest
+    start: list[str]  # statements that set all other states to their values at rest
+    force: list[str]  # statements that compute the estimates of position and velocity from the measured position x
     reset: list[str]  # statements that set the states of the further feedback to 0
     feedback: list[str]  # statements that compute the force r of the further feedback
     law: str  # expression of the force
-    depth: str  # variable of the position estimate: "x" or "y"
+    depth: str  # position that the spring uses: "x" (measured position) or "y" (position estimate)
     max_force: float  # largest force; infinite for none
     system: UnitSystem  # units of the device
 
@@ -142,12 +142,12 @@ def write_wall(
 
 
 class FilterCode(NamedTuple):
-    """Statements of a filter, whose input and output are the variable u."""
+    """Statements of a filter. The variable u is the input before the statements and the output after them."""
 
     states: list[str]  # names of the states
-    start: list[str]  # statements that set the states to those for a constant input u, and u to the constant output
-    update: list[str]  # statements that compute the output from the input
-    gain: float  # factor by which the output still has to be multiplied
+    start: list[str]  # statements that set the states to their steady state for a constant u, and u to the output
+    update: list[str]  # statements that compute the output, without the factor ``gain``, from the input
+    gain: float  # factor by which u is to be multiplied after the statements
 
 
 def write_filter(estimate: Estimate, prefix: str = "") -> FilterCode:
@@ -155,7 +155,7 @@ def write_filter(estimate: Estimate, prefix: str = "") -> FilterCode:
 
     Args:
         estimate: the estimate.
-        prefix: first part of the names of the states.
+        prefix: beginning of the names of all states, different for each filter of a program.
     """
     states, start, update, gain = [], [], [], float(estimate.gain)
     for number, (numerator, denominator) in enumerate(find_sections(estimate)):
@@ -168,7 +168,7 @@ def write_filter(estimate: Estimate, prefix: str = "") -> FilterCode:
             start.append(f"{last} = u")
             gain /= denominator[-1]
             continue
-        # A pole at z = 1 has no constant output for a constant input; its states start at 0.
+        # A section with a pole at z = 1 has no steady state for a constant input, so its states start at 0.
         start += [f"{last} = u / {denominator[-1]!r}", f"u = {numerator[-1]!r} * {last}"] if denominator[-1] else []
         pairs = zip(denominator[1:], names, strict=True)
         feedback = "".join(f" - {factor!r} * {name}" for factor, name in pairs if factor)
@@ -184,7 +184,7 @@ def _reset(states: Sequence[str]) -> list[str]:
 
 
 def _omit_output(start: list[str]) -> list[str]:
-    """Return statements without those at the end that only compute u."""
+    """Return statements without those at the end that compute u, because no later statement uses it."""
     while start and start[-1].startswith("u = "):
         start = start[:-1]
     return start
@@ -208,8 +208,8 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
         force.append(f"@next = (@next + 1) % {count}")
     else:
         force += [f"u = {memory} - @{memory}" if count else f"u = {memory}", f"@{memory} = {memory}"]
-    # Start at rest. The output of a difference is then 0, and so are the states of all sections after it. Without a
-    # difference the first section has the constant input.
+    # Start at rest, i.e. with a constant position. If the velocity estimate starts with a difference, its output is
+    # then 0, and so are the states of its filter. Otherwise the position is the constant input of the filter.
     start = _reset(code.states) if count else _omit_output([f"u = {memory}", *code.start])
     states = code.states + states
     force += [*code.update, f"v = {code.gain / period!r} * u"]

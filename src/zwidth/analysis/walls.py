@@ -317,12 +317,12 @@ class SceneAnalysis(SceneParts):
         With several crossovers, the nearest counts, as in python-control. ``gain_margin`` is the factor nearest to 1 on
         K and B together, ``phase_margin`` the smallest change of phase in degrees, and ``delay_margin`` the smallest
         additional delay in s that moves a pole onto the unit circle. ``modulus_margin`` is the smallest distance of L
-        from -1. Further feedback of the scene changes together with K and B. The phase margin of an unstable wall is
-        negative, its delay margin 0. The delay margin is computed with the exact discretization of every fractional
-        delay, and is NaN if counts of poles below and above it do not confirm it. If no factor, phase or delay moves a
-        pole onto the unit circle, the first three margins are infinite for a stable wall, and 0, NaN and 0 for an
-        unstable one. Walls out of range are NaN. A rigid scene uses `zwidth.margins`. For other scenes, one wall takes
-        about 0.1 s, and many walls in one call some ms per wall.
+        from -1. The factor and the phase apply to the whole force of the controller, including further feedback. The
+        phase margin of an unstable wall is negative, its delay margin 0. The delay margin is computed with the exact
+        discretization of every fractional delay, and is NaN if counts of poles below and above it do not confirm it. If
+        no factor, phase or delay moves a pole onto the unit circle, the first three margins are infinite for a stable
+        wall, and 0, NaN and 0 for an unstable one. Walls out of range are NaN. A rigid scene uses `zwidth.margins`. For
+        other scenes, one wall takes about 0.1 s, and many walls in one call some ms per wall.
         """
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
@@ -338,9 +338,10 @@ class SceneAnalysis(SceneParts):
 def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
     """Return whether searches for the stiffest wall and for islands include walls with B < 0.
 
-    By default they are included for a `zwidth.Device` whose velocity is a positive multiple of the difference of two
-    samples. They are excluded for a device given as a whole system: its true damping is unknown, so a wall with B < 0
-    would cancel modeled damping that may not exist. They are also excluded for the coupling of a simulated tool.
+    By default such walls are included for a `zwidth.Device` whose velocity estimate is a positive multiple of the
+    difference of two samples. They are excluded for a device given as a whole system: its true damping is unknown, so a
+    wall with B < 0 would cancel modeled damping that may not exist. They are also excluded if the wall is the virtual
+    coupling to a simulated tool.
     """
     if negative_damping is not None and not isinstance(negative_damping, bool | np.bool_):
         raise InputError(f"negative_damping: got {negative_damping!r}; pass True, False or None")

@@ -167,7 +167,7 @@ def list_notes(scene: Scene) -> list[str]:
 
 
 def list_tool_notes(scene: Scene) -> list[str]:
-    """Return a list with a note on worlds and tools other than the tool of the scene; empty without a tool."""
+    """Return a note on the stability of a virtual coupling with other tools than the scene's; empty without a tool."""
     if scene.tool is None:
         return []
     if scene.tool.integrator == "semi-implicit":

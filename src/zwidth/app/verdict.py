@@ -232,7 +232,7 @@ def spell_passivity(scene: Scene, verdict: Assessment) -> str:
 
 
 def _spell_worlds(scene: Scene) -> str:
-    """Return a phrase that states whether the coupling of a scene with a tool is stable with every passive world."""
+    """Return a phrase that states whether the virtual coupling of a scene is stable with every passive world."""
     try:
         safe = bool(scene.is_safe_for_every_world())
     except InputError:

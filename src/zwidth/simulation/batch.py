@@ -59,10 +59,10 @@ def name_bodies(scene: Parts) -> tuple[str, ...]:
 
 
 class Model(NamedTuple):
-    """Simulation model of one scene: its chain, estimates, delay, and units."""
+    """Simulation model of one scene: its open loop (chain), estimates, delay, and units."""
 
-    chain: Any  # only its plant and its delay are used
-    program: LoopEstimates  # estimates and further feedback; with another velocity estimate in place of FOAW
+    chain: Any  # open loop, of which only the plant and the delay are used
+    program: LoopEstimates  # linear estimates and further feedback; contains the backward difference in place of FOAW
     estimate: Any  # velocity estimate
     late: int  # integer delay, in periods
     fraction: float  # fractional delay, in periods
@@ -76,8 +76,8 @@ def build_model(scene: Any) -> Model:
     period, mass = float(scene.timing.period), float(scene.mass)
     chain: Any = build_chain(scene, estimate=Estimate())
     fraction = float(chain.d - chain.n_delay)
-    # For FOAW, build the program with another velocity estimate and keep the FOAW parameters separately, because FOAW
-    # is not a linear filter.
+    # `LoopEstimates` contains linear filters only. Replace the nonlinear FOAW by the backward difference in it, and
+    # store the parameters of FOAW separately.
     velocity, adapts = scene.velocity, isinstance(scene.velocity, FOAW)
     linear = replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene
     program = build_estimates(linear) or LoopEstimates(velocity=linear.velocity.estimate(period))

@@ -1,9 +1,9 @@
-"""Control program of a simulation at one sample: measure, estimate position and velocity, compute the command (T2).
+"""Control program of a simulation at one sample: measure, estimate position and velocity, compute the command.
 
-All functions are pure functions of arrays whose last axis is the batch. k is the index of a sample. A *ring* is a
-circular buffer of positions or commands, indexed by k modulo its length, a power of 2. FOAW is the adaptive velocity
-estimate of Janabi-Sharifi et al. 2000. The estimates and the further feedback are described in
-`simulation.parameters`; T2 is a step of docs/theory/simulation.md.
+k is the index of a sample. A *ring* is a circular buffer of positions or commands; sample k is stored at the index k
+modulo its length, a power of 2. All functions are pure functions of arrays whose last axis is the batch of simulations.
+FOAW is the adaptive velocity estimate of Janabi-Sharifi et al. 2000. `simulation.parameters` describes the estimates
+and the further feedback, and docs/theory/simulation.md the program as step T2.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ SLACK = 1.0 + 1e-9
 class FilterStates(NamedTuple):
     """States of the filters of the control program, each of shape (order, batch)."""
 
-    position: Array  # of the position estimate
-    velocity: Array  # of the velocity estimate
-    feedback: Array  # of the further feedback
+    position: Array  # state of the position estimate
+    velocity: Array  # state of the velocity estimate
+    feedback: Array  # state of the further feedback, such as an integral
 
 
 class Controller(NamedTuple):
@@ -76,7 +76,7 @@ def quantize(quantum: Any, position: Any) -> Any:
 def control(
     params: Parameters, options: Options, controller: Controller, k: Array, sensed: Array
 ) -> tuple[Controller, Reading]:
-    """Run the control program at one sample: measure, estimate the velocity and compute the command (T2).
+    """Run the control program at one sample: measure, estimate position and velocity, and compute the command.
 
     Args:
         params: parameters of the simulations.
@@ -128,7 +128,7 @@ def control(
 
 
 def _filter(part: Filter, state: Array, entering: Array) -> tuple[Array, Array]:
-    """Return the output of a filter for the input ``entering``, and its next state."""
+    """Return the output of a filter for the input ``entering``, and the next state of the filter."""
     output = part.D * entering
     if not len(state):
         return output, state
@@ -162,7 +162,7 @@ def start_controller(
 ) -> Controller:
     """Return the state of the control program before the first sample, after uniform motion without commands.
 
-    The estimates are stationary, and the state of the further feedback is 0.
+    The estimates are in steady state: their transients have decayed. The state of the further feedback is 0.
 
     Args:
         params: parameters of the simulations.
@@ -177,7 +177,8 @@ def start_controller(
     if options.position:
         past = np.where(params.filtered_input, position - back[:, None] * change, past)
         speed = np.where(params.filtered_input, change, speed)
-    # The input of the velocity filter is constant if the filter follows a position difference over a window.
+    # If the velocity estimate starts with a difference of positions over a window, the input of its filter is constant
+    # during uniform motion. Otherwise this input is the position, a ramp.
     differs = params.estimator.window > 0
     settled, _, _ = _settle(params.estimator.filter, np.where(differs, speed, past[0]), np.where(differs, 0.0, speed))
     feedback = np.zeros((len(params.feedback.filter.B), x.size))
@@ -186,7 +187,7 @@ def start_controller(
 
 
 def _settle(part: Filter, x: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the stationary state of a filter for the input ``x + k v``, and the value and change of its output.
+    """Return the steady state of a filter whose input at sample k is the ramp ``x + k v``, and the ramp of its output.
 
     Args:
         part: the filter.

@@ -5,9 +5,9 @@ over the batch. A period is divided into equal *substeps*, and a substep into *p
 length of the state x of the bodies (`simulation.mechanics`). The first body *slips*, or friction *holds* it. FOAW is
 the adaptive velocity estimate of Janabi-Sharifi et al. 2000. T1 to T7 are steps of docs/theory/simulation.md.
 
-In every period the control program computes the position estimate p from the measured position, the velocity estimate
-v from p or from the measured position, and the force r of the further feedback (`model.feedback`) from the measured
-position, p and v.
+In every period the control program computes the position estimate p from the measured position, and the velocity
+estimate v from p or from the measured position. The *further feedback* (`model.feedback`), such as an integral gain, is
+a force r in addition to the spring and damper of the wall, computed from p, v or the measured position.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Options(NamedTuple):
     jitter: bool  # some simulation has timestamp jitter
     foaw: int  # longest window of FOAW in samples; 0 for a linear velocity estimate
     position: bool  # the scenes have a position estimate
-    feedback: bool  # the scenes have further feedback
+    feedback: bool  # the scenes have further feedback, such as an integral gain
     record: bool  # readings and frames are recorded
     law: TracedLaw | None  # force law in place of the wall's spring and damper
 
@@ -97,7 +97,7 @@ class Motor(NamedTuple):
 
 
 class Filter(NamedTuple):
-    """A filter in state space, of order q."""
+    """State-space matrices of one filter per simulation, all of order q."""
 
     A: Array  # filter matrix, (q, q, batch)
     B: Array  # input vector, (q, batch)
@@ -108,16 +108,16 @@ class Filter(NamedTuple):
 class Estimator(NamedTuple):
     """Velocity estimate: a position difference over a window, followed by a filter; or FOAW."""
 
-    filter: Filter
+    filter: Filter  # filter after the difference
     window: Array  # length of the window in samples; 0 if the input of the filter is the position
     bound: Array  # noise bound of FOAW, in m
 
 
 class FeedbackLoop(NamedTuple):
-    """Further feedback: a filter whose input is a weighted sum of measured position, position and velocity estimate."""
+    """Further feedback force: a filter of a weighted sum of the measured position and the two estimates."""
 
     filter: Filter
-    weights: Array  # weights of the measured position, of p and of v, (3, batch)
+    weights: Array  # weights of measured position, position estimate and velocity estimate, (3, batch)
 
 
 class Parameters(NamedTuple):
@@ -134,9 +134,9 @@ class Parameters(NamedTuple):
     late: Array  # integer delay, in periods
     motor: Motor  # limits of the motor and friction
     position: Filter  # position estimate
-    filtered_input: Array  # True if the velocity estimate is computed from the position estimate
+    filtered_input: Array  # True if the velocity estimate is computed from the position estimate, not the measurement
     estimator: Estimator  # velocity estimate
-    feedback: FeedbackLoop  # further feedback
+    feedback: FeedbackLoop  # feedback in addition to spring and damper, such as an integral gain
     rate: Array  # matrix of x' = rate @ (x, u), (n, n + forces, batch)
     place: Array  # rows of the positions of the bodies, (bodies, n, batch)
     motion: Array  # rows of the velocities of the bodies, (bodies, n, batch)
@@ -173,10 +173,10 @@ def round_up(size: int) -> int:
 
 
 def _build_filters(estimates: Sequence[Estimate]) -> Filter:
-    """Return the filters of all scenes, padded to the largest order, with the scene as the first axis."""
+    """Return the state-space matrices of one filter per scene, padded to the largest order; first axis: scene."""
     count = len(estimates)
-    # Realize the filter without the difference over a window, because the engine computes this difference from a ring
-    # of the last positions.
+    # Omit the difference over a window from the filter, because the engine computes this difference from the stored
+    # positions of the last samples.
     filters = {
         k: realize_estimate(replace(each, window=0)) for k, each in enumerate(estimates) if each.degree > each.window
     }
@@ -191,11 +191,12 @@ def _build_filters(estimates: Sequence[Estimate]) -> Filter:
 
 
 def build_program(programs: Sequence[LoopEstimates], velocities: Sequence[Any], which: np.ndarray) -> dict[str, Any]:
-    """Return the estimates and the further feedback of all simulations, keyed by the fields of `Parameters`.
+    """Return the filters of the control program for all simulations, by the names of their fields in `Parameters`.
 
     Args:
-        programs: position estimate, velocity estimate and further feedback of each scene.
-        velocities: velocity estimate of each scene; different from that in ``programs`` for FOAW.
+        programs: position estimate, velocity estimate and further feedback of each scene, all linear.
+        velocities: velocity estimate of each scene, used in place of that in ``programs``, because it may be FOAW,
+            which is not linear.
         which: index of the scene of each simulation.
     """
     none = Estimate(0, 0.0)

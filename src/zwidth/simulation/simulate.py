@@ -62,11 +62,12 @@ def simulate(
     """Simulate devices on virtual walls, with contact, encoder, friction, motor limits and jitter.
 
     The device is propagated exactly between samples. The wall occupies positive positions and applies the force
-    ``-(K p_k + B v_k + r_k)``, with the estimates of position and velocity and the force of the further feedback at
-    sample k. Without a position estimate, p_k is the measured position; without further feedback, r_k is 0. Without
-    friction, encoder, limits and contact this is the linear loop whose stability `zwidth.Scene.is_stable` decides; the
-    simulation is independent of that decision. Before the start, the estimates are in the stationary state for the
-    start velocity. The states of the further feedback, such as an integral, are 0 at the start and outside of contact.
+    ``-(K p_k + B v_k + r_k)`` with the position estimate p_k, the velocity estimate v_k and the force r_k of the
+    further feedback at sample k. If a scene has no position estimate, p_k is the measured position. If it has no
+    further feedback, r_k is 0. Without friction, encoder, limits and contact this is the linear loop whose stability
+    `zwidth.Scene.is_stable` decides; the simulation is independent of that decision. At the start, both estimates are
+    in steady state for the start velocity: their transients have decayed. The states of the further feedback, such as
+    an integral, are 0 at the start and outside of contact.
 
     Args:
         scenes: a `zwidth.Scene`, or a list or array of scenes. Its shape and the shapes of the numbers below broadcast
@@ -74,11 +75,11 @@ def simulate(
             has no friction, and its energies are NaN.
         stiffness: K in N/m.
         virtual_damping: B in N s/m. If both are left out, each scene uses its own wall.
-        force: force law in place of the wall's spring and damper: a function of the position (m; estimated if the scene
-            has a position estimate, otherwise measured), the estimated velocity (m/s) and the time of the sample (s,
-            without jitter), arrays with one value per simulation. It returns the force on the device in N and is
-            written with `jax.numpy`. The law is compiled once, so it must not keep values between calls and must use
-            ``jnp.where`` in place of ``if``. Its force is sampled, held and delayed like that of a wall.
+        force: force law in place of the wall's spring and damper: a function of three arrays with one value per
+            simulation. They contain the position p_k in m (see above), the estimated velocity in m/s, and the time of
+            the sample in s, without jitter. It returns the force on the device in N and is written with `jax.numpy`.
+            The law is compiled once, so it must not keep values between calls and must use ``jnp.where`` in place of
+            ``if``. Its force is sampled, held and delayed like that of a wall.
         periods: number of sampling periods, >= 1.
         substeps: recorded instants per period, >= 1.
         start_position: in m; one value for all bodies, or a mapping by their names in `Motion`, as ``{"position": 0,
@@ -89,8 +90,8 @@ def simulate(
             ``external_force``.
         hand_history: recorded position in m of the far end of the spring and damper of a rigid `zwidth.Operator`,
             (..., periods + 1), linear between samples; its force is averaged over each period.
-        contact: "bilateral": the wall acts on both sides of its surface at 0; "unilateral": only at positions > 0,
-            estimated or measured as for ``force``; "push_only": unilateral, and it never pulls.
+        contact: "bilateral": the wall acts on both sides of its surface at 0; "unilateral": only at positions p_k > 0;
+            "push_only": unilateral, and it never pulls.
         resolution: step of the encoder in m, to which measured positions are rounded; 0 for an ideal sensor.
         noise: standard deviation of the measured position before rounding, in m.
         coulomb: Coulomb friction on the device while it slips, in N.

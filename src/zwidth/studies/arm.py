@@ -1,7 +1,8 @@
-"""Arms with several joints in a workspace study: the maximum stiffness for all poses and directions of a MuJoCo model.
+"""Maximum stiffness of walls on an arm with several joints, over the poses and directions of a workspace study.
 
-A pose is a set of joint positions. In each pose the wall acts on one point of the arm, along each of the directions
-(`zwidth.from_mujoco`). K and B are stiffness and damping of the wall, K_max is the maximum stable stiffness.
+A *pose* contains the position of each joint. The wall acts on one point of the arm, along one *direction*. The arm is a
+MuJoCo model (`zwidth.from_mujoco`). K and B are the stiffness and damping of the wall, and K_max is the maximum stable
+stiffness.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ _AXES = ("x", "y", "z")
 
 
 class JointAxis(NamedTuple):
-    """Positions of one joint, in rad or m."""
+    """All positions of one joint in a study, in rad or m."""
 
     axis: Axis
-    is_angle: bool | None  # None if the file gives numbers without units
+    is_angle: bool | None  # True for angles, False for lengths, None if the configuration contains no units
 
 
 def _read_joints(raw: Any) -> dict[str, JointAxis]:
-    """Validate the positions of joints, a mapping of joint names to axes, and return the axes by name."""
+    """Validate the field ``joints``, a mapping from the names of joints to their positions, and return it converted."""
     if not isinstance(raw, dict) or not raw:
         raise problem(f"got {describe(raw)}", "joints are a mapping of names to positions", "write {elbow: [30 deg]}")
     joints: dict[str, JointAxis] = {}
@@ -62,7 +63,7 @@ def _read_joints(raw: Any) -> dict[str, JointAxis]:
 
 
 def _list_texts(raw: Any) -> list[str]:
-    """Return all texts in a value, including those in nested lists and mappings."""
+    """Return all texts in a value of a configuration, including those in nested lists and mappings."""
     if isinstance(raw, str):
         return [raw]
     entries = raw.values() if isinstance(raw, dict) else raw if isinstance(raw, list | tuple) else ()
@@ -83,7 +84,7 @@ def _read_directions(raw: Any) -> tuple[Any, ...]:
 
 
 def _spell_joints(joints: dict[str, JointAxis]) -> dict[str, Any]:
-    """Return the positions of joints as in a configuration, with a unit where the file gives one."""
+    """Return the field ``joints`` as in a configuration, with a unit for each joint whose positions had a unit."""
     spelled = {}
     for name, (axis, is_angle) in joints.items():
         unit = {True: " rad", False: " m", None: ""}[is_angle]
@@ -93,7 +94,7 @@ def _spell_joints(joints: dict[str, JointAxis]) -> dict[str, Any]:
 
 
 def _map_numbers(written: Any, unit: str) -> Any:
-    """Return an axis of a configuration with the unit appended to each number, except the number of values."""
+    """Return the positions of a joint as in a configuration, with a unit after each number except the count ``num``."""
     if isinstance(written, dict):
         return {key: each if key == "num" else _map_numbers(each, unit) for key, each in written.items()}
     return [f"{each!r}{unit}" for each in written] if isinstance(written, list) else f"{written!r}{unit}"
@@ -175,7 +176,7 @@ class Arm(Strict, noun="an arm"):
         return float(f"{np.degrees(value) if self.units[name] == 'deg' else value:.12g}")
 
     def tabulate(self, count: int) -> dict[str, np.ndarray]:
-        """Return columns with the position of each joint, each pose repeated ``count`` times."""
+        """Return one table column per joint with its positions in all poses; each pose has ``count`` rows."""
         return {
             header(name, self.units[name]): np.repeat([self._show(name, pose[name]) for pose in self.poses], count)
             for name in self.joints
@@ -188,7 +189,7 @@ def _spell_direction(direction: Any) -> str:
 
 
 def compute_arm(arm: Arm, timing: Timing, units: UnitSystem) -> Outcome:
-    """Compute K_max for all poses and directions of an arm, and check one wall in all of them."""
+    """Compute K_max for all poses and directions of an arm, and test one softer wall in all of them."""
     cases = list(product(arm.poses, arm.directions))
     scenes: dict[int, Scene] = {}
     notes: list[str] = []
@@ -217,7 +218,7 @@ def compute_arm(arm: Arm, timing: Timing, units: UnitSystem) -> Outcome:
     ends = int(np.nanargmin(stiffness)), int(np.nanargmax(stiffness))
     low, high = (with_unit(round_conservatively(float(stiffness[k]), "below"), units["N/m"]) for k in ends)
     weakest = ends[0]
-    # Test the rounded wall in all poses and directions, because their ranges of stable B differ.
+    # Test the rounded wall in all poses and directions, because the range of stable B differs between them.
     wall = (
         round_conservatively(RECOMMENDED_SHARE * stiffness[weakest], "below"),
         float(f"{damping[weakest]:.4g}"),
@@ -236,9 +237,9 @@ def compute_arm(arm: Arm, timing: Timing, units: UnitSystem) -> Outcome:
 
 
 def _draw_poses(arm: Arm, coordinates: dict[str, np.ndarray], stiffness: np.ndarray) -> dict[str, Any]:
-    """Return the figure of K_max over the first two joints with several positions; no figure for fewer such joints.
+    """Return a figure of K_max over the first two joints that have several positions; empty for fewer such joints.
 
-    The value of a pose is the smallest one of all directions, and of all positions of further joints.
+    The figure shows the smallest K_max over all directions and over all positions of the other joints.
     """
     varied = [name for name, column in coordinates.items() if np.unique(column).size > 1][:2]
     if len(varied) < 2:

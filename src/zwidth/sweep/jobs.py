@@ -326,7 +326,8 @@ def _compute_walls(
     if wanted - {"spectral_radius"}:
         pole = scene.dominant_pole(stiffness, virtual_damping)
         results |= {"spectral_radius": pole.radius, "pole_angle": pole.angle, "frequency": pole.frequency}
-        # Compute these outputs from the decay rate, because the spectral radius rounds to 1 for slow decay.
+        # Compute the margin 1 - radius and the settling time from the decay rate of the pole, because the radius of a
+        # slowly decaying pole rounds to 1.
         margin, settling_time = -np.expm1(-pole.decay_rate * scene.timing.period), decay_time(pole.decay_rate)
         results |= {"decay_rate": pole.decay_rate, "margin": margin, "settling_time": settling_time}
     elif wanted:
@@ -334,7 +335,8 @@ def _compute_walls(
     for name in wanted:
         unknown |= np.isnan(results[name])
     if MARGIN_OUTPUTS & set(outputs):
-        # Do not derive the status from the stability margins, because a wall without such a margin has NaN.
+        # Add the stability margins after the check for NaN, because NaN is also the correct value of a margin that does
+        # not exist.
         margins = scene.margins(stiffness, virtual_damping)
         results |= {name: np.asarray(getattr(margins, name)) for name in MARGIN_OUTPUTS}
     if "passive" in outputs:

@@ -184,7 +184,7 @@ class Controls:
         return new.check()
 
     def check(self) -> Controls:
-        """Return the controls unchanged; raise `InputError` if the page cannot show the poles or the stable set."""
+        """Return the controls unchanged; raise `InputError` if the page cannot show their poles or stable walls."""
         # Build the loop, because this also checks combinations of parts, such as a cutoff above the Nyquist frequency.
         order = self.scene.loop.roots.order
         if order > _MOST_POLES:
@@ -193,7 +193,7 @@ class Controls:
                 "shorten the delay or the window, or use zwidth check"
             )
         if self.scene.tool is not None:
-            _ = self.scene.loop.stable_set  # raises an error if the set of stable couplings is unbounded
+            _ = self.scene.loop.stable_set  # raises `InputError` if the stiffness of stable couplings has no limit
         return self
 
     def _refuse_change(self, name: str) -> None:
