@@ -105,7 +105,7 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
     # One rotary value makes all devices of a file rotary. Skip fit studies, because the units in their logs
     # determine whether their devices are rotary.
     if isinstance(data, Mapping):
-        # The positions of joints may be angles, whatever the units of the wall.
+        # Skip the key "joints", because joint positions may be angles even if the wall acts on a linear motion.
         items = ((str(name), each) for name, each in data.items() if name != "joints")
         return data.get("kind") != "fit" and any(has_rotary_devices(each, name) for name, each in items)
     if isinstance(data, list):
