@@ -32,8 +32,8 @@ NEGLIGIBLE = 1e-16
 def factor_tool(response: ToolResponse) -> FactoredPlant:
     """Convert the response G_t of a tool to gain, zeros and poles."""
     gain, power, a2, a1, a0 = (float(value) for value in response)
-    # Compute the larger root of the quadratic first, and the smaller one as a quotient, so that no digits cancel. A tool
-    # without spring has a0 = 0, so its pole at z = 1 is exact.
+    # Compute the larger root of the quadratic first, and the smaller root as a quotient, so that no digits cancel. A
+    # tool without spring has a0 = 0, so its pole at z = 1 is exact.
     root = np.sqrt(complex(a1 * a1 - 4.0 * a2 * a0))
     large = 0.5 * (a1 + root)
     offsets = np.array([large / a2, a0 / large if large else 0.0])
@@ -79,7 +79,8 @@ def _find_zeros(terms: Terms) -> tuple[float, Array]:
     parts = [gain * np.pad(np.atleast_1d(np.poly(1.0 - offsets)).real, (0, power)) for gain, offsets, power in reduced]
     numerator = np.trim_zeros(np.polyadd(*parts), "f")
     while numerator.size > 1 and abs(numerator[0]) < FAR_ZERO * abs(numerator[1]):
-        # Drop a negligible leading coefficient: its zero is so far from the unit circle that A hardly changes there.
+        # Drop a negligible leading coefficient. The zero of A that it causes is too far from the unit circle to affect
+        # the values of A on the circle.
         numerator = numerator[1:]
     zeta = _refine(reduced, np.roots(numerator) - 1.0 + 0j)
     return float(numerator[0]), np.concatenate([-zeta, np.ones(at_origin)])
