@@ -102,7 +102,7 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
         dimension = DIMENSIONS[SYSTEMS[bool(detect_kind(number))][unit]]
         return read_quantity(number, dimension, allowed, counts=counts)[0]
 
-    # The unit rad/s of a bandwidth does not make a device rotary, so its type has another name.
+    # Give the type of a bandwidth another name, because its unit rad/s does not imply a rotary device.
     return Parsed("bandwidth" if unit == "1/s" else "quantity", read)
 
 

@@ -97,7 +97,7 @@ def to_array(raw: Any) -> np.ndarray:
 
 
 def _check_numbers(raw: Any) -> Any:
-    """Return the value unchanged; raise a problem if it is neither a finite number nor a list of finite numbers."""
+    """Return ``raw`` unchanged; raise a validation error if it is neither a finite number nor a list of them."""
     with suppress(ValueError):
         if np.all(np.isfinite(to_array(raw))):
             return raw

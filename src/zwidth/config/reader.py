@@ -49,7 +49,8 @@ from zwidth.units.unit_system import SYSTEMS
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
-# Keys whose values do not indicate rotary devices: free texts, and the phase margin, an angle for all devices.
+# Keys whose values do not indicate rotary devices: free texts; the phase margin, which is an angle for all devices; and
+# bandwidths, which are in rad/s for all devices.
 _KEYS_WITHOUT_UNIT = ("name", "description", "label", "phase_margin", "bandwidth", "position.bandwidth")
 MAX_FILE_BYTES = 2**20  # bytes (1 MiB)
 MAX_NODES = 50_000  # values per file; aliased values count once per use

@@ -52,7 +52,7 @@ class ControllerParts:
     feedback: IntegralFeedback | None = None
 
     def keys(self) -> Iterator[str]:
-        """Return the names of the parts, for ``**controller``."""
+        """Return the names of the parts, so that ``**controller`` passes them as keyword arguments."""
         return (item.name for item in fields(self))
 
     def __getitem__(self, name: str) -> Any:

@@ -25,7 +25,7 @@ RULES = ("backward", "forward", "trapezoidal")
 
 
 class Weights(NamedTuple):
-    """Weights of the two estimates in the input of the filter R0, for time in sampling periods."""
+    """Weights of position estimate and velocity estimate in the input of R0, for time in sampling periods."""
 
     position: Any  # w_p
     velocity: Any  # w_v

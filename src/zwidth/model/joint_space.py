@@ -405,7 +405,8 @@ def _read_position(model: Any, index: int, value: Any) -> float:
     """
     (joint,) = np.flatnonzero(np.asarray(model.jnt_qposadr) == index)
     name = model.joint(int(joint)).name
-    # Accept a number that is given as text, because an array with one text contains only texts. It is in rad or m.
+    # Accept a number that is given as text, because an array with one text contains only texts. A number without a unit
+    # is in rad or m.
     value = float(value) if isinstance(value, str) and looks_like_number(value) else value
     unit = "m" if list_joints(model).get(name) == "slide" else "rad"
     return check_number(f"pose.{name}", value, unit, ANY)

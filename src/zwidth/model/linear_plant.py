@@ -44,8 +44,8 @@ class System:
     mass: Any  # unit of mass in kg
     d: Any  # delay in periods
     n_delay: int  # integer part of d
-    estimate: Estimate  # velocity estimate F; F = V/P (`model.loop_estimates`) if ``estimates`` is not None
-    estimates: LoopEstimates | None = None  # None without position estimate and further feedback
+    estimate: Estimate  # velocity estimate; divided by the position estimate if ``estimates`` is not None
+    estimates: LoopEstimates | None = None  # None if there is neither a position estimate nor further feedback
 
     @property
     def sampled(self) -> bool:

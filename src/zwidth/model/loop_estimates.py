@@ -40,7 +40,7 @@ class LoopEstimates:
     """Transfer functions P, V and R of a scene that has a position estimate, further feedback, or both."""
 
     position: Estimate = field(default_factory=lambda: Estimate(0))  # P
-    velocity: Estimate = field(default_factory=Estimate)  # F for the structure "series", otherwise V
+    velocity: Estimate = field(default_factory=Estimate)  # F = V/P for the structure "series", otherwise V
     structure: Literal["series", "separate", "common"] = "series"
     feedback: FurtherFeedback | None = None
 

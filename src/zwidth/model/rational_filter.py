@@ -71,7 +71,7 @@ class RationalFilter(Part):
             self._check_poles()
 
     def _combine_forms(self) -> None:
-        """Convert ``sos`` and zeros, poles and gain to sections in ``numerator`` and ``denominator``."""
+        """Convert the forms ``sos`` and zeros-poles-gain to sections of ``numerator`` and ``denominator``."""
         if (self.numerator is None) != (self.denominator is None) or (self.poles is None) != (self.gain is None):
             raise InputError(
                 f"{self._owner}: got half of a form; give numerator and denominator, sos, or poles and gain"
@@ -133,7 +133,7 @@ class RationalFilter(Part):
 
     @cached_property
     def _roots(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """The zeros and the poles other than 0, as offsets; and the number of poles minus that of zeros at z = 0."""
+        """Offsets of the zeros and poles other than z = 0, and number of poles minus number of zeros at z = 0."""
         roots, trailing = [], []
         for part in self._sections:
             sections = [np.array(section) for section in part]

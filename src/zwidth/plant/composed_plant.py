@@ -25,7 +25,8 @@ from zwidth.numerics.polynomials import compute_aberth_step
 from zwidth.plant.factored_plant import CONVERGED_STEP, FAR_ZERO, FactoredPlant
 
 MAX_STEPS = 60  # largest number of Aberth steps
-# Zeros with |A| below this multiple of the two terms of A are not refined, because A is then only a rounding error.
+# |A| relative to the sum of the magnitudes of its two terms. Below this limit, A is only a rounding error, so its zero
+# is not refined further.
 NEGLIGIBLE = 1e-16
 
 

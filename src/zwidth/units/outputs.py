@@ -13,8 +13,9 @@ from typing import Any, Literal, TypeAlias
 from zwidth.core.status import Status
 
 Family: TypeAlias = Literal["wall", "device"]  # an output has one value per wall, or one value per device and delay
-# Kinds of color scales: "truth" for truth values, "diverging" for numbers with a good and a bad side of a center,
-# "logarithmic" for positive numbers, "steep" for positive numbers that may be infinite, "sequential" for other numbers.
+# Kinds of color scales: "truth" for truth values, "diverging" for numbers that are good on one side of a limit and bad
+# on the other, "logarithmic" for positive numbers, "steep" for positive numbers that may be infinite, "sequential" for
+# other numbers.
 ColorScale: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
 NOT_COMPUTED = 255  # status of points that are not computed yet; all other codes are those of `zwidth.Status`
 
