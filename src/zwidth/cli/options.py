@@ -102,7 +102,7 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False, cou
         dimension = DIMENSIONS[SYSTEMS[bool(detect_kind(number))][unit]]
         return read_quantity(number, dimension, allowed, counts=counts)[0]
 
-    # The unit rad/s of a bandwidth does not make a device rotary, so its type has another name.
+    # Give the type of a bandwidth another name, because its unit rad/s does not imply a rotary device.
     return Parsed("bandwidth" if unit == "1/s" else "quantity", read)
 
 
@@ -233,7 +233,7 @@ def take_options(
 
 
 def _find_sampled_period(values: dict[str, Any]) -> float | None:
-    """Return the period of the loop in s if the option --sampled is given, otherwise None; remove this option."""
+    """Remove the option --sampled from ``values``; return the sampling period in s if it was given, otherwise None."""
     if not values.pop("sampled", False):
         return None
     if "rate" in values or "period" in values:
@@ -387,7 +387,7 @@ def find_omitted() -> frozenset[str]:
     Friction is included only if the command simulates an encoder.
     """
     given, hardware = click.get_current_context().params, get_hardware()
-    # A sampled device includes its delay.
+    # Do not report the delay as missing with --sampled, because the transfer function of the device includes the delay.
     named = () if given.get("scene_file") is not None else ("damping", *(() if given.get("sampled") else ("delay",)))
     omitted = {name for name in named if given.get(name) is None}
     values = {name: hardware.get(name) if given[name] is None else given[name] for name in HARDWARE if name in given}

@@ -1,7 +1,7 @@
-"""Parts of a scene from command-line options: velocity and position estimate, further feedback and other parts.
+"""Build the parts of a scene from command-line options: estimates, further feedback and other parts.
 
-The parameters of a part are given by a dictionary by field name. If the option of the kind is missing, the other
-options imply it.
+The *kind* of an estimate or of further feedback, such as "low_pass", selects its class. If no option gives the kind,
+the other options imply it. The parameters of a part are dictionaries keyed by field name.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ FILTER_HELP = (
     "Velocity estimate as a transfer function in z from position to velocity: 'NUM / DEN', such as '1000 -1000 / 1 0', "
     "'zpk: ZEROS / POLES / GAIN' or 'sos: b0 b1 b2 a0 a1 a2; ..'."
 )
-# Parameters of a low-pass filter that exclude each other; one of them must be given.
+# Parameters of low-pass and exponential filters that exclude each other; exactly one of them must be given.
 _ONE_OF = {"cutoff", "time_constant", "coefficient"}
-_KINDS: dict[str, dict[str, Any]] = {"velocity": ESTIMATES, **WITH_KIND}  # classes by owner and kind
+_KINDS: dict[str, dict[str, Any]] = {"velocity": ESTIMATES, **WITH_KIND}  # classes by name of the part and by kind
 _NOUNS = {"velocity": "a velocity estimate", "position": "a position estimate", "feedback": "feedback"}
 
 
@@ -33,7 +33,7 @@ def name_option(path: str) -> str:
 
 
 def _list_needed(kind: Any) -> list[str]:
-    """Return the names of the fields without default value of the class ``kind`` of a part."""
+    """Return the names of the required fields, those without default value, of ``kind``, the class of a part."""
     return [item.name for item in fields(kind) if item.default is MISSING]
 
 
@@ -48,16 +48,16 @@ def make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
 
 
 def select_part(given: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the parameters of one part from the options, as a dict by field name."""
+    """Return the parameters of the part ``name`` from the options, as a dict keyed by field name."""
     return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
 
 
 def imply_kind(owner: str, given: dict[str, Any]) -> str:
-    """Return the kind of an estimate or of further feedback that the given parameters imply.
+    """Return the kind of a part, such as "low_pass", that the given parameters imply.
 
     Args:
-        owner: "velocity", "position" or "feedback".
-        given: parameters by field name, without ``kind``.
+        owner: name of the part, "velocity", "position" or "feedback".
+        given: parameters keyed by field name, without ``kind``.
     """
     if owner == "feedback":
         return "integral"
@@ -69,11 +69,11 @@ def imply_kind(owner: str, given: dict[str, Any]) -> str:
 
 
 def make_kind(owner: str, given: dict[str, Any]) -> Any:
-    """Return the velocity estimate, position estimate or further feedback with given parameters.
+    """Return a velocity estimate, position estimate or further feedback with the given parameters.
 
     Args:
-        owner: "velocity", "position" or "feedback".
-        given: parameters by field name, and optionally ``kind``.
+        owner: name of the part, "velocity", "position" or "feedback".
+        given: parameters keyed by field name, and optionally ``kind``.
     """
     given = dict(given)
     if owner == "velocity" and "filter" in given:
@@ -97,26 +97,28 @@ def make_kind(owner: str, given: dict[str, Any]) -> Any:
     except InputError as error:
         if owner != "position":
             raise
-        # Name the field of the position, because the filters of the velocity estimate are also position estimates.
+        # Replace "velocity" by "position" at the start of the message. Low-pass filters are velocity estimates, which
+        # are also used as position estimates, and their messages name the velocity.
         raise InputError(re.sub("^velocity", owner, str(error))) from None
 
 
 def change_kind(owner: str, part: Any, given: dict[str, Any]) -> Any:
-    """Return a part of a scene file with the parameters replaced that are given as options.
+    """Return a part of a scene file, changed by the parameters that are given as options.
 
     Args:
-        owner: "velocity", "position" or "feedback".
-        part: part of the file; None if the file has none.
-        given: parameters by field name, and optionally ``kind``. If they do not belong to the part of the file, the
-            part is replaced.
+        owner: name of the part, "velocity", "position" or "feedback".
+        part: the part in the scene file; None if the file does not contain this part.
+        given: parameters keyed by field name, and optionally ``kind``. If the part in the file does not have one of
+            these parameters, a new part replaces it.
     """
     kept: dict[str, Any] = {}
     if part is not None and "kind" not in given:
         spelled = spell_kind(part, _KINDS[owner])
-        # The gain of a filter is that of its roots, but the option --feedback-gain is the integral gain.
+        # Replace a filter if --feedback-gain is given, because this option is an integral gain. The field ``gain`` of a
+        # filter has another meaning: it belongs to the form of zeros, poles and gain.
         names = {item.name for item in fields(part)} - ({"gain"} if spelled["kind"] == "filter" else set())
         kept = spelled if given.keys() <= names else {}
     if given.keys() & _ONE_OF:
-        # If an option gives one of the parameters that exclude each other, drop all of these values of the file.
+        # Drop the values of the file for all parameters in `_ONE_OF`, because these parameters exclude each other.
         kept = {name: value for name, value in kept.items() if name not in _ONE_OF}
     return make_kind(owner, {**kept, **given})

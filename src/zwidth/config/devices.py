@@ -1,8 +1,8 @@
 """Models of devices: a sampled mass with damping, a linear system, and a measured frequency response.
 
 Sections are either in SI units ("physical") or normalized; `OneKind` reports keys of the other kind. A linear system
-or a measured response replaces mass, damping and mechanical parts. Its forms are: numerator and denominator, zeros,
-poles and gain, the matrices A, B and C, or second-order sections.
+or a measured response replaces mass, damping and mechanical parts. A linear system has one of four forms: numerator and
+denominator; zeros, poles and gain; the matrices A, B and C; or second-order sections.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Models of the optional parts of a scene, such as estimates, further feedback, operator, coupling and modes.
+"""Pydantic models of the optional parts of a scene in configurations, such as estimates, operator, coupling and modes.
 
-Parts are those in addition to the device and its timing. The model of a section is generated from the dataclass of
-the part in `zwidth.model`: its fields are the keys, and `units.quantities` declares their units and ranges. The part
-itself validates combinations of values.
+Each part has a *section*, a mapping in the configuration. Parts with several *kinds*, such as the velocity estimate,
+select one by the key ``kind``. The model of a section is generated from the dataclass of the part in `zwidth.model`:
+its fields are the keys, and `units.quantities` declares their units and ranges. The dataclass validates combinations
+of values.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ class PartSection(Strict):
 
 
 def to_array(raw: Any) -> np.ndarray:
-    """Return a number or a list as an array, complex if an entry is a text such as "-3+40j".
+    """Convert a number or a list to an array; the array is complex if an entry is a text such as "-3+40j".
 
     Raises:
         ValueError: if an entry is not a number.
@@ -96,7 +97,7 @@ def to_array(raw: Any) -> np.ndarray:
 
 
 def _check_numbers(raw: Any) -> Any:
-    """Return the value unchanged; raise a problem if it is not a number or a list of finite numbers."""
+    """Return ``raw`` unchanged; raise a validation error if it is neither a finite number nor a list of them."""
     with suppress(ValueError):
         if np.all(np.isfinite(to_array(raw))):
             return raw
@@ -141,8 +142,9 @@ def make_section(part: Any, owner: str, noun: str, kind: str = "") -> type[PartS
         keys[item.name] = (form | None if default is None else form, Field(default, description=description))
     prefix, description = "", _head(part)
     if owner == "position" and part in ESTIMATES.values():
-        # Name and describe a velocity filter differently as a position estimate, which has no difference. The names of
-        # the models in a schema are unique.
+        # Velocity estimates are also used as position estimates. Give the model of the position estimate another name,
+        # because names in a schema must be unique. Omit the difference from its description, because a position
+        # estimate uses only the filter.
         prefix, description = "Position", description.removeprefix("The backward difference, followed by ")
         description = description[0].upper() + description[1:]
     section = create_model(f"{prefix}{part.__name__}Section", __base__=PartSection, __doc__=description, **keys)
@@ -155,7 +157,7 @@ def _head(part: Any) -> str:
     return part.__doc__.partition("\n")[0]
 
 
-# Descriptions of the keys of a filter that is given by its roots or by second-order sections.
+# Schema descriptions of the keys of a filter that is given by second-order sections or by zeros, poles and gain.
 _ROOTS = {
     "sos": "Second-order sections of the filter, rows of the coefficients b0 b1 b2 a0 a1 a2.",
     "zeros": "Zeros of the filter in the z plane; complex zeros as text such as '0.9+0.1j', with conjugates.",
@@ -167,7 +169,10 @@ _ROOTS = {
 def _describe(path: str, item: Any, part: Any) -> tuple[Any, str]:
     """Return the type annotation of a key, and its description for the schema.
 
-    ``path`` is the name of the key in `units.quantities`, ``item`` the field of the dataclass ``part``.
+    Args:
+        path: name of the key in `units.quantities`.
+        item: field of the dataclass from which the key is generated.
+        part: the dataclass.
     """
     if path in CHOICES:
         return Literal[CHOICES[path].names], f"{CHOICES[path].sentence}."
@@ -204,9 +209,12 @@ def read_velocity(raw: Any, sections: dict[str, type[PartSection]] = _LINEAR) ->
 def _make_one_of(
     sections: dict[str, type[PartSection]], read: Callable[[Any, dict[str, type[PartSection]]], Any]
 ) -> GetPydanticSchema:
-    """Return the annotation of a field that accepts each of ``sections``, selected by its key ``kind``.
+    """Return the annotation of a field whose value is a section of one of several kinds.
 
-    ``read`` returns the model of the section for the value of the configuration and ``sections``.
+    Args:
+        sections: models of the sections, keyed by kind.
+        read: function that validates a value of the configuration, with the arguments (value, ``sections``), and
+            returns the model of its section.
     """
     every = Annotated[Union[tuple(sections.values())], Field(discriminator="kind")]  # noqa: UP007
     validated = Annotated[every, WrapValidator(lambda raw, _: read(raw, sections))]
@@ -215,7 +223,7 @@ def _make_one_of(
 
 VelocityField = Annotated[PartSection, _make_one_of(_LINEAR, read_velocity)]
 SimulatedVelocityField = Annotated[PartSection, _make_one_of(_ESTIMATES, read_velocity)]
-# Description and noun of the parts that have several kinds, and an example for messages.
+# Description in the schema, noun for messages and example for messages of each part that has several kinds.
 _OF_KIND = {
     "position": ("Position estimate", "a position estimate", "{kind: exponential, coefficient: 0.3}"),
     "feedback": ("Further feedback", "further feedback", "{kind: integral, gain: 1000}"),
@@ -223,7 +231,7 @@ _OF_KIND = {
 
 
 def _make_kinds(name: str) -> Any:
-    """Return the type of the field of a part with several kinds, such as "position"."""
+    """Return the annotation of the field for the part ``name``, which has several kinds, such as "position"."""
     _, noun, example = _OF_KIND[name]
     sections = {
         kind: make_section(part, name, f"{noun} of kind {kind}", kind) for kind, part in WITH_KIND[name].items()

@@ -49,7 +49,8 @@ from zwidth.units.unit_system import SYSTEMS
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
-# Keys whose values do not indicate rotary devices: free texts, and the phase margin, an angle for all devices.
+# Keys whose values do not indicate rotary devices: free texts; the phase margin, which is an angle for all devices; and
+# bandwidths, which are in rad/s for all devices.
 _KEYS_WITHOUT_UNIT = ("name", "description", "label", "phase_margin", "bandwidth", "position.bandwidth")
 MAX_FILE_BYTES = 2**20  # bytes (1 MiB)
 MAX_NODES = 50_000  # values per file; aliased values count once per use
@@ -105,7 +106,7 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
     # One rotary value makes all devices of a file rotary. Skip fit studies, because the units in their logs
     # determine whether their devices are rotary.
     if isinstance(data, Mapping):
-        # The positions of joints may be angles, whatever the units of the wall.
+        # Skip the key "joints", because joint positions may be angles even if the wall acts on a linear motion.
         items = ((str(name), each) for name, each in data.items() if name != "joints")
         return data.get("kind") != "fit" and any(has_rotary_devices(each, name) for name, each in items)
     if isinstance(data, list):

@@ -248,7 +248,7 @@ class Part:
 
 
 def _is_bandwidth(path: str) -> bool:
-    """Return whether a parameter is a bandwidth, whose unit rad/s does not make a device rotary."""
+    """Return whether a parameter is a bandwidth, whose unit rad/s does not imply a rotary device."""
     return path in FIELDS and FIELDS[path].unit == "1/s"
 
 

@@ -1,12 +1,13 @@
-"""Conversion between the gains of usual controllers and the wall, estimates and feedback of a scene.
+"""Convert the gains of PID and cascade controllers to a wall, estimates and further feedback, and back.
 
-A PID controller computes the force ``kp e + ki T sum(e) - kd v`` from the position error e = -x, so that K = kp and
-B = kd, and ki is further feedback. A *cascade* of a position loop and a velocity loop computes
+A PID controller computes the force ``kp e + ki T sum(e) - kd v`` from the position error e = -x and the velocity v, so
+that K = kp and B = kd. Its integral part is further feedback (`model.feedback`) with the gain ki. A *cascade* of a
+position loop and a velocity loop computes
 
     e_v = pos_gain e - v        force = vel_gain e_v + vel_integrator_gain T sum(e_v)
 
-so that B = vel_gain and K = pos_gain vel_gain. Its integrator is further feedback with the weights ``pos_gain`` of the
-position estimate and 1 of the velocity estimate.
+so that B = vel_gain and K = pos_gain vel_gain. The integrator of the cascade is further feedback, which integrates
+-e_v: ``pos_gain`` times the position estimate plus the velocity estimate.
 
 Motor controllers measure angles in turns or degrees, and their output may be a current or a voltage. The *output unit*
 is the force or torque per unit of output: the torque constant in N m/A, or the torque constant divided by the winding
@@ -31,7 +32,7 @@ from zwidth.units.display import compact_repr
 from zwidth.units.quantities import ANY
 
 PositionUnit = Literal["m", "rad", "turns", "degrees"]
-_UNITS = {"m": 1.0, "rad": 1.0, "turns": 2.0 * math.pi, "degrees": math.pi / 180.0}  # in m or rad
+_UNITS = {"m": 1.0, "rad": 1.0, "turns": 2.0 * math.pi, "degrees": math.pi / 180.0}  # size of each unit, in m or rad
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class ControllerParts:
         wall: stiffness K and damping B of the controller.
         velocity: velocity estimate.
         position: position estimate; None for the measured position.
-        feedback: integral part; None without one.
+        feedback: integral part; None for a controller without integral part.
     """
 
     wall: VirtualWall
@@ -51,7 +52,7 @@ class ControllerParts:
     feedback: IntegralFeedback | None = None
 
     def keys(self) -> Iterator[str]:
-        """Return the names of the parts, for ``**controller``."""
+        """Return the names of the parts, so that ``**controller`` passes them as keyword arguments."""
         return (item.name for item in fields(self))
 
     def __getitem__(self, name: str) -> Any:
@@ -61,11 +62,11 @@ class ControllerParts:
 
 @compact_repr()
 class PidGains(NamedTuple):
-    """Gains of a PID controller, in its own units."""
+    """Gains of a PID controller, in the units of the controller."""
 
     kp: float  # output per position unit
-    ki: float  # output per position unit and second
-    kd: float  # output per position unit per second
+    ki: float  # output per (position unit times s)
+    kd: float  # output per velocity unit, i.e. per (position unit/s)
 
 
 @compact_repr()
@@ -73,18 +74,18 @@ class CascadeGains(NamedTuple):
     """Gains of a position loop with an inner velocity loop, in the units of the controller."""
 
     pos_gain: float  # 1/s
-    vel_gain: float  # output per velocity unit
-    vel_integrator_gain: float  # output per velocity unit and second
+    vel_gain: float  # output per velocity unit, i.e. per (position unit/s)
+    vel_integrator_gain: float  # output per position unit, because the integral of the velocity is a position
 
 
 def _find_scale(units: PositionUnit, output_unit: float) -> float:
-    """Return the stiffness in SI units of a controller whose output is 1 per position unit."""
+    """Return the factor that converts a gain of the controller to SI units: output unit divided by position unit."""
     check_choice("units", units, tuple(_UNITS))
     return _read_gain("output_unit", output_unit) / _UNITS[units]
 
 
 def _read_gain(name: str, gain: Any) -> Any:
-    """Convert a gain to a float; raise `InputError` for a text with a unit or a value that is not finite."""
+    """Convert a gain to a float; raise `InputError` if it is a text with a unit or not finite."""
     if isinstance(gain, str):
         raise InputError(
             f"{name}: got the text {gain!r}; pass a number in the unit of your controller, which the arguments units "
@@ -108,11 +109,11 @@ def pid(
 
     Args:
         kp: output per position unit; K = kp in SI units.
-        ki: output per position unit and second.
-        kd: output per position unit per second; B = kd in SI units.
-        derivative_filter: time constant in s of a first-order low-pass of the derivative; or a velocity estimate; None
-            for the backward difference.
-        position: filter of the position that all three terms use; None for the measured position.
+        ki: output per (position unit times s).
+        kd: output per velocity unit, i.e. per (position unit/s); B = kd in SI units.
+        derivative_filter: time constant in s of a first-order low-pass filter of the derivative; or any velocity
+            estimate; None for the backward difference.
+        position: position estimate, from which all three terms are computed; None for the measured position.
         rule: rule of integration, see `IntegralFeedback`.
         units: position unit of the gains: "m", "rad", "turns" (moteus) or "degrees".
         output_unit: force in N or torque in N m per unit of output, such as the torque constant in N m/A.
@@ -185,16 +186,17 @@ def cascade(
 ) -> ControllerParts:
     """Return the parts of a scene for a position loop with an inner velocity loop, as in ODrive, VESC and SimpleFOC.
 
-    The wall is K = pos_gain vel_gain and B = vel_gain. The integrator of the velocity loop is further feedback, whose
-    gain does not change if an analysis varies K and B. The maximum stiffness of the scene is therefore that of a
-    controller with this fixed integrator. The gain margin of the scene scales all gains of the controller together.
+    The wall is K = pos_gain vel_gain and B = vel_gain. The integrator of the velocity loop is further feedback, which
+    stays fixed if an analysis varies K and B. Therefore the maximum stiffness of the scene holds for this integrator
+    gain. The gain margin of the scene is a common factor on all gains, including the integrator gain.
 
     Args:
         pos_gain: gain of the position loop in 1/s.
         vel_gain: output per velocity unit, in N m/(turn/s) for ODrive.
-        vel_integrator_gain: output per velocity unit and second, in N m/turn for ODrive.
+        vel_integrator_gain: output per position unit, in N m/turn for ODrive.
         position: position estimate, such as ``zwidth.Pll(1000)``; None for the measured position.
-        velocity: velocity estimate; None for the backward difference, or for that of the observer or PLL.
+        velocity: velocity estimate; None for the backward difference or, if ``position`` is an observer or PLL, for the
+            velocity estimate of ``position``.
         rule: rule of integration, see `IntegralFeedback`: "backward", "forward" (ODrive), "trapezoidal" (SimpleFOC).
         units: position unit: "turns" (ODrive, moteus), "degrees", "rad" (SimpleFOC) or "m".
         output_unit: torque in N m per unit of output: 1 for a torque (ODrive), the torque constant in N m/A for a

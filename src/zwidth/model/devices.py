@@ -236,7 +236,7 @@ def read_device(text: str, sampled: Any = None) -> PublishedDevice | LinearDevic
     Args:
         text: the name of a device for `find_device`; a transfer function, "NUMERATOR / DENOMINATOR" or another text
             that `LinearDevice` accepts; or the name of a file for `zwidth.MeasuredDevice.read`.
-        sampled: sampling period in s of a transfer function in z; None for one in s.
+        sampled: sampling period in s for a transfer function in z; None for a transfer function in s.
 
     Raises:
         InputError: the text is none of these, or ``sampled`` is given for a device that is not a transfer function.

@@ -1,6 +1,7 @@
-"""Linear estimates: transfer functions in z, for time in sampling periods, by gain, zeros, poles and a difference.
+"""Factored form of a linear velocity or position estimate F(z): gain, zeros, poles and a difference of two samples.
 
-Zeros and poles are stored as offsets ``1 - root``, which are accurate for roots near z = 1.
+F is the transfer function from the measured position to the estimate, for the sampling period T = 1. Zeros and poles
+are stored as *offsets* ``1 - root``, which are accurate for roots near z = 1.
 """
 
 from __future__ import annotations
@@ -16,20 +17,20 @@ from zwidth.model.circle_functions import CirclePoints, Jet, power_jet, product_
 
 @dataclass(frozen=True)
 class Estimate:
-    """A velocity estimate F for T = 1: a difference over ``window`` periods, followed by a filter.
+    """A linear estimate F for T = 1: a difference over ``window`` periods, followed by a filter.
 
     ``F(z) = gain prod(z - z_i)/(z^lag prod(z - p_i)) (1 - z^-window)/window`` with zeros z_i and poles p_i. The last
     factor is omitted for a window of 0.
     """
 
-    window: int = 1
+    window: int = 1  # length of the difference in periods; 0: no difference
     gain: Any = 1.0
-    lag: int = 0
+    lag: int = 0  # number of poles at z = 0; if negative, number of zeros at z = 0
     zeros: Any = field(default_factory=lambda: np.zeros(0, complex))  # offsets 1 - z_i of the zeros
     poles: Any = field(default_factory=lambda: np.zeros(0, complex))  # offsets 1 - p_i of the poles
 
     def jet(self, points: CirclePoints) -> Jet:
-        """Return F and its derivative with respect to w at points e^(jw) of the unit circle."""
+        """Return F and its derivative with respect to the angle w, at points e^(jw) of the unit circle."""
         xp = namespace(points.w)
         product = product_jet(points, self.zeros, self.gain)
         if self.poles.size:
@@ -40,7 +41,7 @@ class Estimate:
             delayed = power_jet(points, -self.window)
             n = self.window
             s = xp.sin(0.5 * n * points.w)
-            # Replace 1 - cos(n w) by 2 sin^2(n w/2), because the difference would cancel at low frequencies.
+            # Compute the real part 1 - cos(n w) as 2 sin^2(n w/2), because the difference loses digits for small w.
             value = xp.where(points.w >= np.pi, 1.0 - delayed.value, 2.0 * s * s - 1j * delayed.value.imag) / n
             product = product.times(Jet(value, -delayed.slope / n))
         return product
@@ -54,5 +55,5 @@ class Estimate:
 
     @property
     def degree(self) -> int:
-        """Order of F: window + abs(lag) + number of zeros and poles; larger than ``window`` if F has a filter."""
+        """Sum of window, abs(lag), number of zeros and number of poles; equals ``window`` if there is no filter."""
         return self.window + abs(self.lag) + self.zeros.size + self.poles.size

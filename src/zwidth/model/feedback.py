@@ -1,9 +1,9 @@
-"""Further feedback: a fixed transfer function R(z) from position to force, in addition to the spring and the damper.
+"""Further feedback: a fixed filter R0(z), such as an integrator, that adds a force to those of spring and damper.
 
-The force of the controller is ``-(K P + B V + R) x`` with the measured position x, the position estimate P and the
-velocity estimate V. The further feedback is a filter R0 whose input is the measured position, or a weighted sum of the
-two estimates: ``R = R0`` or ``R = R0 (w_p P + w_v V)``. Poles of R0 may be on or outside the unit circle, such as the
-pole of an integrator at z = 1; the stability of the closed loop includes them.
+The input of R0 is the measured position x or a weighted sum of the two estimates, the position estimate P x and the
+velocity estimate V x. The total force is ``-(K P + B V + R) x`` with ``R = R0`` or ``R = R0 (w_p P + w_v V)``. Poles of
+R0 may be on or outside the unit circle, such as the pole of an integrator at z = 1. The stability analysis of the
+closed loop includes these poles.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ RULES = ("backward", "forward", "trapezoidal")
 
 
 class Weights(NamedTuple):
-    """Weights of the position estimate P and of the velocity estimate V, for T = 1, in the input of the feedback."""
+    """Weights of position estimate and velocity estimate in the input of R0, for time in sampling periods."""
 
-    position: Any
-    velocity: Any
+    position: Any  # w_p
+    velocity: Any  # w_v
 
 
 def _read_weights(part: Any) -> None:
-    """Convert both weights of a part to floats; None stays None."""
+    """Convert the weights of a further feedback to floats, in place; leave a weight of None unchanged."""
     for name in ("position", "velocity"):
         value = getattr(part, name)
         if value is not None:
@@ -40,7 +40,7 @@ def _read_weights(part: Any) -> None:
 
 
 def _normalize_weights(part: Any, period: Any) -> Weights | None:
-    """Return the weights for T = 1; None if the input is the measured position."""
+    """Return the weights for time in sampling periods; None if the input of R0 is the measured position."""
     if part.position is None and part.velocity is None:
         return None
     position, velocity = (0.0 if weight is None else weight for weight in (part.position, part.velocity))
@@ -51,13 +51,14 @@ def _normalize_weights(part: Any, period: Any) -> Weights | None:
 class Feedback(RationalFilter):
     """Fixed further feedback ``R0(z) = numerator/denominator``, from position in m to force in N.
 
-    The force of the controller is ``-(K P + B V + R) x``. Maximum stiffness, stable region and margins of a scene vary
-    K and B, and R stays fixed.
+    The force of the controller is ``-(K P + B V + R) x``. To compute the maximum stiffness or the stable region of a
+    scene, K and B are varied while R stays fixed. The gain, phase and modulus margins change K, B and R together.
 
     Args:
         numerator: coefficients in N/m, highest power of z first; or a list of sections in series, each a list of
             coefficients.
-        denominator: coefficients or sections, of at least the degree of the numerator; all poles are allowed.
+        denominator: coefficients or sections, as for the numerator. The degree must be at least that of the numerator.
+            Poles on or outside the unit circle are allowed.
         sos, zeros, poles, gain: second-order sections, or roots, as for `VelocityFilter`.
         position: weight of the position estimate in the input of R0.
         velocity: weight of the velocity estimate in the input of R0, in s. If neither weight is given, the input is
@@ -87,15 +88,20 @@ class Feedback(RationalFilter):
     def integral(
         gain: Any, rule: IntegrationRule = "backward", position: Any = None, velocity: Any = None
     ) -> IntegralFeedback:
-        """Return an integral gain, as `IntegralFeedback`; its docstring describes the arguments."""
+        """Return an `IntegralFeedback` with the given arguments, which the docstring of that class describes."""
         return IntegralFeedback(gain, rule, position, velocity)
 
     def estimate(self, unit: Any, period: Any) -> Estimate:
-        """Return R0 divided by the stiffness ``1/unit``; the coefficients do not depend on the sampling period."""
+        """Return the filter R0 of the further feedback in normalized units, i.e. multiplied by ``unit``.
+
+        Args:
+            unit: T^2/m in m/N.
+            period: sampling period T in s; not used, because the coefficients are those of powers of z.
+        """
         return self.factor(unit)
 
     def weights(self, period: Any) -> Weights | None:
-        """Return the weights of both estimates in the input; None if the input is the measured position."""
+        """Return the weights of both estimates, for T = 1; None if the input of R0 is the measured position."""
         return _normalize_weights(self, period)
 
 
@@ -105,8 +111,9 @@ class IntegralFeedback(Part):
 
     Args:
         gain: k_i in N/(m s).
-        rule: rule of integration. "backward" adds T x_k before the sum is used, R0 = k_i T z/(z - 1). "forward" adds it
-            afterwards, R0 = k_i T/(z - 1). "trapezoidal" adds T (x_k + x_(k-1))/2, R0 = k_i (T/2) (z + 1)/(z - 1).
+        rule: rule of integration. "backward" adds T x_k to the sum before the force is computed, R0 = k_i T z/(z - 1).
+            "forward" adds T x_k after the force is computed, R0 = k_i T/(z - 1). "trapezoidal" adds
+            T (x_k + x_(k-1))/2, R0 = k_i (T/2) (z + 1)/(z - 1).
         position: weight of the position estimate in the integrand.
         velocity: weight of the velocity estimate in the integrand, in s. If neither weight is given, the integrand is
             the measured position.
@@ -135,16 +142,21 @@ class IntegralFeedback(Part):
         super().__post_init__()
 
     def estimate(self, unit: Any, period: Any) -> Estimate:
-        """Return R0 divided by the stiffness ``1/unit``, for a sampling period in s."""
+        """Return the filter R0 of the integral feedback in normalized units, i.e. multiplied by ``unit``.
+
+        Args:
+            unit: T^2/m in m/N.
+            period: sampling period T in s.
+        """
         gain, pole = self.gain * period * unit, np.zeros(1, complex)
         if self.rule == "trapezoidal":
             return Estimate(0, 0.5 * gain, 0, np.full(1, 2.0 + 0j), pole)
         return Estimate(0, gain, -1 if self.rule == "backward" else 0, poles=pole)
 
     def weights(self, period: Any) -> Weights | None:
-        """Return the weights of both estimates in the input; None if the input is the measured position."""
+        """Return the weights of both estimates, for T = 1; None if the integrand is the measured position."""
         return _normalize_weights(self, period)
 
 
 FEEDBACKS = {"integral": IntegralFeedback, "filter": Feedback}
-"""Classes of further feedback by the name of their kind in configurations."""
+"""Classes of further feedback, keyed by the name of the kind in configurations."""

@@ -62,8 +62,9 @@ def read_sections(name: str, given: Any) -> tuple[tuple[float, ...], ...]:
 def is_rounding(coefficients: tuple[float, ...]) -> bool:
     """Return whether all roots of a section on or outside the unit circle may be artifacts of rounded coefficients.
 
-    The result is False if there is no such root. Coefficients with few decimals, such as those copied from a printed
-    table, are taken as rounded to this number of decimals, all others as rounded to float64.
+    The result is False if there is no such root. If all coefficients have at most 12 decimals, such as those copied
+    from a printed table, they are assumed to be rounded to their number of decimals. All other coefficients are assumed
+    to be rounded to float64.
     """
     roots = 1.0 - offsets(np.trim_zeros(np.array(coefficients), "b"))
     points = np.exp(1j * np.angle(roots[np.abs(roots) >= 1.0]))
@@ -75,9 +76,9 @@ def is_rounding(coefficients: tuple[float, ...]) -> bool:
 
 
 def _find_last_decimal(coefficients: tuple[float, ...]) -> float:
-    """Return 10^-k, with the smallest number k of decimals with which all coefficients are written; 0 if k > 12.
+    """Return the unit 10^-k of the last decimal of coefficients with k decimals; 0 if k exceeds 12.
 
-    The result is at most 10^-3, because coefficients with fewer decimals are usually exact.
+    At least 3 decimals are assumed, because coefficients with fewer decimals are usually exact.
     """
     return next((10.0**-k for k in range(3, 13) if all(round(value, k) == value for value in coefficients)), 0.0)
 

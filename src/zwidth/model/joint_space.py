@@ -125,9 +125,9 @@ def from_mujoco(
         site: name of the site, the point on which the wall acts. For a model without sites, such as one from URDF, the
             name of a body, whose origin is the point.
         direction: "x", "y", "z" or a vector of three components in world coordinates.
-        pose: joint positions (``qpos``) in rad and m, or texts such as "30 deg"; a dict of positions by the name of
-            the joint, in which other joints keep their reference positions; the name of a keyframe of the model; or
-            None for the reference pose ``qpos0``.
+        pose: pose of the model in one of four forms: a list of joint positions (``qpos``), as numbers in rad or m or as
+            texts such as "30 deg"; a dict of joint positions keyed by joint name, with all other joints in their
+            reference positions; the name of a keyframe of the model; None for the reference pose ``qpos0``.
         rotary: True for a wall that acts on the rotation about ``direction``, such as a knob or a steering wheel.
 
     Returns:
@@ -307,7 +307,10 @@ def _realize(w: np.ndarray, D: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _import_mujoco() -> Any:
-    """Return the package mujoco, as Any because its type stubs lack most functions; `InputError` if not installed."""
+    """Return the package mujoco; raise `InputError` if it is not installed.
+
+    The annotation is Any, because the type stubs of the package lack most functions.
+    """
     try:
         return import_module("mujoco")
     except ImportError:
@@ -316,19 +319,25 @@ def _import_mujoco() -> Any:
 
 
 def list_joints(model: Any) -> dict[str, str]:
-    """Return the kind ("hinge" or "slide") of each named joint with one coordinate of a MuJoCo model, by its name."""
+    """Return the kind, "hinge" or "slide", of the joints of a MuJoCo model, keyed by joint name.
+
+    Joints without a name and joints with several coordinates are omitted.
+    """
     kinds = {int(getattr(_import_mujoco().mjtJoint, f"mjJNT_{kind.upper()}")): kind for kind in ("hinge", "slide")}
     joints = (model.joint(index) for index in range(model.njnt))
     return {joint.name: kinds[int(joint.type[0])] for joint in joints if joint.name and int(joint.type[0]) in kinds}
 
 
 def check_point(model: Any, site: str) -> None:
-    """Raise `InputError` if a MuJoCo model has no site, or without sites no body, with the given name."""
+    """Raise `InputError` if a MuJoCo model has no site with the given name.
+
+    In a model without any sites, the name must be that of a body.
+    """
     _find_point(_import_mujoco(), model, site)
 
 
 def load_model(model: Any) -> Any:
-    """Return the MuJoCo model in the file with the given path; return a loaded model unchanged."""
+    """Load a MuJoCo model from a file, given its path; return an already loaded model unchanged."""
     mujoco = _import_mujoco()
     if isinstance(model, mujoco.MjModel):
         return model
@@ -362,7 +371,7 @@ def _reject_constraints(model: Any) -> None:
 
 
 def _read_pose(model: Any, pose: Any) -> np.ndarray:
-    """Return the joint positions of a pose, given as None, the name of a keyframe, or joint positions."""
+    """Return the joint positions ``qpos`` of a pose, in one of the forms that `from_mujoco` accepts."""
     if pose is None:
         return np.array(model.qpos0)
     if isinstance(pose, str):
@@ -390,10 +399,14 @@ def _read_pose(model: Any, pose: Any) -> np.ndarray:
 
 
 def _read_position(model: Any, index: int, value: Any) -> float:
-    """Return one entry of ``qpos``, given as a number or a text with a unit, in rad (hinges) or m (slides)."""
+    """Convert one entry of ``qpos``, a number or a text with a unit, to rad (hinges) or m (slides).
+
+    ``index`` is the index of the entry in ``qpos``.
+    """
     (joint,) = np.flatnonzero(np.asarray(model.jnt_qposadr) == index)
     name = model.joint(int(joint)).name
-    # The numbers of a list with texts are texts as well; a number without a unit is in rad or m.
+    # Accept a number that is given as text, because an array with one text contains only texts. A number without a unit
+    # is in rad or m.
     value = float(value) if isinstance(value, str) and looks_like_number(value) else value
     unit = "m" if list_joints(model).get(name) == "slide" else "rad"
     return check_number(f"pose.{name}", value, unit, ANY)

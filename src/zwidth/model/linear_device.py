@@ -36,11 +36,11 @@ _FORMS = (
     "(A, B, C), (numerator, denominator), (zeros, poles, gain), {'sos': sections}, or a model of scipy.signal or "
     "python-control with one input and one output"
 )
-# In this distance from the unit circle, in rad/s, all poles of a device given in s lie if its coefficients are probably
-# meant in z. A sampled device with a mass has a pole near z = 1.
-NEAR_CIRCLE = 0.05
-NEAR_ONE = 0.1  # distance of at least one of these poles from 1
-SLOWEST_PERIOD = 0.05  # s; at shorter periods, poles of 1 rad/s are too slow for the device of a control loop
+# Limits for a warning that the coefficients of a device given in s were probably meant in z. If so, no pole is far
+# outside the unit circle, and the mass of the device causes a pole near 1.
+NEAR_CIRCLE = 0.05  # largest distance of a pole outside the unit circle from the circle
+NEAR_ONE = 0.1  # largest distance of the nearest pole from 1
+SLOWEST_PERIOD = 0.05  # s; in loops with longer periods, devices with poles of 1 rad/s are plausible
 
 
 class RationalResponse(NamedTuple):
@@ -174,10 +174,10 @@ class LinearDevice(ResponseDevice):
         return float(1.0 / (size * unit * unit))
 
     def warn_of_variable(self, period: float) -> str:
-        """Return a warning if the coefficients are in s, but probably meant in z; "" otherwise.
+        """Return a warning if the coefficients were given in s, but probably meant in z; otherwise return "".
 
-        The condition is that all poles are on or near the unit circle or inside it, at least one of them is near 1, and
-        the sampling period is so short that such poles are too slow for a device.
+        The warning is returned if no pole is far outside the unit circle, if one pole is near 1, and if the sampling
+        period is so short that poles of about 1 rad/s are implausibly slow. ``period`` is the sampling period in s.
         """
         size, distance = np.abs(self.poles).max(), np.abs(self.poles - 1.0).min()
         if self.dt or size > 1.0 + NEAR_CIRCLE or distance > NEAR_ONE or period > SLOWEST_PERIOD:
@@ -188,7 +188,8 @@ class LinearDevice(ResponseDevice):
 def _read(given: Any, sampled: Any) -> RationalResponse:
     """Convert a system in any accepted form to an exact transfer function; raise `InputError` for other values.
 
-    ``sampled`` is the sampling period of a discrete-time system; None if the system has its own or is continuous-time.
+    ``sampled`` is the sampling period of a discrete-time system. It is None for a continuous-time system, or if
+    ``given`` contains the sampling period.
     """
     given = parse_system("device", given, "s" if sampled is None else "z") if isinstance(given, str) else given
     dt = getattr(given, "dt", None)
@@ -267,10 +268,10 @@ def _read_form(given: Any) -> tuple[Polynomial, Polynomial]:
 
 
 def _read_keys(given: dict[str, Any]) -> tuple[Any, ...]:
-    """Return the system given by the keys of a configuration as a tuple in one of the other forms."""
+    """Convert a system from a dict with the keys of a configuration to a tuple of coefficients, roots or matrices."""
     keys = set(given)
     if keys == {"sos"}:
-        # Exact products, because rounding errors would move the roots.
+        # Multiply the sections exactly, because rounding errors of the products would move the roots.
         rows = read_sos("device.sos", given["sos"])
         numerator, denominator = (reduce(multiply, map(trim, rows[:, part])) for part in (slice(3), slice(3, 6)))
         return numerator, denominator

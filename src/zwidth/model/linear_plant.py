@@ -44,8 +44,8 @@ class System:
     mass: Any  # unit of mass in kg
     d: Any  # delay in periods
     n_delay: int  # integer part of d
-    estimate: Estimate  # as in `zwidth.model.mechanism.Chain`
-    estimates: LoopEstimates | None = None
+    estimate: Estimate  # velocity estimate; divided by the position estimate if ``estimates`` is not None
+    estimates: LoopEstimates | None = None  # None if there is neither a position estimate nor further feedback
 
     @property
     def sampled(self) -> bool:

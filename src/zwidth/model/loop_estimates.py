@@ -1,9 +1,8 @@
-"""Position estimate, velocity estimate and further feedback of one scene, normalized and in factored form.
+"""Normalize the position estimate P, the velocity estimate V and the further feedback R of a scene.
 
-The controller of a scene computes the force ``-(K P + B V + R) x`` (docs/theory/scenes.md, V25), with the position
-estimate P, the velocity estimate V and the further feedback R. In normalized units (period T = 1, unit of mass m = 1)
-the wall has the gains alpha and beta in place of K and B. The stability analyses use the ratio F = V/P. Its factors
-follow from the *structure* of V:
+From the measured position x, the controller computes the force ``-(K P + B V + R) x`` (docs/theory/scenes.md, V25). P,
+V and R are transfer functions, stored as gain, zeros and poles in normalized units (period T = 1, unit of mass m = 1).
+The stability analyses use the ratio F = V/P. Its factors depend on the *structure* of V:
 
     "series"     V = P F, because the velocity is computed from the position estimate
     "separate"   V is computed from the measured position and has no poles in common with P
@@ -24,7 +23,7 @@ from zwidth.model.estimate import Estimate
 from zwidth.model.feedback import Weights
 from zwidth.model.position import Observer, Pll, estimate_position
 
-# Type of a function that returns a frequency response on the unit circle, and its derivative in w.
+# Type of a function that returns a frequency response at points e^(jw), and its derivative with respect to w.
 Response = Callable[[CirclePoints], Jet]
 
 
@@ -33,31 +32,31 @@ class FurtherFeedback:
     """The further feedback ``R = R0`` or, with weights, ``R = R0 (w_p P + w_v V)``, in normalized units."""
 
     filter: Estimate  # R0
-    weights: Weights | None  # None: the input is the measured position
+    weights: Weights | None  # w_p and w_v; None if the input of R0 is the measured position
 
 
 @dataclass(frozen=True)
 class LoopEstimates:
-    """P, V and R of a scene that has a position estimate or further feedback."""
+    """Transfer functions P, V and R of a scene that has a position estimate, further feedback, or both."""
 
     position: Estimate = field(default_factory=lambda: Estimate(0))  # P
-    velocity: Estimate = field(default_factory=Estimate)  # F for the structure "series", otherwise V
+    velocity: Estimate = field(default_factory=Estimate)  # F = V/P for the structure "series", otherwise V
     structure: Literal["series", "separate", "common"] = "series"
     feedback: FurtherFeedback | None = None
 
     def respond(self) -> tuple[Response, ...]:
-        """Return the responses P and V and, with further feedback, R, as functions of points of the unit circle."""
+        """Return functions that compute P, V and, if the scene has further feedback, R on the unit circle."""
         if self.feedback is None:
             return self.position.jet, self._respond_velocity
         return self.position.jet, self._respond_velocity, self._respond_feedback
 
     def _respond_velocity(self, points: CirclePoints) -> Jet:
-        """Return V and its derivative in w."""
+        """Return V and its derivative with respect to w, at points e^(jw) of the unit circle."""
         V = self.velocity.jet(points)
         return V.times(self.position.jet(points)) if self.structure == "series" else V
 
     def _respond_feedback(self, points: CirclePoints) -> Jet:
-        """Return R and its derivative in w."""
+        """Return R and its derivative with respect to w, at points e^(jw) of the unit circle."""
         assert self.feedback is not None
         filtered, weights = self.feedback.filter.jet(points), self.feedback.weights
         if weights is None:
@@ -66,10 +65,13 @@ class LoopEstimates:
         return filtered.times(Jet(*(weights.position * p + weights.velocity * v for p, v in zip(P, V, strict=True))))
 
     def divide(self) -> tuple[Estimate, int]:
-        """Return the ratio F = V/P, and the number of its poles, the last ones, that are zeros of P.
+        """Return the ratio F = V/P, and the number of poles of F that are zeros of P.
+
+        These poles are the last ones in the array of the poles.
 
         Raises:
-            InputError: if V does not share a zero of P on the unit circle; F would then be infinite there.
+            InputError: if P has a zero on the unit circle and V is not computed from the filtered position. F would be
+                infinite at this zero.
         """
         P, V = self.position, self.velocity
         if self.structure == "series":
@@ -80,7 +82,7 @@ class LoopEstimates:
                 "position: the filter has a zero on the unit circle, which the velocity estimate lacks, so no K acts "
                 "there; compute the velocity from the filtered position"
             )
-        # The poles of P cancel those of V in an observer; otherwise, they are zeros of the ratio.
+        # An observer has the same poles in V and P, so they cancel in V/P. Otherwise, the poles of P are zeros of V/P.
         common = self.structure == "common"
         parts = (V.zeros, zeros[:0]) if common else (V.zeros, P.poles)
         poles = (zeros,) if common else (V.poles, zeros)
@@ -91,7 +93,10 @@ class LoopEstimates:
 
 
 def build_estimates(scene: Any) -> LoopEstimates | None:
-    """Return P, V and R of a scene; None if it has neither a position estimate nor further feedback."""
+    """Return the transfer functions P, V and R of a scene in normalized units.
+
+    The result is None if the scene has neither a position estimate nor further feedback.
+    """
     position, feedback, period = scene.position, scene.feedback, scene.timing.period
     if position is None and feedback is None:
         return None

@@ -76,8 +76,8 @@ class Chain:
     sensor: int  # index of the body whose position is measured
     d: Any  # delay in periods
     n_delay: int  # integer part of d
-    estimate: Estimate  # velocity estimate F, or its ratio to the position estimate if ``estimates`` is not None
-    estimates: LoopEstimates | None = None
+    estimate: Estimate  # velocity estimate; divided by the position estimate if ``estimates`` is not None
+    estimates: LoopEstimates | None = None  # None if there is neither a position estimate nor further feedback
 
     sampled: ClassVar[bool] = False
 

@@ -58,7 +58,7 @@ _WHOLE = ("safe_limit",)  # parts that can only be replaced as a whole, because 
 PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator, "tool": Tool}
 """Classes of the optional parts of a scene, by name, in the order in which descriptions list these parts."""
 WITH_KIND: dict[str, dict[str, Any]] = {"position": POSITIONS, "feedback": FEEDBACKS}
-"""Classes of the optional parts that have several kinds, by the name of the part and of the kind."""
+"""Classes of position estimates and of further feedback, keyed by the name of the part and the name of the kind."""
 _OF_DEVICE = ("coupling", "actuator")  # optional parts that are fields of the device
 # Fields of the scene with whose names the paths of their parameters begin.
 _NAMED = ("velocity", *WITH_KIND, *(name for name in PARTS if name not in _OF_DEVICE))
@@ -170,7 +170,10 @@ def spell_estimate(velocity: Velocity, *, every: bool = False) -> dict[str, Any]
 
 
 def spell_kind(part: Any, kinds: dict[str, Any]) -> dict[str, Any]:
-    """Return a dictionary with the key ``kind`` and the fields of a part; ``kinds`` has the classes by kind."""
+    """Return a dictionary with the key ``kind`` and with the fields of a part that differ from their defaults.
+
+    ``kinds`` contains the class of each kind.
+    """
     for kind, each in kinds.items():
         if type(part) is each:
             return {"kind": kind, **spell_part(part)}

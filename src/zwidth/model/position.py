@@ -1,12 +1,11 @@
-"""Position estimates: transfer functions P(z) from the measured position to the position that the wall's spring uses.
+"""Position estimates: filters P(z) of the measured position x, whose output the spring of the wall uses as position.
 
-A program that filters the measured position x computes the spring force from the filtered position P x, and usually
-also differentiates the filtered position: the velocity estimate is then V = P F with the difference F of
-`model.velocity`. A program that differentiates the measured position itself has V = F. An *observer* or a phase-locked
-loop (PLL) has its own velocity estimate V, with the same poles as P.
+The velocity estimate V has one of three forms. If the program differentiates the filtered position, V = P F with the
+difference F of `model.velocity`. If the program differentiates the measured position, V = F. An *observer* or a
+phase-locked loop (PLL) estimates both position and velocity; V then has the same poles as P.
 
-Parameters are in SI units. The method ``estimate`` of each class returns P, and ``estimate_velocity`` returns the
-velocity estimate of an observer for time in sampling periods, both as `Estimate`.
+Parameters are in SI units. The method ``estimate`` of each class returns P as an `Estimate`. The method
+``estimate_velocity`` of observers and PLLs returns V as an `Estimate`, for time in sampling periods.
 """
 
 from __future__ import annotations
@@ -27,24 +26,24 @@ from zwidth.model.velocity import Butterworth, LowPass, as_complex, check_cutoff
 VelocitySource = Literal["position", "measured"]
 SOURCES = ("position", "measured")
 """Inputs of the velocity estimate: the position estimate, or the measured position."""
-LARGEST_BANDWIDTH = 2.0 * (np.sqrt(2.0) - 1.0)  # bandwidth times T of a PLL, above which the PLL is unstable
+LARGEST_BANDWIDTH = 2.0 * (np.sqrt(2.0) - 1.0)  # bandwidth times T at the stability limit of a PLL
 
 
 @dataclass(frozen=True, repr=False)
 class ExponentialFilter(Part):
     """The exponential moving average ``x <- x + a (new - x)`` of the measured position: ``P = a z/(z - 1 + a)``.
 
-    Programs define the coefficient differently; with the sampling period T and the time constant tau or T_f:
+    Programs define the coefficient a differently; with the sampling period T and the time constant tau or T_f:
 
-    - the Arduino libraries: ``alpha`` is the weight of the new sample, ``a = alpha``;
+    - Arduino libraries: ``a = alpha``, because ``alpha`` is the weight of the new sample;
     - zwidth, `LowPass` and a filter designed in continuous time: ``a = 1 - exp(-T/tau)``, from ``time_constant`` or
       ``cutoff = 1/(2 pi tau)``;
-    - SimpleFOC ``LowPassFilter``: ``alpha = T_f/(T_f + T)`` is the weight of the old value, ``a = T/(T_f + T)``;
-      see `ExponentialFilter.simplefoc`.
+    - SimpleFOC ``LowPassFilter``: ``a = T/(T_f + T)``, because ``alpha = T_f/(T_f + T)`` is the weight of the old
+      value; see `ExponentialFilter.simplefoc`.
 
     Args:
-        coefficient: a, the weight of the new sample, above 0 and at most 1. Pass either ``coefficient`` or
-            ``time_constant`` or ``cutoff``.
+        coefficient: a, the weight of the new sample, above 0 and at most 1. Pass exactly one of ``coefficient``,
+            ``time_constant`` and ``cutoff``.
         time_constant: tau in s, > 0.
         cutoff: cut-off frequency in Hz, > 0 and below the Nyquist frequency.
         velocity_from: input of the velocity estimate: "position" (the filtered position) or "measured".
@@ -78,11 +77,11 @@ class ExponentialFilter(Part):
 
     @classmethod
     def simplefoc(cls, time_constant: float, period: float) -> ExponentialFilter:
-        """Return the filter of SimpleFOC with the time constant T_f and the sampling period T, both in s.
+        """Return the filter of the class ``LowPassFilter`` of SimpleFOC, with ``a = T/(T_f + T)``.
 
         Args:
-            time_constant: T_f, the field ``Tf`` of SimpleFOC's ``LowPassFilter``.
-            period: sampling period T of the program.
+            time_constant: T_f in s, the field ``Tf`` of ``LowPassFilter``.
+            period: sampling period T of the program in s.
         """
         return cls(coefficient=period / (time_constant + period))
 
@@ -107,8 +106,8 @@ class PositionFilter(RationalFilter):
 
     Args:
         numerator: coefficients, highest power of z first; or a list of sections in series, each a list of coefficients.
-        denominator: coefficients or sections, of at least the degree of the numerator, with all roots inside the unit
-            circle.
+        denominator: coefficients or sections, as for the numerator. The degree must be at least that of the numerator,
+            and all roots must be inside the unit circle.
         sos, zeros, poles, gain: second-order sections, or roots, as for `VelocityFilter`.
         velocity_from: input of the velocity estimate: "position" (the filtered position) or "measured".
 
@@ -129,7 +128,7 @@ class PositionFilter(RationalFilter):
         super().__post_init__()
 
     def estimate(self, period: Any) -> Estimate:
-        """Return P; the coefficients do not depend on the sampling period."""
+        """Return P, whose coefficients do not depend on the sampling period ``period``."""
         return self.factor(1.0 + 0.0 * period)
 
 
@@ -137,11 +136,12 @@ class PositionFilter(RationalFilter):
 class Pll(Part):
     """The phase-locked loop of motor controllers, which estimates position and velocity.
 
-    In every period the program computes, with the estimates p and v and the measured position x,
+    In every period the program updates the estimates p of the position and v of the velocity with the measured
+    position x:
 
         p <- p + T v;   e = x - p;   p <- p + T k_p e;   v <- v + T k_i e
 
-    with ``k_p = 2 bandwidth`` and ``k_i = k_p^2/4``. With u = bandwidth T and zeta = z - 1,
+    with ``k_p = 2 bandwidth`` and ``k_i = k_p^2/4``. The transfer functions are, with u = bandwidth T and zeta = z - 1,
 
         P = z (2 u zeta + u^2)/D      V = (u^2/T) z zeta/D      D = zeta^2 + (2 u + u^2) zeta + u^2
 
@@ -165,7 +165,7 @@ class Pll(Part):
     bandwidth: Any
 
     def _scale(self, period: Any) -> tuple[Any, Any]:
-        """Return u = bandwidth T, and the offsets of the two poles."""
+        """Return u = bandwidth T, and the two poles of P and V as offsets ``1 - pole``."""
         u = self.bandwidth * period
         if not is_traced(u) and np.ndim(getattr(u, "v", u)) == 0 and u >= LARGEST_BANDWIDTH:
             raise InputError(
@@ -226,11 +226,11 @@ class Observer(Part):
 
     @cached_property
     def _filters(self) -> tuple[PositionFilter, PositionFilter]:
-        """P and V as filters."""
+        """The transfer functions P and V, each as a `PositionFilter`."""
         return PositionFilter(self.position, self.denominator), PositionFilter(self.velocity, self.denominator)
 
     def estimate(self, period: Any) -> Estimate:
-        """Return P; the coefficients do not depend on the sampling period."""
+        """Return P, whose coefficients do not depend on the sampling period ``period``."""
         return self._filters[0].factor(1.0 + 0.0 * period)
 
     def estimate_velocity(self, period: Any) -> Estimate:
@@ -249,11 +249,15 @@ POSITIONS = {
     "pll": Pll,
     "observer": Observer,
 }
-"""Classes of position estimates by the name of their kind in configurations and on the command line."""
+"""Classes of position estimates, keyed by the name of the kind in configurations and on the command line."""
 
 
 def estimate_position(position: Position | None, period: Any) -> Estimate:
-    """Return the position estimate P of a part; 1 for None, and the filter without the difference for a `LowPass`."""
+    """Return the transfer function P of a position estimate, for a sampling period in s.
+
+    P is 1 for None. `LowPass` and `Butterworth` are velocity estimates, a difference followed by a filter; as position
+    estimates, P is the filter without the difference.
+    """
     if position is None:
         return Estimate(0)
     if not isinstance(position, LowPass | Butterworth):
@@ -266,5 +270,5 @@ def estimate_position(position: Position | None, period: Any) -> Estimate:
 
 
 def has_velocity(position: Position | None) -> bool:
-    """Return whether a position estimate has its own velocity estimate, so that a scene has no further one."""
+    """Return whether a position estimate is an observer or a PLL, which also estimates the velocity."""
     return isinstance(position, Pll | Observer)

@@ -1,5 +1,6 @@
-"""Filters that are given by their transfer function in z: coefficients, second-order sections, or zeros and poles.
+"""Filters given by a transfer function in z: its coefficients, second-order sections, or zeros, poles and gain.
 
+Numerator and denominator are products of *sections*, polynomials in z. Roots are computed as *offsets* ``1 - root``.
 `RationalFilter` is the base class of velocity filters, position filters and further feedback.
 """
 
@@ -29,23 +30,23 @@ from zwidth.model.system_forms import pair_roots, read_roots, read_sos
 class RationalFilter(Part):
     """Base class of filters that are given by their transfer function, as coefficients, sections or roots.
 
-    The transfer function is the product of all given forms: numerator/denominator, second-order sections, and zeros,
-    poles and gain.
+    If several forms are given, the transfer function is their product, for example numerator/denominator times the
+    filter with the sections ``sos``.
 
     Args:
         numerator: coefficients, highest power of z first; or a list of sections in series, each a list of coefficients.
-        denominator: coefficients or sections. The total degree of all denominators must be at least that of all
-            numerators (a causal filter). Use sections or roots for a filter of high order, because rounding errors in
-            the coefficients of a single polynomial move its poles.
-        sos: second-order sections, rows of the coefficients b0 b1 b2 a0 a1 a2, as of scipy.signal with
+        denominator: coefficients or sections, as for the numerator. The filter must be causal: the total degree of all
+            denominators must be at least that of all numerators. Use sections or roots for a filter of high order,
+            because rounding errors in the coefficients of a single polynomial move its poles.
+        sos: second-order sections, rows of the coefficients b0 b1 b2 a0 a1 a2, as returned by scipy.signal with
             ``output="sos"``.
         zeros: zeros in z; complex zeros together with their conjugates. Default: none, if ``poles`` is given.
-        poles: poles in z, as the zeros; requires ``gain``.
-        gain: ratio of the leading coefficients; requires ``poles``.
+        poles: poles in z, in the same form as the zeros; requires ``gain``.
+        gain: leading coefficient of the numerator divided by that of the denominator; requires ``poles``.
     """
 
     _owner = "velocity"
-    _poles_inside: ClassVar[bool] = True  # all poles must be inside the unit circle
+    _poles_inside: ClassVar[bool] = True  # True if all poles must be inside the unit circle
 
     numerator: Any = None
     denominator: Any = None
@@ -70,7 +71,7 @@ class RationalFilter(Part):
             self._check_poles()
 
     def _combine_forms(self) -> None:
-        """Convert all given forms to sections of numerator and denominator, and set the other fields to None."""
+        """Convert the forms ``sos`` and zeros-poles-gain to sections of ``numerator`` and ``denominator``."""
         if (self.numerator is None) != (self.denominator is None) or (self.poles is None) != (self.gain is None):
             raise InputError(
                 f"{self._owner}: got half of a form; give numerator and denominator, sos, or poles and gain"
@@ -110,8 +111,8 @@ class RationalFilter(Part):
         if largest < 1.0:
             return
         got = f"{self._owner}.denominator: got a pole of magnitude {largest:.6g}; it must be below 1. "
-        # Report rounding errors of the coefficients as the cause only if several poles are near z = 1, because they
-        # hardly move a single pole; a single pole at z = 1 is probably an intended integrator.
+        # Do not report rounding errors of the coefficients as the cause if exactly one pole is near z = 1, because
+        # rounding errors hardly move a single pole. A single pole at z = 1 is probably an intended integrator.
         slow = np.abs(poles) < NEXT_TO_ONE
         if np.sum(slow) != 1 and any(is_rounding(section) for section in self._sections[1]):
             cause = (
@@ -125,14 +126,14 @@ class RationalFilter(Part):
 
     @property
     def _sections(self) -> tuple[Any, Any]:
-        """The sections of numerator and denominator; each section is a tuple of coefficients."""
+        """Numerator and denominator, each as a tuple of sections; a section is a tuple of coefficients."""
         both: Any = self.numerator, self.denominator
         top, bottom = (part if isinstance(part[0], tuple) else (part,) for part in both)
         return top, bottom
 
     @cached_property
     def _roots(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """The offsets of all zeros and of all poles except at z = 0, and the excess of poles over zeros at z = 0."""
+        """Offsets of the zeros and poles other than z = 0, and number of poles minus number of zeros at z = 0."""
         roots, trailing = [], []
         for part in self._sections:
             sections = [np.array(section) for section in part]
@@ -141,7 +142,7 @@ class RationalFilter(Part):
         return roots[0], roots[1], trailing[1] - trailing[0]
 
     def factor(self, unit: Any) -> Estimate:
-        """Return the transfer function multiplied by ``unit``, in factored form."""
+        """Return the transfer function, multiplied by the number ``unit``, as gain, zeros and poles."""
         tops, bottoms = self._sections
         gain = unit
         for section in tops:
@@ -149,8 +150,8 @@ class RationalFilter(Part):
         for section in bottoms:
             gain = gain / section[0]
         if hasattr(unit, "mid"):
-            # If the unit is a ball, compute the roots as balls from the exact coefficients, because zeros at z = 1 must
-            # be exact.
+            # If ``unit`` is a ball (an interval in certified computations), compute the roots as balls, too. Use the
+            # exact coefficients, so that roots at z = 1 stay exact.
             exact = (np.concatenate([ball_offsets(section) for section in part]) for part in (tops, bottoms))
             return Estimate(0, gain, 0, *exact)
         zeros, poles, lag = self._roots

@@ -72,7 +72,7 @@ def connect_in_series(first: StateSpace, second: StateSpace) -> StateSpace:
 
 
 def _append(first: StateSpace, second: StateSpace) -> StateSpace:
-    """Return two systems with the same input as one system, whose outputs are those of both."""
+    """Combine two systems with a common input into one system with the outputs of the first, then of the second."""
     n, m = len(first.A), len(second.A)
     A = np.block([[first.A, np.zeros((n, m))], [np.zeros((m, n)), second.A]])
     C = np.block([[first.C, np.zeros((len(first.C), m))], [np.zeros((len(second.C), n)), second.C]])
@@ -80,9 +80,10 @@ def _append(first: StateSpace, second: StateSpace) -> StateSpace:
 
 
 def realize_estimates(estimates: LoopEstimates) -> StateSpace:
-    """Return the state-space model with the measured position as input and the outputs of P, V and R, for T = 1.
+    """Return the state-space model of the estimates and the further feedback of a scene, for T = 1.
 
-    The output of R is 0 without further feedback.
+    The input is the measured position. The three outputs are the position estimate, the velocity estimate and the
+    output of the further feedback, which is 0 in a scene without further feedback.
     """
     wire = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)))
     P, V = _realize_filter(estimates.position), realize_estimate(estimates.velocity)
@@ -91,7 +92,7 @@ def realize_estimates(estimates: LoopEstimates) -> StateSpace:
     elif estimates.structure == "separate":
         both = _append(P, V)
     else:
-        # Give both filters equal poles at z = 0, so that they share their states.
+        # Add poles at z = 0, canceled by zeros, so that P and V have the same poles and can share their states.
         at_zero = max(estimates.position.lag, estimates.velocity.lag, 0)
         poles = np.concatenate([estimates.position.poles, np.ones(at_zero)])
         P, V = (

@@ -1,8 +1,8 @@
-"""Forms in which a transfer function is given: coefficients, roots and second-order sections, as values or as text.
+"""Read a transfer function that is given by coefficients, roots or second-order sections, as values or as text.
 
-The forms have the names of scipy.signal: "tf" is numerator and denominator, "zpk" zeros, poles and gain, and "sos" a
-list of second-order sections, each a row of the six coefficients b0 b1 b2 a0 a1 a2 of
-``(b0 + b1/z + b2/z^2)/(a0 + a1/z + a2/z^2)``. The transfer function of the list is the product of its sections.
+The forms have the names of scipy.signal: "tf" is numerator and denominator, and "zpk" is zeros, poles and gain. "sos"
+is a list of second-order sections, whose product is the transfer function. Each section is a row of the six
+coefficients b0 b1 b2 a0 a1 a2 of ``(b0 + b1/z + b2/z^2)/(a0 + a1/z + a2/z^2)``.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ TEXTS = "'NUMERATOR / DENOMINATOR', 'zpk: ZEROS / POLES / GAIN' or 'sos: b0 b1 b
 
 
 def parse_system(field: str, text: str, variable: str) -> dict[str, Any]:
-    """Return the values of a transfer function in one of the forms `TEXTS`, as a dict by the names of its keys.
+    """Parse a transfer function in one of the forms `TEXTS`; return a dict with keys such as "numerator" or "zeros".
 
     Args:
-        field: path of the parameter, for the message.
+        field: path of the parameter, for the error message.
         text: the transfer function; numbers are separated by spaces or commas, complex roots are written 0.9+0.1j.
-        variable: "s" or "z", the variable of the coefficients, for the message.
+        variable: "s" or "z", the variable of the coefficients, for the error message.
     """
     form, colon, body = text.partition(":")
     sides = (body if colon else text).split("/")
@@ -43,12 +43,12 @@ def parse_system(field: str, text: str, variable: str) -> dict[str, Any]:
 
 
 def _split(text: str) -> list[str]:
-    """Return the words of a text, which are separated by spaces or commas."""
+    """Split a text at spaces and commas."""
     return text.replace(",", " ").split()
 
 
 def read_roots(given: Any) -> np.ndarray:
-    """Return roots as complex numbers, from numbers or texts such as "-3+40j"; raise `ValueError` for other values."""
+    """Convert numbers, or texts such as "-3+40j", to an array of complex roots; raise `ValueError` for other values."""
     array = np.ravel(np.array([] if given is None else given))
     if array.dtype.kind == "U":
         array = np.array([complex(root.replace(" ", "")) for root in array])
@@ -56,7 +56,7 @@ def read_roots(given: Any) -> np.ndarray:
 
 
 def read_sos(field: str, given: Any) -> np.ndarray:
-    """Return second-order sections as an array of shape (sections, 6); raise `InputError` for other shapes."""
+    """Convert second-order sections to an array of shape (sections, 6); raise `InputError` for any other shape."""
     try:
         rows: Any = np.array(given, float)
     except (TypeError, ValueError):
@@ -70,7 +70,9 @@ def read_sos(field: str, given: Any) -> np.ndarray:
 
 
 def pair_roots(roots: Any) -> list[tuple[Fraction, ...]]:
-    """Return monic factors with exact coefficients: one of degree 1 per real root, one of degree 2 per conjugate pair.
+    """Return the monic factors, with exact coefficients, of the polynomial with the given roots.
+
+    A real root has a factor of degree 1, a pair of conjugate roots a factor of degree 2.
 
     Raises:
         ValueError: a complex root has no conjugate.

@@ -35,23 +35,24 @@ class ToolResponse(NamedTuple):
 class Tool(Part):
     """A simulated tool (proxy, avatar) that a virtual coupling connects to the device.
 
-    In a scene with a tool, the stiffness K and the damping B of the wall are those of the coupling. Its force at sample
-    k is ``f = K (x - y) + B (v_x - v_y)`` with the sampled position x of the device and the position y of the tool. The
-    velocity estimate of the scene yields the velocity of x - y. The force acts on the tool at the same tick, without
-    delay, because program and tool run on the same computer. On the device it acts with the delay of the scene.
+    In a scene with a tool, the stiffness K and the damping B of the wall are those of the coupling. The force of the
+    coupling at sample k is ``f = K (x - y) + B (v_x - v_y)`` with the sampled position x of the device and the position
+    y of the tool. The velocity v_x - v_y is the velocity estimate of the scene, applied to x - y. The force acts on the
+    tool in the same period, without delay, because the program also simulates the tool. The force acts on the device
+    with the delay of the scene.
 
     Args:
         mass: mass M of the tool in kg, > 0.
         damping: damping c between tool and ground in N s/m, >= 0.
         stiffness: stiffness k between tool and ground in N/m, >= 0.
         integrator: integration method, with one step per period. "semi-implicit" Euler, the usual method of physics
-            engines, computes ``v += T (f - c v - k y)/M; y += T v``, where f follows from the old y. "implicit" Euler
-            evaluates f, c v and k y at the new values, so it solves f and the new y together.
+            engines, computes ``v += T (f - c v - k y)/M; y += T v``, where f is computed from the old y. "implicit"
+            Euler evaluates f, c v and k y at the new values of v and y, so the program solves for f and y together.
 
     Numerics:
-        A tool in semi-implicit Euler is not passive: without damping, the real part of its impedance at the angular
-        frequency w is ``M (cos(w T) - 1)/T < 0``. `Scene.is_safe_for_every_world` does not cover it. A tool in implicit
-        Euler is passive.
+        A tool that is integrated by semi-implicit Euler is not passive: without damping, the real part of its impedance
+        at the angular frequency w is ``M (cos(w T) - 1)/T < 0``. Therefore `Scene.is_safe_for_every_world` is not valid
+        for this tool. A tool that is integrated by implicit Euler is passive.
 
     References:
         Colgate, Stanley, Brown 1995, Proc. IROS, vol. 3 (virtual coupling); Adams, Hannaford 1999, IEEE Trans. Robotics
@@ -65,7 +66,7 @@ class Tool(Part):
     """
 
     _owner = "tool"
-    # Presets of this part in the page of ``zwidth explore``: arguments of the constructor, by name of the preset.
+    # Presets of the tool on the page of ``zwidth explore``: constructor arguments, keyed by the name of the preset.
     usual: ClassVar[dict[str, dict[str, Any]]] = {
         name: {"mass": 0.3, "damping": 0.0, "stiffness": 0.0, "integrator": name} for name in get_args(Integrator)
     }
@@ -76,10 +77,10 @@ class Tool(Part):
     integrator: Integrator = "semi-implicit"
 
     def respond(self, mass: Any, period: Any) -> ToolResponse:
-        """Return the response of the tool in units of T^2/m.
+        """Return the response G_t = y/f of the tool, divided by T^2/m.
 
         Args:
-            mass: unit of mass m in kg.
+            mass: m in kg, the unit of mass of the scene.
             period: sampling period T in s.
         """
         rate = period / self.mass

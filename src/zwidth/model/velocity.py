@@ -152,20 +152,20 @@ class Butterworth(_Checked):
 class VelocityFilter(RationalFilter):
     """Any linear estimate F(z) from position in m to velocity in m/s, by coefficients, sections or roots.
 
-    F is the product of all given forms: numerator/denominator, second-order sections, and zeros, poles and gain. For
-    example, a difference as numerator and denominator, and the sections of a low-pass.
+    If several forms are given, F is their product. For example, numerator and denominator can describe a difference,
+    and ``sos`` a low-pass filter.
 
     Args:
         numerator: coefficients in 1/s, highest power of z first; or a list of sections in series, each a list of
             coefficients.
-        denominator: coefficients or sections, as for the numerator. The degree of F's denominator must be at least that
-            of its numerator (a causal filter), and all poles must be inside the unit circle. Use sections or roots for
+        denominator: coefficients or sections, as for the numerator. F must be causal: the degree of its denominator
+            must be at least that of its numerator. All poles must be inside the unit circle. Use sections or roots for
             a filter of high order, because rounding errors in the coefficients of a single polynomial move its poles.
-        sos: second-order sections, rows of the coefficients b0 b1 b2 a0 a1 a2, as of scipy.signal with
+        sos: second-order sections, rows of the coefficients b0 b1 b2 a0 a1 a2, as returned by scipy.signal with
             ``output="sos"``.
-        zeros: zeros of F; complex zeros together with their conjugates. Default: none, if ``poles`` is given.
-        poles: poles of F, as the zeros; requires ``gain``.
-        gain: ratio of the leading coefficients; requires ``poles``.
+        zeros: zeros in z; complex zeros together with their conjugates. Default: none, if ``poles`` is given.
+        poles: poles in z, in the same form as the zeros; requires ``gain``.
+        gain: leading coefficient of the numerator divided by that of the denominator; requires ``poles``.
 
     Example:
         >>> import zwidth
@@ -253,7 +253,7 @@ def check_cutoff(cutoff: Any, period: Any, owner: str = "velocity") -> None:
 
 
 def get_coded_ratio(period: Any, coded: Any) -> Any:
-    """Return the period of the loop divided by the coded period; 1 if the coded period is None."""
+    """Return the sampling period divided by the period in the program's formula, ``coded``; 1 if ``coded`` is None."""
     return 1.0 if coded is None else period / coded
 
 
@@ -266,7 +266,7 @@ def get_pi(like: Any) -> Any:
 
 
 def as_complex(value: Any) -> Any:
-    """Convert an array to complex dtype; return an array of balls unchanged, because balls need no conversion."""
+    """Convert an array to complex dtype; return an array of balls (dtype object) unchanged."""
     return value if value.dtype == object else value + 0j
 
 

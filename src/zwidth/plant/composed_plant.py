@@ -7,8 +7,9 @@ loop ``1 + C (G + G_t) = 0``, as a wall on a device with the response G + G_t (d
     G = g N/(z^lag zeta^c D),  G_t = g_t N_t/(zeta^c D_t),  G + G_t = A/(z^lag zeta^c D D_t)
     A = g N D_t + g_t N_t z^lag D
 
-The common factor is counted once: the position of device and tool together is not observable in their distance. The
-zeros of A are refined by Aberth's method on the factored form of A. Roots are stored as *offsets* 1 - root.
+The common factor zeta^c is counted once, because a common displacement of device and tool does not change their
+distance and is therefore not observable. The zeros of A are refined by Aberth's method on the factored form of A. Roots
+are stored as *offsets* 1 - root.
 """
 
 from __future__ import annotations
@@ -24,13 +25,16 @@ from zwidth.numerics.polynomials import compute_aberth_step
 from zwidth.plant.factored_plant import CONVERGED_STEP, FAR_ZERO, FactoredPlant
 
 MAX_STEPS = 60  # largest number of Aberth steps
-NEGLIGIBLE = 1e-16  # |A| relative to its two terms, below which a zero is not refined, because A is a rounding error
+# |A| relative to the sum of the magnitudes of its two terms. Below this limit, A is only a rounding error, so its zero
+# is not refined further.
+NEGLIGIBLE = 1e-16
 
 
 def factor_tool(response: ToolResponse) -> FactoredPlant:
-    """Return the zeros, poles and gain of the response of a tool."""
+    """Convert the response G_t of a tool to gain, zeros and poles."""
     gain, power, a2, a1, a0 = (float(value) for value in response)
-    # Solve the quadratic in zeta without cancellation. The pole at z = 1 of a tool without spring is exact.
+    # Compute the larger root of the quadratic first, and the smaller root as a quotient, so that no digits cancel. A
+    # tool without spring has a0 = 0, so its pole at z = 1 is exact.
     root = np.sqrt(complex(a1 * a1 - 4.0 * a2 * a0))
     large = 0.5 * (a1 + root)
     offsets = np.array([large / a2, a0 / large if large else 0.0])
@@ -38,9 +42,9 @@ def factor_tool(response: ToolResponse) -> FactoredPlant:
 
 
 def add_plants(first: FactoredPlant, second: FactoredPlant) -> FactoredPlant:
-    """Return the zeros, poles and gain of the sum of two plants. The second plant has no lag.
+    """Return the zeros, poles and gain of the sum of two plants. The lag of the second plant must be 0.
 
-    Poles at exactly z = 1 that both plants have are counted once.
+    Poles at exactly z = 1 that occur in both plants are counted once.
     """
     common = min(int(np.sum(first.poles == 0)), int(np.sum(second.poles == 0)))
     first_poles, second_poles = (_drop_at_one(plant.poles, common) for plant in (first, second))
@@ -50,23 +54,23 @@ def add_plants(first: FactoredPlant, second: FactoredPlant) -> FactoredPlant:
     )
     gain, zeros = _find_zeros(terms)
     poles = np.concatenate([np.zeros(common), first_poles, second_poles])
-    # Each zero at z = 0 cancels one period of the lag.
+    # Each zero at z = 0 cancels one of the ``lag`` poles at z = 0.
     at_origin = min(int(np.sum(zeros == 1)), first.lag)
     zeros = np.delete(zeros, np.flatnonzero(zeros == 1)[:at_origin])
     return FactoredPlant(gain, first.lag - at_origin, zeros, poles)
 
 
 def _drop_at_one(poles: Array, count: int) -> Array:
-    """Return the offsets of poles without ``count`` of those at exactly z = 1."""
+    """Remove ``count`` poles at exactly z = 1 (offset 0) from an array of offsets."""
     return np.delete(poles, np.flatnonzero(poles == 0)[:count])
 
 
-Terms = Sequence[tuple[float, Array, int]]  # of each term of A: gain, offsets, power of z
+Terms = Sequence[tuple[float, Array, int]]  # gain, offsets of the zeros and power of z, for each term of A
 
 
 def _find_zeros(terms: Terms) -> tuple[float, Array]:
-    """Return the leading coefficient of the sum of two terms, and the offsets of its zeros."""
-    # The smaller number of roots at z = 0 is common to both terms, and exact.
+    """Return the leading coefficient of the polynomial A, the sum of two terms, and the offsets of the zeros of A."""
+    # Split off the power of z that both terms have in common, so that these zeros of A at z = 0 are exact.
     powers = [int(np.sum(offsets == 1)) + power for _, offsets, power in terms]
     at_origin = min(powers)
     reduced = tuple(
@@ -76,14 +80,15 @@ def _find_zeros(terms: Terms) -> tuple[float, Array]:
     parts = [gain * np.pad(np.atleast_1d(np.poly(1.0 - offsets)).real, (0, power)) for gain, offsets, power in reduced]
     numerator = np.trim_zeros(np.polyadd(*parts), "f")
     while numerator.size > 1 and abs(numerator[0]) < FAR_ZERO * abs(numerator[1]):
-        # Drop a zero that is so far from the unit circle that it has no effect on the circle.
+        # Drop a negligible leading coefficient. The zero of A that it causes is too far from the unit circle to affect
+        # the values of A on the circle.
         numerator = numerator[1:]
     zeta = _refine(reduced, np.roots(numerator) - 1.0 + 0j)
     return float(numerator[0]), np.concatenate([-zeta, np.ones(at_origin)])
 
 
 def _refine(terms: Terms, zeta: Array) -> Array:
-    """Return the zeros of the sum of two terms, refined by Aberth's method from approximations of zeta."""
+    """Refine the zeros of A, the sum of two terms, by Aberth's method; zeros are values of zeta = z - 1."""
     for _ in range(MAX_STEPS):
         with np.errstate(all="ignore"):
             first, second = (_evaluate(zeta, *term) for term in terms)
@@ -98,7 +103,7 @@ def _refine(terms: Terms, zeta: Array) -> Array:
 
 
 def _evaluate(zeta: Array, gain: float, offsets: Array, power: int) -> Jet:
-    """Return ``gain z^power prod(zeta + offset)`` and its derivative in zeta."""
+    """Return ``gain z^power prod(zeta + offset)`` and its derivative with respect to zeta."""
     result = Jet(gain * (1.0 + zeta) ** power, gain * power * (1.0 + zeta) ** max(power - 1, 0))
     for offset in offsets:
         result = result.times(Jet(zeta + offset, 1.0))

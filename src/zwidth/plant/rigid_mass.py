@@ -245,14 +245,15 @@ def discretize_plant(delta: Array, d: Array, kind: DelayClasses = ANY) -> Discre
 
 
 def discretize_split_delay(delta: Array, whole: Array, f: Array, remainder: Array, kind: DelayClasses) -> DiscretePlant:
-    """Compute `discretize_plant` from the two parts of the delay d = n + f.
+    """Discretize the device as `discretize_plant`, with the delay d = n + f given by its two parts.
 
     Args:
         delta: normalized damping.
         whole: integer delay n.
         f: fractional delay, 0 <= f < 1.
-        remainder: 1 - f. In float32, a difference computed from the rounded f would lose digits near f = 1.
-        kind: classes of the delays.
+        remainder: 1 - f. For arrays in float32, it must be computed before f is rounded to float32, because the
+            difference 1 - f of a rounded f loses digits near f = 1.
+        kind: classes of the delays, as for `discretize_plant`.
     """
     phi = phi_functions(delta)
     phi_t = phi_functions(delta * remainder) if kind.fractional else phi

@@ -1,4 +1,4 @@
-"""Help texts of the options and keys that describe the columns of a log file, by name."""
+"""Help texts of the options and configuration keys that select the columns of a log file (recorded samples)."""
 
 OF_LOGS = {
     "time": "Time column: HEADER, HEADER:ms, or HEADER:s+HEADER:ns for two columns. Default: recognized by its header.",

@@ -1,6 +1,8 @@
 """Registry of the outputs of sweeps, with unit, color scale, symbol and description of each.
 
-The outputs of configurations, the variables of stores, and the labels of figures are generated from the entries.
+An *output* is a result per wall or per device, such as the spectral radius. A *store* is the Zarr group with the
+results of one sweep. The outputs of configurations, the variables of stores and the labels of figures are generated
+from the entries.
 """
 
 from __future__ import annotations
@@ -11,10 +13,11 @@ from typing import Any, Literal, TypeAlias
 from zwidth.core.status import Status
 
 Family: TypeAlias = Literal["wall", "device"]  # an output has one value per wall, or one value per device and delay
-# Kinds of color scales: "truth" for truth values, "diverging" for numbers with a good and a bad side of a center,
-# "logarithmic" for positive numbers, "steep" for positive numbers that may be infinite, "sequential" for other numbers.
+# Kinds of color scales: "truth" for truth values, "diverging" for numbers that are good on one side of a limit and bad
+# on the other, "logarithmic" for positive numbers, "steep" for positive numbers that may be infinite, "sequential" for
+# other numbers.
 ColorScale: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
-NOT_COMPUTED = 255  # status of points whose chunk does not exist yet; the other codes are those of `zwidth.Status`
+NOT_COMPUTED = 255  # status of points that are not computed yet; all other codes are those of `zwidth.Status`
 
 
 @dataclass(frozen=True)
@@ -28,34 +31,37 @@ class Output:
     family: Family = "wall"
     dtype: Literal["bool", "float64", "uint8"] = "float64"
     units: str = "1"  # unit in a normalized sweep
-    physical_units: str | None = None  # unit in a sweep over SI quantities; None if it is ``units``
+    physical_units: str | None = None  # unit in a sweep over SI quantities; None if equal to ``units``
     physical_only: bool = False  # True if a normalized sweep cannot compute it
     with_parts: bool = False  # True if it can be computed for devices with a velocity filter, a hand or a coupling
     source: str = ""  # other output from which this one is computed at no cost; "" if there is none
-    # Approximate numbers of points per second and core, for rigid devices and for devices with parts.
+    # Approximate speeds in points per second and core: for rigid devices, and for devices with parts.
     rates: tuple[float, float] = (1e6, 10.0)
     label: str = ""  # name in figures, if it differs from ``name``
-    center: float = 0.0  # value between the good and the bad side: the limit of stability or passivity
-    below: bool = False  # True if the good side is below the center
-    flags: dict[str, Any] = field(default_factory=dict)  # meanings of codes and truth values, as CF attributes
+    center: float = 0.0  # limit of stability or passivity, which separates good from bad values
+    below: bool = False  # True if values below the center are good
+    flags: dict[str, Any] = field(default_factory=dict)  # attributes of the CF conventions that explain the codes
 
     @property
     def words(self) -> str:
-        """The name in figures."""
+        """The name of the output in figures."""
         return self.label or self.name.replace("_", " ")
 
     @property
     def logarithmic(self) -> bool:
-        """True if its axes and colors are logarithmic; they cannot show the value 0."""
+        """True if figures show the output on a logarithmic scale, which cannot represent the value 0."""
         return self.color_scale in ("logarithmic", "steep")
 
     def units_in(self, physical: bool) -> str:
-        """Return the unit in a sweep over SI quantities if ``physical``, otherwise in a normalized sweep."""
+        """Return the unit of the output, in a sweep over SI quantities (``physical``) or in a normalized sweep."""
         return self.physical_units if physical and self.physical_units else self.units
 
 
 def _flags(values: list[int], meanings: str) -> dict[str, Any]:
-    """Return the attributes that the CF conventions require for a variable of codes; blanks separate the meanings."""
+    """Return the attributes that the CF conventions require for a variable whose values are codes.
+
+    ``meanings`` lists the meanings of the codes, separated by blanks.
+    """
     return {"flag_values": values, "flag_meanings": meanings}
 
 
@@ -142,16 +148,16 @@ _OUTPUTS = (
 OUTPUTS = {output.name: output for output in _OUTPUTS}
 
 RADIUS_OUTPUTS = frozenset(name for name, output in OUTPUTS.items() if "spectral_radius" in (name, output.source))
-# Stability margins (`zwidth.margins`), which are NaN for a wall without such a margin even if no error occurred.
+# Stability margins (`zwidth.margins`). They can be NaN without an error, because some walls do not have each margin.
 MARGIN_OUTPUTS = frozenset({"gain_margin", "phase_margin", "delay_margin", "modulus_margin"})
 OUTPUTS_WITH_PARTS = tuple(name for name, output in OUTPUTS.items() if output.with_parts)
 
-# Names of the status variables: of the outputs per wall, and of the outputs per device and delay.
+# Name of the status variable for each family: outputs per wall, and outputs per device and delay.
 STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
 
 
 def status_flags() -> dict[str, Any]:
-    """Return the attributes of a status variable, with the codes and their meanings as in the CF conventions."""
+    """Return the attributes of a status variable: the status codes and their meanings, as in the CF conventions."""
     codes = [*(int(status) for status in Status), NOT_COMPUTED]
     meanings = " ".join([*(status.name.lower() for status in Status), "not_computed"])
     return {"long_name": "status of each point", **_flags(codes, meanings)}

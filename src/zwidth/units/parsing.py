@@ -83,7 +83,7 @@ class Dimension:
 MASS = Dimension("kg, g, mg", "0.1 kg")
 TIME = Dimension("s, ms, us, µs, ns", "1 ms")
 RATE = Dimension("Hz, kHz, MHz", "1 kHz")
-# The unit rad/s of a bandwidth does not make a device rotary.
+# Bandwidths have a dimension of their own, because their unit rad/s does not imply a rotary device.
 BANDWIDTH = Dimension("1/s", "1000 rad/s", {"rad/s": 1.0, "krad/s": 1e3, "Hz": 2.0 * math.pi, "kHz": 2e3 * math.pi})
 DAMPING = Dimension("N s/m, mN s/m, kN s/m, N s/mm, mN s/mm, N s/cm, kg/s", "10 N s/m")
 STIFFNESS = Dimension("N/m, mN/m, kN/m, MN/m, N/mm, kN/mm, N/cm", "10 kN/m")
