@@ -32,7 +32,7 @@ from zwidth.stability.rigid.normalization import valid_wall
 # Error bounds of float32 numbers. Steps M1 to M4 of docs/theory/certified.md derive them.
 ROUNDING = 2.0**-22  # relative error of one operation: four rounding units, because GPUs may round less accurately
 INTEGER_PLANT_ERROR = 2.0**-19  # relative error of each parameter of the discretized device, for integer delays
-FRACTIONAL_PLANT_ERROR = 2.0**-17  # the same for fractional delays
+FRACTIONAL_PLANT_ERROR = 2.0**-17  # relative error of each parameter of the discretized device, for fractional delays
 PHASE_ERROR = 2.0**-18  # relative error of the phase lag of the delay, in addition to the relative error of u
 MAX_WIDTH = 2.0**-6  # largest relative error of u; squares of larger errors would not be negligible
 TINY = 2.0**-100  # absolute error of a product; larger than the numbers that processors replace by 0 in float32
