@@ -23,8 +23,9 @@ def call_numpy(
 ) -> list[Array]:
     """Return the results of a NumPy function that compiled JAX code calls.
 
-    All arrays and results have the same type, float32 or float64. The call passes them as bit patterns in int32. It may
-    run in a thread in which JAX's default precision is float32, and float64 values would be rounded there.
+    All arrays and results have the same type, float32 or float64. The call passes them as bit patterns in int32.
+    Otherwise, float64 values could be rounded to float32, because JAX may run the call in a thread with another default
+    precision.
 
     Args:
         function: maps NumPy arrays to a sequence of NumPy arrays; it must not use JAX.

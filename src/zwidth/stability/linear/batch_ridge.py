@@ -46,7 +46,7 @@ LOG_RANGE = (-9.0, 2.0)  # log10 alpha of the first bracket of the maximum
 BISECTIONS = 20  # steps of the bisection for the largest alpha
 CLOSE_CELLS = 4  # largest number of nodes between two crossings that may enclose a smooth maximum of alpha
 NEWTON_STEPS = 8  # for the angles of a corner
-SECANT_STEPS = 24  # largest number, for the angle w of a smooth maximum of alpha; most loops need 10 to 15
+SECANT_STEPS = 24  # at most, for the angle w of a smooth maximum of alpha; most loops need 10 to 15 steps
 # Largest last step of the angle w of a smooth maximum, relative to w. An error of w changes the maximum of alpha only
 # by its square, because alpha is stationary there.
 CONVERGED_PEAK = 1e-7
@@ -352,8 +352,7 @@ def _are_connected(loops: Sampled, axis: LineCrossings, start: Array, alpha: Arr
     straight line from the level with the smallest alpha to K = B = 0.
     """
     xp, n, count = namespace(alpha), alpha.size, len(LEVELS)
-    # Repeat the loops once per level, so that one call finds the crossings on all levels, and another call those on all
-    # sections.
+    # Repeat the loops once per level. One call then finds the crossings on all levels, another those on all sections.
     each = xp.tile(xp.arange(n), count)
     below = xp.asarray(LEVELS)[:, None] * alpha
     level = find_crossings(loops.take(each), Line(a0=below.reshape(-1), b1=1.0))

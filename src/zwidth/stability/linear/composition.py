@@ -129,7 +129,7 @@ def _connect(
         gain, lag, zeros, poles: the plant.
         feedback: the filter R0.
         estimate: the velocity estimate F; None for a loop without damper.
-        shared: number of last zeros of the plant that are last poles of F.
+        shared: number of roots that are both zeros of the plant and poles of F; both lists end with these roots.
     """
     first = zeros.size - shared
     return _build_loop(

@@ -35,7 +35,7 @@ Terms = tuple[Response, ...]
 
 
 def respond_to_position(points: CirclePoints) -> Jet:
-    """Return the value 1 and its derivative 0: without a position estimate, the spring acts on the sampled position."""
+    """Return P = 1 and its derivative 0, the position estimate of a spring that acts on the sampled position itself."""
     return Jet(np.ones(()), np.zeros(()))
 
 
@@ -92,7 +92,7 @@ class LoopRoots(FactoredPlant):
     def open_poles(self) -> np.ndarray:
         """Offsets 1 - pole of the open loop L at the plant input.
 
-        Poles of the estimates may be missing, because they are inside the unit circle.
+        The array may lack poles of the estimates, which are inside the unit circle and need not be counted.
         """
         if self.inner is None:
             return self.poles
@@ -101,12 +101,12 @@ class LoopRoots(FactoredPlant):
 
     @property
     def free_zeros(self) -> np.ndarray:
-        """Offsets 1 - zero of the zeros of G, without those that are also poles of F."""
+        """Offsets 1 - root of those zeros of G that are not poles of F."""
         return self.zeros[: self.zeros.size - self.shared]
 
     @property
     def free_poles(self) -> np.ndarray:
-        """Offsets 1 - pole of the poles of F, without those that are also zeros of G."""
+        """Offsets 1 - root of those poles of F that are not zeros of G."""
         return self.estimate.poles[: self.estimate.poles.size - self.shared]
 
     @property

@@ -87,7 +87,7 @@ def map_by_degree(
 
 @lru_cache(CACHED_KERNELS)
 def compile_by_degree(kernel: Callable[..., Any], degree: Degree, *static: Any) -> Callable[..., Any]:
-    """Return a function of JAX arrays of equal shape that applies the kernel, compiled for one degree of P."""
+    """Return the kernel, compiled by JAX for points of one degree of P, as a function of JAX arrays of equal shape."""
     import jax
 
     def compute(*arrays: Any) -> Any:

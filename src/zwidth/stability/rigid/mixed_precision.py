@@ -99,7 +99,7 @@ class Bounded:
 
 
 def label_in_mixed_precision(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
-    """Return whether each wall is stable, with the labels of float64; False for invalid input.
+    """Return whether each wall is stable, with the same result as float64; False for invalid input.
 
     Args:
         alpha, beta, delta, d: float64 JAX arrays that broadcast.
@@ -164,8 +164,7 @@ def bound_root(coefficients: tuple[Bounded, ...]) -> tuple[Bounded, Array]:
     values = tuple([h.value for h in coefficients])
     u = find_first_root(values)
     slope = horner(u, [k * value for k, value in enumerate(values)][1:])
-    # Choose an interval around u that is twice as wide as the error of H requires, so that the sign of H is certain at
-    # both ends.
+    # Use twice the width that the error of H requires, so that the sign of H is certain at both ends of the interval.
     error = horner(Bounded(u), coefficients).error
     width = lazy_jax.numpy.maximum(2.0 * error / abs(u * slope), ROUNDING)
     low, high = (horner(Bounded(u * (1.0 + side)), coefficients) for side in (-width, width))

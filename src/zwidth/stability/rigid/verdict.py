@@ -137,7 +137,7 @@ def _select_kernel(precision: str, method: str, values: tuple[ArrayLike, ...]) -
                 "precision: got 'mixed' inside a JAX transformation without float64; call "
                 "jax.config.update('jax_enable_x64', True) first"
             )
-    # Import this module only for the precision "mixed", because most programs do not use it.
+    # Import `mixed_precision` only here, because most programs do not use it.
     from zwidth.stability.rigid.mixed_precision import label_in_mixed_precision
 
     return label_in_mixed_precision

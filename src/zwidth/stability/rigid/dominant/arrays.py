@@ -158,8 +158,8 @@ def _map_in_batches(
 def find_wall_axes(shapes: Sequence[tuple[int, ...]]) -> list[int] | None:
     """Return the axis of beta and the axis of alpha of a grid of walls; None if the shapes form no large grid.
 
-    In a grid, alpha varies along one axis, beta along another, and no other argument varies along these two axes. If
-    alpha or beta is constant, it has the first axis, which must then have length 1 for all arguments.
+    In a grid, alpha varies along one axis, beta along another, and no other argument varies along these two axes. For a
+    constant alpha or beta, the first axis is returned; it must have length 1 for all arguments.
 
     Args:
         shapes: shapes of alpha, beta, delta and d, with the same number of axes.

@@ -65,7 +65,7 @@ from zwidth.stability.rigid.dominant.steps import evaluate_polynomial
 from zwidth.stability.rigid.normalization import valid_wall
 from zwidth.stability.rigid.stiffness_limit import label_jax_arrays
 
-# Default relative error of the certificate, as a power of the machine epsilon: 8e-10 in float64, 1e-4 in float32.
+# The default relative error of the radius is eps^ACCURACY_EXPONENT: 8e-10 in float64, 1e-4 in float32.
 ACCURACY_EXPONENT = 0.58
 RESCUE_SIZE = 1 << 9  # number of open walls that a JAX program computes at once by bisection
 # Largest number of circles on which poles are counted to certify a pole after a bisection. Each circle is ten times as
@@ -87,7 +87,7 @@ def compute_jax_poles(arguments: Mapping[str, ArrayLike], accuracy: float | None
     static = classify_delays(arguments["d"]), accuracy, with_rate
     with precision(arguments.values()):
         arrays = convert_for_jax(arguments)
-        # Add a first axis of length 1, as `find_poles` does for a line of walls.
+        # Add a first axis of length 1, because `find_wall_axes` needs it if alpha or beta is constant.
         rank = max(map(np.ndim, arrays)) + 1
         shapes = [(1,) * (rank - np.ndim(array)) + np.shape(array) for array in arrays]
         is_grid = computes_on_one_cpu() and find_wall_axes(shapes) is not None
@@ -143,7 +143,7 @@ def _compute_on_host(accuracy: float, with_rate: bool, *arrays: np.ndarray) -> t
 def pole_kernel(
     alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses, accuracy: float | None, with_rate: bool
 ) -> tuple[Array, ...]:
-    """Return the results of `compute_jax_poles` and their derivatives, for JAX arrays of equal shape.
+    """Return the dominant poles and their derivatives for JAX arrays of equal shape, as `compute_jax_poles` does.
 
     The results are NaN if the pole is not certified or is a multiple pole.
     """
@@ -180,7 +180,7 @@ def pole_kernel(
 
 
 def place_near_one(radius: Array, alpha: Array, stable: Array) -> Array:
-    """Return spectral radii in which values close to 1 agree with the verdict ``stable``; derivatives stay the same."""
+    """Return spectral radii of which those close to 1 are corrected to agree with ``stable``; keep the derivatives."""
     xp, constant = namespace(radius), stop_gradient(radius, namespace(radius))
     near_one = xp.abs(constant - 1.0) <= max(VERDICT_WIDTH, COUNT_ROUNDING * epsilon(radius))
     # Add the correction as a constant, because the derivative of ``xp.where(near_one, limit, radius)`` would be 0.
