@@ -1,4 +1,8 @@
-"""Evaluation of functions on several devices of JAX, each of which computes its part of distributed arrays."""
+"""Evaluate compiled functions of arrays that JAX stores in parts on several processors.
+
+JAX calls these processors *devices*, for example GPUs; here a device is never a haptic device. An array is
+*distributed* if its parts are stored on several devices. A *point* is one entry of the arguments, for example one wall.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +18,14 @@ from zwidth.numerics.evaluate import CACHED_KERNELS
 def map_on_devices(function: Callable[..., Any], arrays: Sequence[Array]) -> Any:
     """Apply a compiled function to JAX arrays; if they are distributed, each device computes its part of the points.
 
-    The compiler of JAX distributes elementwise code itself. This function serves code with loops or matrices, whose
-    results it would gather on one device. Inside `jit`, JAX reports the distribution only for meshes with explicit
-    axes.
+    Use `map_on_devices` for code with loops or matrices, because the compiler of JAX would gather the points of such
+    code on one device. Elementwise code does not need it, because the compiler distributes this code itself. Inside
+    `jit`, JAX reports how an array is distributed only if the axes of the device mesh are explicit.
 
     Args:
-        function: compiled function of arrays whose first axes are those of the points. Each call with the same function
-            uses the same program.
-        arrays: arguments of the function. The last array has the axes of the points only.
+        function: compiled function of arrays whose first axes are those of the points. Pass the same object in repeated
+            calls, because the program for several devices is compiled once per function.
+        arrays: arguments of the function. The last array has the axes of the points and no other axes.
     """
     import jax
 
@@ -39,7 +43,7 @@ def map_on_devices(function: Callable[..., Any], arrays: Sequence[Array]) -> Any
 
 @lru_cache(CACHED_KERNELS)
 def _compile_parts(function: Callable[..., Any], mesh: Any, spec: Any, count: int) -> Callable[..., Any]:
-    """Return a function that applies another function of ``count`` arrays on each device to its part of the arrays."""
+    """Return a compiled function of ``count`` arrays; on each device, it applies ``function`` to the local parts."""
     import jax
 
     return jax.jit(jax.shard_map(function, mesh=mesh, in_specs=(spec,) * count, out_specs=spec, check_vma=False))

@@ -360,7 +360,7 @@ def _map_in_blocks(function: Callable[..., Any], arrays: Sequence[Any], block: i
 
 
 def computes_on_one_cpu() -> bool:
-    """Return whether JAX computes on one CPU device only, so that no array is distributed over several devices."""
+    """Return whether JAX uses a single CPU device only, so that no array is stored in parts on several devices."""
     import jax
 
     return jax.default_backend() == "cpu" and jax.device_count() == 1

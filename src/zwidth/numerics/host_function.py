@@ -78,6 +78,6 @@ def _request(function: HostFunction, count: int, order: int, point: jax.Array) -
 
 
 def _answer(function: HostFunction, order: int, point: np.ndarray) -> list[np.ndarray]:
-    """Compute values and derivatives of a host function at a point, or at an array of points."""
+    """Return values and derivatives of a host function; the last axis of ``point`` holds the function's arguments."""
     parts = function(order, point.reshape(-1, point.shape[-1]).astype(np.float64))
     return [part.reshape(*point.shape[:-1], *part.shape[1:]) for part in parts]

@@ -73,8 +73,8 @@ def count_poles(zeros: RootsLike, poles: RootsLike, gain: ArrayLike, lag: ArrayL
         differs from its argument by at most pi/2. The count is that of the larger part at z = -r, plus m at each
         crossover to B, minus m at each crossover to T, with m = round((arg T - arg B)/(2 pi)) and arguments that are
         continuous in w. The result is -1 unless m is constant on a disk; then nearly coincident crossovers have no net
-        effect. Direct calls compute in float64, JAX arrays on their devices. Under jit or vmap the function is traced
-        in JAX's default float type, and float32 returns -1 more often. A count has no derivative.
+        effect. Direct calls compute in float64; JAX arrays are computed on their own devices. Under jit or vmap the
+        number type is JAX's default; with float32, the result is -1 more often. A count has no derivative.
 
     References:
         Walton, Marshall 1987, IEE Proc. D 134 (crossovers of loops with delay), Nyquist 1932, Bell Syst. Tech. J. 11.
@@ -104,7 +104,7 @@ def count_poles(zeros: RootsLike, poles: RootsLike, gain: ArrayLike, lag: ArrayL
 
 
 def _count_jax_arrays(values: dict[str, Any], members: list[Any]) -> Counts:
-    """Return the counts for arguments with JAX arrays among them, by code that JAX compiles, on their devices."""
+    """Return the pole counts in code compiled by JAX, for arguments of which at least one is a JAX array."""
     import jax.numpy as jnp
 
     arrays = []
@@ -122,7 +122,7 @@ def _count_jax_arrays(values: dict[str, Any], members: list[Any]) -> Counts:
 
 @cache
 def _compile_count() -> Any:
-    """Return `_count`, compiled by JAX as one program: outside jit, each of its 700 operations would be a program."""
+    """Return `_count`, compiled by JAX as one program; without jit, JAX would compile its 700 operations one by one."""
     import jax
 
     return jax.jit(lambda *columns: _count(list(columns), jax.numpy))

@@ -124,7 +124,7 @@ class LineCrossings(NamedTuple):
     doubtful: Array  # True for loops whose nodes do not resolve k, shape (loops,)
 
     def take(self, index: Array) -> LineCrossings:
-        """Return the crossings of the loops with the given indices."""
+        """Return the crossings of a selection of loops, given the indices of these loops."""
         return LineCrossings(*(part[..., index] for part in self))
 
     def count_gaps(self, outside: Array, origin: Array | float = 0.0) -> Array:
@@ -217,28 +217,29 @@ def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
 
 
 def _select_turns(step: Array, k: Array, slope: Array) -> tuple[Array, Array]:
-    """Select the node intervals in which k may have two zeros next to an extremum, from values and slopes at the nodes.
+    """Select the intervals between neighboring nodes in which k may have two zeros, one on each side of an extremum.
 
     Args:
-        step: lengths of the node intervals.
-        k: values at the nodes.
-        slope: derivatives at the nodes.
+        step: lengths of the intervals.
+        k: values of k at the nodes.
+        slope: derivatives of k at the nodes.
 
     Returns:
-        A mask of these intervals; and for each loop, if an interval may have more zeros than the code searches for.
+        A mask of the selected intervals; and for each loop, whether k may have more zeros in some interval than the
+        code searches for.
     """
-    # Let p be the cubic polynomial with the values and slopes of k at both nodes, and b0 .. b3 its Bernstein
-    # coefficients, multiplied by the sign of k at the lower node. They bound p, and their differences bound p'. The
-    # difference between k and p is estimated from the cubic term c of p: where the nodes resolve k, the term of fourth
-    # order is not larger than c. It changes k between the nodes by at most c/16, and p' by less than 3 c/4.
+    # Let p be the cubic polynomial that has the values and slopes of k at both nodes, multiplied by the sign of k at
+    # the lower node. Its Bernstein coefficients b0 .. b3 bound p, and their differences bound the derivative p'.
+    # The cubic term c of p yields an estimate of the difference between k and p: if the nodes resolve k, the
+    # fourth-order term of k is at most c. It changes k by at most c/16 and the derivative by less than 3 c/4.
     xp = namespace(k)
     sign = xp.where(k[:-1] > 0, 1.0, -1.0)
     b0, b3, falls, rises = k[:-1] * sign, k[1:] * sign, slope[:-1] * sign < 0, slope[1:] * sign > 0
     b1, b2 = b0 + step * slope[:-1] * sign / 3.0, b3 - step * slope[1:] * sign / 3.0
     c = xp.abs(b3 - b0 + 3.0 * (b1 - b2))
     low, changes = xp.minimum(b1, b2) <= c / 16.0, b3 <= 0
-    # With one sign at both nodes, k may have two zeros if it has a minimum, or a minimum and a maximum. With different
-    # signs, k may have three zeros if p has a minimum below 0 and a maximum above 0.
+    # If k has the same sign at both nodes, it may have two zeros if |k| has a minimum between the nodes. If the signs
+    # differ, k may have three zeros if p has a minimum below 0 and a maximum above 0.
     monotone = xp.where(falls, b1 - b2, b2 - b1) > c / 4.0
     wavy = xp.where(changes, (b1 <= c / 16.0) & (b2 >= -c / 16.0), low & (falls != rises) & ~monotone)
     return ~changes & low & falls & rises, xp.any(wavy, 0)

@@ -13,9 +13,9 @@ A wall has the normalized stiffness alpha and damping beta. On the *boundary cur
     the line beta = 0            has no stable wall above the line of constant K; needed if only beta >= 0 is allowed
                                  and the line of constant K has a stable wall with beta < 0
 
-If the ray has a crossing below the wall, a path of straight sections between stable walls replaces the ray. The alpha
-of a confirmed wall is within `MARGIN` of that of the stiffest wall. Symbols and shapes are those of
-`stability.linear.batch_lines`.
+A *crossing* is a wall on one of these lines with a pole on the unit circle. If the ray has a crossing below the wall,
+another path from the wall to K = 0 is searched for, a sequence of straight *sections*. The alpha of a confirmed wall is
+within `MARGIN` of that of the stiffest wall. Symbols and shapes are those of `stability.linear.batch_lines`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LOG_RANGE = (-9.0, 2.0)  # log10 alpha of the first bracket of the maximum
 BISECTIONS = 20  # steps of the bisection for the largest alpha
 CLOSE_CELLS = 4  # largest number of nodes between two crossings that may enclose a smooth maximum of alpha
 NEWTON_STEPS = 8  # for the angles of a corner
-SECANT_STEPS = 24  # for the angle of a smooth maximum of alpha; 10 to 15 suffice in most cases
+SECANT_STEPS = 24  # at most, for the angle w of a smooth maximum of alpha; most loops need 10 to 15 steps
 # Largest last step of the angle w of a smooth maximum, relative to w. An error of w changes the maximum of alpha only
 # by its square, because alpha is stationary there.
 CONVERGED_PEAK = 1e-7
@@ -334,7 +334,8 @@ def _confirm(loops: Sampled, axis: LineCrossings, start: Array, alpha: Array, be
     connected = (first == 0) & ~xp.any((ray.t > 0) & (ray.t < 1.0 - MARGIN), 0) & ~ray.doubtful
     if xp is not np:
         return highest & (connected | _are_connected(loops, axis, start, alpha, beta))
-    # Search for another path only for the few loops whose ray is not stable.
+    # Search for a path of several sections only for the few loops with a crossing on the straight line from K = B = 0
+    # to the wall.
     index = pad_index(np.flatnonzero(highest & ~connected))
     if index.size:
         few = loops.take(index), axis.take(index), start[index], alpha[index], beta[index]
@@ -343,14 +344,15 @@ def _confirm(loops: Sampled, axis: LineCrossings, start: Array, alpha: Array, be
 
 
 def _are_connected(loops: Sampled, axis: LineCrossings, start: Array, alpha: Array, beta: Array) -> Array:
-    """Return whether a path of stable walls leads from the wall just below each maximum to K = 0.
+    """Return whether a path of stable walls leads from the wall just below each maximum of alpha to K = B = 0.
 
-    The path descends from each of the `LEVELS` of alpha to the next lower one, to the stable interval of beta that
-    overlaps most with the interval at the upper level, or is nearest to this interval. From the lowest level the path
-    follows a straight line to K = B = 0.
+    A *level* is the line of constant alpha at one of the fractions `LEVELS` of the maximum. The path descends from
+    level to level in straight sections. On each level it passes through one stable interval of beta: the interval that
+    overlaps most with the interval of the level above or, if none overlaps, the nearest interval. The last section is a
+    straight line from the level with the smallest alpha to K = B = 0.
     """
     xp, n, count = namespace(alpha), alpha.size, len(LEVELS)
-    # Evaluate the lines of all levels in one call, then the sections of the path, as lines of repeated loops.
+    # Repeat the loops once per level. One call then finds the crossings on all levels, another those on all sections.
     each = xp.tile(xp.arange(n), count)
     below = xp.asarray(LEVELS)[:, None] * alpha
     level = find_crossings(loops.take(each), Line(a0=below.reshape(-1), b1=1.0))
@@ -365,17 +367,17 @@ def _are_connected(loops: Sampled, axis: LineCrossings, start: Array, alpha: Arr
         reached, shared, new_low, new_high = (
             xp.take_along_axis(part, best, 0)[0] for part in (stable[:, k], overlap, ends[0][:, k], ends[1][:, k])
         )
-        # If both intervals overlap, descend at constant B, otherwise along a straight line between their centers.
+        # If the intervals of both levels overlap, the section has constant beta. Otherwise it connects their centers.
         middle, center = 0.5 * (xp.maximum(new_low, low) + xp.minimum(new_high, high)), 0.5 * (new_low + new_high)
         sections.append([xp.where(shared >= 0, middle, other) for other in (0.5 * (low + high), center)])
         connected, low, high = connected & reached, new_low, new_high
-    # The last section leads from K = B = 0 to the lowest level.
+    # The last section is the straight line from K = B = 0 to the level with the smallest alpha.
     above, zero = xp.concatenate([alpha[None], below[:-1], 0.0 * alpha[None]]), 0.0 * alpha
     below = xp.concatenate([below, below[-1:]])
     first, last = (xp.stack(column) for column in zip(*sections, (zero, 0.5 * (low + high)), strict=True))
     line = Line(*(part.reshape(-1) for part in (above, first, below - above, last - first)))
     path = find_crossings(loops.take(xp.tile(xp.arange(n), count + 1)), line)
-    # The first section starts at the maximum, i.e. at a crossing.
+    # Ignore the crossing at which the first section starts, because the maximum is on the stability boundary.
     origin = xp.concatenate([MARGIN * alpha / (alpha - below[0]), xp.tile(zero, count)])
     free = ~xp.any((path.t > origin) & (path.t < 1.0), 0) & ~path.doubtful
     softest = combine(Line(a1=below[-1], b1=last[-1]), tuple(part[:1] for part in loops.parts))[0]

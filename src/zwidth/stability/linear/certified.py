@@ -142,19 +142,20 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
 def _add_tool(
     numerator: flint.arb_poly, denominator: flint.arb_poly, response: ToolResponse, common: int
 ) -> tuple[flint.arb_poly, flint.arb_poly]:
-    """Return numerator and denominator of the plant plus the response of a tool.
+    """Return numerator and denominator of G + G_t, the sum of the responses of the plant and of a simulated tool.
 
     Args:
-        numerator: numerator of the plant.
-        denominator: denominator of the plant, with its poles at z = 0.
-        response: response of the tool.
-        common: 1 if plant and tool have a common pole at exactly z = 1, which is divided out; otherwise 0.
+        numerator: numerator of G.
+        denominator: denominator of G, with its poles at z = 0.
+        response: response G_t of the tool.
+        common: 1 if both G and G_t have a pole at exactly z = 1, which their sum has only once; otherwise 0.
     """
     import flint
 
     gain, power, a2, a1, a0 = response
     zeta = flint.arb_poly([-1, 1])
-    # A tool without spring has a0 = 0, so that its denominator is zeta (a2 zeta + a1).
+    # With zeta = z - 1, the denominator of G_t is a2 zeta^2 + a1 zeta + a0. A tool without spring has a0 = 0. If G also
+    # has a pole at z = 1, omit the factor zeta of one of the two denominators.
     tool = zeta * a2 + flint.arb_poly([a1]) if common else zeta * zeta * a2 + zeta * a1 + flint.arb_poly([a0])
     rest = denominator // zeta if common else denominator
     return numerator * tool + rest * flint.arb_poly([0] * power + [1]) * gain, denominator * tool
@@ -163,14 +164,15 @@ def _add_tool(
 def _expand_estimates(
     estimates: LoopEstimates, numerator: flint.arb_poly, denominator: flint.arb_poly
 ) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly]:
-    """Return the polynomials D, N1 and N2 of a loop with estimates P and V and further feedback R, normalized.
+    """Return D, N1 and N2 of the characteristic polynomial ``D + alpha N1 + beta N2`` in normalized units.
 
-    Common poles of P and V are not canceled, because they are inside the unit circle and do not change the result.
+    The controller is ``alpha P + beta V + R`` with the position estimate P, the velocity estimate V and the further
+    feedback R. Common poles of P and V are not canceled. They are inside the unit circle, so the verdict is the same.
 
     Args:
         estimates: P, V and R.
         numerator: numerator of the plant.
-        denominator: denominator of the plant, with the delay.
+        denominator: denominator of the plant, with the factors z of the delay.
     """
     p_numerator, p_denominator = _expand_estimate(estimates.position)
     v_numerator, v_denominator = _expand_estimate(estimates.velocity)

@@ -1,9 +1,13 @@
 """Realize the open and the closed loop of a wall in state space.
 
-In normalized units, a wall (alpha, beta) acts on the sampled position y through the velocity estimate F with the force
-``u = -(alpha + beta F) y``. With a position estimate P, a velocity estimate V and further feedback R, the force is ``u
-= -(alpha P + beta V + R) y``. With a tool of the response G_t, the wall is a coupling C, and the controller is
-``C/(1 + C G_t)``. An external force, held constant over each period, acts on the first body without delay.
+In normalized units, the controller of the wall (alpha, beta) computes the force u from the sampled position y:
+
+    u = -(alpha + beta F) y           with a velocity estimate F
+    u = -(alpha P + beta V + R) y     with a position estimate P, a velocity estimate V and further feedback R
+    u = -C/(1 + C G_t) y              with a simulated tool: C is one of the two controllers above, now a coupling, and
+                                      G_t the response of the tool's position to the force
+
+An external force, held constant over each period, acts on the first body without delay.
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ def realize_open_loop(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
 
 
 def _realize_controller(chain: AnyChain, alpha: float, beta: float) -> StateSpace:
-    """Return the controller ``alpha + beta F`` in state space; with estimates P, V and R, ``alpha P + beta V + R``."""
+    """Return the controller in state space: ``alpha + beta F``, or ``alpha P + beta V + R`` if the scene has P or R."""
     if chain.estimates is not None:
         program = realize_estimates(chain.estimates)
         gains = np.array([[alpha, beta, 1.0]])
@@ -34,10 +38,13 @@ def _realize_controller(chain: AnyChain, alpha: float, beta: float) -> StateSpac
 
 
 def _couple_tool(coupling: StateSpace, tool: ToolResponse) -> StateSpace:
-    """Return the response of a coupling and its tool from the position of the device to the force of the coupling."""
+    """Return ``C/(1 + C G_t)`` in state space, for a coupling C and a simulated tool with the response G_t.
+
+    The input is the position x of the device, the output the force C (x - y), with the position y of the tool.
+    """
     plant = factor_tool(tool)
     y = realize_estimate(Estimate(0, plant.gain, 0, plant.zeros, plant.poles))
-    # Distance between device and tool, as coefficients of both states and of the position of the device.
+    # The distance x - y is ``share`` times x plus ``states`` times the states of coupling and tool.
     share = 1.0 / (1.0 + float(y.D[0, 0] * coupling.D[0, 0]))
     states = -share * np.concatenate([y.D @ coupling.C, y.C], 1)
     C = np.pad(coupling.C, ((0, 0), (0, len(y.A)))) + coupling.D @ states
@@ -47,7 +54,10 @@ def _couple_tool(coupling: StateSpace, tool: ToolResponse) -> StateSpace:
 
 
 def realize_closed_loop(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse | None = None) -> StateSpace:
-    """Return the closed loop with a wall in state space, from a held external force to the sampled position."""
+    """Return the closed loop in state space, from an external force held over each period to the sampled position.
+
+    With a tool, the wall (alpha, beta) is the coupling between device and tool.
+    """
     controller = _realize_controller(chain, alpha, beta)
     controller = controller if tool is None else _couple_tool(controller, tool)
     loop, filter_order = connect_in_series(controller, sample_states(chain).realize()), len(controller.A)

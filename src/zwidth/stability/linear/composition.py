@@ -1,14 +1,18 @@
-"""Compose the loop of a scene from its sampled plant, its estimates and its further feedback.
+"""Compute zeros, poles and gain of loops that have filters in the controller.
 
-With the sampled plant H, the position estimate P, the velocity estimate V and the further feedback R
-(`model.loop_estimates`), the closed loop has poles where ``1 + H (alpha P + beta V + R) = 0``. This is the equation
-``1 + G (alpha + beta F) = 0`` of `stability.linear.roots` for
+H is the sampled plant, P the position estimate, V the velocity estimate, and R a further feedback filter. With
 
     G = H P/(1 + H R)      F = V/P
 
-(docs/theory/scenes.md, V25). The zeros of 1 + H R are computed like closed-loop poles, by Aberth's method in z - 1, and
-are poles of G. Common poles of P, V and R cancel by construction, never by a comparison of rounded roots. Roots are
-stored as offsets 1 - root.
+the loop is that of a plant G with the velocity estimate F. A wall has the normalized stiffness alpha and damping beta.
+A closed-loop pole is a root z of ``1 + H (alpha P + beta V + R) = 0``, which is equivalent to the equation
+``1 + G (alpha + beta F) = 0`` of `stability.linear.roots` (docs/theory/scenes.md, V25). R is a filter R0 of the sampled
+position, or a filter R0 of the weighted estimates, ``R = R0 (w_p P + w_v V)`` (`model.loop_estimates`).
+
+The zeros of 1 + H R are poles of G. They are computed like closed-loop poles, by Aberth's method in z - 1. Common poles
+of P, V and R cancel by construction, never by a comparison of rounded roots. *Shared* roots are the last zeros of G,
+which are also the last poles of F. Roots are stored as *offsets* 1 - root. The *lag* of a transfer function is its
+number of factors 1/z; a negative lag is a number of factors z.
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ from zwidth.stability.linear.roots import LoopRoots
 
 
 def find_roots(chain: AnyChain) -> LoopRoots:
-    """Return the zeros, poles and gain of the loop of a chain, without a wall."""
+    """Return the zeros, poles and gain of a loop without a wall, for the model ``chain`` of plant and controller."""
     plant = factor_chain(chain)
     if chain.estimates is None:
         return LoopRoots(**vars(plant), estimate=chain.estimate)
@@ -56,9 +60,10 @@ def compose_loop(plant: FactoredPlant, estimates: LoopEstimates) -> LoopRoots:
 def _build_loop(
     gain: float, lag: int, zeros: np.ndarray, poles: np.ndarray, estimate: Estimate, shared: int
 ) -> LoopRoots:
-    """Return a loop with a nonnegative lag; see `LoopRoots` for the arguments.
+    """Return a loop whose plant G has a nonnegative lag; see `LoopRoots` for the arguments.
 
-    A negative lag becomes zeros at z = 0. If F has poles at z = 0, as many of these zeros as possible are shared.
+    If the given lag is -k < 0, G gets k zeros at z = 0. If F has poles at z = 0, as many as possible of these zeros
+    become shared roots, because they cancel the poles of F.
     """
     zeros, poles = np.asarray(zeros, complex), np.asarray(poles, complex)
     estimate = replace(
@@ -78,7 +83,7 @@ def _build_loop(
 
 
 def _close_measured(plant: FactoredPlant, feedback: Estimate) -> FactoredPlant:
-    """Return the closed loop ``H/(1 + H R)`` of a plant H with the feedback R; its lag may be negative."""
+    """Return the closed loop ``H/(1 + H R)`` of a plant H with feedback R; the lag of the result may be negative."""
     opened = _connect(plant.gain, plant.lag, plant.zeros, plant.poles, feedback)
     poles, lag = _close_at(opened, 1.0, 0.0), plant.lag + feedback.lag
     zeros = np.concatenate([plant.zeros, feedback.poles])
@@ -86,12 +91,12 @@ def _close_measured(plant: FactoredPlant, feedback: Estimate) -> FactoredPlant:
 
 
 def _close_estimated(loop: LoopRoots, feedback: Estimate, weights: Weights) -> LoopRoots:
-    """Return a loop after closing the feedback ``R0 (w_p P + w_v V)`` around it.
+    """Return the loop with further feedback ``R = R0 (w_p P + w_v V)``, from the loop without it.
 
     Args:
-        loop: the loop with ``G = H P`` and ``F = V/P``.
-        feedback: R0.
-        weights: w_p and w_v.
+        loop: the loop without R, i.e. with ``G = H P`` and ``F = V/P``.
+        feedback: the filter R0.
+        weights: the weights w_p and w_v.
     """
     F, lag = loop.estimate, loop.lag + feedback.lag
     if weights.velocity == 0:
@@ -100,11 +105,11 @@ def _close_estimated(loop: LoopRoots, feedback: Estimate, weights: Weights) -> L
     else:
         opened = _connect(loop.gain, loop.lag, loop.zeros, loop.poles, feedback, F, loop.shared)
         poles = _close_at(opened, float(weights.position), float(weights.velocity))
-        # The denominator of F is a factor of the closed loop's numerator, because R contains F.
+        # All poles of F become zeros of the new G, because R = R0 P (w_p + w_v F) has the denominator of F.
         shared, released, delay = F.poles.size, loop.free_poles, max(F.window + F.lag, 0)
     ends = loop.zeros[loop.zeros.size - loop.shared :]
     zeros = np.concatenate([loop.free_zeros, feedback.poles, released, ends])
-    # If R0 has more zeros than G has poles at z = 0, some of them cancel poles of F at z = 0.
+    # With lag < 0, R0 has -lag more zeros at z = 0 than G has poles there. These zeros cancel poles of F at z = 0.
     net = -feedback.lag - delay if lag >= 0 else loop.lag - max(delay + lag, 0)
     return _build_loop(loop.gain, net, zeros, poles, F, shared)
 
@@ -118,7 +123,14 @@ def _connect(
     estimate: Estimate | None = None,
     shared: int = 0,
 ) -> LoopRoots:
-    """Return the loop of a plant in series with the feedback filter R0; see `LoopRoots` for the other arguments."""
+    """Return the loop whose plant is in series with a filter.
+
+    Args:
+        gain, lag, zeros, poles: the plant.
+        feedback: the filter R0.
+        estimate: the velocity estimate F; None for a loop without damper.
+        shared: number of roots that are both zeros of the plant and poles of F; both lists end with these roots.
+    """
     first = zeros.size - shared
     return _build_loop(
         gain * float(feedback.gain),
@@ -131,10 +143,10 @@ def _connect(
 
 
 def _close_at(loop: LoopRoots, alpha: float, beta: float) -> np.ndarray:
-    """Return the offsets of the closed-loop poles with one wall; poles at exactly z = 1 stay exact.
+    """Return the offsets 1 - pole of the closed-loop poles for one wall (alpha, beta).
 
-    A pole at z = 1 that is also a zero stays a pole of the closed loop. It is removed before the other poles are
-    computed.
+    A pole of G at z = 1 that is also a zero of G is a closed-loop pole for every wall. It is removed from G before the
+    other poles are computed, so that its offset is exactly 0.
     """
     zeros, poles = np.flatnonzero(loop.free_zeros == 0), np.flatnonzero(loop.poles == 0)
     count = min(zeros.size, poles.size)

@@ -173,11 +173,11 @@ def count_outside(
 
 
 def _find_sign(loop: LoopRoots, is_integrator: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Return the sign of the open loop of each wall at a real z slightly above 1.
+    """Return the sign of the open loop L of each wall at a real z slightly above 1.
 
     Args:
-        loop: the loop.
-        is_integrator: mask of the poles of the open loop at z = 1.
+        loop: the loop without a wall.
+        is_integrator: mask of the poles of L at z = 1.
         alpha: normalized stiffness, shape (walls,).
         beta: normalized damping, shape (walls,).
     """
@@ -192,7 +192,9 @@ def _find_sign(loop: LoopRoots, is_integrator: np.ndarray, alpha: np.ndarray, be
     at_one = circle_points(np.zeros(1))
     P, V = (term(at_one).value[0].real for term in terms[:2])
     filtered = 1.0 if weights is None else weights.position * P + weights.velocity * V
-    # Multiply by the poles of R0 except those at z = 1. With such poles, R dominates the controller near z = 1.
+    # R0 is the filter of the further feedback R, and ``poles`` are the offsets 1 - pole of its poles not at z = 1. The
+    # sum ``spring + further`` is the controller times the product of these offsets. If R0 has poles at z = 1, R exceeds
+    # the forces of spring and damper near z = 1, so that ``spring`` is 0.
     poles = R0.poles[np.abs(R0.poles) > POLE_AT_ONE]
     further = float(R0.gain) * (np.prod(R0.zeros)).real * filtered
     spring = 0.0 * alpha if poles.size < R0.poles.size else (alpha * P + beta * V) * np.prod(poles).real
@@ -317,7 +319,7 @@ def _solve_delays(
 
     Args:
         plant: the plant for any delay.
-        terms: responses of the controller.
+        terms: position estimate P, velocity estimate V and, if present, further feedback R.
         alpha: normalized stiffness, one value for each starting value.
         beta: normalized damping.
         w: starting values of the angle.

@@ -42,9 +42,10 @@ Pair = tuple[Taylor, Taylor]  # a function of lambda and its derivative
 
 
 class LoopTerms:
-    """Taylor expansions of q = -1/G and F in the numbers of a scene and in further variables.
+    """Taylor expansions of q = -1/G and of F in the numbers of a scene and in further variables.
 
-    F is the velocity estimate or, in a scene with a position estimate, its ratio V/P to the position estimate.
+    If the scene has a position estimate P and a velocity estimate V, F is the ratio V/P; otherwise F is the velocity
+    estimate.
     """
 
     def __init__(self, scene: Any, variables: Sequence[Taylor], n: int, more_delay: Taylor | None = None) -> None:
@@ -88,21 +89,26 @@ class LoopTerms:
             return self._add_tool(q, q_slope, lam)
         if self.estimates is None:
             return q, q_slope
-        # With the position estimate P and the further feedback R, q = (-1/H - R)/P for the plant H (V25).
+        # Here q = -1/H for the sampled plant H. With a position estimate P and further feedback R, G = H P/(1 + H R),
+        # so that q = -1/G = (-1/H - R)/P (docs/theory/scenes.md, V25).
         P, R = self._evaluate_position(lam), self._evaluate_feedback(lam)
         return _divide((q - R[0], q_slope - R[1]), P)
 
     def feedback(self, lam: Taylor) -> Pair:
-        """Return the ratio R/P of the further feedback to the position estimate, and its derivative in lambda.
+        """Return the ratio R/P of further feedback R and position estimate P, and its derivative in lambda.
 
-        The open loop at the plant input is ``L = -(alpha + beta F + R/P)/(q + R/P)``.
+        The open loop L at the plant input is ``L = -(alpha + beta F + R/P)/(q + R/P)``.
         """
         if self.estimates is None or self.estimates.feedback is None:
             return self.one * 0.0, self.one * 0.0
         return _divide(self._evaluate_feedback(lam), self._evaluate_position(lam))
 
     def _add_tool(self, q: Taylor, q_slope: Taylor, lam: Taylor) -> Pair:
-        """Add the response G_t of the tool to G = -1/q: return q/(1 - q G_t) and its derivative in lambda."""
+        """Return q/(1 - q G_t) and its derivative in lambda, for a simulated tool with the response G_t.
+
+        This is the critical controller -1/(G + G_t), because device and tool act like one device with the response
+        G + G_t (docs/theory/passivity.md, U5).
+        """
         z, zeta = lam.exp(), lam.expm1()
         tool = self.varied.tool.respond(self.varied.mass, self.varied.timing.period)
         denominator = (zeta * tool.a2 + tool.a1) * zeta + tool.a0
@@ -180,12 +186,12 @@ class LoopTerms:
 
 
 def _multiply(first: Pair, second: Pair) -> Pair:
-    """Return the product of two functions and its derivative."""
+    """Return the product of two functions of lambda, and the derivative of the product."""
     return first[0] * second[0], first[1] * second[0] + first[0] * second[1]
 
 
 def _divide(first: Pair, second: Pair) -> Pair:
-    """Return the quotient of two functions and its derivative."""
+    """Return the quotient of two functions of lambda, and the derivative of the quotient."""
     value = first[0] / second[0]
     return value, (first[1] - value * second[1]) / second[0]
 

@@ -190,7 +190,7 @@ class Sampled(NamedTuple):
     resolved: Array  # for each loop: True if the nodes resolve q and F
 
     def take(self, index: Array) -> Sampled:
-        """Return the loops with the given indices."""
+        """Return the values of a selection of loops, given the indices of these loops."""
         return Sampled(self.form, *tree_map(lambda part: part[..., index], tuple(self[1:])))
 
     def count_start(self, k_first: Array) -> Array:

@@ -43,7 +43,7 @@ MAX_CONTROLLER_CHANGE = 0.25  # largest relative change of the controller betwee
 
 
 def list_gains(terms: Sequence[Any], alpha: Array, beta: Array) -> list[Array]:
-    """Return the gain of each term of the controller: alpha, beta and, for further feedback, 1."""
+    """Return the factors of P, V and, if present, R in the controller ``alpha P + beta V + R``: alpha, beta and 1."""
     return [alpha, beta, *(np.ones_like(alpha) for _ in terms[2:])]
 
 

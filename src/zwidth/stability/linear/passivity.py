@@ -73,7 +73,7 @@ def find_unsupported_reason(tool: Any = None, *, coupling: Any = None, **parts: 
     Args:
         tool: simulated tool of the scene.
         coupling: coupling of the device.
-        **parts: the other fields of the device, and parts of the scene.
+        **parts: the other fields of the device, and the position estimate and further feedback of the scene, by name.
     """
     if tool is not None:
         return "with a simulated tool: the wall is a coupling; use is_safe_for_every_world"

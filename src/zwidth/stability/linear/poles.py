@@ -104,7 +104,8 @@ def evaluate_polynomial(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array)
 def find_poles(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
     """Return zeta of all poles of each wall by Aberth's method, as an array of shape (walls, order)."""
     D, N1, N2 = affine_polynomial(loop)
-    # The leading coefficient is D[0], except if G has a direct feedthrough, as with a tool in implicit Euler.
+    # Divide by the leading coefficient of each wall. It depends on the wall if G has as many zeros as poles, for
+    # example if a simulated tool is integrated by the implicit Euler method; otherwise it is D[0].
     polynomials = D + alpha[:, None] * N1 + beta[:, None] * N2
     monic = polynomials / polynomials[:, :1]
     zeta = np.linalg.eigvals(companion(monic)) - 1.0 + 0j

@@ -30,21 +30,32 @@ from zwidth.plant.factored_plant import FactoredPlant
 NEGLIGIBLE_COEFFICIENT = 1e-12
 POLE_AT_ONE = 1e-13  # distance from z = 1 below which a pole counts as a pole at z = 1
 
-Terms = tuple[Response, ...]  # responses of the controller: P, V and, with further feedback, R
+# Position estimate P, velocity estimate V and, if the loop has it, further feedback R, as functions on the unit circle.
+Terms = tuple[Response, ...]
 
 
 def respond_to_position(points: CirclePoints) -> Jet:
-    """Return the constant 1: the spring force of the wall is proportional to the sampled position itself."""
+    """Return P = 1 and its derivative 0, the position estimate of a spring that acts on the sampled position itself."""
     return Jet(np.ones(()), np.zeros(()))
 
 
 def list_terms(chain: AnyChain) -> Terms:
-    """Return the responses P and V of the estimates of a chain and, with further feedback, R."""
+    """Return the transfer functions of a controller ``alpha P + beta V + R`` as functions on the unit circle.
+
+    P is the position estimate, V the velocity estimate, and R the further feedback, which is omitted if there is none.
+    """
     return (respond_to_position, chain.estimate.jet) if chain.estimates is None else chain.estimates.respond()
 
 
 def evaluate_controller(terms: Terms, points: CirclePoints, alpha: Array, beta: Array) -> Jet:
-    """Return the controller ``alpha P + beta V + R`` and its derivative in w; walls and points broadcast."""
+    """Return the controller ``alpha P + beta V + R`` at points of the unit circle, and its derivative in the angle w.
+
+    Args:
+        terms: P, V and, if the loop has further feedback, R.
+        points: points of the unit circle; they broadcast with alpha and beta.
+        alpha: normalized stiffness.
+        beta: normalized damping.
+    """
     P, V, *R = (term(points) for term in terms)
     parts = (
         alpha * first + beta * second + sum(rest)
@@ -55,28 +66,34 @@ def evaluate_controller(terms: Terms, points: CirclePoints, alpha: Array, beta: 
 
 @dataclass(frozen=True)
 class LoopRoots(FactoredPlant):
-    """The loop without a wall: the sampled plant G and the velocity estimate F.
+    """The loop without a wall: the response G of the plant and the velocity estimate F, as zeros, poles and gain.
 
-    The last ``shared`` zeros of G are also the last poles of F. They cancel in the open loop ``G (alpha + beta F)``,
-    and are no closed-loop poles (V26).
+    G and F have ``shared`` common roots: the last zeros of G are the last poles of F. These roots cancel in the open
+    loop ``G (alpha + beta F)``, so they are not closed-loop poles (docs/theory/scenes.md, V26).
     """
 
     estimate: Estimate
     shared: int = 0
-    # Sampled plant, position estimate P, velocity estimate V and further feedback R, if the loop has an R. G is then
-    # the closed loop of this plant with R, in series with P, and F is V/P (V25).
+    # Only for controllers alpha P + beta V + R with further feedback R: the sampled plant H, and the position estimate
+    # P, the velocity estimate V and R. G and F are then H P/(1 + H R) and V/P (V25).
     inner: tuple[FactoredPlant, LoopEstimates] | None = None
 
     @property
     def terms(self) -> tuple[FactoredPlant, Terms]:
-        """The sampled plant H, and the responses whose sum, weighted by alpha, beta and 1, is the controller."""
+        """The sampled plant H, and the terms P, V and R of the controller ``alpha P + beta V + R``.
+
+        Without R, the plant is G instead of H, and the terms are 1 and F.
+        """
         if self.inner is None:
             return self, (respond_to_position, self.estimate.jet)
         return self.inner[0], self.inner[1].respond()
 
     @property
     def open_poles(self) -> np.ndarray:
-        """The offsets of the poles of the open loop at the plant input, except those of stable filters."""
+        """Offsets 1 - pole of the open loop L at the plant input.
+
+        The array may lack poles of the estimates, which are inside the unit circle and need not be counted.
+        """
         if self.inner is None:
             return self.poles
         feedback = self.inner[1].feedback
@@ -84,12 +101,12 @@ class LoopRoots(FactoredPlant):
 
     @property
     def free_zeros(self) -> np.ndarray:
-        """The offsets of the zeros of G that are not poles of F."""
+        """Offsets 1 - root of those zeros of G that are not poles of F."""
         return self.zeros[: self.zeros.size - self.shared]
 
     @property
     def free_poles(self) -> np.ndarray:
-        """The offsets of the poles of F that are not zeros of G."""
+        """Offsets 1 - root of those poles of F that are not zeros of G."""
         return self.estimate.poles[: self.estimate.poles.size - self.shared]
 
     @property

@@ -87,7 +87,7 @@ def map_by_degree(
 
 @lru_cache(CACHED_KERNELS)
 def compile_by_degree(kernel: Callable[..., Any], degree: Degree, *static: Any) -> Callable[..., Any]:
-    """Return a kernel, compiled by JAX for one degree, as a function of JAX arrays of one shape."""
+    """Return the kernel, compiled by JAX for points of one degree of P, as a function of JAX arrays of equal shape."""
     import jax
 
     def compute(*arrays: Any) -> Any:
@@ -98,7 +98,10 @@ def compile_by_degree(kernel: Callable[..., Any], degree: Degree, *static: Any) 
 
 
 def _group_delays(delays: np.ndarray) -> np.ndarray:
-    """Return a number per delay that is the same for all delays whose polynomials P have the same degree."""
+    """Return a key for each delay d, by which points are grouped: n for d = n, and n + 1/2 for n < d < n + 1.
+
+    All delays with the same key have polynomials P of the same degree.
+    """
     # Replace delays out of range by 0, so that they do not affect the length of the result.
     defined = np.where((delays >= 0) & (delays <= LONGEST_DELAY), delays, 0.0)
     return 0.5 * (np.floor(defined) + np.ceil(defined))
@@ -107,7 +110,10 @@ def _group_delays(delays: np.ndarray) -> np.ndarray:
 def _join_degrees(
     kernel: Callable[..., Any], arrays: list[Any], degrees: np.ndarray, static: tuple, lead: bool, route: Route = "auto"
 ) -> Any:
-    """Return the vectors of all points for arrays of one shape; ``degrees`` are the numbers of `_group_delays`."""
+    """Evaluate a kernel for arrays of equal shape, separately for each degree of P, and join the resulting vectors.
+
+    ``degrees`` are the keys that `_group_delays` returns; the other arguments are those of `map_by_degree`.
+    """
     xp = namespace(*arrays)
     shape = np.shape(arrays[0])
     columns: list[Any] = [xp.reshape(array, -1) for array in arrays]

@@ -135,15 +135,15 @@ def decide_wall_codes(
     find_root: RootFinder,
     evaluate_phase: DelayPhaseFunction,
 ) -> Array:
-    """Return UNSTABLE, STABLE, OPEN or EDGE for each wall, elementwise, in any arithmetic with error bounds.
+    """Return the code UNSTABLE, STABLE, OPEN or EDGE of each wall, elementwise, for numbers with an error bound.
 
     Args:
-        alpha: normalized stiffness, `Sized` or of another class with the same operators and the attribute ``value``.
-        beta: normalized damping.
-        plant: discretized device, of the same class.
-        kind: classes of the delays.
-        find_root: encloses the gain crossover.
-        evaluate_phase: encloses the phase lag at the gain crossover.
+        alpha: normalized stiffness, a `Sized` number, or a number of a class with the same operators and ``value``.
+        beta: normalized damping, a number of the same class.
+        plant: discretized device; its fields are numbers of the same class.
+        kind: states whether short, long and fractional delays occur.
+        find_root: function that returns the gain crossover with an error bound.
+        evaluate_phase: function that returns the phase lag at the gain crossover with an error bound.
     """
     wall, verdicts = expand_wall(alpha, beta)[:2], []
     xp = namespace(alpha.value, beta.value, plant.whole)

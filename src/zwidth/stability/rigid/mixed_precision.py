@@ -1,10 +1,12 @@
-"""Label rigid walls in float32, and decide in float64 the walls whose float32 label may be wrong.
+"""Label rigid walls as stable or unstable in float32, and again in float64 if the float32 label may be wrong.
+
+A wall is *open* if float32 does not decide its label, usually because the wall lies near the stability boundary.
 
 The float32 step evaluates the source code of `stability.rigid.crossover` with numbers of the class `Bounded`: float32
-values, each with a bound of its error. A comparison is accepted if the difference of the compared numbers exceeds the
-error bound of the difference. A wall that this step does not decide is *open*: it lies near the stability boundary.
-The label of an open wall is that of the closed form in float64. All labels are therefore those of float64
-(docs/theory/certified.md, steps M1 to M4). The method saves time on processors with slow float64 arithmetic.
+values, each with a bound of its error. A comparison of two numbers is accepted only if their difference exceeds the
+error bound of the difference; otherwise the wall is open. Open walls are labeled by the closed form in float64, so all
+labels are those of float64 (docs/theory/certified.md, steps M1 to M4). The method saves time on processors with slow
+float64 arithmetic, such as many GPUs.
 
 As in `stability.rigid.crossover`, the wall has the normalized stiffness alpha and damping beta, the device has the
 normalized damping delta, and the delay is d = n + f periods. The gain crossover w determines u = 1 - cos w, a zero of
@@ -28,21 +30,21 @@ from zwidth.stability.rigid.crossover import DelayPhase, evaluate_phase, find_fi
 from zwidth.stability.rigid.normalization import valid_wall
 
 # Error bounds of float32 numbers. Steps M1 to M4 of docs/theory/certified.md derive them.
-ROUNDING = 2.0**-22  # relative error of one operation: four rounding units, for processors that round less accurately
-INTEGER_PLANT_ERROR = 2.0**-19  # relative error of a parameter of the device, for integer delays
-FRACTIONAL_PLANT_ERROR = 2.0**-17  # relative error of a parameter of the device, for fractional delays
-PHASE_ERROR = 2.0**-18  # relative error of the phase lag of the delay, in addition to that of u
-MAX_WIDTH = 2.0**-6  # largest relative error of u; beyond it, squares of errors are not negligible
-TINY = 2.0**-100  # absolute error of a product; larger than the numbers that float32 flushes to zero
+ROUNDING = 2.0**-22  # relative error of one operation: four rounding units, because GPUs may round less accurately
+INTEGER_PLANT_ERROR = 2.0**-19  # relative error of each parameter of the discretized device, for integer delays
+FRACTIONAL_PLANT_ERROR = 2.0**-17  # relative error of each parameter of the discretized device, for fractional delays
+PHASE_ERROR = 2.0**-18  # relative error of the phase lag of the delay, in addition to the relative error of u
+MAX_WIDTH = 2.0**-6  # largest relative error of u; squares of larger errors would not be negligible
+TINY = 2.0**-100  # absolute error of a product; larger than the numbers that processors replace by 0 in float32
 
-# Capacity of the float64 step: one in OPEN_SHARE walls, but at least MIN_OPEN walls. If more walls are open, all walls
-# are computed in float64.
+# Largest number of open walls that the float64 step computes separately: one in OPEN_SHARE of all walls, but at least
+# MIN_OPEN. If more walls are open, it computes all walls.
 OPEN_SHARE = 64
 MIN_OPEN = 64
 
 
 class Bounded:
-    """Float32 values, each with a bound of its error, elementwise: the exact number is within ``value +- error``.
+    """Array of float32 values with a bound of the error of each: the exact number is within ``value +- error``.
 
     The class has the operators of ``flint.arb`` that `stability.rigid.crossover` uses.
     """
@@ -83,7 +85,7 @@ class Bounded:
         return Bounded(quotient, lazy_jax.numpy.where(least > 0, error, np.inf))
 
     def sqrt(self) -> Bounded:
-        """Return the square root, with NaN if ``value`` is negative."""
+        """Return the square roots; NaN for negative values."""
         root = lazy_jax.numpy.sqrt(self.value)
         # With the value v and the exact number x, |sqrt x - sqrt v| = |x - v|/(sqrt x + sqrt v).
         return Bounded(root, self.error / root + ROUNDING * root)
@@ -97,7 +99,7 @@ class Bounded:
 
 
 def label_in_mixed_precision(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
-    """Return whether each wall is stable, with the labels of float64; False for invalid input.
+    """Return whether each wall is stable, with the same result as float64; False for invalid input.
 
     Args:
         alpha, beta, delta, d: float64 JAX arrays that broadcast.
@@ -110,8 +112,8 @@ def label_in_mixed_precision(alpha: Array, beta: Array, delta: Array, d: Array, 
     capacity = min(stable.size, max(MIN_OPEN, stable.size // OPEN_SHARE))
 
     def decide_open() -> Array:
-        # The length of ``index`` is fixed at compilation. Unused entries are 0, the index of the first wall, which
-        # float64 may decide as well.
+        # The length of ``index`` is fixed at compilation, so that some entries are unused. They are 0, the index of the
+        # first wall, because its float64 label is correct even if the wall is not open.
         index = jnp.nonzero(is_open, size=capacity, fill_value=0)[0]
         labels = stable_kernel(*(x[index] if x.ndim else x for x in columns), kind=kind)
         return stable.at[index].set(labels)
@@ -123,9 +125,9 @@ def label_in_mixed_precision(alpha: Array, beta: Array, delta: Array, d: Array, 
 
 
 def label_in_float32(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> tuple[Array, Array]:
-    """Return whether each wall is stable by its float32 label, and whether the wall is open.
+    """Return two masks: walls that are stable according to float32, and open walls, which float32 does not decide.
 
-    Both are False for an unstable wall and for invalid input.
+    Both masks are False for unstable walls and for invalid input.
     """
     plant = bound_device(delta, d, kind)
     code = decide_wall_codes(round_to_float32(alpha), round_to_float32(beta), plant, kind, bound_root, bound_phase)
@@ -135,34 +137,34 @@ def label_in_float32(alpha: Array, beta: Array, delta: Array, d: Array, kind: De
 
 
 def round_to_float32(value: Array) -> Bounded:
-    """Return a float64 array as float32 numbers, whose errors are those of the conversion."""
+    """Return a float64 array, rounded to float32, as `Bounded` numbers with the rounding errors as error bounds."""
     rounded = value.astype(np.float32)
     return Bounded(rounded, ROUNDING * abs(rounded) + TINY)
 
 
 def bound_device(delta: Array, d: Array, kind: DelayClasses) -> DiscretePlant:
-    """Return the discretized device of float64 arrays delta and d, with bounded errors (step M2)."""
-    # Split the delay in float64, because the fraction of a long delay would lose its digits in float32.
+    """Return the discretized device for float64 arrays delta and d, with `Bounded` parameters (step M2)."""
+    # Split d into n + f in float64, because float32 has too few digits for the fraction f of a long delay.
     whole, f = split_delay(d)
     plant = discretize_split_delay(*(x.astype(np.float32) for x in (delta, whole, f, 1.0 - f)), kind=kind)
     relative = FRACTIONAL_PLANT_ERROR if kind.fractional else INTEGER_PLANT_ERROR
     bounded = DiscretePlant(*(Bounded(value, relative * abs(value) + TINY) for value in plant))
-    # The rounding error of delta changes c by up to delta c 2^-24.
+    # Rounding delta to float32 changes c = e^-delta by up to delta c 2^-24.
     c = Bounded(plant.c, plant.c * (relative + ROUNDING * plant.delta) + TINY)
     bounded = bounded._replace(delta=round_to_float32(delta), whole=plant.whole, c=c, a0=None)
     if kind.fractional:
-        # The rounding error of f changes a0 by up to 2^-22 a1.
+        # Rounding delta and 1 - f to float32 changes a0 by up to 2^-22 a1.
         a0 = Bounded(plant.a0, relative * plant.a0 + ROUNDING * plant.a1 + TINY)
         return bounded._replace(a0=a0, gap=bounded.a2 - bounded.a1 + a0)
     return bounded
 
 
 def bound_root(coefficients: tuple[Bounded, ...]) -> tuple[Bounded, Array]:
-    """Return the zero u of the cubic H, and whether a sign change proves its error bound (step M3)."""
+    """Return the zero u of the cubic H with an error bound, and whether a sign change of H proves it (step M3)."""
     values = tuple([h.value for h in coefficients])
     u = find_first_root(values)
     slope = horner(u, [k * value for k, value in enumerate(values)][1:])
-    # Choose twice the distance at which H exceeds its error bound, so that its sign is certain at both ends.
+    # Use twice the width that the error of H requires, so that the sign of H is certain at both ends of the interval.
     error = horner(Bounded(u), coefficients).error
     width = lazy_jax.numpy.maximum(2.0 * error / abs(u * slope), ROUNDING)
     low, high = (horner(Bounded(u * (1.0 + side)), coefficients) for side in (-width, width))
@@ -170,9 +172,9 @@ def bound_root(coefficients: tuple[Bounded, ...]) -> tuple[Bounded, Array]:
 
 
 def bound_phase(u: Bounded, n: Array) -> DelayPhase:
-    """Return the phase lag (n + 1/2) w at the gain crossover u = 1 - cos w, with bounded errors (step M4)."""
+    """Return the phase lag (n + 1/2) w at the gain crossover u = 1 - cos w, as `Bounded` numbers (step M4)."""
     phase, width = evaluate_phase(u.value, n), u.error / u.value + PHASE_ERROR
-    # Compare (n + 1)^2 u with pi^2/2 for all u within the error bound.
+    # Compare (n + 1)^2 u with pi^2/2. A comparison is True only if it is true for all u within the error bound.
     ratio = u.value * (n + 1.0) * (n + 1.0) / (0.5 * np.pi * np.pi)
     return DelayPhase(
         Bounded(phase.cosine, 4.0 * width),

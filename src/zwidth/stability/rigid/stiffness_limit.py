@@ -231,7 +231,7 @@ def label_jax_arrays(
     Args:
         arguments: alpha, beta, delta and d by name, at least one of them a JAX array; their shapes broadcast.
         kind: `DelayClasses` that occur in d.
-        kernel: function that tests each wall separately.
+        kernel: function that returns whether each wall is stable, used if the shapes form no grid.
     """
     values = arguments.values()
     with precision(values):

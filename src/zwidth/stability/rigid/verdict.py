@@ -5,7 +5,8 @@ methods:
 
 - "crossover": the closed form at the gain crossover (`stability.rigid.crossover`). On a large grid, alpha is compared
   with the stability limit of its line of constant beta, by the same closed form (`stability.rigid.stiffness_limit`).
-  With the precision "mixed", most walls that form no grid are decided in float32 (`stability.rigid.mixed_precision`).
+  The argument ``precision="mixed"`` selects float32 for most walls that form no grid
+  (`stability.rigid.mixed_precision`).
 - "companion": the spectral radius from all eigenvalues of the companion matrix (`stability.rigid.poles`).
 - "certified": the closed form with error bounds, then ball arithmetic (`stability.rigid.certified`).
 """
@@ -61,13 +62,13 @@ def is_stable(
             an argument is constant cost nothing: for a grid pass alpha of shape (1, N) and beta of shape (M, 1).
         method: "crossover" evaluates the phase at the gain crossover, in closed form; "companion" computes all poles;
             "certified" returns True only with a certificate (`zwidth.decide_stability` returns the status of undecided
-            points), and computes on the host, also for JAX arrays. "auto" is "crossover". On a grid of one device it
-            compares alpha with the stability limit at each beta, by the same closed form.
-        precision: number type of the closed form. "auto" is float64 in a direct call, and inside `jit` JAX's default
-            type. "mixed" computes each wall in float32 with an error bound. If the bound does not decide the label, as
-            for fewer than 1 in 1,000 random walls, "mixed" computes the wall again in float64. All its labels are those
-            of float64. On a CPU, "mixed" is slower than "auto"; it is meant for processors with slow float64
-            arithmetic, such as many GPUs. Large grids are computed as by "auto", with one comparison per wall.
+            points); it computes on the CPU, even for JAX arrays on a GPU. "auto" is "crossover". On a grid of walls on
+            one device, "crossover" compares alpha with the stability limit at each beta, by the same closed form.
+        precision: number type of the closed form: "auto" or "mixed". "auto" is float64 in a direct call, and JAX's
+            default type inside `jit`. "mixed" computes each wall in float32 with an error bound. If this bound permits
+            both labels, "mixed" computes the wall again in float64; this happens for fewer than 1 in 1,000 random
+            walls. All labels are those of float64. "mixed" is slower than "auto" on a CPU. Use it on processors with
+            slow float64 arithmetic, such as many GPUs. Large grids are computed in the same way with both values.
 
     Returns:
         Boolean array of the broadcast shape, possibly read-only. False for unstable walls and for invalid input (NaN,
@@ -76,7 +77,8 @@ def is_stable(
 
     Raises:
         InputError: an argument is no real number, a scalar is out of range, shapes do not broadcast, a name is unknown,
-            or the precision is "mixed" with another method than the closed form, or inside `jit` without x64.
+            or ``precision`` is "mixed" together with another method than the closed form, or inside `jit` while float64
+            is disabled in JAX (``jax_enable_x64``).
         TracedDelayError: d is traced with method "companion".
 
     Numerics:
@@ -112,7 +114,7 @@ def is_stable(
 
 
 def _refuse_traced(values: tuple[ArrayLike, ...]) -> None:
-    """Raise `InputError` if JAX traces any argument of the method "certified"."""
+    """Raise `InputError` if JAX traces an argument, because the method "certified" needs concrete numbers."""
     if is_traced(*values):
         raise InputError(
             "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
@@ -121,7 +123,7 @@ def _refuse_traced(values: tuple[ArrayLike, ...]) -> None:
 
 
 def _select_kernel(precision: str, method: str, values: tuple[ArrayLike, ...]) -> Callable[..., Any]:
-    """Return the kernel that tests each wall separately in a precision; raise `InputError` if it is not possible."""
+    """Return the function that labels single walls with the given precision; raise `InputError` if none exists."""
     check_choice("precision", precision, get_args(Precision))
     if precision == "auto":
         return stable_kernel
@@ -135,7 +137,7 @@ def _select_kernel(precision: str, method: str, values: tuple[ArrayLike, ...]) -
                 "precision: got 'mixed' inside a JAX transformation without float64; call "
                 "jax.config.update('jax_enable_x64', True) first"
             )
-    # Import the module only if the precision is requested, because most programs use float64.
+    # Import `mixed_precision` only here, because most programs do not use it.
     from zwidth.stability.rigid.mixed_precision import label_in_mixed_precision
 
     return label_in_mixed_precision
@@ -159,7 +161,8 @@ def decide_stability(
         InputError, TracedDelayError: as for `zwidth.is_stable`.
 
     Numerics:
-        As for `zwidth.is_stable`. JAX arrays are computed on their devices, with method "certified" on the host.
+        As for `zwidth.is_stable`. JAX arrays are computed on the processors that store them; the method "certified"
+        always computes on the CPU.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
@@ -185,7 +188,7 @@ def decide_stability(
 
 
 def _decide_jax_arrays(arguments: dict[str, ArrayLike], method: str) -> Stability:
-    """Return the stability of walls, at least one of whose arguments is a JAX array, by code that JAX compiles."""
+    """Return the stability of walls by code that JAX compiles; at least one of the arguments is a JAX array."""
     values = tuple(arguments.values())
     if method != "companion":
         stable = label_jax_arrays(arguments, classify_delays(values[3]))
@@ -197,7 +200,12 @@ def _decide_jax_arrays(arguments: dict[str, ArrayLike], method: str) -> Stabilit
 
 
 def _status_kernel(alpha: Array, beta: Array, delta: Array, d: Array, *others: Any) -> tuple[Array, Array]:
-    """Return the status of each wall and the code of the method; ``others`` are radii of method "companion", code."""
+    """Return the status of each wall and the code of the method that decided it, elementwise.
+
+    Args:
+        alpha, beta, delta, d: the walls.
+        *others: spectral radii (only for the method "companion"), then the code of the method.
+    """
     *radius, code = others
     status = wall_status(alpha, beta, delta, d)
     xp = namespace(status)
@@ -216,7 +224,7 @@ def _decide(
     Args:
         points: walls.
         method: name of the method.
-        kernel: function that tests each wall separately by the closed form, if the walls form no grid.
+        kernel: function that returns whether each wall is stable, by the closed form; used if the walls form no grid.
     """
     if method == "companion":
         radius = np.asarray(radius_by_companion(*points))

@@ -156,10 +156,13 @@ def _map_in_batches(
 
 
 def find_wall_axes(shapes: Sequence[tuple[int, ...]]) -> list[int] | None:
-    """Return the axes of beta and of alpha in a grid, given the shapes of alpha, beta, delta and d, of equal rank.
+    """Return the axis of beta and the axis of alpha of a grid of walls; None if the shapes form no large grid.
 
-    Return None if the shapes form no large grid. In a grid, alpha and beta each vary along one axis, along which no
-    other argument varies. If alpha or beta is constant, the first axis serves as its axis; it must then have length 1.
+    In a grid, alpha varies along one axis, beta along another, and no other argument varies along these two axes. For a
+    constant alpha or beta, the first axis is returned; it must have length 1 for all arguments.
+
+    Args:
+        shapes: shapes of alpha, beta, delta and d, with the same number of axes.
     """
     wall_axes = []
     for k in (1, 0):
@@ -292,17 +295,17 @@ def compute_rates(poles: DominantPoles, columns: list[np.ndarray], accuracy: flo
 
 
 def is_only_pole_outside(re: Array, im: Array, width: Array, loop: LoopFactors, fractional: bool) -> Array:
-    """Return whether provably no other pole is outside a circle that is smaller by ``width`` in log |z| than e^re.
+    """Return whether a computed pole (or conjugate pair) is provably the only one outside |z| = e^(re - width).
 
-    The dominant pole ``e^(re + j im)`` (or conjugate pair) is then the only one outside this circle. No other pole can
-    be larger, and the error of the decay rate is the error of this pole.
+    The computed pole is ``e^(re + j im)``. If the result is True, the other poles are smaller, so that the error of the
+    decay rate is the error of the computed pole.
     """
     xp, poles_outside = namespace(re), count_poles(re - width, loop, fractional)
     return poles_outside.certain & (poles_outside.outside == xp.where(xp.sin(im) < REAL_AXIS_WIDTH, 1, 2))
 
 
 def _correct_by_verdict(radius: np.ndarray, columns: list[np.ndarray]) -> np.ndarray:
-    """Return radii close to 1, changed such that they are below 1 if and only if the wall is stable."""
+    """Return spectral radii close to 1, corrected such that each is below 1 if and only if its wall is stable."""
     if not radius.size:
         return radius
     with np.errstate(all="ignore"):
@@ -311,7 +314,7 @@ def _correct_by_verdict(radius: np.ndarray, columns: list[np.ndarray]) -> np.nda
 
 
 def place_by_verdict(radius: Array, alpha: Array, stable: Array) -> Array:
-    """Return radii close to 1, replaced by values below 1 for stable walls and of at least 1 for unstable walls."""
+    """Return spectral radii close to 1, limited to values below 1 for stable walls and to at least 1 otherwise."""
     xp = namespace(radius)
     # For alpha = 0, set the radius to 1 if it is 1 up to rounding errors, because one pole is exactly 1. Limit the
     # radius of a stable wall to the largest number below 1.

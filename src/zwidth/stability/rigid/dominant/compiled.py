@@ -1,12 +1,14 @@
-"""Compute the dominant poles of JAX arrays of walls by code that JAX compiles, inside and outside transformations.
+"""Compute the dominant pole of each wall, given as JAX arrays, by code that JAX compiles.
 
-The dominant pole is the pole of largest modulus. Each wall is computed by `search.find_candidate`; walls that this
-method does not certify are *open*, and are computed again by `search.find_by_bisection`. Derivatives are those of the
-implicit function theorem.
+The dominant pole is the pole of largest modulus. A wall is *open* as long as no error bound of its pole is certified;
+a certificate is a count of the poles outside a circle. `search.find_candidate` computes the pole of each wall, and
+`search.find_by_bisection` computes the pole of each open wall again. Derivatives follow from the implicit function
+theorem. All functions work inside and outside JAX transformations.
 
-On a CPU, grids over alpha and beta are computed by NumPy instead (`stability.rigid.dominant.arrays`): the compiled
-program calls Python back, because one Taylor series serves a whole cell of walls, but the search for cells needs
-control flow. A grid of a million walls takes a quarter (d = 1) or a sixth (d = 2.5) of the time of the compiled code.
+On a CPU, grids over alpha and beta are computed by NumPy instead (`stability.rigid.dominant.arrays`), in a call of
+Python from the compiled program. NumPy computes one Taylor series for each cell of neighboring walls; the division of
+the grid into cells needs control flow, which Python has. A grid of a million walls takes a quarter (d = 1) or a sixth
+(d = 2.5) of the time of the compiled code.
 """
 
 from __future__ import annotations
@@ -63,20 +65,20 @@ from zwidth.stability.rigid.dominant.steps import evaluate_polynomial
 from zwidth.stability.rigid.normalization import valid_wall
 from zwidth.stability.rigid.stiffness_limit import label_jax_arrays
 
-# Default relative error of the certificate, as a power of the machine epsilon: 8e-10 in float64, 1e-4 in float32.
+# The default relative error of the radius is eps^ACCURACY_EXPONENT: 8e-10 in float64, 1e-4 in float32.
 ACCURACY_EXPONENT = 0.58
 RESCUE_SIZE = 1 << 9  # number of open walls that a JAX program computes at once by bisection
-# Largest number of circles that are tried for the certificate after a bisection. Each circle is ten times as far from
-# the pole as the previous one, because the rounding error of the count may be too large on a closer circle.
+# Largest number of circles on which poles are counted to certify a pole after a bisection. Each circle is ten times as
+# far from the pole as the previous one, because rounding errors may make the count uncertain on a close circle.
 MAX_TRIALS = 6
 
 
 def compute_jax_poles(arguments: Mapping[str, ArrayLike], accuracy: float | None, with_rate: bool) -> tuple[Array, ...]:
-    """Return the dominant poles of walls, at least one of whose arguments is a JAX array, on the device of the array.
+    """Return the dominant poles of walls, computed on the processors (JAX devices) that store the arguments.
 
     Args:
-        arguments: alpha, beta, delta and d by name; they broadcast.
-        accuracy: largest relative error of the radius; None for the default of the number type.
+        arguments: alpha, beta, delta and d by name; they broadcast, and at least one of them is a JAX array.
+        accuracy: largest relative error of the spectral radius; None for the default of the number type.
         with_rate: whether the decay rate and the angle are computed.
 
     Returns:
@@ -85,24 +87,29 @@ def compute_jax_poles(arguments: Mapping[str, ArrayLike], accuracy: float | None
     static = classify_delays(arguments["d"]), accuracy, with_rate
     with precision(arguments.values()):
         arrays = convert_for_jax(arguments)
-        # Add a first axis of length 1, as `find_poles` does for a line of walls.
+        # Add a first axis of length 1, because `find_wall_axes` needs it if alpha or beta is constant.
         rank = max(map(np.ndim, arrays)) + 1
         shapes = [(1,) * (rank - np.ndim(array)) + np.shape(array) for array in arrays]
         is_grid = computes_on_one_cpu() and find_wall_axes(shapes) is not None
         if is_grid:
             radius, *others = _compile_grid(*static)(*arrays)
         else:
-            # Devices that compute parts of one array bisect different numbers of open walls.
+            # If the arrays are distributed over several JAX devices, run the kernel on each of them separately: the
+            # number of bisections depends on the open walls of each part.
             kernel = compile_kernel(pole_kernel, static)
             radius, *others = map_on_devices(kernel, lazy_jax.numpy.broadcast_arrays(*arrays))
-        # Compile the labels separately, because in a common program the search for the poles takes twice as long.
+        # Compute the labels (stable or not) in a program of their own, because the search for the poles takes twice as
+        # long in a program that also computes labels.
         stable = label_jax_arrays(dict(zip(NAMES, arrays, strict=True)), static[0])
         return lazy_jax.jit(place_near_one)(radius, arrays[0], stable), *others
 
 
 @lru_cache(CACHED_KERNELS)
 def _compile_grid(kind: DelayClasses, accuracy: float | None, with_rate: bool) -> Callable[..., tuple[Array, ...]]:
-    """Return a function of JAX arrays that computes grids of walls by NumPy, and derivatives by compiled code."""
+    """Return a function of JAX arrays that computes the dominant poles of a grid of walls by NumPy.
+
+    Only derivatives are computed by code that JAX compiles.
+    """
     import jax
 
     @jax.custom_jvp
@@ -112,7 +119,7 @@ def _compile_grid(kind: DelayClasses, accuracy: float | None, with_rate: bool) -
         return tuple(call_numpy(host, [shape] * (3 if with_rate else 1), *arrays))
 
     def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> Any:
-        """Return values and derivatives of the compiled kernel."""
+        """Return values and derivatives of `pole_kernel`, compiled by JAX, for `jax.custom_jvp`."""
         moving = [k for k, t in enumerate(tangents) if not isinstance(t, jax.custom_derivatives.SymbolicZero)]
 
         def evaluate_moved(*moved: Any) -> tuple[Array, ...]:
@@ -127,7 +134,7 @@ def _compile_grid(kind: DelayClasses, accuracy: float | None, with_rate: bool) -
 
 
 def _compute_on_host(accuracy: float, with_rate: bool, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return radius, decay rate and angle of a grid of walls, computed by NumPy in float64."""
+    """Return the spectral radius, decay rate and angle for a grid of walls, computed by NumPy in float64."""
     walls = np.broadcast_arrays(*(array.astype(np.float64) for array in arrays))
     poles = find_poles(list(walls), accuracy, with_rate, with_rate, route="numpy")
     return (poles.radius, poles.rate, poles.angle) if with_rate else (poles.radius,)
@@ -136,9 +143,9 @@ def _compute_on_host(accuracy: float, with_rate: bool, *arrays: np.ndarray) -> t
 def pole_kernel(
     alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses, accuracy: float | None, with_rate: bool
 ) -> tuple[Array, ...]:
-    """Return the dominant poles with their derivatives, as `compute_jax_poles`, for JAX arrays of equal shape.
+    """Return the dominant poles and their derivatives for JAX arrays of equal shape, as `compute_jax_poles` does.
 
-    The values are NaN if the pole could not be certified or is a multiple pole.
+    The results are NaN if the pole is not certified or is a multiple pole.
     """
     xp, fractional = namespace(alpha, beta, delta, d), kind.fractional
     loop = materialize(factor_loop(alpha, beta, delta, d, fractional), delta)
@@ -163,7 +170,7 @@ def pole_kernel(
     re, im = (part + valid for part in nan_unless(poles.certified, log_pole.real, log_pole.imag))
     if not with_rate:
         return (xp.exp(re),)
-    # Float32 has not enough digits for an error bound of the rate.
+    # In float32, return the decay rate without checking its error bound, because this number type has too few digits.
     (rate,) = (
         nan_unless(_is_rate_certain(poles, stop_gradient((alpha, beta, delta), xp), loop, tolerance, fractional), -re)
         if unit < 1e-9
@@ -173,10 +180,10 @@ def pole_kernel(
 
 
 def place_near_one(radius: Array, alpha: Array, stable: Array) -> Array:
-    """Return JAX arrays of radii, with those close to 1 replaced by `place_by_verdict`, and unchanged derivatives."""
+    """Return spectral radii of which those close to 1 are corrected to agree with ``stable``; keep the derivatives."""
     xp, constant = namespace(radius), stop_gradient(radius, namespace(radius))
     near_one = xp.abs(constant - 1.0) <= max(VERDICT_WIDTH, COUNT_ROUNDING * epsilon(radius))
-    # Add the difference, a constant for JAX, because the derivative of a selected limit would be 0.
+    # Add the correction as a constant, because the derivative of ``xp.where(near_one, limit, radius)`` would be 0.
     return radius + xp.where(near_one, place_by_verdict(constant, alpha, stable) - constant, 0.0)
 
 
@@ -189,12 +196,12 @@ def _is_rate_certain(
     xp, (alpha, beta, delta) = namespace(poles.re), walls
     loop = stop_gradient(loop, xp)
     width, allowed = certification_width(poles.re, tolerance), MAX_RATE_ERROR * xp.abs(poles.re)
-    # If alpha = 0 and beta + delta = 0, both poles near 1 are exactly 1, so that the decay rate 0 has no error.
+    # If alpha = 0 and beta + delta = 0, z = 1 is a double pole, so that the decay rate 0 is exact.
     certain = (xp.minimum(poles.error, poles.pole_error + width) <= allowed) | (
         (poles.re == 0) & (alpha == 0) & (beta == -delta)
     )
     undecided = ~certain & (poles.pole_error <= allowed)
-    # Count again only if any wall needs it, because a count takes as long as several steps to the pole.
+    # Count poles again only if at least one wall is undecided, because a count takes as long as several Halley steps.
     counted = jax.lax.cond(
         undecided.any(),
         lambda: is_only_pole_outside(poles.re, poles.im, width, loop, fractional),
@@ -204,7 +211,7 @@ def _is_rate_certain(
 
 
 def _find_certified(loop: LoopFactors, fractional: bool, tolerance: float) -> DominantPoles:
-    """Return the dominant poles of JAX arrays: by `find_candidate`, or else by `find_by_bisection`."""
+    """Return the dominant poles of walls, computed by `find_candidate`; those of open walls by `find_by_bisection`."""
     import jax.numpy as xp
     from jax.lax import fori_loop, while_loop
 
@@ -214,7 +221,7 @@ def _find_certified(loop: LoopFactors, fractional: bool, tolerance: float) -> Do
     length = min(size, RESCUE_SIZE)
 
     def rescue(state: tuple[DominantPoles, Array]) -> tuple[DominantPoles, Array]:
-        """Compute the dominant poles of some of the open walls by bisection."""
+        """Compute the dominant poles of up to `RESCUE_SIZE` open walls by bisection."""
         results, is_open = state
         index = xp.nonzero(is_open, size=length, fill_value=size)[0]
         part = LoopFactors(*(column.at[index].get(mode="clip") for column in columns))
@@ -224,7 +231,8 @@ def _find_certified(loop: LoopFactors, fractional: bool, tolerance: float) -> Do
             trial = certify_pole(best.re, best.im, tolerance, part, fractional, False, 10.0**k)
             return DominantPoles(*(xp.where(best.certified, *pair) for pair in zip(best, trial, strict=True)))
 
-        # Try to certify the poles on up to MAX_TRIALS circles. Each call of `certify_pole` also takes a Newton step.
+        # Count poles on up to MAX_TRIALS circles until the pole is certified. Each call of `certify_pole` also takes a
+        # Newton step.
         none = xp.full_like(re, np.inf)
         found = fori_loop(0, MAX_TRIALS, certify, DominantPoles(re, im, none, none))
         results = DominantPoles(

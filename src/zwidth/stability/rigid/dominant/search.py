@@ -11,7 +11,8 @@ finally the radius is bisected by counts of poles.
 
 P = T + B has the factors of `stability.rigid.characteristic_polynomial`; a *crossover* is a point with |T| = |B| on a
 circle. Poles are given by their logarithms: a pole is ``e^(re + j im)`` with 0 <= im <= pi. The same source code serves
-NumPy and JAX. `stability.rigid.dominant.arrays` applies it to NumPy arrays, `compiled` to JAX arrays.
+NumPy and JAX: `stability.rigid.dominant.arrays` applies it to NumPy arrays, `stability.rigid.dominant.compiled` to JAX
+arrays.
 """
 
 from __future__ import annotations

@@ -65,13 +65,13 @@ def spectral_radius(
         TracedDelayError: d is traced with method "companion".
 
     Numerics:
-        Direct calls compute in float64; grids and up to 262,144 other walls are computed without JAX. JAX arrays stay
-        on their devices. Inside `jit` the function computes in JAX's default float type, in which the default of
-        ``accuracy`` is 1e-4 for float32, and d may be traced. On grids, one Taylor series with a certified bound serves
-        a cell of walls (`stability.rigid.dominant.grid`); if JAX computes on a single CPU, also inside `jit`.
-        Derivatives are those of the dominant pole, up to the second order; they are
-        NaN if this pole is a multiple pole. Near a k-fold pole the error of the radius is about 1e-16^(1/k), whatever
-        the accuracy. If the radius is within 1e-16 of 1, use `decay_rate`.
+        Direct calls compute in float64; grids and up to 262,144 other walls are computed without JAX. JAX arrays are
+        computed on the processors that store them. Inside `jit`, the number type is JAX's default, and d may be traced;
+        with float32, ``accuracy`` is 1e-4 by default. On grids, one Taylor series with a certified error bound is used
+        for each cell of neighboring walls (`stability.rigid.dominant.grid`). Inside `jit`, this applies only if JAX
+        uses a single CPU. Derivatives are those of the dominant pole, up to the second order; they are NaN if this pole
+        is a multiple pole. Near a k-fold pole the error of the radius is about 1e-16^(1/k), whatever the accuracy. If
+        the radius is within 1e-16 of 1, use `decay_rate`.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
@@ -117,8 +117,8 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         The rate is computed from z - 1, for the dominant pole z of `zwidth.spectral_radius`. For soft walls the rate
         has at least 11 digits, however small it is; for a pole pair near the unit circle its absolute error is about
         1e-16. If the certified error bound is not below a thousandth of the rate, the rate is NaN. If the magnitudes of
-        some poles agree within 1e-12, the rate is that of any of them. JAX arrays stay on
-        their devices. Inside `jit` the rate has JAX's default float type; in float32 it has no error bound.
+        some poles agree within 1e-12, the rate is that of any of them. JAX arrays are computed on the processors that
+        store them. Inside `jit`, the number type is JAX's default; with float32, the rate has no error bound.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
@@ -185,7 +185,7 @@ def dominant_pole(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayL
 
 
 def _status_kernel(alpha: Array, beta: Array, delta: Array, d: Array, rate: Array) -> Array:
-    """Return the status of dominant poles, given the decay rates, which are NaN without a certificate."""
+    """Return the status of each dominant pole, given its decay rate, which is NaN if the pole is not certified."""
     xp, status = namespace(rate), wall_status(alpha, beta, delta, d)
     return xp.where((status == Status.OK) & xp.isnan(rate), int(Status.NOT_CONVERGED), status)
 
