@@ -25,7 +25,7 @@ RULES = ("backward", "forward", "trapezoidal")
 
 
 class Weights(NamedTuple):
-    """Weights of position estimate and velocity estimate in the input of R0, for time in sampling periods."""
+    """Weights of the position estimate and the velocity estimate in the input of R0; the unit of time is the period."""
 
     position: Any  # w_p
     velocity: Any  # w_v

@@ -371,7 +371,7 @@ def _reject_constraints(model: Any) -> None:
 
 
 def _read_pose(model: Any, pose: Any) -> np.ndarray:
-    """Return the joint positions ``qpos`` of a pose, in one of the forms that `from_mujoco` accepts."""
+    """Return the joint positions ``qpos`` of a pose, which is given in any form that `from_mujoco` accepts."""
     if pose is None:
         return np.array(model.qpos0)
     if isinstance(pose, str):

@@ -104,7 +104,7 @@ def count_poles(zeros: RootsLike, poles: RootsLike, gain: ArrayLike, lag: ArrayL
 
 
 def _count_jax_arrays(values: dict[str, Any], members: list[Any]) -> Counts:
-    """Return the pole counts in code compiled by JAX, for arguments of which at least one is a JAX array."""
+    """Return the pole counts, computed by code that JAX compiles; at least one argument is a JAX array."""
     import jax.numpy as jnp
 
     arrays = []

@@ -59,7 +59,7 @@ def name_bodies(scene: Parts) -> tuple[str, ...]:
 
 
 class Model(NamedTuple):
-    """Simulation model of one scene: its open loop (chain), estimates, delay, and units."""
+    """Simulation model of one scene: its plant (field ``chain``), estimates, delay, and units."""
 
     chain: Any  # open loop, of which only the plant and the delay are used
     program: LoopEstimates  # linear estimates and further feedback; contains the backward difference in place of FOAW

@@ -191,7 +191,7 @@ def _build_filters(estimates: Sequence[Estimate]) -> Filter:
 
 
 def build_program(programs: Sequence[LoopEstimates], velocities: Sequence[Any], which: np.ndarray) -> dict[str, Any]:
-    """Return the filters of the control program for all simulations, by the names of their fields in `Parameters`.
+    """Return the filters of the control program for all simulations, keyed by field name in `Parameters`.
 
     Args:
         programs: position estimate, velocity estimate and further feedback of each scene, all linear.

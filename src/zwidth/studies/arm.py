@@ -45,7 +45,7 @@ class JointAxis(NamedTuple):
 
 
 def _read_joints(raw: Any) -> dict[str, JointAxis]:
-    """Validate the field ``joints``, a mapping from the names of joints to their positions, and return it converted."""
+    """Validate the field ``joints``, which maps names of joints to positions; return it with positions in SI units."""
     if not isinstance(raw, dict) or not raw:
         raise problem(f"got {describe(raw)}", "joints are a mapping of names to positions", "write {elbow: [30 deg]}")
     joints: dict[str, JointAxis] = {}
