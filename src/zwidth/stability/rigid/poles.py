@@ -258,16 +258,16 @@ def _compute_by_companion(alpha: Reals, beta: Reals, delta: Reals, d: Reals, deg
     columns = alpha, beta, delta, d
     if is_jax(alpha):
         return pole_kernel(*columns, degree)
-    few = alpha.size <= count_uncompiled_points(degree)
 
-    # Do not compile for few walls, or for large matrices, whose eigenvalues take most of the time.
-    compiled = None if few or degree.poles > MAX_ABERTH_POLES else compile_by_degree(pole_kernel, degree)
-
+    # Do not compile: the eigenvalues take most of the time, NumPy computes them as fast as JAX, and calls of JAX's
+    # eigenvalues from two threads can block each other forever (jaxlib 0.10.2 on CPUs).
     def compute_block(*walls: Any) -> np.ndarray:
         with np.errstate(all="ignore"):
-            return np.asarray(compiled(*walls) if compiled else pole_kernel(*walls, degree=degree))
+            return pole_kernel(*walls, degree=degree)
 
-    return compute_block(*columns) if few else map_blocks(compute_block, columns, max(1, BLOCK_SIZE // degree.poles**2))
+    if alpha.size <= count_uncompiled_points(degree):
+        return compute_block(*columns)
+    return map_blocks(compute_block, columns, max(1, BLOCK_SIZE // degree.poles**2))
 
 
 def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Coefficients:
