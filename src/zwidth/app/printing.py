@@ -114,8 +114,7 @@ def format_parts(scene: Scene) -> list[str]:
 
 def get_unit(path: str) -> str:
     """Return the SI unit of a parameter of a linear device by its path; "" for numbers without a unit."""
-    unit = FIELDS[path].unit if path in FIELDS else ""
-    return {"1": "", "1/s": "rad/s"}.get(unit, unit)
+    return FIELDS[path].unit_words if path in FIELDS else ""
 
 
 def name_verdict(verdict: Assessment) -> str:

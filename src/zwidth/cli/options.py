@@ -160,7 +160,7 @@ def _add_option(command: Command, path: str) -> Command:
         kind = click.INT if parameter.whole else quantity_type(parameter.unit, allowed)
         kind = Parsed("quantity", _read_delay) if path == "delay" else kind
         unit, note = (
-            "" if parameter.unit == "1" else f", in {parameter.unit}",
+            f", in {parameter.unit_words}" if parameter.unit_words else "",
             f"; {parameter.note}" if parameter.note else "",
         )
         text = f"{parameter.sentence}{unit}{note}"

@@ -408,5 +408,5 @@ Name = Annotated[
 
 def describe_parameter(parameter: Parameter, bounds: str = "") -> str:
     """Return the description of a parameter for the JSON Schema: quantity, unit, text of the bounds, and note."""
-    unit = "" if parameter.unit == "1" else f", in {parameter.unit} or with a unit"
+    unit = f", in {parameter.unit_words} or with a unit" if parameter.unit_words else ""
     return f"{parameter.sentence}{unit}{bounds}{'; ' if parameter.note else ''}{parameter.note}"

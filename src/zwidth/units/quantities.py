@@ -84,6 +84,11 @@ class Parameter:
         return POSITIVE if self.allowed.low > 0 or self.allowed.low_open else NOT_NEGATIVE
 
     @property
+    def unit_words(self) -> str:
+        """The unit in texts: "" for a quantity without unit, and rad/s for a bandwidth."""
+        return {"1": "", "1/s": "rad/s"}.get(self.unit, self.unit)
+
+    @property
     def variable(self) -> str:
         """The name of the variable in a store, without dots, because the CF conventions do not allow them."""
         return self.name.replace(".", "_")
