@@ -27,7 +27,7 @@ from zwidth.core.errors import InputError
 from zwidth.model.joint_space import check_point, from_mujoco, list_joints, load_model
 from zwidth.model.timing import Timing
 from zwidth.plotting.table import SI_COLUMNS
-from zwidth.studies.outcome import Outcome
+from zwidth.studies.outcome import Outcome, track_progress
 from zwidth.units.formatting import describe, format_wall, header, round_conservatively, suggestion, with_unit
 from zwidth.units.parsing import detect_kind
 from zwidth.units.quantities import RECOMMENDED_SHARE
@@ -193,7 +193,7 @@ def compute_arm(arm: Arm, timing: Timing, units: UnitSystem) -> Outcome:
     cases = list(product(arm.poses, arm.directions))
     scenes: dict[int, Scene] = {}
     notes: list[str] = []
-    for index, (pose, direction) in enumerate(cases):
+    for index, (pose, direction) in enumerate(track_progress(cases)):
         try:
             device = from_mujoco(arm.loaded, arm.site, direction, pose=pose, rotary=arm.rotary)
             scenes[index] = Scene(device, timing)

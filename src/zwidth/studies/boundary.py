@@ -42,6 +42,7 @@ from zwidth.studies.outcome import (
     find_device_share,
     spell_stiffest,
     summarize_stiffest,
+    track_progress,
 )
 from zwidth.studies.ridge import find_edges, passive_intervals, passive_outlines, ridge_table
 from zwidth.units.outputs import OUTPUTS
@@ -224,11 +225,13 @@ class CompareStudy(ComputedStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         scenes = {device.label: device.to_scene() for device in self.devices}
+        # Find the stiffest walls first, because this takes longest and the tables use the stored boundaries.
+        tops = {label: loop.max_stiffness() for label, loop in track_progress(list(scenes.items()))}
         table, walls = tabulate_sets(scenes)
         rows = []
-        for label, loop in scenes.items():
+        for label, wall in tops.items():
             islands = table["number"][(table["label"] == label) & (table["piece"] == "island")] if table else []
-            top = summarize_stiffest(loop.max_stiffness())
+            top = summarize_stiffest(wall)
             rows.append({"label": label, **top, "islands": np.unique(islands).size})
         return Outcome(
             table=stack(rows),

@@ -82,7 +82,7 @@ def test_the_response_of_a_pll_is_that_of_its_statements():
         (lambda: zwidth.cascade(20, 1, position=zwidth.Pll(300), velocity=zwidth.LowPass(cutoff=50)), "omit velocity"),
         (lambda: zwidth.cascade_gains(10, 0), "virtual_damping: got 0"),
         (lambda: untyped.pid(1, units="inches"), "units"),
-        (lambda: untyped.pid("10 N/m"), "kp: got '10 N/m'"),
+        (lambda: untyped.pid("10 N/m"), "kp: got the text '10 N/m'"),
         (
             lambda: zwidth.Scene(DEVICE, TIMING, position=zwidth.Pll(900)).is_stable(1, 1),
             "position.bandwidth: got 900 rad/s; the PLL is unstable from 828.427 rad/s on",

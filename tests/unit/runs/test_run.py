@@ -224,9 +224,10 @@ def test_foreign_store_of_the_same_name_is_never_replaced(config_with_sweep, tmp
 def test_slow_study_reports_its_progress(tmp_path):
     events = []
     device = {"mass": 0.1, "damping": 1, "period": 1e-3, "delay": 1e-3}
-    study = {"kind": "filters", "name": "f", "device": device, "damping": [1, 10], "samples": [2, 3]}
+    devices = [{**device, "label": str(n), "velocity": {"kind": "windowed_difference", "samples": n}} for n in (2, 3)]
+    study = {"kind": "compare", "name": "c", "devices": devices}
     assert run({"version": 1, "name": "n", "studies": [study]}, out=tmp_path / "out", progress=events.append).ok
-    assert [event.parts for event in events] == [None, *((result, 6) for result in range(6)), None]
+    assert [event.parts for event in events] == [None, (0, 2), (1, 2), None]
 
 
 def test_record_and_store_have_equal_configuration_hashes(config_with_sweep, tmp_path):

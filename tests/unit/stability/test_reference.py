@@ -86,7 +86,7 @@ def test_maximum_stiffness_has_spectral_radius_1_and_is_a_maximum(x64):
     delta, d = 10 ** rng.uniform(-2, 1, 100), rng.choice([0, 0.25, 1, 1.5, 3], 100)
     point, _ = jax.jit(jnp.vectorize(maximize_stiffness))(delta, d)
     assert np.asarray(point.converged).all()
-    at_top = zwidth.spectral_radius(point.alpha, point.beta, delta, d)
+    at_top = zwidth.spectral_radius(np.asarray(point.alpha), np.asarray(point.beta), delta, d)
     np.testing.assert_allclose(at_top, 1.0, atol=1e-6)  # a double pole at the corner
     for factor in (0.99, 1.01):
         assert not zwidth.is_stable(1.001 * np.asarray(point.alpha), factor * np.asarray(point.beta), delta, d).any()
