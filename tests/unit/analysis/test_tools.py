@@ -1,5 +1,7 @@
 """Scenes with a simulated tool, against eigenvalues of the composed loop and published limits."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -10,9 +12,10 @@ import zwidth
 
 PERIOD = 1e-3
 INTEGRATORS = ("semi-implicit", "implicit")
+untyped: Any = zwidth  # for arguments of wrong types
 
 
-def make_scene(mass, n_delay=1, integrator="semi-implicit", damping=10, **parts):
+def make_scene(mass, n_delay: float = 1, integrator: Any = "semi-implicit", damping=10, **parts):
     tool = zwidth.Tool(mass, integrator=integrator) if mass else None
     return zwidth.Scene(zwidth.Device(0.1, damping), zwidth.Timing(PERIOD, f"{n_delay} periods"), tool=tool, **parts)
 
@@ -203,7 +206,7 @@ def test_rotary_tool():
     ("call", "message"),
     [
         (lambda scene: zwidth.Tool(0), "tool.mass"),
-        (lambda scene: zwidth.Tool(1, integrator="verlet"), "tool.integrator"),
+        (lambda scene: untyped.Tool(1, integrator="verlet"), "tool.integrator"),
         (lambda scene: scene.simulate(5e3, 5), "exclude a tool"),
         (lambda scene: scene.open_loop(5e3, 5), "excludes a tool"),
         (lambda scene: scene.recommend().code(), "code is written for walls only"),

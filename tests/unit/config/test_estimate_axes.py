@@ -1,5 +1,7 @@
 """Sweeps over parameters of position estimates and further feedback, and bandwidths in rad/s, as a user types them."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -9,6 +11,7 @@ from zwidth.cli import cli
 from zwidth.config.fields import ConfigFileError
 
 DEVICE, TIMING = zwidth.Device(0.1, 10), zwidth.Timing("1 ms", "1 ms")
+untyped: Any = zwidth  # for arguments of wrong types
 OPTIONS = ("--mass", "100g", "--damping", "10", "--period", "1ms", "--delay", "1ms", "--stiffness", "1kN/m")
 SCENE = "version: 1\nname: sweep\nscene: {mass: 100 g, damping: 10, rate: 1 kHz, delay: 1 ms, %s}\nstudies:\n  - {%s}\n"
 
@@ -44,9 +47,9 @@ def test_unknown_axis_is_named_if_it_is_the_only_one(tmp_path):
 
 @pytest.mark.parametrize("bandwidth", [500, "500 rad/s", "0.5 krad/s", f"{500 / (2 * np.pi)!r} Hz"])
 def test_bandwidths_do_not_make_a_device_rotary(bandwidth):
-    scene = zwidth.Scene(DEVICE, TIMING, position=zwidth.Pll(bandwidth))
-    assert scene.position.bandwidth == pytest.approx(500)
-    assert not scene.device.rotary
+    pll = zwidth.Pll(bandwidth)
+    assert pll.bandwidth == pytest.approx(500)
+    assert not zwidth.Scene(DEVICE, TIMING, position=pll).device.rotary
     options = [*OPTIONS, "--virtual-damping", "10", "--position-kind", "pll", "--position-bandwidth", str(bandwidth)]
     result = CliRunner().invoke(cli, ["check", *options])
     assert "STABLE" in result.output
@@ -55,6 +58,6 @@ def test_bandwidths_do_not_make_a_device_rotary(bandwidth):
 
 def test_gains_with_units_are_refused_with_a_remedy():
     with pytest.raises(zwidth.InputError, match=r"pos_gain: got the text '20 1/s'; pass a number"):
-        zwidth.cascade("20 1/s", 0.16)
+        untyped.cascade("20 1/s", 0.16)
     with pytest.raises(zwidth.InputError, match=r"kp: got the text '3.2 N m/turn'; pass a number"):
-        zwidth.pid("3.2 N m/turn")
+        untyped.pid("3.2 N m/turn")

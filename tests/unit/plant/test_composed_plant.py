@@ -16,7 +16,8 @@ def test_sum_of_responses(seed):
         zwidth.Device(0.1, damping, modes=[zwidth.Mode(120, 0.02, 0.5)] if seed % 3 == 0 else []),
         zwidth.Timing(1e-3, f"{delay} periods"),
     )
-    tool = zwidth.Tool(mass, *rng.choice([0.0, 1.0], 2), ("semi-implicit", "implicit")[seed % 2])
+    damping, stiffness = rng.choice([0.0, 1.0], 2)
+    tool = zwidth.Tool(mass, damping, stiffness, ("semi-implicit", "implicit")[seed % 2])
     device, second = scene.loop.roots, factor_tool(tool.respond(scene.mass, 1e-3))
     points = circle_points(np.geomspace(1e-4, 3.1, 50))
     total = add_plants(device, second).evaluate_response(points)
