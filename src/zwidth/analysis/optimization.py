@@ -343,7 +343,7 @@ class SceneOptima(SceneAnalysis):
             return math.log(K / stiffness) if status == Status.OK else math.nan
 
         def surplus(value: float) -> float:
-            """Return log(K_max/stiffness) for one value of the parameter, with the special cases of ``compare``."""
+            """Return log(K_max/stiffness) for one value of the parameter, by ``compare`` also if K_max is missing."""
             wall = self.replace(**{parameter: value}).max_stiffness(negative_damping=negative_damping)
             return compare(wall.stiffness, wall.status)
 

@@ -119,6 +119,6 @@ def change_kind(owner: str, part: Any, given: dict[str, Any]) -> Any:
         names = {item.name for item in fields(part)} - ({"gain"} if spelled["kind"] == "filter" else set())
         kept = spelled if given.keys() <= names else {}
     if given.keys() & _ONE_OF:
-        # Drop the values of the file for all parameters in `_ONE_OF`, because these parameters exclude each other.
+        # If an option sets a parameter in `_ONE_OF`, drop those that the file sets, because they exclude each other.
         kept = {name: value for name, value in kept.items() if name not in _ONE_OF}
     return make_kind(owner, {**kept, **given})

@@ -21,7 +21,7 @@ from zwidth.units.quantities import ANY
 
 IntegrationRule = Literal["backward", "forward", "trapezoidal"]
 RULES = ("backward", "forward", "trapezoidal")
-"""Rules of numerical integration."""
+"""Names of the rules by which `IntegralFeedback` integrates numerically."""
 
 
 class Weights(NamedTuple):

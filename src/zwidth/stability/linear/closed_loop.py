@@ -38,9 +38,10 @@ def _realize_controller(chain: AnyChain, alpha: float, beta: float) -> StateSpac
 
 
 def _couple_tool(coupling: StateSpace, tool: ToolResponse) -> StateSpace:
-    """Return ``C/(1 + C G_t)`` in state space, for a coupling C and a simulated tool with the response G_t.
+    """Return the state-space model from the position x of the device to the force of a virtual coupling.
 
-    The input is the position x of the device, the output the force C (x - y), with the position y of the tool.
+    The coupling C connects the device with a simulated tool at the position y = G_t f. Its force f = C (x - y) is
+    therefore ``C/(1 + C G_t) x``.
     """
     plant = factor_tool(tool)
     y = realize_estimate(Estimate(0, plant.gain, 0, plant.zeros, plant.poles))
