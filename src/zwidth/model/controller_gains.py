@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple
 
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.xp import is_traced
-from zwidth.model.checks import check_number
+from zwidth.model.checks import accept_units, check_number
 from zwidth.model.feedback import IntegralFeedback, IntegrationRule
 from zwidth.model.position import Position, has_velocity
 from zwidth.model.velocity import BackwardDifference, LowPass, Velocity
@@ -99,7 +99,7 @@ def pid(
     ki: float = 0.0,
     kd: float = 0.0,
     *,
-    derivative_filter: float | Velocity | None = None,
+    derivative_filter: float | str | Velocity | None = None,
     position: Position | None = None,
     rule: IntegrationRule = "backward",
     units: PositionUnit = "rad",
@@ -134,13 +134,14 @@ def pid(
     scale = _find_scale(units, output_unit)
     kp, ki, kd = (_read_gain(name, gain) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
     velocity: Any = BackwardDifference() if derivative_filter is None else derivative_filter
-    if isinstance(velocity, int | float):
+    if isinstance(velocity, int | float | str):
         velocity = LowPass(time_constant=velocity)
     weight = None if position is None else 1.0
     feedback = IntegralFeedback(ki * scale, rule, weight) if is_traced(ki) or ki else None
     return ControllerParts(VirtualWall(kp * scale, kd * scale), velocity, position, feedback)
 
 
+@accept_units
 def pid_gains(
     stiffness: float,
     virtual_damping: float,
@@ -233,6 +234,7 @@ def cascade(
     return ControllerParts(wall, velocity or BackwardDifference(), position, feedback)
 
 
+@accept_units
 def cascade_gains(
     stiffness: float, virtual_damping: float, *, units: PositionUnit = "turns", output_unit: float = 1.0
 ) -> CascadeGains:

@@ -18,10 +18,11 @@ import numpy as np
 
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.xp import is_traced, namespace
-from zwidth.model.checks import Part
+from zwidth.model.checks import Part, check_number
 from zwidth.model.estimate import Estimate
 from zwidth.model.rational_filter import RationalFilter
 from zwidth.model.velocity import Butterworth, LowPass, as_complex, check_cutoff, get_coded_ratio, get_pi
+from zwidth.units.quantities import POSITIVE
 
 VelocitySource = Literal["position", "measured"]
 SOURCES = ("position", "measured")
@@ -76,14 +77,18 @@ class ExponentialFilter(Part):
         super().__post_init__()
 
     @classmethod
-    def simplefoc(cls, time_constant: float, period: float) -> ExponentialFilter:
+    def simplefoc(cls, time_constant: Any, period: Any) -> ExponentialFilter:
         """Return the filter of the class ``LowPassFilter`` of SimpleFOC, with ``a = T/(T_f + T)``.
 
         Args:
             time_constant: T_f in s, the field ``Tf`` of ``LowPassFilter``.
             period: sampling period T of the program in s.
         """
-        return cls(coefficient=period / (time_constant + period))
+        T_f, T = (
+            check_number(name, value, "s", POSITIVE)
+            for name, value in (("time_constant", time_constant), ("period", period))
+        )
+        return cls(coefficient=T / (T_f + T))
 
     def estimate(self, period: Any) -> Estimate:
         """Return P for a loop with sampling period ``period`` in s."""

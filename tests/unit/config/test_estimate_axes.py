@@ -61,3 +61,15 @@ def test_gains_with_units_are_refused_with_a_remedy():
         untyped.cascade("20 1/s", 0.16)
     with pytest.raises(zwidth.InputError, match=r"kp: got the text '3.2 N m/turn'; pass a number"):
         untyped.pid("3.2 N m/turn")
+
+
+def test_conversions_accept_texts_with_units():
+    assert zwidth.ExponentialFilter.simplefoc("5 ms", "1 ms") == zwidth.ExponentialFilter.simplefoc(5e-3, 1e-3)
+    assert untyped.pid(100, derivative_filter="5 ms").velocity == zwidth.LowPass(time_constant=5e-3)
+    gains = untyped.pid_gains("2 N m/rad", "50 mN m s/rad", units="turns")
+    assert gains == pytest.approx(zwidth.pid_gains(2.0, 0.05, units="turns"))
+    cascade = untyped.cascade_gains("2 N m/rad", "50 mN m s/rad")
+    assert cascade == pytest.approx(zwidth.cascade_gains(2.0, 0.05))
+    assert cascade.pos_gain == pytest.approx(40)
+    with pytest.raises(zwidth.InputError, match="time_constant: got '5 N'"):
+        zwidth.ExponentialFilter.simplefoc("5 N", "1 ms")
