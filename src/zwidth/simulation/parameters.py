@@ -23,6 +23,7 @@ from zwidth.core.types import Array
 from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates
 from zwidth.model.state_space import realize_estimate
+from zwidth.model.tool import ToolStep
 from zwidth.model.velocity import FOAW
 from zwidth.plant.transition import Transition, compute_transition
 from zwidth.simulation.mechanics import Mechanics
@@ -59,6 +60,7 @@ class Options(NamedTuple):
     foaw: int  # longest window of FOAW in samples; 0 for a linear velocity estimate
     position: bool  # the scenes have a position estimate
     feedback: bool  # the scenes have further feedback, such as an integral gain
+    tool: bool  # the scenes have a tool that a virtual coupling connects to the device
     record: bool  # readings and frames are recorded
     law: TracedLaw | None  # force law in place of the wall's spring and damper
 
@@ -81,6 +83,7 @@ class ExternalInputs(NamedTuple):
     velocities: np.ndarray  # initial velocities, (bodies, batch)
     noise: np.ndarray | None  # errors of the measured positions in m, (periods, batch); None without noise
     history: np.ndarray | None  # external force per period, (periods, batch); None without a history
+    tool: np.ndarray  # initial position of the tool (NaN: that of the device) and its change per period, (2, batch)
     durations: np.ndarray | None  # durations of the pieces, (periods, substeps, pieces, batch); None without jitter
     instants: np.ndarray | None  # instants of the samples in periods, (periods + 1, batch); None without jitter
     period: np.ndarray  # sampling period, in s
@@ -137,6 +140,7 @@ class Parameters(NamedTuple):
     filtered_input: Array  # True if the velocity estimate is computed from the position estimate, not the measurement
     estimator: Estimator  # velocity estimate
     feedback: FeedbackLoop  # feedback in addition to spring and damper, such as an integral gain
+    tool: ToolStep  # integration step of the tool; its fields are 0 without a tool
     rate: Array  # matrix of x' = rate @ (x, u), (n, n + forces, batch)
     place: Array  # rows of the positions of the bodies, (bodies, n, batch)
     motion: Array  # rows of the velocities of the bodies, (bodies, n, batch)

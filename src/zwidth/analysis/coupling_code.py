@@ -1,0 +1,179 @@
+"""Source code of a virtual coupling and its simulated tool for a control loop, in C or in Python.
+
+Each period, the program computes the distance e = x - y from the tool, at the position y, to the device, at the
+measured position x. It computes the velocity estimate v of e, and the force f = K e + B v of the coupling on the tool.
+It integrates the tool by one step of length T (`model.tool`), and returns -f, the force on the device.
+
+If the tool is integrated by the implicit Euler method, y is its position after the step, which depends on f. Let v_0 be
+the velocity estimate for e = 0, D its direct feedthrough, e_0 the distance without the force, and h f the displacement
+of the tool by the force. From ``e = e_0 - h f`` and ``f = K e + B (v_0 + D e)`` follows
+
+    e = (e_0 - h B v_0)/(1 + h (K + B D))
+
+The velocity estimate and its filters are written by `analysis.wall_code`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from zwidth.analysis.base import SceneParts
+from zwidth.analysis.wall_code import (
+    describe_cautions,
+    find_sections,
+    format_c,
+    format_python,
+    reset_states,
+    write_filter,
+    write_wall,
+)
+from zwidth.core.errors import check_choice
+from zwidth.model.tool import Tool
+from zwidth.units.formatting import format_wall, with_unit
+from zwidth.units.unit_system import UnitSystem
+
+
+class CouplingProgram(NamedTuple):
+    """Program of a coupling as statements that are valid in C and Python once the mark ``@`` is replaced.
+
+    Statements that start with "# " are comments.
+    """
+
+    head: list[str]  # lines of comment on the coupling and the tool
+    call: list[str]  # lines of comment on the argument and the result
+    window: int  # length of the difference in periods; 0 for none
+    states: list[str]  # names of the states of the filter
+    force: list[str]  # statements that compute the force f from the measured position x, and integrate the tool
+
+
+def write_program(
+    scene: SceneParts, language: str = "c", cautions: Sequence[str] = (), max_force: float = math.inf
+) -> str:
+    """Return the source code of the wall of a scene or, if the scene has a tool, of the coupling to the tool.
+
+    Args:
+        scene: the scene with the wall.
+        language: "c" or "python".
+        cautions: sentences to include in the comment at the head.
+        max_force: largest force of the motor in N, to which the code limits the force on the device.
+    """
+    if scene.tool is None:
+        return write_wall(scene, language, cautions, max_force)
+    check_choice("language", language, ("c", "python"))
+    program = build_coupling_program(scene, scene.tool, cautions, max_force)
+    count, limited = program.window, max_force < math.inf
+    start = ["# Place the tool at rest at the device.", "@tool_position = x", "@tool_velocity = 0.0"]
+    if language == "c":
+        members = ["double tool_position", "double tool_velocity"]
+        members += [f"double past[{count}]", "int next"] if count > 1 else ["double distance"]
+        members += [f"double {name}" for name in program.states]
+        past = [f"for (int k = 0; k < {count}; k++) @past[k] = 0.0", "@next = 0"]
+        start += [*(past if count > 1 else ["@distance = 0.0"]), *reset_states(program.states)]
+        law = f"f > {max_force!r} ? -{max_force!r} : f < -{max_force!r} ? {max_force!r} : -f" if limited else "-f"
+        return format_c("coupling", [*program.head, *program.call], members, start, [*program.force, f"return {law}"])
+    start += [f"@past = [0.0] * {count}", "@next = 0"] if count > 1 else ["@distance = 0.0"]
+    start += reset_states(program.states)
+    law = f"max(-{max_force!r}, min({max_force!r}, -f))" if limited else "-f"
+    return format_python("Coupling", program.head, program.call, start, [*program.force, f"return {law}"])
+
+
+def build_coupling_program(
+    scene: SceneParts, tool: Tool, cautions: Sequence[str] = (), max_force: float = math.inf
+) -> CouplingProgram:
+    """Build the program of a coupling, as statements for either language."""
+    period, system = float(scene.timing.period), scene.unit_system
+    K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
+    estimate = scene.velocity.estimate(period)
+    count, code = estimate.window, write_filter(estimate)
+    # The previous distance is stored in an array if the difference covers several periods.
+    past = "@past[@next]" if count > 1 else "@distance"
+    scale = f"v = {code.gain / period!r} * u"
+
+    def subtract(newest: str) -> str:
+        """Return the statement that computes the input of the filter from the newest distance."""
+        return (
+            f"u = ({newest} - {past}) / {count}"
+            if count > 1
+            else f"u = {newest} - {past}"
+            if count
+            else f"u = {newest}"
+        )
+
+    estimate_velocity = [subtract("e"), f"{past} = e", *([f"@next = (@next + 1) % {count}"] if count > 1 else [])]
+    estimate_velocity += [*code.update, scale]
+    rate = period / float(tool.mass)
+    p, q = float(tool.damping) * rate, float(tool.stiffness) * rate * period
+    if tool.integrator == "implicit":
+        share = 1.0 / (1.0 + p + q)
+        lever = rate * period * share
+        direct = float(estimate.gain) / period / max(count, 1)
+        for numerator, _ in find_sections(estimate):
+            direct *= numerator[0]
+        free = _join((share, "@tool_velocity"), (-share * q / period, "@tool_position"))
+        solve = [
+            "# Implicit Euler method: the step of the tool depends on f. First compute its velocity for f = 0.",
+            f"free = {free}",
+            "# Compute the velocity v that the estimate would return for the distance e = 0.",
+            *[subtract("0.0"), *code.output, scale],
+            "# Solve the equations of tool and coupling for the distance e after the step.",
+            f"e = x - (@tool_position + {period!r} * free)",
+            f"e = (e - {lever * B!r} * v) / {1.0 + lever * (K + B * direct)!r}",
+        ]
+        step = ["# Integrate the tool: velocity, then position.", f"@tool_velocity = free + {rate * share!r} * f"]
+    else:
+        solve = ["# Compute the distance from the tool to the device.", "e = x - @tool_position"]
+        forces = _join((1.0, "f"), (-float(tool.damping), "@tool_velocity"), (-float(tool.stiffness), "@tool_position"))
+        step = ["# Integrate the tool by semi-implicit Euler: velocity, then position."]
+        step += [f"@tool_velocity += {rate!r} * {forces if forces == 'f' else f'({forces})'}"]
+    force = [
+        *solve,
+        "# Estimate the velocity of the device relative to the tool.",
+        *estimate_velocity,
+        f"# Compute the {'torque' if system.rotary else 'force'} of the coupling on the tool.",
+        f"f = {K!r} * e + {B!r} * v",
+        *step,
+        f"@tool_position += {period!r} * @tool_velocity",
+        "# Return the reaction, which acts on the device.",
+    ]
+    head = _describe_coupling(scene, tool, max_force)
+    call = _describe_call(system)
+    return CouplingProgram([*head, *describe_cautions(scene, cautions)], call, count, code.states, force)
+
+
+def _join(*terms: tuple[float, str]) -> str:
+    """Return a sum of products as an expression, without products that are 0."""
+    texts = [
+        f"{'-' if factor < 0 else '+'} {'' if abs(factor) == 1.0 else f'{abs(factor)!r} * '}{name}"
+        for factor, name in terms
+        if factor
+    ]
+    return " ".join(texts).removeprefix("+ ")
+
+
+def _describe_coupling(scene: SceneParts, tool: Tool, max_force: float) -> list[str]:
+    """Return two lines of comment: the coupling and the limit of its force, and the tool."""
+    system, wall = scene.unit_system, scene.wall
+    coupling = format_wall(float(wall.stiffness), float(wall.virtual_damping), system)
+    line = f"Virtual coupling: {coupling}, velocity by {type(scene.velocity).__name__}, "
+    line += f"{with_unit(1.0 / float(scene.timing.period), 'Hz')}."
+    if max_force < math.inf:
+        name = "Torque" if system.rotary else "Force"
+        line += f" {name} on the device limited to {with_unit(max_force, system['N'])}."
+    units = {"mass": "kg", "damping": "N s/m", "stiffness": "N/m"}
+    values = [(name, float(getattr(tool, name)), system[unit]) for name, unit in units.items()]
+    if system.rotary:
+        values[0] = ("moment of inertia", *values[0][1:])
+    texts = [f"{name} {with_unit(value, unit)}" for name, value, unit in values if value]
+    return [line, f"Tool: {', '.join(texts)}, {tool.integrator} Euler method."]
+
+
+def _describe_call(system: UnitSystem) -> list[str]:
+    """Return the lines of comment on the argument and the result of the generated function, and on the tool."""
+    position, force, unit = ("angle", "torque", "rad") if system.rotary else ("position", "force", "m")
+    return [
+        f"x is the {position} of the device in {unit}; the result is the {force} on the device in {system['N']}.",
+        f"tool_position is the {position} of the tool in {unit}, after the step of this call.",
+        "x must be continuous: unwrap an encoder that restarts.",
+    ]
