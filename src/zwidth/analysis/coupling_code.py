@@ -29,7 +29,7 @@ from zwidth.analysis.wall_code import (
     write_filter,
     write_wall,
 )
-from zwidth.core.errors import check_choice
+from zwidth.core.errors import InputError, check_choice
 from zwidth.model.tool import Tool
 from zwidth.units.formatting import format_wall, with_unit
 from zwidth.units.unit_system import UnitSystem
@@ -45,6 +45,7 @@ class CouplingProgram(NamedTuple):
     call: list[str]  # lines of comment on the argument and the result
     window: int  # length of the difference in periods; 0 for none
     states: list[str]  # names of the states of the filter
+    every: int  # number of periods per step of the tool
     force: list[str]  # statements that compute the force f from the measured position x, and integrate the tool
 
 
@@ -62,11 +63,15 @@ def write_program(
     if scene.tool is None:
         return write_wall(scene, language, cautions, max_force)
     check_choice("language", language, ("c", "python"))
+    for name in ("position", "feedback"):
+        if getattr(scene, name) is not None:
+            raise InputError(f"{name}: the code of a coupling excludes it; omit {name} or the tool")
     program = build_coupling_program(scene, scene.tool, cautions, max_force)
     count, limited = program.window, max_force < math.inf
     start = ["# Place the tool at rest at the device.", "@tool_position = x", "@tool_velocity = 0.0"]
+    start += ["@sample = 0"] * (program.every > 1)
     if language == "c":
-        members = ["double tool_position", "double tool_velocity"]
+        members = ["double tool_position", "double tool_velocity", *["int sample"] * (program.every > 1)]
         members += [f"double past[{count}]", "int next"] if count > 1 else ["double distance"]
         members += [f"double {name}" for name in program.states]
         past = [f"for (int k = 0; k < {count}; k++) @past[k] = 0.0", "@next = 0"]
@@ -103,30 +108,37 @@ def build_coupling_program(
 
     estimate_velocity = [subtract("e"), f"{past} = e", *([f"@next = (@next + 1) % {count}"] if count > 1 else [])]
     estimate_velocity += [*code.update, scale]
-    rate = period / float(tool.mass)
-    p, q = float(tool.damping) * rate, float(tool.stiffness) * rate * period
+    every = getattr(tool, "every", 1)
+    length = every * period
+    rate = length / float(tool.mass)
+    p, q = float(tool.damping) * rate, float(tool.stiffness) * rate * length
     if tool.integrator == "implicit":
         share = 1.0 / (1.0 + p + q)
-        lever = rate * period * share
+        lever = rate * length * share
         direct = float(estimate.gain) / period / max(count, 1)
         for numerator, _ in find_sections(estimate):
             direct *= numerator[0]
-        free = _join((share, "@tool_velocity"), (-share * q / period, "@tool_position"))
+        free = _join((share, "@tool_velocity"), (-share * q / length, "@tool_position"))
         solve = [
             "# Implicit Euler method: the step of the tool depends on f. First compute its velocity for f = 0.",
-            f"free = {free}",
+            f"v_free = {free}",
             "# Compute the velocity v that the estimate would return for the distance e = 0.",
             *[subtract("0.0"), *code.output, scale],
             "# Solve the equations of tool and coupling for the distance e after the step.",
-            f"e = x - (@tool_position + {period!r} * free)",
+            f"e = x - (@tool_position + {length!r} * v_free)",
             f"e = (e - {lever * B!r} * v) / {1.0 + lever * (K + B * direct)!r}",
         ]
-        step = ["# Integrate the tool: velocity, then position.", f"@tool_velocity = free + {rate * share!r} * f"]
+        # Compute ``v_free`` before the condition, so that it is always defined.
+        solve = solve if every == 1 else ["e = x - @tool_position", *solve[:2], *_limit_to_steps(solve[2:])]
+        step = ["# Integrate the tool: velocity, then position.", f"@tool_velocity = v_free + {rate * share!r} * f"]
     else:
         solve = ["# Compute the distance from the tool to the device.", "e = x - @tool_position"]
         forces = _join((1.0, "f"), (-float(tool.damping), "@tool_velocity"), (-float(tool.stiffness), "@tool_position"))
         step = ["# Integrate the tool by semi-implicit Euler: velocity, then position."]
         step += [f"@tool_velocity += {rate!r} * {forces if forces == 'f' else f'({forces})'}"]
+    step.append(f"@tool_position += {length!r} * @tool_velocity")
+    if every > 1:
+        step = [*_limit_to_steps(step), f"@sample = (@sample + 1) % {every}"]
     force = [
         *solve,
         "# Estimate the velocity of the device relative to the tool.",
@@ -134,12 +146,16 @@ def build_coupling_program(
         f"# Compute the {'torque' if system.rotary else 'force'} of the coupling on the tool.",
         f"f = {K!r} * e + {B!r} * v",
         *step,
-        f"@tool_position += {period!r} * @tool_velocity",
         "# Return the reaction, which acts on the device.",
     ]
     head = _describe_coupling(scene, tool, max_force)
     call = _describe_call(system)
-    return CouplingProgram([*head, *describe_cautions(scene, cautions)], call, count, code.states, force)
+    return CouplingProgram([*head, *describe_cautions(scene, cautions)], call, count, code.states, every, force)
+
+
+def _limit_to_steps(statements: list[str]) -> list[str]:
+    """Return statements with the condition that the tool makes a step in this period."""
+    return ["if @sample == 0:", *(f"    {line}" for line in statements)]
 
 
 def _join(*terms: tuple[float, str]) -> str:
@@ -166,7 +182,9 @@ def _describe_coupling(scene: SceneParts, tool: Tool, max_force: float) -> list[
     if system.rotary:
         values[0] = ("moment of inertia", *values[0][1:])
     texts = [f"{name} {with_unit(value, unit)}" for name, value, unit in values if value]
-    return [line, f"Tool: {', '.join(texts)}, {tool.integrator} Euler method."]
+    every = getattr(tool, "every", 1)
+    rate = f", one step every {every} periods" if every > 1 else ""
+    return [line, f"Tool: {', '.join(texts)}, {tool.integrator} Euler method{rate}."]
 
 
 def _describe_call(system: UnitSystem) -> list[str]:

@@ -35,7 +35,7 @@ from zwidth.units.formatting import format_wall, with_unit
 from zwidth.units.unit_system import UnitSystem
 
 _COLUMNS = 100  # characters per line of a comment
-LOCALS = (*"uvwefyr", "free")  # local variables of programs, which C programs declare
+LOCALS = (*"uvwefyr", "v_free")  # local variables of programs, which C programs declare
 # Largest ratio of imaginary part to modulus at which a root is treated as real, because rounding errors cause a small
 # imaginary part.
 REAL_TOLERANCE = 1e-13
@@ -273,16 +273,24 @@ def format_c(name: str, comment: Sequence[str], members: Sequence[str], start: l
         comment: lines of the comment at the head.
         members: declarations of the states.
         start: statements of the function that initializes the states; a comment starts with "# ".
-        force: statements of the function that is called once per period.
+        force: statements of the function that is called once per period. Those with an indentation follow a condition
+            in the syntax of Python, as "if @k == 0:".
     """
     blocks = []
     for block in (start, force):
-        variables = [each for each in LOCALS if any(line.startswith(f"{each} =") for line in block)]
+        variables = [each for each in LOCALS if any(line.lstrip().startswith(f"{each} =") for line in block)]
         declared = [f"double {', '.join(variables)}", *block] if variables else block
-        lines = (
-            f"/* {line[2:]} */" if line.startswith("# ") else line if line.endswith("}") else f"{line};"
-            for line in declared
-        )
+        lines = list[str]()
+        for line, following in zip(declared, [*declared[1:], ""], strict=True):
+            text = line.lstrip()
+            if text.startswith("# "):
+                lines.append(line.replace("# ", "/* ") + " */")
+            elif text.startswith("if ") and text.endswith(":"):
+                lines.append(f"if ({text[3:-1]}) {{")
+            else:
+                lines.append(line if line.endswith("}") else f"{line};")
+            if line.startswith("    ") and not following.startswith("    "):
+                lines.append("}")
         blocks.append("\n".join(f"    {line}" for line in lines).replace("@", f"{name}->"))
     members_text, kind = "\n".join(f"    {line};" for line in members), name.capitalize()
     head = "\n   ".join([*comment, f"Call {name}_start once, then {name}_force once per period. */"])

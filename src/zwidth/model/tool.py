@@ -32,12 +32,13 @@ class ToolResponse(NamedTuple):
 
 
 class ToolStep(NamedTuple):
-    """One integration step ``w = decay w - spring y + gain f; y = y + w`` of a tool with the velocity w/T."""
+    """One integration step ``w = decay w - spring y + gain f; y = y + w`` of a tool with the increment w per step."""
 
     decay: Any
     spring: Any
     gain: Any
     implicit: Any  # True if the force f of the coupling is computed from the new y, False if from the old y
+    every: Any  # number of sampling periods per step
 
 
 @dataclass(frozen=True, repr=False)
@@ -105,9 +106,10 @@ class Tool(Part):
             mass: m in kg, the unit of mass of the scene.
             period: sampling period T in s.
         """
-        rate = period / self.mass
-        p, q, gain = self.damping * rate, self.stiffness * (rate * period), mass / self.mass
+        every = getattr(self, "every", 1)
+        rate = every * period / self.mass
+        p, q, gain = self.damping * rate, self.stiffness * (rate * every * period), every**2 * mass / self.mass
         if self.integrator == "implicit":
             scale = 1.0 / (1.0 + p + q)
-            return ToolStep(scale, q * scale, gain * scale, True)
-        return ToolStep(1.0 - p, q, gain, False)
+            return ToolStep(scale, q * scale, gain * scale, True, every)
+        return ToolStep(1.0 - p, q, gain, False, every)

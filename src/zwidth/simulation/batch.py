@@ -84,7 +84,7 @@ def build_model(scene: Any) -> Model:
     linear = replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene
     program = build_estimates(linear) or LoopEstimates(velocity=linear.velocity.estimate(period))
     estimate, window = (velocity, velocity.samples) if adapts else (program.velocity, program.velocity.window)
-    tool = ToolStep(0.0, 0.0, 0.0, False) if scene.tool is None else scene.tool.compute_step(mass, period)
+    tool = ToolStep(0.0, 0.0, 0.0, False, 1) if scene.tool is None else scene.tool.compute_step(mass, period)
     return Model(chain, program, estimate, chain.n_delay, fraction, window, period, mass, tool)
 
 

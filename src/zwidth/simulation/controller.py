@@ -125,12 +125,11 @@ def control(
     tool, further_readings = controller.tool, {}
     if options.tool:
         # Apply the force of the coupling to the tool without the limits of the motor, because the tool is simulated.
-        change = _step_freely(params.tool, tool) - params.tool.gain * force
+        due = k % params.tool.every == 0
+        change = jnp.where(due, _step_freely(params.tool, tool) - params.tool.gain * force, 0.0)
         used = tool[0] + jnp.where(params.tool.implicit, change, 0.0)
-        tool, further_readings = (
-            jnp.stack([tool[0] + change, change]),
-            {"tool_position": used, "coupling_force": -force},
-        )
+        tool = jnp.stack([tool[0] + change, jnp.where(due, change, tool[1])])
+        further_readings = {"tool_position": used, "coupling_force": -force}
     ring, motor = controller.commands, params.motor
     last = read(ring, (k - 1) & (len(ring) - 1))
     force = jnp.clip(force, -motor.max_force, motor.max_force)
@@ -162,11 +161,12 @@ def _find_distance(params: Parameters, options: Options, controller: Controller,
     e_0 is the distance for f = 0, v_0 the velocity estimate for e = 0, and D the direct feedthrough of this estimate.
     """
     tool, estimator = params.tool, params.estimator
-    distance = measured - (controller.tool[0] + jnp.where(tool.implicit, _step_freely(tool, controller.tool), 0.0))
+    solved = tool.implicit & (k % tool.every == 0)
+    distance = measured - (controller.tool[0] + jnp.where(solved, _step_freely(tool, controller.tool), 0.0))
     if options.foaw or options.law is not None:
         # Scenes with a nonlinear coupling have tools integrated by the semi-implicit Euler method only.
         return distance
-    gain, direct = jnp.where(tool.implicit, tool.gain, 0.0), estimator.filter.D / jnp.maximum(estimator.window, 1)
+    gain, direct = jnp.where(solved, tool.gain, 0.0), estimator.filter.D / jnp.maximum(estimator.window, 1)
     rest, _ = _estimate_velocity(estimator, controller.positions, controller.filters.velocity, k, 0.0 * measured)
     return (distance - gain * params.beta * rest) / (1.0 + gain * (params.alpha + params.beta * direct))
 
@@ -227,7 +227,8 @@ def start_controller(
         place = np.where(np.isnan(tool[0]), past[0], tool[0])
         past, speed = past - (place - back[:, None] * tool[1]), v - tool[1]
         # The implicit Euler method makes a step before the force at sample 0 is computed, so start one step earlier.
-        tool = np.stack([place - np.where(params.tool.implicit, tool[1], 0.0), tool[1]])
+        step = params.tool.every * tool[1]
+        tool = np.stack([place - np.where(params.tool.implicit, step, 0.0), step])
     filtered, position, change = _settle(params.position, past[0], v)
     if options.position:
         past = np.where(params.filtered_input, position - back[:, None] * change, past)
