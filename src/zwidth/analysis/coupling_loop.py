@@ -1,11 +1,13 @@
-"""Stability of the virtual coupling ``C = alpha + beta F`` between a device and a simulated tool.
+"""Stability of the virtual coupling between a device and a simulated tool, a spring alpha and a damper beta.
 
-alpha and beta are the normalized stiffness and damping of the coupling, F is the velocity estimate. The closed loop is
-``1 + C (G + G_t) = 0`` with the responses G of the device and G_t of the tool (docs/theory/passivity.md, U5). The
-analyses of `LinearLoop` for a wall are therefore valid for the coupling, with G + G_t in place of G.
+alpha and beta are normalized. With the responses G of the device and G_t of the tool, and the velocity estimate F, the
+closed loop is ``1 + (alpha + beta F) (G + G_t) = 0`` (docs/theory/passivity.md, U5). The analyses of `LinearLoop` for a
+wall are therefore valid for the coupling, with G + G_t in place of G. A position estimate and further feedback of the
+device change G and F (`stability.linear.composition`).
 
 A tool that is integrated by the implicit Euler method responds to the coupling force without delay. The set of stable
-couplings can then be *unbounded*: all couplings with sufficiently large alpha are stable.
+couplings can then be *unbounded*: all couplings with sufficiently large alpha are stable, or those whose beta is
+sufficiently large and in certain ratios to alpha.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ import numpy as np
 from zwidth.analysis.loop import LinearLoop
 from zwidth.core.errors import InputError
 from zwidth.core.status import RidgeKind, Status
-from zwidth.plant.composed_plant import add_plants, factor_tool
+from zwidth.plant.composed_plant import factor_tool
+from zwidth.stability.linear.boundary import Boundary
+from zwidth.stability.linear.composition import compose_coupling
 from zwidth.stability.linear.regions import StableSet
 from zwidth.stability.linear.ridge import RidgeSolution
 from zwidth.stability.linear.roots import LoopRoots
@@ -34,22 +38,37 @@ class CouplingLoop(LinearLoop):
 
     @cached_property
     def roots(self) -> LoopRoots:
-        device, scene = super().roots, self.scene
-        plant = add_plants(device, factor_tool(scene.tool.respond(scene.mass, scene.timing.period)))
-        return LoopRoots(**vars(plant), estimate=device.estimate)
+        return self._add_tool(super().roots)
+
+    def _add_tool(self, device: LoopRoots) -> LoopRoots:
+        """Return the loop of the coupling, from the loop of the device without a tool."""
+        scene = self.scene
+        tool = factor_tool(scene.tool.respond(scene.mass, scene.timing.period))
+        return compose_coupling(device, self.chain.estimates, tool)
+
+    @cached_property
+    def has_free_stiffness(self) -> bool:
+        """True if all couplings with sufficiently large alpha are stable, whatever their beta."""
+        return not self.boundary.count_above(np.zeros(1))
 
     @cached_property
     def unbounded(self) -> bool:
-        """True if all couplings with sufficiently large alpha are stable, whatever their beta."""
-        return not self.boundary.count_above(np.zeros(1))
+        """True if couplings with arbitrarily large alpha and beta are stable, e.g. in a certain ratio to each other."""
+        loop = self.roots
+        if self.has_free_stiffness or not loop.shared or loop.zeros.size < loop.poles.size + loop.lag:
+            return self.has_free_stiffness
+        # For alpha = r beta and beta -> inf, the poles approach the zeros of r + F if all zeros of G are poles of F.
+        # They are the poles of the loop of a spring r with the plant 1/F.
+        intervals = find_stable_intervals(Boundary.trace(loop.invert_estimate()), np.zeros(1))
+        return bool(intervals.high.size)
 
     @cached_property
     def free_damping(self) -> float:
         """The smallest beta in `TESTED_DAMPINGS` with which the coupling is stable for every alpha > 0; NaN if none is.
 
-        It is NaN, too, if the set of stable couplings is bounded.
+        It is NaN, too, if not all couplings with sufficiently large alpha are stable.
         """
-        if not self.unbounded:
+        if not self.has_free_stiffness:
             return np.nan
         intervals = find_stable_intervals(self.boundary, TESTED_DAMPINGS)
         scale = CONNECTED_START * np.abs(self.boundary.ends[0][np.isfinite(self.boundary.ends[0])]).max(initial=1e-60)
@@ -78,7 +97,7 @@ class CouplingLoop(LinearLoop):
     def is_connected(self, alpha: float, beta: float) -> bool:
         if not self.unbounded:
             return super().is_connected(alpha, beta)
-        # All couplings with sufficiently large alpha are stable, whatever their beta, so they are connected to each
+        # If all couplings with sufficiently large alpha are stable, whatever their beta, they are connected to each
         # other. If one beta is stable for every alpha > 0, they are also connected to alpha = 0.
         intervals = find_stable_intervals(self.boundary, np.array([beta]))
         inside = (intervals.low[0] < alpha) & (alpha < intervals.high[0])
