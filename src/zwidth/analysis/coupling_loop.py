@@ -20,14 +20,18 @@ import numpy as np
 from zwidth.analysis.loop import LinearLoop
 from zwidth.core.errors import InputError
 from zwidth.core.status import RidgeKind, Status
+from zwidth.core.xp import nan_beyond
 from zwidth.plant.composed_plant import factor_tool
+from zwidth.plant.factored_plant import FactoredPlant
 from zwidth.stability.linear.boundary import Boundary
 from zwidth.stability.linear.composition import compose_coupling
+from zwidth.stability.linear.coupled_controller import find_coupling_delay_margin
 from zwidth.stability.linear.regions import StableSet
 from zwidth.stability.linear.ridge import RidgeSolution
 from zwidth.stability.linear.roots import LoopRoots
 from zwidth.stability.linear.rows import CONNECTED_START, Island, find_stable_intervals
 from zwidth.stability.results import Margins, RidgePoint
+from zwidth.units.quantities import WALL_RANGE
 
 # Values of the damping beta at which `CouplingLoop.free_damping` tests whether every alpha > 0 is stable.
 TESTED_DAMPINGS = np.concatenate([[0.0], np.geomspace(1e-6, 1e3, 91)])
@@ -42,9 +46,12 @@ class CouplingLoop(LinearLoop):
 
     def _add_tool(self, device: LoopRoots) -> LoopRoots:
         """Return the loop of the coupling, from the loop of the device without a tool."""
-        scene = self.scene
-        tool = factor_tool(scene.tool.respond(scene.mass, scene.timing.period))
-        return compose_coupling(device, self.chain.estimates, tool)
+        return compose_coupling(device, self.chain.estimates, self._factored_tool)
+
+    @cached_property
+    def _factored_tool(self) -> FactoredPlant:
+        """Response G_t of the tool."""
+        return factor_tool(self.scene.tool.respond(self.scene.mass, self.scene.timing.period))
 
     @cached_property
     def has_free_stiffness(self) -> bool:
@@ -113,7 +120,15 @@ class CouplingLoop(LinearLoop):
         return [] if self.unbounded else super().islands(least)
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
-        # Leave the delay margin NaN, because additional delay changes the response of the device, but not of the tool.
-        return super().margins(
-            alpha, beta, [name for name in Margins._fields if name in wanted and name != "delay_margin"]
-        )
+        others = [name for name in Margins._fields if name in wanted and name != "delay_margin"]
+        margins = super().margins(alpha, beta, others)
+        if "delay_margin" not in wanted or self.chain.sampled:
+            return margins
+        stable, tool = np.asarray(self.labels(alpha, beta)), self._factored_tool
+        delay = np.where(np.isnan(nan_beyond(WALL_RANGE, alpha, beta)).any(0), np.nan, 0.0)
+        for index in map(tuple, np.argwhere(stable).tolist()):
+            delay[index] = find_coupling_delay_margin(self.chain, tool, float(alpha[index]), float(beta[index]))
+        return margins._replace(delay_margin=delay[()])
+
+    def with_delay(self, delay: float) -> LoopRoots:
+        return self._add_tool(super().with_delay(delay))
