@@ -6,8 +6,8 @@ wall are therefore valid for the coupling, with G + G_t in place of G. A positio
 device change G and F (`stability.linear.composition`).
 
 A tool that is integrated by the implicit Euler method responds to the coupling force without delay. The set of stable
-couplings can then be *unbounded*: all couplings with sufficiently large alpha are stable, or those whose beta is
-sufficiently large and in certain ratios to alpha.
+couplings can then be *unbounded*: all couplings with sufficiently large alpha are stable, or couplings with large alpha
+and beta in certain ratios.
 """
 
 from __future__ import annotations
@@ -59,15 +59,23 @@ class CouplingLoop(LinearLoop):
         return not self.boundary.count_above(np.zeros(1))
 
     @cached_property
-    def unbounded(self) -> bool:
-        """True if couplings with arbitrarily large alpha and beta are stable, e.g. in a certain ratio to each other."""
+    def stable_ratios(self) -> np.ndarray:
+        """Intervals of the ratio alpha/beta, shape (n, 2), in which all sufficiently stiff couplings are stable.
+
+        The array is empty if no coupling is stable in the limit of large beta, or if `has_free_stiffness` is True.
+        """
         loop = self.roots
         if self.has_free_stiffness or not loop.shared or loop.zeros.size < loop.poles.size + loop.lag:
-            return self.has_free_stiffness
-        # For alpha = r beta and beta -> inf, the poles approach the zeros of r + F if all zeros of G are poles of F.
-        # They are the poles of the loop of a spring r with the plant 1/F.
+            return np.empty((0, 2))
+        # For alpha = r beta and beta -> inf, the poles approach the zeros of r + F, because all zeros of G are poles of
+        # F. They are the poles of the loop of a spring r with the plant 1/F.
         intervals = find_stable_intervals(Boundary.trace(loop.invert_estimate()), np.zeros(1))
-        return bool(intervals.high.size)
+        return np.stack([intervals.low[0], intervals.high[0]], -1)
+
+    @cached_property
+    def unbounded(self) -> bool:
+        """True if couplings with arbitrarily large alpha or beta are stable."""
+        return self.has_free_stiffness or bool(self.stable_ratios.size)
 
     @cached_property
     def free_damping(self) -> float:
@@ -96,6 +104,11 @@ class CouplingLoop(LinearLoop):
     def stiffest(self, negative: bool) -> RidgePoint:
         if not self.unbounded:
             return super().stiffest(negative)
+        low, high = self.stable_ratios.T
+        if ((low <= 0) & (high > 0)).any():
+            # With a sufficiently large beta, couplings of every alpha from 0 on are stable.
+            unlimited, nan = np.float64(np.inf), np.float64(np.nan)
+            return RidgePoint(unlimited, unlimited, nan, np.int32(RidgeKind.NONE), np.int32(Status.OK))
         beta = np.float64(self.free_damping)
         alpha = np.float64(np.nan if np.isnan(beta) else np.inf)
         status = Status.NOT_CONVERGED if np.isnan(beta) else Status.OK

@@ -56,8 +56,9 @@ def _couple_tool(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse)
         program = realize_estimates(replace(estimates, velocity=Estimate(0)))
         sources = np.array([[alpha, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     plant = factor_tool(tool)
-    difference, response = realize_estimate(estimates.of_tool), realize_estimate(
-        Estimate(0, plant.gain, 0, plant.zeros, plant.poles)
+    difference, response = (
+        realize_estimate(estimates.of_tool),
+        realize_estimate(Estimate(0, plant.gain, 0, plant.zeros, plant.poles)),
     )
     # States: those of the program, the velocity filter and the tool. Each signal is a row of factors of the states and
     # of x, in the last column. The filter has the input ``rest - y``, and the coupling has the force

@@ -73,9 +73,7 @@ def _factor(estimate: Estimate) -> FactoredPlant:
 def _multiply(first: FactoredPlant, second: FactoredPlant) -> FactoredPlant:
     """Return the product of two filters."""
     zeros, poles = ([getattr(each, name) for each in (first, second)] for name in ("zeros", "poles"))
-    return FactoredPlant(
-        first.gain * second.gain, first.lag + second.lag, np.concatenate(zeros), np.concatenate(poles)
-    )
+    return FactoredPlant(first.gain * second.gain, first.lag + second.lag, np.concatenate(zeros), np.concatenate(poles))
 
 
 def _add(first: FactoredPlant, second: FactoredPlant, a: float = 1.0, b: float = 1.0) -> FactoredPlant:
