@@ -152,6 +152,7 @@ def spell_scene(scene: Any) -> dict[str, Any]:
         parts["modes"] = [spell_part(mode) for mode in scene.device.modes]
     if isinstance(scene.device, LinearDevice):
         device: dict[str, Any] = {"device": scene.device.spell_form()}
+        device |= {"rotary": True} if scene.device.rotary else {}
     else:
         device = {name: value for name, value in spell_part(scene.device).items() if name not in (*PARTS, "modes")}
         device |= {"damping": scene.device.damping}

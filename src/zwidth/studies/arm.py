@@ -24,7 +24,7 @@ from zwidth.config.fields import LocatedProblem, Strict, combine_problems, list_
 from zwidth.config.parts import parse_message
 from zwidth.config.values import Axis, AxisOf, Quantity
 from zwidth.core.errors import InputError
-from zwidth.model.joint_space import check_point, from_mujoco, list_joints, load_model
+from zwidth.model.mujoco_model import check_point, from_mujoco, list_joints, load_model
 from zwidth.model.timing import Timing
 from zwidth.plotting.table import SI_COLUMNS
 from zwidth.studies.outcome import Outcome, track_progress

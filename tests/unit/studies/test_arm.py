@@ -1,7 +1,6 @@
 """The workspace study of an arm: K_max of all poses and directions against single scenes, and messages for users."""
 
 import json
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,8 @@ from zwidth.core.errors import ConfigError
 from zwidth.studies.document import Config, load_config
 
 pytestmark = pytest.mark.usefixtures("unpainted")
-# The type stubs of MuJoCo lack most functions.
-mujoco: Any = import_module("mujoco")
+# The annotation is Any, because the type stubs of MuJoCo lack most functions.
+mujoco: Any = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
 MODEL = """
 <mujoco><compiler angle="radian"/><worldbody>
