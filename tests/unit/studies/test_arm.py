@@ -71,6 +71,23 @@ def test_every_pose_and_direction_agrees_with_its_scene(tmp_path, capsys):
     assert zwidth.run(tmp_path / "w.yaml", out=tmp_path / "out", resume=True).studies[0].state == "kept"
 
 
+@pytest.mark.parametrize(
+    ("joints", "others"), [(JOINTS, ""), (JOINTS[:-1] + ", slide: [0, 1 cm]}", " and other joints")]
+)
+def test_figure_names_its_quantity_and_the_worst_pose_and_direction(tmp_path, joints, others):
+    (study,) = load_config(write_config(tmp_path, joints)).studies
+    outcome = study.compute(None, True)
+    plt = pytest.importorskip("matplotlib.pyplot")
+    (ax,) = outcome.figures[""]()
+    figure = ax.figure
+    texts = [text.get_text() for legend in [*figure.legends, ax.get_legend()] if legend for text in legend.get_texts()]
+    worst = outcome.answer[0].removeprefix("K_max from ").partition(" to ")[0]
+    assert texts == [f"weakest: {worst}"]
+    bar = figure.axes[-1]
+    assert bar.get_ylabel() == rf"smallest $K_{{\max}}$ over all directions{others}  in kN/m"
+    plt.close(figure)
+
+
 def test_pose_without_motion_along_a_direction_is_a_note(tmp_path, capsys):
     file = write_config(tmp_path, "{elbow: [0 deg, 90 deg]}", "directions: [x]")
     assert run_main("run", file, "--out", tmp_path / "out") == 0
