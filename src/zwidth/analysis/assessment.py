@@ -378,6 +378,10 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
     if scene.device.modes:
         stiffer = tuple(replace(mode, frequency=math.sqrt(2.0) * mode.frequency) for mode in scene.device.modes)
         yield Improvement("modes", "a structure twice as stiff", scene.replace(modes=stiffer))
+    dampings = getattr(scene.device, "joint_dampings", {})
+    if any(dampings.values()):
+        more = {path: 1.1 * damping for path, damping in dampings.items()}
+        yield Improvement("joints", "10 % more damping of the joints", scene.replace(**more))
 
 
 def _can_sample_faster(scene: SceneOptima) -> bool:

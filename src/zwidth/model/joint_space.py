@@ -21,16 +21,18 @@ about a pose in which a motor torque compensates gravity.
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.core.errors import InputError, check_choice
+from zwidth.core.errors import InputError, check_choice, describe_choice
+from zwidth.core.xp import is_traced
 from zwidth.model.checks import check_number
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
 from zwidth.units.parsing import detect_kind
-from zwidth.units.quantities import ANY
+from zwidth.units.quantities import ANY, NOT_NEGATIVE
 from zwidth.units.unit_system import SYSTEMS
 
 # Relative size below which a component of a vector, or an eigenvalue, is treated as a rounding error.
@@ -40,6 +42,76 @@ ASYMMETRY = 1e-6
 # Units of the fields for slides; the corresponding units of rotation are those for hinges.
 _UNITS = {"mass_matrix": "kg", "damping": "N s/m", "stiffness": "N/m"}
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+class Joints(NamedTuple):
+    """Matrices of the joints and the vector J' n of the torques per unit force along n, all in SI units as tuples."""
+
+    mass_matrix: tuple[tuple[float, ...], ...]
+    damping: tuple[tuple[float, ...], ...]
+    stiffness: tuple[tuple[float, ...], ...]
+    vector: tuple[float, ...]
+
+
+@dataclass(frozen=True, repr=False)
+class JointDevice(LinearDevice):
+    """The linear system along one direction of an arm with several joints, with the dampings of its joints.
+
+    `from_mass_matrix` creates it. The damping of joint k, counted from 0, is the entry (k, k) of the damping matrix D.
+    Its dotted path in a scene is "joints.k.damping", such as "joints.0.damping".
+    """
+
+    system: Any = field(init=False, default=None)  # computed from the joints
+    joints: Joints | None = None
+
+    def __post_init__(self, sampled: Any) -> None:
+        # Compute the system from the matrices in every case, so that both always agree.
+        M, D, S, vector = map(np.array, self._get_joints())
+        reduced = _reduce(*_normalize(np.linalg.cholesky(M), vector, D, S))
+        object.__setattr__(self, "system", _realize(*reduced))
+        super().__post_init__(sampled)
+
+    def __repr__(self) -> str:
+        """Return the expression that creates the device."""
+        rotary = ", rotary=True" if self.rotary else ""
+        return f"from_mass_matrix({', '.join(f'{name}={value}' for name, value in self.spell_form().items())}{rotary})"
+
+    def spell_form(self) -> dict[str, Any]:
+        """Return the value of the key ``device`` of a configuration."""
+        joints = self._get_joints()
+        matrices = {name: [list(row) for row in getattr(joints, name)] for name in joints._fields[:3]}
+        # The vector is that of a Jacobian with one row, for which the direction is omitted.
+        return {**matrices, "jacobian": [list(joints.vector)]}
+
+    def _get_joints(self) -> Joints:
+        """Return the matrices of the joints."""
+        assert self.joints is not None, "from_mass_matrix passes the joints"
+        return self.joints
+
+    @property
+    def joint_dampings(self) -> dict[str, float]:
+        """The damping of each joint by dotted path, in N m s/rad (hinges) or N s/m (slides)."""
+        return {f"joints.{k}.damping": row[k] for k, row in enumerate(self._get_joints().damping)}
+
+    def replace_dampings(self, values: dict[str, Any]) -> JointDevice:
+        """Return the device with other dampings of some joints; ``values`` contains them by dotted path."""
+        joints, paths = self._get_joints(), list(self.joint_dampings)
+        damping = np.array(joints.damping)
+        for path, value in values.items():
+            if path not in paths:
+                raise InputError(f"parameter: {describe_choice(path, tuple(paths))}")
+            if is_traced(value):
+                raise InputError(f"{path}: got a value traced by JAX; it must be a number; use Scene.sensitivities")
+            unit = SYSTEMS[detect_kind(value) is not False]["N s/m"]
+            k = paths.index(path)
+            damping[k, k] = check_number(path, value, unit, NOT_NEGATIVE)
+        checked = _read_matrix("damping", damping, len(damping))
+        return replace(self, joints=joints._replace(damping=_to_tuples(checked)))
+
+
+def _to_tuples(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    """Return the rows of a matrix as tuples of floats."""
+    return tuple(map(tuple, matrix.tolist()))
 
 
 def from_mass_matrix(
@@ -74,7 +146,9 @@ def from_mass_matrix(
 
     Returns:
         A `Device` with the effective mass ``1/(n' J M^-1 J' n)`` and its damping if a single motion remains, for
-        example without damping or if the damping is proportional to M; otherwise a `LinearDevice`.
+        example without damping or if the damping is proportional to M; otherwise a `LinearDevice`. In a scene with this
+        `LinearDevice`, the damping of joint k, counted from 0, has the path "joints.k.damping": `Scene.replace` changes
+        it, and `Scene.sensitivities` returns the derivative of K_max with respect to it.
 
     Raises:
         InputError: an array has the wrong shape, is not finite or not symmetric; M is not positive definite; damping or
@@ -108,7 +182,8 @@ def from_mass_matrix(
         # Solve with M instead of its factor, because a product of two square roots is not exact.
         mass = 1.0 / float(vector @ np.linalg.solve(inertia, vector))
         return Device(mass, float(D[0, 0]) * mass, rotary=rotary)
-    return LinearDevice(_realize(w, D, S), rotary=rotary)
+    joints = Joints(_to_tuples(inertia), _to_tuples(damper), _to_tuples(spring), tuple(vector.tolist()))
+    return JointDevice(joints=joints, rotary=rotary)
 
 
 def _read_matrix(name: str, value: Any, joints: int | None) -> np.ndarray:

@@ -60,7 +60,8 @@ def test_texts_with_units_equal_numbers_in_si():
 def test_rotary_arm_with_damped_joints_has_rotary_units():
     device = zwidth.from_mass_matrix([[0.03, 0.01], [0.01, 0.01]], 0.02, direction=[1, 0], rotary=True)
     assert isinstance(device, zwidth.LinearDevice)
-    assert eval(repr(device), {"LinearDevice": zwidth.LinearDevice}).rotary
+    assert eval(repr(device), {"from_mass_matrix": zwidth.from_mass_matrix}) == device
+    assert eval(repr(zwidth.LinearDevice("1 / 1 2 0", rotary=True)), {"LinearDevice": zwidth.LinearDevice}).rotary
     scene = zwidth.Scene(device, zwidth.Timing("1 ms", "1 ms"), zwidth.VirtualWall("2 N m/rad"))
     assert scene.wall.stiffness == 2
     with pytest.raises(zwidth.InputError, match="linear units"):
