@@ -232,14 +232,17 @@ def refuse_unsupported(scenes: list[Any], contact: str, law: TracedLaw | None) -
     for scene in scenes:
         if scene.tool is None:
             continue
-        if scene.position is not None or scene.feedback is not None:
+        adapts = isinstance(scene.velocity, FOAW)
+        if adapts and (scene.position is not None or scene.feedback is not None):
             name = "feedback" if scene.position is None else "position"
-            raise InputError(f"{name}: simulated only without a tool; omit {name} or the tool")
+            raise InputError(
+                f"{name}: got {name} and a tool with FOAW, which is not linear; use another velocity estimate"
+            )
         if contact != "bilateral":
             raise InputError(
                 f"contact: got {contact!r}, but a coupling to a tool has no surface; use contact='bilateral'"
             )
-        nonlinear = "force" if law is not None else "velocity" if isinstance(scene.velocity, FOAW) else ""
+        nonlinear = "force" if law is not None else "velocity" if adapts else ""
         if nonlinear and scene.tool.integrator == "implicit":
             raise InputError(
                 f"{nonlinear}: got a nonlinear function, but the implicit Euler method needs a linear coupling; use "

@@ -188,7 +188,7 @@ def build_batch(
             numbers["static"] * force,
         ),
         tool=spread_scenes(ToolStep(*(np.array(column) for column in zip(*tools, strict=True))), which),
-        **build_program(programs, estimates, which),
+        **build_program(programs, estimates, which, options.filters_tool),
         **build_transitions(build_mechanics(chains), np.moveaxis(durations, -1, 0), which, options),
     )
     instants = durations = None

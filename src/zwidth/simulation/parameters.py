@@ -61,6 +61,12 @@ class Options(NamedTuple):
     position: bool  # the scenes have a position estimate
     feedback: bool  # the scenes have further feedback, such as an integral gain
     tool: bool  # the scenes have a tool that a virtual coupling connects to the device
+
+    @property
+    def filters_tool(self) -> bool:
+        """True if the velocity of the tool has a separate estimate (T9)."""
+        return self.tool and (self.position or self.feedback)
+
     record: bool  # readings and frames are recorded
     law: TracedLaw | None  # force law in place of the wall's spring and damper
 
@@ -141,6 +147,7 @@ class Parameters(NamedTuple):
     estimator: Estimator  # velocity estimate
     feedback: FeedbackLoop  # feedback in addition to spring and damper, such as an integral gain
     tool: ToolStep  # integration step of the tool; its fields are 0 without a tool
+    tool_estimator: Estimator  # estimate of the velocity of the tool in scenes with `Options.filters_tool`
     rate: Array  # matrix of x' = rate @ (x, u), (n, n + forces, batch)
     place: Array  # rows of the positions of the bodies, (bodies, n, batch)
     motion: Array  # rows of the velocities of the bodies, (bodies, n, batch)
@@ -194,7 +201,9 @@ def _build_filters(estimates: Sequence[Estimate]) -> Filter:
     return Filter(A, B, C, D)
 
 
-def build_program(programs: Sequence[LoopEstimates], velocities: Sequence[Any], which: np.ndarray) -> dict[str, Any]:
+def build_program(
+    programs: Sequence[LoopEstimates], velocities: Sequence[Any], which: np.ndarray, filters_tool: bool
+) -> dict[str, Any]:
     """Return the filters of the control program for all simulations, keyed by field name in `Parameters`.
 
     Args:
@@ -202,6 +211,7 @@ def build_program(programs: Sequence[LoopEstimates], velocities: Sequence[Any], 
         velocities: velocity estimate of each scene, used in place of that in ``programs``, because it may be FOAW,
             which is not linear.
         which: index of the scene of each simulation.
+        filters_tool: whether the velocity of a tool has a separate estimate.
     """
     none = Estimate(0, 0.0)
     feedbacks = [each.feedback for each in programs]
@@ -214,11 +224,14 @@ def build_program(programs: Sequence[LoopEstimates], velocities: Sequence[Any], 
         np.array([each.samples if adapts else each.window for each in velocities]),
         np.array([each.noise if adapts else 0.0 for each in velocities]),
     )
+    of_tool = [each.of_tool if filters_tool else none for each in programs]
+    windows = np.array([each.window for each in of_tool])
     further = _build_filters([none if each is None else each.filter for each in feedbacks])
     return {
         "position": spread_scenes(_build_filters([each.position for each in programs]), which),
         "filtered_input": spread_scenes(np.array([each.structure == "series" for each in programs]), which),
         "estimator": spread_scenes(estimator, which),
+        "tool_estimator": spread_scenes(Estimator(_build_filters(of_tool), windows, 0.0 * windows), which),
         "feedback": spread_scenes(FeedbackLoop(further, weights), which),
     }
 

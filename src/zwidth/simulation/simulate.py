@@ -70,10 +70,10 @@ def simulate(
     in steady state for the start velocity: their transients have decayed. The states of the further feedback, such as
     an integral, are 0 at the start and outside of contact.
 
-    In a scene with a `zwidth.Tool`, the force ``f = K (x_k - y_k) + B v_k`` of the virtual coupling acts on the tool,
-    and -f is the command of the device. Here x_k is the measured position of the device, y_k the position of the tool,
-    and v_k the velocity estimate of x - y. The limits of the motor apply only to the command. At the start, the tool is
-    at rest at the measured position of the device.
+    In a scene with a `zwidth.Tool`, the force ``f_k = K (p_k - y_k) + B v_k`` of the virtual coupling acts on the tool,
+    and ``-(f_k + r_k)`` is the command of the device. Here y_k is the position of the tool, and v_k the estimated
+    velocity of the device relative to the tool. The limits of the motor apply only to the command. At the start, the
+    tool is at rest at the measured position of the device.
 
     Args:
         scenes: a `zwidth.Scene`, or a list or array of scenes. Its shape and the shapes of the numbers below broadcast
@@ -85,7 +85,7 @@ def simulate(
             simulation. They contain the position p_k in m (see above), the estimated velocity in m/s, and the time of
             the sample in s, without jitter. It returns the force on the device in N and is written with `jax.numpy`.
             The law is compiled once, so it must not keep values between calls and must use ``jnp.where`` in place of
-            ``if``. Its force is sampled, held and delayed like that of a wall. With a tool, the position is x_k - y_k;
+            ``if``. Its force is sampled, held and delayed like that of a wall. With a tool, the position is p_k - y_k;
             a tool that is integrated by the implicit Euler method excludes a law.
         periods: number of sampling periods, >= 1.
         substeps: recorded instants per period, >= 1.

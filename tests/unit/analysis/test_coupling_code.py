@@ -118,3 +118,12 @@ def test_code_names_rotary_units():
     text = write_program(scene.replace(tool=zwidth.Tool("3e-4 kg m^2", integrator="implicit")))
     assert "x is the angle of the device in rad; the result is the torque on the device in N m." in text
     assert "moment of inertia" in text
+
+
+@pytest.mark.parametrize(
+    "part", [{"position": zwidth.ExponentialFilter(0.3)}, {"feedback": zwidth.IntegralFeedback(2000)}]
+)
+def test_position_estimate_and_feedback_are_refused(part):
+    scene = make_scene("difference", "free", "implicit", **part)
+    with pytest.raises(zwidth.InputError, match=f"{next(iter(part))}: the code of a coupling excludes it"):
+        write_program(scene)

@@ -2,6 +2,7 @@
 
 Reference: an independent state-space model of device, hand, delayed commands, velocity filter and tool. It is composed
 from one period of an independent program, in which the equations of the tool and of the coupling are solved together.
+For position estimates and further feedback, the reference is `coupling_loop.step_coupling`.
 """
 
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from coupling_loop import draw_coupling, step_coupling
+from program_loop import find_plant
 from scipy import signal
 from scipy.linalg import expm
 
@@ -341,6 +344,9 @@ def test_refusals(options, message):
         adaptive.simulate(1e3, 5)
     with pytest.raises(zwidth.InputError, match=r"start_position: .*'tool_position'"):
         scene.replace(tool=None).simulate(1e3, 5, start_position={"tool_position": 0})
+    filtered = adaptive.replace(tool=zwidth.Tool(0.3), position=zwidth.ExponentialFilter(0.3))
+    with pytest.raises(zwidth.InputError, match=r"position: got position and a tool with FOAW"):
+        filtered.simulate(1e3, 5)
 
 
 def test_traced_scene_is_refused():
@@ -350,3 +356,46 @@ def test_traced_scene_is_refused():
 
     with pytest.raises(zwidth.InputError, match="traced by JAX"):
         jax.jit(end)(1e3)
+
+
+LOOPS = 60
+PULSE = 1.0  # N; external force in the first period
+
+
+@pytest.fixture(scope="module")
+def controlled() -> Any:
+    """Simulate random tools with a position estimate or further feedback, after an external force in one period."""
+    rng = np.random.default_rng(4)
+    scenes, walls = [], []
+    for _ in range(LOOPS):
+        scene = draw_coupling(rng)
+        m, period = float(scene.mass), scene.timing.period
+        scenes.append(scene)
+        walls.append((rng.uniform(0.002, 0.1) * m / period**2, rng.uniform(0.0, 0.2) * m / period))
+    K, B = np.array(walls).T
+    force = np.eye(1, PERIODS)[0] * PULSE
+    return scenes, K, B, zwidth.simulate(scenes, K, B, periods=PERIODS, external_force_history=force)
+
+
+@pytest.mark.parametrize("block", range(4))
+def test_position_estimates_and_feedback_agree_with_the_composed_state_space(block, controlled):
+    scenes, K, B, motion = controlled
+    for index in range(block, LOOPS, 4):
+        scene = scenes[index]
+        period = step_coupling(scene, K[index], B[index])
+        A, b, C = find_plant(scene)
+        n, rate = len(b), np.zeros((len(b) + 1, len(b) + 1))
+        rate[:n] = np.column_stack([A, b])
+        state = np.zeros(len(period))
+        state[:n] = expm(rate * scene.timing.period)[:n, n] * PULSE
+        rows: list[Any] = [(0.0, 0.0, 0.0)]
+        for _ in range(1, PERIODS):
+            position, tool = C @ state[:n], state[-2]
+            state = period @ state
+            rows.append((position, state[n], state[-2] if scene.tool.integrator == "implicit" else tool))
+        expected = np.array(rows).T
+        simulated = [getattr(motion, name)[index] for name in ("measured", "command", "tool_position")]
+        for values, reference in zip(simulated, expected, strict=True):
+            scale = np.abs(reference).max()
+            assert scale > 0
+            np.testing.assert_allclose(values, reference, rtol=0, atol=TOLERANCE * scale, err_msg=str(scene))
