@@ -30,6 +30,7 @@ from zwidth.analysis.wall_code import (
     write_wall,
 )
 from zwidth.core.errors import InputError, check_choice
+from zwidth.model.estimate import Estimate
 from zwidth.model.tool import Tool
 from zwidth.units.formatting import format_wall, with_unit
 from zwidth.units.unit_system import UnitSystem
@@ -88,74 +89,89 @@ def build_coupling_program(
     scene: SceneParts, tool: Tool, cautions: Sequence[str] = (), max_force: float = math.inf
 ) -> CouplingProgram:
     """Build the program of a coupling, as statements for either language."""
-    period, system = float(scene.timing.period), scene.unit_system
     K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
-    estimate = scene.velocity.estimate(period)
-    count, code = estimate.window, write_filter(estimate)
-    # The previous distance is stored in an array if the difference covers several periods.
-    past = "@past[@next]" if count > 1 else "@distance"
-    scale = f"v = {code.gain / period!r} * u"
-
-    def subtract(newest: str) -> str:
-        """Return the statement that computes the input of the filter from the newest distance."""
-        return (
-            f"u = ({newest} - {past}) / {count}"
-            if count > 1
-            else f"u = {newest} - {past}"
-            if count
-            else f"u = {newest}"
-        )
-
-    estimate_velocity = [subtract("e"), f"{past} = e", *([f"@next = (@next + 1) % {count}"] if count > 1 else [])]
-    estimate_velocity += [*code.update, scale]
+    velocity = write_velocity(scene.velocity.estimate(float(scene.timing.period)), float(scene.timing.period))
+    solve, step = write_tool(scene, tool, velocity)
     every = getattr(tool, "every", 1)
-    length = every * period
-    rate = length / float(tool.mass)
-    p, q = float(tool.damping) * rate, float(tool.stiffness) * rate * length
-    if tool.integrator == "implicit":
-        share = 1.0 / (1.0 + p + q)
-        lever = rate * length * share
-        direct = float(estimate.gain) / period / max(count, 1)
-        for numerator, _ in find_sections(estimate):
-            direct *= numerator[0]
-        free = _join((share, "@tool_velocity"), (-share * q / length, "@tool_position"))
-        solve = [
-            "# Implicit Euler method: the step of the tool depends on f. First compute its velocity for f = 0.",
-            f"v_free = {free}",
-            "# Compute the velocity v that the estimate would return for the distance e = 0.",
-            *[subtract("0.0"), *code.output, scale],
-            "# Solve the equations of tool and coupling for the distance e after the step.",
-            f"e = x - (@tool_position + {length!r} * v_free)",
-            f"e = (e - {lever * B!r} * v) / {1.0 + lever * (K + B * direct)!r}",
-        ]
-        # Compute ``v_free`` before the condition, so that it is always defined.
-        solve = solve if every == 1 else ["e = x - @tool_position", *solve[:2], *_limit_to_steps(solve[2:])]
-        step = ["# Integrate the tool: velocity, then position.", f"@tool_velocity = v_free + {rate * share!r} * f"]
-    else:
-        solve = ["# Compute the distance from the tool to the device.", "e = x - @tool_position"]
-        forces = _join((1.0, "f"), (-float(tool.damping), "@tool_velocity"), (-float(tool.stiffness), "@tool_position"))
-        step = ["# Integrate the tool by semi-implicit Euler: velocity, then position."]
-        step += [f"@tool_velocity += {rate!r} * {forces if forces == 'f' else f'({forces})'}"]
-    step.append(f"@tool_position += {length!r} * @tool_velocity")
-    if every > 1:
-        step = [*_limit_to_steps(step), f"@sample = (@sample + 1) % {every}"]
+    counter = [f"@sample = (@sample + 1) % {every}"] if every > 1 else []
     force = [
         *solve,
         "# Estimate the velocity of the device relative to the tool.",
-        *estimate_velocity,
-        f"# Compute the {'torque' if system.rotary else 'force'} of the coupling on the tool.",
+        *velocity.update,
+        f"# Compute the {'torque' if scene.unit_system.rotary else 'force'} of the coupling on the tool.",
         f"f = {K!r} * e + {B!r} * v",
         *step,
+        *counter,
         "# Return the reaction, which acts on the device.",
     ]
-    head = _describe_coupling(scene, tool, max_force)
-    call = _describe_call(system)
-    return CouplingProgram([*head, *describe_cautions(scene, cautions)], call, count, code.states, every, force)
+    head = [*_describe_coupling(scene, tool, max_force), *describe_cautions(scene, cautions)]
+    return CouplingProgram(head, _describe_call(scene.unit_system), velocity.window, velocity.states, every, force)
 
 
-def _limit_to_steps(statements: list[str]) -> list[str]:
-    """Return statements with the condition that the tool makes a step in this period."""
-    return ["if @sample == 0:", *(f"    {line}" for line in statements)]
+class VelocityCode(NamedTuple):
+    """Statements that compute the velocity estimate v of the distance e."""
+
+    window: int  # length of the difference in periods; 0 for none
+    states: list[str]  # names of the states of the filter
+    update: list[str]  # statements that compute v from e, and the states of the next sample
+    at_zero: list[str]  # statements that compute v for e = 0, and leave the states unchanged
+    direct: float  # direct feedthrough from e to v, in 1/s
+
+
+def write_velocity(estimate: Estimate, period: float) -> VelocityCode:
+    """Return the statements of the velocity estimate of the distance; ``period`` is the sampling period in s."""
+    count, code = estimate.window, write_filter(estimate)
+    # The distances of the last periods are stored in an array if the difference covers several periods.
+    past = "@past[@next]" if count > 1 else "@distance"
+    scale, advance = f"v = {code.gain / period!r} * u", [f"@next = (@next + 1) % {count}"] if count > 1 else []
+
+    def subtract(newest: str) -> str:
+        """Return the statement that computes the input u of the filter from the newest distance."""
+        difference = f"{newest} - {past}" if count else newest
+        return f"u = ({difference}) / {count}" if count > 1 else f"u = {difference}"
+
+    direct = float(estimate.gain) / period / max(count, 1)
+    for numerator, _ in find_sections(estimate):
+        direct *= numerator[0]
+    update = [subtract("e"), f"{past} = e", *advance, *code.update, scale]
+    return VelocityCode(count, code.states, update, [subtract("0.0"), *code.output, scale], direct)
+
+
+def write_tool(scene: SceneParts, tool: Tool, velocity: VelocityCode) -> tuple[list[str], list[str]]:
+    """Return the statements that compute the distance e, and those that integrate the tool after the force f."""
+    every = getattr(tool, "every", 1)
+    length = every * float(scene.timing.period)
+    rate, damping, stiffness = length / float(tool.mass), float(tool.damping), float(tool.stiffness)
+    move = f"@tool_position += {length!r} * @tool_velocity"
+
+    def limit(statements: list[str]) -> list[str]:
+        """Return statements with the condition that the tool makes a step in this period."""
+        return statements if every == 1 else ["if @sample == 0:", *(f"    {line}" for line in statements)]
+
+    if tool.integrator == "semi-implicit":
+        forces = _join((1.0, "f"), (-damping, "@tool_velocity"), (-stiffness, "@tool_position"))
+        change = f"@tool_velocity += {rate!r} * {forces if forces == 'f' else f'({forces})'}"
+        solve = ["# Compute the distance from the tool to the device.", "e = x - @tool_position"]
+        return solve, limit(["# Integrate the tool by semi-implicit Euler: velocity, then position.", change, move])
+    K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
+    share = 1.0 / (1.0 + damping * rate + stiffness * rate * length)
+    lever = rate * length * share
+    # Compute v_free and e before the condition, so that both are always defined.
+    solve = ["e = x - @tool_position"] * (every > 1) + [
+        "# Implicit Euler method: the step of the tool depends on f. First compute its velocity for f = 0.",
+        f"v_free = {_join((share, '@tool_velocity'), (-share * rate * stiffness, '@tool_position'))}",
+    ]
+    solve += limit(
+        [
+            "# Compute the velocity v that the estimate would return for the distance e = 0.",
+            *velocity.at_zero,
+            "# Solve the equations of tool and coupling for the distance e after the step.",
+            f"e = x - (@tool_position + {length!r} * v_free)",
+            f"e = (e - {lever * B!r} * v) / {1.0 + lever * (K + B * velocity.direct)!r}",
+        ]
+    )
+    change = f"@tool_velocity = v_free + {rate * share!r} * f"
+    return solve, limit(["# Integrate the tool: velocity, then position.", change, move])
 
 
 def _join(*terms: tuple[float, str]) -> str:
