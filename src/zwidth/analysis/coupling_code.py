@@ -10,7 +10,10 @@ of the tool by the force. From ``e = e_0 - h f`` and ``f = K e + B (v_0 + D e)``
 
     e = (e_0 - h B v_0)/(1 + h (K + B D))
 
-The velocity estimate and its filters are written by `analysis.wall_code`.
+If the scene has a position estimate or further feedback, e is computed from the position estimate of the device, and v
+is the velocity estimate of the device minus that of the tool. In the equation of e, v_0 is then the estimate of the
+device minus that of the tool for a tool at the position of the device. The force r of the feedback is added to f after
+the step of the tool. Estimates and filters are written by `analysis.wall_code`.
 """
 
 from __future__ import annotations
@@ -21,33 +24,50 @@ from typing import NamedTuple
 
 from zwidth.analysis.base import SceneParts
 from zwidth.analysis.wall_code import (
+    build_program,
     describe_cautions,
     find_sections,
     format_c,
     format_python,
+    omit_output,
     reset_states,
     write_filter,
+    write_memory,
     write_wall,
 )
-from zwidth.core.errors import InputError, check_choice
-from zwidth.model.estimate import Estimate
+from zwidth.core.errors import check_choice
+from zwidth.model.loop_estimates import build_estimates
+from zwidth.model.position import has_velocity
 from zwidth.model.tool import Tool
 from zwidth.units.formatting import format_wall, with_unit
 from zwidth.units.unit_system import UnitSystem
 
 
 class CouplingProgram(NamedTuple):
-    """Program of a coupling as statements that are valid in C and Python once the mark ``@`` is replaced.
+    """Program of a coupling as statements for one language; the mark ``@`` precedes states, "# " precedes comments."""
 
-    Statements that start with "# " are comments.
-    """
+    members: list[str]  # declarations of the states in C
+    start: list[str]  # statements that set the states to their values at rest, with the tool at the device
+    force: list[str]  # statements that compute the opposite f of the force on the device, and integrate the tool
 
-    head: list[str]  # lines of comment on the coupling and the tool
-    call: list[str]  # lines of comment on the argument and the result
-    window: int  # length of the difference in periods; 0 for none
-    states: list[str]  # names of the states of the filter
-    every: int  # number of periods per step of the tool
-    force: list[str]  # statements that compute the force f from the measured position x, and integrate the tool
+
+class DeviceCode(NamedTuple):
+    """Statements of the position and velocity estimates of the device and of the further feedback."""
+
+    members: list[str]  # declarations of the states in C
+    start: list[str]  # statements that set the states to their values at rest
+    update: list[str]  # statements that compute the estimates of position and velocity, and the force r of the feedback
+    position: str  # position that the coupling uses: "x" (measured position) or "y" (position estimate)
+
+
+class VelocityCode(NamedTuple):
+    """Statements of the velocity estimate of the distance or, in addition to that of the device, of the tool."""
+
+    members: list[str]  # declarations of the states in C
+    start: list[str]  # statements that set the states to their values at rest
+    update: list[str]  # statements that compute the relative velocity v, and the states of the next sample
+    at_zero: list[str]  # statements that compute v for e = 0, and leave the states unchanged
+    direct: float  # direct feedthrough from e to v, in 1/s
 
 
 def write_program(
@@ -64,81 +84,102 @@ def write_program(
     if scene.tool is None:
         return write_wall(scene, language, cautions, max_force)
     check_choice("language", language, ("c", "python"))
-    for name in ("position", "feedback"):
-        if getattr(scene, name) is not None:
-            raise InputError(f"{name}: the code of a coupling excludes it; omit {name} or the tool")
-    program = build_coupling_program(scene, scene.tool, cautions, max_force)
-    count, limited = program.window, max_force < math.inf
-    start = ["# Place the tool at rest at the device.", "@tool_position = x", "@tool_velocity = 0.0"]
-    start += ["@sample = 0"] * (program.every > 1)
+    members, start, force = build_coupling_program(scene, scene.tool, language)
+    head = [*_describe_coupling(scene, scene.tool, max_force), *describe_cautions(scene, cautions)]
+    call, limited = _describe_call(scene.unit_system), max_force < math.inf
     if language == "c":
-        members = ["double tool_position", "double tool_velocity", *["int sample"] * (program.every > 1)]
-        members += [f"double past[{count}]", "int next"] if count > 1 else ["double distance"]
-        members += [f"double {name}" for name in program.states]
-        past = [f"for (int k = 0; k < {count}; k++) @past[k] = 0.0", "@next = 0"]
-        start += [*(past if count > 1 else ["@distance = 0.0"]), *reset_states(program.states)]
         law = f"f > {max_force!r} ? -{max_force!r} : f < -{max_force!r} ? {max_force!r} : -f" if limited else "-f"
-        return format_c("coupling", [*program.head, *program.call], members, start, [*program.force, f"return {law}"])
-    start += [f"@past = [0.0] * {count}", "@next = 0"] if count > 1 else ["@distance = 0.0"]
-    start += reset_states(program.states)
+        return format_c("coupling", [*head, *call], members, start, [*force, f"return {law}"])
     law = f"max(-{max_force!r}, min({max_force!r}, -f))" if limited else "-f"
-    return format_python("Coupling", program.head, program.call, start, [*program.force, f"return {law}"])
+    return format_python("Coupling", head, call, start, [*force, f"return {law}"])
 
 
-def build_coupling_program(
-    scene: SceneParts, tool: Tool, cautions: Sequence[str] = (), max_force: float = math.inf
-) -> CouplingProgram:
-    """Build the program of a coupling, as statements for either language."""
-    K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
-    velocity = write_velocity(scene.velocity.estimate(float(scene.timing.period)), float(scene.timing.period))
-    solve, step = write_tool(scene, tool, velocity)
-    every = getattr(tool, "every", 1)
-    counter = [f"@sample = (@sample + 1) % {every}"] if every > 1 else []
+def build_coupling_program(scene: SceneParts, tool: Tool, language: str) -> CouplingProgram:
+    """Build the program of a coupling."""
+    K, B, every = float(scene.wall.stiffness), float(scene.wall.virtual_damping), getattr(tool, "every", 1)
+    device = write_device(scene, language)
+    velocity = write_velocity(scene, language, device.position)
+    solve, step = write_tool(scene, tool, device.position, velocity)
+    name = "torque" if scene.unit_system.rotary else "force"
+    further = [f"# Add the {name} of the further feedback, which acts on the device only.", "f += r"]
     force = [
+        *device.update,
         *solve,
         "# Estimate the velocity of the device relative to the tool.",
         *velocity.update,
-        f"# Compute the {'torque' if scene.unit_system.rotary else 'force'} of the coupling on the tool.",
+        f"# Compute the {name} of the coupling on the tool.",
         f"f = {K!r} * e + {B!r} * v",
         *step,
-        *counter,
+        *[f"@sample = (@sample + 1) % {every}"] * (every > 1),
+        *(further if scene.feedback is not None else []),
         "# Return the reaction, which acts on the device.",
     ]
-    head = [*_describe_coupling(scene, tool, max_force), *describe_cautions(scene, cautions)]
-    return CouplingProgram(head, _describe_call(scene.unit_system), velocity.window, velocity.states, every, force)
+    members = ["double tool_position", "double tool_velocity", *["int sample"] * (every > 1)]
+    start = ["# Place the tool at rest at the device.", "@tool_position = x", "@tool_velocity = 0.0"]
+    start += ["@sample = 0"] * (every > 1)
+    return CouplingProgram(
+        [*members, *device.members, *velocity.members], [*start, *device.start, *velocity.start], force
+    )
 
 
-class VelocityCode(NamedTuple):
-    """Statements that compute the velocity estimate v of the distance e."""
+def write_device(scene: SceneParts, language: str) -> DeviceCode:
+    """Return the statements of the estimates of the device; none if the scene has no position estimate or feedback."""
+    if scene.position is None and scene.feedback is None:
+        return DeviceCode([], [], [], "x")
+    program = build_program(scene)
+    members, fill = write_memory(language, program.window, program.memory, program.memory)
+    update = ["# Estimate the position and the velocity of the device.", *program.force]
+    if program.feedback:
+        update += ["# Compute the further feedback.", *program.feedback]
+    members += [f"double {name}" for name in program.states]
+    return DeviceCode(members, [*program.begin, *fill, *program.start], update, program.depth)
 
-    window: int  # length of the difference in periods; 0 for none
-    states: list[str]  # names of the states of the filter
-    update: list[str]  # statements that compute v from e, and the states of the next sample
-    at_zero: list[str]  # statements that compute v for e = 0, and leave the states unchanged
-    direct: float  # direct feedthrough from e to v, in 1/s
 
+def write_velocity(scene: SceneParts, language: str, position: str) -> VelocityCode:
+    """Return the statements of the estimate of the relative velocity; ``position`` is that which the coupling uses."""
+    period, estimates = float(scene.timing.period), build_estimates(scene)
+    # With a position estimate or feedback, subtract an estimate of the velocity of the tool from that of the device.
+    # Otherwise compute one estimate from the distance.
+    prefix, newest, value, at_rest = ("tool_", "y_tool", "v_tool", "x") if estimates else ("", "e", "v", "0.0")
+    estimate = estimates.of_tool if estimates else scene.velocity.estimate(period)
+    count, code = estimate.window, write_filter(estimate, prefix)
+    single = "last_y_tool" if estimates else "distance"
+    past = f"@{prefix}past[@{prefix}next]" if count > 1 else f"@{single}"
+    advance = [f"@{prefix}next = (@{prefix}next + 1) % {count}"] if count > 1 else []
 
-def write_velocity(estimate: Estimate, period: float) -> VelocityCode:
-    """Return the statements of the velocity estimate of the distance; ``period`` is the sampling period in s."""
-    count, code = estimate.window, write_filter(estimate)
-    # The distances of the last periods are stored in an array if the difference covers several periods.
-    past = "@past[@next]" if count > 1 else "@distance"
-    scale, advance = f"v = {code.gain / period!r} * u", [f"@next = (@next + 1) % {count}"] if count > 1 else []
-
-    def subtract(newest: str) -> str:
-        """Return the statement that computes the input u of the filter from the newest distance."""
-        difference = f"{newest} - {past}" if count else newest
-        return f"u = ({difference}) / {count}" if count > 1 else f"u = {difference}"
+    def estimate_from(name: str, statements: list[str]) -> list[str]:
+        """Return the statements that compute the estimate from the newest value ``name``."""
+        difference = f"{name} - {past}" if count else name
+        entering = f"u = ({difference}) / {count}" if count > 1 else f"u = {difference}"
+        scale = f"{value} = {code.gain / period!r} * u"
+        return [entering, *statements, scale, *(["v_rest = v - v_tool"] if estimates else [])]
 
     direct = float(estimate.gain) / period / max(count, 1)
     for numerator, _ in find_sections(estimate):
         direct *= numerator[0]
-    update = [subtract("e"), f"{past} = e", *advance, *code.update, scale]
-    return VelocityCode(count, code.states, update, [subtract("0.0"), *code.output, scale], direct)
+    members, start = write_memory(language, count, single, at_rest, prefix)
+    start += reset_states(code.states) if count or not estimates else omit_output(["u = x", *code.start])
+    update = estimate_from(newest, [f"{past} = {newest}", *advance, *code.update])
+    if estimates:
+        update = [f"y_tool = {position} - e", *update[:-1], "v -= v_tool"]
+    return VelocityCode(
+        [*members, *(f"double {name}" for name in code.states)],
+        start,
+        update,
+        estimate_from(position if estimates else "0.0", code.output),
+        direct,
+    )
 
 
-def write_tool(scene: SceneParts, tool: Tool, velocity: VelocityCode) -> tuple[list[str], list[str]]:
-    """Return the statements that compute the distance e, and those that integrate the tool after the force f."""
+def write_tool(scene: SceneParts, tool: Tool, position: str, velocity: VelocityCode) -> tuple[list[str], list[str]]:
+    """Return the statements that compute the distance e, and those that integrate the tool after the force f.
+
+    Args:
+        scene: the scene with the wall.
+        tool: the tool.
+        position: name of the position of the device that the coupling uses.
+        velocity: statements of the estimate of the relative velocity.
+    """
     every = getattr(tool, "every", 1)
     length = every * float(scene.timing.period)
     rate, damping, stiffness = length / float(tool.mass), float(tool.damping), float(tool.stiffness)
@@ -151,23 +192,24 @@ def write_tool(scene: SceneParts, tool: Tool, velocity: VelocityCode) -> tuple[l
     if tool.integrator == "semi-implicit":
         forces = _join((1.0, "f"), (-damping, "@tool_velocity"), (-stiffness, "@tool_position"))
         change = f"@tool_velocity += {rate!r} * {forces if forces == 'f' else f'({forces})'}"
-        solve = ["# Compute the distance from the tool to the device.", "e = x - @tool_position"]
+        solve = ["# Compute the distance from the tool to the device.", f"e = {position} - @tool_position"]
         return solve, limit(["# Integrate the tool by semi-implicit Euler: velocity, then position.", change, move])
     K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
     share = 1.0 / (1.0 + damping * rate + stiffness * rate * length)
     lever = rate * length * share
+    rest = "v" if position == "x" and scene.feedback is None else "v_rest"
     # Compute v_free and e before the condition, so that both are always defined.
-    solve = ["e = x - @tool_position"] * (every > 1) + [
+    solve = [f"e = {position} - @tool_position"] * (every > 1) + [
         "# Implicit Euler method: the step of the tool depends on f. First compute its velocity for f = 0.",
         f"v_free = {_join((share, '@tool_velocity'), (-share * rate * stiffness, '@tool_position'))}",
     ]
     solve += limit(
         [
-            "# Compute the velocity v that the estimate would return for the distance e = 0.",
+            f"# Compute the relative velocity {rest} that the estimate would return for the distance e = 0.",
             *velocity.at_zero,
             "# Solve the equations of tool and coupling for the distance e after the step.",
-            f"e = x - (@tool_position + {length!r} * v_free)",
-            f"e = (e - {lever * B!r} * v) / {1.0 + lever * (K + B * velocity.direct)!r}",
+            f"e = {position} - (@tool_position + {length!r} * v_free)",
+            f"e = (e - {lever * B!r} * {rest}) / {1.0 + lever * (K + B * velocity.direct)!r}",
         ]
     )
     change = f"@tool_velocity = v_free + {rate * share!r} * f"
@@ -185,13 +227,14 @@ def _join(*terms: tuple[float, str]) -> str:
 
 
 def _describe_coupling(scene: SceneParts, tool: Tool, max_force: float) -> list[str]:
-    """Return two lines of comment: the coupling and the limit of its force, and the tool."""
+    """Return lines of comment: the coupling and the limit of its force, the tool, the estimate and the feedback."""
     system, wall = scene.unit_system, scene.wall
     coupling = format_wall(float(wall.stiffness), float(wall.virtual_damping), system)
-    line = f"Virtual coupling: {coupling}, velocity by {type(scene.velocity).__name__}, "
+    estimator = type(scene.position if has_velocity(scene.position) else scene.velocity).__name__
+    line = f"Virtual coupling: {coupling}, velocity by {estimator}, "
     line += f"{with_unit(1.0 / float(scene.timing.period), 'Hz')}."
+    name = "Torque" if system.rotary else "Force"
     if max_force < math.inf:
-        name = "Torque" if system.rotary else "Force"
         line += f" {name} on the device limited to {with_unit(max_force, system['N'])}."
     units = {"mass": "kg", "damping": "N s/m", "stiffness": "N/m"}
     values = [(name, float(getattr(tool, name)), system[unit]) for name, unit in units.items()]
@@ -200,7 +243,12 @@ def _describe_coupling(scene: SceneParts, tool: Tool, max_force: float) -> list[
     texts = [f"{name} {with_unit(value, unit)}" for name, value, unit in values if value]
     every = getattr(tool, "every", 1)
     rate = f", one step every {every} periods" if every > 1 else ""
-    return [line, f"Tool: {', '.join(texts)}, {tool.integrator} Euler method{rate}."]
+    lines = [line, f"Tool: {', '.join(texts)}, {tool.integrator} Euler method{rate}."]
+    if scene.position is not None:
+        lines.append(f"The coupling uses the position estimate y, computed by {type(scene.position).__name__}.")
+    if scene.feedback is not None:
+        lines.append(f"{name} r of {type(scene.feedback).__name__} acts on the device in addition to the coupling.")
+    return lines
 
 
 def _describe_call(system: UnitSystem) -> list[str]:

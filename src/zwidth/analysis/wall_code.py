@@ -35,7 +35,7 @@ from zwidth.units.formatting import format_wall, with_unit
 from zwidth.units.unit_system import UnitSystem
 
 _COLUMNS = 100  # characters per line of a comment
-LOCALS = (*"uvwefyr", "v_free")  # local variables of programs, which C programs declare
+LOCALS = (*"uvwefyr", "v_free", "y_tool", "v_tool", "v_rest")  # local variables of programs, which C programs declare
 # Largest ratio of imaginary part to modulus at which a root is treated as real, because rounding errors cause a small
 # imaginary part.
 REAL_TOLERANCE = 1e-13
@@ -188,7 +188,7 @@ def reset_states(states: Sequence[str]) -> list[str]:
     return [f"@{name} = 0.0" for name in states]
 
 
-def _omit_output(start: list[str]) -> list[str]:
+def omit_output(start: list[str]) -> list[str]:
     """Return statements without those at the end that compute u, because no later statement uses it."""
     while start and start[-1].startswith("u = "):
         start = start[:-1]
@@ -206,7 +206,7 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
         code = write_filter(estimates.position, "position_")
         states, output = code.states, f"y = {code.gain!r} * u"
         force = ["u = x", *code.update, output]
-        begin = ["u = x", *code.start, output] if memory == "y" else _omit_output(["u = x", *code.start])
+        begin = ["u = x", *code.start, output] if memory == "y" else omit_output(["u = x", *code.start])
     count, code = estimates.velocity.window, write_filter(estimates.velocity)
     if count > 1:
         force += [f"u = ({memory} - @past[@next]) / {count}", f"@past[@next] = {memory}"]
@@ -215,7 +215,7 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
         force += [f"u = {memory} - @{memory}" if count else f"u = {memory}", f"@{memory} = {memory}"]
     # Start at rest, i.e. with a constant position. If the velocity estimate starts with a difference, its output is
     # then 0, and so are the states of its filter. Otherwise the position is the constant input of the filter.
-    start = reset_states(code.states) if count else _omit_output([f"u = {memory}", *code.start])
+    start = reset_states(code.states) if count else omit_output([f"u = {memory}", *code.start])
     states = code.states + states
     force += [*code.update, f"v = {code.gain / period!r} * u"]
     K, B, system = float(scene.wall.stiffness), float(scene.wall.virtual_damping), scene.unit_system
@@ -244,12 +244,27 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
     )
 
 
+def write_memory(language: str, count: int, name: str, value: str, prefix: str = "") -> tuple[list[str], list[str]]:
+    """Return the declarations in C, and the statements that set the memory of a difference to a value.
+
+    Args:
+        language: "c" or "python".
+        count: length of the difference in periods; 0 for none. For more than 1, the memory is an array.
+        name: name of the state if it is no array.
+        value: expression of the value.
+        prefix: beginning of the names of the array and of its index.
+    """
+    if count <= 1:
+        return [f"double {name}"], [f"@{name} = {value}"]
+    fill = f"for (int k = 0; k < {count}; k++) @{prefix}past[k] = {value}"
+    fill = fill if language == "c" else f"@{prefix}past = [{value}] * {count}"
+    return [f"double {prefix}past[{count}]", f"int {prefix}next"], [fill, f"@{prefix}next = 0"]
+
+
 def _write_c(program: WallProgram) -> str:
     """Return the source code of a program in C99, with a struct for its states and two functions."""
-    count, memory = program.window, program.memory
-    members = [f"double past[{count}]", "int next"] if count > 1 else [f"double {memory}"]
-    fill = [f"for (int k = 0; k < {count}; k++) @past[k] = {memory}", "@next = 0"]
-    start = [*program.begin, *(fill if count > 1 else [f"@{memory} = {memory}"]), *program.start]
+    members, fill = write_memory("c", program.window, program.memory, program.memory)
+    start = [*program.begin, *fill, *program.start]
     limit, law, inside = program.max_force, program.law, f"{program.depth} > 0.0"
     lines = program.force
     if program.feedback:
@@ -301,8 +316,7 @@ def format_c(name: str, comment: Sequence[str], members: Sequence[str], start: l
 
 def _write_python(program: WallProgram) -> str:
     """Return the source code of a program as a Python class with the method ``force``."""
-    count, memory = program.window, program.memory
-    fill = [f"@past = [{memory}] * {count}", "@next = 0"] if count > 1 else [f"@{memory} = {memory}"]
+    _, fill = write_memory("python", program.window, program.memory, program.memory)
     limit, law, inside = program.max_force, program.law, f"{program.depth} > 0.0"
     law = law if limit == math.inf else f"max(-{limit!r}, min({limit!r}, {law}))"
     force = program.force

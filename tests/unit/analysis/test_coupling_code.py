@@ -120,10 +120,46 @@ def test_code_names_rotary_units():
     assert "moment of inertia" in text
 
 
-@pytest.mark.parametrize(
-    "part", [{"position": zwidth.ExponentialFilter(0.3)}, {"feedback": zwidth.IntegralFeedback(2000)}]
-)
-def test_position_estimate_and_feedback_are_refused(part):
-    scene = make_scene("difference", "free", "implicit", **part)
-    with pytest.raises(zwidth.InputError, match=f"{next(iter(part))}: the code of a coupling excludes it"):
-        write_program(scene)
+CONTROLLERS: dict[str, dict[str, Any]] = {
+    "average": {"position": zwidth.ExponentialFilter(0.4)},
+    "average and window": {"position": zwidth.ExponentialFilter(0.4), "velocity": zwidth.WindowedDifference(5)},
+    "measured": {
+        "position": zwidth.ExponentialFilter(0.4, velocity_from="measured"),
+        "velocity": zwidth.LowPass(cutoff=150, order=2),
+    },
+    "no difference": {
+        "position": zwidth.LowPass(cutoff="150 Hz"),
+        "velocity": ESTIMATES["filter without a difference"],
+    },
+    "pll": {"position": zwidth.Pll(500)},
+    "integral": {"feedback": zwidth.IntegralFeedback(2000)},
+    "weights": {
+        "position": zwidth.Pll(500),
+        "feedback": zwidth.Feedback([0.1, 0.1], [1, -0.5], position=5, velocity=1),
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def controlled():
+    force = 2.0 * np.sin(np.arange(SAMPLES) / 30.0)
+    scenes = {
+        (name, integrator): make_scene("difference", "grounded", integrator).replace(**parts)
+        for name, parts in CONTROLLERS.items()
+        for integrator in ("semi-implicit", "implicit")
+    }
+    motion = zwidth.simulate(list(scenes.values()), periods=SAMPLES, start_position=2e-3, external_force_history=force)
+    rows = zip(scenes.values(), motion.measured, motion.command, strict=True)
+    return dict(zip(scenes, rows, strict=True))
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "implicit"])
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_programs_with_position_estimates_and_feedback(name, integrator, controlled, tmp_path):
+    scene, positions, expected = controlled[name, integrator]
+    scale = np.abs(expected).max()
+    assert scale > 0.1
+    forces, _ = drive_python(write_program(scene, "python"), positions)
+    np.testing.assert_allclose(forces, expected, rtol=0, atol=TOLERANCE * scale)
+    forces = drive_c(write_program(scene, "c"), positions, tmp_path)
+    np.testing.assert_allclose(forces, expected, rtol=0, atol=TOLERANCE * scale)
