@@ -222,3 +222,45 @@ def test_invalid_arguments_raise(changes, message):
 def test_invalid_environments_raise(call, message):
     with pytest.raises(zwidth.InputError, match=message):
         call(zwidth.AdmittanceDisplay(20, 60, LAG, TIMING))
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_grids_equal_single_displays(program):
+    """A grid contains limits, displays without a limit, and displays near the limit of the explicit damper."""
+    display = zwidth.AdmittanceDisplay(20, 60, LAG, zwidth.Timing(rate="500 Hz", delay="1.5 periods"), *program)
+    masses, dampings, dampers = [[[0.1]], [[2]], [[50]]], [[0.05], [30], [150]], [0, 12.5]
+    grid = display.max_environment_stiffness(dampers, virtual_mass=masses, virtual_damping=dampings)
+    assert grid.stiffness.shape == grid.frequency.shape == grid.status.shape == (3, 3, 2)
+    for i, j, k in np.ndindex(grid.stiffness.shape):
+        single = zwidth.AdmittanceDisplay(masses[i][0][0], dampings[j][0], LAG, display.timing, *program)
+        # The stable intervals of the gain come from exact polynomials (V11 to V15).
+        intervals = single.scene(0, dampers[k]).stable_stiffness(0.0)
+        expected = intervals[intervals[:, 0] <= 0]
+        assert (grid.status[i, j, k] == zwidth.Status.OK) == (expected.size > 0)
+        if expected.size:
+            assert grid.stiffness[i, j, k] == pytest.approx(expected[0, 1], rel=1e-11)
+            frequency = single.scene(grid.stiffness[i, j, k], dampers[k]).dominant_pole().frequency
+            assert grid.frequency[i, j, k] == pytest.approx(frequency, rel=1e-9)
+        else:
+            assert np.isnan(grid.stiffness[i, j, k])
+
+
+def test_grids_accept_texts_and_empty_arrays():
+    display = zwidth.AdmittanceDisplay(20, 60, LAG, TIMING)
+    limits = display.max_environment_stiffness(virtual_mass=["5 kg", "20 kg"], virtual_damping="60 N s/m")
+    assert limits.stiffness[1] == display.max_environment_stiffness().stiffness
+    assert display.max_environment_stiffness(virtual_mass=np.ones((0, 2))).stiffness.shape == (0, 2)
+    with pytest.raises(zwidth.InputError, match="virtual_mass: got -1 kg; it must be > 0"):
+        display.max_environment_stiffness(virtual_mass=[1, -1])
+    with pytest.raises(zwidth.InputError, match="virtual_damping: got '3 kg'"):
+        display.max_environment_stiffness(virtual_damping="3 kg")
+
+
+def test_weakly_damped_and_long_delayed_displays():
+    """Displays whose poles are too close to the unit circle for eigenvalues, or with many delayed commands."""
+    for delay in ("0 periods", "25 periods", "40.5 periods"):
+        display = zwidth.AdmittanceDisplay(100, 1e-3, LAG, zwidth.Timing("1 ms", delay), "velocity", "trapezoidal")
+        for virtual_damping in (1e-3, 10.0):
+            limit = display.max_environment_stiffness(virtual_damping=virtual_damping)
+            single = zwidth.AdmittanceDisplay(100, virtual_damping, LAG, display.timing, "velocity", "trapezoidal")
+            assert limit.stiffness == pytest.approx(single.scene().stable_stiffness(0.0)[-1, 1], rel=1e-9)
