@@ -79,6 +79,21 @@ class VirtualMassLimit(NamedTuple):
     status: int
 
 
+@compact_repr(virtual_damping="N s/m", largest="N s/m", frequency="Hz")
+class VirtualDampingLimit(NamedTuple):
+    """The smallest virtual damping with which an admittance display is stable.
+
+    The display is stable with every damping from ``virtual_damping`` to ``largest``, both in N s/m. ``frequency`` is
+    the frequency in Hz of the oscillation with the smallest damping; it is NaN if that damping is 0. If no damping is
+    stable, all three are NaN and ``status`` is NO_BOUNDARY.
+    """
+
+    virtual_damping: float
+    largest: float
+    frequency: float
+    status: int
+
+
 @dataclass(frozen=True, repr=False)
 class AdmittanceDisplay(Part):
     """A position- or velocity-controlled robot that displays a virtual mass and damping to a hand or an environment.
@@ -253,7 +268,7 @@ class AdmittanceDisplay(Part):
         for k in np.flatnonzero(limits.status == Status.UNDECIDED).tolist():
             mass, damping, environment_damping = rows[k].tolist()
             display = self._replace(mass, damping)
-            limit = display._find_limit("stiffness", {"environment_damping": environment_damping})
+            limit = display._find_limit({"environment_damping": environment_damping})
             for column, value in zip(result, limit, strict=True):
                 column[k] = value
         return result
@@ -290,9 +305,38 @@ class AdmittanceDisplay(Part):
             VirtualMassLimit(virtual_mass=10.0125 g, largest=inf kg, frequency=500 Hz, status=OK)
         """
         K, B = self._read_environment(hand_stiffness, hand_damping, "hand", POSITIVE)
-        gain, frequency, status, least = self._find_range("mass", {"stiffness": K, "environment_damping": B})
+        factors = {"stiffness": K, "environment_damping": B}
+        least, gain, status = self._find_range("mass", factors)
         largest = np.inf if least == 0 else 1.0 / least
+        frequency = self._find_frequency("mass", factors, gain)
         return self._label(VirtualMassLimit(1.0 / gain, largest, frequency, status))
+
+    def min_virtual_damping(self, environment_stiffness: Any, environment_damping: Any = 0.0) -> VirtualDampingLimit:
+        """Return the smallest virtual damping with which the display is stable in an environment.
+
+        The virtual mass is that of the display. The virtual damping of the display has no effect on the result. With
+        dampings above ``largest`` of the result, the display may be unstable again.
+
+        Args:
+            environment_stiffness: K in N/m, > 0.
+            environment_damping: B in N s/m, >= 0.
+
+        References:
+            Keemink, van der Kooij, Stienen 2018, International Journal of Robotics Research 37(11), 1421-1444 (effect
+            of the virtual damping on the stability of a contact).
+
+        Example:
+            >>> import zwidth
+            >>> robot, timing = zwidth.Actuator(time_constant="5 ms"), zwidth.Timing(rate="1 kHz", delay="2 periods")
+            >>> display = zwidth.AdmittanceDisplay(5, 20, robot, timing)
+            >>> display.min_virtual_damping("20 kN/m")
+            VirtualDampingLimit(virtual_damping=119.246 N s/m, largest=9.999 kN s/m, frequency=9.54812 Hz, status=OK)
+        """
+        K, B = self._read_environment(environment_stiffness, environment_damping, "environment", POSITIVE)
+        factors = {"stiffness": K, "environment_damping": B}
+        least, largest, status = self._find_range("damping", factors)
+        frequency = self._find_frequency("damping", factors, least) if least else np.nan
+        return self._label(VirtualDampingLimit(least, largest, frequency, status))
 
     def _label(self, result: Any) -> Any:
         """Store the unit system of the display in a result, for printing, and return the result."""
@@ -349,18 +393,22 @@ class AdmittanceDisplay(Part):
         system = (rest, parts[gain]) if gain == "mass" else (parts[gain], rest)
         return Scene(LinearDevice(system, float(self.timing.period)), Timing(float(self.timing.period)))
 
-    def _find_limit(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int]:
-        """Return the upper end of the stable interval of a gain that starts at 0, its frequency in Hz, and a status."""
-        top, frequency, status, least = self._find_range(gain, factors)
-        return (top, frequency, status) if least == 0 else (np.nan, np.nan, int(Status.NO_BOUNDARY))
+    def _find_limit(self, factors: dict[str, float]) -> tuple[float, float, int]:
+        """Return the largest stiffness K such that all from 0 to K are stable, its frequency in Hz, and a status."""
+        least, largest, status = self._find_range("stiffness", factors)
+        if least > 0 or status != Status.OK:
+            return np.nan, np.nan, int(Status.NO_BOUNDARY)
+        return largest, self._find_frequency("stiffness", factors, largest), status
 
-    def _find_range(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int, float]:
-        """Return the lowest stable interval of a gain: upper end, frequency there in Hz, status, and lower end."""
-        scene = self._make_scene(gain, factors)
-        intervals = scene.stable_stiffness(0.0)
+    def _find_range(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int]:
+        """Return both ends of the lowest stable interval of gains, and a status; arguments as `_make_scene`."""
+        intervals = self._make_scene(gain, factors).stable_stiffness(0.0)
         intervals = intervals[intervals[:, 1] > 0]
         if not intervals.size:
-            return np.nan, np.nan, int(Status.NO_BOUNDARY), np.nan
+            return np.nan, np.nan, int(Status.NO_BOUNDARY)
         low, high = intervals[0].tolist()
-        pole = scene.dominant_pole(high, 0.0)
-        return high, float(pole.frequency), int(pole.status), max(low, 0.0)
+        return max(low, 0.0), high, int(Status.OK)
+
+    def _find_frequency(self, gain: str, factors: dict[str, float], value: float) -> float:
+        """Return the frequency in Hz of the dominant pole with a value of a gain; arguments as `_make_scene`."""
+        return float(self._make_scene(gain, factors).dominant_pole(value, 0.0).frequency) if value == value else np.nan

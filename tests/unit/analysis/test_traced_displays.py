@@ -59,7 +59,7 @@ def test_gradients_equal_central_differences(command, integrator, order):
         slopes = jax.jacobian(lambda *numbers: limit(*numbers)[:2], argnums=tuple(range(6)))(*numbers)
     for k, number in enumerate(numbers):
         step = 1e-4 * number
-        moved = [limit(*numbers[:k], number + offset * step, *numbers[k + 1 :]) for offset in (-2, -1, 1, 2)]
+        moved = [limit(*(*numbers[:k], number + offset * step, *numbers[k + 1 :])) for offset in (-2, -1, 1, 2)]
         for result, name in enumerate(("stiffness", "frequency")):
             far_low, low, high, far_high = (getattr(each, name) for each in moved)
             expected = (8 * (high - low) - (far_high - far_low)) / (12 * step)
