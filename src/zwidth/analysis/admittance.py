@@ -25,7 +25,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.analysis.admittance_code import write_code
 from zwidth.analysis.admittance_loop import AdmittanceLoop, Command, Integrator, add, find_loop
+from zwidth.analysis.admittance_motion import simulate
 from zwidth.analysis.environment_limits import find_limits
 from zwidth.analysis.scene import Scene
 from zwidth.core.errors import InputError, check_choice
@@ -337,6 +339,9 @@ class AdmittanceDisplay(Part):
         least, largest, status = self._find_range("damping", factors)
         frequency = self._find_frequency("damping", factors, least) if least else np.nan
         return self._label(VirtualDampingLimit(least, largest, frequency, status))
+
+    simulate = simulate
+    code = write_code
 
     def _label(self, result: Any) -> Any:
         """Store the unit system of the display in a result, for printing, and return the result."""
