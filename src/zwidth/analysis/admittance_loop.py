@@ -8,7 +8,8 @@ robot, and V(z) from the command to the velocity of the robot. The closed loop i
     Y = N_Y/(M q_M + D q_D),   P = N_P/(Q z^lag),   V = N_V/(Q z^lag)
 
 where N_Y, q_M, q_D, N_P, N_V and Q are polynomials and ``lag`` is an integer. Multiplied by all denominators, the
-characteristic polynomial is ``M p_M + D p_D + K p_K + B p_B`` (docs/theory/admittance.md, W1 to W4).
+characteristic polynomial is ``M p_M + D p_D + K p_K + B p_B`` (docs/theory/admittance.md, W1 to W4; there, Q includes
+the factor z^lag).
 """
 
 from __future__ import annotations

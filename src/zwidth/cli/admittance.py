@@ -83,8 +83,11 @@ def _add_lag(command: Any) -> Any:
     default=0.0,
     help="Damping B of the environment, in N s/m.  [default: 0]",
 )
+@click.option("--code", type=click.Choice(("c", "python")), help="Print only the program of the display.")
 @json_option
-def admittance(environment: float | None, environment_damping: float, as_json: bool, **given: Any) -> None:
+def admittance(
+    environment: float | None, environment_damping: float, code: str | None, as_json: bool, **given: Any
+) -> None:
     """Compute the environments in which an admittance display is stable.
 
     An admittance display is a robot that measures the contact force and moves like a virtual mass with a virtual
@@ -97,6 +100,13 @@ def admittance(environment: float | None, environment_damping: float, as_json: b
     for stable and for unstable contacts, and 1 if no environment is stable.
     """
     display = _make_display(**given)
+    if code is not None:
+        if environment is not None and not display.is_stable(environment, environment_damping):
+            raise click.ClickException(
+                "--code: the contact with this environment is unstable; see the output without it"
+            )
+        click.echo(display.code(code), nl=False)
+        return
     limit = display.max_environment_stiffness(environment_damping)
     result: dict[str, Any] = {
         "stiffness_limit": float(limit.stiffness),

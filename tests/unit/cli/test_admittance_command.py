@@ -120,6 +120,13 @@ def test_invalid_arguments_exit_with_2(arguments, message):
     assert result.exit_code == 2 or isinstance(result.exception, zwidth.InputError)
 
 
+def test_code_is_printed_alone_and_only_for_a_stable_contact():
+    expected = make_display().code("c")
+    assert call(*DISPLAY, *LAG, *LOOP, "--code", "c", "--environment", "1 kN/m") == expected
+    output = call(*DISPLAY, *LAG, *LOOP, "--code", "c", "--environment", "5 kN/m", code=1)
+    assert "--code: the contact with this environment is unstable" in output
+
+
 def test_help_groups_the_virtual_damping_with_the_virtual_mass():
     output = call("--help")
     own = output.partition("This command:")[2].partition("Output:")[0]
