@@ -93,7 +93,7 @@ def simulate(
 
 
 def _count_periods(duration: Any, period: float) -> int:
-    """Return the number of whole periods of a duration; raise `InputError` if it is not between 1 and the maximum."""
+    """Return the integer number of periods in a duration; raise `InputError` if it is not between 1 and the maximum."""
     count = int(np.floor(check_span("duration", duration).periods(period) + 1e-9))
     if not 1 <= count <= MAX_PERIODS:
         raise InputError(f"duration: got {duration!r}, {count} periods; it must be 1 to {MAX_PERIODS} periods")
