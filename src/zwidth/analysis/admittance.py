@@ -214,6 +214,8 @@ class AdmittanceDisplay(Part):
             read_texts("environment_stiffness", environment_stiffness, SYSTEMS[self.rotary]["N/m"]),
         )
         K, B = np.broadcast_arrays(K, self._read_array("environment_damping", environment_damping))
+        if not np.all(B >= 0):
+            raise InputError(f"environment_damping: got {float(B[~(B >= 0)].flat[0]):g} N s/m; it must be >= 0")
         labels = np.zeros(K.shape, bool)
         for damping in np.unique(B[np.isfinite(B)]).tolist():
             chosen = damping == B
@@ -239,7 +241,10 @@ class AdmittanceDisplay(Part):
 
         Returns:
             Stiffness in N/m and frequency in Hz, of the shape of the broadcast arguments. The relative error is about
-            1e-12.
+            1e-12. Entries of arrays that are out of range yield NaN and the status INVALID_INPUT.
+
+        Raises:
+            InputError: a single number is out of range, or an argument has a wrong unit or type.
 
         Example:
             >>> import zwidth
@@ -257,17 +262,20 @@ class AdmittanceDisplay(Part):
         if is_traced(*given.values(), *list_leaves(self)):
             return self._trace_limit(given)
         factors = np.broadcast_arrays(*(self._read_array(name, value) for name, value in given.items()))
-        self.loop.check_damper(float(factors[2].max(initial=0.0)))
+        self.loop.check_damper(float(np.nanmax(factors[2], initial=0.0)))
         K, frequency, status = (each.reshape(factors[0].shape)[()] for each in self._find_limits(*factors))
         return self._label(EnvironmentLimit(K, frequency, status))
 
     def _find_limits(self, M: np.ndarray, D: np.ndarray, B: np.ndarray) -> EnvironmentLimit:
         """Return the limits for arrays of one shape, as vectors."""
         rows = np.stack([M, D, B], -1).reshape(-1, 3)
-        limits = find_limits(self.loop, *rows.T)
-        frequency = limits.angle / (2.0 * np.pi * float(self.timing.period))
-        result = EnvironmentLimit(limits.stiffness, frequency, limits.status)
-        for k in np.flatnonzero(limits.status == Status.UNDECIDED).tolist():
+        is_valid = np.isfinite(rows).all(-1) & (rows[:, 0] > 0) & (rows[:, 1:] >= 0).all(-1)
+        limits = find_limits(self.loop, *np.where(is_valid, rows.T, [[1.0], [0.0], [0.0]]))
+        K, frequency = np.where(
+            is_valid, (limits.stiffness, limits.angle / (2.0 * np.pi * float(self.timing.period))), np.nan
+        )
+        result = EnvironmentLimit(K, frequency, np.where(is_valid, limits.status, int(Status.INVALID_INPUT)))
+        for k in np.flatnonzero(result.status == Status.UNDECIDED).tolist():
             mass, damping, environment_damping = rows[k].tolist()
             display = self._replace(mass, damping)
             limit = display._find_limit({"environment_damping": environment_damping})
@@ -364,14 +372,13 @@ class AdmittanceDisplay(Part):
         return K, check_number(f"{name}_damping", damping, units["N s/m"], NOT_NEGATIVE)
 
     def _read_array(self, name: str, value: Any) -> np.ndarray:
-        """Return an argument as an array in SI units; raise `InputError` if an entry is out of range."""
+        """Return an argument as an array in SI units; raise `InputError` if a single number is out of range."""
         unit, allowed = _QUANTITIES[name]
         unit = SYSTEMS[self.rotary][unit]
         array = as_float64(name, read_texts(name, value, unit))
-        is_allowed = allowed.holds(array) & np.isfinite(array)
-        if not np.all(is_allowed):
+        if not array.ndim and not (allowed.holds(array) and np.isfinite(array)):
             sign = ">" if allowed.low_open else ">="
-            raise InputError(f"{name}: got {float(array[~is_allowed].flat[0]):g} {unit}; it must be {sign} 0")
+            raise InputError(f"{name}: got {float(array):g} {unit}; it must be {sign} 0")
         return np.asarray(array)
 
     def _make_scene(self, gain: str, factors: dict[str, float]) -> Scene:

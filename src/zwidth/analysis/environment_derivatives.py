@@ -41,11 +41,8 @@ def find_environment_limits(display: Any, points: np.ndarray, order: int) -> lis
         Values of shape (points, 3), and derivatives with one or two further axes for the variables.
     """
     M, D, B = points.T
-    is_valid = np.isfinite(points).all(-1) & (M > 0) & (D >= 0) & (B >= 0)
-    safe = np.where(is_valid[:, None], points, [1.0, 1.0, 0.0]).T
-    limit = display.max_environment_stiffness(safe[2], virtual_mass=safe[0], virtual_damping=safe[1])
+    limit = display.max_environment_stiffness(B, virtual_mass=M, virtual_damping=D)
     values = np.stack([*limit], -1).astype(float)
-    values[~is_valid] = np.nan, np.nan, Status.INVALID_INPUT
     size, period = len(list_leaves(display)) + 3, float(display.timing.period)
     results = [values, *(np.zeros((len(points), 3, *[size] * k)) for k in range(1, order + 1))]
     for result in results[1:]:

@@ -177,7 +177,11 @@ def test_grids_accept_texts_and_empty_arrays():
     assert limits.stiffness[1] == display.max_environment_stiffness().stiffness
     assert display.max_environment_stiffness(virtual_mass=np.ones((0, 2))).stiffness.shape == (0, 2)
     with pytest.raises(zwidth.InputError, match="virtual_mass: got -1 kg; it must be > 0"):
-        display.max_environment_stiffness(virtual_mass=[1, -1])
+        display.max_environment_stiffness(virtual_mass=-1)
+    limits = display.max_environment_stiffness([0, np.nan], virtual_mass=[[20], [-1], [np.inf]])
+    assert limits.stiffness[0, 0] == display.max_environment_stiffness().stiffness
+    assert np.all(np.isnan(limits.stiffness.ravel()[1:]))
+    np.testing.assert_array_equal(limits.status.ravel(), [0, *[zwidth.Status.INVALID_INPUT] * 5])
     with pytest.raises(zwidth.InputError, match="virtual_damping: got '3 kg'"):
         display.max_environment_stiffness(virtual_damping="3 kg")
 
