@@ -29,12 +29,12 @@ from zwidth.model.device import Device
 from zwidth.model.devices import DEVICES
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.measured_device import SUFFIXES, MeasuredDevice
+from zwidth.model.mujoco_model import MODEL_SUFFIXES
 from zwidth.model.parameter_paths import CONTAINED
 from zwidth.model.system_forms import parse_system
 from zwidth.units.formatting import describe, suggestion
 from zwidth.units.quantities import HARDWARE, POSITIVE
 
-MODEL_SUFFIXES = (".xml", ".urdf", ".mjb")  # endings of the names of model files of MuJoCo
 FORMS = "a published name, 'NUMERATOR / DENOMINATOR' in s, a table FILE.csv of a response, or a mapping"
 # Keys of each form of a linear system. The last key identifies the form, because it is required and in no other form.
 _SYSTEM_FORMS = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"), ("sos",))
