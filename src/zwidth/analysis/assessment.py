@@ -391,6 +391,10 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
     if scene.tool is not None:
         for factor, words in TOOL_MASSES:
             yield Improvement("tool", words, scene.replace(**{"tool.mass": factor * scene.tool.mass}))
+    dampings = getattr(scene.device, "joint_dampings", {})
+    if any(dampings.values()):
+        more = {path: 1.1 * damping for path, damping in dampings.items()}
+        yield Improvement("joints", "10 % more damping of the joints", scene.replace(**more))
 
 
 def _can_sample_faster(scene: SceneOptima) -> bool:
