@@ -92,9 +92,9 @@ def unsafe_world(scene: Scene, stiffness: Wall = None, virtual_damping: Wall = N
         InputError: as `is_safe_for_every_world`; or the coupling is not one pair of finite numbers.
 
     Numerics:
-        The search is complete only for B = 0: a world is found from 1.00001 times the safe stiffness on. With the best
-        B, the search succeeds from 1.09 (n = 1) or 1.06 (n = 2) times the safe stiffness on, because a hand with a
-        single resonance is not the worst operator at high frequencies. Takes about 1 s.
+        With B = 0, the search finds a world from about 1.00001 times the safe stiffness on. With the B of the stiffest
+        safe coupling, it finds one from 1.07 (one period of delay) or 1.04 (two periods) times the safe stiffness on,
+        because a hand with a single resonance is not the worst operator at high frequencies. Takes about 1 s.
 
     References:
         Colgate, Schenkel 1994 (the operator that destabilizes a wall that is not passive).
@@ -109,17 +109,30 @@ def unsafe_world(scene: Scene, stiffness: Wall = None, virtual_damping: Wall = N
     K, B = read_single_wall(*scene.normalize_walls(stiffness, virtual_damping))
     n_delay, mass, period = find_delay(scene), float(scene.device.mass), float(scene.timing.period)
     units = scene.units
-    nan = (math.nan,) * 6
     if is_safe_for_every_world(scene, K * units.stiffness, B * units.virtual_damping).item():
-        return UnsafeWorld(*nan, Status.UNREACHABLE)
+        return _report_none(Status.UNREACHABLE)
     share = float(scene.mass) / mass
     alpha, beta, delta = K * share, B * share, float(scene.device.damping) * period / mass
     found = _search(alpha, beta, delta, n_delay)
     if found is None:
-        return UnsafeWorld(*nan, Status.NOT_CONVERGED)
+        return _report_none(Status.NOT_CONVERGED)
     world, log_radius, angle = found
-    values = [value * unit for value, unit in zip(world, 2 * (mass, mass / period**2), strict=True)]
-    return UnsafeWorld(*values, angle / (2.0 * math.pi * period), math.exp(log_radius), Status.OK)
+    unit, frequency = mass / period**2, angle / (2.0 * math.pi * period)
+    return UnsafeWorld(
+        world.tool_mass * mass,
+        world.tool_stiffness * unit,
+        world.hand_mass * mass,
+        world.hand_stiffness * unit,
+        frequency,
+        math.exp(log_radius),
+        Status.OK,
+    )
+
+
+def _report_none(status: Status) -> UnsafeWorld:
+    """Return the result without a world."""
+    nan = math.nan
+    return UnsafeWorld(nan, nan, nan, nan, nan, nan, status)
 
 
 def _search(alpha: float, beta: float, delta: float, n_delay: int) -> tuple[_World, float, float] | None:

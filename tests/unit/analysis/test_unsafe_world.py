@@ -1,5 +1,7 @@
 """Passive worlds with which a coupling beyond the safe limit is unstable, against the composed polynomial in z."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.polynomial import polynomial
@@ -79,5 +81,6 @@ def test_units_and_refusals():
         make_scene(0.5).unsafe_world(1e4, 0)
     with pytest.raises(zwidth.InputError, match="backward difference"):
         make_scene(1, velocity=zwidth.LowPass(cutoff=50)).unsafe_world(1e4, 0)
+    untyped: Any = make_scene(1)
     with pytest.raises(zwidth.InputError, match="pass one wall"):
-        make_scene(1).unsafe_world([1e4, 2e4], 0)
+        untyped.unsafe_world([1e4, 2e4], 0)
