@@ -17,7 +17,7 @@ from zwidth.analysis.wall_search import (
     DEFAULT_PHASE_MARGIN,
     Requirements,
     WallChoice,
-    choose_wall,
+    choose_controller,
 )
 from zwidth.core.status import Status
 from zwidth.model.device import Device
@@ -112,7 +112,8 @@ def _advise(
     """
     for words, requirements in options.items():
         scene = recommendation.scene
-        wall = choose_wall(scene, requirements, recommendation.stiffest, recommendation.stiffness, COARSE)
+        choice = choose_controller(scene, requirements, recommendation.stiffest, recommendation.stiffness, COARSE)
+        wall, scene = choice.wall, choice.scene
         if wall.status == Status.OK and accepts(scene.replace(stiffness=wall.stiffness, virtual_damping=wall.damping)):
             return f"use recommend {words}: {_spell_change(recommendation, wall)}"
     return otherwise
@@ -136,9 +137,9 @@ def price_passivity(recommendation: Any) -> str:
     scene, requirements = recommendation.scene, recommendation.requirements
     if recommendation.verdict is None or recommendation.verdict.passive is not False:
         return ""
-    wall = choose_wall(
+    wall = choose_controller(
         scene, requirements._replace(passive=True), recommendation.stiffest, recommendation.stiffness, COARSE
-    )
+    ).wall
     if wall.status != Status.OK:
         return "no passive wall satisfies the same requirements"
     # State every requirement as an option, because the option --passive replaces the default requirements.

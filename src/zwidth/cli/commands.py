@@ -16,6 +16,7 @@ import click
 
 from zwidth import __version__
 from zwidth.app import printing
+from zwidth.app.gains import list_cascade
 from zwidth.app.printing import format_row
 from zwidth.cli.hardware import diagnose_wall, hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
@@ -413,6 +414,7 @@ def recommend(
     notes, lines, result = [*printing.list_period_notes(scene), *recommendation.notes], list[str](), dict[str, Any]()
     if as_json:
         result = recommendation.as_dict() | {"notes": notes}
+        result |= {"gains": gains} if (gains := list_cascade(recommendation)) else {}
         result["cautions"] += printing.list_omission_cautions(scene, find_omitted())
         result |= {} if diagnosis is None else {"diagnosis": diagnosis.as_dict()}
     else:

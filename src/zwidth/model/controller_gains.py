@@ -32,6 +32,7 @@ from zwidth.units.display import compact_repr
 from zwidth.units.quantities import ANY
 
 PositionUnit = Literal["m", "rad", "turns", "degrees"]
+ControllerKind = Literal["pid", "cascade"]
 _UNITS = {"m": 1.0, "rad": 1.0, "turns": 2.0 * math.pi, "degrees": math.pi / 180.0}  # size of each unit, in m or rad
 
 
@@ -236,18 +237,26 @@ def cascade(
 
 @accept_units
 def cascade_gains(
-    stiffness: float, virtual_damping: float, *, units: PositionUnit = "turns", output_unit: float = 1.0
+    stiffness: float,
+    virtual_damping: float,
+    integral_gain: float = 0.0,
+    *,
+    units: PositionUnit = "turns",
+    output_unit: float = 1.0,
 ) -> CascadeGains:
     """Return the gains of a position loop with an inner velocity loop that renders a wall: the inverse of `cascade`.
 
     Args:
         stiffness: K in N/m or N m/rad.
         virtual_damping: B in N s/m or N m s/rad, not 0.
+        integral_gain: gain of the integrator of the velocity loop, in N/m or N m/rad.
         units: position unit of the gains, see `cascade`.
         output_unit: force or torque per unit of output, see `cascade`.
 
     Returns:
-        ``pos_gain = K/B`` and ``vel_gain = B`` in the units of the controller; ``vel_integrator_gain`` is 0.
+        ``pos_gain = K/B``, ``vel_gain = B`` and ``vel_integrator_gain`` in the units of the controller. The integrator
+        must be that of a scene whose further feedback contains the same ``pos_gain``, such as the scene of
+        `zwidth.Scene.recommend`.
 
     Raises:
         InputError: if the damping is 0, because a cascade renders a spring only together with a damper.
@@ -263,4 +272,37 @@ def cascade_gains(
     if not virtual_damping:
         raise InputError("virtual_damping: got 0; a cascade needs damping, K = pos_gain B; pass a value other than 0")
     scale = _find_scale(units, output_unit)
-    return CascadeGains(stiffness / virtual_damping, virtual_damping / scale, 0.0)
+    return CascadeGains(stiffness / virtual_damping, virtual_damping / scale, integral_gain / scale)
+
+
+def find_gains(
+    scene: Any, kind: ControllerKind, units: PositionUnit | None = None, output_unit: float = 1.0
+) -> PidGains | CascadeGains:
+    """Return the gains of a controller that renders the wall and the integral feedback of a scene.
+
+    Args:
+        scene: the scene; its further feedback is None or an `IntegralFeedback`.
+        kind: "pid" or "cascade".
+        units: position unit of the gains, see `cascade`. Default: "m" for a linear device; for a rotary device "turns"
+            for a cascade and "rad" for a PID controller.
+        output_unit: force or torque per unit of output, see `cascade`.
+
+    Raises:
+        InputError: if the further feedback is not the integrator of a controller of this kind.
+    """
+    feedback, K, B = scene.feedback, float(scene.wall.stiffness), float(scene.wall.virtual_damping)
+    integral, is_cascade = 0.0, kind == "cascade"
+    if units is None:
+        units = "m" if not scene.unit_system.rotary else "turns" if is_cascade else "rad"
+    if feedback is not None:
+        integrated = isinstance(feedback, IntegralFeedback) and feedback.is_cascade == is_cascade
+        if is_cascade and integrated:
+            # Compare pos_gain B with K, because B may be small. Six digits of K and B agree to 1e-5.
+            integrated = abs(feedback.position / feedback.velocity * B - K) <= 1e-5 * abs(K)
+        if not integrated or (not is_cascade and feedback.velocity):
+            allowed = "the integrator of a cascade with pos_gain = K/B" if is_cascade else "an integral of the position"
+            raise InputError(f"feedback: got {feedback!r}; these gains require {allowed}, or no feedback")
+        weight = feedback.velocity if is_cascade else 1.0 if feedback.position is None else feedback.position
+        integral = feedback.gain * weight
+    convert: Any = cascade_gains if is_cascade else pid_gains
+    return convert(K, B, integral, units=units, output_unit=output_unit)

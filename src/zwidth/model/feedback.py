@@ -8,8 +8,8 @@ closed loop includes these poles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -156,6 +156,20 @@ class IntegralFeedback(Part):
     def weights(self, period: Any) -> Weights | None:
         """Return the weights of both estimates, for T = 1; None if the integrand is the measured position."""
         return _normalize_weights(self, period)
+
+    @property
+    def is_cascade(self) -> bool:
+        """True if the integrand contains position and velocity, as that of `zwidth.cascade`, whose pos_gain is K/B."""
+        return bool(self.position) and bool(self.velocity)
+
+    def match_wall(self, stiffness: float, virtual_damping: float) -> Self:
+        """Return the integrator of a cascade for a new wall: the ratio of its weights becomes K/B, the new pos_gain.
+
+        Args:
+            stiffness: K in N/m.
+            virtual_damping: B in N s/m, not 0.
+        """
+        return replace(self, position=self.velocity * (stiffness / virtual_damping))
 
 
 FEEDBACKS = {"integral": IntegralFeedback, "filter": Feedback}
