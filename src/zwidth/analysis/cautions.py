@@ -22,8 +22,10 @@ from zwidth.analysis.wall_search import (
 from zwidth.core.status import Status
 from zwidth.model.device import Device
 from zwidth.model.grasps import list_grasps
+from zwidth.model.safe_limit import SafeLimit
 from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.units.formatting import format_wall, plain, with_unit
+from zwidth.units.unit_system import UnitSystem
 
 # Limits of acceptable walls. A recommended wall that violates one of these limits has a caution.
 LEAST_PHASE_MARGIN = 10.0  # smallest phase margin, in degrees
@@ -167,3 +169,18 @@ def judge_grasps(scene: Any) -> dict[str, bool]:
     for name, grasp in hands:
         labels[name] = labels.get(name, True) and bool(scene.replace(operator=grasp).is_stable())
     return labels
+
+
+def describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -> list[str]:
+    """Return a list of texts on the safe limit: its values and reason, then its warnings.
+
+    Args:
+        limit: the safe limit of the scene; None for none.
+        ignored: True if the recommendation ignores the limit.
+        units: unit system of the texts.
+    """
+    if limit is None or (limit.forbids_all and not ignored):
+        # Return no text if the safe limit excludes all walls, because the reason for the missing recommendation states
+        # this.
+        return []
+    return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]

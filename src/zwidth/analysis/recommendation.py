@@ -25,7 +25,7 @@ from zwidth.analysis.assessment import (
     name_kind,
     round_margin,
 )
-from zwidth.analysis.cautions import judge_grasps, list_cautions
+from zwidth.analysis.cautions import describe_limit, judge_grasps, list_cautions
 from zwidth.analysis.optimization import SceneOptima, StiffestWall
 from zwidth.analysis.wall_code import write_wall
 from zwidth.analysis.wall_search import (
@@ -39,10 +39,10 @@ from zwidth.analysis.wall_search import (
 from zwidth.core.errors import InputError
 from zwidth.core.status import Status
 from zwidth.model.checks import check_limit
-from zwidth.model.controller_gains import CascadeGains, ControllerKind, PidGains, PositionUnit, find_gains
+from zwidth.model.controller_gains import CascadeGains, ControllerKind, PidGains, PositionUnit, find_gains, find_units
 from zwidth.model.device import Device
 from zwidth.model.grasps import RADII
-from zwidth.model.safe_limit import SafeLimit, reserve_damping
+from zwidth.model.safe_limit import reserve_damping
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.rigid.step_response import decay_time
@@ -251,7 +251,10 @@ class Recommendation:
         """Return the gains of the wall for a kind of controller; raise `InputError` if no wall is recommended."""
         if self.status != Status.OK:
             raise InputError(f"gains: there is no wall: {self.reason}")
-        return find_gains(self.scene, kind, units, output_unit)
+        scene = self.scene
+        return find_gains(
+            scene.wall, scene.feedback, kind, find_units(kind, units, self.unit_system.rotary), output_unit
+        )
 
     def lines(self) -> tuple[str, ...]:
         """Return lines of text on the wall, its margins and its cautions, or the reason why no wall is recommended."""
@@ -366,21 +369,6 @@ class Recommendation:
         return to_json(result)
 
 
-def _describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -> list[str]:
-    """Return a list of texts on the safe limit: its values and reason, then its warnings.
-
-    Args:
-        limit: the safe limit of the scene; None for none.
-        ignored: True if the recommendation ignores the limit.
-        units: unit system of the texts.
-    """
-    if limit is None or (limit.forbids_all and not ignored):
-        # Return no text if the safe limit excludes all walls, because the reason for the missing recommendation states
-        # this.
-        return []
-    return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]
-
-
 class SceneAdvice(SceneOptima):
     """Base class of `zwidth.Scene` with the method `recommend`."""
 
@@ -447,7 +435,7 @@ class SceneAdvice(SceneOptima):
             raise InputError("tool: the coupling is stable with every stiffness; choose K and B by assess or margins")
         bare, top, choice = choose_controller(bare, requirements, top)
         notes += [choice.note] if choice.note else []
-        notes += _describe_limit(self.safe_limit, beyond_safe, self.unit_system)
+        notes += describe_limit(self.safe_limit, beyond_safe, self.unit_system)
         if choice.status == Status.OK:
             bare = bare.replace(wall=VirtualWall(choice.stiffness, choice.damping))
         return Recommendation(bare, top, requirements, choice.limit, choice.status, choice.reason, tuple(notes))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from zwidth.app.printing import format_line
 from zwidth.core.status import Status
-from zwidth.model.controller_gains import CascadeGains, PidGains, PositionUnit
+from zwidth.model.controller_gains import ControllerKind, PositionUnit
 from zwidth.model.feedback import IntegralFeedback
 from zwidth.units.formatting import plain
 
@@ -14,32 +15,32 @@ if TYPE_CHECKING:
     from zwidth.analysis.recommendation import Recommendation
 
 _SINGULAR = {"turns": "turn", "degrees": "deg", "rad": "rad", "m": "m"}
-_INVERSE_SECONDS = "1/s"
 
 
-def list_units(kind: Any, units: PositionUnit, output: str) -> dict[str, str]:
+def list_units(kind: ControllerKind, units: PositionUnit, output: str) -> dict[str, str]:
     """Return the unit of each gain of a controller by name.
 
     Args:
-        kind: `PidGains` or `CascadeGains`.
+        kind: "pid" or "cascade".
         units: position unit of the gains.
         output: unit of the output of the controller, such as "N m".
     """
     position = _SINGULAR[units]
     proportional, derivative = f"{output}/{position}", f"{output}/({position}/s)"
-    if issubclass(kind, PidGains):
+    if kind == "pid":
         return {"kp": proportional, "ki": f"{output}/({position} s)", "kd": derivative}
-    return {"pos_gain": _INVERSE_SECONDS, "vel_gain": derivative, "vel_integrator_gain": proportional}
+    return {"pos_gain": "1/s", "vel_gain": derivative, "vel_integrator_gain": proportional}
 
 
-def spell_gains(gains: PidGains | CascadeGains, units: PositionUnit, output: str) -> str:
-    """Return a phrase with the gains of a controller that are not 0 and their units; see `list_units`."""
-    kind = type(gains)
-    return ", ".join(
-        f"{name} {plain(getattr(gains, name))} {unit}"
-        for name, unit in list_units(kind, units, output).items()
-        if getattr(gains, name)
-    )
+def spell_gains(kind: ControllerKind, gains: Mapping[str, float], units: PositionUnit, output: str) -> str:
+    """Return a phrase with the gains of a controller that are not 0, and their units; see `list_units`."""
+    named = list_units(kind, units, output)
+    return ", ".join(f"{name} {plain(gain)} {named[name]}" for name, gain in gains.items() if gain)
+
+
+def spell_output(rotary: bool, output_unit: float) -> str:
+    """Return the unit of the output of a controller: N or N m, or "output" if its unit is another one."""
+    return "output" if output_unit != 1.0 else "N m" if rotary else "N"
 
 
 def list_cascade(recommendation: Recommendation) -> dict[str, Any]:
@@ -57,5 +58,5 @@ def format_cascade(recommendation: Recommendation) -> list[str]:
     named = list_cascade(recommendation)
     if not named:
         return []
-    units, output = named.pop("units"), "N m" if recommendation.unit_system.rotary else "N"
-    return [format_line("gains", spell_gains(CascadeGains(**named), units, output))]
+    units, output = named.pop("units"), spell_output(recommendation.unit_system.rotary, 1.0)
+    return [format_line("gains", spell_gains("cascade", named, units, output))]

@@ -171,17 +171,19 @@ def _add_option(command: Command, path: str) -> Command:
 _TIMED = ("mass", "damping", "period", "rate", "delay")
 
 
-def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
+def scene_options(
+    *, wall: bool, instead: str = "", make: Callable[[dict[str, Any], UnitSystem], Any] | None = None
+) -> Callable[[Command], Command]:
     """Return a decorator that adds the options of a scene, with or without wall, and the argument of a scene file.
 
     The command receives a `zwidth.Scene` as ``scene``, or None if ``instead`` names alternative options and no scene
-    option is given.
+    option is given. With ``make``, the command receives the result of ``make(values, units)`` instead.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "sampled", *_TIMED)
     take = take_options(
         "scene",
         (*bare, "velocity.filter", *_PARTS),
-        lambda given, system: build_scene(given, system, instead, wall=wall),
+        make or (lambda given, system: build_scene(given, system, instead, wall=wall)),
     )
     file = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=click.Path(path_type=Path))
     return lambda command: file(take(command))

@@ -29,7 +29,7 @@ from zwidth.model.position import Position, has_velocity
 from zwidth.model.velocity import BackwardDifference, LowPass, Velocity
 from zwidth.model.wall import VirtualWall
 from zwidth.units.display import compact_repr
-from zwidth.units.quantities import ANY
+from zwidth.units.quantities import ANY, POSITIVE
 
 PositionUnit = Literal["m", "rad", "turns", "degrees"]
 ControllerKind = Literal["pid", "cascade"]
@@ -276,24 +276,26 @@ def cascade_gains(
 
 
 def find_gains(
-    scene: Any, kind: ControllerKind, units: PositionUnit | None = None, output_unit: float = 1.0
+    wall: VirtualWall,
+    feedback: Any,
+    kind: ControllerKind,
+    units: PositionUnit,
+    output_unit: float = 1.0,
 ) -> PidGains | CascadeGains:
-    """Return the gains of a controller that renders the wall and the integral feedback of a scene.
+    """Return the gains of a controller that renders a wall with integral feedback.
 
     Args:
-        scene: the scene; its further feedback is None or an `IntegralFeedback`.
+        wall: K and B.
+        feedback: further feedback of the scene: None or an `IntegralFeedback`.
         kind: "pid" or "cascade".
-        units: position unit of the gains, see `cascade`. Default: "m" for a linear device; for a rotary device "turns"
-            for a cascade and "rad" for a PID controller.
+        units: position unit of the gains, see `cascade`.
         output_unit: force or torque per unit of output, see `cascade`.
 
     Raises:
         InputError: if the further feedback is not the integrator of a controller of this kind.
     """
-    feedback, K, B = scene.feedback, float(scene.wall.stiffness), float(scene.wall.virtual_damping)
+    K, B = float(wall.stiffness), float(wall.virtual_damping)
     integral, is_cascade = 0.0, kind == "cascade"
-    if units is None:
-        units = "m" if not scene.unit_system.rotary else "turns" if is_cascade else "rad"
     if feedback is not None:
         integrated = isinstance(feedback, IntegralFeedback) and feedback.is_cascade == is_cascade
         if is_cascade and integrated:
@@ -306,3 +308,58 @@ def find_gains(
         integral = feedback.gain * weight
     convert: Any = cascade_gains if is_cascade else pid_gains
     return convert(K, B, integral, units=units, output_unit=output_unit)
+
+
+GAIN_NAMES: dict[str, tuple[str, ...]] = {"pid": PidGains._fields, "cascade": CascadeGains._fields}
+"""Names of the gains of each kind of controller."""
+
+
+def find_output_unit(output_unit: float | None, torque_constant: float | None, resistance: float | None) -> float:
+    """Return the force or torque per unit of output of a controller.
+
+    Args:
+        output_unit: the force in N or torque in N m per unit of output.
+        torque_constant: torque constant in N m/A of a motor whose current is the output.
+        resistance: winding resistance in ohm, if the output is a voltage; requires ``torque_constant``.
+
+    Returns:
+        ``output_unit``; or the torque constant, divided by the resistance if given; or 1 without any argument.
+    """
+    given = {"output_unit": output_unit, "torque_constant": torque_constant, "resistance": resistance}
+    numbers = {name: check_number(name, value, "1", POSITIVE) for name, value in given.items() if value is not None}
+    if "output_unit" in numbers and len(numbers) > 1:
+        raise InputError(f"output_unit: got {output_unit} and torque_constant or resistance; give only one of them")
+    if "resistance" in numbers and "torque_constant" not in numbers:
+        raise InputError(f"resistance: got {resistance} without torque_constant; give torque_constant too")
+    return numbers.get("output_unit", numbers.get("torque_constant", 1.0) / numbers.get("resistance", 1.0))
+
+
+def find_units(kind: ControllerKind, units: PositionUnit | None, rotary: bool) -> PositionUnit:
+    """Return the position unit of the gains of a controller, checked against the kind of device.
+
+    Args:
+        kind: "pid" or "cascade".
+        units: the position unit; None for "m" with a linear device, and for "turns" (cascade) or "rad" (PID) with a
+            rotary device.
+        rotary: True for a rotary device.
+    """
+    if units is None:
+        return "m" if not rotary else "turns" if kind == "cascade" else "rad"
+    check_choice("units", units, tuple(_UNITS))
+    if (units == "m") == rotary:
+        allowed = "turns, degrees or rad" if rotary else "m, or write the inertia with its unit, such as '12 g cm^2'"
+        raise InputError(f"units: got {units!r} for a {'rotary' if rotary else 'linear'} device; use {allowed}")
+    return units
+
+
+def make_controller(
+    kind: ControllerKind,
+    gains: dict[str, float],
+    position: Position | None,
+    rule: IntegrationRule,
+    units: PositionUnit,
+    output_unit: float,
+) -> ControllerParts:
+    """Return the parts of a scene for a controller of a kind, from its gains by name; see `pid` and `cascade`."""
+    options: Any = {"position": position, "rule": rule, "units": units, "output_unit": output_unit}
+    return cascade(**gains, **options) if kind == "cascade" else pid(**gains, **options)
