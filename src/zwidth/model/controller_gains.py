@@ -23,13 +23,14 @@ from typing import Any, Literal, NamedTuple
 
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.xp import is_traced
-from zwidth.model.checks import accept_units, check_number
+from zwidth.model.checks import accept_units, check_number, read_texts
 from zwidth.model.feedback import IntegralFeedback, IntegrationRule
 from zwidth.model.position import Position, has_velocity
 from zwidth.model.velocity import BackwardDifference, LowPass, Velocity
 from zwidth.model.wall import VirtualWall
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import ANY, POSITIVE
+from zwidth.units.unit_system import SYSTEMS
 
 PositionUnit = Literal["m", "rad", "turns", "degrees"]
 ControllerKind = Literal["pid", "cascade"]
@@ -172,6 +173,7 @@ def pid_gains(
         12.566 N m/turn
     """
     scale = _find_scale(units, output_unit)
+    integral_gain = read_texts("integral_gain", integral_gain, SYSTEMS[units != "m"]["N/(m s)"])
     return PidGains(stiffness / scale, integral_gain / scale, virtual_damping / scale)
 
 
@@ -272,6 +274,7 @@ def cascade_gains(
     if not virtual_damping:
         raise InputError("virtual_damping: got 0; a cascade needs damping, K = pos_gain B; pass a value other than 0")
     scale = _find_scale(units, output_unit)
+    integral_gain = read_texts("integral_gain", integral_gain, SYSTEMS[units != "m"]["N/m"])
     return CascadeGains(stiffness / virtual_damping, virtual_damping / scale, integral_gain / scale)
 
 

@@ -110,7 +110,7 @@ class IntegralFeedback(Part):
     """Integral gain k_i: further feedback with the integral of the position, ``R0 = k_i T z/(z - 1)``.
 
     Args:
-        gain: k_i in N/(m s).
+        gain: k_i in N/(m s) or N m/(rad s).
         rule: rule of integration. "backward" adds T x_k to the sum before the force is computed, R0 = k_i T z/(z - 1).
             "forward" adds T x_k after the force is computed, R0 = k_i T/(z - 1). "trapezoidal" adds
             T (x_k + x_(k-1))/2, R0 = k_i (T/2) (z + 1)/(z - 1).

@@ -100,10 +100,13 @@ ANGULAR_SPEED = Dimension("rad/s, mrad/s, deg/s, rpm", "0.1 rad/s")
 TORQUE_RATE = Dimension("N m/s, mN m/s", "0.5 N m/s")
 SPEED = Dimension("m/s, cm/s, mm/s, um/s", "1 mm/s")
 FORCE_RATE = Dimension("N/s, kN/s, N/ms", "500 N/s")
+INTEGRAL_GAIN = Dimension("N/(m s), kN/(m s), N/(mm s)", "2 kN/(m s)")
+ANGULAR_INTEGRAL_GAIN = Dimension("N m/(rad s), mN m/(rad s), N m/(deg s), N m/(turn s)", "2 N m/(rad s)")
 RATIO = Dimension("", "0.02")
 _SCALES = (
     *(MASS, TIME, RATE, BANDWIDTH, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED),
     *(INERTIA, ANGULAR_DAMPING, ANGULAR_STIFFNESS, TORQUE, TORQUE_RATE, ANGLE, ANGULAR_SPEED),
+    *(INTEGRAL_GAIN, ANGULAR_INTEGRAL_GAIN),
 )
 DIMENSIONS = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
 # Base unit of a quantity on the other kind of device, by its base unit: "N m/rad" for "N/m" and vice versa.
