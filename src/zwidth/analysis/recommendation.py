@@ -375,9 +375,9 @@ class SceneAdvice(SceneOptima):
     def recommend(
         self,
         *,
-        stiffness_fraction: float | None = None,
-        gain_margin: float | None = None,
-        phase_margin: float | None = None,
+        stiffness_fraction: float | str | None = None,
+        gain_margin: float | str | None = None,
+        phase_margin: float | str | None = None,
         passive: bool = False,
         grasps: Grasps | None = None,
         beyond_safe: bool = False,
@@ -385,9 +385,9 @@ class SceneAdvice(SceneOptima):
         """Return the wall recommended for this device: the stiffest that satisfies the requirements.
 
         Args:
-            stiffness_fraction: largest K as a fraction of K_max, between 0 and 1.
-            gain_margin: smallest gain margin, a factor on K and B together, > 1.
-            phase_margin: smallest phase margin in degrees, > 0.
+            stiffness_fraction: largest K as a fraction of K_max, between 0 and 1, or a text such as "50%".
+            gain_margin: smallest gain margin, a factor on K and B together, > 1, or a text such as "6 dB".
+            phase_margin: smallest phase margin in degrees, > 0, or a text such as "30 deg".
             passive: require a passive wall.
             grasps: require stability in "all" or only the "soft" grasps of `zwidth.reference_grasps`, or in "none".
             beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its K is at most

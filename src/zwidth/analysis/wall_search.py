@@ -30,7 +30,7 @@ from zwidth.model.feedback import IntegralFeedback
 from zwidth.model.grasps import list_grasps
 from zwidth.model.safe_limit import SafeLimit, reserve_damping
 from zwidth.numerics.root_finding import false_position, find_global_minimum
-from zwidth.units.parsing import to_float
+from zwidth.units.parsing import read_degrees, read_factor, read_share, to_float
 from zwidth.units.quantities import FRACTION, RECOMMENDED_SHARE, Range
 
 # Requirements that apply if the user gives none; docs/guides/my-device.md gives the reasons for these values.
@@ -55,6 +55,7 @@ MAX_STEPS = 60  # root-finding steps on log K, bisections included; 8 usually su
 
 RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
 _EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
+_READERS = {"stiffness_fraction": read_share, "gain_margin": read_factor, "phase_margin": read_degrees}
 OTHER_DAMPING = "B differs from that of the stiffest wall, because with that B this share of K_max is unstable"
 
 Slack = Callable[[float, Any], dict[str, np.ndarray]]
@@ -74,16 +75,17 @@ class Requirements(NamedTuple):
     @classmethod
     def check(
         cls,
-        stiffness_fraction: float | None,
-        gain_margin: float | None,
-        phase_margin: float | None,
+        stiffness_fraction: float | str | None,
+        gain_margin: float | str | None,
+        phase_margin: float | str | None,
         passive: bool,
         beyond_safe: bool = False,
         grasps: Grasps | None = None,
     ) -> Requirements:
         """Check the arguments of `recommend`, and return them as requirements; the defaults apply if none is given."""
         ranges = {"stiffness_fraction": FRACTION, **RANGES}
-        limits = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
+        given = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
+        limits = {name: _read_limit(name, value) for name, value in given.items()}
         for name, value in limits.items():
             number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
             if value is not None and not (number and math.isfinite(to_float(value)) and ranges[name].holds(value)):
@@ -119,6 +121,16 @@ class Requirements(NamedTuple):
     def safe_share(self) -> float:
         """Upper limit of K as a fraction of the safe limit's stiffness."""
         return self.stiffness_fraction or RECOMMENDED_SHARE
+
+
+def _read_limit(name: str, value: Any) -> Any:
+    """Convert a requirement given as text, such as "50%", "6 dB" or "30 deg", to a number; return others unchanged."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return _READERS[name](value)
+    except ValueError:
+        return value
 
 
 class WallChoice(NamedTuple):

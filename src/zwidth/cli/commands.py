@@ -29,7 +29,6 @@ from zwidth.cli.options import (
     get_hardware,
     json_option,
     quantity_type,
-    read_factor,
     save_figure,
     scene_options,
     verbose_option,
@@ -41,6 +40,7 @@ from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.timing import Timing
 from zwidth.model.wall import VirtualWall
 from zwidth.units.formatting import format_stiffness, plain, with_unit
+from zwidth.units.parsing import read_degrees, read_factor
 from zwidth.units.quantities import SIZES, Range
 
 EXIT_FAILED = 1  # exit code if no wall exists or a computation fails
@@ -343,7 +343,7 @@ def report(folder: Path, out: Path | None, as_json: bool) -> None:
 
 
 _FACTOR = Parsed("FACTOR", read_factor, "write a factor, such as 2 or 6 dB")
-_DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")), "write degrees, such as 30")
+_DEGREES = Parsed("DEGREES", read_degrees, "write degrees, such as 30")
 
 
 @cli.command(**show_example("recommend --phase-margin 30", OF_SCENE))

@@ -120,12 +120,6 @@ def _read_delay(text: str) -> Any:
 SHARE = Parsed("SHARE", read_share, "write a share, such as 2% or 0.02")
 
 
-def read_factor(text: str) -> float:
-    """Return the factor given by a text such as ``2`` or ``6 dB``."""
-    number = float(text.strip().removesuffix("dB"))
-    return 10.0 ** (number / 20.0) if text.strip().endswith("dB") else number
-
-
 def _read_figure(text: str) -> Path:
     """Return the path of a figure to write; raise an error if its folder does not exist."""
     file = Path(text)

@@ -390,6 +390,17 @@ def read_share(text: str) -> float:
     return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
 
 
+def read_factor(text: str) -> float:
+    """Convert a text such as "2" or "6 dB" to a factor; raise `ValueError` for other texts."""
+    number = float(text.strip().removesuffix("dB"))
+    return 10.0 ** (number / 20.0) if text.strip().endswith("dB") else number
+
+
+def read_degrees(text: str) -> float:
+    """Convert a text such as "30", "30 deg" or "30°" to an angle in degrees; raise `ValueError` for other texts."""
+    return float(text.strip().removesuffix("deg").removesuffix("°"))
+
+
 # Dimensions of the columns of logs and frequency responses.
 _COLUMN_DIMENSIONS = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
 # Further units of these columns.
