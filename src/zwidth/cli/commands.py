@@ -39,12 +39,15 @@ from zwidth.model.device import Device
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.timing import Timing
 from zwidth.model.wall import VirtualWall
-from zwidth.units.formatting import format_stiffness, plain, with_unit
+from zwidth.units.formatting import format_periods, format_stiffness, plain, with_unit
 from zwidth.units.parsing import read_degrees, read_factor
 from zwidth.units.quantities import SIZES, Range
 
 EXIT_FAILED = 1  # exit code if no wall exists or a computation fails
 EXIT_INPUT = 2  # exit code for invalid input
+# Delay in periods from which `recommend` announces a long search. Every wall of the search needs the poles of the loop,
+# whose number grows with the delay, and the time for all poles grows with the cube of their number.
+LONG_SEARCH = 300.0
 _PACKAGE = Path(__file__).resolve().parents[1]
 # Pattern of an entry of a configuration that refers to a CSV table in the same folder.
 _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
@@ -393,6 +396,12 @@ def recommend(
 
     if code and as_json:
         raise click.UsageError("give only one of --code or --json: each replaces the whole output")
+    if float(scene.d) >= LONG_SEARCH:
+        click.echo(
+            f"zwidth: the delay is {format_periods(float(scene.d))}, so the search for a wall may take minutes; zwidth "
+            "ridge prints K_max at once",
+            err=True,
+        )
     recommendation = scene.recommend(**wanted)
     written = []
     if figure is not None:
