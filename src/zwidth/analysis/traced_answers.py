@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.analysis.environment_derivatives import find_environment_limits
 from zwidth.analysis.optimization import SIDES
 from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError
@@ -24,7 +25,6 @@ from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import RidgeKind, Status
 from zwidth.model.circle_functions import circle_points
 from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, seed
-from zwidth.stability.linear.delay_margin import change_delay
 from zwidth.stability.linear.derivatives import LoopTerms, differentiate, differentiate_ridge, index_parameters, split
 from zwidth.stability.linear.margins import evaluate_walls
 from zwidth.stability.linear.passivity import PassivityCondition
@@ -203,7 +203,7 @@ def _meet_distance(terms: LoopTerms, alpha: Taylor, beta: Taylor, distance: Tayl
 def _find_delayed_angle(scene: Any, wall: list[float], delay: float) -> float | None:
     """Return the angle w of the pole that is on the unit circle if the delay grows by ``delay``, the delay margin."""
     chain, (alpha, beta) = scene.loop.chain, wall
-    loop, w = change_delay(chain, float(chain.d) + delay), np.append(scene.loop.boundary.w, np.pi)
+    loop, w = scene.loop.with_delay(float(chain.d) + delay), np.append(scene.loop.boundary.w, np.pi)
     for _ in range(ANGLE_STEPS):
         L = evaluate_walls(loop, alpha, beta, circle_points(w))
         distance = np.abs(1.0 + L.value)
@@ -355,8 +355,12 @@ ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {
     "margins": (find_margins, 7),
     "passivity_margin": (find_passivity_margin, 1),
     "required": (find_required, 5),
+    "environment_limit": (find_environment_limits, 3),
 }
-"""Function that computes results with derivatives, and their number, for each method of `zwidth.analysis.loop`."""
+"""Function that computes results with derivatives, and their number, for each method of `zwidth.analysis.loop`.
+
+The method "environment_limit" belongs to `zwidth.AdmittanceDisplay`, which takes the place of the scene.
+"""
 
 # Values for scenes with a parameter out of range, for methods whose values are then not all NaN; the label 0 means
 # "not stable".
@@ -364,4 +368,5 @@ INVALID = {
     "stiffest": [np.nan, np.nan, np.nan, RidgeKind.NONE, Status.INVALID_INPUT],
     "labels": [0.0],
     "required": [np.nan, SIDES.index("nowhere"), np.nan, np.nan, Status.INVALID_INPUT],
+    "environment_limit": [np.nan, np.nan, Status.INVALID_INPUT],
 }

@@ -26,7 +26,7 @@ from zwidth.model.checks import Span, find_kind, read_span
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.mode import Mode
-from zwidth.model.parameter_paths import PARTS, WITH_KIND, find_parts
+from zwidth.model.parameter_paths import CONTAINED, PARTS, WITH_KIND, find_parts
 from zwidth.model.timing import Timing
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.units.parsing import DIMENSIONS, detect_kind, looks_like_number, read_quantity, read_share
@@ -48,8 +48,6 @@ Command: TypeAlias = Callable[..., Any]
 # Names of the parts of a scene; and the paths of the parameters of all parts, sorted by part.
 _PART_NAMES = tuple(dict.fromkeys(("velocity", *WITH_KIND, *(path.rpartition(".")[0] for path in OF_PARTS))))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
-# Parts that cannot be added to a linear system or a measured response, because such a device includes them.
-_CONTAINED = ("operator", "coupling", "actuator", "modes")
 # Names of the structural modes among the parts: "modes.0", "modes.1" and so on.
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
 _BARE = {"mass", "damping"}  # parameters of a rigid device
@@ -137,7 +135,8 @@ def _add_option(command: Command, path: str) -> Command:
             "A published device of `zwidth devices`, with its period and delay; other options add or replace "
             "parameters. Or, in place of mass, damping and all parts: a transfer function 'NUM / DEN' by its "
             "coefficients in s, such as '1 / 0.1 10 0', by its roots, 'zpk: ZEROS / POLES / GAIN', or by sections, "
-            "'sos: b0 b1 b2 a0 a1 a2; ..'; or a measured response FILE.csv (.npz, .mat)."
+            "'sos: b0 b1 b2 a0 a1 a2; ..'; a measured response FILE.csv (.npz, .mat); or FILE.yaml with the keys of a "
+            "device of a scene file, such as mass_matrix, or model and site of a robot."
         )
         return click.option("--device", metavar="NAME", help=words)(command)
     if path == "sampled":
@@ -205,13 +204,16 @@ def take_options(
                 if values.get("sampled") and "device" not in values:
                     raise click.UsageError("--sampled: give --device 'NUM / DEN' with coefficients in z")
                 if "device" in values:
-                    from zwidth.model.devices import read_device
+                    from zwidth.config.device_files import read_device_option
 
-                    values["device"] = read_device(values["device"], _find_sampled_period(values))
+                    options = context.meta.get(_WITH_KIND, {})
+                    values["device"] = read_device_option(
+                        values["device"], _find_sampled_period(values), rotary=bool(find_kind(options))
+                    )
                     # Ignore the unit system and the hardware of the scene file, because the option --device replaces
                     # the device of the file.
                     context.meta.pop(_HARDWARE, None)
-                    with_kind = context.meta.get(_WITH_KIND, {}) | {"--device": values["device"]}
+                    with_kind = options | {"--device": values["device"]}
                 return function(**{name: make(values, SYSTEMS[bool(find_kind(with_kind))])}, **given)
             except InputError as error:
                 field, _, text = str(error).partition(": ")
@@ -351,8 +353,10 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
         device = Device(**select("mass", "damping"), rotary=system.rotary)
     elif isinstance(device, PublishedDevice):
         timing, device = device.to_timing, device.to_device(**select("mass", "damping"))
+    elif isinstance(device, Device):
+        device = replace(device, **select("mass", "damping"))
     else:
-        for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _CONTAINED):
+        for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in CONTAINED):
             raise click.UsageError(
                 f"{name_option(path)}: the given --device already contains it; give only one of the two"
             )
