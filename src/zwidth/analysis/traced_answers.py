@@ -46,10 +46,13 @@ def no_derivatives(values: np.ndarray, arguments: int, order: int, fill: float =
 
 
 def fill_rows(results: Derivatives, point: Any, rows: Sequence[int], parts: Implicit, factor: float = 1.0) -> None:
-    """Store the derivatives of unknowns, multiplied by a factor, in the given rows of the results for one point."""
+    """Store the derivatives of unknowns in the given rows of the results for one point.
+
+    The derivatives of the first unknown are multiplied by ``factor``.
+    """
     for result, part in zip(results[1:], parts, strict=False):
         for k, row in enumerate(rows):
-            result[point, row] = factor * part[k] if part is not None else np.nan
+            result[point, row] = np.nan if part is None else part[k] if k else factor * part[k]
 
 
 def find_stiffest(scene: Any, points: np.ndarray, order: int, negative_damping: bool | None) -> Derivatives:
@@ -126,14 +129,10 @@ def find_margins(scene: Any, points: np.ndarray, order: int) -> Derivatives:
             factor: float = 1.0,
             added: float | None = None,
         ) -> None:
-            parts = differentiate(scene, order, wall, unknowns, equations, added)
-            fill_rows(results, k, rows[:1], Implicit(parts.first[:1], _first(parts.second)), factor)
-            if len(unknowns) > 1:
-                second = None if parts.second is None else parts.second[1:2]
-                fill_rows(results, k, rows[1:], Implicit(parts.first[1:2], second))
-            else:
-                for result in results[1:]:
-                    result[k, rows[1:]] = 0.0
+            parts, count = differentiate(scene, order, wall, unknowns, equations, added), len(unknowns)
+            fill_rows(results, k, rows[:count], parts, factor)
+            for result in results[1:]:
+                result[k, rows[count:]] = 0.0
 
         if np.isfinite(w_gain):
             fill(*_at_angle(_meet_gain, [gain], w_gain), [0, 4])
@@ -148,11 +147,6 @@ def find_margins(scene: Any, points: np.ndarray, order: int) -> Derivatives:
             if w is not None:
                 fill(*_at_angle(_meet_delay, [delay], w), [2], added=delay)
     return results
-
-
-def _first(part: np.ndarray | None) -> np.ndarray | None:
-    """Return the second derivatives of the first unknown; None if second derivatives are not computed."""
-    return None if part is None else part[:1]
 
 
 def _at_angle(meet: Callable[..., list[Taylor]], unknowns: list[float], w: float) -> tuple[list[float], Any]:
