@@ -23,7 +23,7 @@ from zwidth.core.errors import InputError
 from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import RidgeKind, Status
 from zwidth.model.circle_functions import circle_points
-from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, seed
+from zwidth.numerics.taylor import Taylor, differentiate_implicitly, seed
 from zwidth.stability.linear.delay_margin import change_delay
 from zwidth.stability.linear.derivatives import LoopTerms, differentiate, differentiate_ridge, index_parameters, split
 from zwidth.stability.linear.margins import evaluate_walls
@@ -45,14 +45,11 @@ def no_derivatives(values: np.ndarray, arguments: int, order: int, fill: float =
     return [values, *(np.full((*values.shape, *[arguments] * k), fill) for k in range(1, order + 1))]
 
 
-def fill_rows(results: Derivatives, point: Any, rows: Sequence[int], parts: Implicit, factor: float = 1.0) -> None:
-    """Store the derivatives of unknowns in the given rows of the results for one point.
-
-    The derivatives of the first unknown are multiplied by ``factor``.
-    """
-    for result, part in zip(results[1:], parts, strict=False):
-        for k, row in enumerate(rows):
-            result[point, row] = np.nan if part is None else part[k] if k else factor * part[k]
+def fill_rows(results: Derivatives, point: Any, rows: Sequence[int], unknowns: Sequence[Taylor]) -> None:
+    """Store the derivatives of unknowns in the given rows of the results for one point."""
+    for row, unknown in zip(rows, unknowns, strict=False):
+        for result, part in zip(results[1:], (unknown.first, unknown.second), strict=False):
+            result[point, row] = part
 
 
 def find_stiffest(scene: Any, points: np.ndarray, order: int, negative_damping: bool | None) -> Derivatives:
@@ -89,12 +86,8 @@ def find_radius(scene: Any, points: np.ndarray, order: int) -> Derivatives:
         except InputError:
             continue  # too many poles to compute all; the derivatives remain NaN
         pole = np.log1p(zeta[np.argmax(log_modulus(zeta))])
-        parts = differentiate(scene, order, wall.tolist(), [pole.real, abs(pole.imag)], equations)
-        # Convert the derivatives of the first unknown, log(radius), to those of the radius.
-        first = radius[k, 0] * parts.first[:1]
-        second = parts.second if order < 2 or parts.second is None else radius[k, 0] * parts.second[:1]
-        second = None if second is None else second + first[:, :, None] * parts.first[:1, None, :]
-        fill_rows(results, k, [0], Implicit(first, second))
+        log_radius, _ = differentiate(scene, order, wall.tolist(), [pole.real, abs(pole.imag)], equations)
+        fill_rows(results, k, [0], [log_radius.exp()])
     return results
 
 
@@ -129,10 +122,10 @@ def find_margins(scene: Any, points: np.ndarray, order: int) -> Derivatives:
             factor: float = 1.0,
             added: float | None = None,
         ) -> None:
-            parts, count = differentiate(scene, order, wall, unknowns, equations, added), len(unknowns)
-            fill_rows(results, k, rows[:count], parts, factor)
+            margin, *angle = differentiate(scene, order, wall, unknowns, equations, added)
             for result in results[1:]:
-                result[k, rows[count:]] = 0.0
+                result[k, rows] = 0.0  # for the angle, unless it is one of the unknowns
+            fill_rows(results, k, rows, [margin * factor, *angle])
 
         if np.isfinite(w_gain):
             fill(*_at_angle(_meet_gain, [gain], w_gain), [0, 4])
@@ -303,15 +296,15 @@ def find_required(scene: Any, points: np.ndarray, order: int, parameter: str, *o
             result[k, 0] = np.nan
         if order and needed.status == Status.OK and needed.crossings:
             fill_rows(
-                results, k, [0], _differentiate_required(scene, parameter, needed.value, stiffness, order, negative)
+                results, k, [0], [_differentiate_required(scene, parameter, needed.value, stiffness, order, negative)]
             )
     return results
 
 
 def _differentiate_required(
     scene: Any, parameter: str, value: float, stiffness: float, order: int, negative: bool | None
-) -> Implicit:
-    """Return the derivatives of a required parameter value in the numbers of the scene and the required stiffness."""
+) -> Taylor:
+    """Return a required parameter value, with derivatives in the numbers of the scene and the required stiffness."""
     path, x = ("period", 1.0 / value) if parameter == "rate" else (parameter, value)
     changed = scene.replace(**{path: x})
     count, index = len(list_leaves(scene)), index_parameters(changed)[path]
@@ -333,12 +326,8 @@ def _differentiate_required(
 
     equation = Taylor(K.v - stiffness, move(K.first), None if K.second is None else move(K.second))
     equation.first[count] = -1.0
-    result = differentiate_implicitly([equation])
-    if parameter != "rate":
-        return result
-    # The unknown is the period. Convert its derivatives to those of the rate 1/period.
-    period = Taylor(x, result.first[0], None if result.second is None else result.second[0]).reciprocal()
-    return Implicit(period.first[None], None if period.second is None else period.second[None])
+    (unknown,) = differentiate_implicitly([equation], [x])
+    return unknown.reciprocal() if parameter == "rate" else unknown
 
 
 ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {

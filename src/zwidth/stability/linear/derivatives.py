@@ -27,7 +27,7 @@ from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import build_estimates
 from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import list_parameters
-from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, flow, seed, solve, stack
+from zwidth.numerics.taylor import Taylor, differentiate_implicitly, flow, seed, solve, stack
 from zwidth.stability.linear.ridge import Condition, RidgeSolution
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import WALL
@@ -228,8 +228,8 @@ def differentiate(
     unknowns: Sequence[float],
     equations: Equations,
     added_delay: float | None = None,
-) -> Implicit:
-    """Return the derivatives of the solution of equations in the numbers of a scene and in further parameters.
+) -> list[Taylor]:
+    """Return the unknowns of equations, with their derivatives in the numbers of a scene and in further parameters.
 
     Args:
         scene: the scene, whose numbers are floats.
@@ -241,19 +241,20 @@ def differentiate(
         added_delay: value of the first unknown if it is a delay in periods to be added to that of the scene.
 
     Returns:
-        The derivatives, NaN if they are not available.
+        Each unknown; derivatives that are not available are NaN.
     """
     n = int(np.floor(scene.d + (added_delay or 0.0)))
     leaves = list_leaves(scene)
 
-    def compute(n: int) -> Implicit:
+    def compute(n: int) -> list[Taylor]:
         variables = seed([*leaves, *parameters, *unknowns], order)
         added = None if added_delay is None else variables[len(leaves) + len(parameters)]
         terms = LoopTerms(scene, variables, n, added)
-        return differentiate_implicitly(list(equations(terms, variables[len(leaves) :])))
+        return differentiate_implicitly(equations(terms, variables[len(leaves) :]), unknowns)
 
     index, size = index_parameters(scene), len(leaves) + len(parameters)
     is_sampled = getattr(scene.device, "dt", None) is not None
+    unavailable = [Taylor(value, *(np.full([size] * k, np.nan) for k in (1, 2))) for value in unknowns]
     has_kink = not is_sampled and hasattr(scene.device, "system") and n == scene.d > 0 and added_delay is None
     with np.errstate(all="ignore"):
         try:
@@ -263,21 +264,20 @@ def differentiate(
                 # side of smaller delays, because a longer period reduces the delay in periods.
                 _replace_derivatives(result, compute(n - 1), index["period"])
         except (ArithmeticError, np.linalg.LinAlgError):
-            return Implicit(*(np.full((len(unknowns), *[size] * k), np.nan) for k in (1, 2)))
+            return unavailable
     if is_sampled:
         # A device in discrete time is valid for one period and one delay only, so these derivatives do not exist.
         for path in ("period", "delay"):
-            _replace_derivatives(result, None, index[path])
+            _replace_derivatives(result, unavailable, index[path])
     return result
 
 
-def _replace_derivatives(result: Implicit, other: Implicit | None, k: int) -> None:
-    """Replace the derivatives in the parameter with the index k by those of ``other``, or by NaN."""
-    result.first[:, k] = math.nan if other is None else other.first[:, k]
-    if result.second is not None:
-        second = None if other is None else other.second
-        result.second[:, k, :] = math.nan if second is None else second[:, k, :]
-        result.second[:, :, k] = math.nan if second is None else second[:, :, k]
+def _replace_derivatives(result: list[Taylor], others: list[Taylor], k: int) -> None:
+    """Replace the derivatives of each unknown in the parameter with the index k by those of ``others``."""
+    for unknown, other in zip(result, others, strict=True):
+        unknown.first[k] = other.first[k]
+        if unknown.second is not None:
+            unknown.second[k], unknown.second[:, k] = other.second[k], other.second[:, k]
 
 
 def index_parameters(scene: Any) -> dict[str, int]:
@@ -304,8 +304,8 @@ def split(value: Taylor) -> list[Taylor]:
     return [value.real, value.imag]
 
 
-def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> Implicit:
-    """Return the derivatives of alpha, beta and omega of the stiffest wall in all numbers of a scene (V21)."""
+def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> list[Taylor]:
+    """Return alpha, beta and omega of the stiffest wall, with their derivatives in all numbers of a scene (V21)."""
     is_pair = ridge.first == Condition.PAIR, ridge.second == Condition.PAIR
     free = [k for k in range(2) if is_pair[k]]
     extra = [ridge.alpha, ridge.beta, *((ridge.w1, ridge.w2)[k] for k in free)]
@@ -327,17 +327,10 @@ def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> Implici
         r = terms.residual(alpha, beta, w[1] * 1j)[0]
         return [*result, *(split(r) if is_pair[1] else [r.real])]
 
-    result = differentiate(scene, order, [], extra, equations)
-    # Append the derivatives of the angle omega, which are 0 if omega is the constant angle of a real pole.
-    angles = (ridge.w1, ridge.w2)
-    rows = [0, 1, 2 + free.index(angles.index(ridge.omega)) if angles.index(ridge.omega) in free else None]
-
-    def select(part: np.ndarray | None) -> np.ndarray | None:
-        return None if part is None else np.stack([0.0 * part[0] if row is None else part[row] for row in rows])
-
-    first = select(result.first)
-    assert first is not None
-    return Implicit(first, select(result.second))
+    alpha, beta, *angles = differentiate(scene, order, [], extra, equations)
+    # The derivatives of omega are 0 if omega is the constant angle of a real pole.
+    k = (ridge.w1, ridge.w2).index(ridge.omega)
+    return [alpha, beta, angles[free.index(k)] if k in free else alpha * 0.0]
 
 
 @compact_repr()
@@ -362,10 +355,10 @@ def compute_sensitivities(scene: Any, ridge: RidgeSolution | None, status: Statu
     paths = list_ridge_parameters(scene)
     if ridge is None:
         return SceneSensitivities(np.float64(math.nan), dict.fromkeys(paths, math.nan), np.int32(status))
-    slopes, index = differentiate_ridge(scene, ridge, 1).first[0], index_parameters(scene)
-    varied = replace_leaves(scene, iter(seed(list_leaves(scene), 1)))
+    varied, index = replace_leaves(scene, iter(seed(list_leaves(scene), 1))), index_parameters(scene)
     unit = varied.mass / varied.timing.period / varied.timing.period
-    per = {path: float(unit.v * slopes[index[path]] + ridge.alpha * unit.first[index[path]]) for path in paths}
+    stiffness = differentiate_ridge(scene, ridge, 1)[0] * unit
+    per = {path: float(stiffness.first[index[path]]) for path in paths}
     if scene.timing.in_periods:
         per["delay"] /= scene.timing.period
     status = Status.NOT_CONVERGED if any(map(math.isnan, per.values())) else status
