@@ -22,7 +22,7 @@ import numpy as np
 from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import Status
 from zwidth.core.types import Array
-from zwidth.model.circle_functions import circle_points
+from zwidth.model.circle_functions import Jet, circle_points
 from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import build_estimates
 from zwidth.model.mechanism import build_chain
@@ -37,8 +37,6 @@ RESPONSE_TOLERANCE = 1e-8  # largest relative difference of q = -1/G computed fr
 # difference is used for velocity estimates that accept only floats.
 CENTRAL_DIFFERENCE = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
 DIFFERENCE_STEP = 1e-3
-
-Pair = tuple[Taylor, Taylor]  # a function of lambda and its derivative
 
 
 class LoopTerms:
@@ -75,7 +73,7 @@ class LoopTerms:
             self.psi, self.full = flow(A, B, self.one)
             self.late = flow(A, B, self.one - (delay - n))[1]
 
-    def controller(self, lam: Taylor) -> Pair:
+    def controller(self, lam: Taylor) -> Jet:
         """Return q = -1/G and its derivative in lambda = log z."""
         z, zeta = lam.exp(), lam.expm1()
         size = len(self.full.v)
@@ -88,22 +86,22 @@ class LoopTerms:
         if self.scene.tool is not None:
             return self._add_tool(q, q_slope, lam)
         if self.estimates is None:
-            return q, q_slope
+            return Jet(q, q_slope)
         # Here q = -1/H for the sampled plant H. With a position estimate P and further feedback R, G = H P/(1 + H R),
         # so that q = -1/G = (-1/H - R)/P (docs/theory/scenes.md, V25).
         P, R = self._evaluate_position(lam), self._evaluate_feedback(lam)
-        return _divide((q - R[0], q_slope - R[1]), P)
+        return Jet(q - R.value, q_slope - R.slope).over(P)
 
-    def feedback(self, lam: Taylor) -> Pair:
+    def feedback(self, lam: Taylor) -> Jet:
         """Return the ratio R/P of further feedback R and position estimate P, and its derivative in lambda.
 
         The open loop L at the plant input is ``L = -(alpha + beta F + R/P)/(q + R/P)``.
         """
         if self.estimates is None or self.estimates.feedback is None:
-            return self.one * 0.0, self.one * 0.0
-        return _divide(self._evaluate_feedback(lam), self._evaluate_position(lam))
+            return Jet(self.one * 0.0, self.one * 0.0)
+        return self._evaluate_feedback(lam).over(self._evaluate_position(lam))
 
-    def _add_tool(self, q: Taylor, q_slope: Taylor, lam: Taylor) -> Pair:
+    def _add_tool(self, q: Taylor, q_slope: Taylor, lam: Taylor) -> Jet:
         """Return q/(1 - q G_t) and its derivative in lambda, for a simulated tool with the response G_t.
 
         This is the critical controller -1/(G + G_t), because device and tool act like one device with the response
@@ -115,39 +113,39 @@ class LoopTerms:
         response = (lam * tool.power).exp() * tool.gain / denominator
         slope = response * (tool.power - (zeta * (tool.a2 * 2.0) + tool.a1) * z / denominator)
         share = 1.0 / (self.one - q * response)
-        return q * share, (q_slope + q * q * slope) * share * share
+        return Jet(q * share, (q_slope + q * q * slope) * share * share)
 
-    def _evaluate_position(self, lam: Taylor) -> Pair:
+    def _evaluate_position(self, lam: Taylor) -> Jet:
         """Return the position estimate P and its derivative in lambda."""
         assert self.estimates is not None
         return evaluate_estimate(self.estimates.position, lam, self.one)
 
-    def _evaluate_velocity(self, lam: Taylor) -> Pair:
+    def _evaluate_velocity(self, lam: Taylor) -> Jet:
         """Return the velocity estimate V and its derivative in lambda."""
         assert self.estimates is not None
         V = evaluate_estimate(self.estimates.velocity, lam, self.one)
-        return _multiply(V, self._evaluate_position(lam)) if self.estimates.structure == "series" else V
+        return V.times(self._evaluate_position(lam)) if self.estimates.structure == "series" else V
 
-    def _evaluate_feedback(self, lam: Taylor) -> Pair:
+    def _evaluate_feedback(self, lam: Taylor) -> Jet:
         """Return the further feedback R and its derivative in lambda."""
         assert self.estimates is not None
         feedback = self.estimates.feedback
         if feedback is None:
-            return self.one * 0.0, self.one * 0.0
+            return Jet(self.one * 0.0, self.one * 0.0)
         filtered = evaluate_estimate(feedback.filter, lam, self.one)
         if feedback.weights is None:
             return filtered
         P, V = self._evaluate_position(lam), self._evaluate_velocity(lam)
         position, velocity = (self.one * weight for weight in feedback.weights)
-        total = (position * P[0] + velocity * V[0], position * P[1] + velocity * V[1])
-        return _multiply(filtered, total)
+        total = Jet(*(position * p + velocity * v for p, v in zip(P, V, strict=True)))
+        return filtered.times(total)
 
-    def estimate(self, lam: Taylor) -> Pair:
+    def estimate(self, lam: Taylor) -> Jet:
         """Return the velocity estimate F and its derivative in lambda = log z."""
         if self.estimates is not None:
             if self.estimates.structure == "series":
                 return evaluate_estimate(self.estimates.velocity, lam, self.one)
-            return _divide(self._evaluate_velocity(lam), self._evaluate_position(lam))
+            return self._evaluate_velocity(lam).over(self._evaluate_position(lam))
         velocity, period = self.varied.velocity, self.varied.timing.period
         try:
             return evaluate_estimate(velocity.estimate(period), lam, self.one)
@@ -155,13 +153,13 @@ class LoopTerms:
             # A user-defined velocity estimate may accept only floats.
             return self._difference_estimate(lam)
 
-    def _difference_estimate(self, lam: Taylor) -> Pair:
+    def _difference_estimate(self, lam: Taylor) -> Jet:
         """Return F and F' of an estimate that accepts only floats, with first derivatives by finite differences."""
         leaves = list_leaves(self.scene)
         names = [id(each) for each in (self.varied.timing.period, *list_leaves(self.varied.velocity))]
         at = Taylor(lam.v, np.zeros(0))
 
-        def evaluate(values: list[Any]) -> Pair:
+        def evaluate(values: list[Any]) -> Jet:
             scene = replace_leaves(self.scene, iter(values))
             return evaluate_estimate(scene.velocity.estimate(scene.timing.period), at, at * 0.0 + 1.0)
 
@@ -185,35 +183,19 @@ class LoopTerms:
         return (alpha + beta * f - q) * scale, (beta * f_slope - q_slope) * scale, f
 
 
-def _multiply(first: Pair, second: Pair) -> Pair:
-    """Return the product of two functions of lambda, and the derivative of the product."""
-    return first[0] * second[0], first[1] * second[0] + first[0] * second[1]
-
-
-def _divide(first: Pair, second: Pair) -> Pair:
-    """Return the quotient of two functions of lambda, and the derivative of the quotient."""
-    value = first[0] / second[0]
-    return value, (first[1] - value * second[1]) / second[0]
-
-
-def evaluate_estimate(estimate: Estimate, lam: Taylor, one: Taylor) -> Pair:
+def evaluate_estimate(estimate: Estimate, lam: Taylor, one: Taylor) -> Jet:
     """Return F and dF/dlambda of a velocity estimate whose gain, zeros and poles are numbers or Taylor objects."""
-    z, zeta = lam.exp(), lam.expm1()
-    value, slope = one * estimate.gain, one * 0.0
+    z, zeta, F = lam.exp(), lam.expm1(), Jet(one * estimate.gain, one * 0.0)
     for zero in np.ravel(estimate.zeros):
-        factor = zeta + zero
-        value, slope = value * factor, slope * factor + value * z
+        F = F.times(Jet(zeta + zero, z))
     for pole in np.ravel(estimate.poles):
-        factor = zeta + pole
-        value = value / factor
-        slope = (slope - value * z) / factor
+        F = F.over(Jet(zeta + pole, z))
     if estimate.lag:
         power = (lam * -estimate.lag).exp()
-        value, slope = value * power, (slope - value * estimate.lag) * power
+        F = Jet(F.value * power, (F.slope - F.value * estimate.lag) * power)
     if n := estimate.window:
-        difference = -(lam * -n).expm1() / n
-        value, slope = value * difference, slope * difference + value * (lam * -n).exp()
-    return value, slope
+        F = F.times(Jet(-(lam * -n).expm1() / n, (lam * -n).exp()))
+    return F
 
 
 # Type of a function that returns the real equations of a result, such as a margin. Its arguments are q and F of the
