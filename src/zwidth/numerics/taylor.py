@@ -238,3 +238,11 @@ def differentiate_implicitly(equations: Sequence[Taylor], values: Sequence[float
     directions = np.concatenate([np.eye(parameters), first])
     curvatures = np.array([directions.T @ each.second @ directions for each in equations])
     return list(map(Taylor, values, first, np.tensordot(inverse, curvatures, 1)))
+
+
+def replace_derivatives(results: list[Taylor], others: list[Taylor], k: int) -> None:
+    """Replace the derivatives of each result in the variable with the index k by those of ``others``."""
+    for result, other in zip(results, others, strict=True):
+        result.first[k] = other.first[k]
+        if result.second is not None and other.second is not None:
+            result.second[k], result.second[:, k] = other.second[k], other.second[:, k]

@@ -27,7 +27,7 @@ from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import build_estimates
 from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import list_parameters
-from zwidth.numerics.taylor import Taylor, differentiate_implicitly, flow, seed, solve, stack
+from zwidth.numerics.taylor import Taylor, differentiate_implicitly, flow, replace_derivatives, seed, solve, stack
 from zwidth.stability.linear.ridge import Condition, RidgeSolution
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import WALL
@@ -257,22 +257,14 @@ def differentiate(
             if has_kink:
                 # Without inertia, the result has a kink at integer delays. For the derivative in the period, use the
                 # side of smaller delays, because a longer period reduces the delay in periods.
-                _replace_derivatives(result, compute(n - 1), index["period"])
+                replace_derivatives(result, compute(n - 1), index["period"])
         except (ArithmeticError, np.linalg.LinAlgError):
             return unavailable
     if is_sampled:
         # A device in discrete time is valid for one period and one delay only, so these derivatives do not exist.
         for path in ("period", "delay"):
-            _replace_derivatives(result, unavailable, index[path])
+            replace_derivatives(result, unavailable, index[path])
     return result
-
-
-def _replace_derivatives(result: list[Taylor], others: list[Taylor], k: int) -> None:
-    """Replace the derivatives of each unknown in the parameter with the index k by those of ``others``."""
-    for unknown, other in zip(result, others, strict=True):
-        unknown.first[k] = other.first[k]
-        if unknown.second is not None:
-            unknown.second[k], unknown.second[:, k] = other.second[k], other.second[:, k]
 
 
 def index_parameters(scene: Any) -> dict[str, int]:
