@@ -21,11 +21,13 @@ from zwidth.app.printing import format_row
 from zwidth.cli.hardware import diagnose_wall, hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
+    PATH,
     SHARE,
     Parsed,
     beyond_safe_option,
     figure_option,
     find_omitted,
+    folder_argument,
     get_hardware,
     json_option,
     quantity_type,
@@ -297,7 +299,7 @@ def find_examples() -> dict[str, Path]:
 
 
 @cli.command()
-@click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(path_type=Path))
+@click.argument("path", metavar="[CONFIG|DIR]", required=False, type=PATH)
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free one]")
 @click.option("--no-browser", is_flag=True, help="Print the address without opening a browser.")
 def explore(path: Path | None, port: int, no_browser: bool) -> None:
@@ -330,8 +332,8 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
 
 
 @cli.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="File to write.  [default: DIR/report.html]")
+@folder_argument
+@click.option("--out", type=PATH, help="File to write.  [default: DIR/report.html]")
 @json_option
 def report(folder: Path, out: Path | None, as_json: bool) -> None:
     """Write the results of the run in DIR as one HTML file, with slices of its sweeps.
