@@ -20,6 +20,7 @@ from zwidth.analysis.unsafe_world import unsafe_world
 from zwidth.core.errors import InputError
 from zwidth.core.types import ArrayLike
 from zwidth.core.xp import is_traced, namespace
+from zwidth.model.checks import read_texts
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.numerics.evaluate import as_float64
 from zwidth.simulation.simulate import simulate
@@ -77,12 +78,14 @@ class Scene(SceneAdvice):
         """Return the walls that have a pole pair on the unit circle at a given frequency.
 
         Args:
-            omega: angular frequency in rad/s, between 0 and the Nyquist frequency ``pi/T``.
+            omega: angular frequency in rad/s, between 0 and the Nyquist frequency ``pi/T``; or a text such as "80 Hz".
 
         Returns:
             ``stiffness`` in N/m and ``virtual_damping`` in N s/m; NaN for other frequencies.
         """
-        w = (omega if is_traced(omega) else as_float64("omega", omega)) * self.timing.period
+        if not is_traced(omega):
+            omega = as_float64("omega", read_texts("omega", omega, "1/s"))
+        w = omega * self.timing.period
         inside, units = (w > 0) & (w < np.pi), self.units
         alpha, beta = self._loop_for(w).critical_walls(namespace(w).where(inside, w, 1.0))
         walls = alpha * units.stiffness, beta * units.virtual_damping
