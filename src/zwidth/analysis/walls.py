@@ -324,7 +324,7 @@ class SceneAnalysis(SceneParts):
         or delay moves a pole onto the unit circle, the first three margins are infinite for a stable wall, and 0, NaN
         and 0 for an unstable one. Walls out of range are NaN. A rigid scene uses `zwidth.margins`. For other scenes,
         one wall takes about 0.1 s, and many walls in one call some ms per wall. With a simulated tool, the delay margin
-        takes about 0.1 s per wall.
+        takes another 0.05 s per wall.
         """
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
