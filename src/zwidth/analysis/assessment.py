@@ -28,6 +28,7 @@ from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.results import Margins
 from zwidth.units.display import ResultList, compact_repr, find_unit, with_units
 from zwidth.units.formatting import format_interval, plain, round_conservatively, to_json, with_unit
+from zwidth.units.quantities import FIELDS
 from zwidth.units.unit_system import LINEAR, UnitSystem
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
@@ -123,11 +124,8 @@ def assess(scene: SceneOptima) -> Assessment:
     # Compute the dominant pole before the other results, because this step raises an error if the loop has too many
     # poles.
     dominant, period = scene.loop.find_dominant(float(scene.alpha), float(scene.beta)), scene.timing.period
-    margins, best, has_condition = (
-        scene.margins(),
-        scene.max_stiffness(),
-        not find_obstacle(scene),
-    )
+    margins = scene.margins() if scene.loop.has_boundary else Margins(*[math.nan] * len(Margins._fields))
+    best, has_condition = scene.max_stiffness(), not find_obstacle(scene)
     margin = float(scene.passivity_margin()) if has_condition else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
     in_stiffness, in_damping = (
@@ -246,6 +244,7 @@ IMPROVEMENTS = {
     "actuator.cutoff": (2.0, "an amplifier twice as fast"),
     "actuator.time_constant": (0.5, "an amplifier twice as fast"),
     "coupling.stiffness": (2.0, "a link twice as stiff"),
+    "tool.every": (0.5, "a physics engine twice as fast"),
 }
 
 
@@ -328,6 +327,8 @@ def describe_islands(scene: SceneOptima) -> list[str]:
     A device is unstable if it is unstable without a wall.
     """
     lines, system = [], scene.unit_system
+    if not scene.loop.has_boundary:
+        return lines
     least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
     if least is not None:
         softest = with_unit(round_conservatively(least * scene.units.stiffness, "above"), system["N/m"])
@@ -394,15 +395,20 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
         return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
     later = scene.d if scene.timing.in_periods else 2 * scene.d
+    if scene.tool is not None and 2 * scene.tool.every > FIELDS["tool.every"].allowed.high:
+        return False
     return 2 * window + later <= scene.loop.most_periods
 
 
 def _double_rate(scene: SceneOptima) -> SceneOptima:
     """Return a copy of the scene with half the sampling period.
 
-    Filter and velocity window stay constant in seconds, and the delay in the unit in which it was given.
+    Filter, velocity window and step of a slow tool stay constant in seconds, and the delay in the unit in which it was
+    given.
     """
     changes: dict[str, float] = {"period": scene.timing.period / 2}
+    if scene.tool is not None and scene.tool.every > 1:
+        changes["tool.every"] = 2 * scene.tool.every
     if isinstance(scene.velocity, WindowedDifference):
         changes["velocity.samples"] = scene.velocity.samples * 2
     if not isinstance(scene.velocity, VelocityFilter | FOAW) and scene.velocity.coded_period is not None:

@@ -23,6 +23,7 @@ import numpy as np
 from zwidth.analysis.coupling_loop import CouplingLoop
 from zwidth.analysis.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.analysis.measured_loop import MeasuredLoop
+from zwidth.analysis.slow_tool_loop import SlowToolLoop
 from zwidth.core.errors import InputError
 from zwidth.core.pytrees import list_leaves
 from zwidth.core.types import Array, ArrayLike
@@ -142,7 +143,7 @@ class SceneParts(Part):
         if self.nonrigid_parts and self.traced_path is not None:
             return self.traced_loop
         if self.tool is not None:
-            return CouplingLoop(make_plain(self))
+            return (CouplingLoop if self.tool.every == 1 else SlowToolLoop)(make_plain(self))
         return LinearLoop(make_plain(self)) if self.nonrigid_parts else RigidLoop(self)
 
     @cached_property
@@ -152,7 +153,8 @@ class SceneParts(Part):
 
     def check_parts(self) -> None:
         """Raise `InputError` for an invalid combination of parts, such as a cutoff above the Nyquist frequency."""
-        _ = self.loop.walls if isinstance(self.loop, MeasuredLoop) else self.loop.roots
+        loop = self.loop
+        _ = loop.walls if isinstance(loop, MeasuredLoop) else loop.roots if loop.has_boundary else loop.chain
 
     @cached_property
     def mass(self) -> Any:

@@ -75,13 +75,14 @@ class Tool(Part):
     damping: Any = 0.0
     stiffness: Any = 0.0
     integrator: Integrator = "semi-implicit"
+    every: int = 1
 
     def respond(self, mass: Any, period: Any) -> ToolResponse:
         """Return the response G_t = y/f of the tool, divided by T^2/m.
 
         Args:
             mass: m in kg, the unit of mass of the scene.
-            period: sampling period T in s.
+            period: length of one step of the tool in s, the sampling period T if ``every`` is 1.
         """
         rate = period / self.mass
         p, q = self.damping * rate, self.stiffness * (rate * period)
