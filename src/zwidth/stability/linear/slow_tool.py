@@ -15,7 +15,7 @@ Then the positions of the device are measured relative to y, and the state has n
 
 With the period maps H of a period without a step and S of a period with a step, the state changes over N periods by the
 *monodromy matrix* ``H^(N-1) S``. The loop is stable if and only if the spectral radius of this matrix is below 1
-(Floquet theory; docs/theory/passivity.md, U7). All matrices are stored minus the identity, because the subtraction of 1
+(Floquet theory; docs/theory/passivity.md, U9). All matrices are stored minus the identity, because the subtraction of 1
 from an eigenvalue near 1 would lose digits.
 """
 
