@@ -47,7 +47,7 @@ SUMMITS = 3  # highest local maxima of the fine grid that are refined
 ROWS, COLUMNS = 12, 17  # points of alpha and of beta in the window
 FIRST_HEIGHT = 0.1  # height of the first window, relative to alpha
 SHRINK_HEIGHT, SHRINK_WIDTH = 1 / 3, 0.5  # ratio of the sizes of two successive windows
-MAX_ZOOMS = 100  # largest number of windows
+MAX_ZOOMS = 300  # largest number of windows
 CLOSE = 1e-13  # size of the last window, relative to alpha and beta
 SAME_MODULUS = 1e-6  # largest |log|z|| per N periods of poles on the unit circle at the stiffest coupling
 
@@ -178,8 +178,9 @@ class SlowToolLoop(LinearLoop):
             status = Status.NOT_CONVERGED if summits is None else Status.NO_BOUNDARY
             return RidgePoint(nan, nan, nan, np.int32(RidgeKind.NONE), np.int32(status))
         alpha, beta = max(self._climb(*window) for window in summits)
-        if self._compute_logs(np.float64(alpha), np.float64(0.0)) < 0:
-            beta = 0.0
+        inside = np.float64(alpha * (1.0 - 10.0 * CLOSE))
+        if self._compute_logs(inside, np.float64(0.0)) < 0:
+            alpha, beta = float(inside), 0.0
         multipliers = self.model.compute_multipliers(np.array([alpha]), np.array([beta]))[0][0]
         poles = 1.0 + multipliers[multipliers.imag >= 0]
         poles = poles[np.argsort(-np.abs(poles))[:2]]
@@ -248,15 +249,23 @@ class SlowToolLoop(LinearLoop):
             height: height of the window above ``alpha`` in which the maximum is sought first.
             width: half the width of this window around ``beta``.
         """
+        highest, widest = height, width
         for _ in range(MAX_ZOOMS):
             rows, columns = np.linspace(alpha, alpha + height, ROWS), beta + width * np.linspace(-1.0, 1.0, COLUMNS)
             logs = self._compute_logs(rows[:, None], np.maximum(columns, 0.0))
             row = int(np.flatnonzero((logs < 0).any(1)).max(initial=0))
             column = int(np.argmin(logs[row]))
             alpha, beta = float(rows[row]), max(float(columns[column]), 0.0)
-            # Move the window if the best coupling is at its end, otherwise make it smaller.
-            height *= 1.0 if row == ROWS - 1 else SHRINK_HEIGHT
-            width *= 1.0 if column in (0, COLUMNS - 1) and columns[column] > 0 else SHRINK_WIDTH
+            # Enlarge the window if the best coupling is at its end, so that the window moves; otherwise shrink it.
+            at_side = column in (0, COLUMNS - 1) and columns[column] > 0
+            if row == ROWS - 1:
+                height = min(height / SHRINK_HEIGHT, highest)
+            elif not (at_side and row):
+                height *= SHRINK_HEIGHT
+            if at_side and row:
+                width = min(width / SHRINK_WIDTH, widest)
+            elif not (at_side or row == ROWS - 1):
+                width *= SHRINK_WIDTH
             if height <= CLOSE * alpha and width <= CLOSE * beta:
                 break
         return alpha, beta
