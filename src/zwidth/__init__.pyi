@@ -65,10 +65,10 @@ from .model.feedback import Feedback as Feedback
 from .model.feedback import IntegralFeedback as IntegralFeedback
 from .model.grasps import reference_grasps as reference_grasps
 from .model.joint_space import from_mass_matrix as from_mass_matrix
-from .model.joint_space import from_mujoco as from_mujoco
 from .model.linear_device import LinearDevice as LinearDevice
 from .model.measured_device import MeasuredDevice as MeasuredDevice
 from .model.mode import Mode as Mode
+from .model.mujoco_model import from_mujoco as from_mujoco
 from .model.operator import Operator as Operator
 from .model.position import ExponentialFilter as ExponentialFilter
 from .model.position import Observer as Observer

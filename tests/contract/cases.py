@@ -223,7 +223,7 @@ OTHERS = {
     "fit_log": "one device: tests/unit/identification/test_log_fit.py",
     "limits_of": "one scene: tests/unit/analysis/test_limits.py",
     "from_mass_matrix": "one device: tests/unit/model/test_joint_space.py",
-    "from_mujoco": "one device: tests/unit/model/test_joint_space.py",
+    "from_mujoco": "one device: tests/unit/model/test_mujoco_model.py",
     "load_config": "a file: tests/unit/config/test_reader.py",
     "load_scene": "a file: tests/unit/cli/test_scene_file.py",
     "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",

@@ -109,8 +109,6 @@ class SceneParts(Part):
             )
         if self.tool is not None and isinstance(self.device, MeasuredDevice):
             raise InputError("tool: not allowed with a measured response; use a model of the device")
-        if self.tool is not None and (self.position is not None or self.feedback is not None):
-            raise InputError("tool: not allowed together with position or feedback; omit the tool, or omit these parts")
 
     def _shift_parts(self) -> None:
         """Move velocity estimate and operator to their fields if the positional arguments omit the wall before them."""

@@ -24,7 +24,6 @@ from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import RidgeKind, Status
 from zwidth.model.circle_functions import circle_points
 from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, seed
-from zwidth.stability.linear.delay_margin import change_delay
 from zwidth.stability.linear.derivatives import LoopTerms, differentiate, differentiate_ridge, index_parameters, split
 from zwidth.stability.linear.margins import evaluate_walls
 from zwidth.stability.linear.passivity import PassivityCondition
@@ -203,7 +202,7 @@ def _meet_distance(terms: LoopTerms, alpha: Taylor, beta: Taylor, distance: Tayl
 def _find_delayed_angle(scene: Any, wall: list[float], delay: float) -> float | None:
     """Return the angle w of the pole that is on the unit circle if the delay grows by ``delay``, the delay margin."""
     chain, (alpha, beta) = scene.loop.chain, wall
-    loop, w = change_delay(chain, float(chain.d) + delay), np.append(scene.loop.boundary.w, np.pi)
+    loop, w = scene.loop.with_delay(float(chain.d) + delay), np.append(scene.loop.boundary.w, np.pi)
     for _ in range(ANGLE_STEPS):
         L = evaluate_walls(loop, alpha, beta, circle_points(w))
         distance = np.abs(1.0 + L.value)

@@ -160,6 +160,8 @@ def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> 
 
 def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]:
     """Return printed lines with K_max and its wall, and the percentage of K_max that the wall of the scene uses."""
+    if isinf(verdict.virtual_damping_at_max):
+        return [format_line("K_max", "none: with a sufficiently large B, every K > 0 is stable with this tool")]
     if isinf(verdict.stiffness_max):
         damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
         return [format_line("K_max", f"none: every K > 0 is stable at B = {damping} with this tool")]

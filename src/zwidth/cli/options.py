@@ -143,7 +143,8 @@ def _add_option(command: Command, path: str) -> Command:
             "A published device of `zwidth devices`, with its period and delay; other options add or replace "
             "parameters. Or, in place of mass, damping and all parts: a transfer function 'NUM / DEN' by its "
             "coefficients in s, such as '1 / 0.1 10 0', by its roots, 'zpk: ZEROS / POLES / GAIN', or by sections, "
-            "'sos: b0 b1 b2 a0 a1 a2; ..'; or a measured response FILE.csv (.npz, .mat)."
+            "'sos: b0 b1 b2 a0 a1 a2; ..'; a measured response FILE.csv (.npz, .mat); or FILE.yaml with the keys of a "
+            "device of a scene file, such as mass_matrix, or model and site of a robot."
         )
         return click.option("--device", metavar="NAME", help=words)(command)
     if path == "sampled":
@@ -209,13 +210,16 @@ def take_options(
                 if values.get("sampled") and "device" not in values:
                     raise click.UsageError("--sampled: give --device 'NUM / DEN' with coefficients in z")
                 if "device" in values:
-                    from zwidth.model.devices import read_device
+                    from zwidth.config.device_files import read_device_option
 
-                    values["device"] = read_device(values["device"], _find_sampled_period(values))
+                    options = context.meta.get(_WITH_KIND, {})
+                    values["device"] = read_device_option(
+                        values["device"], _find_sampled_period(values), rotary=bool(find_kind(options))
+                    )
                     # Ignore the unit system and the hardware of the scene file, because the option --device replaces
                     # the device of the file.
                     context.meta.pop(_HARDWARE, None)
-                    with_kind = context.meta.get(_WITH_KIND, {}) | {"--device": values["device"]}
+                    with_kind = options | {"--device": values["device"]}
                 return function(**{name: make(values, SYSTEMS[bool(find_kind(with_kind))])}, **given)
             except InputError as error:
                 field, _, text = str(error).partition(": ")
@@ -355,6 +359,8 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
         device = Device(**select("mass", "damping"), rotary=system.rotary)
     elif isinstance(device, PublishedDevice):
         timing, device = device.to_timing, device.to_device(**select("mass", "damping"))
+    elif isinstance(device, Device):
+        device = replace(device, **select("mass", "damping"))
     else:
         for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _CONTAINED):
             raise click.UsageError(

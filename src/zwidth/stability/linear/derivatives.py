@@ -76,7 +76,16 @@ class LoopTerms:
             self.late = flow(A, B, self.one - (delay - n))[1]
 
     def controller(self, lam: Taylor) -> Pair:
-        """Return q = -1/G and its derivative in lambda = log z."""
+        """Return q = -1/G and its derivative in lambda = log z; with a simulated tool, G includes its response."""
+        q = self._control_device(lam)
+        if self.scene.tool is None:
+            return q
+        response = self._respond_with_tool(lam)
+        share = 1.0 / (self.one - q[0] * response[0])
+        return q[0] * share, (q[1] + q[0] * q[0] * response[1]) * share * share
+
+    def _control_device(self, lam: Taylor) -> Pair:
+        """Return q = -1/G of the device without a tool, and its derivative in lambda."""
         z, zeta = lam.exp(), lam.expm1()
         size = len(self.full.v)
         matrix = zeta.map(lambda part: np.multiply.outer(np.eye(size), part)) - self.psi
@@ -85,8 +94,6 @@ class LoopTerms:
         change = solve(matrix, late - x * z.map(lambda part: np.asarray(part)[None]))
         q = -(lam * self.lag).exp() / x[0]
         q_slope = q * (self.one * self.lag - change[0] / x[0])
-        if self.scene.tool is not None:
-            return self._add_tool(q, q_slope, lam)
         if self.estimates is None:
             return q, q_slope
         # Here q = -1/H for the sampled plant H. With a position estimate P and further feedback R, G = H P/(1 + H R),
@@ -97,25 +104,20 @@ class LoopTerms:
     def feedback(self, lam: Taylor) -> Pair:
         """Return the ratio R/P of further feedback R and position estimate P, and its derivative in lambda.
 
-        The open loop L at the plant input is ``L = -(alpha + beta F + R/P)/(q + R/P)``.
+        The open loop L at the plant input is ``L = -(alpha + beta F + R/P)/(q + R/P)``. With a simulated tool, the
+        ratio is 0, because the open loop of a coupling is that of the coupling force, which excludes R.
         """
-        if self.estimates is None or self.estimates.feedback is None:
+        if self.estimates is None or self.estimates.feedback is None or self.scene.tool is not None:
             return self.one * 0.0, self.one * 0.0
         return _divide(self._evaluate_feedback(lam), self._evaluate_position(lam))
 
-    def _add_tool(self, q: Taylor, q_slope: Taylor, lam: Taylor) -> Pair:
-        """Return q/(1 - q G_t) and its derivative in lambda, for a simulated tool with the response G_t.
-
-        This is the critical controller -1/(G + G_t), because device and tool act like one device with the response
-        G + G_t (docs/theory/passivity.md, U5).
-        """
+    def _respond_with_tool(self, lam: Taylor) -> Pair:
+        """Return the response G_t of the simulated tool, and its derivative in lambda."""
         z, zeta = lam.exp(), lam.expm1()
         tool = self.varied.tool.respond(self.varied.mass, self.varied.timing.period)
         denominator = (zeta * tool.a2 + tool.a1) * zeta + tool.a0
         response = (lam * tool.power).exp() * tool.gain / denominator
-        slope = response * (tool.power - (zeta * (tool.a2 * 2.0) + tool.a1) * z / denominator)
-        share = 1.0 / (self.one - q * response)
-        return q * share, (q_slope + q * q * slope) * share * share
+        return response, response * (tool.power - (zeta * (tool.a2 * 2.0) + tool.a1) * z / denominator)
 
     def _evaluate_position(self, lam: Taylor) -> Pair:
         """Return the position estimate P and its derivative in lambda."""
@@ -147,13 +149,24 @@ class LoopTerms:
         if self.estimates is not None:
             if self.estimates.structure == "series":
                 return evaluate_estimate(self.estimates.velocity, lam, self.one)
-            return _divide(self._evaluate_velocity(lam), self._evaluate_position(lam))
+            ratio = _divide(self._evaluate_velocity(lam), self._evaluate_position(lam))
+            return ratio if self.scene.tool is None else self._estimate_coupling(ratio, lam)
         velocity, period = self.varied.velocity, self.varied.timing.period
         try:
             return evaluate_estimate(velocity.estimate(period), lam, self.one)
         except (TypeError, ValueError, AttributeError):
             # A user-defined velocity estimate may accept only floats.
             return self._difference_estimate(lam)
+
+    def _estimate_coupling(self, ratio: Pair, lam: Taylor) -> Pair:
+        """Return F of a coupling and its derivative in lambda, from the ratio V/P of the estimates of the device.
+
+        F is (V H + V_t G_t)/G with G = P H + G_t, so it is ``q (V/P/q_d - V_t G_t)`` with q_d = -1/(P H).
+        """
+        assert self.estimates is not None
+        tool = evaluate_estimate(self.estimates.of_tool, lam, self.one)
+        device, moved = _divide(ratio, self._control_device(lam)), _multiply(tool, self._respond_with_tool(lam))
+        return _multiply(self.controller(lam), (device[0] - moved[0], device[1] - moved[1]))
 
     def _difference_estimate(self, lam: Taylor) -> Pair:
         """Return F and F' of an estimate that accepts only floats, with first derivatives by finite differences."""
