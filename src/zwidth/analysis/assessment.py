@@ -284,10 +284,10 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
     Each part and parameter of the scene is improved separately, by a step that is available in practice: twice the
     rate, half the delay, 10 % more damping, a filter or an amplifier twice as fast, a window half as long, a coupling
-    twice as stiff, a structure twice as stiff for the modes, or a simulated tool of twice or half the mass. At twice
-    the rate the window keeps its length in seconds and the delay stays constant in the unit in which it was given; a
-    delay given in seconds is also evaluated constant in periods. If twice the cutoff exceeds the Nyquist frequency, the
-    filter is removed instead.
+    twice as stiff, a structure twice as stiff for the modes, a simulated tool of twice or half the mass, or a physics
+    engine twice as fast. At twice the rate the window keeps its length in seconds and the delay stays constant in the
+    unit in which it was given; a delay given in seconds is also evaluated constant in periods. If twice the cutoff
+    exceeds the Nyquist frequency, the filter is removed instead.
 
     Args:
         scene: a scene whose parameters are plain numbers.
@@ -337,13 +337,11 @@ def describe_islands(scene: SceneOptima) -> list[str]:
     A device is unstable if it is unstable without a wall.
     """
     lines, system = [], scene.unit_system
-    if not scene.loop.has_boundary:
-        return lines
     least = scene.loop.least_stiffness(-math.inf if allows_negative(scene, None) else 0.0)
     if least is not None:
         softest = with_unit(round_conservatively(least * scene.units.stiffness, "above"), system["N/m"])
         lines.append(f"the device is unstable without a wall: no wall softer than K = {softest} is stable")
-    for island in scene.islands():
+    for island in scene.islands() if scene.loop.has_boundary else []:
         units = {"K": (island.stiffness, system["N/m"]), "B": (island.virtual_damping, system["N s/m"])}
         ends = (f"{name} from {' to '.join(format_interval(*ends, u))}" for name, (ends, u) in units.items())
         lines.append(f"an island of stable walls, {', '.join(ends)}, is not connected to K = 0 and excluded from K_max")
@@ -408,20 +406,18 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
         return False
     if isinstance(scene.feedback, Feedback) or isinstance(scene.position, PositionFilter | Observer):
         return False
-    if getattr(scene.position, "coefficient", None) is not None:
+    too_many_periods = scene.tool is not None and 2 * scene.tool.every > FIELDS["tool.every"].allowed.high
+    if too_many_periods or getattr(scene.position, "coefficient", None) is not None:
         return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
     later = scene.d if scene.timing.in_periods else 2 * scene.d
-    if scene.tool is not None and 2 * scene.tool.every > FIELDS["tool.every"].allowed.high:
-        return False
     return 2 * window + later <= scene.loop.most_periods
 
 
 def _double_rate(scene: SceneOptima) -> SceneOptima:
     """Return a copy of the scene with half the sampling period.
 
-    Filter, velocity window and step of a slow tool stay constant in seconds, and the delay in the unit in which it was
-    given.
+    Filter, velocity window and steps of a slow tool stay constant in seconds, the delay in the unit of its input.
     """
     changes: dict[str, float] = {"period": scene.timing.period / 2}
     if scene.tool is not None and scene.tool.every > 1:

@@ -109,6 +109,9 @@ class SceneParts(Part):
             )
         if self.tool is not None and isinstance(self.device, MeasuredDevice):
             raise InputError("tool: not allowed with a measured response; use a model of the device")
+        if self.tool is not None and self.tool.every > 1 and (self.position is not None or self.feedback is not None):
+            name = "feedback" if self.position is None else "position"
+            raise InputError(f"{name}: not allowed with tool.every = {self.tool.every}; omit {name}, or set every=1")
 
     def _shift_parts(self) -> None:
         """Move velocity estimate and operator to their fields if the positional arguments omit the wall before them."""

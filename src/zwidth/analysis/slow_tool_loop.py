@@ -61,9 +61,6 @@ class SlowToolLoop(LinearLoop):
     def model(self) -> SlowToolModel:
         """State-space model of the loop, from which the monodromy matrices of couplings follow."""
         scene, every = self.scene, int(self.scene.tool.every)
-        for name in ("position", "feedback"):
-            if getattr(scene, name) is not None:
-                raise InputError(f"{name}: not allowed with tool.every = {every}; omit {name}, or set every=1")
         response = scene.tool.respond(float(scene.mass), every * float(scene.timing.period))
         return SlowToolModel.build(self.chain, response, every)
 

@@ -224,6 +224,15 @@ def test_other_results_are_refused(call):
         call(make_scene(8))
 
 
+@pytest.mark.parametrize(
+    "part", [{"position": zwidth.ExponentialFilter(cutoff=100)}, {"feedback": zwidth.IntegralFeedback(1)}]
+)
+def test_position_estimates_are_refused(part):
+    (name,) = part
+    with pytest.raises(zwidth.InputError, match=rf"{name}: not allowed with tool\.every = 8"):
+        make_scene(8).replace(**part)
+
+
 @pytest.mark.parametrize("value", [0, -1, 1.5, 1001, "2", None, True])
 def test_invalid_steps(value):
     with pytest.raises(zwidth.InputError, match=r"tool\.every: got"):
@@ -237,7 +246,7 @@ def test_assessment_and_improvements():
     assert verdict.stiffness_max == pytest.approx(8011.5, rel=1e-4)
     assert verdict.spectral_radius == pytest.approx(float(scene.spectral_radius()))
     assert np.isnan(verdict.gain_margin)
-    labels = [limit.label for limit in zwidth.limits_of(scene)]
+    labels = [limit.label for limit in zwidth.limits_of(make_scene(4))]
     assert "a physics engine twice as fast" in labels
     walls = zwidth.stiffest_walls(scene, {"tool.every": [1, 8]})
     assert walls.stiffness.tolist() == pytest.approx([22200.6, 8011.5], rel=1e-4)
