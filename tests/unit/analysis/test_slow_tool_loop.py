@@ -1,14 +1,17 @@
 """Scenes with a tool that makes one step every N periods, against a simulation of each event of the composed loop."""
 
+import json
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.linalg import expm
 
 import zwidth
 from zwidth.analysis.slow_tool_loop import SlowToolLoop
+from zwidth.cli.commands import cli
 
 PERIOD = 1e-3
 INTEGRATORS = ("semi-implicit", "implicit")
@@ -155,6 +158,28 @@ def test_monodromy_matrix_of_one_period_equals_poles(seed):
     assert (loop.labels(*walls) == scene.is_stable(K, B))[np.abs(expected - 1) > 1e-9].all()
 
 
+DEVICES = {
+    "tip": zwidth.Device(0.1, 5, coupling=zwidth.Coupling(0.05, 20e3, 1, "tip")),
+    "actuator": zwidth.Device(0.1, 5, actuator=zwidth.Actuator(cutoff=200, order=2)),
+    "mode": zwidth.Device(0.1, 5, modes=[zwidth.Mode(frequency=80, damping_ratio=0.02, mass=0.5)]),
+    "linear": zwidth.LinearDevice("1 / 0.1 5 0"),
+    "spring": zwidth.LinearDevice("1 / 0.1 5 300"),
+    "sampled": zwidth.LinearDevice("4.9e-6 4.8e-6 / 1 -1.95 0.95", sampled="1 ms"),
+}
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("stiffness", [0, 50])
+def test_monodromy_matrix_of_one_period_with_every_device(device, integrator, stiffness):
+    tool, timing = zwidth.Tool(0.2, 0, stiffness, integrator), zwidth.Timing(PERIOD, "1 periods")
+    scene = zwidth.Scene(DEVICES[device], timing, velocity=zwidth.Butterworth(100, 3), tool=tool)
+    loop, rng = SlowToolLoop(scene), np.random.default_rng(1)
+    K, B = 10 ** rng.uniform(1, 5, 20), 10 ** rng.uniform(-1, 2, 20)
+    np.testing.assert_allclose(loop.radius(*scene.normalize_walls(K, B)), scene.spectral_radius(K, B), rtol=1e-10)
+    assert scene.replace(**{"tool.every": 3}).max_stiffness().status == zwidth.Status.OK
+
+
 @pytest.mark.parametrize(("mass", "n_delay"), [(1, 0), (0.3, 0), (0.3, 1), (0.1, 1)])
 def test_monodromy_matrix_of_one_period_has_the_same_stiffest_coupling(mass, n_delay):
     scene = make_scene(1, mass, n_delay)
@@ -186,6 +211,14 @@ def test_numbers_of_the_guide(case):
     undamped, top = scene.stable_stiffness(0)[0], scene.max_stiffness()
     assert undamped.tolist() == pytest.approx([0, TABLE[case][0]], rel=1e-4)
     assert top.stiffness == pytest.approx(TABLE[case][1], rel=1e-5)
+
+
+def test_cutoff_above_the_nyquist_frequency_is_refused():
+    scene = make_scene(8).replace(velocity=zwidth.LowPass(cutoff=600))
+    with pytest.raises(zwidth.InputError, match="cutoff"):
+        scene.check_parts()
+    with pytest.raises(zwidth.InputError, match="cutoff"):
+        scene.is_stable(1e3, 1)
 
 
 def test_dominant_pole_and_poles():
@@ -250,6 +283,40 @@ def test_assessment_and_improvements():
     assert "a physics engine twice as fast" in labels
     walls = zwidth.stiffest_walls(scene, {"tool.every": [1, 8]})
     assert walls.stiffness.tolist() == pytest.approx([22200.6, 8011.5], rel=1e-4)
+
+
+def test_command_line_and_configuration(tmp_path):
+    options = [
+        *("--mass", "0.1", "--damping", "10", "--rate", "1kHz", "--delay", "1ms"),
+        *("--tool-mass", "300g", "--tool-every", "8"),
+    ]
+    result = CliRunner().invoke(cli, ["check", *options, "--stiffness", "1 kN/m", "--virtual-damping", "0.5", "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.output)["stiffness_max"] == pytest.approx(8011.5, rel=1e-4)
+    ridge = CliRunner().invoke(cli, ["ridge", *options])
+    assert ridge.exit_code == 0, ridge.output
+    assert "8.011 kN/m" in ridge.output
+    refused = CliRunner().invoke(cli, ["recommend", *options])
+    assert refused.exit_code != 0
+    assert "set every=1" in refused.output
+    (tmp_path / "sweep.yaml").write_text(
+        """
+version: 1
+name: engines
+scene: {mass: 100 g, damping: 10, period: 1 ms, delay: 1 ms, tool: {mass: 300 g, every: 8}}
+studies:
+  - kind: sweep
+    name: walls
+    axes: {tool.every: [1, 8], stiffness: [500, 5000], virtual_damping: [0.5]}
+    outputs: [stable, spectral_radius]
+"""
+    )
+    run = CliRunner().invoke(cli, ["run", str(tmp_path / "sweep.yaml"), "--out", str(tmp_path / "out")])
+    assert run.exit_code == 0, run.output
+    with zwidth.open_dataset(tmp_path / "out" / "walls.zarr") as sweep:
+        radius = sweep.spectral_radius.squeeze().values
+    expected = [make_scene(every).spectral_radius([500, 5000], 0.5) for every in (1, 8)]
+    np.testing.assert_allclose(radius, expected, rtol=1e-12)
 
 
 def test_transformations_of_jax():
