@@ -4,8 +4,8 @@ The loop is periodic with the period N T. Its poles are the eigenvalues of the m
 the loop to the state N periods later (`zwidth.stability.linear.slow_tool`). alpha and beta are the normalized stiffness
 and damping of the coupling. The eigenvalues depend on alpha and beta in a nonlinear way, so the stable couplings are
 found by samples of the spectral radius and refinement of its crossings of 1: on geometric grids along a line of
-constant alpha or beta, and on a grid in the plane for the stiffest coupling. The answers that need the stability
-boundary as a curve, such as margins, islands and derivatives, are not available; they raise `InputError`.
+constant alpha or beta, and on a grid in the plane for the stiffest coupling. Methods that need the stability boundary
+as a curve, such as those for margins, islands and derivatives, raise `InputError`.
 """
 
 from __future__ import annotations
@@ -171,10 +171,10 @@ class SlowToolLoop(LinearLoop):
         if negative:
             raise InputError(f"negative_damping: must be False with tool.every = {self.model.every}; omit it")
         summits, nan = self._find_summits(), np.float64(np.nan)
-        if not summits:
-            status = Status.NOT_CONVERGED if summits is None else Status.NO_BOUNDARY
+        alpha, beta, converged = max([self._climb(*window) for window in summits or []], default=(0.0, 0.0, False))
+        if not converged:
+            status = Status.NO_BOUNDARY if summits == [] else Status.NOT_CONVERGED
             return RidgePoint(nan, nan, nan, np.int32(RidgeKind.NONE), np.int32(status))
-        alpha, beta = max(self._climb(*window) for window in summits)
         inside = np.float64(alpha * (1.0 - 10.0 * CLOSE))
         if self._compute_logs(inside, np.float64(0.0)) < 0:
             alpha, beta = float(inside), 0.0
@@ -237,8 +237,8 @@ class SlowToolLoop(LinearLoop):
         tops[column] = find_zeros_in_brackets(lambda x: self._compute_logs(x, beta[column]), *ends)
         return tops
 
-    def _climb(self, alpha: float, beta: float, height: float, width: float) -> tuple[float, float]:
-        """Return alpha and beta of a local maximum of alpha on the boundary of the stable couplings.
+    def _climb(self, alpha: float, beta: float, height: float, width: float) -> tuple[float, float, bool]:
+        """Return alpha and beta of a local maximum of alpha of the stable couplings, and whether the search converged.
 
         Args:
             alpha: alpha of a stable coupling.
@@ -250,7 +250,8 @@ class SlowToolLoop(LinearLoop):
         for _ in range(MAX_ZOOMS):
             rows, columns = np.linspace(alpha, alpha + height, ROWS), beta + width * np.linspace(-1.0, 1.0, COLUMNS)
             logs = self._compute_logs(rows[:, None], np.maximum(columns, 0.0))
-            row = int(np.flatnonzero((logs < 0).any(1)).max(initial=0))
+            # Stop below the first row without a stable coupling, because the window must not move to another region.
+            row = max(int(np.argmin(np.append((logs < 0).any(1)[1:], False))), 0)
             column = int(np.argmin(logs[row]))
             alpha, beta = float(rows[row]), max(float(columns[column]), 0.0)
             # Enlarge the window if the best coupling is at its end, so that the window moves; otherwise shrink it.
@@ -263,9 +264,9 @@ class SlowToolLoop(LinearLoop):
                 width = min(width / SHRINK_WIDTH, widest)
             elif not (at_side or row == ROWS - 1):
                 width *= SHRINK_WIDTH
-            if height <= CLOSE * alpha and width <= CLOSE * beta:
-                break
-        return alpha, beta
+            if height <= CLOSE * alpha and width <= CLOSE * max(beta, widest):
+                return alpha, beta, True
+        return alpha, beta, False
 
 
 def space(low: float, high: float, per_decade: int) -> Array:
