@@ -2,7 +2,9 @@
 
 from .analysis.admittance import AdmittanceDisplay as AdmittanceDisplay
 from .analysis.admittance import EnvironmentLimit as EnvironmentLimit
+from .analysis.admittance import VirtualDampingLimit as VirtualDampingLimit
 from .analysis.admittance import VirtualMassLimit as VirtualMassLimit
+from .analysis.admittance_motion import AdmittanceMotion as AdmittanceMotion
 from .analysis.assessment import Assessment as Assessment
 from .analysis.assessment import Limit as Limit
 from .analysis.assessment import assess as assess

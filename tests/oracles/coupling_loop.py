@@ -39,12 +39,13 @@ class Coupling:
         """Return the next state, and the commanded force."""
         n, m = self.estimates.size, self.velocity.size
         program, memory, (y, v) = state[:n], state[n : n + m], state[n + m :]
-        outputs = []
-        for K, B in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
-            self.estimates.K, self.estimates.B = K, B
-            later, force = self.estimates.step(program, x)
-            outputs.append(force)
-        rest, p, speed = outputs[0], outputs[0] - outputs[1], outputs[0] - outputs[2]
+        weights, self.estimates.K, self.estimates.B = self.estimates.weights, 0.0, 0.0
+        later, rest = self.estimates.step(program, x)
+        # Evaluate the estimates without the further feedback, whose large force would cancel.
+        self.estimates.weights, estimates = None, []
+        for self.estimates.K, self.estimates.B in ((-1.0, 0.0), (0.0, -1.0)):
+            estimates.append(self.estimates.step(program, x)[1])
+        self.estimates.weights, (p, speed) = weights, estimates
 
         def couple(y: float) -> tuple[np.ndarray, float]:
             """Return the next state of the velocity filter, and the force of the coupling, for a position y."""

@@ -26,8 +26,8 @@ from zwidth.analysis.assessment import (
     round_margin,
 )
 from zwidth.analysis.cautions import judge_grasps, list_cautions
+from zwidth.analysis.coupling_code import write_program
 from zwidth.analysis.optimization import SceneOptima, StiffestWall
-from zwidth.analysis.wall_code import write_wall
 from zwidth.analysis.wall_search import COARSE, Grasps, Requirements, choose_wall, list_grasped_scenes, measure_slack
 from zwidth.core.errors import InputError
 from zwidth.core.status import Status
@@ -177,7 +177,7 @@ class Recommendation:
         return {} if self.status != Status.OK else judge_grasps(self.scene)
 
     def code(self, language: Literal["c", "python"] = "c", *, max_force: float | str = math.inf) -> str:
-        """Return the wall and its velocity estimate as source code for a control loop.
+        """Return the wall, or the coupling and its tool, with the velocity estimate as source code for a control loop.
 
         Args:
             language: "c" (C99 without any library) or "python".
@@ -187,7 +187,8 @@ class Recommendation:
             Source code with a state, a function that initializes it at rest, and a function to call once per period,
             which converts the position in m, positive into the wall, to the force on the device in N. The forces equal
             those of `zwidth.simulate` with ``contact="unilateral"`` and the same ``max_force``, except for rounding
-            errors.
+            errors. If the scene has a tool, the program also integrates the tool, and the forces equal those of
+            `zwidth.simulate` with ``contact="bilateral"``.
 
         Raises:
             InputError: no wall is recommended, the language is unknown, or ``max_force`` is not positive.
@@ -195,7 +196,7 @@ class Recommendation:
         if self.status != Status.OK:
             raise InputError(f"code: there is no wall: {self.reason}")
         limit = check_limit("max_force", max_force, self.unit_system["N"])
-        return write_wall(self.scene, language, self.cautions, limit)
+        return write_program(self.scene, language, self.cautions, limit)
 
     def lines(self) -> tuple[str, ...]:
         """Return lines of text on the wall, its margins and its cautions, or the reason why no wall is recommended."""

@@ -60,9 +60,8 @@ class SlowToolLoop(LinearLoop):
     @cached_property
     def model(self) -> SlowToolModel:
         """State-space model of the loop, from which the monodromy matrices of couplings follow."""
-        scene, every = self.scene, int(self.scene.tool.every)
-        response = scene.tool.respond(float(scene.mass), every * float(scene.timing.period))
-        return SlowToolModel.build(self.chain, response, every)
+        scene = self.scene
+        return SlowToolModel.build(self.chain, scene.tool.compute_step(float(scene.mass), float(scene.timing.period)))
 
     @cached_property
     def roots(self) -> LoopRoots:
@@ -134,7 +133,7 @@ class SlowToolLoop(LinearLoop):
         alpha = float(wall.alpha) if wall.status == Status.OK and wall.alpha > 0 else 1.0
         beta = max(alpha, float(wall.beta)) if np.isfinite(wall.beta) else alpha
         # A tool of mass M between fixed walls, integrated with steps of N T, allows alpha up to 4 M/(m N^2).
-        light = LIGHT_TOOL * self.model.a2 / self.model.gain
+        light = LIGHT_TOOL / self.model.gain
         return (
             (min(LOWEST * alpha, light), HIGHEST * alpha),
             (min(LOWEST * beta, light * self.model.every), HIGHEST * beta),

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.analysis.environment_derivatives import find_environment_limits
 from zwidth.analysis.optimization import SIDES
 from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError
@@ -354,8 +355,12 @@ ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {
     "margins": (find_margins, 7),
     "passivity_margin": (find_passivity_margin, 1),
     "required": (find_required, 5),
+    "environment_limit": (find_environment_limits, 3),
 }
-"""Function that computes results with derivatives, and their number, for each method of `zwidth.analysis.loop`."""
+"""Function that computes results with derivatives, and their number, for each method of `zwidth.analysis.loop`.
+
+The method "environment_limit" belongs to `zwidth.AdmittanceDisplay`, which takes the place of the scene.
+"""
 
 # Values for scenes with a parameter out of range, for methods whose values are then not all NaN; the label 0 means
 # "not stable".
@@ -363,4 +368,5 @@ INVALID = {
     "stiffest": [np.nan, np.nan, np.nan, RidgeKind.NONE, Status.INVALID_INPUT],
     "labels": [0.0],
     "required": [np.nan, SIDES.index("nowhere"), np.nan, np.nan, Status.INVALID_INPUT],
+    "environment_limit": [np.nan, np.nan, Status.INVALID_INPUT],
 }

@@ -282,8 +282,9 @@ def list_slopes(scene: Scene) -> list[Slope]:
             # Skip the dampings of joints, because their units depend on the kind of joint, which is unknown.
             continue
         unit, value = system[get_unit(path)], float(slope)
-        # Choose the scale of the parameter: the period for a delay, because the delay may be 0; otherwise its value.
-        size = scene.timing.period if path == "delay" else values[path]
+        # Choose the scale of the parameter: the period for a delay, because the delay may be 0; otherwise the magnitude
+        # of its value, because modal masses and weights of feedback may be negative.
+        size = scene.timing.period if path == "delay" else abs(values[path])
         by_one = not size or unit == "N s/m"
         # Choose the step of the parameter whose effect is stated: the power of ten nearest to one percent of the scale;
         # 1 N s/m for a linear damping; 1 or, for rotary devices, 1e-3 if the scale is 0.

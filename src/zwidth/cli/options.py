@@ -26,7 +26,7 @@ from zwidth.model.checks import Span, find_kind, read_span
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.mode import Mode
-from zwidth.model.parameter_paths import PARTS, WITH_KIND, find_parts
+from zwidth.model.parameter_paths import CONTAINED, PARTS, WITH_KIND, find_parts
 from zwidth.model.timing import Timing
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.units.parsing import DIMENSIONS, detect_kind, looks_like_number, read_quantity, read_share
@@ -48,8 +48,6 @@ Command: TypeAlias = Callable[..., Any]
 # Names of the parts of a scene; and the paths of the parameters of all parts, sorted by part.
 _PART_NAMES = tuple(dict.fromkeys(("velocity", *WITH_KIND, *(path.rpartition(".")[0] for path in OF_PARTS))))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
-# Parts that cannot be added to a linear system or a measured response, because such a device includes them.
-_CONTAINED = ("operator", "coupling", "actuator", "modes")
 # Names of the structural modes among the parts: "modes.0", "modes.1" and so on.
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
 _BARE = {"mass", "damping"}  # parameters of a rigid device
@@ -362,7 +360,7 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
     elif isinstance(device, Device):
         device = replace(device, **select("mass", "damping"))
     else:
-        for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _CONTAINED):
+        for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in CONTAINED):
             raise click.UsageError(
                 f"{name_option(path)}: the given --device already contains it; give only one of the two"
             )

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, RootModel
 
-from zwidth.config.devices import MODEL_SUFFIXES, DeviceForm
+from zwidth.config.devices import DeviceForm
 from zwidth.config.fields import problem
 from zwidth.config.reader import read_model
 from zwidth.core.errors import InputError
@@ -15,6 +15,7 @@ from zwidth.model.device import Device
 from zwidth.model.devices import PublishedDevice, read_device
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.measured_device import MeasuredDevice
+from zwidth.model.mujoco_model import MODEL_SUFFIXES
 
 _SUFFIXES = (".yaml", ".yml", ".json")
 

@@ -29,12 +29,12 @@ from zwidth.model.device import Device
 from zwidth.model.devices import DEVICES
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.measured_device import SUFFIXES, MeasuredDevice
-from zwidth.model.parameter_paths import PARTS
+from zwidth.model.mujoco_model import MODEL_SUFFIXES
+from zwidth.model.parameter_paths import CONTAINED
 from zwidth.model.system_forms import parse_system
 from zwidth.units.formatting import describe, suggestion
 from zwidth.units.quantities import HARDWARE, POSITIVE
 
-MODEL_SUFFIXES = (".xml", ".urdf", ".mjb")  # endings of the names of model files of MuJoCo
 FORMS = "a published name, 'NUMERATOR / DENOMINATOR' in s, a table FILE.csv of a response, or a mapping"
 # Keys of each form of a linear system. The last key identifies the form, because it is required and in no other form.
 _SYSTEM_FORMS = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"), ("sos",))
@@ -253,11 +253,19 @@ def find_second_period(keys: Iterable[str]) -> Iterable[LocatedProblem]:
 
 
 def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
-    """Yield a problem for each key that a linear system or measured response replaces: mass, damping and parts."""
+    """Yield a problem for each key that a system, a response or joints replace: mass, damping and parts."""
+    device = keys.get("device")
+    has_joints = isinstance(device, dict) and bool(_IDENTIFYING[MassMatrixSection] & device.keys())
+    has_joints |= isinstance(device, MassMatrixSection) or (isinstance(device, dict) and "model" in device)
     for key in keys:
-        if key.partition(".")[0] in ("mass", "damping", *PARTS, "modes") and keys[key]:
-            message, allowed = f"got {key!r} together with a system or response", "the system or response contains it"
-            yield (key,), problem(message, allowed, "remove one", on_key=True)
+        if key.partition(".")[0] not in ("mass", "damping", *CONTAINED) or not keys[key]:
+            continue
+        message, allowed, remedy = "a system or response", "the system or response contains it", "remove one"
+        if has_joints:
+            message, allowed = "joints", "the joints determine mass and damping"
+            if key not in ("mass", "damping"):
+                allowed, remedy = "an arm that is no rigid mass has no separate parts", "add them to its matrices"
+        yield (key,), problem(f"got {key!r} together with {message}", allowed, remedy, on_key=True)
 
 
 def _add_device(schema: dict[str, Any]) -> None:

@@ -251,6 +251,7 @@ _SECTIONS: Any = {
     name: make_section(part, name, f"{'an' if name[0] in 'aeiou' else 'a'} {name}") for name, part in PARTS.items()
 }
 ModeSection: Any = make_section(Mode, "mode", "a mode")
+ActuatorSection: Any = _SECTIONS["actuator"]
 
 
 class SafeLimitSection(PartSection, noun="a safe limit"):

@@ -32,7 +32,7 @@ from zwidth.core.errors import InputError
 from zwidth.core.xp import within
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
-from zwidth.model.parameter_paths import PARTS, replace_parameters
+from zwidth.model.parameter_paths import CONTAINED, replace_parameters
 from zwidth.model.timing import Timing
 from zwidth.model.velocity import FOAW
 from zwidth.model.wall import VirtualWall
@@ -51,7 +51,7 @@ class _PhysicalPlant(_Parts, SampledMass):
             allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
             yield ("delay",), problem(f"got {self.delay}, which is {short(self.d)} periods", allowed, "check the units")
             return
-        if self.device is not None and any(getattr(self, name) for name in (*PARTS, "modes")):
+        if self.device is not None and any(getattr(self, name) for name in CONTAINED):
             # Skip the checks below, because parts that conflict with a linear system or measured response are already
             # reported.
             return

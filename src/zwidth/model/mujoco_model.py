@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,8 @@ from zwidth.model.joint_space import from_mass_matrix
 from zwidth.model.linear_device import LinearDevice
 from zwidth.units.parsing import looks_like_number
 from zwidth.units.quantities import ANY
+
+MODEL_SUFFIXES = (".xml", ".urdf", ".mjb")  # endings of the names of model files
 
 
 class JointSpace(NamedTuple):
@@ -148,6 +151,24 @@ def load_model(model: Any) -> Any:
         return load(str(path))
     except ValueError as error:
         raise InputError(f"model: MuJoCo cannot read {str(path)!r}: {error}") from None
+
+
+def pack_model(path: Path) -> tuple[bytes, str]:
+    """Return a self-contained copy of a model file: its content, and the suffix of its name.
+
+    The content is that of the file if the model needs no other files. Otherwise, for example with meshes or included
+    files, it is the compiled model in MuJoCo's binary format ".mjb", which the same release of MuJoCo can read.
+    """
+    content = path.read_bytes()
+    with TemporaryDirectory() as folder:
+        copy, compiled = Path(folder, path.name), Path(folder, "compiled.mjb")
+        copy.write_bytes(content)
+        try:
+            load_model(copy)
+        except InputError:
+            _import_mujoco().mj_saveModel(load_model(path), str(compiled))
+            return compiled.read_bytes(), compiled.suffix
+    return content, path.suffix
 
 
 def _reject_constraints(model: Any) -> None:

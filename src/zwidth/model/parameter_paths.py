@@ -58,6 +58,8 @@ _BARE = ("device", "timing", "wall")  # parts whose parameters have paths withou
 _WHOLE = ("safe_limit",)  # parts that can only be replaced as a whole, because their parameters have no paths
 PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator, "tool": Tool}
 """Classes of the optional parts of a scene, by name, in the order in which descriptions list these parts."""
+CONTAINED = ("operator", "coupling", "actuator", "modes")
+"""Parts that a linear system or a measured response already contains, so that they cannot be added to it."""
 WITH_KIND: dict[str, dict[str, Any]] = {"position": POSITIONS, "feedback": FEEDBACKS}
 """Classes of position estimates and of further feedback, keyed by the name of the part and the name of the kind."""
 _OF_DEVICE = ("coupling", "actuator")  # optional parts that are fields of the device

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from scipy.linalg import expm
 
 import zwidth
+from zwidth.analysis.coupling_code import write_program
 from zwidth.analysis.slow_tool_loop import SlowToolLoop
 from zwidth.cli.commands import cli
 
@@ -49,13 +50,20 @@ class Composed:
 
     def compute_radius(self, K, B, drift=False):
         """Return the spectral radius per period; ``drift``: without the pole of a common displacement."""
-        state = np.eye(self.size)
+        multipliers = np.linalg.eigvals(self.run(K, B, np.eye(self.size), self.every)[0])
+        if drift:
+            multipliers = np.delete(multipliers, np.argmin(np.abs(multipliers - 1.0)))
+        return np.abs(multipliers).max() ** (1.0 / self.every)
+
+    def run(self, K, B, state, periods):
+        """Return the state after some periods; and the positions of device and tool, and the force, at each sample."""
         device, state = state[: self.count], state[self.count :]
         queue, state = list(state[: self.n + 1]), state[self.n + 1 :]
         velocity, distance, y, speed = state
         M, c, k = self.tool
-        for period in range(self.every):
-            step, tick = self.every * PERIOD, period == 0
+        samples = []
+        for period in range(periods):
+            step, tick = self.every * PERIOD, period % self.every == 0
             gain = B * (1.0 - self.pole) / PERIOD
             if tick and self.integrator == "implicit":
                 # f = f0 - (K + gain) y with the new y = y + step * speed and the new speed.
@@ -66,17 +74,15 @@ class Composed:
             e = device[0] - y
             velocity = self.pole * velocity + (1.0 - self.pole) * (e - distance) / PERIOD
             distance, f = e, K * e + B * velocity
+            samples.append((device[0], y, f))
             if tick and self.integrator == "semi-implicit":
                 speed = speed + step / M * (f - c * speed - k * y)
                 y = y + step * speed
             queue = [-f, *queue]
             for part, force in zip(self.parts, (queue[self.n + 1], queue[self.n]), strict=True):
-                device = part @ np.vstack([device, force])
+                device = part @ np.concatenate([device, force[None]])
             queue = queue[: self.n + 1]
-        multipliers = np.linalg.eigvals(np.vstack([device, *queue, velocity, distance, y, speed]))
-        if drift:
-            multipliers = np.delete(multipliers, np.argmin(np.abs(multipliers - 1.0)))
-        return np.abs(multipliers).max() ** (1.0 / self.every)
+        return np.array([*device, *queue, velocity, distance, y, speed]), np.array(samples)
 
 
 def draw_case(seed):
@@ -211,6 +217,33 @@ def test_numbers_of_the_guide(case):
     undamped, top = scene.stable_stiffness(0)[0], scene.max_stiffness()
     assert undamped.tolist() == pytest.approx([0, TABLE[case][0]], rel=1e-4)
     assert top.stiffness == pytest.approx(TABLE[case][1], rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_simulation_against_events(seed):
+    scene, unit, composed, _, _ = draw_case(seed)
+    K, B, periods = 0.3 * unit, 0.05 * unit * PERIOD, 200
+    start = np.zeros(composed.size)
+    start[-3], start[-2] = -1e-3, 1e-3  # distance before the first sample, and position of the tool
+    expected = composed.run(K, B, start, periods)[1]
+    motion = zwidth.simulate(scene, K, B, start_position={"tool_position": 1e-3}, periods=periods)
+    for name, values in zip(("measured", "tool_position", "coupling_force"), expected.T, strict=True):
+        np.testing.assert_allclose(getattr(motion, name), values, rtol=0, atol=1e-12 * np.abs(values).max())
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_program_and_growth_of_the_simulation(integrator):
+    scene = make_scene(5, damping=10, integrator=integrator).replace(wall=zwidth.VirtualWall(1500, 1))
+    external = 2.0 * np.sin(np.arange(300) / 30.0)
+    motion = zwidth.simulate(scene, periods=300, start_position=2e-3, external_force_history=external)
+    names: dict[str, Any] = {}
+    exec(write_program(scene, "python"), names)
+    coupling = names["Coupling"](motion.measured[0])
+    force = np.array([coupling.force(x) for x in motion.measured.tolist()])
+    np.testing.assert_allclose(force, motion.command, rtol=0, atol=1e-12 * np.abs(motion.command).max())
+    limit = scene.stable_stiffness(0)[0, 1]
+    kinds = [scene.simulate(factor * limit, 0, start_velocity=0.1, periods=20_000).outcome for factor in (0.98, 1.02)]
+    assert kinds == [zwidth.MotionKind.DECAYING, zwidth.MotionKind.GROWING]
 
 
 def test_cutoff_above_the_nyquist_frequency_is_refused():

@@ -74,6 +74,14 @@ studies: [{{kind: recommend, name: wall}}]
 """
 
 
+def test_sensitivity_to_a_negative_modal_mass_is_printed():
+    # The modal mass is negative if actuator and sensor move in opposite directions.
+    mode = ["--modes-0-frequency", "120 Hz", "--modes-0-damping-ratio", "0.02", "--modes-0-mass", "-0.5"]
+    lines = ridge(*DEVICE, *mode).splitlines()
+    (line,) = [line for line in lines if line.startswith("dK_max/d(modes.0.mass)")]
+    assert line.endswith("for 10 g more")
+
+
 def test_maximum_above_the_safe_limit_has_a_caution(tmp_path):
     file = tmp_path / "fitted.yaml"
     file.write_text(

@@ -73,6 +73,14 @@ def test_rigid_arm_is_a_mass_that_accepts_a_hand(load):
     assert scene.operator == zwidth.Operator(0.1)
 
 
+@pytest.mark.parametrize("damping", ["0", "0.02"])
+def test_arm_has_a_simulated_tool(load, damping):
+    scene = load(scene_with(f"{MATRIX}, damping: {damping}", f"{TIMED}, tool: {{mass: 300 g}}")).scene.to_scene()
+    arm = zwidth.from_mass_matrix([[0.03, 0.01], [0.01, 0.01]], float(damping), jacobian=[[-0.2, -0.1]])
+    expected = zwidth.Scene(arm, zwidth.Timing("1 ms", "1 ms"), tool=zwidth.Tool(0.3)).max_stiffness()
+    assert scene.max_stiffness().stiffness == expected.stiffness
+
+
 @pytest.mark.parametrize(
     ("pose", "given"),
     [
@@ -150,8 +158,8 @@ def test_studies_and_sweeps_have_their_own_arms(load):
         (f"{MATRIX}, dampng: 1", TIMED, "device.dampng", "did you mean 'damping'"),
         (f"{MATRIX}, damping: [1, 2, 3]", TIMED, "device.damping", "got 3 values for 2 joints"),
         (f"{MATRIX}, damping: 3 kg", TIMED, "device.damping", "the units allowed are"),
-        (MATRIX, f"{TIMED}, mass: 1 kg", "mass", "remove one"),
-        (f"{MATRIX}, damping: 1", f"{TIMED}, operator: {{mass: 1}}", "operator", "remove one"),
+        (MATRIX, f"{TIMED}, mass: 1 kg", "mass", "the joints determine mass and damping; remove one"),
+        (f"{MATRIX}, damping: 1", f"{TIMED}, operator: {{mass: 1}}", "operator", "add them to its matrices"),
         ("model: arm.xml, site: hand, direction: x", TIMED, "device.site", "did you mean 'handle'"),
         ("model: arn.xml, site: handle, direction: x", TIMED, "device.model", "not a file"),
         ("model: arm.xml, site: handle", TIMED, "device.direction", "missing"),

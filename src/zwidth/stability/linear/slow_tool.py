@@ -2,12 +2,12 @@
 
 The program computes the coupling force f from the distance e = x - y of device and tool in each period. The engine
 integrates the tool by one step of length N T at the samples 0, N, 2 N, ...; between these steps the position y of the
-tool is constant. In normalized units (T = 1 and the mass m = 1), with the states s of the velocity estimate, the
-*increment* w of y per step, and the response of the tool (`model.tool.Tool.respond` with the period N T and the gain g
-in units of (N T)^2/m), one period changes the state Z = (s, device, delayed forces, w, y) as follows:
+tool is constant. In normalized units (T = 1 and the mass m = 1), with the states s of the velocity estimate F and the
+*increment* w of y per step (`model.tool.ToolStep`), one period changes the state Z = (s, device, delayed forces, w, y)
+as follows:
 
     every period     f = alpha e + beta F e;  velocity estimate and device advance by one period with the force -f
-    every N periods  w = ((a2 - a1 + a0) w + g N^2 f - a0 y)/a2;  y = y + w
+    every N periods  w = decay w - spring y + gain f;  y = y + w
 
 "semi-implicit": f is computed from the old y; all samples after the step have the new y. "implicit": f is computed from
 the new y, in the period of the step also. If device and tool are free, a common displacement of both does not change e.
@@ -28,7 +28,7 @@ import numpy as np
 from zwidth.core.types import Array
 from zwidth.model.mechanism import AnyChain
 from zwidth.model.state_space import realize_estimate
-from zwidth.model.tool import ToolResponse
+from zwidth.model.tool import ToolStep
 from zwidth.plant.sampled_states import sample_states
 from zwidth.stability.linear.composition import find_roots
 from zwidth.stability.linear.poles import log_modulus
@@ -53,25 +53,17 @@ class SlowToolModel:
     distance: Array  # row of e
     velocity: Array  # row of the velocity estimate F e
     increment: Array  # row of w
-    step: Array  # change of the increment in one step without force, as a row, times a2
+    step: Array  # row of the change of w in one step without force
     moved: Array  # change of the state if y increases by 1 while the device stays where it is
-    gain: float  # g N^2
-    a2: float  # leading coefficient of the denominator of the tool's response
+    gain: float  # gain of the step of the tool
     feedthrough: float | None  # direct feedthrough of the velocity estimate; None for "semi-implicit"
 
     @classmethod
-    def build(cls, chain: AnyChain, tool: ToolResponse, every: int) -> SlowToolModel:
-        """Return the model of a device and a tool.
-
-        Args:
-            chain: model of device, hand, delay and velocity estimate.
-            tool: response of the tool with the period N T.
-            every: N, periods per step of the engine.
-        """
+    def build(cls, chain: AnyChain, tool: ToolStep) -> SlowToolModel:
+        """Return the model of a device with hand, delay and velocity estimate (``chain``), and of a tool."""
         F, plant, states = realize_estimate(chain.estimate), sample_states(chain), sample_states(chain).realize()
         n_filter, n_body, n_device = len(F.A), plant.psi.shape[-1], len(states.A)
-        a2, a1, a0 = (float(value) for value in tool[2:])
-        rigid = find_rigid_displacement(chain, plant.psi) if a0 == 0 else None
+        rigid = find_rigid_displacement(chain, plant.psi) if tool.spring == 0 else None
         rows = np.eye(n_filter + n_device + 1 + (rigid is None))
         w, device = rows[n_filter + n_device], slice(n_filter, n_filter + n_device)
         distance = rows[n_filter].copy()
@@ -89,11 +81,9 @@ class SlowToolModel:
         force[device] = states.B[:, 0]
         velocity = float(F.D[0, 0]) * distance
         velocity[:n_filter] += F.C[0]
-        feedthrough = float(F.D[0, 0]) if tool.power == 2 else None
-        step = (a0 - a1) * w - a0 * y
-        return cls(
-            every, drift, force, distance, velocity, w, step, moved, float(tool.gain) * every**2, a2, feedthrough
-        )
+        feedthrough = float(F.D[0, 0]) if tool.implicit else None
+        step = (float(tool.decay) - 1.0) * w - float(tool.spring) * y
+        return cls(tool.every, drift, force, distance, velocity, w, step, moved, float(tool.gain), feedthrough)
 
     def compute_multipliers(self, alpha: Array, beta: Array) -> tuple[Array, Array]:
         """Return the eigenvalues of the monodromy matrices of couplings, and the largest ``log|eigenvalue|`` of each.
@@ -134,13 +124,11 @@ class SlowToolModel:
         """Return the maps H of a period without and S of a period with a step, minus the identity, per coupling."""
         f = alpha[:, None] * self.distance + beta[:, None] * self.velocity
         hold = self.drift - self.force[:, None] * f[:, None, :]
-        change, denominator = self.step + self.gain * f, np.full(alpha.size, self.a2)
+        change = self.step + self.gain * f
         if self.feedthrough is not None:
             # f is computed from the new y, which reduces e by the new w. Solve both equations for w.
-            stiffness = self.gain * (alpha + beta * self.feedthrough)
-            change = change - stiffness[:, None] * self.increment
-            denominator = denominator + stiffness
-        change = change / denominator[:, None]
+            stiffness = self.gain * (alpha + beta * self.feedthrough)[:, None]
+            change = (change - stiffness * self.increment) / (1.0 + stiffness)
         step = self.increment[:, None] * change[:, None, :]
         step = step + self.moved[:, None] * (self.increment + change)[:, None, :]
         return hold, hold + step if self.feedthrough is None else _compose(hold, step)
