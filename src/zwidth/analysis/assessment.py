@@ -42,7 +42,7 @@ _UNITS: dict[str, Any] = {
 }
 _MISSING = {
     "passivity_margin": "no condition is known for these parts",
-    "delay_margin": "not confirmed by the number of poles, or not computed because of a tool",
+    "delay_margin": "not confirmed by the number of poles",
     "phase_margin": "no gain crossover determines it",
     **dict.fromkeys(
         ("alpha_max", "beta_at_max", "stiffness_max", "virtual_damping_at_max", "ridge_frequency"), "no wall is stable"

@@ -93,7 +93,9 @@ class SceneParts(Part):
             part = getattr(self, name)
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; pass an object such as {example}")
-        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit", "tool")}
+        named = {
+            name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit", "feedback", "tool")
+        }
         check_kind(self.unit_system.rotary, named)
         if self.operator is not None and not isinstance(self.device, Device):
             raise InputError(

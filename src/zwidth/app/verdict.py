@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from zwidth.analysis.assessment import round_margin
 from zwidth.analysis.cautions import find_thin, price_passivity
 from zwidth.analysis.stabilization import stabilize
+from zwidth.app.gains import format_cascade
 from zwidth.app.printing import (
     format_diagnosis,
     format_hardware,
@@ -297,6 +298,7 @@ def format_recommendation(
     passive = "; ".join(filter(None, (passive, price_passivity(recommendation))))
     lines = [
         format_line("SET", f"{recommendation.spell_wall()}; {recommendation.spell_limit()}{alarm}"),
+        *format_cascade(recommendation),
         *device,
         *margins,
         *([format_line("grasps", hands)] if (hands := recommendation.spell_hands()) else []),

@@ -118,12 +118,6 @@ def _read_delay(text: str) -> Any:
 SHARE = Parsed("SHARE", read_share, "write a share, such as 2% or 0.02")
 
 
-def read_factor(text: str) -> float:
-    """Return the factor given by a text such as ``2`` or ``6 dB``."""
-    number = float(text.strip().removesuffix("dB"))
-    return 10.0 ** (number / 20.0) if text.strip().endswith("dB") else number
-
-
 def _read_figure(text: str) -> Path:
     """Return the path of a figure to write; raise an error if its folder does not exist."""
     file = Path(text)
@@ -170,17 +164,19 @@ def _add_option(command: Command, path: str) -> Command:
 _TIMED = ("mass", "damping", "period", "rate", "delay")
 
 
-def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
+def scene_options(
+    *, wall: bool, instead: str = "", make: Callable[[dict[str, Any], UnitSystem], Any] | None = None
+) -> Callable[[Command], Command]:
     """Return a decorator that adds the options of a scene, with or without wall, and the argument of a scene file.
 
     The command receives a `zwidth.Scene` as ``scene``, or None if ``instead`` names alternative options and no scene
-    option is given.
+    option is given. With ``make``, the command receives the result of ``make(values, units)`` instead.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "sampled", *_TIMED)
     take = take_options(
         "scene",
         (*bare, "velocity.filter", *_PARTS),
-        lambda given, system: build_scene(given, system, instead, wall=wall),
+        make or (lambda given, system: build_scene(given, system, instead, wall=wall)),
     )
     return lambda command: scene_argument(take(command))
 
