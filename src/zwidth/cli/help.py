@@ -13,6 +13,10 @@ OWN = "This command"  # heading of the options that belong to no other group
 # Groups of options in the help: the heading of each group, and the prefixes of the options in it.
 GROUPS = {
     "Wall": ("--stiffness", "--virtual-damping"),
+    "Gains of the controller": (
+        *("--pos-gain", "--vel-", "--kp", "--ki", "--kd", "--rule"),
+        *("--units", "--output-unit", "--torque-constant", "--resistance"),
+    ),
     "Device": ("--device", "--sampled", "--mass", "--damping"),
     "Timing": ("--period", "--rate", "--delay"),
     OWN: (),

@@ -200,7 +200,7 @@ DeviceForm = Annotated[_Section | MujocoSection, WrapValidator(lambda raw, _: re
 
 
 PHYSICAL_KEYS = frozenset({"device", "rotary", "mass", "damping", "period", "rate", "delay", *PART_NAMES})
-PHYSICAL_KEYS |= {"stiffness", "virtual_damping", "safe_limit", *HARDWARE}
+PHYSICAL_KEYS |= {"stiffness", "virtual_damping", "controller", "safe_limit", *HARDWARE}
 NORMALIZED_KEYS = frozenset({"delta", "d", "alpha", "beta"})
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from zwidth.core.errors import InputError, ResourceError, describe_choice
 from zwidth.core.xp import compute_concretely, is_traced
-from zwidth.model.checks import read_texts
+from zwidth.model.checks import check_integer, check_span, read_texts
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.velocity import FOAW
@@ -36,6 +36,8 @@ JITTER_BYTES = 20 * 8  # memory per instant for the durations between jittered s
 DRAWN_BYTES = 4 * 8  # memory per period for noise, and again for external forces
 MOST_BYTES = 4 << 30  # largest estimate that is accepted: 4 GiB
 
+DEFAULT_PERIODS = 1000  # sampling periods
+MAX_PERIODS = 10**9  # sampling periods; the memory limits recorded simulations to fewer
 STARTS = ("start_position", "start_velocity")  # arguments with one initial value per body
 ARGUMENTS = {
     name: (FIELDS[name].unit, ANY if FIELDS[name].allowed == ANY else NOT_NEGATIVE)
@@ -69,6 +71,21 @@ def find_system(scenes: list[Any]) -> UnitSystem:
     if len(systems := {scene.device.unit_system for scene in scenes}) > 1:
         raise InputError("scenes: got both rotary and linear devices; simulate one kind per call")
     return systems.pop() if systems else LINEAR
+
+
+def count_periods(scenes: list[Any], periods: Any, duration: Any) -> int:
+    """Return the number of sampling periods of a simulation, from ``periods`` or ``duration``; 1000 without both."""
+    if duration is None:
+        return check_integer("periods", DEFAULT_PERIODS if periods is None else periods, 1, MAX_PERIODS)
+    if periods is not None:
+        raise InputError(f"duration: got {duration!r} together with periods = {periods!r}; pass only one of them")
+    span = check_span("duration", duration)
+    counts = {round(span.periods(float(scene.timing.period))) for scene in scenes} or {1}
+    if len(counts) > 1:
+        raise InputError(f"duration: got {duration!r} with scenes of different sampling periods; pass periods instead")
+    if not 1 <= (count := counts.pop()) <= MAX_PERIODS:
+        raise InputError(f"duration: got {duration!r}, i.e. {count:g} periods; it must be 1 to {MAX_PERIODS} periods")
+    return count
 
 
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from zwidth.simulation.arguments import (
     ARGUMENTS,
     check_memory,
     convert_hand,
+    count_periods,
     list_scenes,
     read_arguments,
     refuse_bodies,
@@ -41,7 +42,8 @@ def simulate(
     virtual_damping: ArrayLike | None = None,
     *,
     force: Law | None = None,
-    periods: int = 1000,
+    periods: int | None = None,
+    duration: float | str | None = None,
     substeps: int = 1,
     start_position: ArrayLike | Mapping[str, ArrayLike] = 0.0,
     start_velocity: ArrayLike | Mapping[str, ArrayLike] = 0.0,
@@ -87,7 +89,9 @@ def simulate(
             The law is compiled once, so it must not keep values between calls and must use ``jnp.where`` in place of
             ``if``. Its force is sampled, held and delayed like that of a wall. With a tool, the position is p_k - y_k;
             a tool that is integrated by the implicit Euler method excludes a law.
-        periods: number of sampling periods, >= 1.
+        periods: number of sampling periods, >= 1; 1000 if left out.
+        duration: length of the simulation in s, or as a text such as "2 s" or "500 periods", in place of ``periods``;
+            rounded to an integer number of periods.
         substeps: recorded instants per period, >= 1.
         start_position: in m; one value for all bodies, or a mapping by their names in `Motion`, as ``{"position": 0,
             "hand_position": 1e-3}``; other bodies start with the device. The name of a tool is "tool_position".
@@ -140,11 +144,11 @@ def simulate(
     """
     given = {name: value for name, value in locals().items() if name in ARGUMENTS}
     check_choice("contact", contact, CONTACTS)
-    periods = check_integer("periods", periods, 1, 10**9)
     substeps = check_integer("substeps", substeps, 1, 10_000)
+    distinct, which = list_scenes(scenes)
+    periods = count_periods(distinct, periods, duration)
     tail = max(periods // 4, 1) if tail is None else check_integer("tail", tail, 1, periods)
     settings = Settings(periods, substeps, tail, contact, record)
-    distinct, which = list_scenes(scenes)
     if force is not None:
         settings = settings._replace(law=trace_law(force, stiffness, virtual_damping))
         given |= {"stiffness": 0.0, "virtual_damping": 0.0}
