@@ -35,7 +35,7 @@ class Coupling:
             self.size = sum(part.size for part in self.estimates.parts.values()) + self.velocity.size + 2
             self.estimates.size = self.size - self.velocity.size - 2
 
-    def step(self, state: np.ndarray, x: float) -> tuple[np.ndarray, float]:
+    def step(self, state: np.ndarray, x: Any) -> tuple[np.ndarray, float]:
         """Return the next state, and the commanded force."""
         n, m = self.estimates.size, self.velocity.size
         program, memory, (y, v) = state[:n], state[n : n + m], state[n + m :]
@@ -124,5 +124,6 @@ def draw_coupling(rng: np.random.Generator) -> Any:
     T, mass = scene.timing.period, scene.mass * 10 ** rng.uniform(-1, 1)
     damping = rng.choice([0.0, rng.uniform(0.001, 0.1)]) * mass / T
     stiffness = rng.choice([0.0, rng.uniform(1e-5, 1e-3)]) * mass / T**2
-    tool = zwidth.Tool(mass, damping, stiffness, ["semi-implicit", "implicit"][rng.integers(2)])
+    integrator: Any = ["semi-implicit", "implicit"][rng.integers(2)]
+    tool = zwidth.Tool(mass, damping, stiffness, integrator)
     return scene.replace(tool=tool)

@@ -24,7 +24,8 @@ import numpy as np
 from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import Status
 from zwidth.model.actuator import Actuator
-from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, flow, seed, solve, stack
+from zwidth.numerics.taylor import Taylor, differentiate_implicitly, replace_derivatives, seed, stack
+from zwidth.stability.linear.derivatives import StateTerms
 
 NYQUIST_TOLERANCE = 1e-12  # relative distance of the angle w from pi below which the pole is at z = -1
 
@@ -53,14 +54,14 @@ def find_environment_limits(display: Any, points: np.ndarray, order: int) -> lis
     differentiate = _make_rule(display, order)
     for k in rows:
         K, frequency = values[k, :2].tolist()
-        parts = differentiate(points[k].tolist(), K, 2.0 * np.pi * frequency * period)
-        for result, part in zip(results[1:], parts, strict=False):
-            result[k, :2] = part
+        pair = differentiate(points[k].tolist(), K, 2.0 * np.pi * frequency * period)
+        for order_index, result in enumerate(results[1:]):
+            result[k, :2] = [(each.first, each.second)[order_index] for each in pair]
     return results
 
 
-def _make_rule(display: Any, order: int) -> Callable[[list[float], float, float], Implicit]:
-    """Return a function of M, D and B (a list), K and w, which returns the derivatives of stiffness and frequency.
+def _make_rule(display: Any, order: int) -> Callable[[list[float], float, float], list[Taylor]]:
+    """Return a function of M, D and B (a list), K and w, which returns stiffness and frequency with derivatives.
 
     At an integer delay, the response of some robots has a kink. The derivative in the delay is then that of longer
     delays. For a delay in seconds, the derivative in the period is that of longer periods. A sampled robot is valid for
@@ -72,13 +73,14 @@ def _make_rule(display: Any, order: int) -> Callable[[list[float], float, float]
     has_kink = not loop.plant.dt and n == loop.d > 0 and not display.timing.in_periods
     shorter = LimitTerms(display, order, n - 1) if has_kink else None
 
-    def differentiate(factors: list[float], K: float, w: float) -> Implicit:
+    def differentiate(factors: list[float], K: float, w: float) -> list[Taylor]:
         with np.errstate(all="ignore"):
             result = terms.differentiate(factors, K, w)
             if shorter is not None:
-                _replace(result, shorter.differentiate(factors, K, w), (count - 2,))
+                replace_derivatives(result, shorter.differentiate(factors, K, w), count - 2)
         if loop.plant.dt:
-            _replace(result, None, (count - 2, count - 1))
+            for k in (count - 2, count - 1):
+                replace_derivatives(result, [each * np.nan for each in result], k)
         return result
 
     return differentiate
@@ -101,14 +103,10 @@ class LimitTerms:
         # Use the value of d of the loop, because the quotient has a rounding error, which `Timing.d` removes.
         fraction = Taylor(np.float64(self.loop.d), d.first, d.second) - n
         self.A, self.b = self._realize()
-        if self.loop.plant.dt:
-            self.psi, self.full, self.late = self.A + stack(-np.eye(len(self.A.v)), self.one), self.b, self.b
-        else:
-            self.psi, self.full = flow(self.A, self.b, self.one)
-            self.late = flow(self.A, self.b, self.one - fraction)[1]
+        self.states = StateTerms(self.A, self.b, self.one, fraction, bool(self.loop.plant.dt))
 
-    def differentiate(self, factors: list[float], K: float, w: float) -> Implicit:
-        """Return the derivatives of stiffness and frequency in the leaves of the display, followed by M, D and B.
+    def differentiate(self, factors: list[float], K: float, w: float) -> list[Taylor]:
+        """Return stiffness and frequency, with derivatives in the leaves of the display, followed by M, D and B.
 
         Args:
             factors: values of M, D and B.
@@ -123,8 +121,11 @@ class LimitTerms:
         residual = self._evaluate((M, D, B, stiffness), angle * 1j) * (1.0 / K)
         # At the Nyquist frequency, the residual is real, and the angle is constant.
         is_nyquist = w > np.pi * (1.0 - NYQUIST_TOLERANCE)
-        solution = differentiate_implicitly([residual.real, angle - np.pi if is_nyquist else residual.imag])
-        return _convert_angle(solution, w, self.period)
+        equations = [residual.real, angle - np.pi if is_nyquist else residual.imag]
+        limit, angle = differentiate_implicitly(equations, [K, w])
+        size, second = self.count + 3, self.period.second
+        period = Taylor(self.period.v, self.period.first[:size], None if second is None else second[:size, :size])
+        return [limit, angle / (period * (2.0 * np.pi))]
 
     def _evaluate(self, factors: tuple[Taylor, ...], lam: Taylor) -> Taylor:
         """Return ``(M q_M + D q_D)/N_Y + K P + B V`` at ``z = e^lam``; ``factors`` are M, D, B and K."""
@@ -144,11 +145,9 @@ class LimitTerms:
 
     def _respond(self, zeta: Taylor) -> tuple[Taylor, Taylor]:
         """Return ``X_1`` and ``(A_1 X + b_1)/T`` of the robot."""
-        size = len(self.b.v)
-        matrix = zeta.map(lambda part: np.multiply.outer(np.eye(size), part)) - self.psi
-        state = solve(matrix, self.full + self.late * zeta.map(lambda part: np.asarray(part)[None]))
+        state = self.states.respond(zeta)[1]
         velocity = self.b[0]
-        for k in range(size):
+        for k in range(len(self.b.v)):
             velocity = velocity + self.A[0, k] * state[k]
         return state[0], velocity / self.period
 
@@ -171,25 +170,3 @@ class LimitTerms:
             rows = [[0.0, T, *[0.0] * (robot.order - 1)], *([0.0, *row] for row in rows)]
             force = [0.0, *force]
         return stack(rows, self.one), stack(force, self.one)
-
-
-def _convert_angle(solution: Implicit, w: float, period: Taylor) -> Implicit:
-    """Return the derivatives of K and the angle w, converted to those of K and the frequency ``w/(2 pi T)``."""
-    first, second = solution
-    count = first.shape[1]
-    zeros = None if period.second is None else period.second[:count, :count]
-    T = Taylor(period.v, period.first[:count], zeros)
-    frequency = Taylor(np.float64(w), first[1], None if second is None else second[1]) / (T * (2.0 * np.pi))
-    return Implicit(
-        np.stack([first[0], frequency.first]), None if second is None else np.stack([second[0], frequency.second])
-    )
-
-
-def _replace(result: Implicit, other: Implicit | None, indices: tuple[int, ...]) -> None:
-    """Replace the derivatives in the leaves with the given indices by those of ``other``, or by NaN."""
-    for k in indices:
-        result.first[:, k] = np.nan if other is None else other.first[:, k]
-        if result.second is not None:
-            second = None if other is None else other.second
-            result.second[:, k] = np.nan if second is None else second[:, k]
-            result.second[:, :, k] = np.nan if second is None else second[:, :, k]

@@ -16,6 +16,7 @@ from zwidth.analysis.base import WallSI, wrap_methods
 from zwidth.analysis.coupling import is_safe_for_every_world, max_safe_coupling
 from zwidth.analysis.lightest_tool import lightest_tool
 from zwidth.analysis.recommendation import SceneAdvice
+from zwidth.analysis.unsafe_world import unsafe_world
 from zwidth.core.errors import InputError
 from zwidth.core.types import ArrayLike
 from zwidth.core.xp import is_traced, namespace
@@ -106,6 +107,7 @@ class Scene(SceneAdvice):
     is_safe_for_every_world = is_safe_for_every_world
     lightest_tool = lightest_tool
     max_safe_coupling = max_safe_coupling
+    unsafe_world = unsafe_world
     simulate = simulate
     """Method that calls `zwidth.simulate` with this scene and all other arguments."""
 

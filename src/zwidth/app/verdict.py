@@ -111,7 +111,7 @@ def format_check(
     lines += [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
     # With K = 0, print the stable dampings of a pure damper. Exclude measured responses, which have no poles and
     # therefore the frequency NaN.
-    damper = wall.stiffness == 0 and not isnan(verdict.frequency)
+    damper = wall.stiffness == 0 and not isnan(verdict.frequency) and scene.loop.has_boundary
     dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
     if word == "MARGINAL":
         lines.append(format_line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
@@ -121,9 +121,8 @@ def format_check(
     elif word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no stabilizing change of one parameter was found"]
         lines += [format_line("remedy", changes[0]), *(format_line("", f"or {change}") for change in changes[1:])]
-        lines.append(
-            format_line("", "these are limits of stability, without margins: for a wall to set, use recommend")
-        )
+        advice = ": for a wall to set, use recommend" if scene.loop.has_boundary else ""
+        lines.append(format_line("", f"these are limits of stability, without margins{advice}"))
     lines += format_margins(verdict)
     lines += format_decay(verdict)
     if word != "UNSTABLE" or verbose:
@@ -164,13 +163,12 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
     """Return printed lines with K_max and its wall, and the percentage of K_max that the wall of the scene uses."""
     if isinf(verdict.virtual_damping_at_max):
         return [format_line("K_max", "none: with a sufficiently large B, every K > 0 is stable with this tool")]
+    damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
     if isinf(verdict.stiffness_max):
-        damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
         return [format_line("K_max", f"none: every K > 0 is stable at B = {damping} with this tool")]
     if not isfinite(verdict.stiffness_max):
         none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
         return [format_line("K_max", none)]
-    damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
     top = f"{format_stiffness(verdict.stiffness_max, scene.unit_system)} at B = {damping}"
     used = f"; this wall uses {plain(100.0 * scene.wall.stiffness / verdict.stiffness_max, 3)} %"
     lines = [format_line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]
@@ -185,7 +183,7 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
 
 def format_margins(verdict: Assessment) -> list[str]:
     """Return a list with the printed line of the margins of a stable wall; empty for other walls."""
-    if not verdict.stable:
+    if not verdict.stable or isnan(verdict.gain_margin):
         return []
     gain, phase, late, least = (
         round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay", "modulus")

@@ -21,11 +21,13 @@ from zwidth.app.printing import format_row
 from zwidth.cli.hardware import diagnose_wall, hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
+    PATH,
     SHARE,
     Parsed,
     beyond_safe_option,
     figure_option,
     find_omitted,
+    folder_argument,
     get_hardware,
     json_option,
     quantity_type,
@@ -96,9 +98,10 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
             *printing.list_limit_cautions(scene),
             *printing.list_omission_cautions(scene, find_omitted()),
         ]
-        result["islands"] = [island._asdict() for island in scene.islands()]
+        result["islands"] = _list_islands(scene)
         unstable = verdict.stable is False and not verdict.marginal
-        if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
+        has_damper_range = scene.loop.has_boundary and not isinstance(scene.device, MeasuredDevice)
+        if scene.wall.stiffness == 0 and has_damper_range:
             result["damper_range"] = scene.damper_range().tolist()
         result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
     else:
@@ -154,19 +157,21 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
             ]
     result["kind"] = kind
     if given is not None:
-        slopes, notes = printing.list_slopes(scene), printing.list_notes(scene) + _list_obstacles(scene)
+        slopes = printing.list_slopes(scene) if scene.loop.has_boundary else []
+        notes = printing.list_notes(scene) + _list_obstacles(scene)
         stiffest = scene.replace(wall=VirtualWall(float(wall.stiffness), float(wall.virtual_damping)))
         cautions = [*printing.compare_with_limit(stiffest), *printing.list_omission_cautions(scene, find_omitted())]
         wall_values = wall.stiffness, wall.virtual_damping, wall.frequency
         named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, wall_values), strict=True))
         result |= named | {
             "sensitivities": {slope.name: slope.as_dict() for slope in slopes},
-            "islands": [island._asdict() for island in scene.islands()],
+            "islands": _list_islands(scene),
             "notes": notes,
             "cautions": cautions,
         }
         B, f = with_unit(wall_values[1], scene.unit_system["N s/m"]), with_unit(named["frequency"], "Hz")
         K = format_stiffness(named["stiffness_max"], scene.unit_system)
+        advice = "zwidth recommend, with the same options, for the wall to set"
         top = f"{K} at B = {B}, {f} ({kind.replace('_', ' ')} optimum)"
         lines = [
             printing.format_line("K_max", top),
@@ -174,12 +179,17 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
             printing.format_line("device", spell_device(scene, find_omitted())),
             *printing.format_parts(scene),
             *(printing.format_line("CAUTION", text) for text in cautions),
-            printing.format_line("next", "zwidth recommend, with the same options, for the wall to set"),
+            *([printing.format_line("next", advice)] if scene.loop.has_boundary else []),
             "",
             *(slope.line() for slope in slopes),
             *printing.format_notes(notes),
         ]
     printing.print_result(result, lines, as_json, printing.LABEL)
+
+
+def _list_islands(scene: Any) -> list[dict[str, Any]] | None:
+    """Return the islands of a scene for a record; None if they are not available, with a slow simulated tool."""
+    return [island._asdict() for island in scene.islands()] if scene.loop.has_boundary else None
 
 
 def _list_obstacles(scene: Any) -> list[str]:
@@ -297,7 +307,7 @@ def find_examples() -> dict[str, Path]:
 
 
 @cli.command()
-@click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(path_type=Path))
+@click.argument("path", metavar="[CONFIG|DIR]", required=False, type=PATH)
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free one]")
 @click.option("--no-browser", is_flag=True, help="Print the address without opening a browser.")
 def explore(path: Path | None, port: int, no_browser: bool) -> None:
@@ -330,8 +340,8 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
 
 
 @cli.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="File to write.  [default: DIR/report.html]")
+@folder_argument
+@click.option("--out", type=PATH, help="File to write.  [default: DIR/report.html]")
 @json_option
 def report(folder: Path, out: Path | None, as_json: bool) -> None:
     """Write the results of the run in DIR as one HTML file, with slices of its sweeps.

@@ -20,7 +20,7 @@ import click
 from zwidth.app.printing import format_row
 from zwidth.cli.help import OF_SCENE as OF_SCENE
 from zwidth.cli.help import show_example as show_example
-from zwidth.cli.parts import FILTER_HELP, change_kind, make_kind, make_part, name_option, select_part
+from zwidth.cli.parts import FILTER_HELP, change_kind, make_part, name_option, select_part
 from zwidth.core.errors import InputError
 from zwidth.model.checks import Span, find_kind, read_span
 from zwidth.model.device import Device
@@ -178,8 +178,7 @@ def scene_options(
         (*bare, "velocity.filter", *_PARTS),
         make or (lambda given, system: build_scene(given, system, instead, wall=wall)),
     )
-    file = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=click.Path(path_type=Path))
-    return lambda command: file(take(command))
+    return lambda command: scene_argument(take(command))
 
 
 def take_options(
@@ -286,7 +285,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
-    """Return the scene of a file with the parameters replaced that are given as options."""
+    """Return a scene with the parameters replaced that are given as options; a part that it lacks is added."""
     from zwidth.model.devices import PublishedDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}
@@ -340,14 +339,6 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
         """Return the values that are given among the named parameters, as a dict by name."""
         return {name: given[name] for name in names if name in given}
 
-    parts: dict[str, Any] = {
-        name: make_part(name, kind, part_values)
-        for name, kind in PARTS.items()
-        if (part_values := select_part(given, name))
-    }
-    parts |= {name: make_kind(name, part_values) for name in WITH_KIND if (part_values := select_part(given, name))}
-    modes = [make_part(name, Mode, part_values) for name in _MODES if (part_values := select_part(given, name))]
-    parts |= {"modes": modes} if modes else {}
     timing = Timing
     if device is None:
         device = Device(**select("mass", "damping"), rotary=system.rotary)
@@ -361,8 +352,8 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
                 f"{name_option(path)}: the given --device already contains it; give only one of the two"
             )
     wall = VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0))
-    velocity = make_kind("velocity", select_part(given, "velocity"))
-    return Scene(device, timing(**select("period", "rate", "delay")), wall, velocity).replace(**parts)
+    rigid = Scene(device, timing(**select("period", "rate", "delay")), wall)
+    return change_scene(rigid, {path: value for path, value in given.items() if "." in path})
 
 
 def _check_published(device: PublishedDevice, given: dict[str, Any], more: Sequence[str] = ()) -> None:
@@ -373,6 +364,9 @@ def _check_published(device: PublishedDevice, given: dict[str, Any], more: Seque
         raise click.UsageError(f"--device {device.name}: also give {', '.join(flags)}; not published for this device")
 
 
+PATH = click.Path(path_type=Path)
+folder_argument = click.argument("folder", metavar="DIR", type=PATH)
+scene_argument = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=PATH)
 figure_option = click.option(
     "--figure", type=Parsed("FILE.png", _read_figure), help="Write a figure: FILE.png, .svg or .pdf."
 )

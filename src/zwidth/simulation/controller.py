@@ -102,8 +102,9 @@ def control(
         states = states._replace(position=filtered)
         estimated_from = jnp.where(params.filtered_input, position, measured)
     if options.tool and not options.filters_tool:
-        past = _estimate_velocity(params.estimator, controller.positions, states.velocity, k, 0.0 * measured)[0]
-        position = estimated_from = _find_distance(params, options, controller, k, measured, past)
+        # Compute one estimate of the velocity from the distance.
+        rest = _estimate_velocity(params.estimator, controller.positions, states.velocity, k, 0.0 * measured)[0]
+        position = estimated_from = _find_distance(params, options, controller, k, measured, rest)
     positions = write(controller.positions, estimated_from, k & (len(controller.positions) - 1))
     if options.foaw:
         velocity = _adapt_window(positions, k, estimated_from, params.estimator.bound, options.foaw)
@@ -112,6 +113,7 @@ def control(
         states = states._replace(velocity=filtered)
     estimates, tool_positions = jnp.stack([measured, position, velocity]), controller.tool_positions
     if options.filters_tool:
+        # Subtract an estimate of the velocity of the tool from that of the device.
         estimate = params.tool_estimator, tool_positions, states.tool, k
         rest = velocity - _estimate_velocity(*estimate, position)[0]
         distance = _find_distance(params, options, controller, k, position, rest)
@@ -138,10 +140,7 @@ def control(
     tool, further_readings = controller.tool, {}
     if options.tool:
         # Apply the force of the coupling to the tool without the limits of the motor, because the tool is simulated.
-        due = k % params.tool.every == 0
-        change = jnp.where(due, _step_freely(params.tool, tool) + params.tool.gain * coupling_force, 0.0)
-        used = tool[0] + jnp.where(params.tool.implicit, change, 0.0)
-        tool = jnp.stack([tool[0] + change, jnp.where(due, change, tool[1])])
+        tool, used = _integrate_tool(params.tool, tool, k, coupling_force)
         further_readings = {"tool_position": used, "coupling_force": coupling_force}
     ring, motor = controller.commands, params.motor
     last = read(ring, (k - 1) & (len(ring) - 1))
@@ -159,6 +158,14 @@ def _estimate_velocity(
     window = estimator.window
     difference = (newest - look_back(positions, k, window)) / jnp.maximum(window, 1)
     return _filter(estimator.filter, state, jnp.where(window > 0, difference, newest))
+
+
+def _integrate_tool(step: ToolStep, tool: Array, k: Array, force: Array) -> tuple[Array, Array]:
+    """Return the state of the tool after period k, and the position from which the force of the coupling follows."""
+    due = k % step.every == 0
+    change = jnp.where(due, _step_freely(step, tool) + step.gain * force, 0.0)
+    after = jnp.stack([tool[0] + change, jnp.where(due, change, tool[1])])
+    return after, jnp.where(step.implicit, after[0], tool[0])
 
 
 def _step_freely(step: ToolStep, tool: Array) -> Array:

@@ -256,6 +256,10 @@ _PARAMETERS = (
     Parameter("tool.mass", "mass of the simulated tool", "M", POSITIVE, "kg", (1e-3, 2.0), "", "mass of the tool"),
     Parameter("tool.damping", "damping of the simulated tool", "c_t", NOT_NEGATIVE, "N s/m", (0.0, 9.0), "default 0"),
     Parameter("tool.stiffness", "stiffness of the simulated tool", "k_t", NOT_NEGATIVE, "N/m", (0.0, 1e3), "default 0"),
+    Parameter(
+        "tool.every", "sampling periods per step of the simulated tool", "N", Range(1, 1000),
+        note="> 1 for a physics engine that is slower than the control program; default 1", whole=True,
+    ),
     Parameter("stiffness", "stiffness K of the virtual wall", "K", ANY, "N/m", (0.0, 50e3), short_name="stiffness"),
     Parameter(
         "alpha", "normalized stiffness of the virtual wall, K T^2/m", r"\alpha", ANY, slider=(0.0, 1.0),

@@ -147,7 +147,9 @@ def test_every_method_agrees(integrator):
     gain = scene.margins(5e3, 20).gain_margin
     assert scene.is_stable(0.999999 * gain * 5e3, 0.999999 * gain * 20)
     assert not scene.is_stable(1.000001 * gain * 5e3, 1.000001 * gain * 20)
-    assert np.isnan(scene.margins(5e3, 20).delay_margin)
+    late = float(scene.margins(5e3, 20).delay_margin)
+    assert scene.replace(delay=1e-3 + 0.999999 * late).is_stable(5e3, 20)
+    assert not scene.replace(delay=1e-3 + 1.000001 * late).is_stable(5e3, 20)
     assert scene.stable_region()[0].stiffness.max() == pytest.approx(float(scene.max_stiffness().stiffness), rel=1e-4)
 
 
