@@ -397,10 +397,11 @@ def recommend(
     The options --mass (or --device) and --rate (or --period) are required; the defaults of damping and delay are 0.
     Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). If you use
     --stiffness-fraction, --gain-margin, --phase-margin or --passive, your requirement replaces all default
-    requirements; --grasps does not replace them. With --resolution, --friction or --max-force, the command also
-    simulates the wall to find limit cycles and saturation; --max-force also limits the force in the code of --code. A
-    hand (--operator-...) is a part of the device, and the command also checks the wall without this hand. The exit code
-    is 1 if no wall exists.
+    requirements; --grasps does not replace them. So --passive alone recommends the stiffest passive wall, the limit
+    that publications state; add --phase-margin 30 --gain-margin 2 to keep the default margins. With --resolution,
+    --friction or --max-force, the command also simulates the wall to find limit cycles and saturation; --max-force also
+    limits the force in the code of --code. A hand (--operator-...) is a part of the device, and the command also checks
+    the wall without this hand. The exit code is 1 if no wall exists.
     """
     from zwidth.app.verdict import format_recommendation
 
