@@ -19,11 +19,12 @@ References:
 from __future__ import annotations
 
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.analysis.admittance_loop import AdmittanceLoop
+from zwidth.analysis.admittance_loop import KEPT_LOOPS, AdmittanceLoop, to_zeta
 from zwidth.core.status import Status
 from zwidth.model.exact_polynomials import Polynomial
 from zwidth.numerics.polynomials import companion
@@ -33,7 +34,8 @@ NEWTON_STEPS = 8  # Newton steps for the angle of a crossing; 3 suffice after th
 STEP = 1e-5  # relative step of w for the derivative in Newton's method
 RESIDUAL = 1e-9  # largest imaginary part of K at a crossing, relative to K
 NEAR_REAL = 1e-3  # imaginary part of x, relative to the distance from 1 or -1, below which a crossing is ambiguous
-CLEARANCE = 1e-6  # distance of all poles from the unit circle above which their eigenvalues decide the stability
+CLEARANCE = 1e-6  # distance of a pole from the unit circle, relative to |zeta|, above which its eigenvalue is accurate
+LARGEST_DEGREE = 30  # degree of the characteristic polynomial up to which eigenvalues are accurate
 NEGLIGIBLE = 1e-18  # coefficient of the Chebyshev series, relative to the largest one, that rounding errors exceed
 TESTED = (1 / 16, 1 / 2, 15 / 16)  # fractions of the smallest positive K at which the stability must be the same
 # Angles between which the number of crossings is compared with the signs of the Chebyshev series, in rad per period.
@@ -50,16 +52,25 @@ class Limits(NamedTuple):
 
 def find_limits(loop: AdmittanceLoop, M: np.ndarray, D: np.ndarray, B: np.ndarray) -> Limits:
     """Return the largest K such that displays are stable from 0 to K; M, D and B are vectors of one length."""
-    coefficients = loop.coefficients
-    parts = (coefficients.mass, coefficients.damping, coefficients.environment_damping)
-    series = _stack([_expand_crossings(part, coefficients.stiffness) for part in parts], at_end=True)
+    if len(loop.coefficients.mass) > LARGEST_DEGREE + 1:
+        unknown = np.full(len(M), np.nan)
+        return Limits(unknown, unknown.copy(), np.full(len(M), int(Status.UNDECIDED)))
+    series, polynomials = _convert(loop)
     factors = np.stack([M, D, B], -1)
-    polynomials = _stack([np.array(part, float) for part in (*parts, coefficients.stiffness)], at_end=False)
     results = [
         _find_block(loop, series, polynomials, factors[start : start + BLOCK])
         for start in range(0, max(len(M), 1), BLOCK)
     ]
     return Limits(*(np.concatenate(column) for column in zip(*results, strict=True)))
+
+
+@lru_cache(KEPT_LOOPS)
+def _convert(loop: AdmittanceLoop) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Chebyshev series of the crossings for M, D and B, and p_M, p_D, p_B and p_K in powers of zeta."""
+    mass, damping, stiffness, environment_damping = loop.coefficients
+    parts = mass, damping, environment_damping
+    series = _stack([_expand_crossings(part, stiffness) for part in parts], at_end=True)
+    return series, _stack([np.array(to_zeta(part), float) for part in (*parts, stiffness)], at_end=False)
 
 
 def _find_block(loop: AdmittanceLoop, series: np.ndarray, polynomials: np.ndarray, factors: np.ndarray) -> Limits:
@@ -166,13 +177,15 @@ def _label_poles(polynomials: np.ndarray, factors: np.ndarray, K: np.ndarray) ->
     """Return 1 for stable and -1 for unstable displays, and 0 if a pole is too close to the unit circle.
 
     Args:
-        polynomials: coefficients of p_M, p_D, p_B and p_K.
+        polynomials: coefficients of p_M, p_D, p_B and p_K, in powers of zeta.
         factors: a row (M, D, B) per display.
         K: stiffness of the environment, one per display.
     """
     monic = np.concatenate([factors, K[:, None]], -1) @ polynomials
     monic = monic / monic[:, :1]
     is_valid: Any = np.isfinite(monic).all(-1)
-    poles = np.linalg.eigvals(companion(np.where(is_valid[:, None], monic, 0.0)))
-    radius = np.abs(poles).max(-1)
-    return np.where(is_valid & (np.abs(radius - 1.0) > CLEARANCE), np.sign(1.0 - radius), 0.0)
+    # Slow poles are a cluster near z = 1. In powers of zeta, their eigenvalues have small relative errors.
+    zeta: Any = np.linalg.eigvals(companion(np.where(is_valid[:, None], monic, 0.0)))
+    excess, bound = 2.0 * zeta.real + np.abs(zeta) ** 2, CLEARANCE * np.abs(zeta)  # excess is |z|^2 - 1
+    is_stable, is_unstable = (excess < -bound).all(-1), (excess > bound).any(-1)
+    return np.where(is_valid, is_stable * 1.0 - is_unstable * 1.0, 0.0)
