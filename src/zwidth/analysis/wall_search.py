@@ -48,6 +48,7 @@ FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which i
 WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
 COARSE = 1e-3  # half-width of the bracket of log K for alternatives, whose gain or cost is printed with 2 or 3 digits
 MATCHED = 1e-5  # relative change of K/B at which the search for a wall that matches the integrator of a cascade ends
+RESTARTS = (0.5, 0.1, 0.02)  # pos_gain of further searches, relative to that of the wall without integrator
 MAX_MATCHES = 8  # walls that this search chooses; 3 usually suffice
 # Factors on K and B, tried in this order, until a wall satisfies the requirements with the integrator that matches it.
 REDUCTIONS = (1.0, 1.0 - 1e-5, 1.0 - 1e-4, 0.999, 0.99, 0.97, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
@@ -378,13 +379,37 @@ def choose_controller(
     feedback = scene.feedback
     if not (isinstance(feedback, IntegralFeedback) and feedback.is_cascade):
         return ControllerChoice(scene, top, choice)
-    nan = math.nan
+    first = result = _match_integrator(scene, feedback, requirements, top, choice, width)
+    if result.wall.status != Status.OK:
+        # Start again from smaller values of pos_gain, because the given one may be too large for every wall.
+        free = scene.replace(feedback=None)
+        start = choose_wall(free, requirements, free.max_stiffness(), None, COARSE)
+        for factor in RESTARTS if start.status == Status.OK and start.damping > 0 else ():
+            feedback = feedback.match_wall(factor * start.stiffness, start.damping)
+            changed = scene.replace(feedback=feedback)
+            top = changed.max_stiffness()
+            choice = choose_wall(changed, requirements, top, None, width)
+            result = _match_integrator(changed, feedback, requirements, top, choice, width)
+            if result.wall.status == Status.OK:
+                return result
+    return first if result.wall.status != Status.OK else result
+
+
+def _match_integrator(
+    scene: SceneOptima,
+    feedback: IntegralFeedback,
+    requirements: Requirements,
+    top: StiffestWall,
+    choice: WallChoice,
+    width: float,
+) -> ControllerChoice:
+    """Choose walls until the integrator of a cascade matches the wall; ``choice`` is the first wall of ``scene``."""
     for _ in range(MAX_MATCHES):
         if choice.status != Status.OK:
             return ControllerChoice(scene, top, choice)
         if not choice.damping > 0:
             reason = "no wall with B > 0 satisfies the requirements, and a cascade requires pos_gain = K/B > 0"
-            return ControllerChoice(scene, top, WallChoice(nan, nan, "", Status.UNREACHABLE, reason))
+            return ControllerChoice(scene, top, WallChoice(math.nan, math.nan, "", Status.UNREACHABLE, reason))
         matched = feedback.match_wall(choice.stiffness, choice.damping)
         changed = abs(matched.position - feedback.position) > max(MATCHED, width) * abs(matched.position)
         feedback, scene = matched, scene.replace(feedback=matched)
