@@ -38,6 +38,9 @@ DIRECTIONS = {
 POINTS = 14  # values of a parameter tried, from the current one to the end of the search range
 HALVINGS = 14  # bisection steps between two tried values
 
+# Sentence to print after the remedies of an unstable loop.
+WITHOUT_MARGINS = "these are limits of stability, without margins: for a wall to set, use recommend"
+
 NAMES = {
     "stiffness": "K",
     "virtual_damping": "B",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from zwidth.analysis.assessment import round_margin
 from zwidth.analysis.cautions import find_thin, price_passivity
-from zwidth.analysis.stabilization import stabilize
+from zwidth.analysis.stabilization import WITHOUT_MARGINS, stabilize
 from zwidth.app.printing import (
     format_diagnosis,
     format_hardware,
@@ -118,11 +118,12 @@ def format_check(
     if word == "UNSTABLE" and damper and dampings:
         lines.append(format_line("remedy", f"a pure damper: {_spell_intervals('B', dampings, units['N s/m'], 'K')}"))
     elif word == "UNSTABLE" and limits is not None:
-        changes = [each.spell() for each in stabilize(scene)] or ["no stabilizing change of one parameter was found"]
-        lines += [format_line("remedy", changes[0]), *(format_line("", f"or {change}") for change in changes[1:])]
+        changes = [each.spell() for each in stabilize(scene)]
+        notes = [f"or {change}" for change in changes[1:]] + [WITHOUT_MARGINS]
         lines.append(
-            format_line("", "these are limits of stability, without margins: for a wall to set, use recommend")
+            format_line("remedy", changes[0] if changes else "no stabilizing change of one parameter was found")
         )
+        lines += [format_line("", note) for note in notes if changes]
     lines += format_margins(verdict)
     lines += format_decay(verdict)
     if word != "UNSTABLE" or verbose:
