@@ -52,7 +52,7 @@ def _describe_command(command: click.Command, parent: click.Context, shared: dic
             continue
         flag = option.opts[-1]
         row = f"| `{record[0]}` | {_escape(record[1])} |"
-        if (group := find_group(flag)) == OWN:
+        if (group := find_group(flag, getattr(command, "own", ()))) == OWN:
             own.append(row)
         else:
             shared[group].setdefault(flag, row)

@@ -100,7 +100,7 @@ _QUESTIONS = {
     "stable or not, each label certified": ("stable", "certified", "map"),
     "passive or not": ("passive", "worst frequency", "map"),
     "spectral radius, certified to 1e-9": ("spectral_radius", "map to 1e-09", "map"),
-    "spectral radius, certified to 1e-2": ("spectral_radius", "map to 0.01", "map"),
+    "spectral radius, certified to 1e-12": ("spectral_radius", "map to 1e-12", "map"),
     "all poles": ("spectral_radius", "aberth", "map"),
     "all poles, by eigenvalues": ("spectral_radius", "companion", "map"),
     "stiffest wall, one per device": ("alpha_max", "newton", "scattered"),

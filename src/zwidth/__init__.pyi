@@ -2,7 +2,9 @@
 
 from .analysis.admittance import AdmittanceDisplay as AdmittanceDisplay
 from .analysis.admittance import EnvironmentLimit as EnvironmentLimit
+from .analysis.admittance import VirtualDampingLimit as VirtualDampingLimit
 from .analysis.admittance import VirtualMassLimit as VirtualMassLimit
+from .analysis.admittance_motion import AdmittanceMotion as AdmittanceMotion
 from .analysis.assessment import Assessment as Assessment
 from .analysis.assessment import Limit as Limit
 from .analysis.assessment import assess as assess
@@ -65,10 +67,10 @@ from .model.feedback import Feedback as Feedback
 from .model.feedback import IntegralFeedback as IntegralFeedback
 from .model.grasps import reference_grasps as reference_grasps
 from .model.joint_space import from_mass_matrix as from_mass_matrix
-from .model.joint_space import from_mujoco as from_mujoco
 from .model.linear_device import LinearDevice as LinearDevice
 from .model.measured_device import MeasuredDevice as MeasuredDevice
 from .model.mode import Mode as Mode
+from .model.mujoco_model import from_mujoco as from_mujoco
 from .model.operator import Operator as Operator
 from .model.position import ExponentialFilter as ExponentialFilter
 from .model.position import Observer as Observer

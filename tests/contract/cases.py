@@ -194,7 +194,15 @@ def make_scene_case(question, answer, velocity=None, **options):
     return Case(f"Scene.{question}", call, good, {}, point=INTEGER_SI, one_number=device, **options)
 
 
-# Methods of `Scene` for the type matrix: rigid scenes, and `max_stiffness` with a velocity filter.
+def find_environment_limit(virtual_mass, virtual_damping, environment_damping, period, delay):
+    """Return the limit of an admittance display whose numbers and environment may be traced or arrays."""
+    robot = zwidth.Actuator(time_constant=2 * period)
+    display = zwidth.AdmittanceDisplay(1, 1, robot, zwidth.Timing(period, delay))
+    factors = {"virtual_mass": virtual_mass, "virtual_damping": virtual_damping}
+    return display.max_environment_stiffness(environment_damping, **factors)
+
+
+# Methods for the type matrix: of rigid scenes, `max_stiffness` with a velocity filter, and of admittance displays.
 SCENE_CASES = [
     make_scene_case("is_stable", zwidth.Scene.is_stable, derivatives=None),
     make_scene_case("is_passive", zwidth.Scene.is_passive, derivatives=None),
@@ -208,6 +216,14 @@ SCENE_CASES = [
     make_scene_case("max_stiffness behind a filter", zwidth.Scene.max_stiffness, zwidth.LowPass(time_constant=2)),
     make_scene_case(
         "to_si", lambda scene, stiffness, virtual_damping: scene.to_si(alpha=stiffness, beta=virtual_damping)
+    ),
+    Case(
+        "AdmittanceDisplay.max_environment_stiffness",
+        find_environment_limit,
+        {name: [1.0] for name in ("virtual_mass", "virtual_damping", "environment_damping", "period", "delay")},
+        {},
+        point={"virtual_mass": 20, "delay": 2},
+        one_number=("period", "delay"),
     ),
 ]
 
@@ -223,7 +239,7 @@ OTHERS = {
     "fit_log": "one device: tests/unit/identification/test_log_fit.py",
     "limits_of": "one scene: tests/unit/analysis/test_limits.py",
     "from_mass_matrix": "one device: tests/unit/model/test_joint_space.py",
-    "from_mujoco": "one device: tests/unit/model/test_joint_space.py",
+    "from_mujoco": "one device: tests/unit/model/test_mujoco_model.py",
     "load_config": "a file: tests/unit/config/test_reader.py",
     "load_scene": "a file: tests/unit/cli/test_scene_file.py",
     "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",

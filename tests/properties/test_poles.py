@@ -57,20 +57,11 @@ def test_boundary_is_continuous_at_zero_damping(delta, omega, d):
     assert abs(damped.beta - free.beta) <= slope * (delta + 1e-14)
 
 
-@given(alphas, ratios, magnitudes(-9, 4), st.sampled_from([0, 1, 3]), magnitudes(-15, -6))
-def test_polynomial_is_continuous_above_integer_delays(alpha, beta, delta, integer, fraction):
-    assume(integer + fraction != integer)
-    partial = zwidth.char_poly(alpha, beta, delta, integer + fraction)
-    expected = np.append(zwidth.char_poly(alpha, beta, delta, integer), 0.0)
-    # The step after rounding d = n + f.
-    step = (integer + fraction) - integer
-    assert (np.abs(partial - expected) <= (2 * step * (1 + delta) + 1e-15) * size(alpha, beta)).all()
-
-
-@given(alphas, ratios, magnitudes(-9, 4), st.sampled_from([0, 1, 3]), magnitudes(-15, -6))
-def test_polynomial_is_continuous_below_integer_delays(alpha, beta, delta, integer, rest):
-    d = integer + 1 - rest
-    assume(d < integer + 1)
-    partial, expected = (zwidth.char_poly(alpha, beta, delta, value) for value in (d, integer + 1))
-    step = (integer + 1) - d
-    assert (np.abs(partial - expected) <= (2 * step * (1 + delta) + 1e-15) * size(alpha, beta)).all()
+@given(alphas, ratios, magnitudes(-9, 4), st.sampled_from([0, 1, 3]), magnitudes(-15, -6), st.booleans())
+def test_polynomial_is_continuous_at_integer_delays(alpha, beta, delta, integer, fraction, below):
+    # From above, P is compared with the P of n = d in powers of z higher by one; from below, with the P of n + 1.
+    end, d = (integer + 1, integer + 1 - fraction) if below else (integer, integer + fraction)
+    assume(d != end)
+    partial, expected = (zwidth.char_poly(alpha, beta, delta, value) for value in (d, end))
+    expected = expected if below else np.append(expected, 0.0)
+    assert (np.abs(partial - expected) <= (2 * abs(d - end) * (1 + delta) + 1e-15) * size(alpha, beta)).all()

@@ -39,7 +39,7 @@ def _once(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 _fit_log, _fit_buzz, _diagnose = _once(columns.fit_log), _once(onset_fit.fit_buzz), _once(diagnosis.diagnose)
-_choose_wall, _judge_grasps = _once(recommendation.choose_wall), _once(cautions.judge_grasps)
+_choose_controller, _judge_grasps = _once(recommendation.choose_controller), _once(cautions.judge_grasps)
 _find_safe_wall = _once(device_fit.find_safe_wall)
 
 
@@ -53,8 +53,8 @@ def fitting_once() -> Iterator[None]:
         patch.object(columns, "fit_log", _fit_log),
         patch.object(onset_fit, "fit_buzz", _fit_buzz),
         patch.object(diagnosis, "diagnose", _diagnose),
-        patch.object(recommendation, "choose_wall", _choose_wall),
-        patch.object(cautions, "choose_wall", _choose_wall),
+        patch.object(recommendation, "choose_controller", _choose_controller),
+        patch.object(cautions, "choose_controller", _choose_controller),
         patch.object(recommendation, "judge_grasps", _judge_grasps),
         patch.object(cautions, "judge_grasps", _judge_grasps),
         patch.object(device_fit, "find_safe_wall", _find_safe_wall),

@@ -18,46 +18,39 @@ device: the gain is K for the stiffness of the environment, and 1/M for the virt
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import cached_property, reduce
-from typing import Any, Literal, NamedTuple
+from functools import reduce
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.analysis.admittance_code import write_code
+from zwidth.analysis.admittance_loop import AdmittanceLoop, Command, Integrator, add, find_loop
+from zwidth.analysis.admittance_motion import simulate
+from zwidth.analysis.environment_limits import find_limits
 from zwidth.analysis.scene import Scene
 from zwidth.core.errors import InputError, check_choice
+from zwidth.core.pytrees import list_leaves
 from zwidth.core.status import Status
 from zwidth.core.types import Array, ArrayLike
+from zwidth.core.xp import is_traced
 from zwidth.model.actuator import Actuator
-from zwidth.model.checks import check_number, find_kind, read_texts
-from zwidth.model.exact_polynomials import Polynomial, characteristic_polynomial, multiply, subtract, trim
+from zwidth.model.checks import Part, check_number, find_kind, read_texts
+from zwidth.model.exact_polynomials import multiply
 from zwidth.model.linear_device import LinearDevice
-from zwidth.model.linear_plant import System
 from zwidth.model.timing import Timing
-from zwidth.model.velocity import Estimate
-from zwidth.numerics.evaluate import as_float64
-from zwidth.plant.sampled_states import sample_states
+from zwidth.numerics.evaluate import as_float64, broadcast_traced
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import NOT_NEGATIVE, POSITIVE, Range
 from zwidth.units.unit_system import SYSTEMS
 
-Command = Literal["position", "velocity"]
-Integrator = Literal["semi-implicit", "trapezoidal"]
-# Polynomials in zeta = z - 1; the coefficient of the highest power is the first one.
-ZETA: Polynomial = (Fraction(1), Fraction(0))
-Z: Polynomial = (Fraction(1), Fraction(1))  # z = zeta + 1
-TWO: Polynomial = (Fraction(1), Fraction(2))  # z + 1 = zeta + 2
-ONE: Polynomial = (Fraction(1),)
-
-
-class Coefficients(NamedTuple):
-    """The four polynomials in z in the characteristic polynomial ``M p_M + D p_D + K p_K + B p_B``."""
-
-    mass: Polynomial  # p_M, multiplied by the virtual mass M
-    damping: Polynomial  # p_D, multiplied by the virtual damping D
-    stiffness: Polynomial  # p_K, multiplied by the stiffness K of the environment
-    environment_damping: Polynomial  # p_B, multiplied by the damping B of the environment
+# Units on a linear device, and allowed ranges, of the arguments of `AdmittanceDisplay.max_environment_stiffness`.
+_QUANTITIES = {
+    "virtual_mass": ("kg", POSITIVE),
+    "virtual_damping": ("N s/m", NOT_NEGATIVE),
+    "environment_damping": ("N s/m", NOT_NEGATIVE),
+}
 
 
 @compact_repr(frequency="Hz")
@@ -88,8 +81,23 @@ class VirtualMassLimit(NamedTuple):
     status: int
 
 
-@dataclass(frozen=True)
-class AdmittanceDisplay:
+@compact_repr(virtual_damping="N s/m", largest="N s/m", frequency="Hz")
+class VirtualDampingLimit(NamedTuple):
+    """The smallest virtual damping with which an admittance display is stable.
+
+    The display is stable with every damping from ``virtual_damping`` to ``largest``, both in N s/m. ``frequency`` is
+    the frequency in Hz of the oscillation with the smallest damping; it is NaN if that damping is 0. If no damping is
+    stable, all three are NaN and ``status`` is NO_BOUNDARY.
+    """
+
+    virtual_damping: float
+    largest: float
+    frequency: float
+    status: int
+
+
+@dataclass(frozen=True, repr=False)
+class AdmittanceDisplay(Part):
     """A position- or velocity-controlled robot that displays a virtual mass and damping to a hand or an environment.
 
     In each period T the program measures the contact force f. It updates the velocity v of the virtual mass and the
@@ -160,8 +168,20 @@ class AdmittanceDisplay:
             )
         if self.command == "velocity" and isinstance(self.robot, LinearDevice) and self.robot.dt:
             raise InputError("robot: got a sampled system with a velocity command; use its response to position")
-        if self._plant.dt:
-            System(self._plant, self.timing.period, 1.0, self.timing.d, self._n_delay, Estimate()).check()
+        if isinstance(self.robot, LinearDevice) and self.robot.dt and not is_traced(*list_leaves(self.timing)):
+            self.loop.make_system()
+
+    def _rebuild(self) -> AdmittanceDisplay:
+        """Return the display with all numbers checked, because JAX sets numbers unchecked."""
+        timing = self.timing._rebuild()
+        robot = self.robot._rebuild() if isinstance(self.robot, Actuator) else self.robot
+        return AdmittanceDisplay(self.virtual_mass, self.virtual_damping, robot, timing, self.command, self.integrator)
+
+    @property
+    def loop(self) -> AdmittanceLoop:
+        """The parts of the display that do not depend on its virtual mass and damping."""
+        timing = self.timing
+        return find_loop(self.robot, float(timing.period), float(timing.d), self.command, self.integrator)
 
     rotary = False
     """True if virtual mass and damping have rotary units."""
@@ -189,26 +209,93 @@ class AdmittanceDisplay:
             environment_stiffness: K in N/m, > 0.
             environment_damping: B in N s/m, >= 0.
         """
-        K, B = np.broadcast_arrays(*self._read_environments(environment_stiffness, environment_damping))
+        K = as_float64(
+            "environment_stiffness",
+            read_texts("environment_stiffness", environment_stiffness, SYSTEMS[self.rotary]["N/m"]),
+        )
+        K, B = np.broadcast_arrays(K, self._read_array("environment_damping", environment_damping))
+        if not np.all(B >= 0):
+            raise InputError(f"environment_damping: got {float(B[~(B >= 0)].flat[0]):g} N s/m; it must be >= 0")
         labels = np.zeros(K.shape, bool)
         for damping in np.unique(B[np.isfinite(B)]).tolist():
             chosen = damping == B
             labels[chosen] = self.scene(0.0, damping).is_stable(K[chosen], 0.0)
         return labels[()]
 
-    def max_environment_stiffness(self, environment_damping: ArrayLike = 0.0) -> EnvironmentLimit:
+    def max_environment_stiffness(
+        self,
+        environment_damping: ArrayLike = 0.0,
+        *,
+        virtual_mass: ArrayLike | None = None,
+        virtual_damping: ArrayLike | None = None,
+    ) -> EnvironmentLimit:
         """Return the largest stiffness K of the environment such that the display is stable from 0 to K.
+
+        The arguments are broadcast, so that one call computes K for a grid of virtual masses and dampings. Inside JAX
+        transformations, such as ``jit``, ``vmap`` and ``grad``, numbers of the display and arguments may be traced.
 
         Args:
             environment_damping: damping B of the environment in N s/m, >= 0; a number or an array.
+            virtual_mass: values of M in kg, > 0, in place of that of the display.
+            virtual_damping: values of D in N s/m, >= 0, in place of that of the display.
 
         Returns:
-            Stiffness in N/m and frequency in Hz, of the shape of the damping. The relative error is about 1e-12.
+            Stiffness in N/m and frequency in Hz, of the shape of the broadcast arguments. The relative error is about
+            1e-12. Entries of arrays that are out of range yield NaN and the status INVALID_INPUT.
+
+        Raises:
+            InputError: a single number is out of range, or an argument has a wrong unit or type.
+
+        Example:
+            >>> import zwidth
+            >>> robot, timing = zwidth.Actuator(time_constant="5 ms"), zwidth.Timing(rate="1 kHz", delay="2 periods")
+            >>> display = zwidth.AdmittanceDisplay(5, 20, robot, timing)
+            >>> display.max_environment_stiffness(virtual_mass=[1, 2, 5]).stiffness.round()
+            array([3309., 3190., 3117.])
         """
-        B = self._read_environments(0.0, environment_damping)[1]
-        limits = [self._find_limit("stiffness", {"environment_damping": b}) for b in B.ravel().tolist()]
-        columns = (np.array(column).reshape(B.shape)[()] for column in zip(*limits, strict=True))
-        return self._label(EnvironmentLimit(*columns))
+        own = self.virtual_mass, self.virtual_damping
+        M, D = (
+            each if given is None else given for each, given in zip(own, (virtual_mass, virtual_damping), strict=True)
+        )
+        names = "virtual_mass", "virtual_damping", "environment_damping"
+        given: dict[str, Any] = dict(zip(names, (M, D, environment_damping), strict=True))
+        if is_traced(*given.values(), *list_leaves(self)):
+            return self._trace_limit(given)
+        factors = np.broadcast_arrays(*(self._read_array(name, value) for name, value in given.items()))
+        self.loop.check_damper(float(np.nanmax(factors[2], initial=0.0)))
+        K, frequency, status = (each.reshape(factors[0].shape)[()] for each in self._find_limits(*factors))
+        return self._label(EnvironmentLimit(K, frequency, status))
+
+    def _find_limits(self, M: np.ndarray, D: np.ndarray, B: np.ndarray) -> EnvironmentLimit:
+        """Return the limits for arrays of one shape, as vectors."""
+        rows = np.stack([M, D, B], -1).reshape(-1, 3)
+        is_valid = np.isfinite(rows).all(-1) & (rows[:, 0] > 0) & (rows[:, 1:] >= 0).all(-1)
+        limits = find_limits(self.loop, *np.where(is_valid, rows.T, [[1.0], [0.0], [0.0]]))
+        K, frequency = np.where(
+            is_valid, (limits.stiffness, limits.angle / (2.0 * np.pi * float(self.timing.period))), np.nan
+        )
+        result = EnvironmentLimit(K, frequency, np.where(is_valid, limits.status, int(Status.INVALID_INPUT)))
+        for k in np.flatnonzero(result.status == Status.UNDECIDED).tolist():
+            mass, damping, environment_damping = rows[k].tolist()
+            display = self._replace(mass, damping)
+            limit = display._find_limit({"environment_damping": environment_damping})
+            for column, value in zip(result, limit, strict=True):
+                column[k] = value
+        return result
+
+    def _trace_limit(self, given: dict[str, Any]) -> EnvironmentLimit:
+        """Return the limit for M, D and B of which JAX traces some, or for a display whose numbers it traces."""
+        from zwidth.analysis.traced_loop import ask
+
+        units = SYSTEMS[self.rotary]
+        given = {name: read_texts(name, value, units[_QUANTITIES[name][0]]) for name, value in given.items()}
+        # Replace M and D of the display by constants, so that displays with other M and D form one batch.
+        K, frequency, status = ask(self._replace(1.0, 0.0), "environment_limit", *broadcast_traced(given))
+        return self._label(EnvironmentLimit(K, frequency, status.astype("int32")))
+
+    def _replace(self, virtual_mass: float, virtual_damping: float) -> AdmittanceDisplay:
+        """Return the display with another virtual mass in kg and virtual damping in N s/m."""
+        return replace(self, virtual_mass=virtual_mass, virtual_damping=virtual_damping)
 
     def min_virtual_mass(self, hand_stiffness: Any, hand_damping: Any = 0.0) -> VirtualMassLimit:
         """Return the smallest virtual mass with which the display is stable in a hand or environment.
@@ -228,9 +315,41 @@ class AdmittanceDisplay:
             VirtualMassLimit(virtual_mass=10.0125 g, largest=inf kg, frequency=500 Hz, status=OK)
         """
         K, B = self._read_environment(hand_stiffness, hand_damping, "hand", POSITIVE)
-        gain, frequency, status, least = self._find_range("mass", {"stiffness": K, "environment_damping": B})
+        factors = {"stiffness": K, "environment_damping": B}
+        least, gain, status = self._find_range("mass", factors)
         largest = np.inf if least == 0 else 1.0 / least
+        frequency = self._find_frequency("mass", factors, gain)
         return self._label(VirtualMassLimit(1.0 / gain, largest, frequency, status))
+
+    def min_virtual_damping(self, environment_stiffness: Any, environment_damping: Any = 0.0) -> VirtualDampingLimit:
+        """Return the smallest virtual damping with which the display is stable in an environment.
+
+        The virtual mass is that of the display. The virtual damping of the display has no effect on the result. With
+        dampings above ``largest`` of the result, the display may be unstable again.
+
+        Args:
+            environment_stiffness: K in N/m, > 0.
+            environment_damping: B in N s/m, >= 0.
+
+        References:
+            Keemink, van der Kooij, Stienen 2018, International Journal of Robotics Research 37(11), 1421-1444 (effect
+            of the virtual damping on the stability of a contact).
+
+        Example:
+            >>> import zwidth
+            >>> robot, timing = zwidth.Actuator(time_constant="5 ms"), zwidth.Timing(rate="1 kHz", delay="2 periods")
+            >>> display = zwidth.AdmittanceDisplay(5, 20, robot, timing)
+            >>> display.min_virtual_damping("20 kN/m")
+            VirtualDampingLimit(virtual_damping=119.246 N s/m, largest=9.999 kN s/m, frequency=9.54812 Hz, status=OK)
+        """
+        K, B = self._read_environment(environment_stiffness, environment_damping, "environment", POSITIVE)
+        factors = {"stiffness": K, "environment_damping": B}
+        least, largest, status = self._find_range("damping", factors)
+        frequency = self._find_frequency("damping", factors, least) if least else np.nan
+        return self._label(VirtualDampingLimit(least, largest, frequency, status))
+
+    simulate = simulate
+    code = write_code
 
     def _label(self, result: Any) -> Any:
         """Store the unit system of the display in a result, for printing, and return the result."""
@@ -252,91 +371,15 @@ class AdmittanceDisplay:
         K = check_number(f"{name}_stiffness", stiffness, units["N/m"], allowed)
         return K, check_number(f"{name}_damping", damping, units["N s/m"], NOT_NEGATIVE)
 
-    def _read_environments(self, stiffness: Any, damping: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return arrays of stiffness and damping in SI units; raise `InputError` if a damping is negative."""
-        units = SYSTEMS[self.rotary]
-        texts = (("environment_stiffness", stiffness, "N/m"), ("environment_damping", damping, "N s/m"))
-        K, B = (np.asarray(as_float64(name, read_texts(name, value, units[unit]))) for name, value, unit in texts)
-        if np.any(~(B >= 0)):
-            raise InputError(f"environment_damping: got {float(B[~(B >= 0)].flat[0]):g} N s/m; it must be >= 0")
-        return K, B
-
-    @property
-    def _n_delay(self) -> int:
-        """Integer part n of the delay in periods."""
-        return int(np.floor(self.timing.d))
-
-    @cached_property
-    def _plant(self) -> LinearDevice:
-        """Model of the robot, from its position or velocity command to its position."""
-        device = self.robot
-        if isinstance(device, Actuator):
-            w = float(device.rate)
-            lags = {1: ([w], [1.0, w]), 2: ([w * w], [1.0, 2.0 * float(device.damping_ratio or 0.0) * w, w * w])}
-            device = LinearDevice(lags[device.order])
-        if self.command == "position":
-            return device
-        numerator, denominator, _ = device.system
-        return LinearDevice((numerator, (*denominator, Fraction(0))))
-
-    @cached_property
-    def _coefficients(self) -> Coefficients:
-        """The polynomials p_M, p_D, p_K and p_B, computed from floats without rounding errors."""
-        period = Fraction(float(self.timing.period))
-        position, velocity, denominator = self._sample_plant(period)
-        # The response of the virtual velocity v to the force is top/(M mass + D damping), and the response of the
-        # command to v is path/integral (docs/theory/admittance.md, W1).
-        top, mass, damping = (period,), ZETA, (period,)
-        top = multiply(top, Z)
-        path, integral = multiply((period,), Z), ZETA
-        if self.integrator == "trapezoidal":
-            half = (period / 2,)
-            top = reduce(multiply, (half, Z, TWO))
-            mass, damping = multiply(Z, ZETA), multiply(half, TWO)
-            path = multiply(half, TWO)
-        if self.command == "velocity":
-            path, integral = ONE, ONE
-        common, forward = multiply(integral, denominator), multiply(top, path)
-        parts = (multiply(mass, common), multiply(damping, common), multiply(forward, position))
-        return Coefficients(*map(_in_z, (*parts, multiply(forward, velocity))))
-
-    def _sample_plant(self, period: Fraction) -> tuple[Polynomial, Polynomial, Polynomial]:
-        """Return the numerators of P and V, and their common denominator, as polynomials in zeta.
-
-        P and V are the responses of position and velocity of the robot to its command, computed from the matrices Psi
-        and Gamma of the sampled robot (docs/theory/admittance.md, W2 and W3). For a robot that is given as a sampled
-        system, the numerator of V is zero, because such a model does not define the velocity.
-        """
-        delays = reduce(multiply, [Z] * (self._n_delay + 1), ONE)
-        if self._plant.dt:
-            numerator, denominator = (_in_zeta(part) for part in self._plant.system[:2])
-            return multiply(numerator, Z), (), multiply(denominator, delays)
-        T = float(self.timing.period)
-        system = System(self._plant, T, T * T, self.timing.d, self._n_delay, Estimate())
-        system.check()
-        states, (A, B, _) = sample_states(system), system.realize()
-        psi = _to_fractions(states.psi)
-        whole = _to_fractions(states.full)
-        late = whole if states.late is None else _to_fractions(states.late)
-        denominator = characteristic_polynomial(psi)
-
-        def respond(output: np.ndarray) -> Polynomial:
-            """Return ``c adj(zeta - Psi) (zeta Gamma(1 - f) + Gamma(1))`` for the row c = ``output``.
-
-            Both terms follow from determinants by the matrix determinant lemma.
-            """
-            first, second = (
-                subtract(denominator, characteristic_polynomial(psi + np.outer(force, output)))
-                for force in (late, whole)
-            )
-            return _add(multiply(first, ZETA), second)
-
-        sensor = _to_fractions(np.eye(len(B))[0])
-        velocity = _add(respond(_to_fractions(A[0])), multiply((Fraction(float(B[0])),), denominator))
-        # The numerator of V is zero at z = 1 (W3). Set its constant coefficient to exactly 0, because a rounding error
-        # would separate the pole at z = 1, a drift of the position, from the zero that cancels it.
-        velocity = trim((*(value / period for value in velocity[:-1]), Fraction(0)))
-        return respond(sensor), velocity, multiply(denominator, delays)
+    def _read_array(self, name: str, value: Any) -> np.ndarray:
+        """Return an argument as an array in SI units; raise `InputError` if a single number is out of range."""
+        unit, allowed = _QUANTITIES[name]
+        unit = SYSTEMS[self.rotary][unit]
+        array = as_float64(name, read_texts(name, value, unit))
+        if not array.ndim and not (allowed.holds(array) and np.isfinite(array)):
+            sign = ">" if allowed.low_open else ">="
+            raise InputError(f"{name}: got {float(array):g} {unit}; it must be {sign} 0")
+        return np.asarray(array)
 
     def _make_scene(self, gain: str, factors: dict[str, float]) -> Scene:
         """Return a scene in which one of the gains 1/M, D, K and B is the stiffness of the wall.
@@ -346,61 +389,38 @@ class AdmittanceDisplay:
             factors: values of the other factors by the same names. The default of M and D is the value of the display,
                 the default of K and B is 0.
         """
-        if self._plant.dt and factors.get("environment_damping"):
+        if is_traced(*list_leaves(self), *factors.values()):
             raise InputError(
-                "environment_damping: got a damper with a sampled robot, whose velocity is unknown; use a model in s"
+                "display: got a value that JAX traces, allowed only in max_environment_stiffness; call this method "
+                "outside of jit, vmap and grad"
             )
+        self.loop.check_damper(factors.get("environment_damping", 0.0))
         mass, damping = Fraction(float(self.virtual_mass)), Fraction(float(self.virtual_damping))
         values = {"mass": mass, "damping": damping} | {name: Fraction(value) for name, value in factors.items()}
-        parts = self._coefficients._asdict()
+        parts = self.loop.coefficients._asdict()
         rest = reduce(
-            _add, (multiply((values[name],), part) for name, part in parts.items() if name != gain and values.get(name))
+            add, (multiply((values[name],), part) for name, part in parts.items() if name != gain and values.get(name))
         )
         # With the gain 1/M, the characteristic polynomial divided by M is p_M + (1/M) rest, so p_M is the denominator.
         system = (rest, parts[gain]) if gain == "mass" else (parts[gain], rest)
         return Scene(LinearDevice(system, float(self.timing.period)), Timing(float(self.timing.period)))
 
-    def _find_limit(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int]:
-        """Return the upper end of the stable interval of a gain that starts at 0, its frequency in Hz, and a status."""
-        top, frequency, status, least = self._find_range(gain, factors)
-        return (top, frequency, status) if least == 0 else (np.nan, np.nan, int(Status.NO_BOUNDARY))
+    def _find_limit(self, factors: dict[str, float]) -> tuple[float, float, int]:
+        """Return the largest stiffness K such that all from 0 to K are stable, its frequency in Hz, and a status."""
+        least, largest, status = self._find_range("stiffness", factors)
+        if least > 0 or status != Status.OK:
+            return np.nan, np.nan, int(Status.NO_BOUNDARY)
+        return largest, self._find_frequency("stiffness", factors, largest), status
 
-    def _find_range(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int, float]:
-        """Return the lowest stable interval of a gain: upper end, frequency there in Hz, status, and lower end."""
-        scene = self._make_scene(gain, factors)
-        intervals = scene.stable_stiffness(0.0)
+    def _find_range(self, gain: str, factors: dict[str, float]) -> tuple[float, float, int]:
+        """Return both ends of the lowest stable interval of gains, and a status; arguments as `_make_scene`."""
+        intervals = self._make_scene(gain, factors).stable_stiffness(0.0)
         intervals = intervals[intervals[:, 1] > 0]
         if not intervals.size:
-            return np.nan, np.nan, int(Status.NO_BOUNDARY), np.nan
+            return np.nan, np.nan, int(Status.NO_BOUNDARY)
         low, high = intervals[0].tolist()
-        pole = scene.dominant_pole(high, 0.0)
-        return high, float(pole.frequency), int(pole.status), max(low, 0.0)
+        return max(low, 0.0), high, int(Status.OK)
 
-
-def _to_fractions(values: Any) -> np.ndarray:
-    """Return an array of floats as exact fractions."""
-    floats = np.asarray(values, float)
-    return np.array([Fraction(value) for value in floats.ravel().tolist()], object).reshape(floats.shape)
-
-
-def _add(one: Polynomial, other: Polynomial) -> Polynomial:
-    """Return the sum of two polynomials."""
-    return subtract(one, tuple(-value for value in other))
-
-
-def _in_z(polynomial: Polynomial) -> Polynomial:
-    """Return the coefficients in z of a polynomial in zeta = z - 1."""
-    return _substitute(polynomial, -1)
-
-
-def _in_zeta(polynomial: Polynomial) -> Polynomial:
-    """Return the coefficients in zeta of a polynomial in z = zeta + 1."""
-    return _substitute(polynomial, 1)
-
-
-def _substitute(polynomial: Polynomial, offset: int) -> Polynomial:
-    """Return the coefficients of the polynomial p(x + offset) in x, by Horner's method."""
-    result: Polynomial = ()
-    for value in polynomial:
-        result = _add(multiply(result, (Fraction(1), Fraction(offset))), (value,)) if result else trim((value,))
-    return result
+    def _find_frequency(self, gain: str, factors: dict[str, float], value: float) -> float:
+        """Return the frequency in Hz of the dominant pole with a value of a gain; arguments as `_make_scene`."""
+        return float(self._make_scene(gain, factors).dominant_pole(value, 0.0).frequency) if value == value else np.nan

@@ -42,7 +42,7 @@ _UNITS: dict[str, Any] = {
 }
 _MISSING = {
     "passivity_margin": "no condition is known for these parts",
-    "delay_margin": "not confirmed by the number of poles, or not computed because of a tool",
+    "delay_margin": "not confirmed by the number of poles",
     "phase_margin": "no gain crossover determines it",
     **dict.fromkeys(
         ("alpha_max", "beta_at_max", "stiffness_max", "virtual_damping_at_max", "ridge_frequency"), "no wall is stable"
@@ -247,6 +247,9 @@ IMPROVEMENTS = {
     "actuator.time_constant": (0.5, "an amplifier twice as fast"),
     "coupling.stiffness": (2.0, "a link twice as stiff"),
 }
+# A lighter tool raises K_max of some scenes and lowers that of others, so only the better one of these two is listed.
+TOOL_MASSES = ((2.0, "a tool twice as heavy"), (0.5, "a tool half as heavy"))
+HARMFUL_GAIN = 0.9995  # gain below which the note of a change states that it lowers the stiffness
 
 
 @compact_repr()
@@ -257,7 +260,8 @@ class Limit(NamedTuple):
     label: str  # the improvement in words, such as "half the delay"
     stiffness: float  # in N/m: K_max, or K recommended under the same requirements, of the improved scene
     gain: float  # ratio of that stiffness to the current one
-    note: str = ""  # quantity that stays constant, such as "the delay stays 1 ms"
+    # Quantity that stays constant, such as "the delay stays 1 ms", and "harmful" if the change lowers the stiffness.
+    note: str = ""
 
     def spell(self) -> str:
         """Return a text with the improvement, the stiffness that results from it, and the gain."""
@@ -281,17 +285,19 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
     Each part and parameter of the scene is improved separately, by a step that is available in practice: twice the
     rate, half the delay, 10 % more damping, a filter or an amplifier twice as fast, a window half as long, a coupling
-    twice as stiff, or a structure twice as stiff for the modes. At twice the rate the window keeps its length in
-    seconds and the delay stays constant in the unit in which it was given; a delay given in seconds is also evaluated
-    constant in periods. If twice the cutoff exceeds the Nyquist frequency, the filter is removed instead.
+    twice as stiff, a structure twice as stiff for the modes, or a simulated tool of twice or half the mass. At twice
+    the rate the window keeps its length in seconds and the delay stays constant in the unit in which it was given; a
+    delay given in seconds is also evaluated constant in periods. If twice the cutoff exceeds the Nyquist frequency, the
+    filter is removed instead.
 
     Args:
         scene: a scene whose parameters are plain numbers.
 
     Returns:
         List of `Limit`, one per improvement, the largest gain first. Changes that reduce K_max are included, with a
-        gain below 1, because a filter may also increase K_max. A filter given by its coefficients is not changed and
-        excludes other rates. NaN if K_max cannot be computed; these entries are last.
+        gain below 1 and the note "harmful", because a filter or a delay may also increase K_max. A filter given by its
+        coefficients is not changed and excludes other rates. NaN if K_max cannot be computed; these entries are last.
+        The list is empty if K_max is infinite, which is possible for a virtual coupling.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII (influence of damping, mass, rate and delay on a rigid device).
@@ -315,9 +321,13 @@ def compute_gains(scene: SceneOptima, now: float, measure: Callable[[SceneOptima
         measure: function that returns the stiffness of an improved scene in N/m, such as its K_max.
     """
     limits = []
-    for name, words, improved, note in list_improvements(scene):
+    for name, words, improved, note in list_improvements(scene) if not math.isinf(now) else ():
         stiffness = measure(improved)
-        limits.append(Limit(name, words, stiffness, stiffness / now, note))
+        gain = stiffness / now
+        if gain < HARMFUL_GAIN:
+            note = "; ".join(filter(None, (note, "harmful")))
+        if name != "tool" or gain > 1:
+            limits.append(Limit(name, words, stiffness, gain, note))
     limits.sort(key=lambda limit: (not limit.gain >= 0, -limit.gain))
     return with_units(ResultList(limits), scene.unit_system)
 
@@ -378,6 +388,13 @@ def list_improvements(scene: SceneOptima) -> Iterator[Improvement]:
     if scene.device.modes:
         stiffer = tuple(replace(mode, frequency=math.sqrt(2.0) * mode.frequency) for mode in scene.device.modes)
         yield Improvement("modes", "a structure twice as stiff", scene.replace(modes=stiffer))
+    if scene.tool is not None:
+        for factor, words in TOOL_MASSES:
+            yield Improvement("tool", words, scene.replace(**{"tool.mass": factor * scene.tool.mass}))
+    dampings = getattr(scene.device, "joint_dampings", {})
+    if any(dampings.values()):
+        more = {path: 1.1 * damping for path, damping in dampings.items()}
+        yield Improvement("joints", "10 % more damping of the joints", scene.replace(**more))
 
 
 def _can_sample_faster(scene: SceneOptima) -> bool:

@@ -93,7 +93,9 @@ class SceneParts(Part):
             part = getattr(self, name)
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; pass an object such as {example}")
-        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit", "tool")}
+        named = {
+            name: getattr(self, name) for name in ("wall", "operator", "velocity", "safe_limit", "feedback", "tool")
+        }
         check_kind(self.unit_system.rotary, named)
         if self.operator is not None and not isinstance(self.device, Device):
             raise InputError(
@@ -108,8 +110,6 @@ class SceneParts(Part):
             )
         if self.tool is not None and isinstance(self.device, MeasuredDevice):
             raise InputError("tool: not allowed with a measured response; use a model of the device")
-        if self.tool is not None and (self.position is not None or self.feedback is not None):
-            raise InputError("tool: not allowed together with position or feedback; omit the tool, or omit these parts")
 
     def _shift_parts(self) -> None:
         """Move velocity estimate and operator to their fields if the positional arguments omit the wall before them."""

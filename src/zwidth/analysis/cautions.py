@@ -17,13 +17,15 @@ from zwidth.analysis.wall_search import (
     DEFAULT_PHASE_MARGIN,
     Requirements,
     WallChoice,
-    choose_wall,
+    choose_controller,
 )
 from zwidth.core.status import Status
 from zwidth.model.device import Device
 from zwidth.model.grasps import list_grasps
+from zwidth.model.safe_limit import SafeLimit
 from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.units.formatting import format_wall, plain, with_unit
+from zwidth.units.unit_system import UnitSystem
 
 # Limits of acceptable walls. A recommended wall that violates one of these limits has a caution.
 LEAST_PHASE_MARGIN = 10.0  # smallest phase margin, in degrees
@@ -112,7 +114,8 @@ def _advise(
     """
     for words, requirements in options.items():
         scene = recommendation.scene
-        wall = choose_wall(scene, requirements, recommendation.stiffest, recommendation.stiffness, COARSE)
+        choice = choose_controller(scene, requirements, recommendation.stiffest, recommendation.stiffness, COARSE)
+        wall, scene = choice.wall, choice.scene
         if wall.status == Status.OK and accepts(scene.replace(stiffness=wall.stiffness, virtual_damping=wall.damping)):
             return f"use recommend {words}: {_spell_change(recommendation, wall)}"
     return otherwise
@@ -136,9 +139,9 @@ def price_passivity(recommendation: Any) -> str:
     scene, requirements = recommendation.scene, recommendation.requirements
     if recommendation.verdict is None or recommendation.verdict.passive is not False:
         return ""
-    wall = choose_wall(
+    wall = choose_controller(
         scene, requirements._replace(passive=True), recommendation.stiffest, recommendation.stiffness, COARSE
-    )
+    ).wall
     if wall.status != Status.OK:
         return "no passive wall satisfies the same requirements"
     # State every requirement as an option, because the option --passive replaces the default requirements.
@@ -166,3 +169,18 @@ def judge_grasps(scene: Any) -> dict[str, bool]:
     for name, grasp in hands:
         labels[name] = labels.get(name, True) and bool(scene.replace(operator=grasp).is_stable())
     return labels
+
+
+def describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -> list[str]:
+    """Return a list of texts on the safe limit: its values and reason, then its warnings.
+
+    Args:
+        limit: the safe limit of the scene; None for none.
+        ignored: True if the recommendation ignores the limit.
+        units: unit system of the texts.
+    """
+    if limit is None or (limit.forbids_all and not ignored):
+        # Return no text if the safe limit excludes all walls, because the reason for the missing recommendation states
+        # this.
+        return []
+    return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]

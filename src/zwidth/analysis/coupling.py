@@ -63,7 +63,7 @@ def is_safe_for_every_world(scene: Scene, stiffness: Walls = None, virtual_dampi
         >>> scene.is_safe_for_every_world([4900, 5100, 7600], [0, 0, 2.83])
         array([ True, False,  True])
     """
-    n_delay = _find_delay(scene)
+    n_delay = find_delay(scene)
     alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, virtual_damping))
     delta = float(scene.device.damping) / scene.units.virtual_damping
     with np.errstate(all="ignore"):
@@ -85,14 +85,14 @@ def max_safe_coupling(scene: Scene) -> SafeCoupling:
         >>> scene.max_safe_coupling()
         SafeCoupling(stiffness=7.698 kN/m, virtual_damping=2.81766 N s/m)
     """
-    spring, damper = find_stiffest(_find_delay(scene))
+    spring, damper = find_stiffest(find_delay(scene))
     # Reduce the stiffness slightly, so that `is_safe_for_every_world` is true in spite of rounding errors.
     spring *= 1.0 - INWARD
     damping = float(scene.device.damping)
     return SafeCoupling(2.0 * spring * damping / float(scene.timing.period), damper * damping)
 
 
-def _find_delay(scene: Scene) -> int:
+def find_delay(scene: Scene) -> int:
     """Return the delay, an integer number of periods; raise `InputError` if no condition is known for the scene."""
     # Ignore the operator and the tool of the scene, because the condition holds for every passive operator and tool.
     unsupported = [part for part in scene.nonrigid_parts if part not in ("operator", "tool")]

@@ -1,11 +1,13 @@
-"""Stability of the virtual coupling ``C = alpha + beta F`` between a device and a simulated tool.
+"""Stability of the virtual coupling between a device and a simulated tool, a spring alpha and a damper beta.
 
-alpha and beta are the normalized stiffness and damping of the coupling, F is the velocity estimate. The closed loop is
-``1 + C (G + G_t) = 0`` with the responses G of the device and G_t of the tool (docs/theory/passivity.md, U5). The
-analyses of `LinearLoop` for a wall are therefore valid for the coupling, with G + G_t in place of G.
+alpha and beta are normalized. With the responses G of the device and G_t of the tool, and the velocity estimate F, the
+closed loop is ``1 + (alpha + beta F) (G + G_t) = 0`` (docs/theory/passivity.md, U5). The analyses of `LinearLoop` for a
+wall are therefore valid for the coupling, with G + G_t in place of G. A position estimate and further feedback of the
+device change G and F (`stability.linear.composition`).
 
 A tool that is integrated by the implicit Euler method responds to the coupling force without delay. The set of stable
-couplings can then be *unbounded*: all couplings with sufficiently large alpha are stable.
+couplings can then be *unbounded*: all couplings with sufficiently large alpha are stable, or couplings with large alpha
+and beta in certain ratios.
 """
 
 from __future__ import annotations
@@ -18,12 +20,18 @@ import numpy as np
 from zwidth.analysis.loop import LinearLoop
 from zwidth.core.errors import InputError
 from zwidth.core.status import RidgeKind, Status
-from zwidth.plant.composed_plant import add_plants, factor_tool
+from zwidth.core.xp import nan_beyond
+from zwidth.plant.composed_plant import factor_tool
+from zwidth.plant.factored_plant import FactoredPlant
+from zwidth.stability.linear.boundary import Boundary
+from zwidth.stability.linear.composition import compose_coupling
+from zwidth.stability.linear.coupled_controller import find_coupling_delay_margin
 from zwidth.stability.linear.regions import StableSet
 from zwidth.stability.linear.ridge import RidgeSolution
 from zwidth.stability.linear.roots import LoopRoots
 from zwidth.stability.linear.rows import CONNECTED_START, Island, find_stable_intervals
 from zwidth.stability.results import Margins, RidgePoint
+from zwidth.units.quantities import WALL_RANGE
 
 # Values of the damping beta at which `CouplingLoop.free_damping` tests whether every alpha > 0 is stable.
 TESTED_DAMPINGS = np.concatenate([[0.0], np.geomspace(1e-6, 1e3, 91)])
@@ -34,22 +42,48 @@ class CouplingLoop(LinearLoop):
 
     @cached_property
     def roots(self) -> LoopRoots:
-        device, scene = super().roots, self.scene
-        plant = add_plants(device, factor_tool(scene.tool.respond(scene.mass, scene.timing.period)))
-        return LoopRoots(**vars(plant), estimate=device.estimate)
+        return self._add_tool(super().roots)
+
+    def _add_tool(self, device: LoopRoots) -> LoopRoots:
+        """Return the loop of the coupling, from the loop of the device without a tool."""
+        return compose_coupling(device, self.chain.estimates, self._factored_tool)
+
+    @cached_property
+    def _factored_tool(self) -> FactoredPlant:
+        """Response G_t of the tool."""
+        return factor_tool(self.scene.tool.respond(self.scene.mass, self.scene.timing.period))
+
+    @cached_property
+    def has_free_stiffness(self) -> bool:
+        """True if all couplings with sufficiently large alpha are stable, whatever their beta."""
+        return not self.boundary.count_above(np.zeros(1))
+
+    @cached_property
+    def stable_ratios(self) -> np.ndarray:
+        """Intervals of the ratio alpha/beta, shape (n, 2), in which all sufficiently stiff couplings are stable.
+
+        The array is empty if no coupling is stable in the limit of large beta, or if `has_free_stiffness` is True.
+        """
+        loop = self.roots
+        if self.has_free_stiffness or not loop.shared or loop.zeros.size < loop.poles.size + loop.lag:
+            return np.empty((0, 2))
+        # For alpha = r beta and beta -> inf, the poles approach the zeros of r + F, because all zeros of G are poles of
+        # F. They are the poles of the loop of a spring r with the plant 1/F.
+        intervals = find_stable_intervals(Boundary.trace(loop.invert_estimate()), np.zeros(1))
+        return np.stack([intervals.low[0], intervals.high[0]], -1)
 
     @cached_property
     def unbounded(self) -> bool:
-        """True if all couplings with sufficiently large alpha are stable, whatever their beta."""
-        return not self.boundary.count_above(np.zeros(1))
+        """True if couplings with arbitrarily large alpha or beta are stable."""
+        return self.has_free_stiffness or bool(self.stable_ratios.size)
 
     @cached_property
     def free_damping(self) -> float:
         """The smallest beta in `TESTED_DAMPINGS` with which the coupling is stable for every alpha > 0; NaN if none is.
 
-        It is NaN, too, if the set of stable couplings is bounded.
+        It is NaN, too, if not all couplings with sufficiently large alpha are stable.
         """
-        if not self.unbounded:
+        if not self.has_free_stiffness:
             return np.nan
         intervals = find_stable_intervals(self.boundary, TESTED_DAMPINGS)
         scale = CONNECTED_START * np.abs(self.boundary.ends[0][np.isfinite(self.boundary.ends[0])]).max(initial=1e-60)
@@ -70,6 +104,11 @@ class CouplingLoop(LinearLoop):
     def stiffest(self, negative: bool) -> RidgePoint:
         if not self.unbounded:
             return super().stiffest(negative)
+        low, high = self.stable_ratios.T
+        if ((low <= 0) & (high > 0)).any():
+            # With a sufficiently large beta, couplings of every alpha from 0 on are stable.
+            unlimited, nan = np.float64(np.inf), np.float64(np.nan)
+            return RidgePoint(unlimited, unlimited, nan, np.int32(RidgeKind.NONE), np.int32(Status.OK))
         beta = np.float64(self.free_damping)
         alpha = np.float64(np.nan if np.isnan(beta) else np.inf)
         status = Status.NOT_CONVERGED if np.isnan(beta) else Status.OK
@@ -78,7 +117,7 @@ class CouplingLoop(LinearLoop):
     def is_connected(self, alpha: float, beta: float) -> bool:
         if not self.unbounded:
             return super().is_connected(alpha, beta)
-        # All couplings with sufficiently large alpha are stable, whatever their beta, so they are connected to each
+        # If all couplings with sufficiently large alpha are stable, whatever their beta, they are connected to each
         # other. If one beta is stable for every alpha > 0, they are also connected to alpha = 0.
         intervals = find_stable_intervals(self.boundary, np.array([beta]))
         inside = (intervals.low[0] < alpha) & (alpha < intervals.high[0])
@@ -94,7 +133,15 @@ class CouplingLoop(LinearLoop):
         return [] if self.unbounded else super().islands(least)
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, wanted: Container[str] = Margins._fields) -> Margins:
-        # Leave the delay margin NaN, because additional delay changes the response of the device, but not of the tool.
-        return super().margins(
-            alpha, beta, [name for name in Margins._fields if name in wanted and name != "delay_margin"]
-        )
+        others = [name for name in Margins._fields if name in wanted and name != "delay_margin"]
+        margins = super().margins(alpha, beta, others)
+        if "delay_margin" not in wanted or self.chain.sampled:
+            return margins
+        stable, tool = np.asarray(self.labels(alpha, beta)), self._factored_tool
+        delay = np.where(np.isnan(nan_beyond(WALL_RANGE, alpha, beta)).any(0), np.nan, 0.0)
+        for index in map(tuple, np.argwhere(stable).tolist()):
+            delay[index] = find_coupling_delay_margin(self.chain, tool, float(alpha[index]), float(beta[index]))
+        return margins._replace(delay_margin=delay[()])
+
+    def with_delay(self, delay: float) -> LoopRoots:
+        return self._add_tool(super().with_delay(delay))

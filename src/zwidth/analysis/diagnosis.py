@@ -19,6 +19,7 @@ from zwidth.analysis.remedies import search_remedies
 from zwidth.analysis.stabilization import WITHOUT_MARGINS, Remedy, stabilize
 from zwidth.analysis.trials import LONG_DELAY, Experiment, Hardware, SustainedMotion, list_starts
 from zwidth.analysis.walls import read_single_wall
+from zwidth.core.errors import InputError
 from zwidth.model.checks import check_limit, check_number
 from zwidth.model.wall import VirtualWall, resolve_wall
 from zwidth.simulation.result import MotionKind
@@ -185,7 +186,8 @@ def diagnose(
         motion; from other initial conditions a larger one may exist.
 
     Raises:
-        InputError: a value is not usable, the scene has no wall, or its device is a measured response without a model.
+        InputError: a value is not usable, the scene has no wall or has a tool, or its device is a measured response
+            without a model.
 
     References:
         Abbott, Okamura 2005, IEEE Trans. Robotics 21(5):952-964 (encoder and friction).
@@ -198,6 +200,8 @@ def diagnose(
         >>> diagnosis.cause
         'quantization'
     """
+    if scene.tool is not None:
+        raise InputError(f"tool: got {scene.tool!r}, but diagnose supports walls only; use zwidth.simulate")
     units = scene.unit_system
     K, B = read_single_wall(*map(np.asarray, resolve_wall(scene.wall, stiffness, virtual_damping, units)))
     sliding = check_number("coulomb", coulomb, units["N"])

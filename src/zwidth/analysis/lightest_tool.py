@@ -1,10 +1,11 @@
 """Compute the masses of a simulated tool with which a virtual coupling is stable.
 
-The *coupling* C is a spring K and a damper B between the device and the *tool*, a mass M that the computer simulates.
-The closed loop is ``1 + C (G + G_t) = 0`` with the responses G of the device and G_t of the tool. It has a pole at
-z = e^(jw) on the unit circle if ``1/G_t = R`` with ``R = -1/(1/C + G)``. Because 1/G_t is affine in M (`model.tool`),
-this equation yields one complex M at each angle w. If this M is real and positive, it is a *critical mass*. Between two
-neighboring critical masses, the coupling is stable with every mass or with none (docs/theory/passivity.md, U6).
+The *coupling* is a spring K and a damper B between the device and the *tool*, a mass M that the computer simulates. The
+closed loop is ``1 + C G + C_t G_t = 0`` with the responses G of the device and G_t of the tool, ``C = K + B F`` and
+``C_t = K + B V_t`` with the velocity estimates F and V_t of device and tool. It has a pole at z = e^(jw) on the unit
+circle if ``1/G_t = R`` with ``R = -C_t/(1 + C G)``. Because 1/G_t is affine in M (`model.tool`), this equation yields
+one complex M at each angle w. If this M is real and positive, it is a *critical mass*. Between two neighboring critical
+masses, the coupling is stable with every mass or with none (docs/theory/passivity.md, U6).
 """
 
 from __future__ import annotations
@@ -119,7 +120,8 @@ def _find_critical_masses(scene: Scene, tool: Tool, alpha: float, beta: float) -
 
     ``alpha`` and ``beta`` are the normalized K and B of the coupling; the mass of ``tool`` has no effect.
     """
-    loop = find_roots(scene.replace(tool=None).loop.chain)
+    chain = scene.replace(tool=None).loop.chain
+    loop, of_tool = find_roots(chain), chain.estimate if chain.estimates is None else chain.estimates.of_tool
     mass, period = float(scene.mass), float(scene.timing.period)
     one, three = (Tool(m * mass, tool.damping, tool.stiffness, tool.integrator).respond(mass, period) for m in (1, 3))
 
@@ -127,8 +129,8 @@ def _find_critical_masses(scene: Scene, tool: Tool, alpha: float, beta: float) -
         """Return the complex M that solves 1/G_t = R at each angle w, in units of the mass of the device."""
         points = circle_points(w)
         with np.errstate(all="ignore"):
-            controller = alpha + beta * loop.estimate.jet(points).value
-            target = -1.0 / (1.0 / controller + loop.evaluate_response(points).value)
+            controller, coupling = (alpha + beta * each.jet(points).value for each in (loop.estimate, of_tool))
+            target = -coupling / (1.0 + controller * loop.evaluate_response(points).value)
             first, third = (
                 ((r.a2 * points.z_minus_1 + r.a1) * points.z_minus_1 + r.a0) / (r.gain * points.z**r.power)
                 for r in (one, three)

@@ -35,6 +35,7 @@ from zwidth.plant.rigid_mass import classify_delays
 from zwidth.stability.linear.boundary import Boundary
 from zwidth.stability.linear.composition import find_roots
 from zwidth.stability.linear.curve import evaluate_curve
+from zwidth.stability.linear.delay_margin import change_delay
 from zwidth.stability.linear.derivatives import SceneSensitivities, compute_sensitivities
 from zwidth.stability.linear.margins import compute_margins, evaluate_walls
 from zwidth.stability.linear.passivity import PassivityCondition, compute_passivity_margins
@@ -293,6 +294,10 @@ class LinearLoop:
         Margins not named in ``wanted`` may be NaN.
         """
         return compute_margins(self.chain, self.boundary, alpha, beta, wanted)
+
+    def with_delay(self, delay: float) -> LoopRoots:
+        """Return the poles and zeros of the loop without a wall after replacing its delay by ``delay``, in periods."""
+        return change_delay(self.chain, delay)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """Return the damping of the device minus the damping that passive walls require, in units of m/T."""

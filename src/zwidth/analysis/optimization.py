@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
+from zwidth.analysis.joint_damping import add_joint_dampings
 from zwidth.analysis.walls import SceneAnalysis, allows_negative
 from zwidth.core.errors import InputError, check_choice, describe_choice
 from zwidth.core.status import RidgeKind, Status
@@ -275,7 +276,8 @@ class SceneOptima(SceneAnalysis):
         Numerics:
             Closed form for a rigid device. Otherwise implicit derivatives of the active constraints, some ms per
             parameter, with a relative error of 1e-6; if a derivative is nearly 0, the absolute error is 1e-11 times
-            K_max over the parameter (1e-9 with a spring ten million times as stiff as the wall).
+            K_max over the parameter (1e-9 with a spring ten million times as stiff as the wall). For the dampings of
+            joints, numerical differences of K_max.
 
         Example:
             >>> import zwidth
@@ -285,7 +287,8 @@ class SceneOptima(SceneAnalysis):
         """
         if self.traced_path is not None:
             return self.traced_loop.trace_sensitivities(negative_damping)
-        return self.loop.sensitivities(allows_negative(self, negative_damping))
+        result = self.loop.sensitivities(allows_negative(self, negative_damping))
+        return add_joint_dampings(self, result, lambda scene: scene.max_stiffness(negative_damping=negative_damping)[0])
 
     def required(
         self,

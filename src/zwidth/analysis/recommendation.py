@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -25,16 +25,24 @@ from zwidth.analysis.assessment import (
     name_kind,
     round_margin,
 )
-from zwidth.analysis.cautions import judge_grasps, list_cautions
+from zwidth.analysis.cautions import describe_limit, judge_grasps, list_cautions
+from zwidth.analysis.coupling_code import write_program
 from zwidth.analysis.optimization import SceneOptima, StiffestWall
-from zwidth.analysis.wall_code import write_wall
-from zwidth.analysis.wall_search import COARSE, Grasps, Requirements, choose_wall, list_grasped_scenes, measure_slack
+from zwidth.analysis.wall_search import (
+    COARSE,
+    Grasps,
+    Requirements,
+    choose_controller,
+    list_grasped_scenes,
+    measure_slack,
+)
 from zwidth.core.errors import InputError
 from zwidth.core.status import Status
 from zwidth.model.checks import check_limit
+from zwidth.model.controller_gains import CascadeGains, ControllerKind, PidGains, PositionUnit, find_gains, find_units
 from zwidth.model.device import Device
 from zwidth.model.grasps import RADII
-from zwidth.model.safe_limit import SafeLimit, reserve_damping
+from zwidth.model.safe_limit import reserve_damping
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.rigid.step_response import decay_time
@@ -156,7 +164,7 @@ class Recommendation:
         try:
             top = improved.max_stiffness()
             near = self.stiffness * float(top.stiffness) / float(self.stiffest.stiffness)
-            return choose_wall(improved, self.requirements, top, near, COARSE).stiffness
+            return choose_controller(improved, self.requirements, top, near, COARSE).wall.stiffness
         except InputError:
             # Return NaN for an invalid improved scene: at twice the sampling rate, a long delay may exceed the largest
             # allowed number of periods.
@@ -177,7 +185,7 @@ class Recommendation:
         return {} if self.status != Status.OK else judge_grasps(self.scene)
 
     def code(self, language: Literal["c", "python"] = "c", *, max_force: float | str = math.inf) -> str:
-        """Return the wall and its velocity estimate as source code for a control loop.
+        """Return the wall, or the coupling and its tool, with the velocity estimate as source code for a control loop.
 
         Args:
             language: "c" (C99 without any library) or "python".
@@ -187,7 +195,8 @@ class Recommendation:
             Source code with a state, a function that initializes it at rest, and a function to call once per period,
             which converts the position in m, positive into the wall, to the force on the device in N. The forces equal
             those of `zwidth.simulate` with ``contact="unilateral"`` and the same ``max_force``, except for rounding
-            errors.
+            errors. If the scene has a tool, the program also integrates the tool, and the forces equal those of
+            `zwidth.simulate` with ``contact="bilateral"``.
 
         Raises:
             InputError: no wall is recommended, the language is unknown, or ``max_force`` is not positive.
@@ -195,7 +204,58 @@ class Recommendation:
         if self.status != Status.OK:
             raise InputError(f"code: there is no wall: {self.reason}")
         limit = check_limit("max_force", max_force, self.unit_system["N"])
-        return write_wall(self.scene, language, self.cautions, limit)
+        return write_program(self.scene, language, self.cautions, limit)
+
+    def cascade_gains(self, units: PositionUnit | None = None, output_unit: float = 1.0) -> CascadeGains:
+        """Return the gains of a position loop with an inner velocity loop, such as those of ODrive, for the wall.
+
+        The integrator gain is that of the scene. The wall is stable and satisfies the requirements with these gains:
+        the integrator of ``scene`` contains ``pos_gain`` = K/B of the recommended wall.
+
+        Args:
+            units: position unit of the gains: "turns", "degrees", "rad" or "m". Default: turns, or m for a linear
+                device.
+            output_unit: force or torque per unit of output, see `zwidth.cascade`.
+
+        Raises:
+            InputError: no wall is recommended, or the further feedback is not the integrator of a cascade.
+
+        Example:
+            >>> import zwidth
+            >>> device, timing = zwidth.Device("1e-4 kg m^2", "1e-4 N m s/rad"), zwidth.Timing(rate="8 kHz")
+            >>> scene = zwidth.Scene(device, timing, **zwidth.cascade(20, 0.16, vel_integrator_gain=0.3))
+            >>> scene.recommend(stiffness_fraction=0.1).cascade_gains().vel_integrator_gain
+            0.3
+        """
+        return cast(CascadeGains, self._find_gains("cascade", units, output_unit))
+
+    def pid_gains(self, units: PositionUnit | None = None, output_unit: float = 1.0) -> PidGains:
+        """Return the gains of a PID controller for the wall; the integral gain is that of the scene.
+
+        Args:
+            units: position unit of the gains: "turns", "degrees", "rad" or "m". Default: rad, or m for a linear
+                device.
+            output_unit: force or torque per unit of output, see `zwidth.pid`.
+
+        Raises:
+            InputError: no wall is recommended, or the further feedback is not the integral of the position.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3), **zwidth.pid(1000, 2000, 10))
+            >>> print(f"{scene.recommend(stiffness_fraction=0.1).pid_gains().ki:.6g}")
+            2000
+        """
+        return cast(PidGains, self._find_gains("pid", units, output_unit))
+
+    def _find_gains(self, kind: ControllerKind, units: PositionUnit | None, output_unit: float) -> Any:
+        """Return the gains of the wall for a kind of controller; raise `InputError` if no wall is recommended."""
+        if self.status != Status.OK:
+            raise InputError(f"gains: there is no wall: {self.reason}")
+        scene = self.scene
+        return find_gains(
+            scene.wall, scene.feedback, kind, find_units(kind, units, self.unit_system.rotary), output_unit
+        )
 
     def lines(self) -> tuple[str, ...]:
         """Return lines of text on the wall, its margins and its cautions, or the reason why no wall is recommended."""
@@ -310,30 +370,15 @@ class Recommendation:
         return to_json(result)
 
 
-def _describe_limit(limit: SafeLimit | None, ignored: bool, units: UnitSystem) -> list[str]:
-    """Return a list of texts on the safe limit: its values and reason, then its warnings.
-
-    Args:
-        limit: the safe limit of the scene; None for none.
-        ignored: True if the recommendation ignores the limit.
-        units: unit system of the texts.
-    """
-    if limit is None or (limit.forbids_all and not ignored):
-        # Return no text if the safe limit excludes all walls, because the reason for the missing recommendation states
-        # this.
-        return []
-    return [f"safe limit{' (ignored)' if ignored else ''}: {limit.describe(units)}", *limit.warnings]
-
-
 class SceneAdvice(SceneOptima):
     """Base class of `zwidth.Scene` with the method `recommend`."""
 
     def recommend(
         self,
         *,
-        stiffness_fraction: float | None = None,
-        gain_margin: float | None = None,
-        phase_margin: float | None = None,
+        stiffness_fraction: float | str | None = None,
+        gain_margin: float | str | None = None,
+        phase_margin: float | str | None = None,
         passive: bool = False,
         grasps: Grasps | None = None,
         beyond_safe: bool = False,
@@ -341,9 +386,9 @@ class SceneAdvice(SceneOptima):
         """Return the wall recommended for this device: the stiffest that satisfies the requirements.
 
         Args:
-            stiffness_fraction: largest K as a fraction of K_max, between 0 and 1.
-            gain_margin: smallest gain margin, a factor on K and B together, > 1.
-            phase_margin: smallest phase margin in degrees, > 0.
+            stiffness_fraction: largest K as a fraction of K_max, between 0 and 1, or a text such as "50%".
+            gain_margin: smallest gain margin, a factor on K and B together, > 1, or a text such as "6 dB".
+            phase_margin: smallest phase margin in degrees, > 0, or a text such as "30 deg".
             passive: require a passive wall.
             grasps: require stability in "all" or only the "soft" grasps of `zwidth.reference_grasps`, or in "none".
             beyond_safe: ignore the scene's safe limit. By default the wall lies within the limit, and its K is at most
@@ -359,6 +404,9 @@ class SceneAdvice(SceneOptima):
             ``improvements``, changes of the device that allow a stiffer wall under the same requirements;
             ``code("c")``, the wall as a program for a control loop. ``status`` is UNREACHABLE if no wall satisfies the
             requirements.
+
+        If the further feedback is the integrator of a cascade (`zwidth.cascade`), ``pos_gain`` = K/B of the recommended
+        wall also becomes the ``pos_gain`` of the integrator. ``recommend(...).cascade_gains()`` returns all gains.
 
         Numerics:
             A stiffness fraction without other requirements needs no search: B is that of the stiffest wall if the wall
@@ -386,9 +434,9 @@ class SceneAdvice(SceneOptima):
         top, notes = bare.max_stiffness(), describe_islands(bare)
         if np.isinf(top.stiffness):
             raise InputError("tool: the coupling is stable with every stiffness; choose K and B by assess or margins")
-        choice = choose_wall(bare, requirements, top)
+        bare, top, choice = choose_controller(bare, requirements, top)
         notes += [choice.note] if choice.note else []
-        notes += _describe_limit(self.safe_limit, beyond_safe, self.unit_system)
+        notes += describe_limit(self.safe_limit, beyond_safe, self.unit_system)
         if choice.status == Status.OK:
             bare = bare.replace(wall=VirtualWall(choice.stiffness, choice.damping))
         return Recommendation(bare, top, requirements, choice.limit, choice.status, choice.reason, tuple(notes))

@@ -16,9 +16,11 @@ from zwidth.analysis.base import WallSI, wrap_methods
 from zwidth.analysis.coupling import is_safe_for_every_world, max_safe_coupling
 from zwidth.analysis.lightest_tool import lightest_tool
 from zwidth.analysis.recommendation import SceneAdvice
+from zwidth.analysis.unsafe_world import unsafe_world
 from zwidth.core.errors import InputError
 from zwidth.core.types import ArrayLike
 from zwidth.core.xp import is_traced, namespace
+from zwidth.model.checks import read_texts
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.numerics.evaluate import as_float64
 from zwidth.simulation.simulate import simulate
@@ -76,12 +78,14 @@ class Scene(SceneAdvice):
         """Return the walls that have a pole pair on the unit circle at a given frequency.
 
         Args:
-            omega: angular frequency in rad/s, between 0 and the Nyquist frequency ``pi/T``.
+            omega: angular frequency in rad/s, between 0 and the Nyquist frequency ``pi/T``; or a text such as "80 Hz".
 
         Returns:
             ``stiffness`` in N/m and ``virtual_damping`` in N s/m; NaN for other frequencies.
         """
-        w = (omega if is_traced(omega) else as_float64("omega", omega)) * self.timing.period
+        if not is_traced(omega):
+            omega = as_float64("omega", read_texts("omega", omega, "1/s"))
+        w = omega * self.timing.period
         inside, units = (w > 0) & (w < np.pi), self.units
         alpha, beta = self._loop_for(w).critical_walls(namespace(w).where(inside, w, 1.0))
         walls = alpha * units.stiffness, beta * units.virtual_damping
@@ -103,6 +107,7 @@ class Scene(SceneAdvice):
     is_safe_for_every_world = is_safe_for_every_world
     lightest_tool = lightest_tool
     max_safe_coupling = max_safe_coupling
+    unsafe_world = unsafe_world
     simulate = simulate
     """Method that calls `zwidth.simulate` with this scene and all other arguments."""
 

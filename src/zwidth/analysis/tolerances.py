@@ -8,6 +8,7 @@ hardly ever occur in practice; if the wall must nevertheless be stable on every 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -19,6 +20,7 @@ from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError, check_choice, describe_choice
 from zwidth.model.checks import check_integer
 from zwidth.units.display import compact_repr
+from zwidth.units.parsing import read_share
 from zwidth.units.quantities import WALL
 
 CONFIDENCE = 0.95  # confidence level of the interval of a share
@@ -32,7 +34,7 @@ class Tolerance(NamedTuple):
     distribution has a standard deviation of ``share`` times the nominal value.
     """
 
-    share: float
+    share: float | str  # a number, or a text such as "5%"
     distribution: Literal["uniform", "normal"] = "uniform"
 
 
@@ -65,7 +67,8 @@ def simulate_tolerances(
 
     Args:
         scene: nominal device, timing, other parts, and the wall.
-        tolerances: a `Tolerance` or its share by dotted path, as in ``scene.parameters()``; e.g. ``{"mass": 0.1}``.
+        tolerances: a `Tolerance` or its share by dotted path, as in ``scene.parameters()``; e.g. ``{"mass": 0.1}`` or
+            ``{"mass": "10%"}``.
         samples: number of drawn devices, up to 1,000,000. A rigid scene takes some microseconds per device, any other
             scene about a millisecond.
         seed: seed of the random numbers; equal seeds draw equal devices.
@@ -124,6 +127,9 @@ def _draw(scene: Scene, tolerances: dict[str, Any], count: int, seed: int) -> di
         if name not in nominal:
             raise InputError(f"tolerances: {describe_choice(name, tuple(nominal))}")
         share, distribution = tolerance if isinstance(tolerance, Tolerance) else Tolerance(tolerance)
+        if isinstance(share, str):
+            with suppress(ValueError):
+                share = read_share(share)
         check_choice(f"tolerances: {name}", distribution, ("uniform", "normal"))
         most = 1 / 3 if distribution == "normal" else 1.0
         if isinstance(share, bool | str) or not np.isreal(share) or not 0 < share < most:

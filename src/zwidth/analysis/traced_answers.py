@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.analysis.environment_derivatives import find_environment_limits
 from zwidth.analysis.optimization import SIDES
 from zwidth.analysis.walls import allows_negative
 from zwidth.core.errors import InputError
 from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import RidgeKind, Status
 from zwidth.model.circle_functions import circle_points
-from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, seed
-from zwidth.stability.linear.delay_margin import change_delay
+from zwidth.numerics.taylor import Taylor, differentiate_implicitly, seed
 from zwidth.stability.linear.derivatives import LoopTerms, differentiate, differentiate_ridge, index_parameters, split
 from zwidth.stability.linear.margins import evaluate_walls
 from zwidth.stability.linear.passivity import PassivityCondition
@@ -45,11 +45,11 @@ def no_derivatives(values: np.ndarray, arguments: int, order: int, fill: float =
     return [values, *(np.full((*values.shape, *[arguments] * k), fill) for k in range(1, order + 1))]
 
 
-def fill_rows(results: Derivatives, point: Any, rows: Sequence[int], parts: Implicit, factor: float = 1.0) -> None:
-    """Store the derivatives of unknowns, multiplied by a factor, in the given rows of the results for one point."""
-    for result, part in zip(results[1:], parts, strict=False):
-        for k, row in enumerate(rows):
-            result[point, row] = factor * part[k] if part is not None else np.nan
+def fill_rows(results: Derivatives, point: Any, rows: Sequence[int], unknowns: Sequence[Taylor]) -> None:
+    """Store the derivatives of unknowns in the given rows of the results for one point."""
+    for row, unknown in zip(rows, unknowns, strict=False):
+        for result, part in zip(results[1:], (unknown.first, unknown.second), strict=False):
+            result[point, row] = part
 
 
 def find_stiffest(scene: Any, points: np.ndarray, order: int, negative_damping: bool | None) -> Derivatives:
@@ -86,12 +86,8 @@ def find_radius(scene: Any, points: np.ndarray, order: int) -> Derivatives:
         except InputError:
             continue  # too many poles to compute all; the derivatives remain NaN
         pole = np.log1p(zeta[np.argmax(log_modulus(zeta))])
-        parts = differentiate(scene, order, wall.tolist(), [pole.real, abs(pole.imag)], equations)
-        # Convert the derivatives of the first unknown, log(radius), to those of the radius.
-        first = radius[k, 0] * parts.first[:1]
-        second = parts.second if order < 2 or parts.second is None else radius[k, 0] * parts.second[:1]
-        second = None if second is None else second + first[:, :, None] * parts.first[:1, None, :]
-        fill_rows(results, k, [0], Implicit(first, second))
+        log_radius, _ = differentiate(scene, order, wall.tolist(), [pole.real, abs(pole.imag)], equations)
+        fill_rows(results, k, [0], [log_radius.exp()])
     return results
 
 
@@ -126,14 +122,10 @@ def find_margins(scene: Any, points: np.ndarray, order: int) -> Derivatives:
             factor: float = 1.0,
             added: float | None = None,
         ) -> None:
-            parts = differentiate(scene, order, wall, unknowns, equations, added)
-            fill_rows(results, k, rows[:1], Implicit(parts.first[:1], _first(parts.second)), factor)
-            if len(unknowns) > 1:
-                second = None if parts.second is None else parts.second[1:2]
-                fill_rows(results, k, rows[1:], Implicit(parts.first[1:2], second))
-            else:
-                for result in results[1:]:
-                    result[k, rows[1:]] = 0.0
+            margin, *angle = differentiate(scene, order, wall, unknowns, equations, added)
+            for result in results[1:]:
+                result[k, rows] = 0.0  # for the angle, unless it is one of the unknowns
+            fill_rows(results, k, rows, [margin * factor, *angle])
 
         if np.isfinite(w_gain):
             fill(*_at_angle(_meet_gain, [gain], w_gain), [0, 4])
@@ -148,11 +140,6 @@ def find_margins(scene: Any, points: np.ndarray, order: int) -> Derivatives:
             if w is not None:
                 fill(*_at_angle(_meet_delay, [delay], w), [2], added=delay)
     return results
-
-
-def _first(part: np.ndarray | None) -> np.ndarray | None:
-    """Return the second derivatives of the first unknown; None if second derivatives are not computed."""
-    return None if part is None else part[:1]
 
 
 def _at_angle(meet: Callable[..., list[Taylor]], unknowns: list[float], w: float) -> tuple[list[float], Any]:
@@ -203,7 +190,7 @@ def _meet_distance(terms: LoopTerms, alpha: Taylor, beta: Taylor, distance: Tayl
 def _find_delayed_angle(scene: Any, wall: list[float], delay: float) -> float | None:
     """Return the angle w of the pole that is on the unit circle if the delay grows by ``delay``, the delay margin."""
     chain, (alpha, beta) = scene.loop.chain, wall
-    loop, w = change_delay(chain, float(chain.d) + delay), np.append(scene.loop.boundary.w, np.pi)
+    loop, w = scene.loop.with_delay(float(chain.d) + delay), np.append(scene.loop.boundary.w, np.pi)
     for _ in range(ANGLE_STEPS):
         L = evaluate_walls(loop, alpha, beta, circle_points(w))
         distance = np.abs(1.0 + L.value)
@@ -309,15 +296,15 @@ def find_required(scene: Any, points: np.ndarray, order: int, parameter: str, *o
             result[k, 0] = np.nan
         if order and needed.status == Status.OK and needed.crossings:
             fill_rows(
-                results, k, [0], _differentiate_required(scene, parameter, needed.value, stiffness, order, negative)
+                results, k, [0], [_differentiate_required(scene, parameter, needed.value, stiffness, order, negative)]
             )
     return results
 
 
 def _differentiate_required(
     scene: Any, parameter: str, value: float, stiffness: float, order: int, negative: bool | None
-) -> Implicit:
-    """Return the derivatives of a required parameter value in the numbers of the scene and the required stiffness."""
+) -> Taylor:
+    """Return a required parameter value, with derivatives in the numbers of the scene and the required stiffness."""
     path, x = ("period", 1.0 / value) if parameter == "rate" else (parameter, value)
     changed = scene.replace(**{path: x})
     count, index = len(list_leaves(scene)), index_parameters(changed)[path]
@@ -339,12 +326,8 @@ def _differentiate_required(
 
     equation = Taylor(K.v - stiffness, move(K.first), None if K.second is None else move(K.second))
     equation.first[count] = -1.0
-    result = differentiate_implicitly([equation])
-    if parameter != "rate":
-        return result
-    # The unknown is the period. Convert its derivatives to those of the rate 1/period.
-    period = Taylor(x, result.first[0], None if result.second is None else result.second[0]).reciprocal()
-    return Implicit(period.first[None], None if period.second is None else period.second[None])
+    (unknown,) = differentiate_implicitly([equation], [x])
+    return unknown.reciprocal() if parameter == "rate" else unknown
 
 
 ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {
@@ -355,8 +338,12 @@ ANSWERS: dict[str, tuple[Callable[..., Derivatives], int]] = {
     "margins": (find_margins, 7),
     "passivity_margin": (find_passivity_margin, 1),
     "required": (find_required, 5),
+    "environment_limit": (find_environment_limits, 3),
 }
-"""Function that computes results with derivatives, and their number, for each method of `zwidth.analysis.loop`."""
+"""Function that computes results with derivatives, and their number, for each method of `zwidth.analysis.loop`.
+
+The method "environment_limit" belongs to `zwidth.AdmittanceDisplay`, which takes the place of the scene.
+"""
 
 # Values for scenes with a parameter out of range, for methods whose values are then not all NaN; the label 0 means
 # "not stable".
@@ -364,4 +351,5 @@ INVALID = {
     "stiffest": [np.nan, np.nan, np.nan, RidgeKind.NONE, Status.INVALID_INPUT],
     "labels": [0.0],
     "required": [np.nan, SIDES.index("nowhere"), np.nan, np.nan, Status.INVALID_INPUT],
+    "environment_limit": [np.nan, np.nan, Status.INVALID_INPUT],
 }

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.analysis.base import SceneParts
-from zwidth.core.errors import InputError, check_choice
+from zwidth.core.errors import check_choice
 from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.position import has_velocity
@@ -35,6 +35,7 @@ from zwidth.units.formatting import format_wall, with_unit
 from zwidth.units.unit_system import UnitSystem
 
 _COLUMNS = 100  # characters per line of a comment
+LOCALS = (*"uvwefyr", "v_free", "y_tool", "v_tool", "v_rest")  # local variables of programs, which C programs declare
 # Largest ratio of imaginary part to modulus at which a root is treated as real, because rounding errors cause a small
 # imaginary part.
 REAL_TOLERANCE = 1e-13
@@ -49,7 +50,7 @@ def _describe_call(system: UnitSystem) -> tuple[str, str]:
     )
 
 
-def _describe_cautions(scene: SceneParts, cautions: Sequence[str]) -> list[str]:
+def describe_cautions(scene: SceneParts, cautions: Sequence[str]) -> list[str]:
     """Return the lines of comment on the safe limit and the cautions for the head of a program."""
     limit, texts = scene.safe_limit, [f"CAUTION: {caution}" for caution in cautions]
     if limit is not None:
@@ -135,18 +136,20 @@ def write_wall(
         max_force: largest force of the motor in N, to which the code limits the force.
     """
     check_choice("language", language, ("c", "python"))
-    if scene.tool is not None:
-        raise InputError("tool: code is written for walls only; write the coupling with the update of zwidth.Tool")
     program = build_program(scene, cautions, max_force)
     return _write_c(program) if language == "c" else _write_python(program)
 
 
 class FilterCode(NamedTuple):
-    """Statements of a filter. The variable u is the input before the statements and the output after them."""
+    """Statements of a filter. The variable u is the input before the statements and the output after them.
+
+    The output must be multiplied by the factor ``gain``.
+    """
 
     states: list[str]  # names of the states
     start: list[str]  # statements that set the states to their steady state for a constant u, and u to the output
-    update: list[str]  # statements that compute the output, without the factor ``gain``, from the input
+    update: list[str]  # statements that compute the output from the input, and the states of the next sample
+    output: list[str]  # statements that compute only the output, and leave the states unchanged
     gain: float  # factor by which u is to be multiplied after the statements
 
 
@@ -157,7 +160,7 @@ def write_filter(estimate: Estimate, prefix: str = "") -> FilterCode:
         estimate: the estimate.
         prefix: beginning of the names of all states, different for each filter of a program.
     """
-    states, start, update, gain = [], [], [], float(estimate.gain)
+    states, start, update, preview, gain = [], [], [], [], float(estimate.gain)
     for number, (numerator, denominator) in enumerate(find_sections(estimate)):
         *inner, last = names = [f"@{prefix}{name}{number}" for name in "pq"[3 - len(denominator) :]]
         states += [name[1:] for name in names]
@@ -165,6 +168,7 @@ def write_filter(estimate: Estimate, prefix: str = "") -> FilterCode:
         if numerator == (1.0, 1.0) and denominator[-1] != 0:
             # Write a section with a zero at z = 0 as q += a0 (u - q), the usual form of a first-order low-pass filter.
             update += [f"{last} += {denominator[-1]!r} * (u - {last})", f"u = {last}"]
+            preview.append(f"u = {last} + {denominator[-1]!r} * (u - {last})")
             start.append(f"{last} = u")
             gain /= denominator[-1]
             continue
@@ -173,17 +177,18 @@ def write_filter(estimate: Estimate, prefix: str = "") -> FilterCode:
         pairs = zip(denominator[1:], names, strict=True)
         feedback = "".join(f" - {factor!r} * {name}" for factor, name in pairs if factor)
         terms = [f"{factor!r} * {name}" for factor, name in zip(numerator, ("w", *names), strict=True) if factor]
-        update += [f"w = u{feedback}", f"u = {' + '.join(terms)}", *(f"{last} += {name}" for name in inner)]
-        update.append(f"{names[0]} += w")
-    return FilterCode(states, start, update, gain)
+        output = [f"w = u{feedback}", f"u = {' + '.join(terms)}"]
+        preview += output
+        update += [*output, *(f"{last} += {name}" for name in inner), f"{names[0]} += w"]
+    return FilterCode(states, start, update, preview, gain)
 
 
-def _reset(states: Sequence[str]) -> list[str]:
+def reset_states(states: Sequence[str]) -> list[str]:
     """Return the statements that set states to 0."""
     return [f"@{name} = 0.0" for name in states]
 
 
-def _omit_output(start: list[str]) -> list[str]:
+def omit_output(start: list[str]) -> list[str]:
     """Return statements without those at the end that compute u, because no later statement uses it."""
     while start and start[-1].startswith("u = "):
         start = start[:-1]
@@ -201,7 +206,7 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
         code = write_filter(estimates.position, "position_")
         states, output = code.states, f"y = {code.gain!r} * u"
         force = ["u = x", *code.update, output]
-        begin = ["u = x", *code.start, output] if memory == "y" else _omit_output(["u = x", *code.start])
+        begin = ["u = x", *code.start, output] if memory == "y" else omit_output(["u = x", *code.start])
     count, code = estimates.velocity.window, write_filter(estimates.velocity)
     if count > 1:
         force += [f"u = ({memory} - @past[@next]) / {count}", f"@past[@next] = {memory}"]
@@ -210,14 +215,14 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
         force += [f"u = {memory} - @{memory}" if count else f"u = {memory}", f"@{memory} = {memory}"]
     # Start at rest, i.e. with a constant position. If the velocity estimate starts with a difference, its output is
     # then 0, and so are the states of its filter. Otherwise the position is the constant input of the filter.
-    start = _reset(code.states) if count else _omit_output([f"u = {memory}", *code.start])
+    start = reset_states(code.states) if count else omit_output([f"u = {memory}", *code.start])
     states = code.states + states
     force += [*code.update, f"v = {code.gain / period!r} * u"]
     K, B, system = float(scene.wall.stiffness), float(scene.wall.virtual_damping), scene.unit_system
     law, reset, feedback = f"{K!r} * {depth} + {B!r} * v", [], []
     if further is not None:
         code = write_filter(further.estimate(1.0, period), "feedback_")
-        states, reset = states + code.states, _reset(code.states)
+        states, reset = states + code.states, reset_states(code.states)
         pairs = (further.position, depth), (further.velocity, "v")
         terms = [f"{weight!r} * {name}" for weight, name in pairs if weight is not None]
         feedback = [f"u = {' + '.join(terms) or 'x'}", *code.update, f"r = {code.gain!r} * u"]
@@ -233,18 +238,33 @@ def build_program(scene: SceneParts, cautions: Sequence[str] = (), max_force: fl
     if further is not None:
         name = type(further).__name__
         lines.append(f"The {force_name} r of {name} is added inside of the wall; its states are 0 outside of the wall.")
-    head = "\n".join([*lines, *_describe_cautions(scene, cautions)])
+    head = "\n".join([*lines, *describe_cautions(scene, cautions)])
     return WallProgram(
         head, count, memory, states, begin, start, force, reset, feedback, f"-({law})", depth, float(max_force), system
     )
 
 
+def write_memory(language: str, count: int, name: str, value: str, prefix: str = "") -> tuple[list[str], list[str]]:
+    """Return the declarations in C, and the statements that set the memory of a difference to a value.
+
+    Args:
+        language: "c" or "python".
+        count: length of the difference in periods; 0 for none. For more than 1, the memory is an array.
+        name: name of the state if it is no array.
+        value: expression of the value.
+        prefix: beginning of the names of the array and of its index.
+    """
+    if count <= 1:
+        return [f"double {name}"], [f"@{name} = {value}"]
+    fill = f"for (int k = 0; k < {count}; k++) @{prefix}past[k] = {value}"
+    fill = fill if language == "c" else f"@{prefix}past = [{value}] * {count}"
+    return [f"double {prefix}past[{count}]", f"int {prefix}next"], [fill, f"@{prefix}next = 0"]
+
+
 def _write_c(program: WallProgram) -> str:
     """Return the source code of a program in C99, with a struct for its states and two functions."""
-    count, memory = program.window, program.memory
-    members = [f"double past[{count}]", "int next"] if count > 1 else [f"double {memory}"]
-    fill = [f"for (int k = 0; k < {count}; k++) @past[k] = {memory}", "@next = 0"]
-    start = [*program.begin, *(fill if count > 1 else [f"@{memory} = {memory}"]), *program.start]
+    members, fill = write_memory("c", program.window, program.memory, program.memory)
+    start = [*program.begin, *fill, *program.start]
     limit, law, inside = program.max_force, program.law, f"{program.depth} > 0.0"
     lines = program.force
     if program.feedback:
@@ -255,29 +275,48 @@ def _write_c(program: WallProgram) -> str:
     if limit < math.inf:
         law = f"f > {limit!r} ? {limit!r} : f < -{limit!r} ? -{limit!r} : f"
         lines = [*lines, f"f = {program.law if program.feedback else f'{inside} ? {program.law} : 0.0'}"]
+    members += [f"double {name}" for name in program.states]
+    comment = [*program.head.split("\n"), *_describe_call(program.system)]
+    return format_c("wall", comment, members, start, [*lines, f"return {law}"])
+
+
+def format_c(name: str, comment: Sequence[str], members: Sequence[str], start: list[str], force: list[str]) -> str:
+    """Return the source code of a C program with a struct for its states and two functions.
+
+    Args:
+        name: name of the pointer to the struct, and beginning of the names of the functions, as "wall".
+        comment: lines of the comment at the head.
+        members: declarations of the states.
+        start: statements of the function that initializes the states; a comment starts with "# ".
+        force: statements of the function that is called once per period. Those with an indentation follow a condition
+            in the syntax of Python, as "if @k == 0:".
+    """
     blocks = []
-    for block in (start, [*lines, f"return {law}"]):
-        names = [name for name in "uvwfyr" if any(line.startswith(f"{name} =") for line in block)]
-        declared = [f"double {', '.join(names)}", *block] if names else block
-        text = "\n".join(f"    {line}" + ("" if line.endswith("}") else ";") for line in declared)
-        blocks.append(text.replace("@", "wall->"))
-    members_text = "\n".join(f"    {line};" for line in (*members, *(f"double {name}" for name in program.states)))
-    comment = "\n   ".join(
-        [
-            "/* " + program.head.replace("\n", "\n   "),
-            *_describe_call(program.system),
-            "Call wall_start once, then wall_force once per period. */",
-        ]
-    )
-    signatures = "void wall_start(Wall *wall, double x)\n{\n", "double wall_force(Wall *wall, double x)\n{\n"
-    functions = [f"{head}{block}\n}}\n" for head, block in zip(signatures, blocks, strict=True)]
-    return "\n".join([comment, f"typedef struct {{\n{members_text}\n}} Wall;\n", *functions])
+    for block in (start, force):
+        variables = [each for each in LOCALS if any(line.lstrip().startswith(f"{each} =") for line in block)]
+        declared = [f"double {', '.join(variables)}", *block] if variables else block
+        lines = list[str]()
+        for line, following in zip(declared, [*declared[1:], ""], strict=True):
+            text = line.lstrip()
+            if text.startswith("# "):
+                lines.append(line.replace("# ", "/* ") + " */")
+            elif text.startswith("if ") and text.endswith(":"):
+                lines.append(f"if ({text[3:-1]}) {{")
+            else:
+                lines.append(line if line.endswith("}") else f"{line};")
+            if line.startswith("    ") and not following.startswith("    "):
+                lines.append("}")
+        blocks.append("\n".join(f"    {line}" for line in lines).replace("@", f"{name}->"))
+    members_text, kind = "\n".join(f"    {line};" for line in members), name.capitalize()
+    head = "\n   ".join([*comment, f"Call {name}_start once, then {name}_force once per period. */"])
+    signatures = f"void {name}_start({kind} *{name}, double x)", f"double {name}_force({kind} *{name}, double x)"
+    functions = [f"{each}\n{{\n{block}\n}}\n" for each, block in zip(signatures, blocks, strict=True)]
+    return "\n".join([f"/* {head}", f"typedef struct {{\n{members_text}\n}} {kind};\n", *functions])
 
 
 def _write_python(program: WallProgram) -> str:
     """Return the source code of a program as a Python class with the method ``force``."""
-    count, memory = program.window, program.memory
-    fill = [f"@past = [{memory}] * {count}", "@next = 0"] if count > 1 else [f"@{memory} = {memory}"]
+    _, fill = write_memory("python", program.window, program.memory, program.memory)
     limit, law, inside = program.max_force, program.law, f"{program.depth} > 0.0"
     law = law if limit == math.inf else f"max(-{limit!r}, min({limit!r}, {law}))"
     force = program.force
@@ -286,17 +325,23 @@ def _write_python(program: WallProgram) -> str:
         force = [*force, f"if not {inside}:", *outside, *program.feedback, f"return {law}"]
     else:
         force = [*force, f"return {law} if {inside} else 0.0"]
-    docstring = "\n    ".join(
-        [
-            '    """' + program.head.replace("\n", "\n    ") + "\n",
-            *_describe_call(program.system),
-            "Create one instance, then call force once per period.",
-            '"""',
-        ]
-    )
+    head = program.head.split("\n")
+    return format_python("Wall", head, _describe_call(program.system), [*program.begin, *fill, *program.start], force)
+
+
+def format_python(name: str, head: Sequence[str], call: Sequence[str], start: list[str], force: list[str]) -> str:
+    """Return the source code of a Python class with the method ``force``.
+
+    Args:
+        name: name of the class.
+        head: lines of the first paragraph of its docstring.
+        call: lines of the docstring on the argument and the result of the method.
+        start: statements that initialize the states; a comment starts with "# ".
+        force: statements of the method.
+    """
+    lines = [*head[:-1], f"{head[-1]}\n", *call, "Create one instance, then call force once per period.", '"""']
+    docstring = '    """' + "\n    ".join(lines)
     heads = "    def __init__(self, x=0.0):", "    def force(self, x):"
-    blocks = [
-        "\n".join(f"        {line}" for line in lines) for lines in ([*program.begin, *fill, *program.start], force)
-    ]
-    functions = [f"{head}\n{block}\n".replace("@", "self.") for head, block in zip(heads, blocks, strict=True)]
-    return "\n".join([f"class Wall:\n{docstring}\n", *functions])
+    blocks = ["\n".join(f"        {line}" for line in block) for block in (start, force)]
+    functions = [f"{each}\n{block}\n".replace("@", "self.") for each, block in zip(heads, blocks, strict=True)]
+    return "\n".join([f"class {name}:\n{docstring}\n", *functions])

@@ -26,10 +26,11 @@ from zwidth.analysis.optimization import (
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.status import Status
 from zwidth.model.device import Device
+from zwidth.model.feedback import IntegralFeedback
 from zwidth.model.grasps import list_grasps
 from zwidth.model.safe_limit import SafeLimit, reserve_damping
 from zwidth.numerics.root_finding import false_position, find_global_minimum
-from zwidth.units.parsing import to_float
+from zwidth.units.parsing import read_degrees, read_factor, read_share, to_float
 from zwidth.units.quantities import FRACTION, RECOMMENDED_SHARE, Range
 
 # Requirements that apply if the user gives none; docs/guides/my-device.md gives the reasons for these values.
@@ -46,10 +47,15 @@ GRASP_GUESS = 0.95  # factor on K for the initial guess if a grasp destabilizes 
 FIRST_STEP = 0.9  # factor of the first step from an initial guess of K, which is usually close
 WIDTH = 4e-5  # half-width of the bracket of log K at which the search ends
 COARSE = 1e-3  # half-width of the bracket of log K for alternatives, whose gain or cost is printed with 2 or 3 digits
+MATCHED = 1e-5  # relative change of K/B at which the search for a wall that matches the integrator of a cascade ends
+MAX_MATCHES = 8  # walls that this search chooses; 3 usually suffice
+# Factors on K and B, tried in this order, until a wall satisfies the requirements with the integrator that matches it.
+REDUCTIONS = (1.0, 1.0 - 1e-5, 1.0 - 1e-4, 0.999, 0.99, 0.97, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
 MAX_STEPS = 60  # root-finding steps on log K, bisections included; 8 usually suffice
 
 RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
 _EXAMPLES = {"stiffness_fraction": "0.6 for 60 %", "gain_margin": "2 for 6 dB", "phase_margin": "30 for 30 degrees"}
+_READERS = {"stiffness_fraction": read_share, "gain_margin": read_factor, "phase_margin": read_degrees}
 OTHER_DAMPING = "B differs from that of the stiffest wall, because with that B this share of K_max is unstable"
 
 Slack = Callable[[float, Any], dict[str, np.ndarray]]
@@ -69,16 +75,17 @@ class Requirements(NamedTuple):
     @classmethod
     def check(
         cls,
-        stiffness_fraction: float | None,
-        gain_margin: float | None,
-        phase_margin: float | None,
+        stiffness_fraction: float | str | None,
+        gain_margin: float | str | None,
+        phase_margin: float | str | None,
         passive: bool,
         beyond_safe: bool = False,
         grasps: Grasps | None = None,
     ) -> Requirements:
         """Check the arguments of `recommend`, and return them as requirements; the defaults apply if none is given."""
         ranges = {"stiffness_fraction": FRACTION, **RANGES}
-        limits = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
+        given = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
+        limits = {name: _read_limit(name, value) for name, value in given.items()}
         for name, value in limits.items():
             number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
             if value is not None and not (number and math.isfinite(to_float(value)) and ranges[name].holds(value)):
@@ -114,6 +121,16 @@ class Requirements(NamedTuple):
     def safe_share(self) -> float:
         """Upper limit of K as a fraction of the safe limit's stiffness."""
         return self.stiffness_fraction or RECOMMENDED_SHARE
+
+
+def _read_limit(name: str, value: Any) -> Any:
+    """Convert a requirement given as text, such as "50%", "6 dB" or "30 deg", to a number; return others unchanged."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return _READERS[name](value)
+    except ValueError:
+        return value
 
 
 class WallChoice(NamedTuple):
@@ -335,3 +352,65 @@ def _choose_free(
         return WallChoice(nan, nan, "", Status.UNREACHABLE, reason)
     note = OTHER_DAMPING if usual != top.virtual_damping and active == "stiffness_fraction" else ""
     return WallChoice(most, usual, active, Status.OK, note=note)
+
+
+class ControllerChoice(NamedTuple):
+    """A chosen wall, and the scene and the stiffest wall for which it is chosen."""
+
+    scene: SceneOptima  # the given scene; if it is that of a cascade, with the integrator that matches the wall
+    top: StiffestWall  # the stiffest stable wall of this scene
+    wall: WallChoice
+
+
+def choose_controller(
+    scene: SceneOptima, requirements: Requirements, top: StiffestWall, near: float | None = None, width: float = WIDTH
+) -> ControllerChoice:
+    """Choose the stiffest wall of a scene by `choose_wall`; for a cascade, with the integrator that matches the wall.
+
+    The integrator of a cascade integrates the velocity plus ``pos_gain`` times the position, and ``pos_gain`` is K/B.
+    Each new wall therefore changes the integrator. The search chooses a wall, matches the integrator to this wall and
+    chooses again until K/B converges. Then K and B are reduced together, which does not change the integrator, until
+    the loop with the matching integrator satisfies the requirements.
+
+    The arguments are those of `choose_wall`.
+    """
+    choice = choose_wall(scene, requirements, top, near, width)
+    feedback = scene.feedback
+    if not (isinstance(feedback, IntegralFeedback) and feedback.is_cascade):
+        return ControllerChoice(scene, top, choice)
+    nan = math.nan
+    for _ in range(MAX_MATCHES):
+        if choice.status != Status.OK:
+            return ControllerChoice(scene, top, choice)
+        if not choice.damping > 0:
+            reason = "no wall with B > 0 satisfies the requirements, and a cascade requires pos_gain = K/B > 0"
+            return ControllerChoice(scene, top, WallChoice(nan, nan, "", Status.UNREACHABLE, reason))
+        matched = feedback.match_wall(choice.stiffness, choice.damping)
+        changed = abs(matched.position - feedback.position) > max(MATCHED, width) * abs(matched.position)
+        feedback, scene = matched, scene.replace(feedback=matched)
+        top = scene.max_stiffness()
+        if not changed:
+            break
+        choice = choose_wall(scene, requirements, top, choice.stiffness, width)
+    return _confirm_cascade(scene, feedback, requirements, choice)
+
+
+def _confirm_cascade(
+    scene: SceneOptima, feedback: IntegralFeedback, requirements: Requirements, choice: WallChoice
+) -> ControllerChoice:
+    """Reduce K and B together until the loop with the matching integrator satisfies the requirements."""
+    safe = None if requirements.beyond_safe else scene.safe_limit
+    for factor in REDUCTIONS if choice.status == Status.OK else ():
+        wall = float(f"{factor * choice.stiffness:.6g}"), float(f"{factor * choice.damping:.6g}")
+        scene = scene.replace(feedback=feedback.match_wall(*wall))
+        if (
+            scene.is_stable(*wall)
+            and all(value >= 0 for value in measure_slack(scene, requirements)(*wall).values())
+            and all(_is_stable_in_grasp(each, *wall) for each in list_grasped_scenes(scene, requirements))
+            and (safe is None or safe.allows(*wall))
+        ):
+            return ControllerChoice(scene, scene.max_stiffness(), choice._replace(stiffness=wall[0], damping=wall[1]))
+    if choice.status == Status.OK:
+        reason = "no wall satisfies the requirements with the integrator of the cascade; reduce vel_integrator_gain"
+        choice = WallChoice(math.nan, math.nan, "", Status.UNREACHABLE, reason)
+    return ControllerChoice(scene, scene.max_stiffness(), choice)

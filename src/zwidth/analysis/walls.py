@@ -317,12 +317,14 @@ class SceneAnalysis(SceneParts):
         With several crossovers, the nearest counts, as in python-control. ``gain_margin`` is the factor nearest to 1 on
         K and B together, ``phase_margin`` the smallest change of phase in degrees, and ``delay_margin`` the smallest
         additional delay in s that moves a pole onto the unit circle. ``modulus_margin`` is the smallest distance of L
-        from -1. The factor and the phase apply to the whole force of the controller, including further feedback. The
-        phase margin of an unstable wall is negative, its delay margin 0. The delay margin is computed with the exact
-        discretization of every fractional delay, and is NaN if counts of poles below and above it do not confirm it. If
-        no factor, phase or delay moves a pole onto the unit circle, the first three margins are infinite for a stable
-        wall, and 0, NaN and 0 for an unstable one. Walls out of range are NaN. A rigid scene uses `zwidth.margins`. For
-        other scenes, one wall takes about 0.1 s, and many walls in one call some ms per wall.
+        from -1. The factor and the phase apply to the whole force of the controller, including further feedback; with a
+        simulated tool, they apply to the force of the coupling, without further feedback. The phase margin of an
+        unstable wall is negative, its delay margin 0. The delay margin is computed with the exact discretization of
+        every fractional delay, and is NaN if counts of poles below and above it do not confirm it. If no factor, phase
+        or delay moves a pole onto the unit circle, the first three margins are infinite for a stable wall, and 0, NaN
+        and 0 for an unstable one. Walls out of range are NaN. A rigid scene uses `zwidth.margins`. For other scenes,
+        one wall takes about 0.1 s, and many walls in one call some ms per wall. With a simulated tool, the delay margin
+        takes about 0.1 s per wall.
         """
         alpha, beta = self._broadcast_walls(stiffness, virtual_damping)
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)

@@ -269,6 +269,9 @@ def list_slopes(scene: Scene) -> list[Slope]:
     per, values = scene.sensitivities().per, scene.parameters()
     slopes, system = [], scene.unit_system
     for path, slope in per.items():
+        if path not in values:
+            # Skip the dampings of joints, because their units depend on the kind of joint, which is unknown.
+            continue
         unit, value = system[get_unit(path)], float(slope)
         # Choose the scale of the parameter: the period for a delay, because the delay may be 0; otherwise the magnitude
         # of its value, because modal masses and weights of feedback may be negative.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from zwidth.analysis.assessment import round_margin
 from zwidth.analysis.cautions import find_thin, price_passivity
 from zwidth.analysis.stabilization import WITHOUT_MARGINS, stabilize
+from zwidth.app.gains import format_cascade
 from zwidth.app.printing import (
     format_diagnosis,
     format_hardware,
@@ -162,13 +163,14 @@ def _spell_intervals(name: str, intervals: Intervals, unit: str, other: str) -> 
 
 def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]:
     """Return printed lines with K_max and its wall, and the percentage of K_max that the wall of the scene uses."""
+    if isinf(verdict.virtual_damping_at_max):
+        return [format_line("K_max", "none: with a sufficiently large B, every K > 0 is stable with this tool")]
+    damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
     if isinf(verdict.stiffness_max):
-        damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
         return [format_line("K_max", f"none: every K > 0 is stable at B = {damping} with this tool")]
     if not isfinite(verdict.stiffness_max):
         none = "no wall with K > 0 is stable" if not isnan(verdict.frequency) else "the response certifies no wall"
         return [format_line("K_max", none)]
-    damping = with_unit(verdict.virtual_damping_at_max, scene.unit_system["N s/m"])
     top = f"{format_stiffness(verdict.stiffness_max, scene.unit_system)} at B = {damping}"
     used = f"; this wall uses {plain(100.0 * scene.wall.stiffness / verdict.stiffness_max, 3)} %"
     lines = [format_line("K_max", top + (used if scene.wall.stiffness > 0 and verdict.stable else ""))]
@@ -297,6 +299,7 @@ def format_recommendation(
     passive = "; ".join(filter(None, (passive, price_passivity(recommendation))))
     lines = [
         format_line("SET", f"{recommendation.spell_wall()}; {recommendation.spell_limit()}{alarm}"),
+        *format_cascade(recommendation),
         *device,
         *margins,
         *([format_line("grasps", hands)] if (hands := recommendation.spell_hands()) else []),

@@ -16,19 +16,21 @@ import click
 
 from zwidth import __version__
 from zwidth.app import printing
+from zwidth.app.gains import list_cascade
 from zwidth.app.printing import format_row
 from zwidth.cli.hardware import diagnose_wall, hardware_options, spell_hardware_of_file
 from zwidth.cli.help import OF_SCENE, show_example
 from zwidth.cli.options import (
+    PATH,
     SHARE,
     Parsed,
     beyond_safe_option,
     figure_option,
     find_omitted,
+    folder_argument,
     get_hardware,
     json_option,
     quantity_type,
-    read_factor,
     save_figure,
     scene_options,
     verbose_option,
@@ -39,11 +41,15 @@ from zwidth.model.device import Device
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.timing import Timing
 from zwidth.model.wall import VirtualWall
-from zwidth.units.formatting import format_stiffness, plain, with_unit
+from zwidth.units.formatting import format_periods, format_stiffness, plain, with_unit
+from zwidth.units.parsing import read_degrees, read_factor
 from zwidth.units.quantities import SIZES, Range
 
 EXIT_FAILED = 1  # exit code if no wall exists or a computation fails
 EXIT_INPUT = 2  # exit code for invalid input
+# Delay in periods from which `recommend` announces a long search. Every wall of the search needs the poles of the loop,
+# whose number grows with the delay, and the time for all poles grows with the cube of their number.
+LONG_SEARCH = 300.0
 _PACKAGE = Path(__file__).resolve().parents[1]
 # Pattern of an entry of a configuration that refers to a CSV table in the same folder.
 _TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
@@ -293,7 +299,7 @@ def find_examples() -> dict[str, Path]:
 
 
 @cli.command()
-@click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(path_type=Path))
+@click.argument("path", metavar="[CONFIG|DIR]", required=False, type=PATH)
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free one]")
 @click.option("--no-browser", is_flag=True, help="Print the address without opening a browser.")
 def explore(path: Path | None, port: int, no_browser: bool) -> None:
@@ -326,8 +332,8 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
 
 
 @cli.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="File to write.  [default: DIR/report.html]")
+@folder_argument
+@click.option("--out", type=PATH, help="File to write.  [default: DIR/report.html]")
 @json_option
 def report(folder: Path, out: Path | None, as_json: bool) -> None:
     """Write the results of the run in DIR as one HTML file, with slices of its sweeps.
@@ -342,7 +348,7 @@ def report(folder: Path, out: Path | None, as_json: bool) -> None:
 
 
 _FACTOR = Parsed("FACTOR", read_factor, "write a factor, such as 2 or 6 dB")
-_DEGREES = Parsed("DEGREES", lambda text: float(text.strip().removesuffix("deg")), "write degrees, such as 30")
+_DEGREES = Parsed("DEGREES", read_degrees, "write degrees, such as 30")
 
 
 @cli.command(**show_example("recommend --phase-margin 30", OF_SCENE))
@@ -392,6 +398,12 @@ def recommend(
 
     if code and as_json:
         raise click.UsageError("give only one of --code or --json: each replaces the whole output")
+    if float(scene.d) >= LONG_SEARCH:
+        click.echo(
+            f"zwidth: the delay is {format_periods(float(scene.d))}, so the search for a wall may take minutes; zwidth "
+            "ridge prints K_max at once",
+            err=True,
+        )
     recommendation = scene.recommend(**wanted)
     written = []
     if figure is not None:
@@ -413,6 +425,7 @@ def recommend(
     notes, lines, result = [*printing.list_period_notes(scene), *recommendation.notes], list[str](), dict[str, Any]()
     if as_json:
         result = recommendation.as_dict() | {"notes": notes}
+        result |= {"gains": gains} if (gains := list_cascade(recommendation)) else {}
         result["cautions"] += printing.list_omission_cautions(scene, find_omitted())
         result |= {} if diagnosis is None else {"diagnosis": diagnosis.as_dict()}
     else:

@@ -13,6 +13,10 @@ OWN = "This command"  # heading of the options that belong to no other group
 # Groups of options in the help: the heading of each group, and the prefixes of the options in it.
 GROUPS = {
     "Wall": ("--stiffness", "--virtual-damping"),
+    "Gains of the controller": (
+        *("--pos-gain", "--vel-", "--kp", "--ki", "--kd", "--rule"),
+        *("--units", "--output-unit", "--torque-constant", "--resistance"),
+    ),
     "Device": ("--device", "--sampled", "--mass", "--damping"),
     "Timing": ("--period", "--rate", "--delay"),
     OWN: (),
@@ -30,20 +34,27 @@ EXACT = ("--stiffness", "--delay")  # matched as whole names; other groups have 
 class GroupedCommand(click.Command):
     """Command whose help lists its options in groups."""
 
+    def __init__(self, *args: Any, own: tuple[str, ...] = (), **settings: Any) -> None:
+        """Create the command; ``own`` are options that another command uses in another meaning, in another group."""
+        super().__init__(*args, **settings)
+        self.own = own
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options to the help text, in one section per group."""
         rows: dict[str, list[tuple[str, str]]] = {name: [] for name in GROUPS}
         for option in self.get_params(ctx):
             if isinstance(option, click.Option) and (record := option.get_help_record(ctx)) is not None:
-                rows[find_group(option.opts[-1])].append(record)
+                rows[find_group(option.opts[-1], self.own)].append(record)
         for name, records in rows.items():
             if records:
                 with formatter.section(name):
                     formatter.write_dl(records)
 
 
-def find_group(flag: str) -> str:
-    """Return the heading of the group that contains an option."""
+def find_group(flag: str, own: tuple[str, ...] = ()) -> str:
+    """Return the heading of the group that contains an option; options in ``own`` belong to the command itself."""
+    if flag in own:
+        return OWN
     for name, prefixes in GROUPS.items():
         if any(flag == each or (each not in EXACT and flag.startswith(each)) for each in prefixes):
             return name

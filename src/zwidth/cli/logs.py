@@ -20,6 +20,7 @@ from zwidth.cli.commands import EXIT_FAILED, cli
 from zwidth.cli.hardware import add_option, diagnose_wall
 from zwidth.cli.help import show_example
 from zwidth.cli.options import (
+    PATH,
     SHARE,
     Parsed,
     figure_option,
@@ -214,7 +215,7 @@ def _list_lines(device_fit: Any, source: str, diagnosis: Any, verbose: bool) -> 
     return [format_line(*each).rstrip() for each in rows]
 
 
-_FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
+_TIME = quantity_type("s", POSITIVE)
 
 
 @cli.command(**show_example("excite --rate '1 kHz' --force '2 N' --resolution '10 um'"))
@@ -226,8 +227,8 @@ _FILE, _TIME = click.Path(path_type=Path), quantity_type("s", POSITIVE)
     help="Encoder step in m, or counts per revolution such as '2000 counts'.",
 )
 @click.option("--duration", type=_TIME, default="60 s", show_default=True, help="Length of the record, in s.")
-@click.option("--response", type=_FILE, help="Response to a first record, to design a second one.")
-@click.option("--out", type=_FILE, default=Path("play.csv"), show_default=True, help="File of the record.")
+@click.option("--response", type=PATH, help="Response to a first record, to design a second one.")
+@click.option("--out", type=PATH, default=Path("play.csv"), show_default=True, help="File of the record.")
 @json_option
 def excite(
     loop: RecordLoop,
@@ -295,7 +296,7 @@ def _print_excitation(made: Any, out: Path, as_json: bool) -> None:
 @loop_options(logs=True)
 @click.option("--cycle", type=_TIME, help="Period of the force, in s.  [default: detected from the force]")
 @log_options
-@click.option("--save", type=_FILE, metavar="FILE.csv", help="File for the response.")
+@click.option("--save", type=PATH, metavar="FILE.csv", help="File for the response.")
 @figure_option
 @json_option
 def respond(

@@ -111,7 +111,9 @@ def simulate(
     A hit starts at the surface of the wall, at a sample, with the given speed; the wall is then unilateral and
     otherwise bilateral. Without --hit, --external-force and --hold the device is released at a depth of 1 mm (1 mrad if
     rotary), or of 50 encoder steps if --resolution is given. The row "in contact" states what zwidth diagnose finds for
-    a device that stays in the wall, which may differ from the simulated motion. The options
+    a device that stays in the wall, which may differ from the simulated motion. With a tool (--tool-mass), the tool is
+    initially at rest at the position 0, --hit is the speed of the device at this position, --hold its distance from the
+    tool, and the row "linear loop" replaces the row "in contact". The options
     --stiffness, --mass (or --device) and --rate (or --period) are required. Parameters that are not given as options
     are taken from SCENE.yaml (or from the folder of a run).
     """
@@ -122,25 +124,29 @@ def simulate(
     options = _choose_start(scene, hit, external_force, hold, hardware)
     periods = _choose_length(scene) if duration is None else max(1, round(duration.periods(scene.timing.period)))
     motion = scene.simulate(**options, **hardware, periods=periods)
-    cause, ending = find_cause(scene, **hardware, remedies=False), describe_ending(motion)
-    units = scene.unit_system
-    load = "torque" if units.rotary else "force"
-    start = [f"hits the wall at {with_unit(hit, units['m/s'], 3)}"] if hit is not None else []
-    if hit is None and (depth := options.get("start_position")):
-        start.append(f"released at a depth of {with_unit(depth, units['m'], 3)}")
+    # Diagnose walls only, because zwidth.diagnose does not support a tool.
+    cause = None if scene.tool is not None else find_cause(scene, **hardware, remedies=False)
+    ending, units = describe_ending(motion), scene.unit_system
+    load, body = "torque" if units.rotary else "force", "wall" if scene.tool is None else "tool"
+    start = [f"hits the {body} at {with_unit(hit, units['m/s'], 3)}"] if hit is not None else []
+    if hit is None and (depth := _get_depth(options)):
+        place = "at a depth of " if scene.tool is None else "at a distance from the tool of "
+        start.append(f"released {place}{with_unit(depth, units['m'], 3)}")
     if push := options.get("external_force"):
         start.append(f"external {load} {with_unit(push, units['N'], 3)}")
     force = max(abs(float(motion.command.min())), abs(float(motion.command.max())))
-    depth = f"penetrates {with_unit(float(motion.penetration), units['m'], 3)}, "
+    depth = f"{'penetrates' if cause else 'reaches'} {with_unit(float(motion.penetration), units['m'], 3)}, "
     depth += f"{load} up to {with_unit(force, units['N'], 3)}; "
     # Omit the largest depth and force of a growing motion, because they grow with the simulated time.
     depth = "" if int(motion.outcome) == MotionKind.GROWING else depth
     lines = [
         format_row("start", ", ".join(start) or "at rest"),
         format_row("motion", depth + ending),
-        format_row("in contact", f"{cause.word}: {cause.explain()}"),
+        format_row("in contact", f"{cause.word}: {cause.explain()}")
+        if cause is not None
+        else format_row("linear loop", "stable" if scene.is_stable() else "unstable"),
     ]
-    if cause.cause not in ("none", "undecided"):
+    if cause is not None and cause.cause not in ("none", "undecided"):
         lines.append(format_row("remedies", "zwidth diagnose, with the same options"))
     lines += [format_row("hardware", text)] if (text := spell_hardware_of_file(scene)) else []
     lines += [format_row("CAUTION", text) for text in _list_cautions(scene)]
@@ -148,7 +154,8 @@ def simulate(
         lines.append(save_figure(_draw_motion(motion), figure))
     result = {name: getattr(motion, name) for name in OF_WHOLE if name not in ("outcome", "status")}
     result = {name: value.item() for name, value in result.items()} | {"outcome": MotionKind(int(motion.outcome)).name}
-    printing.print_result(result | {"ending": ending, "periods": periods, "diagnosis": cause.as_dict()}, lines, as_json)
+    diagnosis = None if cause is None else cause.as_dict()
+    printing.print_result(result | {"ending": ending, "periods": periods, "diagnosis": diagnosis}, lines, as_json)
 
 
 def _draw_motion(motion: Any) -> Any:
@@ -177,14 +184,26 @@ def _choose_start(
             "--hold: given together with --hit; give only one of them, because a hit starts outside the wall"
         )
     if hit is not None:
-        return {"start_velocity": hit, "external_force": external_force or 0.0, "contact": "unilateral"}
+        contact = "unilateral" if scene.tool is None else "bilateral"
+        return {"start_velocity": hit, "external_force": external_force or 0.0, "contact": contact}
     if hold is None and external_force is None:
         depth = DEFAULT_STEPS * hardware["resolution"] if "resolution" in hardware else DEFAULT_DEPTH
-        if isinstance(scene.device, LinearDevice):
+        if isinstance(scene.device, LinearDevice) and scene.tool is None:
             # Displace a linear system by a constant external force, because its simulation always starts at rest at 0.
             return {"external_force": depth * float(scene.wall.stiffness)}
         hold = depth
-    return {"start_position": hold or 0.0, "external_force": external_force or 0.0}
+    start: Any = hold or 0.0
+    if scene.tool is not None:
+        # Displace the tool in place of a linear system, because such a device starts at 0.
+        linear = isinstance(scene.device, LinearDevice)
+        start = {"tool_position": start} if linear else {"position": start, "tool_position": 0.0}
+    return {"start_position": start, "external_force": external_force or 0.0}
+
+
+def _get_depth(options: dict[str, Any]) -> float:
+    """Return the initial depth in the wall or distance from the tool, from the arguments of `zwidth.simulate`."""
+    start = options.get("start_position", 0.0)
+    return abs(start.get("position", 0.0) - start["tool_position"]) if isinstance(start, dict) else start
 
 
 def _choose_length(scene: Any) -> int:

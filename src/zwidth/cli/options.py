@@ -20,13 +20,13 @@ import click
 from zwidth.app.printing import format_row
 from zwidth.cli.help import OF_SCENE as OF_SCENE
 from zwidth.cli.help import show_example as show_example
-from zwidth.cli.parts import FILTER_HELP, change_kind, make_kind, make_part, name_option, select_part
+from zwidth.cli.parts import FILTER_HELP, change_kind, make_part, name_option, select_part
 from zwidth.core.errors import InputError
 from zwidth.model.checks import Span, find_kind, read_span
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.mode import Mode
-from zwidth.model.parameter_paths import PARTS, WITH_KIND, find_parts
+from zwidth.model.parameter_paths import CONTAINED, PARTS, WITH_KIND, find_parts
 from zwidth.model.timing import Timing
 from zwidth.model.wall import NoWall, VirtualWall
 from zwidth.units.parsing import DIMENSIONS, detect_kind, looks_like_number, read_quantity, read_share
@@ -48,8 +48,6 @@ Command: TypeAlias = Callable[..., Any]
 # Names of the parts of a scene; and the paths of the parameters of all parts, sorted by part.
 _PART_NAMES = tuple(dict.fromkeys(("velocity", *WITH_KIND, *(path.rpartition(".")[0] for path in OF_PARTS))))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
-# Parts that cannot be added to a linear system or a measured response, because such a device includes them.
-_CONTAINED = ("operator", "coupling", "actuator", "modes")
 # Names of the structural modes among the parts: "modes.0", "modes.1" and so on.
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
 _BARE = {"mass", "damping"}  # parameters of a rigid device
@@ -120,12 +118,6 @@ def _read_delay(text: str) -> Any:
 SHARE = Parsed("SHARE", read_share, "write a share, such as 2% or 0.02")
 
 
-def read_factor(text: str) -> float:
-    """Return the factor given by a text such as ``2`` or ``6 dB``."""
-    number = float(text.strip().removesuffix("dB"))
-    return 10.0 ** (number / 20.0) if text.strip().endswith("dB") else number
-
-
 def _read_figure(text: str) -> Path:
     """Return the path of a figure to write; raise an error if its folder does not exist."""
     file = Path(text)
@@ -143,7 +135,8 @@ def _add_option(command: Command, path: str) -> Command:
             "A published device of `zwidth devices`, with its period and delay; other options add or replace "
             "parameters. Or, in place of mass, damping and all parts: a transfer function 'NUM / DEN' by its "
             "coefficients in s, such as '1 / 0.1 10 0', by its roots, 'zpk: ZEROS / POLES / GAIN', or by sections, "
-            "'sos: b0 b1 b2 a0 a1 a2; ..'; or a measured response FILE.csv (.npz, .mat)."
+            "'sos: b0 b1 b2 a0 a1 a2; ..'; a measured response FILE.csv (.npz, .mat); or FILE.yaml with the keys of a "
+            "device of a scene file, such as mass_matrix, or model and site of a robot."
         )
         return click.option("--device", metavar="NAME", help=words)(command)
     if path == "sampled":
@@ -171,20 +164,21 @@ def _add_option(command: Command, path: str) -> Command:
 _TIMED = ("mass", "damping", "period", "rate", "delay")
 
 
-def scene_options(*, wall: bool, instead: str = "") -> Callable[[Command], Command]:
+def scene_options(
+    *, wall: bool, instead: str = "", make: Callable[[dict[str, Any], UnitSystem], Any] | None = None
+) -> Callable[[Command], Command]:
     """Return a decorator that adds the options of a scene, with or without wall, and the argument of a scene file.
 
     The command receives a `zwidth.Scene` as ``scene``, or None if ``instead`` names alternative options and no scene
-    option is given.
+    option is given. With ``make``, the command receives the result of ``make(values, units)`` instead.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "sampled", *_TIMED)
     take = take_options(
         "scene",
         (*bare, "velocity.filter", *_PARTS),
-        lambda given, system: build_scene(given, system, instead, wall=wall),
+        make or (lambda given, system: build_scene(given, system, instead, wall=wall)),
     )
-    file = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=click.Path(path_type=Path))
-    return lambda command: file(take(command))
+    return lambda command: scene_argument(take(command))
 
 
 def take_options(
@@ -209,13 +203,16 @@ def take_options(
                 if values.get("sampled") and "device" not in values:
                     raise click.UsageError("--sampled: give --device 'NUM / DEN' with coefficients in z")
                 if "device" in values:
-                    from zwidth.model.devices import read_device
+                    from zwidth.config.device_files import read_device_option
 
-                    values["device"] = read_device(values["device"], _find_sampled_period(values))
+                    options = context.meta.get(_WITH_KIND, {})
+                    values["device"] = read_device_option(
+                        values["device"], _find_sampled_period(values), rotary=bool(find_kind(options))
+                    )
                     # Ignore the unit system and the hardware of the scene file, because the option --device replaces
                     # the device of the file.
                     context.meta.pop(_HARDWARE, None)
-                    with_kind = context.meta.get(_WITH_KIND, {}) | {"--device": values["device"]}
+                    with_kind = options | {"--device": values["device"]}
                 return function(**{name: make(values, SYSTEMS[bool(find_kind(with_kind))])}, **given)
             except InputError as error:
                 field, _, text = str(error).partition(": ")
@@ -288,7 +285,7 @@ def build_scene(given: dict[str, Any], system: UnitSystem, instead: str = "", *,
 
 
 def change_scene(scene: Scene, given: dict[str, Any]) -> Scene:
-    """Return the scene of a file with the parameters replaced that are given as options."""
+    """Return a scene with the parameters replaced that are given as options; a part that it lacks is added."""
     from zwidth.model.devices import PublishedDevice
 
     changes = {path: value for path, value in given.items() if "." not in path}
@@ -342,27 +339,21 @@ def _make_scene(given: dict[str, Any], system: UnitSystem, instead: str) -> Scen
         """Return the values that are given among the named parameters, as a dict by name."""
         return {name: given[name] for name in names if name in given}
 
-    parts: dict[str, Any] = {
-        name: make_part(name, kind, part_values)
-        for name, kind in PARTS.items()
-        if (part_values := select_part(given, name))
-    }
-    parts |= {name: make_kind(name, part_values) for name in WITH_KIND if (part_values := select_part(given, name))}
-    modes = [make_part(name, Mode, part_values) for name in _MODES if (part_values := select_part(given, name))]
-    parts |= {"modes": modes} if modes else {}
     timing = Timing
     if device is None:
         device = Device(**select("mass", "damping"), rotary=system.rotary)
     elif isinstance(device, PublishedDevice):
         timing, device = device.to_timing, device.to_device(**select("mass", "damping"))
+    elif isinstance(device, Device):
+        device = replace(device, **select("mass", "damping"))
     else:
-        for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _CONTAINED):
+        for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in CONTAINED):
             raise click.UsageError(
                 f"{name_option(path)}: the given --device already contains it; give only one of the two"
             )
     wall = VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0))
-    velocity = make_kind("velocity", select_part(given, "velocity"))
-    return Scene(device, timing(**select("period", "rate", "delay")), wall, velocity).replace(**parts)
+    rigid = Scene(device, timing(**select("period", "rate", "delay")), wall)
+    return change_scene(rigid, {path: value for path, value in given.items() if "." in path})
 
 
 def _check_published(device: PublishedDevice, given: dict[str, Any], more: Sequence[str] = ()) -> None:
@@ -373,6 +364,9 @@ def _check_published(device: PublishedDevice, given: dict[str, Any], more: Seque
         raise click.UsageError(f"--device {device.name}: also give {', '.join(flags)}; not published for this device")
 
 
+PATH = click.Path(path_type=Path)
+folder_argument = click.argument("folder", metavar="DIR", type=PATH)
+scene_argument = click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=PATH)
 figure_option = click.option(
     "--figure", type=Parsed("FILE.png", _read_figure), help="Write a figure: FILE.png, .svg or .pdf."
 )

@@ -15,10 +15,12 @@ import click
 
 from zwidth.cli.options import (
     BOTH_PERIODS,
+    PATH,
     Command,
     change_scene,
     get_hardware,
     get_options_with_kind,
+    scene_argument,
     take_options,
 )
 from zwidth.cli.parts import make_kind, name_option, select_part
@@ -81,12 +83,11 @@ def loop_options(*, logs: bool) -> Callable[[Command], Command]:
     """
     paths = ("period", "rate", *(path for path in (*CHOICES, *OF_PARTS) if path.startswith("velocity.")))
     take = take_options("loop", paths, _make_loop)
-    kind = click.Path(path_type=Path)
 
     def decorate(command: Command) -> Command:
         made = take(command)
         if not logs:
-            return click.argument("scene_file", metavar="[SCENE.yaml|DIR]", required=False, type=kind)(made)
+            return scene_argument(made)
 
         @wraps(made)
         def with_files(files: tuple[Path, ...], **given: Any) -> Any:
@@ -96,7 +97,7 @@ def loop_options(*, logs: bool) -> Callable[[Command], Command]:
             given["logs"] = tuple(file for file in files if file not in scenes)
             return made(scene_file=scenes[0] if scenes else None, **given)
 
-        return click.argument("files", metavar="[LOG.csv]... [SCENE.yaml|DIR]", nargs=-1, type=kind)(with_files)
+        return click.argument("files", metavar="[LOG.csv]... [SCENE.yaml|DIR]", nargs=-1, type=PATH)(with_files)
 
     return decorate
 

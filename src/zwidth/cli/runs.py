@@ -21,7 +21,7 @@ import click
 
 from zwidth.app.printing import format_row, print_json, print_lines
 from zwidth.cli.commands import EXIT_FAILED, cli
-from zwidth.cli.options import Parsed, json_option, read_pairs
+from zwidth.cli.options import PATH, Parsed, folder_argument, json_option, read_pairs
 from zwidth.core.errors import ResourceError
 from zwidth.units.formatting import plain
 
@@ -69,8 +69,8 @@ _FIGURE_SIZE = Parsed(
 
 
 @cli.command()
-@click.argument("path", metavar="CONFIG", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for the results.  [default: runs/NAME]")
+@click.argument("path", metavar="CONFIG", type=PATH)
+@click.option("--out", type=PATH, help="Folder for the results.  [default: runs/NAME]")
 @click.option("--overwrite", is_flag=True, help="Replace an existing run in the folder.")
 @click.option("--resume", is_flag=True, help="Continue a stopped run, and repair damaged files.")
 @click.option("--workers", type=click.IntRange(min=1), help="Number of worker processes for sweeps.  [default: none]")
@@ -185,7 +185,7 @@ def _report_end(result: RunResult, command: str) -> None:
 
 
 @cli.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@folder_argument
 @json_option
 def verify(folder: Path, as_json: bool) -> None:
     """Verify the checksums of all files of the sweeps in DIR.
@@ -207,9 +207,9 @@ def verify(folder: Path, as_json: bool) -> None:
 
 
 @cli.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--netcdf", type=click.Path(path_type=Path), help="Write a netCDF-4 file.")
-@click.option("--csv", "table", type=click.Path(path_type=Path), help="Write a table; at most one million points.")
+@folder_argument
+@click.option("--netcdf", type=PATH, help="Write a netCDF-4 file.")
+@click.option("--csv", "table", type=PATH, help="Write a table; at most one million points.")
 def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
     """Write the sweep in DIR, or in a store, as netCDF or CSV."""
     if netcdf is None and table is None:
@@ -228,7 +228,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
 
 
 @cli.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@folder_argument
 @click.option(
     "--at",
     "selection",
@@ -241,10 +241,8 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
               help="File format; may be repeated.  [default: png, svg]")  # fmt: skip
 @click.option("--dpi", type=_DPI, help="Resolution in dots per inch.")
 @click.option("--size", type=_FIGURE_SIZE, help="Size: 7x4.5 in inches, or a width such as 85mm.")
-@click.option(
-    "--style", type=click.Path(path_type=Path), help="Style sheet of matplotlib, e.g. with 'svg.fonttype: none'."
-)
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
+@click.option("--style", type=PATH, help="Style sheet of matplotlib, e.g. with 'svg.fonttype: none'.")
+@click.option("--out", type=PATH, help="Folder for the figures.  [default: DIR/figures]")
 @json_option
 def figures(folder: Path, selection: dict[str, str], out: Path | None, as_json: bool, **drawing: Any) -> None:
     """Draw the sweeps in DIR, as PNG and SVG.

@@ -1,29 +1,36 @@
-"""Models of devices: a sampled mass with damping, a linear system, and a measured frequency response.
+"""Models of devices: a sampled mass with damping, a linear system, a measured frequency response, and joints.
 
 Sections are either in SI units ("physical") or normalized; `OneKind` reports keys of the other kind. A linear system
 or a measured response replaces mass, damping and mechanical parts. A linear system has one of four forms: numerator and
-denominator; zeros, poles and gain; the matrices A, B and C; or second-order sections.
+denominator; zeros, poles and gain; the matrices A, B and C; or second-order sections. A device with several joints
+(`zwidth.config.joint_devices`) is replaced by its mass and damping if it is a rigid mass; otherwise it is a linear
+system.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import ConfigDict, Field, PlainValidator, ValidationInfo, WrapValidator
+from pydantic import ConfigDict, Field, ValidationError, ValidationInfo, WrapValidator
+from pydantic_core import PydanticCustomError
 
 from zwidth.config.device_table import find_file
 from zwidth.config.fields import LocatedProblem, Strict, combine_problems, problem, quote_names
+from zwidth.config.joint_devices import MassMatrixSection, MujocoSection
 from zwidth.config.parts import PART_NAMES, Numbers, PartSection, parse_message, to_array
-from zwidth.config.values import Delay, Quantity, get_system, quantity_of
+from zwidth.config.values import Delay, Quantity, Rotary, get_system, quantity_of, read_rotary
 from zwidth.core.errors import InputError
 from zwidth.model.checks import Span
+from zwidth.model.device import Device
 from zwidth.model.devices import DEVICES
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.measured_device import SUFFIXES, MeasuredDevice
-from zwidth.model.parameter_paths import PARTS
+from zwidth.model.mujoco_model import MODEL_SUFFIXES
+from zwidth.model.parameter_paths import CONTAINED
 from zwidth.model.system_forms import parse_system
 from zwidth.units.formatting import describe, suggestion
 from zwidth.units.quantities import HARDWARE, POSITIVE
@@ -138,30 +145,62 @@ class ResponseSection(PartSection, noun="a response"):
         return MeasuredDevice(self.frequency, real + 1j * imag, self.deviation, self.rotary)
 
 
-def _read_form(raw: Any) -> SystemSection | ResponseSection:
-    """Return the model of a linear system or a measured response, from a mapping, a text or the name of a file."""
-    if isinstance(raw, SystemSection | ResponseSection):
+_Section = SystemSection | ResponseSection | MassMatrixSection
+# Keys that identify the section of a device; a mapping without any of them is a linear system.
+_IDENTIFYING: dict[type[Strict], set[str]] = {
+    ResponseSection: {"frequency"},
+    MujocoSection: {"model", "site", "pose"},
+    MassMatrixSection: {"mass_matrix", "jacobian", "direction"},
+}
+
+
+def read_device_form(raw: Any) -> _Section:
+    """Return the model of a device that is no mass with damping, from a mapping, a text or the name of a file."""
+    if isinstance(raw, _Section):
         return raw
     try:
         if isinstance(raw, str) and raw.endswith(SUFFIXES):
             return ResponseSection.read(raw)
-        if isinstance(raw, str) and ("/" in raw or raw.startswith("sos:")):
+        if isinstance(raw, str) and ("/" in raw or raw.startswith("sos:")) and not raw.endswith(MODEL_SUFFIXES):
             raw = parse_system("device", raw, "s")
     except InputError as error:
         # Remove the prefix "device: ", because the location is reported separately.
         raise parse_message(str(error).removeprefix("device: ")) from None
+    if isinstance(raw, str) and raw.endswith(MODEL_SUFFIXES):
+        allowed = "a device from a model has the keys 'model', 'site' and 'direction'"
+        raise problem(f"got {describe(raw)}", allowed, f"write {{model: {raw}, site: handle, direction: x}}")
     if not isinstance(raw, dict):
         names = tuple(device.name for device in DEVICES)
         allowed = f"published are {quote_names(names)}"
         raise problem(f"got {describe(raw)}", allowed, suggestion(raw, names, f"zwidth devices lists them; or {FORMS}"))
-    return (ResponseSection if "frequency" in raw else SystemSection).model_validate(raw)
+    section = next((section for section, keys in _IDENTIFYING.items() if keys & raw.keys()), SystemSection)
+    model: Any = section.model_validate(raw)
+    return MassMatrixSection.model_validate(model.joints) if isinstance(model, MujocoSection) else model
 
 
-DeviceForm = Annotated[SystemSection | ResponseSection, WrapValidator(lambda raw, _: _read_form(raw))]
+def replace_rigid(raw: dict[str, Any]) -> dict[str, Any]:
+    """Return a mapping with mass and damping in place of its device with joints, if that device is a rigid mass.
+
+    The mapping is unchanged if it also contains mass or damping, or if the device is invalid; both are reported later.
+    """
+    device = raw.get("device")
+    if not isinstance(device, dict | MassMatrixSection) or {"mass", "damping"} & raw.keys():
+        return raw
+    with suppress(PydanticCustomError, ValidationError):
+        section = read_device_form(device)
+        if isinstance(section, MassMatrixSection) and isinstance(section.instance, Device):
+            rigid = {"mass": section.instance.mass, "damping": section.instance.damping}
+            rigid |= {"rotary": True} if section.instance.rotary else {}
+            return {**{key: value for key, value in raw.items() if key != "device"}, **rigid}
+    return raw
+
+
+# The union contains `MujocoSection` only for the JSON Schema, because `read_device_form` replaces it.
+DeviceForm = Annotated[_Section | MujocoSection, WrapValidator(lambda raw, _: read_device_form(raw))]
 
 
 PHYSICAL_KEYS = frozenset({"device", "rotary", "mass", "damping", "period", "rate", "delay", *PART_NAMES})
-PHYSICAL_KEYS |= {"stiffness", "virtual_damping", "safe_limit", *HARDWARE}
+PHYSICAL_KEYS |= {"stiffness", "virtual_damping", "controller", "safe_limit", *HARDWARE}
 NORMALIZED_KEYS = frozenset({"delta", "d", "alpha", "beta"})
 
 
@@ -214,23 +253,19 @@ def find_second_period(keys: Iterable[str]) -> Iterable[LocatedProblem]:
 
 
 def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
-    """Yield a problem for each key that a linear system or measured response replaces: mass, damping and parts."""
+    """Yield a problem for each key that a system, a response or joints replace: mass, damping and parts."""
+    device = keys.get("device")
+    has_joints = isinstance(device, dict) and bool(_IDENTIFYING[MassMatrixSection] & device.keys())
+    has_joints |= isinstance(device, MassMatrixSection) or (isinstance(device, dict) and "model" in device)
     for key in keys:
-        if key.partition(".")[0] in ("mass", "damping", *PARTS, "modes") and keys[key]:
-            message, allowed = f"got {key!r} together with a system or response", "the system or response contains it"
-            yield (key,), problem(message, allowed, "remove one", on_key=True)
-
-
-def read_rotary(value: Any = None) -> bool | None:
-    """Validate the key ``rotary``; return True if the devices of the file are rotary, otherwise None."""
-    if value is not None and not isinstance(value, bool):
-        raise problem(f"got {describe(value)}", "it must be true or false", "remove it: the units determine the kind")
-    if value is False and get_system().rotary:
-        raise problem("got false", "other devices of the file are rotary, or have units of rotation", "write two files")
-    return value or get_system().rotary or None
-
-
-Rotary = Annotated[bool | None, PlainValidator(read_rotary, json_schema_input_type=bool)]
+        if key.partition(".")[0] not in ("mass", "damping", *CONTAINED) or not keys[key]:
+            continue
+        message, allowed, remedy = "a system or response", "the system or response contains it", "remove one"
+        if has_joints:
+            message, allowed = "joints", "the joints determine mass and damping"
+            if key not in ("mass", "damping"):
+                allowed, remedy = "an arm that is no rigid mass has no separate parts", "add them to its matrices"
+        yield (key,), problem(f"got {key!r} together with {message}", allowed, remedy, on_key=True)
 
 
 def _add_device(schema: dict[str, Any]) -> None:
@@ -247,11 +282,14 @@ class SampledMass(OneKind):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Replace the name of a published device by its parameters; keys of the section override them."""
+        """Replace the name of a published device, or a rigid device with joints, by mass and damping.
+
+        Keys of the section override those of a published device.
+        """
         name = raw.get("device")
         published = {device.name: device for device in DEVICES}.get(name) if isinstance(name, str) else None
         if published is None:
-            return super().prepare(raw)
+            return super().prepare(replace_rigid(raw))
         if published.rotary != get_system().rotary:
             allowed = "this device is linear, and others of the file are rotary"
             fault = problem(f"got {describe(name)}", allowed, "write two files")
@@ -263,7 +301,8 @@ class SampledMass(OneKind):
 
     device: DeviceForm | None = None
     """Name of a published device, which supplies mass and damping if they are not given; or a device that is not a mass
-    with damping: a linear system ('1 / 0.1 10 0' in s, or a mapping), or a measured response (FILE.csv)."""
+    with damping: a linear system ('1 / 0.1 10 0' in s, or a mapping), a measured response (FILE.csv), or an arm with
+    joints (a mapping with mass_matrix, or with model and site)."""
 
     mass: Annotated[float | None, quantity_of("mass"), WrapValidator(_validate_mass)] = Field(
         default=None, validate_default=True

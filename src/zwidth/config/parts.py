@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from functools import cached_property
 from math import isfinite
 from typing import Annotated, Any, ClassVar, Literal, Union
@@ -30,6 +30,7 @@ from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, fin
 from zwidth.config.values import Quantity, read_entries
 from zwidth.core.errors import InputError
 from zwidth.model.checks import find_range
+from zwidth.model.linear_device import LinearDevice
 from zwidth.model.mode import Mode
 from zwidth.model.parameter_paths import PARTS, WITH_KIND
 from zwidth.model.rational_filter import RationalFilter
@@ -250,6 +251,7 @@ _SECTIONS: Any = {
     name: make_section(part, name, f"{'an' if name[0] in 'aeiou' else 'a'} {name}") for name, part in PARTS.items()
 }
 ModeSection: Any = make_section(Mode, "mode", "a mode")
+ActuatorSection: Any = _SECTIONS["actuator"]
 
 
 class SafeLimitSection(PartSection, noun="a safe limit"):
@@ -307,7 +309,11 @@ def list_parts(owner: Any) -> dict[str, Any]:
 
 def build_parts(owner: Any) -> dict[str, Any]:
     """Return the given parts of a device, scene or study as objects of `zwidth.model`, by the name of the part."""
-    return {
+    parts: dict[str, Any] = {
         name: [each.instance for each in section] if isinstance(section, list) else section.instance
         for name, section in list_parts(owner).items()
     }
+    if owner.rotary and isinstance(parts.get("device"), LinearDevice):
+        # Set the kind of the device here, because the units of the whole file determine it.
+        parts["device"] = replace(parts["device"], rotary=True)
+    return parts

@@ -106,9 +106,11 @@ def has_rotary_devices(data: Any, key: str = "") -> bool:
     # One rotary value makes all devices of a file rotary. Skip fit studies, because the units in their logs
     # determine whether their devices are rotary.
     if isinstance(data, Mapping):
-        # Skip the key "joints", because joint positions may be angles even if the wall acts on a linear motion.
-        items = ((str(name), each) for name, each in data.items() if name != "joints")
-        return data.get("kind") != "fit" and any(has_rotary_devices(each, name) for name, each in items)
+        if "mass_matrix" in data or "model" in data:
+            # Skip all values of an arm except ``rotary``, because joints may have positions in degrees and damping in
+            # N m s/rad even if the wall acts on a linear motion.
+            return data.get("rotary") is True
+        return data.get("kind") != "fit" and any(has_rotary_devices(each, str(name)) for name, each in data.items())
     if isinstance(data, list):
         return any(has_rotary_devices(each, key) for each in data)
     if key == "device" and isinstance(data, str):

@@ -14,9 +14,10 @@ from functools import cached_property
 from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
-from pydantic import ConfigDict, WrapValidator
+from pydantic import ConfigDict, Field, WrapValidator
 
 from zwidth.analysis.scene import Scene
+from zwidth.config.controllers import ControllerField, derive_keys, find_second_wall
 from zwidth.config.devices import NORMALIZED_KEYS, PHYSICAL_KEYS, OneKind, SampledMass
 from zwidth.config.fields import LocatedProblem, problem, quote_names
 from zwidth.config.parts import (
@@ -32,7 +33,7 @@ from zwidth.core.errors import InputError
 from zwidth.core.xp import within
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
-from zwidth.model.parameter_paths import PARTS, replace_parameters
+from zwidth.model.parameter_paths import CONTAINED, replace_parameters
 from zwidth.model.timing import Timing
 from zwidth.model.velocity import FOAW
 from zwidth.model.wall import VirtualWall
@@ -51,7 +52,7 @@ class _PhysicalPlant(_Parts, SampledMass):
             allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
             yield ("delay",), problem(f"got {self.delay}, which is {short(self.d)} periods", allowed, "check the units")
             return
-        if self.device is not None and any(getattr(self, name) for name in (*PARTS, "modes")):
+        if self.device is not None and any(getattr(self, name) for name in CONTAINED):
             # Skip the checks below, because parts that conflict with a linear system or measured response are already
             # reported.
             return
@@ -179,8 +180,20 @@ def _pick_wall(scene: Any, kind: Any) -> Any:
 class PhysicalScene(_PhysicalPlant, noun="a scene"):
     """Device, timing and wall in SI units, the default values of the studies."""
 
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        return super().prepare(derive_keys(raw))
+
+    @classmethod
+    def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        yield from super().find_conflicts(raw)
+        yield from find_second_wall(raw)
+
     stiffness: Annotated[float, quantity_of("stiffness")] | None = None
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
+
+    controller: ControllerField | None = Field(default=None, exclude=True)
+    """Gains of a motor controller, in place of stiffness, virtual damping and feedback."""
 
     velocity: SimulatedVelocityField | None = None
     """Velocity estimate. Default: the difference of two samples."""

@@ -21,16 +21,15 @@ from zwidth.config.device_table import TableField, read_table
 from zwidth.config.devices import (
     DeviceForm,
     ResponseSection,
-    Rotary,
     find_second_device,
     find_second_period,
-    read_rotary,
+    replace_rigid,
 )
 from zwidth.config.fields import LocatedProblem, Strict, describe_parameter, problem, quote_names, require_entries
 from zwidth.config.parts import build_parts, list_parts, make_parts_base, parse_input_error
 from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import Study, register
-from zwidth.config.values import Axis, Quantity, axis_of
+from zwidth.config.values import Axis, Quantity, Rotary, axis_of, read_rotary
 from zwidth.core.errors import InputError
 from zwidth.model.device import Device
 from zwidth.model.parameter_paths import PARTS
@@ -216,7 +215,7 @@ class SweepStudy(_Parts, Study):
     """Parameters and their values; all combinations are computed."""
 
     device: DeviceForm | None = None
-    """Linear system or measured response that replaces mass and damping. Default: that of the scene."""
+    """Linear system, measured response or arm with joints in place of mass and damping. Default: that of the scene."""
 
     rotary: Rotary = Field(default_factory=read_rotary)
     """True for rotary devices. One quantity with a rotary unit makes all devices of a file rotary."""
@@ -238,6 +237,17 @@ class SweepStudy(_Parts, Study):
     certification fails, mostly close to double poles, the status is NOT_CONVERGED; the value is then present if an
     error of at most 0.1 is certified, otherwise NaN.
     """
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        """Replace a rigid device with joints by the axes mass and damping, unless the axes contain one of them."""
+        axes = raw.get("axes")
+        if isinstance(axes, dict) and not {"mass", "damping"} & _list_given(axes):
+            changed = replace_rigid(raw)
+            if changed is not raw:
+                changed["axes"] = {**axes, **{name: changed.pop(name) for name in ("mass", "damping")}}
+            raw = changed
+        return super().prepare(raw)
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:

@@ -19,7 +19,14 @@ from math import inf
 from typing import Annotated, Any, TypeAlias, cast
 
 import numpy as np
-from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, ValidationInfo
+from pydantic import (
+    BeforeValidator,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    PlainValidator,
+    ValidationError,
+    ValidationInfo,
+)
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from zwidth.config.fields import LocatedProblem, Strict, combine_problems, find_repeated, list_problems, problem
@@ -61,6 +68,18 @@ def read_in_units(system: UnitSystem) -> AbstractContextManager[None]:
 def get_system() -> UnitSystem:
     """Return the unit system, linear or rotary, of the configuration that is being read."""
     return _system.get()
+
+
+def read_rotary(value: Any = None) -> bool | None:
+    """Validate the key ``rotary``; return True if the devices of the file are rotary, otherwise None."""
+    if value is not None and not isinstance(value, bool):
+        raise problem(f"got {describe(value)}", "it must be true or false", "remove it: the units determine the kind")
+    if value is False and get_system().rotary:
+        raise problem("got false", "other devices of the file are rotary, or have units of rotation", "write two files")
+    return value or get_system().rotary or None
+
+
+Rotary = Annotated[bool | None, PlainValidator(read_rotary, json_schema_input_type=bool)]
 
 
 @dataclass(frozen=True)

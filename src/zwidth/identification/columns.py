@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,11 +47,11 @@ _EPOCH_UNITS = (("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3))  # possible units of t
 _COARSEST = 1.1  # rad or m; largest accepted encoder step (6 steps per turn), because a larger value is a count
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class LoggedMotion:
     """Time, position and force of one log in SI units, as arrays with one entry per row of the file.
 
-    NaN marks a cell without a number.
+    NaN marks a cell without a number. Comparisons of two logs ignore the arrays.
 
     Attributes:
         time: times in s; None if the period replaces them.
@@ -62,22 +62,12 @@ class LoggedMotion:
         notes: assumptions about columns and units that the user should check, one clause each.
     """
 
-    time: np.ndarray | None
-    position: np.ndarray
-    force: np.ndarray
+    time: np.ndarray | None = field(compare=False)
+    position: np.ndarray = field(compare=False)
+    force: np.ndarray = field(compare=False)
     resolution: float | None
     rotary: bool
     notes: tuple[str, ...] = ()
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether all values of two logs are equal; NaN counts as 0, because NaN does not equal itself."""
-        return isinstance(other, LoggedMotion) and all(
-            np.array_equal(*(np.nan_to_num(getattr(each, part.name)) for each in (self, other)))
-            if isinstance(getattr(self, part.name), np.ndarray) and isinstance(getattr(other, part.name), np.ndarray)
-            else getattr(self, part.name) is getattr(other, part.name)
-            or (part.name not in QUANTITIES and getattr(self, part.name) == getattr(other, part.name))
-            for part in fields(self)
-        )
 
 
 def read_log(

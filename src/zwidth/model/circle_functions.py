@@ -24,10 +24,10 @@ _UNDAMPED = 8.0 * np.finfo(float).eps
 
 
 class Jet(NamedTuple):
-    """The value of a complex function of w, and its derivative."""
+    """The value of a complex function of w, or of another variable, and its derivative."""
 
     value: Array
-    slope: Array  # derivative with respect to w
+    slope: Array  # derivative with respect to the variable
 
     def times(self, other: Jet) -> Jet:
         """Return the product with another function, with the derivative by the product rule."""

@@ -23,15 +23,17 @@ from typing import Any, Literal, NamedTuple
 
 from zwidth.core.errors import InputError, check_choice
 from zwidth.core.xp import is_traced
-from zwidth.model.checks import accept_units, check_number
+from zwidth.model.checks import accept_units, check_number, read_texts
 from zwidth.model.feedback import IntegralFeedback, IntegrationRule
 from zwidth.model.position import Position, has_velocity
 from zwidth.model.velocity import BackwardDifference, LowPass, Velocity
 from zwidth.model.wall import VirtualWall
 from zwidth.units.display import compact_repr
-from zwidth.units.quantities import ANY
+from zwidth.units.quantities import ANY, POSITIVE
+from zwidth.units.unit_system import SYSTEMS
 
 PositionUnit = Literal["m", "rad", "turns", "degrees"]
+ControllerKind = Literal["pid", "cascade"]
 _UNITS = {"m": 1.0, "rad": 1.0, "turns": 2.0 * math.pi, "degrees": math.pi / 180.0}  # size of each unit, in m or rad
 
 
@@ -171,6 +173,7 @@ def pid_gains(
         12.566 N m/turn
     """
     scale = _find_scale(units, output_unit)
+    integral_gain = read_texts("integral_gain", integral_gain, SYSTEMS[units != "m"]["N/(m s)"])
     return PidGains(stiffness / scale, integral_gain / scale, virtual_damping / scale)
 
 
@@ -236,18 +239,26 @@ def cascade(
 
 @accept_units
 def cascade_gains(
-    stiffness: float, virtual_damping: float, *, units: PositionUnit = "turns", output_unit: float = 1.0
+    stiffness: float,
+    virtual_damping: float,
+    integral_gain: float = 0.0,
+    *,
+    units: PositionUnit = "turns",
+    output_unit: float = 1.0,
 ) -> CascadeGains:
     """Return the gains of a position loop with an inner velocity loop that renders a wall: the inverse of `cascade`.
 
     Args:
         stiffness: K in N/m or N m/rad.
         virtual_damping: B in N s/m or N m s/rad, not 0.
+        integral_gain: gain of the integrator of the velocity loop, in N/m or N m/rad.
         units: position unit of the gains, see `cascade`.
         output_unit: force or torque per unit of output, see `cascade`.
 
     Returns:
-        ``pos_gain = K/B`` and ``vel_gain = B`` in the units of the controller; ``vel_integrator_gain`` is 0.
+        ``pos_gain = K/B``, ``vel_gain = B`` and ``vel_integrator_gain`` in the units of the controller. The integrator
+        must be that of a scene whose further feedback contains the same ``pos_gain``, such as the scene of
+        `zwidth.Scene.recommend`.
 
     Raises:
         InputError: if the damping is 0, because a cascade renders a spring only together with a damper.
@@ -263,4 +274,95 @@ def cascade_gains(
     if not virtual_damping:
         raise InputError("virtual_damping: got 0; a cascade needs damping, K = pos_gain B; pass a value other than 0")
     scale = _find_scale(units, output_unit)
-    return CascadeGains(stiffness / virtual_damping, virtual_damping / scale, 0.0)
+    integral_gain = read_texts("integral_gain", integral_gain, SYSTEMS[units != "m"]["N/m"])
+    return CascadeGains(stiffness / virtual_damping, virtual_damping / scale, integral_gain / scale)
+
+
+def find_gains(
+    wall: VirtualWall,
+    feedback: Any,
+    kind: ControllerKind,
+    units: PositionUnit,
+    output_unit: float = 1.0,
+) -> PidGains | CascadeGains:
+    """Return the gains of a controller that renders a wall with integral feedback.
+
+    Args:
+        wall: K and B.
+        feedback: further feedback of the scene: None or an `IntegralFeedback`.
+        kind: "pid" or "cascade".
+        units: position unit of the gains, see `cascade`.
+        output_unit: force or torque per unit of output, see `cascade`.
+
+    Raises:
+        InputError: if the further feedback is not the integrator of a controller of this kind.
+    """
+    K, B = float(wall.stiffness), float(wall.virtual_damping)
+    integral, is_cascade = 0.0, kind == "cascade"
+    if feedback is not None:
+        integrated = isinstance(feedback, IntegralFeedback) and feedback.is_cascade == is_cascade
+        if is_cascade and integrated:
+            # Compare pos_gain B with K, because B may be small. Six digits of K and B agree to 1e-5.
+            integrated = abs(feedback.position / feedback.velocity * B - K) <= 1e-5 * abs(K)
+        if not integrated or (not is_cascade and feedback.velocity):
+            allowed = "the integrator of a cascade with pos_gain = K/B" if is_cascade else "an integral of the position"
+            raise InputError(f"feedback: got {feedback!r}; these gains require {allowed}, or no feedback")
+        weight = feedback.velocity if is_cascade else 1.0 if feedback.position is None else feedback.position
+        integral = feedback.gain * weight
+    convert: Any = cascade_gains if is_cascade else pid_gains
+    return convert(K, B, integral, units=units, output_unit=output_unit)
+
+
+GAIN_NAMES: dict[str, tuple[str, ...]] = {"pid": PidGains._fields, "cascade": CascadeGains._fields}
+"""Names of the gains of each kind of controller."""
+
+
+def find_output_unit(output_unit: float | None, torque_constant: float | None, resistance: float | None) -> float:
+    """Return the force or torque per unit of output of a controller.
+
+    Args:
+        output_unit: the force in N or torque in N m per unit of output.
+        torque_constant: torque constant in N m/A of a motor whose current is the output.
+        resistance: winding resistance in ohm, if the output is a voltage; requires ``torque_constant``.
+
+    Returns:
+        ``output_unit``; or the torque constant, divided by the resistance if given; or 1 without any argument.
+    """
+    given = {"output_unit": output_unit, "torque_constant": torque_constant, "resistance": resistance}
+    numbers = {name: check_number(name, value, "1", POSITIVE) for name, value in given.items() if value is not None}
+    if "output_unit" in numbers and len(numbers) > 1:
+        raise InputError(f"output_unit: got {output_unit} and torque_constant or resistance; give only one of them")
+    if "resistance" in numbers and "torque_constant" not in numbers:
+        raise InputError(f"resistance: got {resistance} without torque_constant; give torque_constant too")
+    return numbers.get("output_unit", numbers.get("torque_constant", 1.0) / numbers.get("resistance", 1.0))
+
+
+def find_units(kind: ControllerKind, units: PositionUnit | None, rotary: bool) -> PositionUnit:
+    """Return the position unit of the gains of a controller, checked against the kind of device.
+
+    Args:
+        kind: "pid" or "cascade".
+        units: the position unit; None for "m" with a linear device, and for "turns" (cascade) or "rad" (PID) with a
+            rotary device.
+        rotary: True for a rotary device.
+    """
+    if units is None:
+        return "m" if not rotary else "turns" if kind == "cascade" else "rad"
+    check_choice("units", units, tuple(_UNITS))
+    if (units == "m") == rotary:
+        allowed = "turns, degrees or rad" if rotary else "m, or write the inertia with its unit, such as '12 g cm^2'"
+        raise InputError(f"units: got {units!r} for a {'rotary' if rotary else 'linear'} device; use {allowed}")
+    return units
+
+
+def make_controller(
+    kind: ControllerKind,
+    gains: dict[str, float],
+    position: Position | None,
+    rule: IntegrationRule,
+    units: PositionUnit,
+    output_unit: float,
+) -> ControllerParts:
+    """Return the parts of a scene for a controller of a kind, from its gains by name; see `pid` and `cascade`."""
+    options: Any = {"position": position, "rule": rule, "units": units, "output_unit": output_unit}
+    return cascade(**gains, **options) if kind == "cascade" else pid(**gains, **options)

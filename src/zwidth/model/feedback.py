@@ -8,8 +8,8 @@ closed loop includes these poles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -110,7 +110,7 @@ class IntegralFeedback(Part):
     """Integral gain k_i: further feedback with the integral of the position, ``R0 = k_i T z/(z - 1)``.
 
     Args:
-        gain: k_i in N/(m s).
+        gain: k_i in N/(m s) or N m/(rad s).
         rule: rule of integration. "backward" adds T x_k to the sum before the force is computed, R0 = k_i T z/(z - 1).
             "forward" adds T x_k after the force is computed, R0 = k_i T/(z - 1). "trapezoidal" adds
             T (x_k + x_(k-1))/2, R0 = k_i (T/2) (z + 1)/(z - 1).
@@ -156,6 +156,20 @@ class IntegralFeedback(Part):
     def weights(self, period: Any) -> Weights | None:
         """Return the weights of both estimates, for T = 1; None if the integrand is the measured position."""
         return _normalize_weights(self, period)
+
+    @property
+    def is_cascade(self) -> bool:
+        """True if the integrand contains position and velocity, as that of `zwidth.cascade`, whose pos_gain is K/B."""
+        return bool(self.position) and bool(self.velocity)
+
+    def match_wall(self, stiffness: float, virtual_damping: float) -> Self:
+        """Return the integrator of a cascade for a new wall: the ratio of its weights becomes K/B, the new pos_gain.
+
+        Args:
+            stiffness: K in N/m.
+            virtual_damping: B in N s/m, not 0.
+        """
+        return replace(self, position=self.velocity * (stiffness / virtual_damping))
 
 
 FEEDBACKS = {"integral": IntegralFeedback, "filter": Feedback}

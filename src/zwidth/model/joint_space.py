@@ -21,24 +21,97 @@ about a pose in which a motor torque compensates gravity.
 
 from __future__ import annotations
 
-from importlib import import_module
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.core.errors import InputError, check_choice, format_install_command
+from zwidth.core.errors import InputError, check_choice, describe_choice
+from zwidth.core.xp import is_traced
 from zwidth.model.checks import check_number
 from zwidth.model.device import Device
 from zwidth.model.linear_device import LinearDevice
-from zwidth.units.parsing import looks_like_number
-from zwidth.units.quantities import ANY
+from zwidth.units.parsing import detect_kind
+from zwidth.units.quantities import ANY, NOT_NEGATIVE
+from zwidth.units.unit_system import SYSTEMS
 
 # Relative size below which a component of a vector, or an eigenvalue, is treated as a rounding error.
 NEGLIGIBLE = 1e-11
 # Largest asymmetry of a matrix, relative to its largest entry, that is attributed to rounding errors.
 ASYMMETRY = 1e-6
+# Units of the fields for slides; the corresponding units of rotation are those for hinges.
+_UNITS = {"mass_matrix": "kg", "damping": "N s/m", "stiffness": "N/m"}
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+class Joints(NamedTuple):
+    """Matrices of the joints and the vector J' n of the torques per unit force along n, all in SI units as tuples."""
+
+    mass_matrix: tuple[tuple[float, ...], ...]
+    damping: tuple[tuple[float, ...], ...]
+    stiffness: tuple[tuple[float, ...], ...]
+    vector: tuple[float, ...]
+
+
+@dataclass(frozen=True, repr=False)
+class JointDevice(LinearDevice):
+    """The linear system along one direction of an arm with several joints, with the dampings of its joints.
+
+    `from_mass_matrix` creates it. The damping of joint k, counted from 0, is the entry (k, k) of the damping matrix D.
+    Its dotted path in a scene is "joints.k.damping", such as "joints.0.damping".
+    """
+
+    system: Any = field(init=False, default=None)  # computed from the joints
+    joints: Joints | None = None
+
+    def __post_init__(self, sampled: Any) -> None:
+        # Compute the system from the matrices in every case, so that both always agree.
+        M, D, S, vector = map(np.array, self._get_joints())
+        reduced = _reduce(*_normalize(np.linalg.cholesky(M), vector, D, S))
+        object.__setattr__(self, "system", _realize(*reduced))
+        super().__post_init__(sampled)
+
+    def __repr__(self) -> str:
+        """Return the expression that creates the device."""
+        rotary = ", rotary=True" if self.rotary else ""
+        return f"from_mass_matrix({', '.join(f'{name}={value}' for name, value in self.spell_form().items())}{rotary})"
+
+    def spell_form(self) -> dict[str, Any]:
+        """Return the value of the key ``device`` of a configuration."""
+        joints = self._get_joints()
+        matrices = {name: [list(row) for row in getattr(joints, name)] for name in joints._fields[:3]}
+        # The vector is that of a Jacobian with one row, for which the direction is omitted.
+        return {**matrices, "jacobian": [list(joints.vector)]}
+
+    def _get_joints(self) -> Joints:
+        """Return the matrices of the joints."""
+        assert self.joints is not None, "from_mass_matrix passes the joints"
+        return self.joints
+
+    @property
+    def joint_dampings(self) -> dict[str, float]:
+        """The damping of each joint by dotted path, in N m s/rad (hinges) or N s/m (slides)."""
+        return {f"joints.{k}.damping": row[k] for k, row in enumerate(self._get_joints().damping)}
+
+    def replace_dampings(self, values: dict[str, Any]) -> JointDevice:
+        """Return the device with other dampings of some joints; ``values`` contains them by dotted path."""
+        joints, paths = self._get_joints(), list(self.joint_dampings)
+        damping = np.array(joints.damping)
+        for path, value in values.items():
+            if path not in paths:
+                raise InputError(f"parameter: {describe_choice(path, tuple(paths))}")
+            if is_traced(value):
+                raise InputError(f"{path}: got a value traced by JAX; it must be a number; use Scene.sensitivities")
+            unit = SYSTEMS[detect_kind(value) is not False]["N s/m"]
+            k = paths.index(path)
+            damping[k, k] = check_number(path, value, unit, NOT_NEGATIVE)
+        checked = _read_matrix("damping", damping, len(damping))
+        return replace(self, joints=joints._replace(damping=_to_tuples(checked)))
+
+
+def _to_tuples(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    """Return the rows of a matrix as tuples of floats."""
+    return tuple(map(tuple, matrix.tolist()))
 
 
 def from_mass_matrix(
@@ -59,7 +132,8 @@ def from_mass_matrix(
 
     Args:
         mass_matrix: symmetric, positive definite matrix M of the joints, shape (joints, joints), in kg m^2 for hinges
-            and in kg for slides, including the inertia of the motors.
+            and in kg for slides, including the inertia of the motors. All values of the three matrices are numbers in
+            these units, or texts with units such as "20 mN m s/rad".
         damping: viscous damping of the joints in N m s/rad (hinges) or N s/m (slides): one number, one per joint, or a
             symmetric matrix without negative eigenvalues.
         direction: direction n of the wall, of any length > 0: "x", "y" or "z", or a vector with one component per row
@@ -68,12 +142,13 @@ def from_mass_matrix(
             ``J q'`` for the joint velocities q'. None if ``direction`` is in joint coordinates.
         stiffness: stiffness of springs from the joints to ground in N m/rad or N/m, in the same form as ``damping``. A
             spring k between two coordinates has the matrix ``[[k, -k], [-k, k]]``.
-        rotary: True if the direction is an axis of rotation. A `Device` then has rotary units; a `LinearDevice` prints
-            the units of a linear device in any case.
+        rotary: True if the direction is an axis of rotation; walls are then in N m/rad and N m s/rad.
 
     Returns:
         A `Device` with the effective mass ``1/(n' J M^-1 J' n)`` and its damping if a single motion remains, for
-        example without damping or if the damping is proportional to M; otherwise a `LinearDevice`.
+        example without damping or if the damping is proportional to M; otherwise a `LinearDevice`. In a scene with this
+        `LinearDevice`, the damping of joint k, counted from 0, has the path "joints.k.damping": `Scene.replace` changes
+        it, and `Scene.sensitivities` returns the derivative of K_max with respect to it.
 
     Raises:
         InputError: an array has the wrong shape, is not finite or not symmetric; M is not positive definite; damping or
@@ -107,69 +182,8 @@ def from_mass_matrix(
         # Solve with M instead of its factor, because a product of two square roots is not exact.
         mass = 1.0 / float(vector @ np.linalg.solve(inertia, vector))
         return Device(mass, float(D[0, 0]) * mass, rotary=rotary)
-    return LinearDevice(_realize(w, D, S))
-
-
-def from_mujoco(
-    model: Any, site: str, direction: Any, *, pose: Any = None, rotary: bool = False
-) -> Device | LinearDevice:
-    """Return the device that a wall along one direction at a site of a MuJoCo model acts on; see `from_mass_matrix`.
-
-    Mass matrix (with armature), Jacobian, joint damping and joint springs come from the model in the given pose. Joints
-    with actuators are driven and measured, all others move passively; in a model without actuators, all joints are
-    driven. The wall replaces the gains of the actuators. Friction, contacts, and gravity are not included. Needs the
-    extra ``mujoco``.
-
-    Args:
-        model: path of a model (MJCF ``.xml``, ``.urdf`` or ``.mjb``) or a ``mujoco.MjModel``.
-        site: name of the site, the point on which the wall acts. For a model without sites, such as one from URDF, the
-            name of a body, whose origin is the point.
-        direction: "x", "y", "z" or a vector of three components in world coordinates.
-        pose: pose of the model in one of four forms: a list of joint positions (``qpos``), as numbers in rad or m or as
-            texts such as "30 deg"; a dict of joint positions keyed by joint name, with all other joints in their
-            reference positions; the name of a keyframe of the model; None for the reference pose ``qpos0``.
-        rotary: True for a wall that acts on the rotation about ``direction``, such as a knob or a steering wheel.
-
-    Returns:
-        A `Device` or `LinearDevice`, as `from_mass_matrix`.
-
-    Raises:
-        InputError: the model cannot be read, it has no such site or keyframe, or it contains equality constraints,
-            elastic tendons or nonlinear springs, which a mass matrix does not describe.
-
-    References:
-        E. Todorov, T. Erez and Y. Tassa, MuJoCo: a physics engine for model-based control, IROS 2012.
-
-    Example:
-        >>> import mujoco, zwidth
-        >>> wheel = "<joint axis='0 0 1' damping='.3'/><geom type='cylinder' size='.2 .01' mass='2'/><site name='hub'/>"
-        >>> model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody><body>{wheel}</body></worldbody></mujoco>")
-        >>> zwidth.from_mujoco(model, "hub", "z", rotary=True)
-        Device(mass=0.04, damping=0.3, rotary=True)
-    """
-    mujoco, model = _import_mujoco(), load_model(model)
-    _reject_constraints(model)
-    data = mujoco.MjData(model)
-    data.qpos[:] = _read_pose(model, pose)
-    mujoco.mj_forward(model, data)
-    count = int(model.nv)
-    translation, rotation = np.zeros((3, count)), np.zeros((3, count))
-    kind, index = _find_point(mujoco, model, site)
-    compute_jacobian = mujoco.mj_jacSite if kind == "site" else mujoco.mj_jacBody
-    compute_jacobian(model, data, translation, rotation, index)
-    inertia = np.zeros((count, count))
-    for column, unit in zip(inertia, np.eye(count), strict=True):
-        mujoco.mj_mulM(model, data, column, unit)
-    jacobian = np.where(_find_driven(mujoco, model), rotation if rotary else translation, 0.0)
-    springs = np.asarray(model.jnt_stiffness)[model.dof_jntid]
-    return from_mass_matrix(
-        inertia,
-        np.array(model.dof_damping),
-        direction=direction,
-        jacobian=jacobian,
-        stiffness=springs,
-        rotary=rotary,
-    )
+    joints = Joints(_to_tuples(inertia), _to_tuples(damper), _to_tuples(spring), tuple(vector.tolist()))
+    return JointDevice(joints=joints, rotary=rotary)
 
 
 def _read_matrix(name: str, value: Any, joints: int | None) -> np.ndarray:
@@ -181,9 +195,11 @@ def _read_matrix(name: str, value: Any, joints: int | None) -> np.ndarray:
         joints: number of joints, or None if the matrix determines it.
     """
     try:
-        array = np.array(value, float)
+        array = np.array(_convert_units(name, value), float)
+    except InputError:
+        raise
     except (TypeError, ValueError):
-        raise InputError(f"{name}: got {value!r}; it must be numbers in SI units") from None
+        raise InputError(f"{name}: got {value!r}; it must be numbers, one list per row") from None
     if joints is not None and array.ndim < 2:
         if array.ndim == 1 and array.size != joints:
             raise InputError(f"{name}: got {array.size} values for {joints} joints; give one number or one per joint")
@@ -205,30 +221,49 @@ def _read_matrix(name: str, value: Any, joints: int | None) -> np.ndarray:
     return array
 
 
+def _convert_units(name: str, value: Any) -> Any:
+    """Return a matrix, a vector or a number with all texts, such as "20 mN m s/rad", converted to SI units.
+
+    ``name`` is the name of the field, which determines the dimension: a mass, a damping or a stiffness, in the units of
+    rotation for hinges and of translation for slides.
+    """
+    if isinstance(value, list | tuple):
+        return [_convert_units(name, entry) for entry in value]
+    if not isinstance(value, str):
+        return value
+    return check_number(name, value, SYSTEMS[detect_kind(value) is not False][_UNITS[name]], ANY)
+
+
 def _project(direction: Any, jacobian: Any, joints: int) -> np.ndarray:
     """Return the joint torques J' n for a unit force along the direction n, with the Jacobian J; shape (joints,)."""
-    try:
-        rows = np.eye(joints) if jacobian is None else np.array(jacobian, float)
-        if isinstance(direction, str):
-            check_choice("direction", direction, tuple(_AXES))
-            direction = _AXES[direction][: len(rows)]
-        if direction is None and len(rows) > 1:
-            raise InputError(f"direction: missing; give a vector of {len(rows)} components, or 'x', 'y' or 'z'")
-        n = np.array([1.0] if direction is None else direction, float)
-    except InputError:
-        raise
-    except (TypeError, ValueError):
-        raise InputError("jacobian, direction: got values that are not numbers; give numbers in SI units") from None
+    rows = np.eye(joints) if jacobian is None else _read_array("jacobian", jacobian)
     if rows.ndim != 2 or rows.shape[1] != joints:
         raise InputError(f"jacobian: got shape {rows.shape}; it must be (axes, {joints}), one column per joint")
+    if isinstance(direction, str):
+        check_choice("direction", direction, tuple(_AXES))
+        direction = _AXES[direction][: len(rows)]
+    if direction is None and len(rows) > 1:
+        raise InputError(f"direction: missing; give a vector of {len(rows)} components, or 'x', 'y' or 'z'")
+    n = _read_array("direction", [1.0] if direction is None else direction)
     if n.shape != (len(rows),):
         raise InputError(f"direction: got shape {n.shape}; it must be ({len(rows)},), one component per row of J")
-    if not (np.isfinite(rows).all() and np.isfinite(n).all() and np.any(n)):
-        raise InputError("direction: got a zero or nonfinite vector, or a nonfinite jacobian; give finite numbers")
+    if not np.any(n):
+        raise InputError("direction: got a zero vector; it must have a length > 0; give a vector such as [0, 1]")
     vector = rows.T @ (n / np.linalg.norm(n))
     if np.linalg.norm(vector) <= NEGLIGIBLE * np.linalg.norm(rows):
         raise InputError("direction: no joint moves the point along it in this pose; choose another pose or direction")
     return vector
+
+
+def _read_array(name: str, value: Any) -> np.ndarray:
+    """Return an array of finite numbers; ``name`` is the name of the field for error messages."""
+    try:
+        array = np.array(value, float)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if not np.isfinite(array).all():
+        raise InputError(f"{name}: got {value!r}; it must be finite numbers in SI units")
+    return array
 
 
 def _normalize(
@@ -304,132 +339,3 @@ def _realize(w: np.ndarray, D: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, n
     B = np.concatenate([np.zeros(positions), w])
     C = np.concatenate([np.ones(has_free), w[count:], np.zeros(size)])
     return A, B, C
-
-
-def _import_mujoco() -> Any:
-    """Return the package mujoco; raise `InputError` if it is not installed.
-
-    The annotation is Any, because the type stubs of the package lack most functions.
-    """
-    try:
-        return import_module("mujoco")
-    except ImportError:
-        command = format_install_command("mujoco")
-        raise InputError(f"from_mujoco: MuJoCo is not installed; it is needed to read models; run {command}") from None
-
-
-def list_joints(model: Any) -> dict[str, str]:
-    """Return the kind, "hinge" or "slide", of the joints of a MuJoCo model, keyed by joint name.
-
-    Joints without a name and joints with several coordinates are omitted.
-    """
-    kinds = {int(getattr(_import_mujoco().mjtJoint, f"mjJNT_{kind.upper()}")): kind for kind in ("hinge", "slide")}
-    joints = (model.joint(index) for index in range(model.njnt))
-    return {joint.name: kinds[int(joint.type[0])] for joint in joints if joint.name and int(joint.type[0]) in kinds}
-
-
-def check_point(model: Any, site: str) -> None:
-    """Raise `InputError` if a MuJoCo model has no site with the given name.
-
-    In a model without any sites, the name must be that of a body.
-    """
-    _find_point(_import_mujoco(), model, site)
-
-
-def load_model(model: Any) -> Any:
-    """Load a MuJoCo model from a file, given its path; return an already loaded model unchanged."""
-    mujoco = _import_mujoco()
-    if isinstance(model, mujoco.MjModel):
-        return model
-    if not isinstance(model, str | Path):
-        raise InputError(f"model: got {model!r}; it must be a path or a mujoco.MjModel")
-    path = Path(model).expanduser()
-    if not path.is_file():
-        text = str(model)
-        shown = text if len(text) <= 60 and text.isprintable() else f"a text of {len(text)} characters"
-        raise InputError(
-            f"model: got {shown!r}, which is not a file; give the path of an .xml, .urdf or .mjb file, or a MjModel"
-        )
-    load = mujoco.MjModel.from_binary_path if path.suffix == ".mjb" else mujoco.MjModel.from_xml_path
-    try:
-        return load(str(path))
-    except ValueError as error:
-        raise InputError(f"model: MuJoCo cannot read {str(path)!r}: {error}") from None
-
-
-def _reject_constraints(model: Any) -> None:
-    """Raise `InputError` if a MuJoCo model has parts that affect its motion, but not its mass matrix."""
-    tendons = np.any(model.tendon_stiffness) or np.any(model.tendon_damping)
-    faults = {
-        "equality constraints": model.neq > 0,
-        "tendons with stiffness or damping": tendons,
-        "nonlinear joint springs": np.any(getattr(model, "jnt_stiffnesspoly", 0.0)),
-    }
-    for fault, present in faults.items():
-        if present:
-            raise InputError(f"model: got {fault}; only trees of joints are supported; remove them or pass M and J")
-
-
-def _read_pose(model: Any, pose: Any) -> np.ndarray:
-    """Return the joint positions ``qpos`` of a pose, which is given in any form that `from_mujoco` accepts."""
-    if pose is None:
-        return np.array(model.qpos0)
-    if isinstance(pose, str):
-        check_choice("pose", pose, tuple(model.key(index).name for index in range(model.nkey)))
-        return np.array(model.key(pose).qpos)
-    if isinstance(pose, dict):
-        positions, kinds = np.array(model.qpos0), list_joints(model)
-        for name, value in pose.items():
-            check_choice("pose", name, tuple(kinds))
-            unit = "rad" if kinds[name] == "hinge" else "m"
-            positions[int(model.joint(name).qposadr[0])] = check_number(f"pose.{name}", value, unit, ANY)
-        return positions
-    try:
-        values = np.array(pose)
-        if values.dtype.kind in "US" and values.shape == (model.nq,):
-            values = [_read_position(model, index, text) for index, text in enumerate(pose)]
-        values = np.array(values, float)
-    except InputError:
-        raise
-    except (TypeError, ValueError):
-        values = np.array(np.nan)
-    if values.shape != (model.nq,) or not np.isfinite(values).all():
-        raise InputError(f"pose: got {pose!r}; it must be {model.nq} joint positions or the name of a keyframe")
-    return values
-
-
-def _read_position(model: Any, index: int, value: Any) -> float:
-    """Convert one entry of ``qpos``, a number or a text with a unit, to rad (hinges) or m (slides).
-
-    ``index`` is the index of the entry in ``qpos``.
-    """
-    (joint,) = np.flatnonzero(np.asarray(model.jnt_qposadr) == index)
-    name = model.joint(int(joint)).name
-    # Accept a number that is given as text, because an array with one text contains only texts. A number without a unit
-    # is in rad or m.
-    value = float(value) if isinstance(value, str) and looks_like_number(value) else value
-    unit = "m" if list_joints(model).get(name) == "slide" else "rad"
-    return check_number(f"pose.{name}", value, unit, ANY)
-
-
-def _find_point(mujoco: Any, model: Any, name: str) -> tuple[str, int]:
-    """Return "site" or "body", and the index of the site or body with the given name in a MuJoCo model."""
-    for kind, count, code in (
-        ("site", model.nsite, mujoco.mjtObj.mjOBJ_SITE),
-        ("body", model.nbody, mujoco.mjtObj.mjOBJ_BODY),
-    ):
-        if count and (kind == "site" or not model.nsite):
-            names = tuple(mujoco.mj_id2name(model, code, index) or "" for index in range(count))
-            check_choice("site", name, tuple(filter(None, names)))
-            return kind, names.index(name)
-    raise InputError(f"site: got {name!r}; the model has neither sites nor bodies; add a site")
-
-
-def _find_driven(mujoco: Any, model: Any) -> np.ndarray:
-    """Return a Boolean array, True for each degree of freedom with an actuator; all True without any actuators."""
-    if not model.nu:
-        return np.ones(model.nv, bool)
-    on_joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-    if not np.isin(model.actuator_trntype, on_joints).all():
-        raise InputError("model: got an actuator that does not act on a joint; use actuators of joints or pass M and J")
-    return np.isin(model.dof_jntid, model.actuator_trnid[:, 0])

@@ -97,6 +97,7 @@ class LinearDevice(ResponseDevice):
         sampled: sampling period of a discrete-time system in s, which must equal the period of the loop. A
             discrete-time system must include hold and delay. Default: the period of ``system``, if it has one;
             otherwise the system is continuous-time.
+        rotary: True for a system from torque (N m) to angle (rad); walls are then in N m/rad and N m s/rad.
 
     Raises:
         InputError: the system has none of these forms, or it is not strictly proper.
@@ -113,6 +114,7 @@ class LinearDevice(ResponseDevice):
 
     system: Any
     sampled: InitVar[Any] = None
+    rotary: bool = False
 
     def __post_init__(self, sampled: Any) -> None:
         if not isinstance(self.system, RationalResponse):
@@ -120,7 +122,7 @@ class LinearDevice(ResponseDevice):
 
     def __repr__(self) -> str:
         """Return the expression that creates the device."""
-        return f"LinearDevice({self.spell_form()!r})"
+        return f"LinearDevice({self.spell_form()!r}{', rotary=True' if self.rotary else ''})"
 
     def spell_form(self) -> str | dict[str, Any]:
         """Return the value of the key ``device`` of a configuration, with the coefficients rounded to float64."""

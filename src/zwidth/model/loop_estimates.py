@@ -44,6 +44,20 @@ class LoopEstimates:
     structure: Literal["series", "separate", "common"] = "series"
     feedback: FurtherFeedback | None = None
 
+    @property
+    def of_tool(self) -> Estimate:
+        """The estimate V_t of the velocity of a simulated tool, whose position is known without a filter.
+
+        It is the velocity estimate of the scene, or the backward difference if an observer estimates the velocity.
+        """
+        return Estimate() if self.structure == "common" else self.velocity
+
+    @property
+    def uses_velocity(self) -> bool:
+        """True if V x is needed by itself: an observer estimates it, or it is an input of the further feedback."""
+        weights = None if self.feedback is None else self.feedback.weights
+        return self.structure == "common" or (weights is not None and bool(np.any(weights.velocity != 0)))
+
     def respond(self) -> tuple[Response, ...]:
         """Return functions that compute P, V and, if the scene has further feedback, R on the unit circle."""
         if self.feedback is None:

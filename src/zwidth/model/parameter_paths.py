@@ -8,7 +8,7 @@ parameter of another part begins with the name of the part: ``velocity.cutoff``,
 from __future__ import annotations
 
 from dataclasses import MISSING, fields, replace
-from typing import Any, ClassVar, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar, cast
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from zwidth.core.xp import is_jax
 from zwidth.model.actuator import Actuator
 from zwidth.model.device import Coupling, Device
 from zwidth.model.feedback import FEEDBACKS, Feedback, IntegralFeedback
+from zwidth.model.joint_space import JointDevice
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.operator import Operator
@@ -57,6 +58,8 @@ _BARE = ("device", "timing", "wall")  # parts whose parameters have paths withou
 _WHOLE = ("safe_limit",)  # parts that can only be replaced as a whole, because their parameters have no paths
 PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator, "tool": Tool}
 """Classes of the optional parts of a scene, by name, in the order in which descriptions list these parts."""
+CONTAINED = ("operator", "coupling", "actuator", "modes")
+"""Parts that a linear system or a measured response already contains, so that they cannot be added to it."""
 WITH_KIND: dict[str, dict[str, Any]] = {"position": POSITIONS, "feedback": FEEDBACKS}
 """Classes of position estimates and of further feedback, keyed by the name of the part and the name of the kind."""
 _OF_DEVICE = ("coupling", "actuator")  # optional parts that are fields of the device
@@ -114,6 +117,8 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     parts = {name: part for _, name, part in _parts(scene)}
     owners = {prefix + item.name: (name, item.name) for prefix, name, part in _parts(scene) for item in fields(part)}
     owners |= {name: ("", name) for name in (*_BARE, *_NAMED, *_WHOLE)}
+    # The dampings of joints are no fields, because `JointDevice` computes its system from them.
+    owners |= {path: ("joints", path) for path in getattr(scene.device, "joint_dampings", ())}
     changed: dict[str, dict[str, Any]] = {}
     for path, value in changes.items():
         if path not in owners:
@@ -130,12 +135,15 @@ def _replace_fields(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     if isinstance(scene.wall, NoWall):
         parts["wall"] = VirtualWall(0.0)
     whole_parts, device_fields = changed.pop("", {}), changed.pop("device", {})
+    joint_dampings = changed.pop("joints", {})
     new_parts = {name: replace(parts[name], **values) for name, values in changed.items()}
     device_fields |= {name: new_parts.pop(name) for name in _OF_DEVICE if name in new_parts}
     if any(name.startswith("modes.") for name in new_parts):
         device_fields["modes"] = tuple(new_parts.pop(f"modes.{k}", mode) for k, mode in enumerate(scene.device.modes))
     if device_fields:
         new_parts["device"] = replace(scene.device, **device_fields)
+    if joint_dampings:
+        new_parts["device"] = cast(JointDevice, scene.device).replace_dampings(joint_dampings)
     return replace(scene, **whole_parts, **new_parts)
 
 
@@ -152,6 +160,7 @@ def spell_scene(scene: Any) -> dict[str, Any]:
         parts["modes"] = [spell_part(mode) for mode in scene.device.modes]
     if isinstance(scene.device, LinearDevice):
         device: dict[str, Any] = {"device": scene.device.spell_form()}
+        device |= {"rotary": True} if scene.device.rotary else {}
     else:
         device = {name: value for name, value in spell_part(scene.device).items() if name not in (*PARTS, "modes")}
         device |= {"damping": scene.device.damping}

@@ -10,6 +10,7 @@ Parameters are in SI units. The method ``estimate`` of each class returns P as a
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias
@@ -231,8 +232,20 @@ class Observer(Part):
 
     @cached_property
     def _filters(self) -> tuple[PositionFilter, PositionFilter]:
-        """The transfer functions P and V, each as a `PositionFilter`."""
-        return PositionFilter(self.position, self.denominator), PositionFilter(self.velocity, self.denominator)
+        """The transfer functions P and V, each as a `PositionFilter`.
+
+        Raises:
+            InputError: a numerator is invalid; the message names ``position.position`` or ``position.velocity``, the
+                field of this class, in place of the numerator of the filter.
+        """
+
+        def make(name: str) -> PositionFilter:
+            try:
+                return PositionFilter(getattr(self, name), self.denominator)
+            except InputError as error:
+                raise InputError(re.sub(r"^position\.numerator", f"position.{name}", str(error))) from None
+
+        return make("position"), make("velocity")
 
     def estimate(self, period: Any) -> Estimate:
         """Return P, whose coefficients do not depend on the sampling period ``period``."""

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from zwidth.core.errors import InputError
-from zwidth.core.xp import is_jax
+from zwidth.core.xp import is_jax, is_traced
 from zwidth.model.checks import Part, Span, check_number, check_span, to_periods
 from zwidth.units.formatting import format_periods, with_unit
 
@@ -22,6 +22,8 @@ class Timing(Part):
         period: sampling period T in s, > 0. Pass either ``period`` or ``rate``.
         delay: delay t_d from a sample to the start of its force in s, >= 0, or a text in periods, "1.5 periods". It
             need not be a multiple of the period. If the period changes, a delay in periods keeps its number of periods.
+            Derivatives by JAX with respect to such a delay are per period: in a gradient, this number is
+            ``gradient.timing.span.value``.
         rate: sampling rate 1/T in Hz, > 0.
 
     Example:
@@ -56,7 +58,10 @@ class Timing(Part):
     def __repr__(self) -> str:
         """Return the expression that creates this timing, with the delay in its original unit, seconds or periods."""
         text = super().__repr__()
-        return text if not self.in_periods else text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
+        if not self.in_periods or self.delay is self._periods:
+            # A derivative is no delay, and `_unflatten` then stores the same object in both attributes.
+            return text
+        return text.replace(f"delay={self.delay!r}", f"delay='{self.span}'")
 
     def _flatten(self) -> tuple[tuple[tuple[str, Any], ...], Any]:
         # Pass the delay to JAX in the unit in which it was given, because it is constant in this unit.
@@ -67,9 +72,10 @@ class Timing(Part):
         timing, (period, delay) = object.__new__(cls), children
         values = {"period": period, "delay": delay, "rate": None}
         if structure:
-            # Keep the delay in periods if JAX passes objects that are not numbers and cannot be multiplied.
+            # Keep the delay in periods if JAX passes objects that are not numbers and cannot be multiplied; and if a
+            # number is out of range, because it is then a derivative, and no product of derivatives is a delay.
             with suppress(TypeError):
-                values["delay"] = delay * period
+                values["delay"] = delay if _is_derivative(period, delay) else delay * period
             values |= {"_periods": delay, "in_periods": True}
         for name, value in values.items():
             object.__setattr__(timing, name, value)
@@ -97,3 +103,10 @@ class Timing(Part):
         if self.in_periods:
             return self._periods if is_jax(self._periods) else np.float64(self._periods)
         return to_periods(*(value if is_jax(value) else np.float64(value) for value in (self.delay, self.period)))
+
+
+def _is_derivative(period: Any, count: Any) -> bool:
+    """Return whether a period or a number of periods is out of range, so that both are derivatives of a function."""
+    if is_traced(period, count) or np.ndim(period) or np.ndim(count):
+        return False
+    return float(period) <= 0 or float(count) < 0

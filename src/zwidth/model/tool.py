@@ -31,6 +31,16 @@ class ToolResponse(NamedTuple):
     a0: Any
 
 
+class ToolStep(NamedTuple):
+    """One integration step ``w = decay w - spring y + gain f; y = y + w`` of a tool with the increment w per step."""
+
+    decay: Any
+    spring: Any
+    gain: Any
+    implicit: Any  # True if the force f of the coupling is computed from the new y, False if from the old y
+    every: Any  # number of sampling periods per step
+
+
 @dataclass(frozen=True, repr=False)
 class Tool(Part):
     """A simulated tool (proxy, avatar) that a virtual coupling connects to the device.
@@ -40,6 +50,9 @@ class Tool(Part):
     y of the tool. The velocity v_x - v_y is the velocity estimate of the scene, applied to x - y. The force acts on the
     tool in the same period, without delay, because the program also simulates the tool. The force acts on the device
     with the delay of the scene.
+
+    If the scene has a position estimate P, the coupling uses P x instead of x, and the exact y. If an observer or PLL
+    estimates the velocity v_x, then v_y is the backward difference of y. Further feedback acts on the device alone.
 
     Args:
         mass: mass M of the tool in kg, > 0.
@@ -88,3 +101,18 @@ class Tool(Part):
         if self.integrator == "implicit":
             return ToolResponse(mass / self.mass, 2, p + q + 1.0, p + q + q, q)
         return ToolResponse(mass / self.mass, 1, p * 0.0 + 1.0, p + q, q)
+
+    def compute_step(self, mass: Any, period: Any) -> ToolStep:
+        """Return the integration step of the tool for forces f in units of m/T^2 times the unit of position.
+
+        Args:
+            mass: m in kg, the unit of mass of the scene.
+            period: sampling period T in s.
+        """
+        every = getattr(self, "every", 1)
+        rate = every * period / self.mass
+        p, q, gain = self.damping * rate, self.stiffness * (rate * every * period), every**2 * mass / self.mass
+        if self.integrator == "implicit":
+            scale = 1.0 / (1.0 + p + q)
+            return ToolStep(scale, q * scale, gain * scale, True, every)
+        return ToolStep(1.0 - p, q, gain, False, every)

@@ -40,7 +40,9 @@ def bisect(holds: Function, low: Array, high: Array) -> Array:
     return 0.5 * (low + high)
 
 
-def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) -> tuple[Array, Array]:
+def newton(
+    function: Sloped, low: Array, high: Array, start: Array, steps: int, close: float = CONVERGED_STEP
+) -> tuple[Array, Array]:
     """Find the zero of a function in a bracket by Newton's method; a bisection replaces a step that leaves the bracket.
 
     Args:
@@ -49,6 +51,7 @@ def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) 
         high: upper end of the bracket.
         start: starting value.
         steps: largest number of steps.
+        close: magnitude of a step, relative to the zero, after which the search stops.
 
     Returns:
         The zero, and the magnitude of the last step.
@@ -61,14 +64,53 @@ def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) 
         low, high = xp.where(value < 0, x, low), xp.where(value < 0, high, x)
         new = x - value / slope
         new = xp.where((new >= low) & (new <= high), new, 0.5 * (low + high))
-        converged = last <= CONVERGED_STEP * xp.abs(x)
+        converged = last <= close * xp.abs(x)
         return xp.where(converged, x, new), low, high, xp.where(converged, last, xp.abs(new - x))
 
     def is_done(_: tuple[Array, ...], new: tuple[Array, ...]) -> bool:
-        return bool(np.all(new[3] <= CONVERGED_STEP * np.abs(new[0])))
+        return bool(np.all(new[3] <= close * np.abs(new[0])))
 
     x, _, _, last = iterate(steps, step, (start, low, high, xp.full_like(start, xp.inf)[()]), xp, is_done)
     return x, last
+
+
+def illinois(
+    function: Function, low: Array, high: Array, first: Array, last: Array, steps: int, close: float
+) -> tuple[Array, Array]:
+    """Find the zero of a function in a bracket by the Illinois method; a bisection replaces a step out of the bracket.
+
+    The method takes the zero of the secant between both ends. The value at an end that stays twice in a row is halved.
+
+    Args:
+        function: a continuous function.
+        low: lower ends of the brackets.
+        high: upper ends of the brackets.
+        first: values at ``low``.
+        last: values at ``high``, of the opposite sign.
+        steps: largest number of steps.
+        close: magnitude of a step, relative to the zero, after which the search stops.
+
+    Returns:
+        The zero, and the magnitude of the last step.
+    """
+    xp, positive = namespace(low, first), first > 0
+
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        low, high, first, last, x, side, move = state
+        value = function(x)
+        before = (value > 0) == positive
+        last = xp.where(before, xp.where(side > 0, 0.5 * last, last), value)
+        first = xp.where(before, value, xp.where(side < 0, 0.5 * first, first))
+        low, high = xp.where(before, x, low), xp.where(before, high, x)
+        new = high - last * (high - low) / (last - first)
+        new = xp.where((new > low) & (new < high), new, 0.5 * (low + high))
+        done = move <= close * x
+        side, move = xp.where(before, 1.0, -1.0), xp.where(done, move, xp.abs(new - x))
+        return low, high, first, last, xp.where(done, x, new), side, move
+
+    begin = low, high, first, last, 0.5 * (low + high), 0.0 * low, high - low
+    *_, x, _, move = iterate(steps, step, begin, xp, lambda old, new: bool(np.all(old[4] == new[4])))
+    return x, move
 
 
 GOLDEN_SECTION = 0.3819660112501051  # (3 - sqrt(5))/2, the position of a trial point in the longer part

@@ -9,7 +9,7 @@ also accept zero-dimensional Taylor objects and NumPy arrays of such objects.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -214,19 +214,16 @@ def _join(a: Taylor, b: Taylor) -> Taylor:
     return Taylor(np.concatenate([a.v, b.v], 1), np.concatenate([a.first, b.first], 1), second)
 
 
-class Implicit(NamedTuple):
-    """Derivatives of the solution u(p) of a system of equations with parameters p; NaN if the system is singular."""
-
-    first: np.ndarray  # (unknowns, parameters)
-    second: np.ndarray | None  # (unknowns, parameters, parameters)
-
-
-def differentiate_implicitly(equations: Sequence[Taylor]) -> Implicit:
-    """Return the derivatives of the solution u of ``F(p, u) = 0`` by the implicit function theorem.
+def differentiate_implicitly(equations: Sequence[Taylor], values: Sequence[float]) -> list[Taylor]:
+    """Return the solution u of ``F(p, u) = 0`` with its derivatives in p, by the implicit function theorem.
 
     Args:
         equations: components of F at the solution, which are real. The variables of their derivatives are all
             parameters p, followed by the unknowns u, whose number equals that of the equations.
+        values: values of the unknowns.
+
+    Returns:
+        Each unknown; the derivatives are NaN if the system is singular.
     """
     count = len(equations)
     slopes = np.array([each.first for each in equations])
@@ -237,7 +234,15 @@ def differentiate_implicitly(equations: Sequence[Taylor]) -> Implicit:
         inverse = np.full((count, count), np.nan)
     first = inverse @ slopes[:, :parameters]
     if equations[0].second is None:
-        return Implicit(first, None)
+        return list(map(Taylor, values, first))
     directions = np.concatenate([np.eye(parameters), first])
     curvatures = np.array([directions.T @ each.second @ directions for each in equations])
-    return Implicit(first, np.tensordot(inverse, curvatures, 1))
+    return list(map(Taylor, values, first, np.tensordot(inverse, curvatures, 1)))
+
+
+def replace_derivatives(results: list[Taylor], others: list[Taylor], k: int) -> None:
+    """Replace the derivatives of each result in the variable with the index k by those of ``others``."""
+    for result, other in zip(results, others, strict=True):
+        result.first[k] = other.first[k]
+        if result.second is not None and other.second is not None:
+            result.second[k], result.second[:, k] = other.second[k], other.second[:, k]

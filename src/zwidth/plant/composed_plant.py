@@ -60,9 +60,9 @@ def add_plants(first: FactoredPlant, second: FactoredPlant) -> FactoredPlant:
     return FactoredPlant(gain, first.lag - at_origin, zeros, poles)
 
 
-def _drop_at_one(poles: Array, count: int) -> Array:
-    """Remove ``count`` poles at exactly z = 1 (offset 0) from an array of offsets."""
-    return np.delete(poles, np.flatnonzero(poles == 0)[:count])
+def _drop_at_one(roots: Array, count: int) -> Array:
+    """Remove ``count`` roots at exactly z = 1 (offset 0) from an array of offsets."""
+    return np.delete(roots, np.flatnonzero(roots == 0)[:count])
 
 
 Terms = Sequence[tuple[float, Array, int]]  # gain, offsets of the zeros and power of z, for each term of A
@@ -70,11 +70,11 @@ Terms = Sequence[tuple[float, Array, int]]  # gain, offsets of the zeros and pow
 
 def _find_zeros(terms: Terms) -> tuple[float, Array]:
     """Return the leading coefficient of the polynomial A, the sum of two terms, and the offsets of the zeros of A."""
-    # Split off the power of z that both terms have in common, so that these zeros of A at z = 0 are exact.
+    # Split off the powers of z and of z - 1 that both terms have in common, so that these zeros of A are exact.
     powers = [int(np.sum(offsets == 1)) + power for _, offsets, power in terms]
-    at_origin = min(powers)
+    at_origin, at_one = min(powers), min(int(np.sum(offsets == 0)) for _, offsets, _ in terms)
     reduced = tuple(
-        (gain, offsets[offsets != 1], power - at_origin)
+        (gain, _drop_at_one(offsets[offsets != 1], at_one), power - at_origin)
         for (gain, offsets, _), power in zip(terms, powers, strict=True)
     )
     parts = [gain * np.pad(np.atleast_1d(np.poly(1.0 - offsets)).real, (0, power)) for gain, offsets, power in reduced]
@@ -84,7 +84,7 @@ def _find_zeros(terms: Terms) -> tuple[float, Array]:
         # the values of A on the circle.
         numerator = numerator[1:]
     zeta = _refine(reduced, np.roots(numerator) - 1.0 + 0j)
-    return float(numerator[0]), np.concatenate([-zeta, np.ones(at_origin)])
+    return float(numerator[0]), np.concatenate([-zeta, np.zeros(at_one), np.ones(at_origin)])
 
 
 def _refine(terms: Terms, zeta: Array) -> Array:

@@ -1,6 +1,7 @@
 """Public names of `zwidth.plotting`, and the modules that define them."""
 
 from . import plot as plot
+from .admittance import draw_environment_limits as draw_environment_limits
 from .curves import draw_curves as draw_curves
 from .curves import draw_outlines as draw_outlines
 from .design import draw_filter_noise as draw_filter_noise

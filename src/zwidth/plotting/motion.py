@@ -133,7 +133,7 @@ def _read_responses(table: Table) -> list[Any]:
 
 @draws_tables
 def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
-    """Draw the position and the wall force of each motion over time; thin lines show the positions of tip and hand.
+    """Draw the position and the wall force of each motion over time; thin lines show positions of tip, hand and tool.
 
     If all motions leave the wall, the time axis ends at three times the end of the last contact. A motion that grows
     without bound is clipped at eight times the largest value of the smallest motion.
@@ -145,9 +145,12 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     motions = _read_motions(table)
     panels = style.panels(axes, 2, 6.4, 4.8, height_ratios=(1.6, 1.0), sharex=True)
     clock, second = style.si_unit([each.time_s[-1] for each in motions], "s")
-    further = [name for name in ("tip_position_m", "hand_position_m") if hasattr(motions[0], name)]
-    quantities = (("position_m", _name_position(), further), ("wall_force_N", _name_force(), []))
-    for ax, (name, words, others) in zip(panels, quantities, strict=False):
+    names = {"tip_position_m": "tip or hand", "hand_position_m": "tip or hand", "tool_position_m": "tool"}
+    further = [name for name in names if hasattr(motions[0], name)]
+    words = ", ".join(dict.fromkeys(names[name] for name in further))
+    force = _name_force().replace("wall", "coupling") if "tool_position_m" in further else _name_force()
+    quantities = (("position_m", _name_position(), further), ("wall_force_N", force, []))
+    for ax, (name, label, others) in zip(panels, quantities, strict=False):
         factor, unit = _limit(ax, "y", [getattr(each, one) for each in motions for one in (name, *others)], name[-1])
         for each in motions:
             look = each.look if name == "position_m" else {**each.look, **_ZERO_ORDER_HOLD}
@@ -156,11 +159,11 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
                 look = {**each.look, "linewidth": 0.6}
                 ax.plot(each.time_s * clock, getattr(each, other) * factor, label=f"{other}, {each.label}", **look)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=2)
-        ax.set_ylabel(f"{words}  in {unit}")
+        ax.set_ylabel(f"{label}  in {unit}")
         _begin_at_zero(ax, max(float(each.time_s[-1]) for each in motions) * clock)
     _mark_wall(panels[0], "y", motions)
     panels[-1].set_xlabel(f"time  $t$  in {second}")
-    _add_legend(panels, motions, *([style.line("tip or hand", width=0.6)] if further else []), outside=axes is None)
+    _add_legend(panels, motions, *([style.line(words, width=0.6)] if further else []), outside=axes is None)
     return panels
 
 

@@ -44,6 +44,7 @@ _FINITE_IF_STABLE = ("settling_time", "delay_margin")
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
 _FEW_TICKS = 1000.0  # ratio of largest to smallest value below which a color bar also has ticks at 2 and 5
 _LABELLED = 0.1  # fraction of a panel that a region must fill for contour labels
+_SMOOTH_GRID = 12  # poses per axis from which neighboring poses have similar colors; up to 12 fit as ticks
 _SEEN = 0.003  # fraction of a panel that corner optima must fill for a legend entry
 # Line style of boundaries, and style of the marker at the stiffest stable wall.
 _EDGE: dict[str, Any] = {"color": style.BLACK, "linestyle": style.SOLID, "linewidth": 1.3, "zorder": 2.2}
@@ -304,10 +305,12 @@ def draw_workspace(
     axes: style.AnyAxes | None = None,
     *,
     names: tuple[tuple[str, str], tuple[str, str]] | None = None,
+    quantity: str = r"maximum stable stiffness  $K_{\max}$",
+    weakest_pose: str = "weakest pose",
 ) -> np.ndarray:
     """Draw the maximum stiffness over two coordinates of a device's pose, and mark the pose with the smallest one.
 
-    Poses on a grid are drawn as a surface with contours, other poses as dots.
+    Poses on a fine grid are drawn as a surface with contours, those on a coarse grid as cells, and others as dots.
 
     Args:
         table: columns of a workspace study.
@@ -316,15 +319,15 @@ def draw_workspace(
         axes: an existing Axes.
         names: name and unit of both coordinates; "" for no unit. By default the unit follows the last underscore of
             the column.
+        quantity: description of the stiffness for the color bar, without its unit.
+        weakest_pose: description of the pose with the smallest stiffness for the legend.
     """
     (ax,) = panels = style.panels(axes, 1, 5.9, 4.3)
     # Use the last column whose name begins with "stiffness_", because the coordinates precede it and may have any name.
     wanted = [str(name) for name in table if str(name).startswith("stiffness_")][-1]
     x, y, stiffness = (np.asarray(table[name], float) for name in (across, up, wanted))
     factor, unit = style.si_unit(stiffness, "N/m")
-    # Shade cell by cell if the stiffness of some poses is undecided, because smooth shading cannot leave them empty.
     stiffness = np.ma.masked_invalid(stiffness)
-    shading = "nearest" if np.ma.is_masked(stiffness) else "gouraud"
     norm, weakest = LogNorm(factor * stiffness.min(), factor * stiffness.max()), int(stiffness.argmin())
     columns, rows = np.unique(x), np.unique(y)
     order = np.lexsort((x, y))
@@ -332,17 +335,25 @@ def draw_workspace(
     grid = np.stack(np.meshgrid(columns, rows)).reshape(2, -1)
     if min(shape) > 1 and np.array_equal(np.stack([x, y])[:, order], grid):
         values = factor * stiffness[order].reshape(shape)
+        # Shade coarse grids cell by cell and without contours, because smooth shading mixes the colors of neighbors to
+        # colors outside the color map. Shading cell by cell can also leave poses with undecided stiffness empty.
+        is_fine = min(shape) >= _SMOOTH_GRID
+        shading = "gouraud" if is_fine and not np.ma.is_masked(stiffness) else "nearest"
         image = ax.pcolormesh(columns, rows, values, shading=shading, rasterized=True, norm=norm)
-        draw_contours(ax, columns, rows, values, OUTPUTS["stiffness_max"], norm, [np.array([[x[weakest], y[weakest]]])])
+        if is_fine:
+            marker = np.array([[x[weakest], y[weakest]]])
+            draw_contours(ax, columns, rows, values, OUTPUTS["stiffness_max"], norm, [marker])
+        else:
+            few = {"xticks": columns, "yticks": rows}
+            ax.set(**{name: ticks for name, ticks in few.items() if ticks.size <= _SMOOTH_GRID})
     else:
         image = ax.scatter(x, y, c=factor * stiffness, s=9.0, norm=norm, label="poses")
-    ax.plot(x[weakest], y[weakest], linestyle="", label="weakest pose", clip_on=False, zorder=5, **_PEAK)
+    ax.plot(x[weakest], y[weakest], linestyle="", label=weakest_pose, clip_on=False, zorder=5, **_PEAK)
     for axis, (name, unit_name) in zip("xy", names or map(_split_column, (across, up)), strict=True):
         ax.set(**{f"{axis}label": style.literal(name) + (f"  in {style.literal(unit_name)}" if unit_name else "")})
-    label = rf"maximum stable stiffness  $K_{{\max}}$  in {unit}"
-    bar = style.figure_of(panels).colorbar(image, ax=ax, label=label)
+    bar = style.figure_of(panels).colorbar(image, ax=ax, label=f"{quantity}  in {unit}")
     style.use_logarithmic(bar.ax, "y", factor * stiffness)
-    style.legend(panels, [style.line("weakest pose", "", **_PEAK)], outside=axes is None)
+    style.legend(panels, [style.line(weakest_pose, "", **_PEAK)], outside=axes is None)
     return panels
 
 

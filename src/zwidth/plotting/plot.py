@@ -420,7 +420,7 @@ def poles(
 
 @_with_house_style
 def motion(motion: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
-    """Draw the position of one or several simulated motions over time.
+    """Draw the position of one or several simulated motions over time; thin lines show the position of the tool.
 
     Args:
         motion: Result of `zwidth.simulate` with recorded positions.
@@ -437,6 +437,9 @@ def motion(motion: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()
     times = np.broadcast_to(motion.time.reshape(-1, rows.shape[-1]), rows.shape)
     contact = motion.contact.reshape(len(rows), -1)
     touching = np.repeat(contact, rows.shape[-1] // contact.shape[-1], axis=1)
-    columns = zip(list(labels) or [""] * len(rows), times, rows, touching, strict=True)
-    names = ("label", "time_s", "position_m", "contact")
-    return draw_motion(stack(dict(zip(names, each, strict=True)) for each in columns), _choose_axes(ax))[0]
+    columns = {"label": list(labels) or [""] * len(rows), "time_s": times, "position_m": rows, "contact": touching}
+    if motion.tool_position is not None:
+        tool = motion.tool_position.reshape(len(rows), -1)
+        columns["tool_position_m"] = np.repeat(tool, rows.shape[-1] // tool.shape[-1], axis=1)
+    parts = (dict(zip(columns, each, strict=True)) for each in zip(*columns.values(), strict=True))
+    return draw_motion(stack(parts), _choose_axes(ax))[0]

@@ -24,6 +24,7 @@ from zwidth.config.reader import find_values
 from zwidth.core.errors import InputError, StoreError, StoreExistsError
 from zwidth.io.files import remove_quietly, write_atomically
 from zwidth.model.measured_device import SUFFIXES
+from zwidth.model.mujoco_model import MODEL_SUFFIXES, pack_model
 from zwidth.sweep.engine import refuse_changes, refuse_versions
 from zwidth.sweep.files import (
     ELSEWHERE,
@@ -331,13 +332,19 @@ def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[
     spans.sort(key=lambda span: span[1])
     for name, _, _ in spans:
         if name not in names and (folder / name).is_file():
-            copy = _choose_name(name, files)
-            files[copy] = (folder / name).read_bytes()
+            content, suffix = _read_input(folder / name)
+            copy = _choose_name(str(PurePath(name).with_suffix(suffix)), files)
+            files[copy] = content
             names[name] = f"{INPUTS}/{copy}"
     for name, first, last in reversed(spans):
         if name in names:
             text = f"{text[:first]}{names[name]}{text[last:]}"
     return text, files, names
+
+
+def _read_input(file: Path) -> tuple[bytes, str]:
+    """Return the content of the copy of a file, and the suffix of its name."""
+    return pack_model(file) if file.suffix in MODEL_SUFFIXES else (file.read_bytes(), file.suffix)
 
 
 def _choose_name(name: str, taken: dict[str, bytes]) -> str:

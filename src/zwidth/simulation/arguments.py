@@ -17,9 +17,10 @@ import numpy as np
 
 from zwidth.core.errors import InputError, ResourceError, describe_choice
 from zwidth.core.xp import compute_concretely, is_traced
-from zwidth.model.checks import read_texts
+from zwidth.model.checks import check_integer, check_span, read_texts
 from zwidth.model.linear_device import LinearDevice
 from zwidth.model.measured_device import MeasuredDevice
+from zwidth.model.velocity import FOAW
 from zwidth.model.wall import resolve_wall
 from zwidth.numerics.evaluate import as_float64, join_shapes
 from zwidth.numerics.threads import count_processors
@@ -35,6 +36,8 @@ JITTER_BYTES = 20 * 8  # memory per instant for the durations between jittered s
 DRAWN_BYTES = 4 * 8  # memory per period for noise, and again for external forces
 MOST_BYTES = 4 << 30  # largest estimate that is accepted: 4 GiB
 
+DEFAULT_PERIODS = 1000  # sampling periods
+MAX_PERIODS = 10**9  # sampling periods; the memory limits recorded simulations to fewer
 STARTS = ("start_position", "start_velocity")  # arguments with one initial value per body
 ARGUMENTS = {
     name: (FIELDS[name].unit, ANY if FIELDS[name].allowed == ANY else NOT_NEGATIVE)
@@ -57,8 +60,6 @@ def list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
             raise InputError(
                 "scenes: got a measured response, which has no model to simulate; fit one to a log (zwidth.fit_log)"
             )
-        if scene.tool is not None:
-            raise InputError(f"scenes: got {scene.tool!r}, but simulations exclude a tool; use poles or dominant_pole")
         if scene.traced_path is not None:
             raise InputError("scenes: got values traced by JAX; call simulate outside of jit, vmap and grad")
         which[index] = numbers.setdefault(id(scene), len(numbers))
@@ -72,20 +73,37 @@ def find_system(scenes: list[Any]) -> UnitSystem:
     return systems.pop() if systems else LINEAR
 
 
+def count_periods(scenes: list[Any], periods: Any, duration: Any) -> int:
+    """Return the number of sampling periods of a simulation, from ``periods`` or ``duration``; 1000 without both."""
+    if duration is None:
+        return check_integer("periods", DEFAULT_PERIODS if periods is None else periods, 1, MAX_PERIODS)
+    if periods is not None:
+        raise InputError(f"duration: got {duration!r} together with periods = {periods!r}; pass only one of them")
+    span = check_span("duration", duration)
+    counts = {round(span.periods(float(scene.timing.period))) for scene in scenes} or {1}
+    if len(counts) > 1:
+        raise InputError(f"duration: got {duration!r} with scenes of different sampling periods; pass periods instead")
+    if not 1 <= (count := counts.pop()) <= MAX_PERIODS:
+        raise InputError(f"duration: got {duration!r}, i.e. {count:g} periods; it must be 1 to {MAX_PERIODS} periods")
+    return count
+
+
 def spread_starts(scenes: list[Any], given: dict[str, Any]) -> dict[str, Any]:
     """Return all arguments by name, with ``start_position`` and ``start_velocity`` split into one per body.
 
     An example of a new argument is "start_position.tip_position". A body for which the user specifies no initial value
-    has that of the device.
+    has that of the device. A tool has such an argument only if the user specifies its initial value.
     """
     bodies = dict.fromkeys(["position", *(name for scene in scenes for name in name_bodies(scene))])
+    tool = ["tool_position"] * any(scene.tool is not None for scene in scenes)
     for name in STARTS:
         start = given.pop(name)
         start = dict(start) if isinstance(start, Mapping) else {"position": start}
-        for body in start.keys() - bodies.keys():
-            raise InputError(f"{name}: {describe_choice(body, tuple(bodies))}")
+        for body in start.keys() - {*bodies, *tool}:
+            raise InputError(f"{name}: {describe_choice(body, (*bodies, *tool))}")
         of_device = start.get("position", 0.0)
         given |= {f"{name}.{body}": start.get(body, of_device) for body in bodies}
+        given |= {f"{name}.{body}": start[body] for body in tool if body in start}
     return given
 
 
@@ -226,10 +244,34 @@ def read_arguments(
     return numbers, which, good.reshape(-1)
 
 
+def refuse_unsupported(scenes: list[Any], contact: str, law: TracedLaw | None) -> None:
+    """Raise `InputError` if the simulation does not support the tool of a scene, because of the contact or the law."""
+    for scene in scenes:
+        if scene.tool is None:
+            continue
+        adapts = isinstance(scene.velocity, FOAW)
+        if adapts and (scene.position is not None or scene.feedback is not None):
+            name = "feedback" if scene.position is None else "position"
+            raise InputError(
+                f"{name}: got {name} and a tool with FOAW, which is not linear; use another velocity estimate"
+            )
+        if contact != "bilateral":
+            raise InputError(
+                f"contact: got {contact!r}, but a coupling to a tool has no surface; use contact='bilateral'"
+            )
+        nonlinear = "force" if law is not None else "velocity" if adapts else ""
+        if nonlinear and scene.tool.integrator == "implicit":
+            raise InputError(
+                f"{nonlinear}: got a nonlinear function, but the implicit Euler method needs a linear coupling; use "
+                "tool.integrator='semi-implicit'"
+            )
+
+
 def refuse_bodies(scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray]) -> None:
     """Raise `InputError` if friction or initial values are specified for a `LinearDevice`, whose bodies are unknown."""
     system = np.array([isinstance(scene.device, LinearDevice) for scene in scenes])[which.ravel()]
-    for name in ("static", *(name for name in numbers if name.startswith(STARTS))):
+    starts = (name for name in numbers if name.startswith(STARTS) and not name.endswith(".tool_position"))
+    for name in ("static", *starts):
         if np.any((numbers[name] != 0) & system):
             field = "coulomb, static" if name == "static" else _spell(name)
             raise InputError(

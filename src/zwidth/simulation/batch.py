@@ -19,6 +19,7 @@ from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import Parts, replace_parameters
+from zwidth.model.tool import ToolStep
 from zwidth.model.velocity import FOAW, BackwardDifference
 from zwidth.numerics.threads import run_in_threads
 from zwidth.simulation.mechanics import build_mechanics
@@ -47,7 +48,7 @@ def find_structure(scene: Parts) -> tuple[Any, ...]:
     # combination of both needs a separate program.
     system = None if isinstance(scene.device, Device) else (scene.device, scene.timing.period)
     longest = scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
-    program = scene.position is not None, scene.feedback is not None
+    program = scene.position is not None, scene.feedback is not None, scene.tool is not None
     return *name_bodies(scene), sensor, *orders, longest, *program, system
 
 
@@ -69,6 +70,7 @@ class Model(NamedTuple):
     window: int  # number of past samples that the estimate uses
     period: float  # sampling period, in s
     mass: float  # mass that the force of the wall acts on, in kg
+    tool: ToolStep  # integration step of the tool; all fields are 0 without a tool
 
 
 def build_model(scene: Any) -> Model:
@@ -82,7 +84,8 @@ def build_model(scene: Any) -> Model:
     linear = replace_parameters(scene, {"velocity": BackwardDifference()}) if adapts else scene
     program = build_estimates(linear) or LoopEstimates(velocity=linear.velocity.estimate(period))
     estimate, window = (velocity, velocity.samples) if adapts else (program.velocity, program.velocity.window)
-    return Model(chain, program, estimate, chain.n_delay, fraction, window, period, mass)
+    tool = ToolStep(0.0, 0.0, 0.0, False, 1) if scene.tool is None else scene.tool.compute_step(mass, period)
+    return Model(chain, program, estimate, chain.n_delay, fraction, window, period, mass, tool)
 
 
 def run_scenes(
@@ -109,6 +112,7 @@ def run_scenes(
         foaw=scenes[0].velocity.samples if isinstance(scenes[0].velocity, FOAW) else 0,
         position=scenes[0].position is not None,
         feedback=scenes[0].feedback is not None,
+        tool=scenes[0].tool is not None,
         record=settings.record,
         law=settings.law,
     )
@@ -162,7 +166,7 @@ def build_batch(
         options: structure of the compiled program.
         names: fields of `Motion` with the positions of the bodies.
     """
-    chains, programs, estimates, late, fractions, _, periods, masses = zip(*models, strict=True)
+    chains, programs, estimates, late, fractions, _, periods, masses, tools = zip(*models, strict=True)
     period, mass = np.array(periods)[which], np.array(masses)[which]
     force = period * period / mass
     durations = cut_period(np.ones(len(models)), [np.array(fractions)][: options.pieces - 1], settings.substeps)
@@ -183,17 +187,20 @@ def build_batch(
             numbers["coulomb"] * force,
             numbers["static"] * force,
         ),
-        **build_program(programs, estimates, which),
+        tool=spread_scenes(ToolStep(*(np.array(column) for column in zip(*tools, strict=True))), which),
+        **build_program(programs, estimates, which, options.filters_tool),
         **build_transitions(build_mechanics(chains), np.moveaxis(durations, -1, 0), which, options),
     )
     instants = durations = None
     if options.jitter:
         instants, durations = draw_instants(numbers["seed"], numbers["jitter"] / period, late, fractions, settings)
+    tool = numbers.get("start_position.tool_position", mass * np.nan), numbers.get("start_velocity.tool_position", 0.0)
     return params, ExternalInputs(
         positions=np.stack([numbers[f"start_position.{name}"] for name in names]),
         velocities=np.stack([numbers[f"start_velocity.{name}"] for name in names]) * period,
         noise=draw_noise(numbers["seed"], numbers["noise"], settings.periods),
         history=(numbers["external_force_history"] * force[:, None]).T if "external_force_history" in numbers else None,
+        tool=np.stack([tool[0], tool[1] * period]),
         durations=durations,
         instants=instants,
         period=period,

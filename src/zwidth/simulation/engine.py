@@ -136,7 +136,8 @@ def initial_state(params: Parameters, options: Options, inputs: ExternalInputs, 
     inverse, first = np.linalg.inv(params.place[:, :count, 0]), np.argmax(params.motion[0, :, 0])
     body[:count], body[first : first + count] = inverse @ inputs.positions, inverse @ inputs.velocities
     x, v = body[0], body[first]
-    controller, zero = start_controller(params, options, (x, v), rings), np.zeros(x.size)
+    controller, zero = start_controller(params, options, (x, v), inputs.tool, rings), np.zeros(x.size)
+    count += options.tool  # the statistics include the position of the tool
     far, turns = np.full((1 + SEGMENTS, 2, count, x.size), -np.inf), np.zeros((1 + SEGMENTS, x.size))
     summary = Summary(zero, zero + np.nan, zero, far, turns, np.full((2, x.size), np.nan))
     return State(BodyState(body, np.sign(inputs.velocities[0])), controller, np.zeros((4, x.size)), summary)
@@ -199,7 +200,8 @@ def _simulate_period(
         (body, work), frame = substep(carry, 0)
         frames = None if frame is None else frame[None]
     summary = _summarize(params, state, reading, body, work, inputs.k, ends)
-    return State(body, controller, work, summary), (jnp.stack(reading), frames) if options.record else None
+    readings = jnp.stack([row for row in reading if row is not None])
+    return State(body, controller, work, summary), (readings, frames) if options.record else None
 
 
 def _summarize(
@@ -217,7 +219,8 @@ def _summarize(
         ends: indices of the periods at which the segments of the tail begin, and the number of periods.
     """
     summary, before = state.summary, state.controller.touching
-    places = jnp.stack([dot(row, state.body.x) for row in params.place])
+    places = [dot(row, state.body.x) for row in params.place]
+    places = jnp.stack(places if reading.tool_position is None else [*places, reading.tool_position])
     v, next_v = dot(params.motion[0], state.body.x), dot(params.motion[0], body.x)
     hits = reading.touching & ~before & (k > 0) & jnp.isnan(summary.impact)
     turning = (v <= 0) & (next_v > 0)
@@ -240,7 +243,7 @@ def compile_block(options: Options) -> Any:
 
     def block(params: Parameters, ends: Array, state: State, inputs: PeriodInputs) -> tuple[State, Any]:
         size, bodies = state.work.shape[-1], len(params.place)
-        shapes = (BLOCK, len(Reading._fields), size), (BLOCK, options.substeps, bodies + 8, size)
+        shapes = (BLOCK, 6 if options.tool else 4, size), (BLOCK, options.substeps, bodies + 8, size)
         rows = tuple(np.broadcast_to(0.0, shape) for shape in shapes) if options.record else None
 
         def one(j: Array, carry: Any) -> Any:
@@ -267,8 +270,8 @@ def run_batch(
         rings: lengths of the rings of positions and of commands.
 
     Returns:
-        The final state; the readings, of shape (periods, 4, batch); and the frames, of shape (periods, substeps, rows,
-        batch). Readings and frames are None if nothing is recorded.
+        The final state; the readings, of shape (periods, 4, batch) or, with a tool, (periods, 6, batch); and the
+        frames, of shape (periods, substeps, rows, batch). Readings and frames are None if nothing is recorded.
     """
     edges = settings.periods - settings.tail * np.arange(SEGMENTS, -1, -1) // SEGMENTS
     # Transfer all arrays to JAX in one call, because separate transfers would take as long as the simulation itself.

@@ -23,6 +23,7 @@ from zwidth.core.types import Array
 from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import LoopEstimates
 from zwidth.model.state_space import realize_estimate
+from zwidth.model.tool import ToolStep
 from zwidth.model.velocity import FOAW
 from zwidth.plant.transition import Transition, compute_transition
 from zwidth.simulation.mechanics import Mechanics
@@ -59,6 +60,13 @@ class Options(NamedTuple):
     foaw: int  # longest window of FOAW in samples; 0 for a linear velocity estimate
     position: bool  # the scenes have a position estimate
     feedback: bool  # the scenes have further feedback, such as an integral gain
+    tool: bool  # the scenes have a tool that a virtual coupling connects to the device
+
+    @property
+    def filters_tool(self) -> bool:
+        """True if the velocity of the tool has a separate estimate (T9)."""
+        return self.tool and (self.position or self.feedback)
+
     record: bool  # readings and frames are recorded
     law: TracedLaw | None  # force law in place of the wall's spring and damper
 
@@ -81,6 +89,7 @@ class ExternalInputs(NamedTuple):
     velocities: np.ndarray  # initial velocities, (bodies, batch)
     noise: np.ndarray | None  # errors of the measured positions in m, (periods, batch); None without noise
     history: np.ndarray | None  # external force per period, (periods, batch); None without a history
+    tool: np.ndarray  # initial position of the tool (NaN: that of the device) and its change per period, (2, batch)
     durations: np.ndarray | None  # durations of the pieces, (periods, substeps, pieces, batch); None without jitter
     instants: np.ndarray | None  # instants of the samples in periods, (periods + 1, batch); None without jitter
     period: np.ndarray  # sampling period, in s
@@ -137,6 +146,8 @@ class Parameters(NamedTuple):
     filtered_input: Array  # True if the velocity estimate is computed from the position estimate, not the measurement
     estimator: Estimator  # velocity estimate
     feedback: FeedbackLoop  # feedback in addition to spring and damper, such as an integral gain
+    tool: ToolStep  # integration step of the tool; its fields are 0 without a tool
+    tool_estimator: Estimator  # estimate of the velocity of the tool in scenes with `Options.filters_tool`
     rate: Array  # matrix of x' = rate @ (x, u), (n, n + forces, batch)
     place: Array  # rows of the positions of the bodies, (bodies, n, batch)
     motion: Array  # rows of the velocities of the bodies, (bodies, n, batch)
@@ -190,7 +201,9 @@ def _build_filters(estimates: Sequence[Estimate]) -> Filter:
     return Filter(A, B, C, D)
 
 
-def build_program(programs: Sequence[LoopEstimates], velocities: Sequence[Any], which: np.ndarray) -> dict[str, Any]:
+def build_program(
+    programs: Sequence[LoopEstimates], velocities: Sequence[Any], which: np.ndarray, filters_tool: bool
+) -> dict[str, Any]:
     """Return the filters of the control program for all simulations, keyed by field name in `Parameters`.
 
     Args:
@@ -198,6 +211,7 @@ def build_program(programs: Sequence[LoopEstimates], velocities: Sequence[Any], 
         velocities: velocity estimate of each scene, used in place of that in ``programs``, because it may be FOAW,
             which is not linear.
         which: index of the scene of each simulation.
+        filters_tool: whether the velocity of a tool has a separate estimate.
     """
     none = Estimate(0, 0.0)
     feedbacks = [each.feedback for each in programs]
@@ -210,11 +224,14 @@ def build_program(programs: Sequence[LoopEstimates], velocities: Sequence[Any], 
         np.array([each.samples if adapts else each.window for each in velocities]),
         np.array([each.noise if adapts else 0.0 for each in velocities]),
     )
+    of_tool = [each.of_tool if filters_tool else none for each in programs]
+    windows = np.array([each.window for each in of_tool])
     further = _build_filters([none if each is None else each.filter for each in feedbacks])
     return {
         "position": spread_scenes(_build_filters([each.position for each in programs]), which),
         "filtered_input": spread_scenes(np.array([each.structure == "series" for each in programs]), which),
         "estimator": spread_scenes(estimator, which),
+        "tool_estimator": spread_scenes(Estimator(_build_filters(of_tool), windows, 0.0 * windows), which),
         "feedback": spread_scenes(FeedbackLoop(further, weights), which),
     }
 

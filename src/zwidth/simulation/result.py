@@ -59,8 +59,8 @@ FRAME = (
     *("energy", "wall_work", "external_work", "damping_loss", "friction_loss"),
 )
 """Fields of `Motion` with one value per recorded instant, in the order of a frame, which begins with the positions."""
-READING = ("measured", "estimated_velocity", "command", "contact")
-"""Fields of `Motion` with one value per sample, in the order of a reading."""
+READING = ("measured", "estimated_velocity", "command", "contact", "tool_position", "coupling_force")
+"""Fields of `Motion` with one value per sample, in the order of a reading; the last two only with a tool."""
 
 # Description and SI unit of each field of `Motion` over time.
 OF_MOTION = {
@@ -74,6 +74,8 @@ OF_MOTION = {
     "estimated_velocity": ("estimated velocity", "m/s"),
     "command": ("force commanded at the sample", "N"),
     "contact": ("contact at the sample", "1"),
+    "tool_position": ("position of the tool at the sample", "m"),
+    "coupling_force": ("force of the coupling on the tool", "N"),
     "wall_work": ("energy supplied by the wall since the start", "J"),
     "external_work": ("energy supplied by the external force", "J"),
     "damping_loss": ("energy dissipated by dampers", "J"),
@@ -126,7 +128,12 @@ class Motion:
             if there is no such body.
         wall_force: force of the wall from the instant on, in N; with an actuator, its commanded force.
         sticking: True if friction holds the device.
-        measured, estimated_velocity, command, contact: result of the control program at each sample.
+        measured, estimated_velocity, command, contact: result of the control program at each sample. With a tool, the
+            velocity is that of the device relative to the tool, and the command that of the coupling.
+        tool_position: position y of the tool at each sample in m, from which the force is computed; None without a
+            tool.
+        coupling_force: force f of the coupling on the tool at each sample, in N, before the limits of the motor; None
+            without a tool.
         wall_work, external_work: energy supplied by the wall and by the external force since the start, in J.
         damping_loss, friction_loss: energy dissipated by dampers and by friction, in J.
         energy: kinetic and elastic energy of all bodies; increases by the work and decreases by the losses.
@@ -155,6 +162,8 @@ class Motion:
     estimated_velocity: Any
     command: Any
     contact: Any
+    tool_position: Any
+    coupling_force: Any
     wall_work: Any
     external_work: Any
     damping_loss: Any
@@ -289,8 +298,8 @@ def convert_to_si(
     if frames is None:
         return columns
     units = {"velocity": 1.0 / period, "estimated_velocity": 1.0 / period}
-    units |= dict.fromkeys(("wall_force", "command", *FRAME[3:]), force)
-    for rows, names in ((frames, (*bodies, *FRAME)), (readings[:, None], READING)):
+    units |= dict.fromkeys(("wall_force", "command", "coupling_force", *FRAME[3:]), force)
+    for rows, names in ((frames, (*bodies, *FRAME)), (readings[:, None], READING[: readings.shape[1]])):
         # Convert each array from the axes (periods, substeps, rows, batch) to (rows, batch, instants), where a row is
         # one recorded quantity. The axes of periods and substeps are merged into one axis of recorded instants, in
         # order of time.

@@ -19,9 +19,11 @@ from zwidth.simulation.arguments import (
     ARGUMENTS,
     check_memory,
     convert_hand,
+    count_periods,
     list_scenes,
     read_arguments,
     refuse_bodies,
+    refuse_unsupported,
     spread_starts,
     trace_law,
 )
@@ -40,7 +42,8 @@ def simulate(
     virtual_damping: ArrayLike | None = None,
     *,
     force: Law | None = None,
-    periods: int = 1000,
+    periods: int | None = None,
+    duration: float | str | None = None,
     substeps: int = 1,
     start_position: ArrayLike | Mapping[str, ArrayLike] = 0.0,
     start_velocity: ArrayLike | Mapping[str, ArrayLike] = 0.0,
@@ -69,6 +72,11 @@ def simulate(
     in steady state for the start velocity: their transients have decayed. The states of the further feedback, such as
     an integral, are 0 at the start and outside of contact.
 
+    In a scene with a `zwidth.Tool`, the force ``f_k = K (p_k - y_k) + B v_k`` of the virtual coupling acts on the tool,
+    and ``-(f_k + r_k)`` is the command of the device. Here y_k is the position of the tool, and v_k the estimated
+    velocity of the device relative to the tool. The limits of the motor apply only to the command. At the start, the
+    tool is at rest at the measured position of the device.
+
     Args:
         scenes: a `zwidth.Scene`, or a list or array of scenes. Its shape and the shapes of the numbers below broadcast
             to the batch shape. Numbers may be strings with a unit, "2 N". A `zwidth.LinearDevice` starts at rest at 0,
@@ -79,19 +87,23 @@ def simulate(
             simulation. They contain the position p_k in m (see above), the estimated velocity in m/s, and the time of
             the sample in s, without jitter. It returns the force on the device in N and is written with `jax.numpy`.
             The law is compiled once, so it must not keep values between calls and must use ``jnp.where`` in place of
-            ``if``. Its force is sampled, held and delayed like that of a wall.
-        periods: number of sampling periods, >= 1.
+            ``if``. Its force is sampled, held and delayed like that of a wall. With a tool, the position is p_k - y_k;
+            a tool that is integrated by the implicit Euler method excludes a law.
+        periods: number of sampling periods, >= 1; 1000 if left out.
+        duration: length of the simulation in s, or as a text such as "2 s" or "500 periods", in place of ``periods``;
+            rounded to an integer number of periods.
         substeps: recorded instants per period, >= 1.
         start_position: in m; one value for all bodies, or a mapping by their names in `Motion`, as ``{"position": 0,
-            "hand_position": 1e-3}``; other bodies start with the device.
-        start_velocity: in m/s, likewise. Before the start, the device moves at its start velocity.
+            "hand_position": 1e-3}``; other bodies start with the device. The name of a tool is "tool_position".
+        start_velocity: in m/s, likewise; the velocity of a tool is 0 unless the mapping contains its name. Before the
+            start, device and tool move at their start velocities.
         external_force: constant external force on the device, in N; on a `LinearDevice` it acts where the wall acts.
         external_force_history: external force in N, constant over each period, (..., periods); added to
             ``external_force``.
         hand_history: recorded position in m of the far end of the spring and damper of a rigid `zwidth.Operator`,
             (..., periods + 1), linear between samples; its force is averaged over each period.
         contact: "bilateral": the wall acts on both sides of its surface at 0; "unilateral": only at positions p_k > 0;
-            "push_only": unilateral, and it never pulls.
+            "push_only": unilateral, and it never pulls. A coupling to a tool has no surface and is always bilateral.
         resolution: step of the encoder in m, to which measured positions are rounded; 0 for an ideal sensor.
         noise: standard deviation of the measured position before rounding, in m.
         coulomb: Coulomb friction on the device while it slips, in N.
@@ -109,7 +121,8 @@ def simulate(
 
     Raises:
         InputError: an argument is invalid; friction with a pole of more than 64 rad per period; JAX cannot trace the
-            law, or the law keeps values between calls.
+            law, or the law keeps values between calls; a scene has a tool, which the contact, the law or the velocity
+            estimate excludes.
         ResourceError: the recorded or random numbers need more than 4 GiB.
 
     Numerics:
@@ -131,14 +144,15 @@ def simulate(
     """
     given = {name: value for name, value in locals().items() if name in ARGUMENTS}
     check_choice("contact", contact, CONTACTS)
-    periods = check_integer("periods", periods, 1, 10**9)
     substeps = check_integer("substeps", substeps, 1, 10_000)
+    distinct, which = list_scenes(scenes)
+    periods = count_periods(distinct, periods, duration)
     tail = max(periods // 4, 1) if tail is None else check_integer("tail", tail, 1, periods)
     settings = Settings(periods, substeps, tail, contact, record)
-    distinct, which = list_scenes(scenes)
     if force is not None:
         settings = settings._replace(law=trace_law(force, stiffness, virtual_damping))
         given |= {"stiffness": 0.0, "virtual_damping": 0.0}
+    refuse_unsupported(distinct, contact, settings.law)
     if hand_history is not None:
         external_force_history = convert_hand(distinct, which, hand_history, external_force_history, periods)
     numbers, which, good = read_arguments(

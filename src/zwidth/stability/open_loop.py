@@ -1,10 +1,11 @@
-"""Find the angles w that determine the stability margins of open loops L, with the same source code for NumPy and JAX.
+"""Find the angles w that determine the stability margins of open loops L.
 
 L(z) at z = e^(jw) is tabulated at *nodes*, angles w so close that log L changes little between neighbors. The closed
 loop has poles where ``1 + L = 0``, with ``L = G (K P + B V)``: G is the sampled plant, K and B are gains, and P and V
 are the responses of the feedback terms, such as position and velocity. Only the values of L and dL/dw on the unit
 circle are used. All arrays have the shape (loops, nodes) or (loops, crossovers), where "loops" stands for any number of
-axes. If a loop has fewer crossovers than others, its remaining entries are NaN.
+axes. If a loop has fewer crossovers than others, its remaining entries are NaN. The functions compute in NumPy, except
+`find_nearest_angle`, which also accepts JAX arrays.
 
 The open loop has a *gain crossover* where |L| = 1, and a *phase crossover* where L is real and negative. Both are zeros
 of real functions of L, found between two nodes with different signs. Between nodes with equal signs, two zeros are
@@ -50,7 +51,6 @@ def evaluate_open_loop(points: CirclePoints, plant: Response, terms: Sequence[Re
         terms: response of each feedback term.
         gains: gain of each term.
     """
-    xp = namespace(points.w)
     with np.errstate(all="ignore"):
         value, slope = (
             sum(gain * part for gain, part in zip(gains, parts, strict=True))
@@ -58,7 +58,7 @@ def evaluate_open_loop(points: CirclePoints, plant: Response, terms: Sequence[Re
         )
         L = Jet(value, slope).times(plant(points))
         # Set the imaginary part of L at w = pi to 0, because L is real there and only a rounding error would remain.
-        return Jet(xp.where(points.w >= np.pi, L.value.real + 0j, L.value), L.slope)
+        return Jet(np.where(points.w >= np.pi, L.value.real + 0j, L.value), L.slope)
 
 
 def tabulate_open_loop(w: Array, plant: Response, terms: Sequence[Response], gains: Sequence[Array]) -> OpenLoop:
@@ -74,90 +74,80 @@ def tabulate_open_loop(w: Array, plant: Response, terms: Sequence[Response], gai
     return OpenLoop(respond, w, respond(w))
 
 
-def find_gain_crossovers(loop: OpenLoop, most: int | None = None) -> Array:
-    """Return the angles at which ``|L| = 1``, ascending.
-
-    Args:
-        loop: open loops.
-        most: number of sign changes per loop for which the result has space; required for JAX. By default, the largest
-            number of sign changes that a loop has.
-    """
+def find_gain_crossovers(loop: OpenLoop) -> np.ndarray:
+    """Return the angles at which ``|L| = 1``, ascending."""
 
     def log_gain(L: Jet) -> tuple[Array, Array]:
         """Return ``log|L|`` and its derivative in w."""
-        return namespace(L.value).log(abs(L.value)), (L.slope / L.value).real
+        return np.log(abs(L.value)), (L.slope / L.value).real
 
-    return _find_zeros(loop, log_gain, most)
+    return _find_zeros(loop, log_gain)
 
 
-def find_phase_crossovers(loop: OpenLoop, most: int | None = None) -> Array:
-    """Return the angles in (0, pi] at which L is real and negative, ascending; see `find_gain_crossovers`."""
+def find_phase_crossovers(loop: OpenLoop) -> np.ndarray:
+    """Return the angles in (0, pi] at which L is real and negative, ascending."""
 
     def phase_sine(L: Jet) -> tuple[Array, Array]:
         """Return the sine of arg L and its derivative in w."""
         unit = L.value / abs(L.value)
         return unit.imag, unit.real * (L.slope / L.value).imag
 
-    xp = namespace(loop.L.value)
     # Exclude the last node from the search and append the angle pi instead, because L is always real at w = pi.
     inner = OpenLoop(loop.respond, loop.w[..., :-1], Jet(*(part[..., :-1] for part in loop.L)))
-    w = _find_zeros(inner, phase_sine, most)
-    w = xp.concatenate([w, xp.full_like(w, np.pi, shape=(*w.shape[:-1], 1))], -1)
+    w = _find_zeros(inner, phase_sine)
+    w = np.concatenate([w, np.full((*w.shape[:-1], 1), np.pi)], -1)
     with np.errstate(all="ignore"):
         L = loop.respond(w)
         # Exclude zeros of L, at which the phase jumps: L is 0 at these angles for any gain, so that no closed-loop pole
         # can occur there.
         is_crossover = (L.value.real < 0) & (abs(L.value) > ZERO_OF_L * w * abs(L.slope))
-    return xp.where(is_crossover, w, np.nan)
+    return np.where(is_crossover, w, np.nan)
 
 
-def _find_zeros(loop: OpenLoop, function: RealFunction, most: int | None) -> Array:
-    """Return the angles at which a real function of L is 0, ascending; ``most`` as in `find_gain_crossovers`."""
+def _find_zeros(loop: OpenLoop, function: RealFunction) -> np.ndarray:
+    """Return the angles at which a real function of L is 0, ascending."""
 
     def evaluate(w: Array, part: int) -> Array:
         return function(loop.respond(w))[part]
 
     with np.errstate(all="ignore"):
         value, slope = function(loop.L)
-        xp, w = namespace(value), namespace(value).broadcast_to(loop.w, value.shape)
-        step, sign, size, descent = xp.diff(w), xp.sign(value), abs(value), abs(slope)
-        lowest = xp.minimum(size[..., :-1] - descent[..., :-1] * step, size[..., 1:] - descent[..., 1:] * step)
+        w = np.broadcast_to(loop.w, value.shape)
+        step, sign, size, descent = np.diff(w), np.sign(value), abs(value), abs(slope)
+        lowest = np.minimum(size[..., :-1] - descent[..., :-1] * step, size[..., 1:] - descent[..., 1:] * step)
         # If the function has equal signs at two neighboring nodes, but its magnitude decreases from both nodes inward,
         # it may have two zeros between them. The comparisons are False for NaN, which occurs if L is 0 at the Nyquist
         # frequency.
         touches = (sign[..., 1:] == sign[..., :-1]) & (lowest < 0)
         touches &= (sign[..., :-1] * slope[..., :-1] < 0) & (sign[..., :-1] * slope[..., 1:] > 0)
         crosses = (value[..., :-1] > 0) != (value[..., 1:] > 0)
-        k, exists = _list_true(crosses, most)
-        j, is_minimum = _list_true(touches, most)
+        k, exists = _list_true(crosses)
+        j, is_minimum = _list_true(touches)
 
         def take(index: Array, *parts: Array) -> list[Array]:
             """Return values at the nodes before and after the intervals that start at the nodes ``index``."""
-            return [xp.take_along_axis(part, index + i, -1) for part in parts for i in (0, 1)]
+            return [np.take_along_axis(part, index + i, -1) for part in parts for i in (0, 1)]
 
         low, high, first, last = take(k, w, value)
         start, end, before, after, *slopes = take(j, w, value, slope)
-        minima = find_zeros_in_brackets(lambda w: evaluate(w, 1), start, xp.where(is_minimum, end, start), *slopes)
+        minima = find_zeros_in_brackets(lambda w: evaluate(w, 1), start, np.where(is_minimum, end, start), *slopes)
         at_minima = evaluate(minima, 0)
         is_passed = is_minimum & ((at_minima > 0) != (before > 0))
-        exists = xp.concatenate([exists, is_passed, is_passed], -1)
-        low, high = xp.concatenate([low, start, minima], -1), xp.concatenate([high, minima, end], -1)
-        first, last = xp.concatenate([first, before, at_minima], -1), xp.concatenate([last, at_minima, after], -1)
-        zeros = find_zeros_in_brackets(lambda w: evaluate(w, 0), low, xp.where(exists, high, low), first, last)
-        return xp.sort(xp.where(exists, zeros, np.nan), -1)
+        exists = np.concatenate([exists, is_passed, is_passed], -1)
+        low, high = np.concatenate([low, start, minima], -1), np.concatenate([high, minima, end], -1)
+        first, last = np.concatenate([first, before, at_minima], -1), np.concatenate([last, at_minima, after], -1)
+        zeros = find_zeros_in_brackets(lambda w: evaluate(w, 0), low, np.where(exists, high, low), first, last)
+        return np.sort(np.where(exists, zeros, np.nan), -1)
 
 
-def _list_true(mask: Array, most: int | None) -> tuple[Array, Array]:
-    """Return the first indices along the last axis at which a mask is True, and a mask of the valid ones.
+def _list_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices along the last axis at which a mask is True, and a mask of the valid ones.
 
-    The result has ``most`` indices per row or, if ``most`` is None, as many as the row with the most True entries
-    needs.
+    The result has as many indices per row as the row with the most True entries needs.
     """
-    xp, size = namespace(mask), mask.shape[-1]
-    count = min(size, int(mask.sum(-1).max(initial=0)) if most is None else most)
-    index = xp.where(mask, expand_along(np.arange(size), xp.sum(mask, -1)), size)
-    index = xp.partition(index, max(count - 1, 0), -1)[..., :count] if count else index[..., :0]
-    return xp.minimum(index, size - 1), index < size
+    size, count = mask.shape[-1], int(mask.sum(-1).max(initial=0))
+    index = np.partition(np.where(mask, np.arange(size), size), max(count - 1, 0), -1)[..., :count]
+    return np.minimum(index, size - 1), index < size
 
 
 def find_nearest_angle(respond: Callable[[Array], Jet], w: Array, square: Array) -> Array:
@@ -220,7 +210,7 @@ def _list_minima(values: Array) -> Array:
     return np.argpartition(rank, MAX_MINIMA - 1, axis=-1)[..., :MAX_MINIMA]
 
 
-def select_gain_margin(stable: Array, w: Array, gains: Array) -> tuple[Array, Array]:
+def select_gain_margin(stable: np.ndarray, w: np.ndarray, gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the gain margin, i.e. the gain factor closest to 1 on a logarithmic scale, and the angle of its crossover.
 
     Args:
@@ -232,12 +222,11 @@ def select_gain_margin(stable: Array, w: Array, gains: Array) -> tuple[Array, Ar
         The factor by which the gain must change to put a pole on the unit circle, and the angle of this pole. Without
         crossovers the factor is inf for a stable loop and 0 for an unstable one, and the angle is NaN.
     """
-    xp = namespace(w, gains)
-    w, gain = _select_nearest(w, abs(xp.log(gains)), gains)
-    return xp.where(xp.isnan(w), xp.where(stable, np.inf, 0.0), 1.0 / gain), w
+    w, gain = _select_nearest(w, abs(np.log(gains)), gains)
+    return np.where(np.isnan(w), np.where(stable, np.inf, 0.0), 1.0 / gain), w
 
 
-def select_phase_margin(stable: Array, w: Array, phases: Array) -> tuple[Array, Array]:
+def select_phase_margin(stable: np.ndarray, w: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the phase margin in degrees, which is negative for an unstable loop, and the angle of its gain crossover.
 
     Args:
@@ -249,15 +238,13 @@ def select_phase_margin(stable: Array, w: Array, phases: Array) -> tuple[Array, 
         The margin and the angle of the crossover. Without crossovers the margin is inf for a stable loop and NaN for an
         unstable one, and the angle is NaN.
     """
-    xp = namespace(w, phases)
-    w, degrees = _select_nearest(w, abs(phases), xp.degrees(abs(phases)))
-    return xp.where(xp.isnan(w), xp.where(stable, np.inf, np.nan), xp.where(stable, degrees, -degrees)), w
+    w, degrees = _select_nearest(w, abs(phases), np.degrees(abs(phases)))
+    return np.where(np.isnan(w), np.where(stable, np.inf, np.nan), np.where(stable, degrees, -degrees)), w
 
 
-def _select_nearest(w: Array, cost: Array, values: Array) -> tuple[Array, Array]:
+def _select_nearest(w: np.ndarray, cost: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the crossover with the smallest cost, and the value at this crossover; both are NaN without crossovers."""
-    xp = namespace(w, cost)
-    nan = xp.full_like(cost, np.nan, shape=(*cost.shape[:-1], 1))
-    k = xp.argmin(xp.nan_to_num(xp.concatenate([cost, nan], -1), nan=np.inf), -1)[..., None]
-    w, value = (xp.take_along_axis(xp.concatenate([part, nan], -1), k, -1)[..., 0] for part in (w, values))
+    nan = np.full((*cost.shape[:-1], 1), np.nan)
+    k = np.argmin(np.nan_to_num(np.concatenate([cost, nan], -1), nan=np.inf), -1)[..., None]
+    w, value = (np.take_along_axis(np.concatenate([part, nan], -1), k, -1)[..., 0] for part in (w, values))
     return w, value

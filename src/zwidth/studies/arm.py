@@ -24,8 +24,9 @@ from zwidth.config.fields import LocatedProblem, Strict, combine_problems, list_
 from zwidth.config.parts import parse_message
 from zwidth.config.values import Axis, AxisOf, Quantity
 from zwidth.core.errors import InputError
-from zwidth.model.joint_space import check_point, from_mujoco, list_joints, load_model
+from zwidth.model.mujoco_model import check_point, from_mujoco, list_joints, load_model
 from zwidth.model.timing import Timing
+from zwidth.plotting import style
 from zwidth.plotting.table import SI_COLUMNS
 from zwidth.studies.outcome import Outcome, track_progress
 from zwidth.units.formatting import describe, format_wall, header, round_conservatively, suggestion, with_unit
@@ -233,15 +234,23 @@ def compute_arm(arm: Arm, timing: Timing, units: UnitSystem) -> Outcome:
         answer += (f"no K_max in {len(missing)} of {len(cases)} cases, the first at {arm.spell(*cases[missing[0]])}",)
     unstable = [case for case, label in zip(scenes, stable, strict=True) if not label]
     notes += [f"this wall is unstable at {arm.spell(*cases[unstable[0]])}"] if unstable else []
-    return Outcome(table=table, figures=_draw_poses(arm, coordinates, stiffness), answer=answer, notes=tuple(notes))
+    figures = _draw_poses(arm, coordinates, stiffness, f"{low} at {arm.spell(*cases[weakest])}")
+    return Outcome(table=table, figures=figures, answer=answer, notes=tuple(notes))
 
 
-def _draw_poses(arm: Arm, coordinates: dict[str, np.ndarray], stiffness: np.ndarray) -> dict[str, Any]:
+def _draw_poses(arm: Arm, coordinates: dict[str, np.ndarray], stiffness: np.ndarray, weakest: str) -> dict[str, Any]:
     """Return a figure of K_max over the first two joints that have several positions; empty for fewer such joints.
 
     The figure shows the smallest K_max over all directions and over all positions of the other joints.
+
+    Args:
+        arm: the arm.
+        coordinates: columns of the joint positions, one row per pose and direction.
+        stiffness: K_max of each row, in N/m.
+        weakest: text with the smallest K_max, its pose and its direction, for the legend.
     """
-    varied = [name for name, column in coordinates.items() if np.unique(column).size > 1][:2]
+    several = [name for name, column in coordinates.items() if np.unique(column).size > 1]
+    varied = several[:2]
     if len(varied) < 2:
         return {}
     pairs, group = np.unique(np.stack([coordinates[name] for name in varied]), axis=1, return_inverse=True)
@@ -249,4 +258,7 @@ def _draw_poses(arm: Arm, coordinates: dict[str, np.ndarray], stiffness: np.ndar
     np.minimum.at(least, group.ravel(), np.where(np.isfinite(stiffness), stiffness, np.inf))
     table = dict(zip(varied, pairs, strict=True)) | {SI_COLUMNS[0]: np.where(np.isfinite(least), least, np.nan)}
     labels = {header(name, unit): (name, unit) for name, unit in arm.units.items()}
-    return {"": partial(plotting.draw_workspace, table, *varied, names=tuple(labels[name] for name in varied))}
+    over = "all directions" if len(several) == 2 else "all directions and other joints"
+    texts = {"quantity": rf"smallest $K_{{\max}}$ over {over}", "weakest_pose": f"weakest: {style.literal(weakest)}"}
+    names = tuple(labels[name] for name in varied)
+    return {"": partial(plotting.draw_workspace, table, *varied, names=names, **texts)}

@@ -37,6 +37,7 @@ from zwidth.studies.outcome import (
     ComputedStudy,
     CurvesStudy,
     Outcome,
+    add_device_numbers,
     add_si_columns,
     csv_text,
     find_device_share,
@@ -92,17 +93,7 @@ class BoundaryStudy(CurvesStudy):
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Return the mapping of the study, with the delta and d of its device added.
-
-        For an invalid device both are 0, because the validation of the field ``device`` reports the errors.
-        """
-        if "device" not in raw:
-            return raw
-        try:
-            device = PhysicalDevice.model_validate(raw["device"])
-        except ValueError:
-            return {"delta": 0.0, "d": 0.0, **raw}
-        return {"delta": device.delta, "d": device.d, **raw}
+        return add_device_numbers(raw)
 
     @classmethod
     def find_conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:

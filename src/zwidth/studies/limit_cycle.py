@@ -126,6 +126,8 @@ class LimitCycleStudy(SimulatedStudy, SimulationConditions):
                     message = "given twice, in the condition and as an axis"
                     yield ("conditions", index, name), problem(message, "each parameter once", "remove one")
         scene = self.device.to_scene()
+        if scene.tool is not None:
+            yield ("device",), problem("got a tool", "limit cycles are found on walls only", "use the kind 'simulate'")
         smallest_amplitude, largest_amplitude = self.bound_amplitudes(scene)
         if largest_amplitude <= smallest_amplitude:
             low, high = (with_unit(end, scene.unit_system["m"]) for end in (smallest_amplitude, largest_amplitude))

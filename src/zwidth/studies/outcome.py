@@ -111,6 +111,20 @@ class CurvesStudy(ComputedStudy):
     d: DelayAxis
 
 
+def add_device_numbers(raw: dict[str, Any]) -> dict[str, Any]:
+    """Return the mapping of a study of curves, with the delta and d of its device added if they are absent.
+
+    For an invalid device both are 0, because the validation of the field ``device`` reports the errors.
+    """
+    if "device" not in raw:
+        return raw
+    try:
+        device = PhysicalDevice.model_validate(raw["device"])
+    except ValueError:
+        return {"delta": 0.0, "d": 0.0, **raw}
+    return {"delta": device.delta, "d": device.d, **raw}
+
+
 class WallsStudy(ComputedStudy):
     """Base of the studies of walls that are given explicitly or as a fraction of the maximum stiffness."""
 

@@ -20,11 +20,12 @@ from pydantic import Field, PrivateAttr, ValidationError, WrapValidator
 
 from zwidth import plotting
 from zwidth.analysis.assessment import trace_passivity_boundary
+from zwidth.analysis.batch import stiffest_walls
 from zwidth.analysis.scene import Scene
 from zwidth.config.device_table import DeviceTable, find_file, read_table
 from zwidth.config.devices import find_second_period, read_period
 from zwidth.config.fields import LocatedProblem, Strict, list_problems, problem
-from zwidth.config.scenes import AnyScene
+from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register
 from zwidth.config.values import Delay, quantity_of
 from zwidth.core.errors import InputError
@@ -38,7 +39,7 @@ from zwidth.stability.rigid.passivity import passive_stiffness_slope
 from zwidth.stability.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.stability.rigid.verdict import is_stable
 from zwidth.studies.arm import Arm, compute_arm
-from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, find_device_share
+from zwidth.studies.outcome import ComputedStudy, CurvesStudy, Outcome, add_device_numbers, find_device_share
 from zwidth.units.formatting import describe, format_wall, header, plain, round_conservatively, suggestion, with_unit
 from zwidth.units.parsing import split_head
 from zwidth.units.quantities import RECOMMENDED_SHARE
@@ -52,16 +53,35 @@ class RidgeStudy(CurvesStudy):
     """The maximum stable stiffness over delta, with one curve per d."""
 
     method = "Stationary points of the closed form and corners at z = -1, to some ten rounding errors."
+    takes_parts = True
 
     kind: Literal["ridge"]
+
+    device: PhysicalDevice | None = None
+    """Device in SI units whose parts, such as filters, the curves include. Default: that of the scene if it has parts
+    and delta or d is not given."""
 
     two_scalings: bool = False
     """True to show small values of delta in a separate panel, as in Fig. 10 of the paper."""
 
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        if "device" in raw or (scene.nonrigid_parts and not {"delta", "d"} <= set(raw)):
+            return {"device": scene.without_wall(), **raw}
+        return super().fill(raw, scene)
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        return add_device_numbers(raw)
+
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        table, notes = ridge_table(self.delta.values(), self.d.values())
+        with_parts = self.device is not None and bool(self.device.nonrigid_parts)
+        if self.device is not None and with_parts:
+            table, notes = device_ridge_table(self.device, self.delta.values(), self.d.values())
+        else:
+            table, notes = ridge_table(self.delta.values(), self.d.values())
         drawn: dict[str, Any] = {"": partial(plotting.draw_ridge, table, two_scalings=self.two_scalings)}
-        if table["delta"].max() >= _STRONG_DAMPING:
+        if table["delta"].max() >= _STRONG_DAMPING and not with_parts:
             drawn["_slope"] = partial(plotting.draw_slope, table, slope_table(table))
         return Outcome(table=table, figures=drawn, notes=tuple(notes))
 
@@ -75,13 +95,49 @@ def ridge_table(delta: np.ndarray, d: np.ndarray) -> tuple[dict[str, np.ndarray]
     deltas, delays = np.tile(delta, d.size), np.repeat(d, delta.size)
     points = alpha_max(deltas, delays)
     columns = {"alpha_max": points.alpha, "beta": points.beta, "omega": points.omega}
-    columns["kind"] = np.array([RidgeKind(int(code)).name.lower() for code in points.kind])
-    notes = [
-        f"alpha_max: {count} of {delta.size} points have no result for d = {value:g}"
-        for value in d
-        if (count := np.count_nonzero(points.status[delays == value] != Status.OK))
+    columns["kind"] = _name_kinds(points.kind)
+    return {"d": delays, "delta": deltas, **columns}, _note_missing(points.status, delays)
+
+
+def device_ridge_table(
+    device: PhysicalDevice, delta: np.ndarray, d: np.ndarray
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Compute the stiffest stable wall of a device with parts, for each combination of delta and d.
+
+    The damping of the device is that of delta, and its delay that of d; all other parameters stay the same. With parts,
+    only walls with B >= 0 are considered (`zwidth.Scene.max_stiffness`).
+
+    Returns:
+        A table and notes as for `ridge_table`, with further columns of K and B in SI units.
+    """
+    scene, changed = device.to_scene(), dict[str, np.ndarray]()
+    deltas, delays = np.tile(delta, d.size), np.repeat(d, delta.size)
+    if delta.tolist() != [device.delta]:
+        # Subtract the damping of a rigidly coupled hand, because delta includes this damping.
+        hand = float(scene.damping - scene.device.damping)
+        changed["damping"] = deltas * float(scene.units.virtual_damping) - hand
+    if d.tolist() != [device.d]:
+        changed["delay"] = delays * float(scene.timing.period)
+    walls = stiffest_walls(scene, changed) if changed else stiffest_walls([scene])
+    alpha, beta = scene.normalize_walls(walls.stiffness, walls.virtual_damping)
+    table = {"d": delays, "delta": deltas, "alpha_max": alpha, "beta": beta}
+    table |= {"omega": np.asarray(walls.frequency) * (2.0 * math.pi * float(scene.timing.period))}
+    table |= {"kind": _name_kinds(walls.kind)} | dict(zip(SI_COLUMNS, walls[:2], strict=True))
+    return table, _note_missing(np.asarray(walls.status), delays)
+
+
+def _name_kinds(codes: Any) -> np.ndarray:
+    """Return the names of the kinds of optima, from the codes of `zwidth.RidgeKind`."""
+    return np.array([RidgeKind(int(code)).name.lower() for code in codes])
+
+
+def _note_missing(status: np.ndarray, delays: np.ndarray) -> list[str]:
+    """Return a note for each delay at which some points have no result."""
+    return [
+        f"alpha_max: {count} of {np.count_nonzero(delays == value)} points have no result for d = {value:g}"
+        for value in np.unique(delays)
+        if (count := np.count_nonzero(status[delays == value] != Status.OK))
     ]
-    return {"d": delays, "delta": deltas, **columns}, notes
 
 
 def slope_table(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

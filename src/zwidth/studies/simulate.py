@@ -24,8 +24,9 @@ from zwidth.model.checks import Span
 from zwidth.model.measured_device import MeasuredDevice
 from zwidth.model.velocity import FOAW
 from zwidth.plotting.table import SI_COLUMNS, stack
+from zwidth.simulation.arguments import refuse_unsupported
 from zwidth.simulation.behavior import describe_ending
-from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion
+from zwidth.simulation.result import OF_MOTION, OF_WHOLE, READING, Motion
 from zwidth.simulation.simulate import Contact
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text
 from zwidth.units.formatting import format_wall, header
@@ -35,7 +36,7 @@ MAX_PERIODS = 1_000_000
 """Largest duration of a motion in sampling periods."""
 
 # Variables of the controller, whose arrays have one value per sample instead of one per substep.
-_OF_SAMPLES = ("measured", "estimated_velocity", "command", "contact")
+_OF_SAMPLES = READING
 
 
 class SimulationConditions(Strict):
@@ -88,6 +89,10 @@ class SimulationConditions(Strict):
                 placed.estimate(period)
             except InputError as error:
                 yield parse_input_error(error)
+        try:
+            refuse_unsupported([self.set_velocity(scene)], self.contact, None)
+        except InputError as error:
+            yield parse_input_error(error)
 
     def set_velocity(self, scene: Scene) -> Scene:
         """Return the scene with the velocity estimate of these conditions, or unchanged if they have none."""
@@ -125,6 +130,9 @@ class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
     substeps: Annotated[int, Quantity(allowed=Range(1, 10_000), whole=True)] = 1
     """Number of recorded points per period."""
 
+    tool_position: Annotated[float, quantity_of("start_position")] | None = None
+    """Initial position of the tool in a scene with a tool. Default: that of the device."""
+
     stiffness_fraction: Annotated[Axis, AxisOf(Quantity(allowed=POSITIVE))] | None = None
     """Stiffness as a fraction of the maximum stable stiffness K_max, with the virtual damping at K_max; alternative to
     walls."""
@@ -133,6 +141,11 @@ class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
         yield from super().find_faults()
         scene = self.device.to_scene()
         yield from self.find_inconsistencies(scene)
+        if self.tool_position is not None and scene.tool is None:
+            yield (
+                ("tool_position",),
+                problem("given without a tool", "only a scene with a tool", "remove it", on_key=True),
+            )
         if self.stiffness_fraction is not None and isinstance(self.set_velocity(scene).velocity, FOAW):
             message = "got a fraction of the maximum stiffness"
             yield ("stiffness_fraction",), problem(message, f"{NO_LINEAR_FORM} and no such maximum", "write walls")
@@ -164,7 +177,10 @@ class SimulateStudy(WallsStudy, SimulatedStudy, SimulationConditions):
         simulated = self.set_velocity(self.device.to_scene())
         walls = self.list_walls(simulated)
         stiffness, damping = np.array([wall[1:] for wall in walls]).T
-        motion = simulated.simulate(stiffness, damping, substeps=self.substeps, **self.list_options(self.device.period))
+        options: dict[str, Any] = self.list_options(self.device.period) | {"substeps": self.substeps}
+        if self.tool_position is not None:
+            options["start_position"] = {"position": self.start_position, "tool_position": self.tool_position}
+        motion = simulated.simulate(stiffness, damping, **options)
         linear = None if isinstance(simulated.velocity, FOAW) else simulated.is_stable(stiffness, damping)
         parts, rows, notes = [], [], []
         for k, (label, *wall) in enumerate(walls):

@@ -100,10 +100,13 @@ ANGULAR_SPEED = Dimension("rad/s, mrad/s, deg/s, rpm", "0.1 rad/s")
 TORQUE_RATE = Dimension("N m/s, mN m/s", "0.5 N m/s")
 SPEED = Dimension("m/s, cm/s, mm/s, um/s", "1 mm/s")
 FORCE_RATE = Dimension("N/s, kN/s, N/ms", "500 N/s")
+INTEGRAL_GAIN = Dimension("N/(m s), kN/(m s), N/(mm s)", "2 kN/(m s)")
+ANGULAR_INTEGRAL_GAIN = Dimension("N m/(rad s), mN m/(rad s), N m/(deg s), N m/(turn s)", "2 N m/(rad s)")
 RATIO = Dimension("", "0.02")
 _SCALES = (
     *(MASS, TIME, RATE, BANDWIDTH, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED),
     *(INERTIA, ANGULAR_DAMPING, ANGULAR_STIFFNESS, TORQUE, TORQUE_RATE, ANGLE, ANGULAR_SPEED),
+    *(INTEGRAL_GAIN, ANGULAR_INTEGRAL_GAIN),
 )
 DIMENSIONS = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
 # Base unit of a quantity on the other kind of device, by its base unit: "N m/rad" for "N/m" and vice versa.
@@ -385,6 +388,17 @@ def read_share(text: str) -> float:
     """Convert a text such as "2%" or "0.02" to the number 0.02; raise `ValueError` for other texts."""
     text = text.strip()
     return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+
+
+def read_factor(text: str) -> float:
+    """Convert a text such as "2" or "6 dB" to a factor; raise `ValueError` for other texts."""
+    number = float(text.strip().removesuffix("dB"))
+    return 10.0 ** (number / 20.0) if text.strip().endswith("dB") else number
+
+
+def read_degrees(text: str) -> float:
+    """Convert a text such as "30", "30 deg" or "30°" to an angle in degrees; raise `ValueError` for other texts."""
+    return float(text.strip().removesuffix("deg").removesuffix("°"))
 
 
 # Dimensions of the columns of logs and frequency responses.

@@ -238,7 +238,7 @@ _PARAMETERS = (
     Parameter("position.order", "order of the position filter", "n_p", Range(1, 8), whole=True),
     Parameter("position.coded_period", "sampling period in the formula of the position filter", "T_p", POSITIVE, "s"),
     Parameter("position.bandwidth", "bandwidth of the phase-locked loop", r"\omega_p", POSITIVE, "1/s"),
-    Parameter("feedback.gain", "integral gain, in N/(m s); rotary: N m/(rad s)", "k_i", ANY),
+    Parameter("feedback.gain", "integral gain", "k_i", ANY, "N/(m s)"),
     Parameter("feedback.position", "weight of the position estimate in the input of the feedback", "w_p", ANY),
     Parameter("feedback.velocity", "weight of the velocity estimate in the input of the feedback", "w_v", ANY),
     Parameter("tool.mass", "mass of the simulated tool", "M", POSITIVE, "kg", (1e-3, 2.0), "", "mass of the tool"),

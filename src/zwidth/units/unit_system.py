@@ -19,6 +19,7 @@ _ROTARY_UNITS = {
     "m/s": "rad/s",
     "m/N": "rad/(N m)",
     "N/s": "N m/s",
+    "N/(m s)": "N m/(rad s)",
 }
 UNIT_PAIRS = tuple(_ROTARY_UNITS.items())
 """Pairs of the units of one quantity: the unit on linear devices and the unit on rotary devices."""

@@ -1,87 +1,13 @@
-"""Admittance displays against eigenvalues of a composed state space, a published program, and messages.
-
-The state space of the reference contains the program step by step, the commands on their way, and the robot, which is
-integrated by the matrix exponential of scipy.
-"""
+"""Admittance displays against eigenvalues of a composed state space, a published program, and messages."""
 
 import numpy as np
 import pytest
-from scipy import linalg, signal
+from composed_displays import PROGRAMS, compose, find_radius, make_display
 
 import zwidth
 
 LAG = zwidth.Actuator(time_constant="20 ms")
 TIMING = zwidth.Timing(rate="500 Hz", delay="4 periods")
-PROGRAMS = [(command, method) for command in ("position", "velocity") for method in ("semi-implicit", "trapezoidal")]
-
-
-def make_display(rng):
-    """Return a random display and the state-space model of its robot from command to position."""
-    period = 10.0 ** rng.uniform(-3.3, -2)
-    tau = period * 10.0 ** rng.uniform(0.0, 1.5)
-    zeta = rng.uniform(0.3, 1.2)
-    kind = rng.integers(3)
-    if kind == 2:
-        # A robot with a zero: 1/tau^2 (1 + tau s/2)/(s^2 + 2 zeta s/tau + 1/tau^2).
-        poly = [0.5 / tau, 1 / tau**2], [1, 2 * zeta / tau, 1 / tau**2]
-        robot = zwidth.LinearDevice(poly)
-    elif kind == 1:
-        poly = [1 / tau**2], [1, 2 * zeta / tau, 1 / tau**2]
-        robot = zwidth.Actuator(time_constant=tau, order=2, damping_ratio=zeta)
-    else:
-        poly, robot = ([1 / tau], [1, 1 / tau]), zwidth.Actuator(time_constant=tau)
-    command, method = PROGRAMS[rng.integers(4)]
-    delay = float(rng.choice([float(rng.integers(5)), rng.uniform(0, 4)]))
-    mass = 10.0 ** rng.uniform(-0.5, 1.5)
-    # The damper of the program is explicit, so D T/M must be below 2.
-    damping = mass / period * 10.0 ** rng.uniform(-3, -0.5)
-    timing = zwidth.Timing(period, f"{delay!r} periods")
-    display = zwidth.AdmittanceDisplay(mass, damping, robot, timing, command, method)
-    A, B, C, _ = signal.tf2ss(poly[0], np.append(poly[1], 0.0) if command == "velocity" else poly[1])
-    return display, (A, B, C)
-
-
-def compose(display, robot, stiffness, damper):
-    """Return the matrix of one period: the states are those of the robot, the last commands, and v, a and x_ref."""
-    A, B, C = robot
-    T, M, D = (float(each) for each in (display.timing.period, display.virtual_mass, display.virtual_damping))
-    n = int(np.floor(display.timing.d))
-    f = float(display.timing.d) - n
-    size, lag = len(A), n + 1
-
-    def move(time):
-        """Return e^(A t) and the integral of e^(A s) B for s from 0 to t."""
-        block = linalg.expm(np.block([[A, B], [np.zeros((1, size + 1))]]) * time)
-        return block[:size, :size], block[:size, size:]
-
-    (phi1, gamma1), (phi2, gamma2) = move(f * T), move((1 - f) * T)
-    columns = []
-    for unit in np.eye(size + lag + 3):
-        x, (commands, (v, a, reference)) = unit[:size], np.split(unit[size:], [lag])
-        position = (C @ x).item()
-        # The command before the sample is the oldest stored one, u_(k-n-1).
-        velocity = (C @ (A @ x + B[:, 0] * commands[-1])).item()
-        force = -stiffness * position - damper * velocity
-        if display.integrator == "trapezoidal":
-            new_a = (force - D * v) / M
-            new_v = v + T * (new_a + a) / 2
-            new_reference = reference + T * (new_v + v) / 2
-        else:
-            new_a = (force - D * v) / M
-            new_v = v + T * new_a
-            new_reference = reference + T * new_v
-        sent = np.append(new_v if display.command == "velocity" else new_reference, commands)
-        x = phi2 @ (phi1 @ x + gamma1[:, 0] * sent[n + 1]) + gamma2[:, 0] * sent[n]
-        columns.append(np.concatenate([x, sent[:lag], [new_v, new_a, new_reference]]))
-    matrix = np.array(columns).T
-    if display.command == "velocity":
-        # The program does not integrate the position.
-        matrix = matrix[:-1, :-1]
-    return matrix
-
-
-def find_radius(*given):
-    return np.abs(np.linalg.eigvals(compose(*given))).max()
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -222,3 +148,49 @@ def test_invalid_arguments_raise(changes, message):
 def test_invalid_environments_raise(call, message):
     with pytest.raises(zwidth.InputError, match=message):
         call(zwidth.AdmittanceDisplay(20, 60, LAG, TIMING))
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_grids_equal_single_displays(program):
+    """A grid contains limits, displays without a limit, and displays near the limit of the explicit damper."""
+    display = zwidth.AdmittanceDisplay(20, 60, LAG, zwidth.Timing(rate="500 Hz", delay="1.5 periods"), *program)
+    masses, dampings, dampers = [[[0.1]], [[2]], [[50]]], [[0.05], [30], [150]], [0, 12.5]
+    grid = display.max_environment_stiffness(dampers, virtual_mass=masses, virtual_damping=dampings)
+    assert grid.stiffness.shape == grid.frequency.shape == grid.status.shape == (3, 3, 2)
+    for i, j, k in np.ndindex(grid.stiffness.shape):
+        single = zwidth.AdmittanceDisplay(masses[i][0][0], dampings[j][0], LAG, display.timing, *program)
+        # The stable intervals of the gain come from exact polynomials (V11 to V15).
+        intervals = single.scene(0, dampers[k]).stable_stiffness(0.0)
+        expected = intervals[intervals[:, 0] <= 0]
+        assert (grid.status[i, j, k] == zwidth.Status.OK) == (expected.size > 0)
+        if expected.size:
+            assert grid.stiffness[i, j, k] == pytest.approx(expected[0, 1], rel=1e-11)
+            frequency = single.scene(grid.stiffness[i, j, k], dampers[k]).dominant_pole().frequency
+            assert grid.frequency[i, j, k] == pytest.approx(frequency, rel=1e-9)
+        else:
+            assert np.isnan(grid.stiffness[i, j, k])
+
+
+def test_grids_accept_texts_and_empty_arrays():
+    display = zwidth.AdmittanceDisplay(20, 60, LAG, TIMING)
+    limits = display.max_environment_stiffness(virtual_mass=["5 kg", "20 kg"], virtual_damping="60 N s/m")
+    assert limits.stiffness[1] == display.max_environment_stiffness().stiffness
+    assert display.max_environment_stiffness(virtual_mass=np.ones((0, 2))).stiffness.shape == (0, 2)
+    with pytest.raises(zwidth.InputError, match="virtual_mass: got -1 kg; it must be > 0"):
+        display.max_environment_stiffness(virtual_mass=-1)
+    limits = display.max_environment_stiffness([0, np.nan], virtual_mass=[[20], [-1], [np.inf]])
+    assert limits.stiffness[0, 0] == display.max_environment_stiffness().stiffness
+    assert np.all(np.isnan(limits.stiffness.ravel()[1:]))
+    np.testing.assert_array_equal(limits.status.ravel(), [0, *[zwidth.Status.INVALID_INPUT] * 5])
+    with pytest.raises(zwidth.InputError, match="virtual_damping: got '3 kg'"):
+        display.max_environment_stiffness(virtual_damping="3 kg")
+
+
+def test_weakly_damped_and_long_delayed_displays():
+    """Displays whose poles are too close to the unit circle for eigenvalues, or with many delayed commands."""
+    for delay in ("0 periods", "25 periods", "40.5 periods"):
+        display = zwidth.AdmittanceDisplay(100, 1e-3, LAG, zwidth.Timing("1 ms", delay), "velocity", "trapezoidal")
+        for virtual_damping in (1e-3, 10.0):
+            limit = display.max_environment_stiffness(virtual_damping=virtual_damping)
+            single = zwidth.AdmittanceDisplay(100, virtual_damping, LAG, display.timing, "velocity", "trapezoidal")
+            assert limit.stiffness == pytest.approx(single.scene().stable_stiffness(0.0)[-1, 1], rel=1e-9)

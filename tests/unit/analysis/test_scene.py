@@ -29,14 +29,6 @@ def test_normalize_equals_eqs_14_and_16():
     assert oracles.relative_error(point.d, exact["delay"] / T) <= tol.NORMALIZED.float64
 
 
-@pytest.mark.parametrize("damping, delta", [(0.0, 0.0), (10.0, 0.1), (100.0, 1.0)])
-def test_normalize_paper_example(damping, delta):
-    point = zwidth.normalize(mass=0.1, damping=damping, period=1e-3, delay=1e-3)
-    assert point.delta == pytest.approx(delta, rel=tol.NORMALIZED.float64)
-    assert point.d == 1.0
-    assert point.alpha == point.beta == 0.0
-
-
 @pytest.mark.parametrize("periods", [1, 3, 11, 17, 29, 500])
 @pytest.mark.parametrize("period", [1e-4, 1e-3, 3e-4, 7e-3])
 def test_normalize_keeps_integer_delays_exact(period, periods):

@@ -36,6 +36,7 @@ PARTS = {
     },
     "--position-bandwidth 500": {"position": zwidth.Pll(500)},
     "--feedback-gain 1000": {"feedback": zwidth.IntegralFeedback(1000)},
+    "--feedback-gain 1kN/m/s": {"feedback": zwidth.IntegralFeedback(1000)},
     "--position-bandwidth 500 --feedback-gain 3 --feedback-rule forward --feedback-position 20 --feedback-velocity 1": {
         "position": zwidth.Pll(500),
         "feedback": zwidth.IntegralFeedback(3, "forward", 20, 1),
@@ -127,7 +128,7 @@ def test_faults_name_the_option(options):
 def test_output_names_the_estimates():
     result = run("check", *OPTIONS, *WALL, "--position-bandwidth", "500", "--feedback-gain", "1000")
     assert "position   Pll, bandwidth 500" in result.stdout
-    assert "feedback   IntegralFeedback, gain 1000" in result.stdout
+    assert "feedback   IntegralFeedback, gain 1.000 kN/(m s)" in result.stdout
 
 
 def test_code_of_a_recommendation_contains_the_estimates():

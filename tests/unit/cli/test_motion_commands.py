@@ -130,6 +130,29 @@ def test_push_of_a_transfer_function():
     assert "external force 8.01 N" in output
 
 
+TOOL = "--mass", "100 g", "--damping", "10", "--rate", "1 kHz", "--delay", "1 ms", "--tool-mass", "300 g"
+COUPLING = "--stiffness", "5 kN/m", "--virtual-damping", "20"
+
+
+def test_coupling_to_a_tool(tmp_path):
+    file = tmp_path / "motion.png"
+    hit = run("simulate", *TOOL, *COUPLING, "--hit", "0.1 m/s", "--figure", str(file))
+    assert "hits the tool at 100 mm/s" in hit
+    assert "linear loop           stable" in hit
+    assert "in contact" not in hit
+    assert file.exists()
+    released = run("simulate", *TOOL, *COUPLING, "--max-force", "3 N")
+    assert "released at a distance from the tool of 1.00 mm" in released
+    assert "force up to 3.00 N" in released
+    system = "--device", "1 / 0.1 10 0", *TOOL[4:], *COUPLING
+    assert "released at a distance from the tool of 2.00 mm" in run("simulate", *system, "--hold", "2 mm")
+    output = parse("simulate", *TOOL, "--stiffness", "25 kN/m", "--virtual-damping", "40", "--duration", "0.5 s")
+    assert output["diagnosis"] is None
+    assert output["outcome"] == "GROWING"
+    result = CliRunner().invoke(cli, ["diagnose", *TOOL, *COUPLING])
+    assert "tool: got Tool(mass=0.3), but diagnose supports walls only" in result.output + str(result.exception)
+
+
 def test_scene_file(tmp_path):
     file = tmp_path / "knob.yaml"
     scene = "{mass: 60 g cm^2, damping: 0.02 mN m s/rad, period: 1 ms, stiffness: 0.1 N m/rad, virtual_damping: 1e-3}"

@@ -3,6 +3,7 @@
 References: `alpha_max` of the normalized device, and finite differences.
 """
 
+import jax
 import numpy as np
 import pytest
 
@@ -74,3 +75,17 @@ def test_gradient_in_the_period_equals_sensitivity():
         for scene in (PERIODS, SECONDS):
             slope = jax.grad(lambda period, scene=scene: scene.replace(period=period).max_stiffness().stiffness)(1e-3)
             assert float(slope) == pytest.approx(scene.sensitivities().per["period"], rel=1e-9)
+
+
+def test_a_gradient_prints_no_delay_in_periods(x64):
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing("1 ms", "1.3 periods"))
+    gradient = jax.grad(lambda scene: scene.max_stiffness().stiffness)(scene)
+    derivative = gradient.timing.span.value
+    step = 1e-6
+    ends = [scene.replace(delay=f"{1.3 + k * step} periods").max_stiffness().stiffness for k in (-1, 1)]
+    assert float(derivative) == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-4)
+    assert gradient.timing.delay == derivative
+    assert "periods" not in repr(gradient)
+    moved = jax.tree.map(lambda value, slope: value + 1e-16 * slope, scene, gradient)
+    assert "periods" in repr(moved)
+    assert float(moved.timing.delay) == pytest.approx(1.3e-3, rel=1e-4)

@@ -165,3 +165,20 @@ def test_repr_of_scene_is_short_and_evaluates_to_the_scene():
     linear = zwidth.LinearDevice("1 / 0.1 10 0")
     assert repr(linear) == "LinearDevice('1 / 0.1 10 0')"
     assert linear == zwidth.LinearDevice(([1.0], [0.1, 10.0, 0.0]))
+
+
+def test_integral_gains_have_units():
+    texts = ("2 kN/(m s)", "2 N/(mm s)", "2000 N/m/s", 2000)
+    assert {zwidth.IntegralFeedback(text).gain for text in texts} == {2000.0}
+    feedback = zwidth.IntegralFeedback("2 mN m/(rad s)")
+    scene = zwidth.Scene(zwidth.Device("12 g cm^2"), zwidth.Timing("1 ms"), feedback=feedback)
+    assert scene.parameters()["feedback.gain"] == pytest.approx(2e-3)
+    assert zwidth.IntegralFeedback("1 N m/(turn s)").gain == pytest.approx(1 / (2 * np.pi))
+    untyped: Any = zwidth
+    gains = untyped.pid_gains("2 N m/rad", "50 mN m s/rad", "3 N m/(rad s)", units="turns")
+    assert gains.ki == pytest.approx(6 * np.pi)
+    assert untyped.cascade_gains("2 kN/m", "50 N s/m", "3 kN/m", units="m") == (40.0, 50.0, 3000.0)
+    with pytest.raises(zwidth.InputError, match=r"feedback: got IntegralFeedback.*, in rotary units, for a linear"):
+        zwidth.Scene(zwidth.Device(0.1), zwidth.Timing("1 ms"), feedback=feedback)
+    with pytest.raises(zwidth.InputError, match=r"feedback.gain: got '2 N/m'; the units allowed are N/\(m s\)"):
+        zwidth.IntegralFeedback("2 N/m")

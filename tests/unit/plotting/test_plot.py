@@ -231,6 +231,15 @@ def test_motion_plot_agrees_with_simulate():
         plot.motion(RIGID.simulate(5e3, 20.0, periods=5, record=False))
 
 
+def test_motion_plot_shows_the_tool():
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), tool=zwidth.Tool(0.3))
+    motion = scene.simulate(5e3, 20, start_velocity=0.1, periods=50, substeps=2)
+    ax = zwidth.plot.motion(motion)
+    positions, tool = (np.asarray(ax.lines[k].get_ydata(), float) for k in (0, 1))
+    scale = positions.max() / motion.position.max()
+    np.testing.assert_allclose(tool, scale * np.repeat(motion.tool_position, 2), rtol=1e-12)
+
+
 def test_given_axes_are_used_without_changing_settings():
     before = dict(matplotlib.rcParams)
     ax = Figure().subplots()

@@ -1,7 +1,6 @@
 """The workspace study of an arm: K_max of all poses and directions against single scenes, and messages for users."""
 
 import json
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,8 @@ from zwidth.core.errors import ConfigError
 from zwidth.studies.document import Config, load_config
 
 pytestmark = pytest.mark.usefixtures("unpainted")
-# The type stubs of MuJoCo lack most functions.
-mujoco: Any = import_module("mujoco")
+# The annotation is Any, because the type stubs of MuJoCo lack most functions.
+mujoco: Any = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
 MODEL = """
 <mujoco><compiler angle="radian"/><worldbody>
@@ -70,6 +69,23 @@ def test_every_pose_and_direction_agrees_with_its_scene(tmp_path, capsys):
     # The run contains a copy of the model, and is resumed without computation.
     assert (tmp_path / "out" / "inputs" / "arm.xml").read_text() == MODEL
     assert zwidth.run(tmp_path / "w.yaml", out=tmp_path / "out", resume=True).studies[0].state == "kept"
+
+
+@pytest.mark.parametrize(
+    ("joints", "others"), [(JOINTS, ""), (JOINTS[:-1] + ", slide: [0, 1 cm]}", " and other joints")]
+)
+def test_figure_names_its_quantity_and_the_worst_pose_and_direction(tmp_path, joints, others):
+    (study,) = load_config(write_config(tmp_path, joints)).studies
+    outcome = study.compute(None, True)
+    plt = pytest.importorskip("matplotlib.pyplot")
+    (ax,) = outcome.figures[""]()
+    figure = ax.figure
+    texts = [text.get_text() for legend in [*figure.legends, ax.get_legend()] if legend for text in legend.get_texts()]
+    worst = outcome.answer[0].removeprefix("K_max from ").partition(" to ")[0]
+    assert texts == [f"weakest: {worst}"]
+    bar = figure.axes[-1]
+    assert bar.get_ylabel() == rf"smallest $K_{{\max}}$ over all directions{others}  in kN/m"
+    plt.close(figure)
 
 
 def test_pose_without_motion_along_a_direction_is_a_note(tmp_path, capsys):

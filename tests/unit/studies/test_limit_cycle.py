@@ -258,3 +258,8 @@ def test_run_writes_all_files(tmp_path):
     assert all((tmp_path / "out" / name).stat().st_size for name in ("c.npz", "c_boundary.csv", "c.png", "c.svg"))
     with np.load(tmp_path / "out" / "c.npz") as stored:
         assert stored["amplitude_m"].shape == (2, 3, 2)
+
+
+def test_tool_is_refused():
+    with pytest.raises(ValidationError, match="limit cycles are found on walls only"):
+        make_study(device={**DEVICE, "tool": {"mass": 0.3}})

@@ -1,6 +1,7 @@
 """Studies of devices with filters, couplings and operators, against scenes and pole counts."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -159,3 +160,31 @@ def test_figures_of_filters(filters):
         line.get_ydata(), select(filters.table, estimate="low_pass", damping_N_s_per_m=10.0)[SI_COLUMNS[0]] / 1e3
     )
     assert plotting.draw_filters(filters.table, panels) is not None
+
+
+def test_a_ridge_includes_a_position_filter(tmp_path):
+    text = """\
+version: 1
+name: filtered
+scene: {mass: 100 g, damping: 10, rate: 1 kHz, delay: 1 ms, position: {kind: exponential, coefficient: 0.3}}
+studies:
+  - {kind: ridge, name: one}
+  - {kind: ridge, name: curve, delta: [0.05, 0.1, 0.2]}
+  - {kind: ridge, name: delays, d: [0, 2]}
+  - {kind: ridge, name: rigid, delta: 0.1, d: 1}
+"""
+    file = tmp_path / "filtered.yaml"
+    file.write_text(text, encoding="utf-8")
+    scene = zwidth.load_scene(file)
+    studies: Any = zwidth.load_config(file).studies
+    one, curve, delays, rigid = (study.compute(None, False).table for study in studies)
+    top = scene.max_stiffness()
+    assert one["stiffness_N_per_m"] == pytest.approx(top.stiffness)
+    assert one["omega"] == pytest.approx(2 * np.pi * top.frequency * 1e-3)
+    for delta, alpha in zip(curve["delta"], curve["alpha_max"], strict=True):
+        damped = scene.replace(damping=delta * 100).max_stiffness()
+        assert alpha == pytest.approx(damped.stiffness / 1e5, rel=1e-9)
+    for d, alpha in zip(delays["d"], delays["alpha_max"], strict=True):
+        assert alpha == pytest.approx(scene.replace(delay=f"{d:g} periods").max_stiffness().stiffness / 1e5, rel=1e-9)
+    # With both delta and d, the study is about a rigid mass without parts, as before.
+    assert rigid["alpha_max"] == pytest.approx(zwidth.alpha_max(0.1, 1).alpha)

@@ -53,12 +53,6 @@ def test_onset_of_the_linear_range():
     assert published.linear_from() == pytest.approx(6.14367335767816, abs=1e-9)
 
 
-def test_corner_transition_agrees_with_the_ridge():
-    switch = published.corner_takes_over()
-    below, above = zwidth.alpha_max(np.array([switch - 1e-6, switch + 1e-6]), 0).kind
-    assert (below, above) == (zwidth.RidgeKind.SMOOTH, zwidth.RidgeKind.CORNER)
-
-
 def test_line_of_minus_one_appears_at_the_threshold():
     threshold = published.line_appears()
     below = zwidth.stable_region(threshold - 1e-3, 0)

@@ -207,3 +207,44 @@ def test_run_writes_all_files(tmp_path):
     assert all((tmp_path / "out" / name).stat().st_size for name in names)
     header = (tmp_path / "out" / "s.csv").read_text(encoding="utf-8").splitlines()[0]
     assert header.startswith("label,stiffness_N_per_m,virtual_damping_N_s_per_m,time_s,position_m,velocity_m_per_s")
+
+
+TOOL = {**DEVICE, "damping": 10, "tool": {"mass": 0.3}}
+
+
+def test_coupling_to_a_tool():
+    study = make_study(
+        device=TOOL, stiffness_fraction=[0.98, 1.02], start_position=1e-3, tool_position="0.5 mm", substeps=2
+    )
+    outcome = study.compute(None, True)
+    assert ["decays" in outcome.notes[0], "grows" in outcome.notes[1]] == [True, True]
+    tool, force = outcome.table["tool_position_m"], outcome.table["coupling_force_N"]
+    assert tool.size == outcome.table["position_m"].size
+    assert tool[0] == 0.5e-3
+    top = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), tool=zwidth.Tool(0.3)).max_stiffness()
+    assert force[0] == pytest.approx(0.98 * top.stiffness * 0.5e-3, rel=1e-9)
+    panels = outcome.figures[""]()
+    assert panels[1].get_ylabel().startswith("coupling force")
+
+
+@pytest.mark.parametrize(
+    ("keys", "field", "message"),
+    [
+        ({"device": TOOL, "contact": "unilateral"}, "contact", "no surface"),
+        (
+            {
+                "device": {**TOOL, "tool": {"mass": 0.3, "integrator": "implicit"}},
+                "velocity": {"kind": "foaw", "noise": "1 um"},
+                "walls": [{"stiffness": 1e3, "virtual_damping": 5}],
+            },
+            "velocity",
+            "implicit Euler method needs a linear coupling",
+        ),
+        ({"tool_position": 0}, "tool_position", "given without a tool"),
+    ],
+)
+def test_unsupported_tools_are_refused(keys, field, message):
+    keys = keys if "walls" in keys else {"stiffness_fraction": [0.5], **keys}
+    with pytest.raises(ValueError, match=message) as caught:
+        make_study(**keys)
+    assert field in str(caught.value)

@@ -291,7 +291,7 @@ def _in_seconds(scene: Scene) -> Scene:
 def _show_scene(given: Any, origin: Any) -> Controls:
     """Return the controls for the scene of a configuration; the default wall has half the maximum stiffness."""
     device = getattr(given, "device", None)
-    if device is not None and (isinstance(device, ResponseSection) or device.sampled):
+    if device is not None and (isinstance(device, ResponseSection) or getattr(device, "sampled", None)):
         raise InputError(
             f"{origin}: scene.device: the page needs a model for all rates, not a response or a sampled system; "
             "use zwidth check or zwidth run"

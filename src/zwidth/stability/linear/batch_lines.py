@@ -21,8 +21,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.core.types import Array
-from zwidth.core.xp import iterate, namespace
+from zwidth.core.xp import namespace
 from zwidth.model.circle_functions import distances_inside
+from zwidth.numerics.root_finding import illinois, newton
 from zwidth.stability.linear.loop_batch import Sampled, Values, evaluate, split_values
 
 MOST_CROSSINGS = 12  # sign changes of k per line without delay; the result of a line with more is doubtful
@@ -177,17 +178,12 @@ def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
     low, first, high, last = brackets
     part, each = loops.loop.take(index[1]), _take_line(line, index[1], n)
     rising = last > first
+    sign = xp.where(rising, 1.0, -1.0)
 
-    def refine(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        low, high, x, move = state
-        parts, slopes = split_values(evaluate(loops.form, part, x))
-        value = combine(each, parts)
-        passed = (value > 0) == rising
-        low, high = xp.where(passed, low, x), xp.where(passed, x, high)
-        new = x - value / combine(each, slopes)
-        new = xp.where((new >= low) & (new <= high), new, 0.5 * (low + high))
-        done = move <= CONVERGED_STEP * x
-        return low, high, xp.where(done, x, new), xp.where(done, move, xp.abs(new - x))
+    def rise(x: Array) -> tuple[Array, Array]:
+        """Return k and dk/dw, with the sign with which k increases over the bracket."""
+        k, slope = (combine(each, values) for values in split_values(evaluate(loops.form, part, x)))
+        return sign * k, sign * slope
 
     # Start from the zero of the secant; next to an extremum, start from the zero of a parabola with its vertex there.
     share = first / xp.where(first == last, 1.0, first - last)
@@ -195,8 +191,7 @@ def find_crossings(loops: Sampled, line: Line) -> LineCrossings:
     splits = cells.cell.size, cells.cell.size + turns.cell.size
     share = xp.concatenate([share[: splits[0]], far[splits[0] : splits[1]], near[splits[1] :]])
     start = low + share * (high - low)
-    state = iterate(STEPS, refine, (low, high, start, high - low), xp, lambda old, new: bool(np.all(old[2] == new[2])))
-    crossing, move = state[2:]
+    crossing, move = newton(rise, low, high, start, STEPS, CONVERGED_STEP)
     crosses = (first > 0) != (last > 0)
     t = xp.where(crosses, find_position(each, evaluate(loops.form, part, crossing)), np.inf)
     leaving = xp.where(crosses, xp.where(rising, 2.0, -2.0), 0.0)
@@ -267,22 +262,12 @@ def _find_turns(
     xp, w = namespace(loops.w), loops.w
     part, each = loops.loop.take(turns.loop), _take_line(line, turns.loop, w.shape[1])
 
-    def bisect(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        low, high, first, last, x, side = state
-        value = combine(each, split_values(evaluate(loops.form, part, x))[1])
-        before = (value > 0) == (first > 0)
-        # Illinois method, a variant of regula falsi, for the zero of the derivative of k
-        new_first = xp.where(before, value, xp.where(side < 0, 0.5 * first, first))
-        new_last = xp.where(before, xp.where(side > 0, 0.5 * last, last), value)
-        low, high = xp.where(before, x, low), xp.where(before, high, x)
-        new = high - new_last * (high - low) / (new_last - new_first)
-        new = xp.where((new > low) & (new < high), new, 0.5 * (low + high))
-        return low, high, new_first, new_last, new, xp.where(before, 1.0, -1.0)
+    def evaluate_slope(x: Array) -> Array:
+        """Return the derivative of k, which is 0 at an extremum."""
+        return combine(each, split_values(evaluate(loops.form, part, x))[1])
 
-    low, high = w[turns.cell, turns.loop], w[turns.cell + 1, turns.loop]
-    first, last = slope[turns.cell, turns.loop], slope[turns.cell + 1, turns.loop]
-    begin = low, high, first, last, 0.5 * (low + high), 0.0 * low
-    x = iterate(TURN_STEPS if turns.cell.size else 0, bisect, begin, xp)[4]
+    low, high, first, last = (values[turns.cell + k, turns.loop] for values in (w, slope) for k in (0, 1))
+    x, _ = illinois(evaluate_slope, low, high, first, last, TURN_STEPS if turns.cell.size else 0, CONVERGED_STEP)
     parts = split_values(evaluate(loops.form, part, x))[0]
     value, node = combine(each, parts), k[turns.cell, turns.loop]
     size = sum(

@@ -27,6 +27,7 @@ import numpy as np
 from zwidth.core.status import RidgeKind
 from zwidth.core.types import Array
 from zwidth.core.xp import iterate, namespace
+from zwidth.numerics.root_finding import illinois
 from zwidth.stability.linear.batch_lines import (
     Line,
     LineCrossings,
@@ -285,19 +286,6 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
     def slope(w: Array) -> Array:
         return _trace(evaluate(form, loop, w)).alpha_slope
 
-    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        low, high, first, last, x, side, move = state
-        value = slope(x)
-        before = value > 0
-        last = xp.where(before, xp.where(side > 0, 0.5 * last, last), value)
-        first = xp.where(before, value, xp.where(side < 0, 0.5 * first, first))
-        low, high = xp.where(before, x, low), xp.where(before, high, x)
-        new = high - last * (high - low) / (last - first)
-        new = xp.where((new > low) & (new < high), new, 0.5 * (low + high))
-        done = move <= CONVERGED_STEP * x
-        move = xp.where(done, move, xp.abs(new - x))
-        return low, high, first, last, xp.where(done, x, new), xp.where(before, 1.0, -1.0), move
-
     # Use the narrowest bracket over which the derivative of alpha changes from positive to negative.
     low, high = brackets[-1]
     first, last = slope(low), slope(high)
@@ -306,8 +294,7 @@ def _find_peak(form: Form, loop: LoopBatch, brackets: list[tuple[Array, Array]])
         better = (ends[0] > 0) & (ends[1] < 0)
         pairs = zip((*bracket, *ends), (low, high, first, last), strict=True)
         low, high, first, last = (xp.where(better, new, old) for new, old in pairs)
-    begin = low, high, first, last, 0.5 * (low + high), 0.0 * low, high - low
-    *_, x, _, move = iterate(SECANT_STEPS, step, begin, xp, lambda old, new: bool(np.all(old[4] == new[4])))
+    x, move = illinois(slope, low, high, first, last, SECANT_STEPS, CONVERGED_STEP)
     return x, (first > 0) & (last < 0) & (move <= CONVERGED_PEAK * x)
 
 

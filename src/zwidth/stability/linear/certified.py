@@ -31,6 +31,7 @@ from zwidth.model.loop_estimates import LoopEstimates, build_estimates
 from zwidth.model.mechanism import AnyChain, build_chain
 from zwidth.model.tool import ToolResponse
 from zwidth.numerics.balls import BITS, available
+from zwidth.stability.linear.composition import find_roots
 
 if TYPE_CHECKING:
     import flint
@@ -116,49 +117,47 @@ def _expand_polynomials(scene: Any) -> tuple[flint.arb_poly, flint.arb_poly, fli
     lag = chain.n_delay + (1 if chain.d > chain.n_delay else 0)
     delayed = flint.arb_poly([0] * lag + denominator.coeffs())
     estimates = build_estimates(exact)
-    if estimates is not None:
-        D, N1, N2 = _expand_estimates(estimates, numerator, delayed)
-        return D, N1 * unit, N2 * (unit / period), False
-    estimate = _exact_estimate(exact, scene.velocity, scene.timing.period)
-    f_numerator, f_denominator = _expand_estimate(estimate)
+    if estimates is None:
+        estimates = LoopEstimates(velocity=_exact_estimate(exact, scene.velocity, scene.timing.period))
+    polynomials = _expand_estimates(estimates, numerator, delayed)
     has_integrator = chain.has_integrator
     if exact.tool is not None:
         free = scene.tool.stiffness == 0
-        response = exact.tool.respond(exact.mass, period)
-        numerator, delayed = _add_tool(numerator, delayed, response, int(free and has_integrator))
+        at_one = free and bool(np.any(find_roots(build_chain(scene)).poles == 0)) and polynomials[0](1).contains(0)
+        polynomials = _add_tool(*polynomials, estimates.of_tool, exact.tool.respond(exact.mass, period), int(at_one))
         has_integrator = has_integrator or free
+    D, N1, N2 = polynomials
     # F(1) is exactly 0 if F is a windowed difference, or if one of its zeros is exactly z = 1.
-    has_rest = has_integrator and (
-        estimate.window > 0 or any(offset == 0 for offset in np.asarray(estimate.zeros).tolist())
-    )
-    return (
-        delayed * f_denominator,
-        numerator * f_denominator * unit,
-        numerator * f_numerator * (unit / period),
-        has_rest,
-    )
+    F = estimates.velocity
+    has_rest = has_integrator and (F.window > 0 or any(offset == 0 for offset in np.asarray(F.zeros).tolist()))
+    has_rest = has_rest and scene.position is None and scene.feedback is None
+    return D, N1 * unit, N2 * (unit / period), has_rest
 
 
 def _add_tool(
-    numerator: flint.arb_poly, denominator: flint.arb_poly, response: ToolResponse, common: int
-) -> tuple[flint.arb_poly, flint.arb_poly]:
-    """Return numerator and denominator of G + G_t, the sum of the responses of the plant and of a simulated tool.
+    D: flint.arb_poly, N1: flint.arb_poly, N2: flint.arb_poly, velocity: Estimate, response: ToolResponse, common: int
+) -> tuple[flint.arb_poly, flint.arb_poly, flint.arb_poly]:
+    """Add a simulated tool to the characteristic polynomial ``D + alpha N1 + beta N2`` of a device.
+
+    The responses of the device are P H = N1/D and V H = N2/D, and those of the tool are G_t and V_t G_t, so that the
+    new characteristic polynomial is that of ``1 + alpha (P H + G_t) + beta (V H + V_t G_t)``.
 
     Args:
-        numerator: numerator of G.
-        denominator: denominator of G, with its poles at z = 0.
+        D, N1, N2: the polynomials of the device.
+        velocity: velocity estimate V_t of the tool.
         response: response G_t of the tool.
-        common: 1 if both G and G_t have a pole at exactly z = 1, which their sum has only once; otherwise 0.
+        common: 1 if D and the denominator of G_t have a common zero at exactly z = 1, which counts once; otherwise 0.
     """
     import flint
 
     gain, power, a2, a1, a0 = response
     zeta = flint.arb_poly([-1, 1])
-    # With zeta = z - 1, the denominator of G_t is a2 zeta^2 + a1 zeta + a0. A tool without spring has a0 = 0. If G also
-    # has a pole at z = 1, omit the factor zeta of one of the two denominators.
+    # With zeta = z - 1, the denominator of G_t is a2 zeta^2 + a1 zeta + a0. A tool without spring has a0 = 0. If D also
+    # has a zero at z = 1, omit the factor zeta of one of the two denominators.
     tool = zeta * a2 + flint.arb_poly([a1]) if common else zeta * zeta * a2 + zeta * a1 + flint.arb_poly([a0])
-    rest = denominator // zeta if common else denominator
-    return numerator * tool + rest * flint.arb_poly([0] * power + [1]) * gain, denominator * tool
+    rest = (D // zeta if common else D) * flint.arb_poly([0] * power + [1]) * gain
+    v_numerator, v_denominator = _expand_estimate(velocity)
+    return D * tool * v_denominator, (N1 * tool + rest) * v_denominator, N2 * tool * v_denominator + rest * v_numerator
 
 
 def _expand_estimates(

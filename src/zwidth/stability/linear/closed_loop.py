@@ -4,17 +4,21 @@ In normalized units, the controller of the wall (alpha, beta) computes the force
 
     u = -(alpha + beta F) y           with a velocity estimate F
     u = -(alpha P + beta V + R) y     with a position estimate P, a velocity estimate V and further feedback R
-    u = -C/(1 + C G_t) y              with a simulated tool: C is one of the two controllers above, now a coupling, and
-                                      G_t the response of the tool's position to the force
+
+With a simulated tool, u is the force of a virtual coupling between device and tool, plus R (`_couple_tool`).
 
 An external force, held constant over each period, acts on the first body without delay.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 
 from zwidth.model.estimate import Estimate
+from zwidth.model.loop_estimates import LoopEstimates
 from zwidth.model.mechanism import AnyChain
 from zwidth.model.state_space import StateSpace, connect_in_series, realize_estimate, realize_estimates
 from zwidth.model.tool import ToolResponse
@@ -37,21 +41,48 @@ def _realize_controller(chain: AnyChain, alpha: float, beta: float) -> StateSpac
     return StateSpace(f.A, f.B, beta * f.C, alpha + beta * f.D)
 
 
-def _couple_tool(coupling: StateSpace, tool: ToolResponse) -> StateSpace:
-    """Return the state-space model from the position x of the device to the force of a virtual coupling.
+def _couple_tool(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse) -> StateSpace:
+    """Return the state-space model from the position x of the device to its force, with a virtual coupling to a tool.
 
-    The coupling C connects the device with a simulated tool at the position y = G_t f. Its force f = C (x - y) is
-    therefore ``C/(1 + C G_t) x``.
+    The coupling computes ``f = alpha (P x - y) + beta (V x - V_t y)`` from x and the position y = G_t f of the tool.
+    The force is f + R x. If V is no observer and no input of R, one filter computes V x - V_t y from a difference.
     """
+    estimates = chain.estimates or LoopEstimates(velocity=chain.estimate)
+    if estimates.uses_velocity:
+        # Filter x and y separately, because R or the observer needs V x.
+        program, sources = realize_estimates(estimates), np.array([[alpha, beta, 0.0], [0.0] * 3, [0.0, 0.0, 1.0]])
+    else:
+        # Without the velocity filter, the second output is its input: P x, or x for the structure "separate".
+        program = realize_estimates(replace(estimates, velocity=Estimate(0)))
+        sources = np.array([[alpha, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     plant = factor_tool(tool)
-    y = realize_estimate(Estimate(0, plant.gain, 0, plant.zeros, plant.poles))
-    # The distance x - y is ``share`` times x plus ``states`` times the states of coupling and tool.
-    share = 1.0 / (1.0 + float(y.D[0, 0] * coupling.D[0, 0]))
-    states = -share * np.concatenate([y.D @ coupling.C, y.C], 1)
-    C = np.pad(coupling.C, ((0, 0), (0, len(y.A)))) + coupling.D @ states
-    A = np.block([[coupling.A, np.zeros((len(coupling.A), 2))], [np.zeros((2, len(coupling.A))), y.A]])
-    A += np.concatenate([coupling.B @ states, y.B @ C])
-    return StateSpace(A, share * np.concatenate([coupling.B, y.B @ coupling.D]), C, share * coupling.D)
+    difference, response = (
+        realize_estimate(estimates.of_tool),
+        realize_estimate(Estimate(0, plant.gain, 0, plant.zeros, plant.poles)),
+    )
+    # States: those of the program, the velocity filter and the tool. Each signal is a row of factors of the states and
+    # of x, in the last column. The filter has the input ``rest - y``, and the coupling has the force
+    # ``spring - alpha y + beta (filter output)``.
+    sizes = [len(program.A), len(difference.A), len(response.A)]
+    ends = np.cumsum([0, *sizes])
+    rows = np.eye(ends[-1] + 1)
+    own, filtered, moved = (rows[start:end] for start, end in pairwise(ends.tolist()))
+    x = rows[-1:]
+    spring, rest, further = (sources @ (program.C @ own + program.D @ x))[:, None]
+    through = float(response.D[0, 0])
+    gain = alpha + beta * float(difference.D[0, 0])
+    still = response.C @ moved
+    # Solve y = still + through f together with the force f.
+    f = spring - alpha * still + beta * (difference.C @ filtered + difference.D @ (rest - still))
+    f = f / (1.0 + gain * through)
+    y = still + through * f
+    states = [
+        program.A @ own + program.B @ x,
+        difference.A @ filtered + difference.B @ (rest - y),
+        response.A @ moved + response.B @ f,
+    ]
+    table, force = np.concatenate(states), f + further
+    return StateSpace(table[:, :-1], table[:, -1:], force[:, :-1], force[:, -1:])
 
 
 def realize_closed_loop(chain: AnyChain, alpha: float, beta: float, tool: ToolResponse | None = None) -> StateSpace:
@@ -59,8 +90,8 @@ def realize_closed_loop(chain: AnyChain, alpha: float, beta: float, tool: ToolRe
 
     With a tool, the wall (alpha, beta) is the coupling between device and tool.
     """
-    controller = _realize_controller(chain, alpha, beta)
-    controller = controller if tool is None else _couple_tool(controller, tool)
+    arguments = chain, alpha, beta
+    controller = _realize_controller(*arguments) if tool is None else _couple_tool(*arguments, tool)
     loop, filter_order = connect_in_series(controller, sample_states(chain).realize()), len(controller.A)
     A, _, external = chain.realize()
     B = np.zeros((len(loop.A), 1))

@@ -13,6 +13,11 @@ The zeros of 1 + H R are poles of G. They are computed like closed-loop poles, b
 of P, V and R cancel by construction, never by a comparison of rounded roots. *Shared* roots are the last zeros of G,
 which are also the last poles of F. Roots are stored as *offsets* 1 - root. The *lag* of a transfer function is its
 number of factors 1/z; a negative lag is a number of factors z.
+
+A simulated tool at the position y adds its response G_t. A virtual coupling computes the force ``alpha (P x - y) +
+beta (V x - V_t y)`` from the position x of the device, with the velocity estimate V_t of the tool. The closed loop
+``1 + alpha (P H + G_t) + beta (V H + V_t G_t) = 0`` is also that of a plant G with a velocity estimate F, with
+``H = plant/(1 + plant R)`` (docs/theory/passivity.md, U7).
 """
 
 from __future__ import annotations
@@ -25,6 +30,7 @@ from zwidth.model.estimate import Estimate
 from zwidth.model.feedback import Weights
 from zwidth.model.loop_estimates import LoopEstimates
 from zwidth.model.mechanism import AnyChain
+from zwidth.plant.composed_plant import add_plants
 from zwidth.plant.factored_plant import FactoredPlant, factor_chain
 from zwidth.stability.linear.poles import find_poles
 from zwidth.stability.linear.roots import LoopRoots
@@ -55,6 +61,47 @@ def compose_loop(plant: FactoredPlant, estimates: LoopEstimates) -> LoopRoots:
     if feedback is not None and feedback.weights is not None:
         loop = _close_estimated(loop, feedback.filter, feedback.weights)
     return loop if feedback is None else replace(loop, inner=(plant, estimates))
+
+
+def compose_coupling(device: LoopRoots, estimates: LoopEstimates | None, tool: FactoredPlant) -> LoopRoots:
+    """Return the loop of a virtual coupling, with the response of a simulated tool added to the loop of a device.
+
+    Args:
+        device: the loop of the device without a tool, i.e. with ``G = P H`` and ``F = V/P``.
+        estimates: the estimates P and V of the device; None if P is 1.
+        tool: the response G_t of the tool.
+    """
+    plant, F = add_plants(device, tool), device.estimate
+    if estimates is None or estimates.structure == "series":
+        # With V = P F and V_t = F, the velocity estimate of the coupling is F, too.
+        return LoopRoots(**vars(plant), estimate=F)
+    V, gain, lag = estimates.velocity, device.gain * float(F.gain), device.lag + F.lag
+    if estimates.structure == "separate":
+        # V_t is V, so that V H + V_t G_t = V (H + G_t). The zeros of F = V/P are those of V, then the poles of P. If V
+        # is an input of R, the poles of V are zeros of H, because they are not poles of G F = V H.
+        released = V.poles[: 0 if device.free_poles.size else None]
+        zeros = np.concatenate([device.free_zeros, F.zeros[np.size(V.zeros) :], released])
+        outer, second = V, tool
+        first = _build_plant(gain / float(V.gain), lag - V.lag, zeros, device.poles)
+    else:
+        # V_t is the backward difference (z - 1)/z. Its factor 1/z is split off.
+        outer = Estimate(0, lag=1)
+        first = _build_plant(gain, lag - 1, np.concatenate([device.free_zeros, F.zeros]), device.poles)
+        second = replace(tool, zeros=np.append(tool.zeros, 0.0))
+    total = add_plants(first, second)
+    estimate = Estimate(
+        outer.window,
+        float(outer.gain) * total.gain / plant.gain,
+        outer.lag + total.lag - plant.lag,
+        np.concatenate([outer.zeros, total.zeros]),
+        np.concatenate([outer.poles, plant.zeros]),
+    )
+    return LoopRoots(**vars(plant), estimate=estimate, shared=plant.zeros.size)
+
+
+def _build_plant(gain: float, lag: int, zeros: np.ndarray, poles: np.ndarray) -> FactoredPlant:
+    """Return a plant with a nonnegative lag; a negative lag -k becomes k zeros at z = 0."""
+    return FactoredPlant(gain, max(lag, 0), np.concatenate([zeros, np.ones(max(-lag, 0))]), poles)
 
 
 def _build_loop(

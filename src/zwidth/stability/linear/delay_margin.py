@@ -151,7 +151,8 @@ def count_outside(
     # Start at a real z slightly above 1, where L is real. From there, the path around n poles at z = 1 changes the
     # phase of L by -n pi/2.
     is_integrator = np.abs(loop.open_poles) <= POLE_AT_ONE
-    n = np.count_nonzero(is_integrator)
+    # Each zero at exactly z = 1, such as that of a coupling with a free tool, changes the phase by +pi/2.
+    n = int(np.count_nonzero(is_integrator) - np.count_nonzero(loop.terms[0].zeros == 0))
     sign = _find_sign(loop, is_integrator, alpha, beta)
     start = np.where(sign < 0, np.pi, 0.0)
     first = start - 0.5 * np.pi * n + np.angle(L[:, 0] * sign * 1j**n)
@@ -182,7 +183,8 @@ def _find_sign(loop: LoopRoots, is_integrator: np.ndarray, alpha: np.ndarray, be
         beta: normalized damping, shape (walls,).
     """
     plant, terms = loop.terms
-    product = plant.gain * (np.prod(plant.zeros) / np.prod(loop.open_poles[~is_integrator])).real
+    zeros = plant.zeros[plant.zeros != 0]
+    product = plant.gain * (np.prod(zeros) / np.prod(loop.open_poles[~is_integrator])).real
     if loop.inner is None:
         spring = alpha + beta * loop.estimate.jet(circle_points(np.zeros(1))).value[0].real
         return np.sign(spring * product)

@@ -22,12 +22,12 @@ import numpy as np
 from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import Status
 from zwidth.core.types import Array
-from zwidth.model.circle_functions import circle_points
+from zwidth.model.circle_functions import Jet, circle_points
 from zwidth.model.estimate import Estimate
 from zwidth.model.loop_estimates import build_estimates
 from zwidth.model.mechanism import build_chain
 from zwidth.model.parameter_paths import list_parameters
-from zwidth.numerics.taylor import Implicit, Taylor, differentiate_implicitly, flow, seed, solve, stack
+from zwidth.numerics.taylor import Taylor, differentiate_implicitly, flow, replace_derivatives, seed, solve, stack
 from zwidth.stability.linear.ridge import Condition, RidgeSolution
 from zwidth.units.display import compact_repr
 from zwidth.units.quantities import WALL
@@ -37,8 +37,6 @@ RESPONSE_TOLERANCE = 1e-8  # largest relative difference of q = -1/G computed fr
 # difference is used for velocity estimates that accept only floats.
 CENTRAL_DIFFERENCE = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
 DIFFERENCE_STEP = 1e-3
-
-Pair = tuple[Taylor, Taylor]  # a function of lambda and its derivative
 
 
 class LoopTerms:
@@ -75,8 +73,17 @@ class LoopTerms:
             self.psi, self.full = flow(A, B, self.one)
             self.late = flow(A, B, self.one - (delay - n))[1]
 
-    def controller(self, lam: Taylor) -> Pair:
-        """Return q = -1/G and its derivative in lambda = log z."""
+    def controller(self, lam: Taylor) -> Jet:
+        """Return q = -1/G and its derivative in lambda = log z; with a simulated tool, G includes its response."""
+        q = self._control_device(lam)
+        if self.scene.tool is None:
+            return q
+        response = self._respond_with_tool(lam)
+        share = 1.0 / (self.one - q.value * response.value)
+        return Jet(q.value * share, (q.slope + q.value * q.value * response.slope) * share * share)
+
+    def _control_device(self, lam: Taylor) -> Jet:
+        """Return q = -1/G of the device without a tool, and its derivative in lambda."""
         z, zeta = lam.exp(), lam.expm1()
         size = len(self.full.v)
         matrix = zeta.map(lambda part: np.multiply.outer(np.eye(size), part)) - self.psi
@@ -85,69 +92,63 @@ class LoopTerms:
         change = solve(matrix, late - x * z.map(lambda part: np.asarray(part)[None]))
         q = -(lam * self.lag).exp() / x[0]
         q_slope = q * (self.one * self.lag - change[0] / x[0])
-        if self.scene.tool is not None:
-            return self._add_tool(q, q_slope, lam)
         if self.estimates is None:
-            return q, q_slope
+            return Jet(q, q_slope)
         # Here q = -1/H for the sampled plant H. With a position estimate P and further feedback R, G = H P/(1 + H R),
         # so that q = -1/G = (-1/H - R)/P (docs/theory/scenes.md, V25).
         P, R = self._evaluate_position(lam), self._evaluate_feedback(lam)
-        return _divide((q - R[0], q_slope - R[1]), P)
+        return Jet(q - R.value, q_slope - R.slope).over(P)
 
-    def feedback(self, lam: Taylor) -> Pair:
+    def feedback(self, lam: Taylor) -> Jet:
         """Return the ratio R/P of further feedback R and position estimate P, and its derivative in lambda.
 
-        The open loop L at the plant input is ``L = -(alpha + beta F + R/P)/(q + R/P)``.
+        The open loop L at the plant input is ``L = -(alpha + beta F + R/P)/(q + R/P)``. With a simulated tool, the
+        ratio is 0, because the open loop of a coupling is that of the coupling force, which excludes R.
         """
-        if self.estimates is None or self.estimates.feedback is None:
-            return self.one * 0.0, self.one * 0.0
-        return _divide(self._evaluate_feedback(lam), self._evaluate_position(lam))
+        if self.estimates is None or self.estimates.feedback is None or self.scene.tool is not None:
+            return Jet(self.one * 0.0, self.one * 0.0)
+        return self._evaluate_feedback(lam).over(self._evaluate_position(lam))
 
-    def _add_tool(self, q: Taylor, q_slope: Taylor, lam: Taylor) -> Pair:
-        """Return q/(1 - q G_t) and its derivative in lambda, for a simulated tool with the response G_t.
-
-        This is the critical controller -1/(G + G_t), because device and tool act like one device with the response
-        G + G_t (docs/theory/passivity.md, U5).
-        """
+    def _respond_with_tool(self, lam: Taylor) -> Jet:
+        """Return the response G_t of the simulated tool, and its derivative in lambda."""
         z, zeta = lam.exp(), lam.expm1()
         tool = self.varied.tool.respond(self.varied.mass, self.varied.timing.period)
         denominator = (zeta * tool.a2 + tool.a1) * zeta + tool.a0
         response = (lam * tool.power).exp() * tool.gain / denominator
-        slope = response * (tool.power - (zeta * (tool.a2 * 2.0) + tool.a1) * z / denominator)
-        share = 1.0 / (self.one - q * response)
-        return q * share, (q_slope + q * q * slope) * share * share
+        return Jet(response, response * (tool.power - (zeta * (tool.a2 * 2.0) + tool.a1) * z / denominator))
 
-    def _evaluate_position(self, lam: Taylor) -> Pair:
+    def _evaluate_position(self, lam: Taylor) -> Jet:
         """Return the position estimate P and its derivative in lambda."""
         assert self.estimates is not None
         return evaluate_estimate(self.estimates.position, lam, self.one)
 
-    def _evaluate_velocity(self, lam: Taylor) -> Pair:
+    def _evaluate_velocity(self, lam: Taylor) -> Jet:
         """Return the velocity estimate V and its derivative in lambda."""
         assert self.estimates is not None
         V = evaluate_estimate(self.estimates.velocity, lam, self.one)
-        return _multiply(V, self._evaluate_position(lam)) if self.estimates.structure == "series" else V
+        return V.times(self._evaluate_position(lam)) if self.estimates.structure == "series" else V
 
-    def _evaluate_feedback(self, lam: Taylor) -> Pair:
+    def _evaluate_feedback(self, lam: Taylor) -> Jet:
         """Return the further feedback R and its derivative in lambda."""
         assert self.estimates is not None
         feedback = self.estimates.feedback
         if feedback is None:
-            return self.one * 0.0, self.one * 0.0
+            return Jet(self.one * 0.0, self.one * 0.0)
         filtered = evaluate_estimate(feedback.filter, lam, self.one)
         if feedback.weights is None:
             return filtered
         P, V = self._evaluate_position(lam), self._evaluate_velocity(lam)
         position, velocity = (self.one * weight for weight in feedback.weights)
-        total = (position * P[0] + velocity * V[0], position * P[1] + velocity * V[1])
-        return _multiply(filtered, total)
+        total = Jet(*(position * p + velocity * v for p, v in zip(P, V, strict=True)))
+        return filtered.times(total)
 
-    def estimate(self, lam: Taylor) -> Pair:
+    def estimate(self, lam: Taylor) -> Jet:
         """Return the velocity estimate F and its derivative in lambda = log z."""
         if self.estimates is not None:
             if self.estimates.structure == "series":
                 return evaluate_estimate(self.estimates.velocity, lam, self.one)
-            return _divide(self._evaluate_velocity(lam), self._evaluate_position(lam))
+            ratio = self._evaluate_velocity(lam).over(self._evaluate_position(lam))
+            return ratio if self.scene.tool is None else self._estimate_coupling(ratio, lam)
         velocity, period = self.varied.velocity, self.varied.timing.period
         try:
             return evaluate_estimate(velocity.estimate(period), lam, self.one)
@@ -155,13 +156,23 @@ class LoopTerms:
             # A user-defined velocity estimate may accept only floats.
             return self._difference_estimate(lam)
 
-    def _difference_estimate(self, lam: Taylor) -> Pair:
+    def _estimate_coupling(self, ratio: Jet, lam: Taylor) -> Jet:
+        """Return F of a coupling and its derivative in lambda, from the ratio V/P of the estimates of the device.
+
+        F is (V H + V_t G_t)/G with G = P H + G_t, so it is ``q (V/P/q_d - V_t G_t)`` with q_d = -1/(P H).
+        """
+        assert self.estimates is not None
+        tool = evaluate_estimate(self.estimates.of_tool, lam, self.one)
+        device, moved = ratio.over(self._control_device(lam)), tool.times(self._respond_with_tool(lam))
+        return self.controller(lam).times(Jet(device.value - moved.value, device.slope - moved.slope))
+
+    def _difference_estimate(self, lam: Taylor) -> Jet:
         """Return F and F' of an estimate that accepts only floats, with first derivatives by finite differences."""
         leaves = list_leaves(self.scene)
         names = [id(each) for each in (self.varied.timing.period, *list_leaves(self.varied.velocity))]
         at = Taylor(lam.v, np.zeros(0))
 
-        def evaluate(values: list[Any]) -> Pair:
+        def evaluate(values: list[Any]) -> Jet:
             scene = replace_leaves(self.scene, iter(values))
             return evaluate_estimate(scene.velocity.estimate(scene.timing.period), at, at * 0.0 + 1.0)
 
@@ -185,35 +196,19 @@ class LoopTerms:
         return (alpha + beta * f - q) * scale, (beta * f_slope - q_slope) * scale, f
 
 
-def _multiply(first: Pair, second: Pair) -> Pair:
-    """Return the product of two functions of lambda, and the derivative of the product."""
-    return first[0] * second[0], first[1] * second[0] + first[0] * second[1]
-
-
-def _divide(first: Pair, second: Pair) -> Pair:
-    """Return the quotient of two functions of lambda, and the derivative of the quotient."""
-    value = first[0] / second[0]
-    return value, (first[1] - value * second[1]) / second[0]
-
-
-def evaluate_estimate(estimate: Estimate, lam: Taylor, one: Taylor) -> Pair:
+def evaluate_estimate(estimate: Estimate, lam: Taylor, one: Taylor) -> Jet:
     """Return F and dF/dlambda of a velocity estimate whose gain, zeros and poles are numbers or Taylor objects."""
-    z, zeta = lam.exp(), lam.expm1()
-    value, slope = one * estimate.gain, one * 0.0
+    z, zeta, F = lam.exp(), lam.expm1(), Jet(one * estimate.gain, one * 0.0)
     for zero in np.ravel(estimate.zeros):
-        factor = zeta + zero
-        value, slope = value * factor, slope * factor + value * z
+        F = F.times(Jet(zeta + zero, z))
     for pole in np.ravel(estimate.poles):
-        factor = zeta + pole
-        value = value / factor
-        slope = (slope - value * z) / factor
+        F = F.over(Jet(zeta + pole, z))
     if estimate.lag:
         power = (lam * -estimate.lag).exp()
-        value, slope = value * power, (slope - value * estimate.lag) * power
+        F = Jet(F.value * power, (F.slope - F.value * estimate.lag) * power)
     if n := estimate.window:
-        difference = -(lam * -n).expm1() / n
-        value, slope = value * difference, slope * difference + value * (lam * -n).exp()
-    return value, slope
+        F = F.times(Jet(-(lam * -n).expm1() / n, (lam * -n).exp()))
+    return F
 
 
 # Type of a function that returns the real equations of a result, such as a margin. Its arguments are q and F of the
@@ -228,8 +223,8 @@ def differentiate(
     unknowns: Sequence[float],
     equations: Equations,
     added_delay: float | None = None,
-) -> Implicit:
-    """Return the derivatives of the solution of equations in the numbers of a scene and in further parameters.
+) -> list[Taylor]:
+    """Return the unknowns of equations, with their derivatives in the numbers of a scene and in further parameters.
 
     Args:
         scene: the scene, whose numbers are floats.
@@ -241,19 +236,20 @@ def differentiate(
         added_delay: value of the first unknown if it is a delay in periods to be added to that of the scene.
 
     Returns:
-        The derivatives, NaN if they are not available.
+        Each unknown; derivatives that are not available are NaN.
     """
     n = int(np.floor(scene.d + (added_delay or 0.0)))
     leaves = list_leaves(scene)
 
-    def compute(n: int) -> Implicit:
+    def compute(n: int) -> list[Taylor]:
         variables = seed([*leaves, *parameters, *unknowns], order)
         added = None if added_delay is None else variables[len(leaves) + len(parameters)]
         terms = LoopTerms(scene, variables, n, added)
-        return differentiate_implicitly(list(equations(terms, variables[len(leaves) :])))
+        return differentiate_implicitly(equations(terms, variables[len(leaves) :]), unknowns)
 
     index, size = index_parameters(scene), len(leaves) + len(parameters)
     is_sampled = getattr(scene.device, "dt", None) is not None
+    unavailable = [Taylor(value, *(np.full([size] * k, np.nan) for k in (1, 2))) for value in unknowns]
     has_kink = not is_sampled and hasattr(scene.device, "system") and n == scene.d > 0 and added_delay is None
     with np.errstate(all="ignore"):
         try:
@@ -261,23 +257,14 @@ def differentiate(
             if has_kink:
                 # Without inertia, the result has a kink at integer delays. For the derivative in the period, use the
                 # side of smaller delays, because a longer period reduces the delay in periods.
-                _replace_derivatives(result, compute(n - 1), index["period"])
+                replace_derivatives(result, compute(n - 1), index["period"])
         except (ArithmeticError, np.linalg.LinAlgError):
-            return Implicit(*(np.full((len(unknowns), *[size] * k), np.nan) for k in (1, 2)))
+            return unavailable
     if is_sampled:
         # A device in discrete time is valid for one period and one delay only, so these derivatives do not exist.
         for path in ("period", "delay"):
-            _replace_derivatives(result, None, index[path])
+            replace_derivatives(result, unavailable, index[path])
     return result
-
-
-def _replace_derivatives(result: Implicit, other: Implicit | None, k: int) -> None:
-    """Replace the derivatives in the parameter with the index k by those of ``other``, or by NaN."""
-    result.first[:, k] = math.nan if other is None else other.first[:, k]
-    if result.second is not None:
-        second = None if other is None else other.second
-        result.second[:, k, :] = math.nan if second is None else second[:, k, :]
-        result.second[:, :, k] = math.nan if second is None else second[:, :, k]
 
 
 def index_parameters(scene: Any) -> dict[str, int]:
@@ -304,8 +291,8 @@ def split(value: Taylor) -> list[Taylor]:
     return [value.real, value.imag]
 
 
-def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> Implicit:
-    """Return the derivatives of alpha, beta and omega of the stiffest wall in all numbers of a scene (V21)."""
+def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> list[Taylor]:
+    """Return alpha, beta and omega of the stiffest wall, with their derivatives in all numbers of a scene (V21)."""
     is_pair = ridge.first == Condition.PAIR, ridge.second == Condition.PAIR
     free = [k for k in range(2) if is_pair[k]]
     extra = [ridge.alpha, ridge.beta, *((ridge.w1, ridge.w2)[k] for k in free)]
@@ -327,17 +314,10 @@ def differentiate_ridge(scene: Any, ridge: RidgeSolution, order: int) -> Implici
         r = terms.residual(alpha, beta, w[1] * 1j)[0]
         return [*result, *(split(r) if is_pair[1] else [r.real])]
 
-    result = differentiate(scene, order, [], extra, equations)
-    # Append the derivatives of the angle omega, which are 0 if omega is the constant angle of a real pole.
-    angles = (ridge.w1, ridge.w2)
-    rows = [0, 1, 2 + free.index(angles.index(ridge.omega)) if angles.index(ridge.omega) in free else None]
-
-    def select(part: np.ndarray | None) -> np.ndarray | None:
-        return None if part is None else np.stack([0.0 * part[0] if row is None else part[row] for row in rows])
-
-    first = select(result.first)
-    assert first is not None
-    return Implicit(first, select(result.second))
+    alpha, beta, *angles = differentiate(scene, order, [], extra, equations)
+    # The derivatives of omega are 0 if omega is the constant angle of a real pole.
+    k = (ridge.w1, ridge.w2).index(ridge.omega)
+    return [alpha, beta, angles[free.index(k)] if k in free else alpha * 0.0]
 
 
 @compact_repr()
@@ -362,10 +342,10 @@ def compute_sensitivities(scene: Any, ridge: RidgeSolution | None, status: Statu
     paths = list_ridge_parameters(scene)
     if ridge is None:
         return SceneSensitivities(np.float64(math.nan), dict.fromkeys(paths, math.nan), np.int32(status))
-    slopes, index = differentiate_ridge(scene, ridge, 1).first[0], index_parameters(scene)
-    varied = replace_leaves(scene, iter(seed(list_leaves(scene), 1)))
+    varied, index = replace_leaves(scene, iter(seed(list_leaves(scene), 1))), index_parameters(scene)
     unit = varied.mass / varied.timing.period / varied.timing.period
-    per = {path: float(unit.v * slopes[index[path]] + ridge.alpha * unit.first[index[path]]) for path in paths}
+    stiffness = differentiate_ridge(scene, ridge, 1)[0] * unit
+    per = {path: float(stiffness.first[index[path]]) for path in paths}
     if scene.timing.in_periods:
         per["delay"] /= scene.timing.period
     status = Status.NOT_CONVERGED if any(map(math.isnan, per.values())) else status

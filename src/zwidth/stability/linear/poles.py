@@ -15,6 +15,7 @@ delay.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -256,17 +257,17 @@ def _find_angle(loop: LoopRoots, alpha: float, beta: float, log_radius: float) -
     if not np.isfinite(log_radius):
         return np.nan
     angles = np.linspace(0.0, np.pi, POINTS_PER_POLE * loop.order)
-    zeta = np.expm1(log_radius + 1j * angles)
+    zeta, evaluate = np.expm1(log_radius + 1j * angles), partial(evaluate_polynomial, loop, *np.array([alpha, beta]))
     with np.errstate(all="ignore"):
-        P = evaluate_polynomial(loop, np.float64(alpha), np.float64(beta), zeta)
+        P = evaluate(zeta)
         distance = np.abs(P.value / P.slope)
         inner = np.pad(distance, 1, constant_values=np.inf)
         minima = np.flatnonzero((distance <= inner[:-2]) & (distance <= inner[2:]))
         zeta = zeta[minima[np.argsort(distance[minima])[:MAX_STARTS]]]
         for _ in range(NEWTON_STEPS):
-            P = evaluate_polynomial(loop, np.float64(alpha), np.float64(beta), zeta)
+            P = evaluate(zeta)
             zeta = zeta - P.value / P.slope
-        P = evaluate_polynomial(loop, np.float64(alpha), np.float64(beta), zeta)
+        P = evaluate(zeta)
         misfit = np.where(np.abs(P.value) < 1e-10 * P.size, np.abs(log_modulus(zeta) - log_radius), np.inf)
     k = np.argmin(np.where(np.isnan(misfit), np.inf, misfit))
     re, im = np.real(zeta)[k], np.abs(np.imag(zeta)[k])

@@ -130,16 +130,20 @@ class LoopRoots(FactoredPlant):
         device_poles, estimate_zeros = np.flatnonzero(self.poles == 0), np.flatnonzero(f.zeros == 0)
         if not device_poles.size or not (f.window or estimate_zeros.size):
             return None
-        # Compute the zeros of F/(z - 1) as offsets 1 - z. For a window of n samples they are the n-th roots of 1, but
-        # not 1 itself.
-        angles = 2.0 * np.pi * np.arange(1, f.window) / max(f.window, 1)
-        # Set the offset of z = -1 to exactly 2, so that it is equal to that of a zero of the device at z = -1.
-        window = np.where(angles == np.pi, 2.0, -2j * np.sin(0.5 * angles) * np.exp(0.5j * angles))
+        window = f.list_window_zeros()
         lag = self.lag + f.lag + f.window
         velocity = f.zeros if f.window else np.delete(f.zeros, estimate_zeros[0])
         zeros = np.concatenate([self.free_zeros, velocity, window, np.ones(max(-lag, 0))])
         poles = np.concatenate([np.delete(self.poles, device_poles[0]), self.free_poles])
         return LoopRoots(self.gain * float(f.gain) / max(f.window, 1), max(lag, 0), zeros, poles, Estimate())
+
+    def invert_estimate(self) -> LoopRoots:
+        """Return the loop with the plant 1/F and the backward difference. F must have as many poles as zeros."""
+        f = self.estimate
+        lag, at_one = -f.lag - f.window, np.zeros(min(f.window, 1))
+        zeros = np.concatenate([f.poles, np.ones(max(-lag, 0))])
+        poles = np.concatenate([f.zeros, at_one, f.list_window_zeros()])
+        return LoopRoots(max(f.window, 1) / float(f.gain), max(lag, 0), zeros, poles, Estimate())
 
     def contract_powers(self) -> tuple[LoopRoots, int]:
         """Return the loop in the variable z^k, for the largest k such that G and F are functions of z^k, and this k.

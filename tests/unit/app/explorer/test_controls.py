@@ -156,3 +156,18 @@ def test_rotary_device_is_preserved_by_every_conversion(operator, coupling):
     if not controls.scene.nonrigid_parts and operator == "none":
         assert controls.change({"mode": "normalized"}).change({"mode": "physical"}) == controls
     assert not controls.change({"motion": "linear"}).scene.device.rotary
+
+
+@pytest.mark.parametrize("damping", ["0", "[0.02, 0.05]", "[0.02, 0.05], rotary: true"])
+def test_arm_is_kept_in_links_and_scripts(tmp_path, damping):
+    arm = f"device: {{mass_matrix: [[0.03, 0.01], [0.01, 0.01]], direction: [1, 0], damping: {damping}}}"
+    controls = read_controls(write_config(tmp_path, f"{arm}, period: 1 ms, delay: 1 ms"))
+    assert read_link(to_link(controls)).scene.device == controls.scene.device
+    names: dict[str, Any] = {"zwidth": zwidth}
+    script = to_python(controls)
+    exec(
+        script[script.index("scene = ") : script.index(",\n    timing=")] + ",\n    timing=zwidth.Timing(1e-3))", names
+    )
+    # Numbers with units, such as "21.74 g" for the mass of a rigid arm, are equal to rounding errors.
+    assert names["scene"].device.mass == pytest.approx(controls.scene.device.mass, rel=1e-12)
+    assert names["scene"].device.rotary == controls.scene.device.rotary

@@ -92,13 +92,6 @@ def test_minus_one_coefficient_places_a_pole_at_minus_one():
             assert oracles.relative_error(limit, exact) <= tol.BOUNDARY.float64 * float(condition)
 
 
-def test_threshold_damping_of_remark_3():
-    # Above this damping the line of a pole at -1 touches the stable region: the curve then ends at pi with alpha > 0.
-    threshold = 2.31057135675369424
-    ends = zwidth.boundary(math.pi, threshold + np.array([-1e-12, 1e-12]), 0).alpha
-    assert ends[0] < 0 < ends[1]
-
-
 # Points of differentiation: d integer (derivative from the right) and fractional, including delta = 0.
 SLOPE_POINTS = [(0.3, 0.0, 0.0), (0.7, 0.2, 1.0), (1.1, 3.0, 0.4), (2.6, 2.5, 0.0), (0.2, 1e3, 4.5), (0.05, 1e-9, 8.0)]
 DIRECTIONS = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)], dtype=float)

@@ -130,15 +130,6 @@ def test_si_polynomial_is_eq_11_over_its_leading_coefficient(scene, d):
         assert_coefficients_agree(got, exact, sizes)
 
 
-def test_si_polynomial_without_damping_is_the_limit():
-    np.testing.assert_allclose(
-        characteristic_polynomial_si(0.1, 0.0, 1e-3, 50e3, 50.0, 2e-3),
-        characteristic_polynomial_si(0.1, 1e-9, 1e-3, 50e3, 50.0, 2e-3),
-        rtol=1e-10,
-    )
-    assert np.isfinite(characteristic_polynomial_si(0.1, 0.0, 1e-3, 50e3, 50.0, 2.5e-3)).all()
-
-
 @pytest.mark.parametrize("d", [0, 1, 3])
 @pytest.mark.parametrize("scene", PHYSICAL)
 def test_closed_loop_numerator_is_eq_10(scene, d):

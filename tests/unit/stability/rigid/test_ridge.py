@@ -144,15 +144,6 @@ def boundary_in_mpmath(omega, delta, d):
     return (mp.im(wall) - beta * mp.im(z)) / mp.im(z), beta
 
 
-def test_published_values():
-    undamped = zwidth.alpha_max(0.0, 0)
-    assert undamped.alpha == pytest.approx(12 - 8 * np.sqrt(2), rel=1e-15)
-    assert undamped.beta == pytest.approx(2 * np.sqrt(2) - 2, rel=1e-15)
-    corner_point = zwidth.alpha_max(4.0, 0)
-    assert corner_point.kind == RidgeKind.CORNER
-    assert corner_point.omega == np.pi
-
-
 def test_newton_agrees_with_the_general_solver():
     rng = np.random.default_rng(4)
     delta = np.concatenate([[0.0, 1e-9, 3.6, 3.7, 40.0, 1e4], 10 ** rng.uniform(-3, 3, 58)])

@@ -1,0 +1,197 @@
+"""Characteristic polynomial of an admittance display, computed without rounding errors, and its real gains.
+
+The display has the virtual mass M and damping D; the environment has the stiffness K and damping B. T is the sampling
+period, z = e^(sT), and ``zeta = z - 1``. The delay of the command is n + f periods, with the integer part n. Three
+responses describe the loop: Y(z) from the contact force to the command, P(z) from the command to the position of the
+robot, and V(z) from the command to the velocity of the robot. The closed loop is ``1 + Y (K P + B V) = 0`` with
+
+    Y = N_Y/(M q_M + D q_D),   P = N_P/(Q z^lag),   V = N_V/(Q z^lag)
+
+where N_Y, q_M, q_D, N_P, N_V and Q are polynomials and ``lag`` is an integer. Multiplied by all denominators, the
+characteristic polynomial is ``M p_M + D p_D + K p_K + B p_B`` (docs/theory/admittance.md, W1 to W4; there, Q includes
+the factor z^lag).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property, lru_cache, reduce
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from zwidth.core.errors import InputError
+from zwidth.model.actuator import Actuator
+from zwidth.model.exact_polynomials import Polynomial, characteristic_polynomial, multiply, subtract, trim
+from zwidth.model.linear_device import LinearDevice
+from zwidth.model.linear_plant import System
+from zwidth.model.velocity import Estimate
+from zwidth.plant.sampled_states import sample_states
+
+Command = Literal["position", "velocity"]
+Integrator = Literal["semi-implicit", "trapezoidal"]
+KEPT_LOOPS = 64  # cached loops; displays that differ only in M and D share one
+
+# Polynomials in zeta; the coefficient of the highest power is the first one.
+ZETA: Polynomial = (Fraction(1), Fraction(0))
+Z: Polynomial = (Fraction(1), Fraction(1))  # z = zeta + 1
+TWO: Polynomial = (Fraction(1), Fraction(2))  # z + 1 = zeta + 2
+ONE: Polynomial = (Fraction(1),)
+
+
+class Coefficients(NamedTuple):
+    """The four polynomials in z in the characteristic polynomial ``M p_M + D p_D + K p_K + B p_B``."""
+
+    mass: Polynomial  # p_M, multiplied by the virtual mass M
+    damping: Polynomial  # p_D, multiplied by the virtual damping D
+    stiffness: Polynomial  # p_K, multiplied by the stiffness K of the environment
+    environment_damping: Polynomial  # p_B, multiplied by the damping B of the environment
+
+
+class ProgramPolynomials(NamedTuple):
+    """The response ``Y = numerator/(M mass + D damping)`` of the command to the contact force, in powers of zeta."""
+
+    numerator: Polynomial  # N_Y
+    mass: Polynomial  # q_M
+    damping: Polynomial  # q_D
+
+
+class RobotPolynomials(NamedTuple):
+    """The responses ``P = position/(Q z^lag)`` and ``V = velocity/(Q z^lag)`` of the robot, in powers of zeta."""
+
+    position: Polynomial  # N_P
+    velocity: Polynomial  # N_V; empty for a sampled robot, because such a model does not define the velocity
+    denominator: Polynomial  # Q
+    lag: int
+
+
+@dataclass(frozen=True)
+class AdmittanceLoop:
+    """The parts of an admittance display that do not depend on its virtual mass and damping."""
+
+    robot: Any  # `Actuator` or `LinearDevice`, from the command to the motion of the robot
+    period: float  # T in s
+    d: float  # delay in periods
+    command: Command
+    integrator: Integrator
+
+    @property
+    def n_delay(self) -> int:
+        """Integer part n of the delay in periods."""
+        return int(np.floor(self.d))
+
+    @cached_property
+    def plant(self) -> LinearDevice:
+        """Model of the robot, from its position or velocity command to its position."""
+        device = self.robot
+        if isinstance(device, Actuator):
+            w = float(device.rate)
+            lags = {1: ([w], [1.0, w]), 2: ([w * w], [1.0, 2.0 * float(device.damping_ratio or 0.0) * w, w * w])}
+            device = LinearDevice(lags[device.order])
+        if self.command == "position":
+            return device
+        numerator, denominator, _ = device.system
+        return LinearDevice((numerator, (*denominator, Fraction(0))))
+
+    def make_system(self) -> System:
+        """Return the plant in units of the sampling period; raise `InputError` if it cannot be sampled."""
+        system = System(self.plant, self.period, self.period**2, self.d, self.n_delay, Estimate())
+        system.check()
+        return system
+
+    def check_damper(self, damping: float) -> None:
+        """Raise `InputError` if the environment has a damper, but the model of the robot does not define a velocity."""
+        if damping and self.plant.dt:
+            raise InputError(
+                "environment_damping: got a damper with a sampled robot, whose velocity is unknown; use a model in s"
+            )
+
+    @cached_property
+    def program(self) -> ProgramPolynomials:
+        """Response Y of the command to the contact force (docs/theory/admittance.md, W4)."""
+        period = (Fraction(self.period),)
+        half = (Fraction(self.period) / 2,)
+        if self.integrator == "trapezoidal":
+            numerator, mass, damping = reduce(multiply, (half, Z, TWO)), multiply(Z, ZETA), multiply(half, TWO)
+            path = multiply(half, TWO)
+        else:
+            numerator, mass, damping = multiply(period, Z), ZETA, period
+            path = multiply(period, Z)
+        if self.command == "velocity":
+            return ProgramPolynomials(numerator, mass, damping)
+        # The position command integrates the virtual velocity once more, with the response path/zeta.
+        return ProgramPolynomials(multiply(numerator, path), multiply(mass, ZETA), multiply(damping, ZETA))
+
+    @cached_property
+    def sampled_robot(self) -> RobotPolynomials:
+        """Responses P and V, computed from the matrices Psi and Gamma of the sampled robot (W2 and W3)."""
+        system = self.make_system()
+        if self.plant.dt:
+            numerator, denominator = (to_zeta(part) for part in self.plant.system[:2])
+            return RobotPolynomials(numerator, (), denominator, self.n_delay)
+        states, (A, B, _) = sample_states(system), system.realize()
+        psi = _to_fractions(states.psi)
+        whole = _to_fractions(states.full)
+        late = whole if states.late is None else _to_fractions(states.late)
+        denominator = characteristic_polynomial(psi)
+
+        def respond(output: np.ndarray) -> Polynomial:
+            """Return ``c adj(zeta - Psi) (zeta Gamma(1 - f) + Gamma(1))`` for the row c = ``output``.
+
+            Both terms follow from determinants by the matrix determinant lemma.
+            """
+            first, second = (
+                subtract(denominator, characteristic_polynomial(psi + np.outer(force, output)))
+                for force in (late, whole)
+            )
+            return add(multiply(first, ZETA), second)
+
+        sensor = _to_fractions(np.eye(len(B))[0])
+        velocity = add(respond(_to_fractions(A[0])), multiply((Fraction(float(B[0])),), denominator))
+        # The numerator of V is zero at z = 1 (W3). Set its constant coefficient to exactly 0, because a rounding error
+        # would separate the pole at z = 1, a drift of the position, from the zero that cancels it.
+        velocity = trim((*(value / Fraction(self.period) for value in velocity[:-1]), Fraction(0)))
+        return RobotPolynomials(respond(sensor), velocity, denominator, self.n_delay + 1)
+
+    @cached_property
+    def coefficients(self) -> Coefficients:
+        """The polynomials p_M, p_D, p_K and p_B, computed from floats without rounding errors."""
+        (position, velocity, denominator, lag), program = self.sampled_robot, self.program
+        common = multiply(denominator, reduce(multiply, [Z] * lag, ONE))
+        parts = (multiply(program.mass, common), multiply(program.damping, common))
+        parts = (*parts, multiply(program.numerator, position), multiply(program.numerator, velocity))
+        return Coefficients(*map(to_z, parts))
+
+
+find_loop = lru_cache(KEPT_LOOPS)(AdmittanceLoop)
+"""Return the `AdmittanceLoop` with the given fields, from a cache."""
+
+
+def _to_fractions(values: Any) -> np.ndarray:
+    """Return an array of floats as exact fractions."""
+    floats = np.asarray(values, float)
+    return np.array([Fraction(value) for value in floats.ravel().tolist()], object).reshape(floats.shape)
+
+
+def add(one: Polynomial, other: Polynomial) -> Polynomial:
+    """Return the sum of two polynomials."""
+    return subtract(one, tuple(-value for value in other))
+
+
+def to_z(polynomial: Polynomial) -> Polynomial:
+    """Return the coefficients in z of a polynomial in zeta = z - 1."""
+    return _substitute(polynomial, -1)
+
+
+def to_zeta(polynomial: Polynomial) -> Polynomial:
+    """Return the coefficients in zeta of a polynomial in z = zeta + 1."""
+    return _substitute(polynomial, 1)
+
+
+def _substitute(polynomial: Polynomial, offset: int) -> Polynomial:
+    """Return the coefficients of the polynomial p(x + offset) in x, by Horner's method."""
+    result: Polynomial = ()
+    for value in polynomial:
+        result = add(multiply(result, (Fraction(1), Fraction(offset))), (value,)) if result else trim((value,))
+    return result

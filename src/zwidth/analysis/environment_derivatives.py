@@ -1,0 +1,177 @@
+"""Compute the largest stable stiffness of the environment of an admittance display, with exact derivatives, in NumPy.
+
+Symbols as in `zwidth.analysis.admittance_loop`; w is the angle of the pole on the unit circle, in rad per period, and
+``z = e^(jw)``. The limit K and the angle w solve the closed loop divided by Y,
+
+    (M q_M + D q_D)/N_Y + K P + B V = 0
+
+With the matrices A and b of the robot, in sampling periods, Psi = e^A - 1, and Gamma(t), the state at the time t after
+a unit command from rest, P and V follow from the vector X (docs/theory/admittance.md, W2 and W3):
+
+    (zeta - Psi) X = zeta Gamma(1 - f) + Gamma(1),   P = X_1/z^(n+1),   V = (A_1 X + b_1)/(T z^(n+1))
+
+This equation is evaluated in Taylor arithmetic (`zwidth.numerics.taylor`) and differentiated by the implicit function
+theorem. The *leaves* of a display are its numbers, in the order of `zwidth.core.pytrees.list_leaves`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from zwidth.core.pytrees import list_leaves, replace_leaves
+from zwidth.core.status import Status
+from zwidth.model.actuator import Actuator
+from zwidth.numerics.taylor import Taylor, differentiate_implicitly, flow, replace_derivatives, seed, solve, stack
+
+NYQUIST_TOLERANCE = 1e-12  # relative distance of the angle w from pi below which the pole is at z = -1
+
+
+def find_environment_limits(display: Any, points: np.ndarray, order: int) -> list[np.ndarray]:
+    """Return stiffness, frequency and status of limits, with derivatives in the leaves of the display and in M, D, B.
+
+    Args:
+        display: a display, whose own virtual mass and damping have no effect.
+        points: values of M, D and B, one row per point.
+        order: order of the highest derivative, 0, 1 or 2.
+
+    Returns:
+        Values of shape (points, 3), and derivatives with one or two further axes for the variables.
+    """
+    M, D, B = points.T
+    limit = display.max_environment_stiffness(B, virtual_mass=M, virtual_damping=D)
+    values = np.stack([*limit], -1).astype(float)
+    size, period = len(list_leaves(display)) + 3, float(display.timing.period)
+    results = [values, *(np.zeros((len(points), 3, *[size] * k)) for k in range(1, order + 1))]
+    for result in results[1:]:
+        result[:, :2] = np.nan
+    rows = np.flatnonzero(values[:, 2] == Status.OK).tolist() if order else []
+    if not rows:
+        return results
+    differentiate = _make_rule(display, order)
+    for k in rows:
+        K, frequency = values[k, :2].tolist()
+        pair = differentiate(points[k].tolist(), K, 2.0 * np.pi * frequency * period)
+        for order_index, result in enumerate(results[1:]):
+            result[k, :2] = [(each.first, each.second)[order_index] for each in pair]
+    return results
+
+
+def _make_rule(display: Any, order: int) -> Callable[[list[float], float, float], list[Taylor]]:
+    """Return a function of M, D and B (a list), K and w, which returns stiffness and frequency with derivatives.
+
+    At an integer delay, the response of some robots has a kink. The derivative in the delay is then that of longer
+    delays. For a delay in seconds, the derivative in the period is that of longer periods. A sampled robot is valid for
+    one period and one delay only, so that its derivatives in both are NaN.
+    """
+    loop, count = display.loop, len(list_leaves(display))
+    n = loop.n_delay
+    terms = LimitTerms(display, order, n)
+    has_kink = not loop.plant.dt and n == loop.d > 0 and not display.timing.in_periods
+    shorter = LimitTerms(display, order, n - 1) if has_kink else None
+
+    def differentiate(factors: list[float], K: float, w: float) -> list[Taylor]:
+        with np.errstate(all="ignore"):
+            result = terms.differentiate(factors, K, w)
+            if shorter is not None:
+                replace_derivatives(result, shorter.differentiate(factors, K, w), count - 2)
+        if loop.plant.dt:
+            for k in (count - 2, count - 1):
+                replace_derivatives(result, [each * np.nan for each in result], k)
+        return result
+
+    return differentiate
+
+
+class LimitTerms:
+    """Taylor expansions of the sampled robot in all variables: the leaves of a display, M, D, B, K and w."""
+
+    def __init__(self, display: Any, order: int, n: int) -> None:
+        """Discretize the robot; ``order`` is 1 or 2, and ``n`` the integer part of the delay in periods."""
+        self.loop, self.n = display.loop, n
+        leaves = list_leaves(display)
+        # The robot does not depend on the last five variables, so that any values serve for them.
+        self.variables = seed([*leaves, *[1.0] * 5], order)
+        self.count, self.one = len(leaves), self.variables[0] * 0.0 + 1.0
+        self.varied = replace_leaves(display, iter(self.variables))
+        timing = self.varied.timing
+        self.period = timing.period
+        d = timing._periods if timing.in_periods else timing.delay / timing.period
+        # Use the value of d of the loop, because the quotient has a rounding error, which `Timing.d` removes.
+        fraction = Taylor(np.float64(self.loop.d), d.first, d.second) - n
+        self.A, self.b = self._realize()
+        if self.loop.plant.dt:
+            self.psi, self.full, self.late = self.A + stack(-np.eye(len(self.A.v)), self.one), self.b, self.b
+        else:
+            self.psi, self.full = flow(self.A, self.b, self.one)
+            self.late = flow(self.A, self.b, self.one - fraction)[1]
+
+    def differentiate(self, factors: list[float], K: float, w: float) -> list[Taylor]:
+        """Return stiffness and frequency, with derivatives in the leaves of the display, followed by M, D and B.
+
+        Args:
+            factors: values of M, D and B.
+            K: the limit in N/m.
+            w: angle of the pole on the unit circle.
+        """
+        values = [*factors, K, w]
+        M, D, B, stiffness, angle = (
+            Taylor(np.float64(value), variable.first, variable.second)
+            for value, variable in zip(values, self.variables[self.count :], strict=True)
+        )
+        residual = self._evaluate((M, D, B, stiffness), angle * 1j) * (1.0 / K)
+        # At the Nyquist frequency, the residual is real, and the angle is constant.
+        is_nyquist = w > np.pi * (1.0 - NYQUIST_TOLERANCE)
+        equations = [residual.real, angle - np.pi if is_nyquist else residual.imag]
+        limit, angle = differentiate_implicitly(equations, [K, w])
+        size, second = self.count + 3, self.period.second
+        period = Taylor(self.period.v, self.period.first[:size], None if second is None else second[:size, :size])
+        return [limit, angle / (period * (2.0 * np.pi))]
+
+    def _evaluate(self, factors: tuple[Taylor, ...], lam: Taylor) -> Taylor:
+        """Return ``(M q_M + D q_D)/N_Y + K P + B V`` at ``z = e^lam``; ``factors`` are M, D, B and K."""
+        M, D, B, K = factors
+        z, zeta, T = lam.exp(), lam.expm1(), self.period
+        # With the semi-implicit method, v/f = T z/(M zeta + T D). With the trapezoidal method, T is multiplied by
+        # ``half``, and M zeta by z (W1).
+        half, mass, path = self.one, zeta, z
+        if self.loop.integrator == "trapezoidal":
+            half = (z + 1.0) * 0.5
+            mass, path = zeta * z, half
+        inverse = (M * mass + D * T * half) / (T * z * half)
+        if self.loop.command == "position":
+            inverse = inverse * zeta / (T * path)
+        position, velocity = self._respond(zeta)
+        return inverse + (K * position + B * velocity) * (lam * -(self.n + 1)).exp()
+
+    def _respond(self, zeta: Taylor) -> tuple[Taylor, Taylor]:
+        """Return ``X_1`` and ``(A_1 X + b_1)/T`` of the robot."""
+        size = len(self.b.v)
+        matrix = zeta.map(lambda part: np.multiply.outer(np.eye(size), part)) - self.psi
+        state = solve(matrix, self.full + self.late * zeta.map(lambda part: np.asarray(part)[None]))
+        velocity = self.b[0]
+        for k in range(size):
+            velocity = velocity + self.A[0, k] * state[k]
+        return state[0], velocity / self.period
+
+    def _realize(self) -> tuple[Taylor, Taylor]:
+        """Return the matrices A and b of the robot in units of the sampling period; the first state is the position."""
+        T, robot, loop = self.period, self.varied.robot, self.loop
+        if not isinstance(robot, Actuator):
+            A, b = (stack(part, self.one) for part in loop.make_system().realize()[:2])
+            # The entries of both matrices are proportional to the period.
+            factor = self.one if loop.plant.dt else T / loop.period
+            return tuple(
+                part * factor.map(lambda v, part=part: np.asarray(v)[(None,) * part.v.ndim]) for part in (A, b)
+            )  # pyright: ignore
+        rate = robot.rate * T
+        last = [-rate] if robot.order == 1 else [-(rate * rate), -(rate * robot.damping_ratio * 2.0)]
+        rows = [[0.0, 1.0], last] if robot.order == 2 else [last]
+        force = [*[0.0] * (robot.order - 1), rate**robot.order]
+        if loop.command == "velocity":
+            # A further first state integrates the velocity of the robot, which is the state after it.
+            rows = [[0.0, T, *[0.0] * (robot.order - 1)], *([0.0, *row] for row in rows)]
+            force = [0.0, *force]
+        return stack(rows, self.one), stack(force, self.one)

@@ -1,0 +1,155 @@
+"""Compute the largest stable stiffness of the environment for many virtual masses and dampings at once.
+
+Symbols as in `zwidth.analysis.admittance_loop`: the display has the virtual mass M and damping D, the environment the
+stiffness K and the damping B, and the characteristic polynomial is ``M p_M + D p_D + K p_K + B p_B``. With
+``z = e^(jw)`` and u_M = -p_M/p_K, u_D = -p_D/p_K, u_B = -p_B/p_K, a pole is at the angle w on the unit circle if
+
+    K = M u_M(w) + D u_D(w) + B u_B(w)
+
+is real. The angles w at which this sum is real are the *crossings*. In ``x = cos w`` they are the roots of a real
+polynomial, because the imaginary part of ``p(z) p_K(1/z)`` is sin w times a sum of Chebyshev polynomials U_k(x), and
+its coefficients are affine in M, D and B. The smallest positive K of all crossings is the limit if the display is
+stable with half of it (docs/theory/admittance.md, W5).
+
+References:
+    Good 1961, Quarterly Journal of Mathematics 12(1), 61-68 (colleague matrix, whose eigenvalues are the roots of a
+    Chebyshev series).
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.analysis.admittance_loop import AdmittanceLoop
+from zwidth.core.status import Status
+from zwidth.model.exact_polynomials import Polynomial
+from zwidth.numerics.polynomials import companion
+
+BLOCK = 4096  # displays per call of the eigenvalue solver; bounds the memory
+NEWTON_STEPS = 8  # Newton steps for the angle of a crossing; 3 suffice after the eigenvalue solver
+STEP = 1e-5  # relative step of w for the derivative in Newton's method
+RESIDUAL = 1e-9  # largest imaginary part of K at a crossing, relative to K
+NEAR_REAL = 1e-3  # imaginary part of x, relative to the distance from 1 or -1, below which a crossing is ambiguous
+CLEARANCE = 1e-6  # distance of all poles from the unit circle above which their eigenvalues decide the stability
+
+
+class Limits(NamedTuple):
+    """Limits of many displays, as arrays of one shape; NaN without limit."""
+
+    stiffness: np.ndarray  # K in N/m
+    angle: np.ndarray  # angle w in rad per period of the oscillation at K
+    status: np.ndarray  # code of OK or NO_BOUNDARY, or of UNDECIDED if another method must compute the limit
+
+
+def find_limits(loop: AdmittanceLoop, M: np.ndarray, D: np.ndarray, B: np.ndarray) -> Limits:
+    """Return the largest K such that displays are stable from 0 to K; M, D and B are vectors of one length."""
+    coefficients = loop.coefficients
+    parts = (coefficients.mass, coefficients.damping, coefficients.environment_damping)
+    series = _stack([_expand_crossings(part, coefficients.stiffness) for part in parts], at_end=True)
+    factors = np.stack([M, D, B], -1)
+    polynomials = _stack([np.array(part, float) for part in (*parts, coefficients.stiffness)], at_end=False)
+    results = [
+        _find_block(loop, series, polynomials, factors[start : start + BLOCK])
+        for start in range(0, max(len(M), 1), BLOCK)
+    ]
+    return Limits(*(np.concatenate(column) for column in zip(*results, strict=True)))
+
+
+def _find_block(loop: AdmittanceLoop, series: np.ndarray, polynomials: np.ndarray, factors: np.ndarray) -> Limits:
+    """Return the limits of displays; ``factors`` has a row (M, D, B) per display."""
+    with np.errstate(all="ignore"):
+        angles, is_ambiguous = _find_angles(factors @ series)
+        angles = np.concatenate([_refine(loop, factors, angles), np.full((len(factors), 1), np.pi)], -1)
+        K = _evaluate(loop, factors, angles)
+        is_crossing = (np.abs(K.imag) <= RESIDUAL * np.abs(K)) & (K.real > 0) & np.isfinite(K)
+        candidates = np.where(is_crossing, K.real, np.inf)
+    best = candidates.argmin(-1)[:, None]
+    limit, angle = (np.take_along_axis(each, best, -1)[:, 0] for each in (candidates, angles))
+    is_known = np.isfinite(limit) & ~is_ambiguous
+    label = _label_poles(polynomials, factors, np.where(is_known, limit, 1.0) / 2.0)
+    is_stable, is_unstable = is_known & (label > 0), is_known & (label < 0)
+    status = np.where(is_stable, Status.OK, np.where(is_unstable, Status.NO_BOUNDARY, Status.UNDECIDED))
+    return Limits(np.where(is_stable, limit, np.nan), np.where(is_stable, angle, np.nan), status)
+
+
+def _expand_crossings(p: Polynomial, p_K: Polynomial) -> np.ndarray:
+    """Return the coefficients of U_0, U_1, ... in ``Im(p(z) p_K(1/z))/sin w``, for z = e^(jw)."""
+    ascending, other = p[::-1], p_K[::-1]
+    size = max(len(ascending), len(other), 1)
+    sums = [Fraction(0)] * size
+    for i, a in enumerate(ascending):
+        for j, b in enumerate(other):
+            # The imaginary part of z^(i - j) is sin((i - j) w) = sin w U_(i - j - 1)(cos w).
+            if i != j:
+                sums[abs(i - j) - 1] += a * b if i > j else -a * b
+    return np.array(sums, float)
+
+
+def _stack(rows: list[np.ndarray], *, at_end: bool) -> np.ndarray:
+    """Return rows of different lengths as a matrix, with zeros before the entries or, with ``at_end``, after them."""
+    size = max(map(len, rows))
+    return np.array([np.pad(row, (0, size - len(row)) if at_end else (size - len(row), 0)) for row in rows])
+
+
+def _find_angles(series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the angles of the crossings, NaN in unused places, and whether the number of crossings is ambiguous.
+
+    Args:
+        series: coefficients of U_0, U_1, ..., one row per display.
+    """
+    used = np.flatnonzero(series.any(0))
+    series = series[:, : used[-1] + 1] if used.size else series[:, :1]
+    size, top = series.shape[1] - 1, series[:, -1:]
+    is_invalid = (top[:, 0] == 0) | ~np.isfinite(series).all(-1)
+    # Rows of the colleague matrix: x U_k = (U_(k+1) + U_(k-1))/2, where the last U_k is eliminated by the series.
+    matrix = np.zeros((len(series), size, size))
+    matrix += (np.eye(size, k=1) + np.eye(size, k=-1)) / 2.0
+    if size:
+        matrix[:, -1] -= np.where(is_invalid[:, None], 0.0, series[:, :-1] / top) / 2.0
+    x: Any = np.linalg.eigvals(matrix) + 0j
+    distance = np.minimum(np.abs(1.0 - x), np.abs(1.0 + x))
+    is_real = (x.imag == 0) & (np.abs(x.real) < 1.0)
+    is_near = ~is_real & (np.abs(x.imag) < NEAR_REAL * distance) & (np.abs(x.real) < 1.0)
+    return np.where(is_real, np.arccos(np.clip(x.real, -1, 1)), np.nan), is_invalid | is_near.any(-1)
+
+
+def _evaluate(loop: AdmittanceLoop, factors: np.ndarray, angles: np.ndarray) -> Any:
+    """Return ``M u_M + D u_D + B u_B`` at angles; ``factors`` has a row (M, D, B) per row of ``angles``."""
+    zeta = np.expm1(1j * angles)
+    robot, program = loop.sampled_robot, loop.program
+
+    def at(polynomial: Polynomial) -> np.ndarray:
+        return np.polyval(np.array(polynomial, float), zeta) if polynomial else np.zeros_like(zeta)
+
+    M, D, B = (factors[:, k : k + 1] for k in range(3))
+    by_program = (M * at(program.mass) + D * at(program.damping)) / at(program.numerator)
+    by_robot = np.exp(1j * robot.lag * angles) * at(robot.denominator)
+    return -(by_program * by_robot + B * at(robot.velocity)) / at(robot.position)
+
+
+def _refine(loop: AdmittanceLoop, factors: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Return the angles of crossings after Newton steps for the imaginary part of K."""
+    for _ in range(NEWTON_STEPS):
+        low, high = angles * (1.0 - STEP), angles * (1.0 + STEP)
+        slope = (_evaluate(loop, factors, high) - _evaluate(loop, factors, low)).imag / (high - low)
+        angles = np.clip(angles - _evaluate(loop, factors, angles).imag / slope, 0.0, np.pi)
+    return angles
+
+
+def _label_poles(polynomials: np.ndarray, factors: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Return 1 for stable and -1 for unstable displays, and 0 if a pole is too close to the unit circle.
+
+    Args:
+        polynomials: coefficients of p_M, p_D, p_B and p_K.
+        factors: a row (M, D, B) per display.
+        K: stiffness of the environment, one per display.
+    """
+    monic = np.concatenate([factors, K[:, None]], -1) @ polynomials
+    monic = monic / monic[:, :1]
+    is_valid: Any = np.isfinite(monic).all(-1)
+    poles = np.linalg.eigvals(companion(np.where(is_valid[:, None], monic, 0.0)))
+    radius = np.abs(poles).max(-1)
+    return np.where(is_valid & (np.abs(radius - 1.0) > CLEARANCE), np.sign(1.0 - radius), 0.0)

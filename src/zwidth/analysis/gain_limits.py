@@ -1,0 +1,65 @@
+"""Stable intervals of single gains of a PID or cascade controller, with all other gains unchanged.
+
+The open loop L(z) is affine in every gain x of such a controller: ``L = L_0 + x L_1``. A pole lies on the unit circle
+at z = exp(j w) if and only if ``1 + L_0 + x L_1 = 0``, so that x = -(1 + L_0)/L_1 is real. These critical values bound
+the interval around a stable gain, because the number of unstable poles changes only at a critical value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from zwidth.analysis.base import SceneParts
+
+# Frequencies relative to the Nyquist frequency, at which sign changes of Im x are searched: equal ratios for slow poles
+# of integrators, and equal steps for resonances.
+GRID = np.unique(np.concatenate([np.geomspace(1e-7, 1.0, 4001), np.linspace(1e-4, 1.0, 8001)]))
+SPLITS = 33  # frequencies per bracket and refinement
+REFINEMENTS = 9  # a factor of 32 each, 3e-14 in all
+
+
+def find_gain_limits(make: Callable[[float], Any], gain: float) -> tuple[float, float]:
+    """Return the ends of the interval of stable values around a stable gain, with all other gains unchanged.
+
+    Args:
+        make: function that returns the `zwidth.Scene` of the controller with a value of the gain.
+        gain: value of the gain, > 0, with which the controller is stable.
+
+    Returns:
+        Lower end, at least 0, and upper end; infinity if every larger gain is stable.
+    """
+    without, given = make(0.0), make(gain)
+    nyquist = 0.5 / float(given.timing.period)
+
+    def evaluate(frequency: np.ndarray) -> Any:
+        """Return x = -(1 + L_0)/L_1 relative to the gain, at frequencies relative to the Nyquist frequency."""
+        base = _open_loop(without, frequency * nyquist)
+        with np.errstate(all="ignore"):
+            return -(1.0 + base) / (_open_loop(given, frequency * nyquist) - base)
+
+    values = evaluate(GRID)
+    signs = np.sign(values.imag)
+    (index,) = np.nonzero(signs[:-1] * signs[1:] < 0)
+    low, high, sign = GRID[index], GRID[index + 1], signs[index]
+    for _ in range(REFINEMENTS if index.size else 0):
+        points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, SPLITS)
+        kept = (np.sign(evaluate(points).imag) == sign[:, None])[:, :-1]
+        last = SPLITS - 2 - np.argmax(kept[:, ::-1], axis=1)
+        rows = np.arange(index.size)
+        low, high = points[rows, last], points[rows, last + 1]
+    # At the Nyquist frequency, z = -1 and x is always real.
+    roots = [evaluate(0.5 * (low + high)).real] if index.size else []
+    critical = np.concatenate([*roots, values[-1:].real])
+    # Exclude sign changes at poles of x, where |x| is infinite.
+    critical = critical[np.isfinite(critical) & (critical > 0) & (critical < 1e9)]
+    below, above = critical[critical <= 1.0], critical[critical > 1.0]
+    return gain * float(below.max(initial=0.0)), gain * float(above.min(initial=math.inf))
+
+
+def _open_loop(scene: SceneParts, frequency: np.ndarray) -> np.ndarray:
+    """Return the open loop of a scene with its wall and its further feedback, at frequencies in Hz."""
+    return np.asarray(scene.frequency_response(frequency=frequency))  # pyright: ignore[reportAttributeAccessIssue]

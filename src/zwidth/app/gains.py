@@ -1,0 +1,62 @@
+"""Printed gains of PID and cascade controllers, in the units of the controller (`model.controller_gains`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from zwidth.app.printing import format_line
+from zwidth.core.status import Status
+from zwidth.model.controller_gains import ControllerKind, PositionUnit
+from zwidth.model.feedback import IntegralFeedback
+from zwidth.units.formatting import plain
+
+if TYPE_CHECKING:
+    from zwidth.analysis.recommendation import Recommendation
+
+_SINGULAR = {"turns": "turn", "degrees": "deg", "rad": "rad", "m": "m"}
+
+
+def list_units(kind: ControllerKind, units: PositionUnit, output: str) -> dict[str, str]:
+    """Return the unit of each gain of a controller by name.
+
+    Args:
+        kind: "pid" or "cascade".
+        units: position unit of the gains.
+        output: unit of the output of the controller, such as "N m".
+    """
+    position = _SINGULAR[units]
+    proportional, derivative = f"{output}/{position}", f"{output}/({position}/s)"
+    if kind == "pid":
+        return {"kp": proportional, "ki": f"{output}/({position} s)", "kd": derivative}
+    return {"pos_gain": "1/s", "vel_gain": derivative, "vel_integrator_gain": proportional}
+
+
+def spell_gains(kind: ControllerKind, gains: Mapping[str, float], units: PositionUnit, output: str) -> str:
+    """Return a phrase with the gains of a controller that are not 0, and their units; see `list_units`."""
+    named = list_units(kind, units, output)
+    return ", ".join(f"{name} {plain(gain)} {named[name]}" for name, gain in gains.items() if gain)
+
+
+def spell_output(rotary: bool, output_unit: float) -> str:
+    """Return the unit of the output of a controller: N or N m, or "output" if its unit is another one."""
+    return "output" if output_unit != 1.0 else "N m" if rotary else "N"
+
+
+def list_cascade(recommendation: Recommendation) -> dict[str, Any]:
+    """Return the gains of a recommended cascade with their position unit; empty if the scene is not a cascade's."""
+    scene = recommendation.scene
+    integrator = isinstance(scene.feedback, IntegralFeedback) and scene.feedback.is_cascade
+    if not integrator or recommendation.status != Status.OK:
+        return {}
+    units = "turns" if scene.unit_system.rotary else "m"
+    return {**recommendation.cascade_gains(units)._asdict(), "units": units}
+
+
+def format_cascade(recommendation: Recommendation) -> list[str]:
+    """Return a list with the printed line of the gains of a recommended cascade; empty without these gains."""
+    named = list_cascade(recommendation)
+    if not named:
+        return []
+    units, output = named.pop("units"), spell_output(recommendation.unit_system.rotary, 1.0)
+    return [format_line("gains", spell_gains("cascade", named, units, output))]

@@ -1,0 +1,205 @@
+"""Command ``zwidth gains``: convert the gains of a motor controller to a wall and back, and assess the controller.
+
+The wall has the stiffness K and the virtual damping B. An integrator of the controller is the further feedback of the
+scene.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import click
+
+from zwidth.app import printing
+from zwidth.app.gains import list_units, spell_gains, spell_output
+from zwidth.app.printing import format_line
+from zwidth.cli.commands import cli
+from zwidth.cli.help import show_example
+from zwidth.cli.options import Command, build_scene, find_omitted, json_option, scene_options, verbose_option
+from zwidth.core.errors import InputError
+from zwidth.model.controller_gains import (
+    GAIN_NAMES,
+    ControllerKind,
+    ControllerParts,
+    PositionUnit,
+    find_gains,
+    find_output_unit,
+    find_units,
+    make_controller,
+)
+from zwidth.model.feedback import RULES
+from zwidth.model.wall import VirtualWall
+from zwidth.units.formatting import format_interval, format_wall
+from zwidth.units.unit_system import SYSTEMS, UnitSystem
+
+_HELP = {
+    "pos_gain": "Cascade: gain of the position loop, unit 1/s (ODrive pos_gain, SimpleFOC P_angle.P).",
+    "vel_gain": "Cascade: output per velocity unit (ODrive vel_gain, SimpleFOC PID_velocity.P).",
+    "vel_integrator_gain": "Cascade: output per position unit (ODrive vel_integrator_gain, SimpleFOC PID_velocity.I).",
+    "kp": "PID: output per position unit.",
+    "ki": "PID: output per (position unit times s).",
+    "kd": "PID: output per velocity unit, i.e. per (position unit/s).",
+}
+_REQUIRED = {"cascade": ("pos_gain", "vel_gain"), "pid": ("kp",)}
+_DEVICE = {"scene", "device", "mass", "rate", "period"}  # options that imply a device, of which a scene is built
+
+
+class _Controller(NamedTuple):
+    """A controller: its gains by kind ("pid" or "cascade"), wall and feedback, and its scene if a device is given."""
+
+    gains: dict[ControllerKind, dict[str, float]]  # a wall may have gains of both kinds
+    units: dict[ControllerKind, PositionUnit]  # position unit of the gains
+    wall: VirtualWall
+    feedback: Any
+    scene: Any  # None without a device
+    limits: dict[str, tuple[float, float]]  # stable interval of each gain, with the other gains unchanged
+    system: UnitSystem
+    output: str  # unit of the output of the controller
+
+
+def _add_options(command: Command) -> Command:
+    """Add the options of the gains and of their units to a command."""
+    texts = {
+        "--torque-constant": "Torque constant in N m/A, if the output is a current or, with --resistance, a voltage.",
+        "--resistance": "Winding resistance in ohm, if the output is a voltage.",
+        "--output-unit": "Torque in N m (linear: force in N) per unit of output.  [default: 1]",
+    }
+    units = "Position unit of the gains.  [default: turns for a cascade, rad for a PID; m for a linear device]"
+    rule = "Rule of integration: forward for ODrive, trapezoidal for SimpleFOC.  [default: backward]"
+    options = [
+        *(click.option(f"--{name.replace('_', '-')}", type=float, help=text) for name, text in _HELP.items()),
+        click.option("--rule", type=click.Choice(RULES), help=rule),
+        click.option("--units", type=click.Choice(("turns", "degrees", "rad", "m")), help=units),
+        *(click.option(flag, type=float, help=text) for flag, text in texts.items()),
+    ]
+    for add in reversed(options):
+        command = add(command)
+    return command
+
+
+def _find_kind(given: dict[str, float]) -> ControllerKind | None:
+    """Return the kind of controller that the names of the given gains imply; None without gains."""
+    kinds: list[ControllerKind] = [kind for kind in ("cascade", "pid") if given.keys() & set(GAIN_NAMES[kind])]
+    if len(kinds) > 1:
+        raise click.UsageError("got gains of a cascade and of a PID controller; give only those of one controller")
+    missing = [name for kind in kinds for name in _REQUIRED[kind] if name not in given]
+    if missing:
+        raise click.UsageError(f"a {kinds[0]} controller requires --{missing[0].replace('_', '-')}")
+    return kinds[0] if kinds else None
+
+
+def _read_controller(values: dict[str, Any], system: UnitSystem) -> _Controller:
+    """Return the controller that the options describe; ``values`` are those of the options of a scene."""
+    options = click.get_current_context().params
+    given = {name: options[name] for name in _HELP if options[name] is not None}
+    kind = _find_kind(given)
+    if kind is not None and {"stiffness", "virtual_damping"} & values.keys():
+        raise click.UsageError("got gains together with a wall; give either the gains, or K and B")
+    if kind is None and not values.keys() & {"stiffness", "scene"}:
+        raise click.UsageError("give gains such as --pos-gain and --vel-gain, or --stiffness and --virtual-damping")
+    output_unit = find_output_unit(*(options[name] for name in ("output_unit", "torque_constant", "resistance")))
+    scene = build_scene(dict(values), system, wall=kind is None) if values.keys() & _DEVICE else None
+    if scene is not None:
+        system = scene.unit_system
+    elif options["units"] or kind is not None:
+        system = SYSTEMS[options["units"] != "m"]
+    kinds: tuple[ControllerKind, ...] = ("cascade", "pid") if kind is None else (kind,)
+    units: Any = {each: find_units(each, options["units"], system.rotary) for each in kinds}
+    output = spell_output(system.rotary, output_unit)
+    if kind is None:
+        wall, feedback = VirtualWall(values.get("stiffness", 0.0), values.get("virtual_damping", 0.0)), None
+        if scene is not None:
+            wall, feedback = scene.wall, scene.feedback
+        return _Controller(
+            _list_gains(wall, feedback, units, output_unit), units, wall, feedback, scene, {}, system, output
+        )
+    position = None if scene is None else scene.position
+
+    def make(**changed: float) -> ControllerParts:
+        """Return the parts of the controller, with some gains changed."""
+        rule = options["rule"] or "backward"
+        return make_controller(kind, given | changed, position, rule, units[kind], output_unit)
+
+    parts, limits = make(), dict[str, tuple[float, float]]()
+    if scene is not None:
+        bare, scene = scene, scene.replace(wall=parts.wall, feedback=parts.feedback)
+        if bool(scene.is_stable()):
+            from zwidth.analysis.gain_limits import find_gain_limits
+
+            for name in (name for name in given if given[name] > 0):
+
+                def change(gain: float, name: str = name) -> Any:
+                    """Return the scene with another value of the gain ``name``."""
+                    changed = make(**{name: gain})
+                    return bare.replace(wall=changed.wall, feedback=changed.feedback)
+
+                limits[name] = find_gain_limits(change, given[name])
+    return _Controller({kind: given}, units, parts.wall, parts.feedback, scene, limits, system, output)
+
+
+def _list_gains(
+    wall: VirtualWall, feedback: Any, units: dict[ControllerKind, PositionUnit], output_unit: float
+) -> dict[ControllerKind, dict[str, float]]:
+    """Return the gains of a wall by kind of controller; raise `InputError` if no kind of controller renders it."""
+    gains, faults = dict[ControllerKind, dict[str, float]](), list[InputError]()
+    for kind, unit in units.items():
+        try:
+            gains[kind] = find_gains(wall, feedback, kind, unit, output_unit)._asdict()
+        except InputError as error:
+            faults.append(error)
+    if not gains:
+        raise faults[0]
+    return gains
+
+
+def _format_controller(controller: _Controller) -> list[str]:
+    """Return printed lines with the gains of a controller and their stable intervals."""
+    lines = []
+    for kind, gains in controller.gains.items():
+        lines.append(format_line(kind, spell_gains(kind, gains, controller.units[kind], controller.output)))
+        units, spans = list_units(kind, controller.units[kind], controller.output), []
+        for name, (low, high) in controller.limits.items():
+            ends = format_interval(low, high)
+            spans.append(f"{name} from {'0' if not low else ends[0]} to {ends[1]} {units[name]}")
+        if spans:
+            lines.append(format_line("limits", f"{'; '.join(spans)}; each with the other gains unchanged"))
+    return lines
+
+
+_MOTOR = "--mass '1000 g cm^2' --rate '8 kHz' --delay '1.5 periods'"
+
+
+@cli.command(**show_example("gains --pos-gain 20 --vel-gain 0.16 --position-bandwidth 1000", _MOTOR))
+@_add_options
+@scene_options(wall=True, make=_read_controller)
+@verbose_option
+@json_option
+def gains(scene: _Controller, verbose: bool, as_json: bool, **_: Any) -> None:
+    """Convert the gains of a motor controller to K and B, or K and B to gains; with a device, assess the controller.
+
+    Gains are numbers in the units of the controller: a cascade (ODrive, VESC, SimpleFOC) has --pos-gain, --vel-gain and
+    --vel-integrator-gain; a PID controller (moteus, SmartKnob, Arduino) has --kp, --ki and --kd. With --mass (or
+    --device) and --rate (or --period), or with SCENE.yaml, the command prints the results of `zwidth check` for the
+    controller, and the interval in which each gain is stable. Without gains, it converts --stiffness and
+    --virtual-damping, or the wall of SCENE.yaml, to gains.
+    """
+    controller, wall = scene, scene.wall
+    result: dict[str, Any] = {
+        "gains": {kind: {**each, "units": controller.units[kind]} for kind, each in controller.gains.items()},
+        "stiffness": float(wall.stiffness),
+        "virtual_damping": float(wall.virtual_damping),
+        "integral_gain": float(getattr(controller.feedback, "gain", 0.0)),
+        "limits": controller.limits,
+    }
+    rows = _format_controller(controller)
+    if controller.scene is None:
+        words = format_wall(wall.stiffness, wall.virtual_damping, controller.system)
+        printing.print_result(result, [format_line("wall", words), *rows], as_json, printing.LABEL)
+        return
+    from zwidth.analysis.assessment import assess
+    from zwidth.app.verdict import format_check
+
+    verdict, notes = assess(controller.scene), printing.list_notes(controller.scene)
+    lines = format_check(controller.scene, verdict, None, omitted=find_omitted(), verbose=verbose)
+    result |= {"check": verdict.as_dict(), "notes": notes}
+    printing.print_result(result, [lines[0], *rows, *lines[1:], *printing.format_notes(notes)], as_json, printing.LABEL)

@@ -1,0 +1,61 @@
+"""Devices in files of their own: the value of the key ``device`` of a configuration, for the option ``--device``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, RootModel
+
+from zwidth.config.devices import DeviceForm
+from zwidth.config.fields import problem
+from zwidth.config.reader import read_model
+from zwidth.core.errors import InputError
+from zwidth.model.device import Device
+from zwidth.model.devices import PublishedDevice, read_device
+from zwidth.model.linear_device import LinearDevice
+from zwidth.model.measured_device import MeasuredDevice
+from zwidth.model.mujoco_model import MODEL_SUFFIXES
+
+_SUFFIXES = (".yaml", ".yml", ".json")
+
+
+def _refuse_configuration(raw: Any) -> Any:
+    """Return the content of a file of a device unchanged; raise a problem if it is a whole configuration."""
+    if isinstance(raw, dict) and "version" in raw:
+        allowed = "a file for --device has the keys of one device"
+        raise problem("got a whole configuration", allowed, "give its name without --device")
+    return raw
+
+
+class _DeviceFile(RootModel[Annotated[DeviceForm, BeforeValidator(_refuse_configuration)]]):
+    """A file whose content is the value of the key ``device``."""
+
+
+def read_device_option(
+    text: str, sampled: Any = None, *, rotary: bool = False
+) -> PublishedDevice | Device | LinearDevice | MeasuredDevice:
+    """Return the device that the text of an option ``--device`` describes.
+
+    Args:
+        text: the name of a YAML file with the keys of a device, such as ``mass_matrix`` or ``model``, and file names
+            relative to it; or a text that `zwidth.model.devices.read_device` accepts.
+        sampled: sampling period in s for a transfer function in z; None for a transfer function in s.
+        rotary: True if a transfer function is that of a rotary device, because other options have rotary units.
+
+    Raises:
+        InputError: the text is none of these, or ``sampled`` is given for a device that is not a transfer function.
+        ConfigError: the file cannot be read or has faults.
+    """
+    if text.endswith(MODEL_SUFFIXES):
+        raise InputError(
+            f"device: got {text!r}, a model without point and direction; write model, site and direction into a file "
+            "DEVICE.yaml and give its name"
+        )
+    if not text.endswith(_SUFFIXES):
+        device = read_device(text, sampled)
+        return replace(device, rotary=rotary) if isinstance(device, LinearDevice) else device
+    if sampled is not None:
+        raise InputError(f"device: got {text!r} with --sampled; write the key 'sampled' into the file")
+    section: Any = read_model(text, _DeviceFile).root
+    return section.instance

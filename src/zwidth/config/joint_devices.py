@@ -1,0 +1,105 @@
+"""Models of devices with several joints: a mass matrix, or a model file of the simulator MuJoCo.
+
+Both sections describe an arm with several joints in one pose, and the direction along which a wall acts on one point of
+the arm. `MujocoSection` is converted to a `MassMatrixSection` when it is read, so that a saved configuration contains
+the matrices instead of the name of the model file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cached_property
+from typing import Annotated, Any
+
+from pydantic import Field, WithJsonSchema
+
+from zwidth.config.device_table import find_file
+from zwidth.config.fields import LocatedProblem, Strict
+from zwidth.config.parts import PartSection, parse_input_error
+from zwidth.config.values import Rotary, read_rotary
+from zwidth.core.errors import InputError
+from zwidth.model.device import Device
+from zwidth.model.joint_space import from_mass_matrix
+from zwidth.model.linear_device import LinearDevice
+from zwidth.model.mujoco_model import linearize_model
+
+_ENTRY: dict[str, Any] = {"type": ["number", "string"]}
+_LIST: dict[str, Any] = {"type": "array", "items": _ENTRY, "minItems": 1}
+_ROWS: dict[str, Any] = {"type": "array", "items": {"type": "array", "items": _ENTRY}, "minItems": 1}
+# The functions of `zwidth.model` check the values of these fields, because the size of an array depends on the others.
+_Matrix = Annotated[Any, WithJsonSchema(_ROWS)]
+_OfJoints = Annotated[Any, WithJsonSchema({"anyOf": [_ENTRY, _LIST, _ROWS]})]
+_Direction = Annotated[
+    Any, WithJsonSchema({"anyOf": [{"enum": ["x", "y", "z"]}, {"type": "array", "items": {"type": "number"}}]})
+]
+_Pose = Annotated[
+    Any,
+    WithJsonSchema({"anyOf": [{"type": "object", "additionalProperties": _ENTRY}, _LIST, {"type": "string"}]}),
+]
+
+
+class MassMatrixSection(PartSection, noun="a device with joints"):
+    """A device with several joints in one pose, given by its mass matrix."""
+
+    mass_matrix: _Matrix
+    """Symmetric mass matrix of the joints, a list of rows, in kg m^2 for hinges and kg for slides, or with units."""
+
+    damping: _OfJoints = 0.0
+    """Viscous damping of the joints in N m s/rad (hinges) or N s/m (slides), or with units: one number, a list with one
+    per joint, or a matrix."""
+
+    jacobian: _Matrix | None = None
+    """Jacobian of the point on which the wall acts: one row per axis, one column per joint; zeros in the column of a
+    joint without motor. Default: the direction is in joint coordinates."""
+
+    direction: _Direction | None = None
+    """Direction of the wall: x, y or z, or a vector with one component per row of the Jacobian. Required unless the
+    Jacobian has a single row."""
+
+    stiffness: _OfJoints = 0.0
+    """Stiffness of springs from the joints to ground in N m/rad or N/m, in the same form as the damping. A spring k
+    between two coordinates has the matrix [[k, -k], [-k, k]]."""
+
+    rotary: Rotary = Field(default_factory=read_rotary)
+    """True if the direction is an axis of rotation."""
+
+    @cached_property
+    def instance(self) -> Device | LinearDevice:
+        """The device along the direction: a `Device` if it is a rigid mass, otherwise a `LinearDevice`."""
+        given = {name: getattr(self, name) for name in type(self).model_fields}
+        return from_mass_matrix(**{**given, "rotary": bool(self.rotary)})
+
+
+class MujocoSection(Strict, noun="a device from a MuJoCo model"):
+    """A device with several joints in one pose, given by a model file of MuJoCo."""
+
+    model: str
+    """Name of the model file (MJCF .xml, .urdf or .mjb), relative to the configuration."""
+
+    site: str
+    """Name of the site on which the wall acts; of a body in a model without sites."""
+
+    direction: _Direction
+    """Direction of the wall in world coordinates: x, y or z, or a vector."""
+
+    pose: _Pose | None = None
+    """Positions of joints by name, such as {elbow: 60 deg}; or a list of all positions in rad and m or with units; or
+    the name of a keyframe. Default: the reference pose of the model."""
+
+    rotary: Rotary = Field(default_factory=read_rotary)
+    """True for a wall that acts on the rotation about the direction, such as a knob."""
+
+    @cached_property
+    def joints(self) -> dict[str, Any]:
+        """The keys of a `MassMatrixSection` with the matrices of the model."""
+        matrices = linearize_model(find_file(self.model), self.site, self.pose, rotary=bool(self.rotary))
+        given = {name: values.tolist() for name, values in matrices._asdict().items()}
+        return {**given, "direction": self.direction, **({"rotary": True} if self.rotary else {})}
+
+    def find_faults(self) -> Iterable[LocatedProblem]:
+        try:
+            from_mass_matrix(**self.joints)
+        except InputError as error:
+            path, fault = parse_input_error(error)
+            # Report other problems, such as a missing package, with the path of the section.
+            yield (path if path[0] in type(self).model_fields else ()), fault

@@ -1,0 +1,84 @@
+"""Draw the largest stable stiffness of the environment of admittance displays over virtual mass or virtual damping.
+
+M and D are the virtual mass and the virtual damping of a display; K and B are the stiffness and the damping of the
+environment.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from zwidth.plotting import grid, style
+from zwidth.plotting.table import SI_COLUMNS, Table, draws_tables, in_order, select
+from zwidth.units.formatting import short, with_unit
+
+# Column, symbol and name of both parameters of the horizontal axis, and their unit for linear devices.
+_MASS = ("virtual_mass_kg", "M", "virtual mass", "kg")
+_DAMPING = ("virtual_damping_N_s_per_m", "D", "virtual damping", "N s/m")
+_ENVIRONMENT = "environment_damping_N_s_per_m"
+
+
+@draws_tables
+def draw_environment_limits(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
+    """Draw the largest stable stiffness of the environment over the virtual mass, with one curve per virtual damping.
+
+    If the table contains a single virtual mass, the horizontal axis is the virtual damping. Line styles distinguish
+    delays and dampings of the environment.
+
+    Args:
+        table: Columns of an admittance study.
+        axes: An existing Axes.
+
+    Returns:
+        Array with the Axes.
+
+    Example:
+        >>> import numpy as np, zwidth
+        >>> from zwidth import plotting
+        >>> mass, timing = np.geomspace(1, 50, 30), zwidth.Timing(rate="500 Hz", delay="4 periods")
+        >>> display = zwidth.AdmittanceDisplay(20, 60, zwidth.Actuator(time_constant="20 ms"), timing)
+        >>> table = {"delay_periods": np.full(30, 4.0), "virtual_mass_kg": mass}
+        >>> table |= {"virtual_damping_N_s_per_m": np.full(30, 60.0), "environment_damping_N_s_per_m": np.zeros(30)}
+        >>> table["stiffness_N_per_m"] = display.max_environment_stiffness(virtual_mass=mass).stiffness
+        >>> (ax,) = plotting.draw_environment_limits(table)
+        >>> ax.get_xlabel()
+        'virtual mass  $M$  in kg'
+    """
+    (ax,) = panels = style.panels(axes, 1, 5.6, 4.0)
+    over, hue = (_MASS, _DAMPING) if np.unique(table[_MASS[0]]).size > 1 else (_DAMPING, _MASS)
+    factor, unit = style.si_unit(table[SI_COLUMNS[0]], "N/m")
+    colors = style.color_by_value(table[hue[0]])
+    cases = sorted(
+        set(zip(*(np.asarray(table[name]).tolist() for name in ("delay_periods", _ENVIRONMENT)), strict=True))
+    )
+    dashes = {case: style.STYLES[k % len(style.STYLES)] for k, case in enumerate(cases)}
+    for value, color in colors.items():
+        for (d, B), dash in dashes.items():
+            rows = in_order(select(table, **{hue[0]: value, "delay_periods": d, _ENVIRONMENT: B}), over[0])
+            label = f"{hue[1]} = {value:g}, d = {d:g}, B = {B:g}"
+            ax.plot(rows[over[0]], rows[SI_COLUMNS[0]] * factor, color=color, linestyle=dash, label=label)
+    values = np.unique(table[over[0]])
+    if grid.logarithmic(values):
+        style.use_logarithmic(ax, "x", values, style.DECADES)
+    style.use_logarithmic(ax, "y", np.asarray(table[SI_COLUMNS[0]]) * factor, style.DECADES)
+    ax.set_xlabel(f"{over[2]}  ${over[1]}$  in {style.units()[over[3]]}")
+    ax.set_ylabel(f"largest stable stiffness  $K$  of the environment in {unit}")
+    handles = [style.line(f"${hue[1]}$ = {_spell(value, hue[3])}", color=color) for value, color in colors.items()]
+    handles += [style.line(_name_case(case, cases), dash) for case, dash in dashes.items()] if len(cases) > 1 else []
+    style.legend(panels, handles, outside=axes is None, ncols=3)
+    return panels
+
+
+def _spell(value: float, unit: str) -> str:
+    """Return a value with three digits and its unit, for legends."""
+    return with_unit(value, style.units()[unit], 3)
+
+
+def _name_case(case: tuple[float, float], cases: list[tuple[float, float]]) -> str:
+    """Return the legend entry of a delay and a damping of the environment, without values that all cases share."""
+    varied: list[Any] = [len(set(column)) > 1 for column in zip(*cases, strict=True)]
+    words = [f"delay {short(case[0])} periods"] if varied[0] else []
+    words += [f"$B$ = {_spell(case[1], 'N s/m')}"] if varied[1] else []
+    return ", ".join(words)
