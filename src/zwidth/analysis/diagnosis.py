@@ -16,7 +16,7 @@ import numpy as np
 from zwidth.analysis.base import wrap_function
 from zwidth.analysis.optimization import SceneOptima
 from zwidth.analysis.remedies import search_remedies
-from zwidth.analysis.stabilization import WITHOUT_MARGINS, Remedy, stabilize
+from zwidth.analysis.stabilization import Remedy, stabilize
 from zwidth.analysis.trials import LONG_DELAY, Experiment, Hardware, SustainedMotion, list_starts
 from zwidth.analysis.walls import read_single_wall
 from zwidth.core.errors import InputError
@@ -36,6 +36,7 @@ SETTLED = 2.0  # time constants that must be simulated before a motion may count
 CONFIRMED = "simulated at these and larger changes: check the value that you choose with diagnose"
 UNSEARCHED = f"zwidth diagnose searches for a remedy, unless the delay is longer than {LONG_DELAY:g} periods"
 SMALL = 0.1  # encoder steps; a limit cycle of smaller amplitude is printed without a caution
+WITHOUT_MARGINS = "these are limits of stability, without margins: for a wall to set, use recommend"
 FRICTIONLESS = "without friction a finer encoder only reduces the amplitude, in proportion to its steps"
 
 

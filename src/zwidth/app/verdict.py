@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from zwidth.analysis.assessment import round_margin
 from zwidth.analysis.cautions import find_thin, price_passivity
-from zwidth.analysis.stabilization import WITHOUT_MARGINS, stabilize
+from zwidth.analysis.stabilization import stabilize
 from zwidth.app.gains import format_cascade
 from zwidth.app.printing import (
     format_diagnosis,
@@ -111,7 +111,7 @@ def format_check(
     lines += [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
     # With K = 0, print the stable dampings of a pure damper. Exclude measured responses, which have no poles and
     # therefore the frequency NaN.
-    damper = wall.stiffness == 0 and not isnan(verdict.frequency)
+    damper = wall.stiffness == 0 and not isnan(verdict.frequency) and scene.loop.has_boundary
     dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
     if word == "MARGINAL":
         lines.append(format_line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
@@ -120,11 +120,12 @@ def format_check(
         lines.append(format_line("remedy", f"a pure damper: {_spell_intervals('B', dampings, units['N s/m'], 'K')}"))
     elif word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)]
-        notes = [f"or {change}" for change in changes[1:]] + [WITHOUT_MARGINS]
-        lines.append(
-            format_line("remedy", changes[0] if changes else "no stabilizing change of one parameter was found")
-        )
-        lines += [format_line("", note) for note in notes if changes]
+        if not changes:
+            lines.append(format_line("remedy", "no stabilizing change of one parameter was found"))
+        else:
+            lines += [format_line("remedy", changes[0]), *(format_line("", f"or {change}") for change in changes[1:])]
+            advice = ": for a wall to set, use recommend" if scene.loop.has_boundary else ""
+            lines.append(format_line("", f"these are limits of stability, without margins{advice}"))
     lines += format_margins(verdict)
     lines += format_decay(verdict)
     if word != "UNSTABLE" or verbose:
@@ -185,7 +186,7 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
 
 def format_margins(verdict: Assessment) -> list[str]:
     """Return a list with the printed line of the margins of a stable wall; empty for other walls."""
-    if not verdict.stable:
+    if not verdict.stable or isnan(verdict.gain_margin):
         return []
     gain, phase, late, least = (
         round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay", "modulus")

@@ -334,11 +334,14 @@ def _compute_walls(
         results["spectral_radius"] = np.asarray(scene.spectral_radius(stiffness, virtual_damping))
     for name in wanted:
         unknown |= np.isnan(results[name])
-    if MARGIN_OUTPUTS & set(outputs):
+    if names := MARGIN_OUTPUTS & set(outputs):
         # Add the stability margins after the check for NaN, because NaN is also the correct value of a margin that does
         # not exist.
-        margins = scene.margins(stiffness, virtual_damping)
-        results |= {name: np.asarray(getattr(margins, name)) for name in MARGIN_OUTPUTS}
+        walls = np.broadcast_arrays(alpha, beta)
+        margins = scene.loop.margins(walls[0], walls[1], names)
+        results |= {name: np.asarray(getattr(margins, name)) for name in names}
+        if "delay_margin" in names:
+            results["delay_margin"] = results["delay_margin"] * scene.timing.period
     if "passive" in outputs:
         margin = np.asarray(scene.passivity_margin(stiffness, virtual_damping))
         results["passive"] = margin > 0

@@ -5,9 +5,12 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from coupling_loop import count_drifts, draw_coupling, find_coupling_radius
 
 import zwidth
+from zwidth.cli import cli
+from zwidth.studies import load_config
 
 DEVICE, TIMING = zwidth.Device(0.1, 10), zwidth.Timing("1 ms", "1 ms")
 N_SCENES = 24
@@ -166,3 +169,23 @@ def test_changes_that_harm_are_named():
     assert limits["half the delay"].spell().endswith("harmful)")
     assert limits["a tool twice as heavy"].note == ""
     assert "a tool half as heavy" not in limits
+
+
+def test_configuration_and_command(tmp_path):
+    file = tmp_path / "config.yaml"
+    parts = "position: {kind: pll, bandwidth: 800}, tool: {mass: 300 g, damping: 1, stiffness: 10}"
+    scene = f"scene: {{mass: 100 g, damping: 10, rate: 1 kHz, delay: 1 ms, {parts}}}"
+    file.write_text(f"version: 1\nname: test\n{scene}\nstudies: [{{name: top, kind: boundary}}]\n", encoding="utf-8")
+    expected = make_scene("pll").max_stiffness().stiffness
+    loaded = load_config(file).scene
+    assert loaded is not None
+    assert loaded.to_scene().max_stiffness().stiffness == pytest.approx(float(expected), rel=1e-12)
+    options = {
+        "mass": 0.1, "damping": 10, "rate": "1 kHz", "delay": "1 ms", "position-bandwidth": 800, "stiffness": 4e3,
+        "virtual-damping": 20, "tool-mass": "300 g", "tool-damping": 1, "tool-stiffness": 10,
+    }  # fmt: skip
+    arguments = [text for name, value in options.items() for text in (f"--{name}", str(value))]
+    text = CliRunner().invoke(cli, ["check", *arguments, "--verbose"]).output
+    assert text.startswith("STABLE")
+    assert f"{np.floor(float(expected) / 10) / 100:.2f} kN/m" in text
+    assert "not known" not in next(line for line in text.splitlines() if line.startswith("margins"))
