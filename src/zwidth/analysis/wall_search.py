@@ -334,15 +334,15 @@ def _choose_free(
         usual = min(max(usual, low), high)
     spare = slack(most, usual)
     if spare and not (requirements.stiffness_fraction and min(spare.values()) >= 0):
-        stiffness, damping = find_stiffest(scene, slack, most, near, width, safe)
+        # Return before the search, which may take half a minute, if the damping excludes every passive wall.
+        reason, reserve = "", 0.0 if safe is None else safe.damping_reserve
+        if requirements.passive and scene.device.damping == 0:
+            reason = "no passive wall exists, because the device has no physical damping"
+        elif requirements.passive and scene.device.damping <= reserve:
+            reason = "no wall is passive for certain, because the device may have no physical damping; record longer"
+        stiffness, damping = (nan, nan) if reason else find_stiffest(scene, slack, most, near, width, safe)
         if math.isnan(stiffness):
-            reason = f"no wall satisfies {' and '.join(map(requirements.spell, spare))}; relax a requirement"
-            if requirements.passive and scene.device.damping == 0:
-                reason = "no passive wall exists, because the device has no physical damping"
-            elif requirements.passive and safe is not None and scene.device.damping <= safe.damping_reserve:
-                reason = (
-                    "no wall is passive for certain, because the device may have no physical damping; record longer"
-                )
+            reason = reason or f"no wall satisfies {' and '.join(map(requirements.spell, spare))}; relax a requirement"
             return WallChoice(nan, nan, "", Status.UNREACHABLE, reason)
         spare = slack(stiffness, damping)
         limit = min(spare, key=lambda name: float(spare[name])) if stiffness < most else active
