@@ -28,6 +28,7 @@ from zwidth.stability.linear.passivity import find_obstacle
 from zwidth.stability.results import Margins
 from zwidth.units.display import ResultList, compact_repr, find_unit, with_units
 from zwidth.units.formatting import format_interval, plain, round_conservatively, to_json, with_unit
+from zwidth.units.quantities import FIELDS
 from zwidth.units.unit_system import LINEAR, UnitSystem
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
@@ -123,11 +124,8 @@ def assess(scene: SceneOptima) -> Assessment:
     # Compute the dominant pole before the other results, because this step raises an error if the loop has too many
     # poles.
     dominant, period = scene.loop.find_dominant(float(scene.alpha), float(scene.beta)), scene.timing.period
-    margins, best, has_condition = (
-        scene.margins(),
-        scene.max_stiffness(),
-        not find_obstacle(scene),
-    )
+    margins = scene.margins() if scene.loop.has_boundary else Margins(*[math.nan] * len(Margins._fields))
+    best, has_condition = scene.max_stiffness(), not find_obstacle(scene)
     margin = float(scene.passivity_margin()) if has_condition else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
     in_stiffness, in_damping = (
@@ -246,6 +244,7 @@ IMPROVEMENTS = {
     "actuator.cutoff": (2.0, "an amplifier twice as fast"),
     "actuator.time_constant": (0.5, "an amplifier twice as fast"),
     "coupling.stiffness": (2.0, "a link twice as stiff"),
+    "tool.every": (0.5, "a physics engine twice as fast"),
 }
 # A lighter tool raises K_max of some scenes and lowers that of others, so only the better one of these two is listed.
 TOOL_MASSES = ((2.0, "a tool twice as heavy"), (0.5, "a tool half as heavy"))
@@ -285,10 +284,10 @@ def limits_of(scene: SceneOptima) -> list[Limit]:
 
     Each part and parameter of the scene is improved separately, by a step that is available in practice: twice the
     rate, half the delay, 10 % more damping, a filter or an amplifier twice as fast, a window half as long, a coupling
-    twice as stiff, a structure twice as stiff for the modes, or a simulated tool of twice or half the mass. At twice
-    the rate the window keeps its length in seconds and the delay stays constant in the unit in which it was given; a
-    delay given in seconds is also evaluated constant in periods. If twice the cutoff exceeds the Nyquist frequency, the
-    filter is removed instead.
+    twice as stiff, a structure twice as stiff for the modes, a simulated tool of twice or half the mass, or a physics
+    engine twice as fast. At twice the rate the window keeps its length in seconds and the delay stays constant in the
+    unit in which it was given; a delay given in seconds is also evaluated constant in periods. If twice the cutoff
+    exceeds the Nyquist frequency, the filter is removed instead.
 
     Args:
         scene: a scene whose parameters are plain numbers.
@@ -342,7 +341,7 @@ def describe_islands(scene: SceneOptima) -> list[str]:
     if least is not None:
         softest = with_unit(round_conservatively(least * scene.units.stiffness, "above"), system["N/m"])
         lines.append(f"the device is unstable without a wall: no wall softer than K = {softest} is stable")
-    for island in scene.islands():
+    for island in scene.islands() if scene.loop.has_boundary else []:
         units = {"K": (island.stiffness, system["N/m"]), "B": (island.virtual_damping, system["N s/m"])}
         ends = (f"{name} from {' to '.join(format_interval(*ends, u))}" for name, (ends, u) in units.items())
         lines.append(f"an island of stable walls, {', '.join(ends)}, is not connected to K = 0 and excluded from K_max")
@@ -407,7 +406,8 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
         return False
     if isinstance(scene.feedback, Feedback) or isinstance(scene.position, PositionFilter | Observer):
         return False
-    if getattr(scene.position, "coefficient", None) is not None:
+    too_many_periods = scene.tool is not None and 2 * scene.tool.every > FIELDS["tool.every"].allowed.high
+    if too_many_periods or getattr(scene.position, "coefficient", None) is not None:
         return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
     later = scene.d if scene.timing.in_periods else 2 * scene.d
@@ -417,9 +417,11 @@ def _can_sample_faster(scene: SceneOptima) -> bool:
 def _double_rate(scene: SceneOptima) -> SceneOptima:
     """Return a copy of the scene with half the sampling period.
 
-    Filter and velocity window stay constant in seconds, and the delay in the unit in which it was given.
+    Filter, velocity window and steps of a slow tool stay constant in seconds, the delay in the unit of its input.
     """
     changes: dict[str, float] = {"period": scene.timing.period / 2}
+    if scene.tool is not None and scene.tool.every > 1:
+        changes["tool.every"] = 2 * scene.tool.every
     if isinstance(scene.velocity, WindowedDifference):
         changes["velocity.samples"] = scene.velocity.samples * 2
     if not isinstance(scene.velocity, VelocityFilter | FOAW) and scene.velocity.coded_period is not None:

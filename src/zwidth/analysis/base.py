@@ -23,6 +23,7 @@ import numpy as np
 from zwidth.analysis.coupling_loop import CouplingLoop
 from zwidth.analysis.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.analysis.measured_loop import MeasuredLoop
+from zwidth.analysis.slow_tool_loop import SlowToolLoop
 from zwidth.core.errors import InputError
 from zwidth.core.pytrees import list_leaves
 from zwidth.core.types import Array, ArrayLike
@@ -110,6 +111,9 @@ class SceneParts(Part):
             )
         if self.tool is not None and isinstance(self.device, MeasuredDevice):
             raise InputError("tool: not allowed with a measured response; use a model of the device")
+        if self.tool is not None and self.tool.every > 1 and (self.position is not None or self.feedback is not None):
+            name = "feedback" if self.position is None else "position"
+            raise InputError(f"{name}: not allowed with tool.every = {self.tool.every}; omit {name}, or set every=1")
 
     def _shift_parts(self) -> None:
         """Move velocity estimate and operator to their fields if the positional arguments omit the wall before them."""
@@ -142,7 +146,7 @@ class SceneParts(Part):
         if self.nonrigid_parts and self.traced_path is not None:
             return self.traced_loop
         if self.tool is not None:
-            return CouplingLoop(make_plain(self))
+            return (CouplingLoop if self.tool.every == 1 else SlowToolLoop)(make_plain(self))
         return LinearLoop(make_plain(self)) if self.nonrigid_parts else RigidLoop(self)
 
     @cached_property
@@ -152,7 +156,8 @@ class SceneParts(Part):
 
     def check_parts(self) -> None:
         """Raise `InputError` for an invalid combination of parts, such as a cutoff above the Nyquist frequency."""
-        _ = self.loop.walls if isinstance(self.loop, MeasuredLoop) else self.loop.roots
+        loop = self.loop
+        _ = loop.walls if isinstance(loop, MeasuredLoop) else loop.roots if loop.has_boundary else loop.chain
 
     @cached_property
     def mass(self) -> Any:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from zwidth.analysis.walls import refuse_slow_tool
 from zwidth.core.errors import InputError
 from zwidth.stability.rigid.virtual_coupling import find_margin, find_stiffest
 from zwidth.units.display import compact_repr
@@ -94,6 +95,7 @@ def max_safe_coupling(scene: Scene) -> SafeCoupling:
 
 def find_delay(scene: Scene) -> int:
     """Return the delay, an integer number of periods; raise `InputError` if no condition is known for the scene."""
+    refuse_slow_tool(scene, "the condition for every passive world")
     # Ignore the operator and the tool of the scene, because the condition holds for every passive operator and tool.
     unsupported = [part for part in scene.nonrigid_parts if part not in ("operator", "tool")]
     if unsupported:

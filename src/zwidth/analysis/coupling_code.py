@@ -96,7 +96,7 @@ def write_program(
 
 def build_coupling_program(scene: SceneParts, tool: Tool, language: str) -> CouplingProgram:
     """Build the program of a coupling."""
-    K, B, every = float(scene.wall.stiffness), float(scene.wall.virtual_damping), getattr(tool, "every", 1)
+    K, B, every = float(scene.wall.stiffness), float(scene.wall.virtual_damping), tool.every
     device = write_device(scene, language)
     velocity = write_velocity(scene, language, device.position)
     solve, step = write_tool(scene, tool, device.position, velocity)
@@ -180,7 +180,7 @@ def write_tool(scene: SceneParts, tool: Tool, position: str, velocity: VelocityC
         position: name of the position of the device that the coupling uses.
         velocity: statements of the estimate of the relative velocity.
     """
-    every = getattr(tool, "every", 1)
+    every = tool.every
     length = every * float(scene.timing.period)
     rate, damping, stiffness = length / float(tool.mass), float(tool.damping), float(tool.stiffness)
     move = f"@tool_position += {length!r} * @tool_velocity"
@@ -241,8 +241,7 @@ def _describe_coupling(scene: SceneParts, tool: Tool, max_force: float) -> list[
     if system.rotary:
         values[0] = ("moment of inertia", *values[0][1:])
     texts = [f"{name} {with_unit(value, unit)}" for name, value, unit in values if value]
-    every = getattr(tool, "every", 1)
-    rate = f", one step every {every} periods" if every > 1 else ""
+    rate = f", one step every {tool.every} periods" if tool.every > 1 else ""
     lines = [line, f"Tool: {', '.join(texts)}, {tool.integrator} Euler method{rate}."]
     if scene.position is not None:
         lines.append(f"The coupling uses the position estimate y, computed by {type(scene.position).__name__}.")

@@ -24,7 +24,8 @@ import numpy as np
 from zwidth.core.pytrees import list_leaves, replace_leaves
 from zwidth.core.status import Status
 from zwidth.model.actuator import Actuator
-from zwidth.numerics.taylor import Taylor, differentiate_implicitly, flow, replace_derivatives, seed, solve, stack
+from zwidth.numerics.taylor import Taylor, differentiate_implicitly, replace_derivatives, seed, stack
+from zwidth.stability.linear.derivatives import StateTerms
 
 NYQUIST_TOLERANCE = 1e-12  # relative distance of the angle w from pi below which the pole is at z = -1
 
@@ -102,11 +103,7 @@ class LimitTerms:
         # Use the value of d of the loop, because the quotient has a rounding error, which `Timing.d` removes.
         fraction = Taylor(np.float64(self.loop.d), d.first, d.second) - n
         self.A, self.b = self._realize()
-        if self.loop.plant.dt:
-            self.psi, self.full, self.late = self.A + stack(-np.eye(len(self.A.v)), self.one), self.b, self.b
-        else:
-            self.psi, self.full = flow(self.A, self.b, self.one)
-            self.late = flow(self.A, self.b, self.one - fraction)[1]
+        self.states = StateTerms(self.A, self.b, self.one, fraction, bool(self.loop.plant.dt))
 
     def differentiate(self, factors: list[float], K: float, w: float) -> list[Taylor]:
         """Return stiffness and frequency, with derivatives in the leaves of the display, followed by M, D and B.
@@ -148,11 +145,9 @@ class LimitTerms:
 
     def _respond(self, zeta: Taylor) -> tuple[Taylor, Taylor]:
         """Return ``X_1`` and ``(A_1 X + b_1)/T`` of the robot."""
-        size = len(self.b.v)
-        matrix = zeta.map(lambda part: np.multiply.outer(np.eye(size), part)) - self.psi
-        state = solve(matrix, self.full + self.late * zeta.map(lambda part: np.asarray(part)[None]))
+        state = self.states.respond(zeta)[1]
         velocity = self.b[0]
-        for k in range(size):
+        for k in range(len(self.b.v)):
             velocity = velocity + self.A[0, k] * state[k]
         return state[0], velocity / self.period
 

@@ -9,7 +9,7 @@ stiffness K and the damping B, and the characteristic polynomial is ``M p_M + D 
 is real. The angles w at which this sum is real are the *crossings*. In ``x = cos w`` they are the roots of a real
 polynomial, because the imaginary part of ``p(z) p_K(1/z)`` is sin w times a sum of Chebyshev polynomials U_k(x), and
 its coefficients are affine in M, D and B. The smallest positive K of all crossings is the limit if the display is
-stable with half of it (docs/theory/admittance.md, W5).
+stable with smaller K (docs/theory/admittance.md, W5).
 
 References:
     Good 1961, Quarterly Journal of Mathematics 12(1), 61-68 (colleague matrix, whose eigenvalues are the roots of a
@@ -19,11 +19,12 @@ References:
 from __future__ import annotations
 
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.analysis.admittance_loop import AdmittanceLoop
+from zwidth.analysis.admittance_loop import KEPT_LOOPS, AdmittanceLoop, to_zeta
 from zwidth.core.status import Status
 from zwidth.model.exact_polynomials import Polynomial
 from zwidth.numerics.polynomials import companion
@@ -33,7 +34,12 @@ NEWTON_STEPS = 8  # Newton steps for the angle of a crossing; 3 suffice after th
 STEP = 1e-5  # relative step of w for the derivative in Newton's method
 RESIDUAL = 1e-9  # largest imaginary part of K at a crossing, relative to K
 NEAR_REAL = 1e-3  # imaginary part of x, relative to the distance from 1 or -1, below which a crossing is ambiguous
-CLEARANCE = 1e-6  # distance of all poles from the unit circle above which their eigenvalues decide the stability
+CLEARANCE = 1e-6  # distance of a pole from the unit circle, relative to |zeta|, above which its eigenvalue is accurate
+LARGEST_DEGREE = 30  # degree of the characteristic polynomial up to which eigenvalues are accurate
+NEGLIGIBLE = 1e-18  # coefficient of the Chebyshev series, relative to the largest one, that rounding errors exceed
+TESTED = (1 / 16, 1 / 2, 15 / 16)  # fractions of the smallest positive K at which the stability must be the same
+# Angles between which the number of crossings is compared with the signs of the Chebyshev series, in rad per period.
+NODES = np.concatenate([np.geomspace(1e-6, 0.3, 120), np.linspace(0.3, np.pi - 1e-6, 121)[1:]])
 
 
 class Limits(NamedTuple):
@@ -46,11 +52,11 @@ class Limits(NamedTuple):
 
 def find_limits(loop: AdmittanceLoop, M: np.ndarray, D: np.ndarray, B: np.ndarray) -> Limits:
     """Return the largest K such that displays are stable from 0 to K; M, D and B are vectors of one length."""
-    coefficients = loop.coefficients
-    parts = (coefficients.mass, coefficients.damping, coefficients.environment_damping)
-    series = _stack([_expand_crossings(part, coefficients.stiffness) for part in parts], at_end=True)
+    if len(loop.coefficients.mass) > LARGEST_DEGREE + 1:
+        unknown = np.full(len(M), np.nan)
+        return Limits(unknown, unknown.copy(), np.full(len(M), int(Status.UNDECIDED)))
+    series, polynomials = _convert(loop)
     factors = np.stack([M, D, B], -1)
-    polynomials = _stack([np.array(part, float) for part in (*parts, coefficients.stiffness)], at_end=False)
     results = [
         _find_block(loop, series, polynomials, factors[start : start + BLOCK])
         for start in range(0, max(len(M), 1), BLOCK)
@@ -58,21 +64,47 @@ def find_limits(loop: AdmittanceLoop, M: np.ndarray, D: np.ndarray, B: np.ndarra
     return Limits(*(np.concatenate(column) for column in zip(*results, strict=True)))
 
 
+@lru_cache(KEPT_LOOPS)
+def _convert(loop: AdmittanceLoop) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Chebyshev series of the crossings for M, D and B, and p_M, p_D, p_B and p_K in powers of zeta."""
+    mass, damping, stiffness, environment_damping = loop.coefficients
+    parts = mass, damping, environment_damping
+    series = _stack([_expand_crossings(part, stiffness) for part in parts], at_end=True)
+    return series, _stack([np.array(to_zeta(part), float) for part in (*parts, stiffness)], at_end=False)
+
+
 def _find_block(loop: AdmittanceLoop, series: np.ndarray, polynomials: np.ndarray, factors: np.ndarray) -> Limits:
     """Return the limits of displays; ``factors`` has a row (M, D, B) per display."""
+    coefficients = factors @ series
     with np.errstate(all="ignore"):
-        angles, is_ambiguous = _find_angles(factors @ series)
-        angles = np.concatenate([_refine(loop, factors, angles), np.full((len(factors), 1), np.pi)], -1)
+        angles, is_ambiguous = _find_angles(coefficients)
+        angles = _refine(loop, factors, angles)
+        is_ambiguous |= ~_confirm_angles(coefficients, angles)
+        angles = np.concatenate([angles, np.full((len(factors), 1), np.pi)], -1)
         K = _evaluate(loop, factors, angles)
         is_crossing = (np.abs(K.imag) <= RESIDUAL * np.abs(K)) & (K.real > 0) & np.isfinite(K)
         candidates = np.where(is_crossing, K.real, np.inf)
     best = candidates.argmin(-1)[:, None]
     limit, angle = (np.take_along_axis(each, best, -1)[:, 0] for each in (candidates, angles))
     is_known = np.isfinite(limit) & ~is_ambiguous
-    label = _label_poles(polynomials, factors, np.where(is_known, limit, 1.0) / 2.0)
-    is_stable, is_unstable = is_known & (label > 0), is_known & (label < 0)
+    tested = np.where(is_known, limit, 1.0)
+    labels = np.array([_label_poles(polynomials, factors, fraction * tested) for fraction in TESTED])
+    is_stable, is_unstable = is_known & (labels > 0).all(0), is_known & (labels < 0).all(0)
     status = np.where(is_stable, Status.OK, np.where(is_unstable, Status.NO_BOUNDARY, Status.UNDECIDED))
     return Limits(np.where(is_stable, limit, np.nan), np.where(is_stable, angle, np.nan), status)
+
+
+def _confirm_angles(coefficients: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Return whether the number of crossings between neighboring nodes agrees with the signs of the Chebyshev series.
+
+    The number must be odd if and only if the sign changes. Eigenvalues may miss roots, or yield wrong ones, if the
+    coefficients differ by many orders of magnitude.
+    """
+    # Each series times sin w is a sum of sin((k + 1) w), and sin w is positive.
+    values = coefficients @ np.sin(np.outer(np.arange(1, coefficients.shape[1] + 1), NODES))
+    changes = np.signbit(values[:, 1:]) != np.signbit(values[:, :-1])
+    between = (angles[:, :, None] > NODES[:-1]) & (angles[:, :, None] <= NODES[1:])
+    return np.all((between.sum(1) % 2 == 1) == changes, -1)
 
 
 def _expand_crossings(p: Polynomial, p_K: Polynomial) -> np.ndarray:
@@ -100,14 +132,16 @@ def _find_angles(series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Args:
         series: coefficients of U_0, U_1, ..., one row per display.
     """
-    used = np.flatnonzero(series.any(0))
+    # Omit negligible coefficients of the highest order, because the colleague matrix is divided by the last one.
+    size = np.abs(series)
+    used = np.flatnonzero((size > NEGLIGIBLE * size.max(-1, keepdims=True)).any(0))
     series = series[:, : used[-1] + 1] if used.size else series[:, :1]
-    size, top = series.shape[1] - 1, series[:, -1:]
+    count, top = series.shape[1] - 1, series[:, -1:]
     is_invalid = (top[:, 0] == 0) | ~np.isfinite(series).all(-1)
     # Rows of the colleague matrix: x U_k = (U_(k+1) + U_(k-1))/2, where the last U_k is eliminated by the series.
-    matrix = np.zeros((len(series), size, size))
-    matrix += (np.eye(size, k=1) + np.eye(size, k=-1)) / 2.0
-    if size:
+    matrix = np.zeros((len(series), count, count))
+    matrix += (np.eye(count, k=1) + np.eye(count, k=-1)) / 2.0
+    if count:
         matrix[:, -1] -= np.where(is_invalid[:, None], 0.0, series[:, :-1] / top) / 2.0
     x: Any = np.linalg.eigvals(matrix) + 0j
     distance = np.minimum(np.abs(1.0 - x), np.abs(1.0 + x))
@@ -143,13 +177,15 @@ def _label_poles(polynomials: np.ndarray, factors: np.ndarray, K: np.ndarray) ->
     """Return 1 for stable and -1 for unstable displays, and 0 if a pole is too close to the unit circle.
 
     Args:
-        polynomials: coefficients of p_M, p_D, p_B and p_K.
+        polynomials: coefficients of p_M, p_D, p_B and p_K, in powers of zeta.
         factors: a row (M, D, B) per display.
         K: stiffness of the environment, one per display.
     """
     monic = np.concatenate([factors, K[:, None]], -1) @ polynomials
     monic = monic / monic[:, :1]
     is_valid: Any = np.isfinite(monic).all(-1)
-    poles = np.linalg.eigvals(companion(np.where(is_valid[:, None], monic, 0.0)))
-    radius = np.abs(poles).max(-1)
-    return np.where(is_valid & (np.abs(radius - 1.0) > CLEARANCE), np.sign(1.0 - radius), 0.0)
+    # Slow poles are a cluster near z = 1. In powers of zeta, their eigenvalues have small relative errors.
+    zeta: Any = np.linalg.eigvals(companion(np.where(is_valid[:, None], monic, 0.0)))
+    excess, bound = 2.0 * zeta.real + np.abs(zeta) ** 2, CLEARANCE * np.abs(zeta)  # excess is |z|^2 - 1
+    is_stable, is_unstable = (excess < -bound).all(-1), (excess > bound).any(-1)
+    return np.where(is_valid, is_stable * 1.0 - is_unstable * 1.0, 0.0)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from zwidth.analysis.walls import read_single_wall
+from zwidth.analysis.walls import read_single_wall, refuse_slow_tool
 from zwidth.core.errors import check_choice
 from zwidth.core.status import Status
 from zwidth.model.circle_functions import circle_points
@@ -70,7 +70,8 @@ def lightest_tool(
         coupling is unstable with every tool, both are NaN and ``status`` is NO_BOUNDARY.
 
     Raises:
-        InputError: the device is given by a measured response, or the coupling is not one pair of finite numbers.
+        InputError: the device is given by a measured response, the scene's tool makes one step per several periods
+            (``every`` > 1), or the coupling is not one pair of finite numbers.
 
     Numerics:
         The critical masses, at which a pole is on the unit circle, are computed. They divide all masses into intervals,
@@ -87,6 +88,7 @@ def lightest_tool(
         >>> scene.lightest_tool(4900, 2, integrator="implicit").mass
         0.0
     """
+    refuse_slow_tool(scene, "lightest_tool")
     tool = scene.tool or Tool(1.0)
     integrator = integrator or tool.integrator
     check_choice("integrator", integrator, CHOICES["tool.integrator"].names)

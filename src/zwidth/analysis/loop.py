@@ -92,6 +92,8 @@ class LinearLoop:
     # Largest velocity window and delay, in periods, that searches in other modules try. It is limited, because the run
     # time increases with the square of window and delay.
     most_periods: ClassVar[float] = 128
+    # True if the stability boundary in the plane of alpha and beta is available, from which margins and islands follow.
+    has_boundary: ClassVar[bool] = True
 
     @cached_property
     def chain(self) -> AnyChain:

@@ -396,7 +396,8 @@ class SceneAdvice(SceneOptima):
 
         If neither a fraction, a margin nor passivity is given, the defaults are a stiffness fraction of 0.75, a gain
         margin of 2, a phase margin of 30 degrees and, for a `Device` without an operator, ``grasps="soft"``. If one of
-        them is given, it replaces all defaults. ``grasps`` leaves the other defaults unchanged.
+        them is given, it replaces all defaults, so that ``passive=True`` alone yields the stiffest passive wall.
+        ``grasps`` leaves the other defaults unchanged.
 
         Returns:
             Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, the active requirement; ``cautions``,

@@ -155,6 +155,8 @@ def _search(scene: SceneOptima, path: str, present: float, direction: int, facto
     after = stable.index(False, first) if False in stable[first:] else None
     far = _bisect(holds, values[after - 1], values[after]) if after else None
     note = f"the delay stays {scene.timing.delay_text}" if path == "rate" and scene.timing.delay else ""
+    if path == "rate" and scene.tool is not None and scene.tool.every > 1:
+        note = "; ".join(filter(None, [note, f"the tool keeps one step per {scene.tool.every} periods"]))
     if direction > 0:
         return [Remedy(path, near, math.inf if far is None else far, note)]
     return [Remedy(path, -math.inf if far is None else far, near, note)]

@@ -122,11 +122,30 @@ class TracedLoop(LinearLoop):
             "scene: got values traced by JAX; this question needs plain numbers, outside jit, vmap and grad"
         )
 
+    def _forbid_derivatives(self, value: Array) -> Array:
+        """Return the value; differentiation by JAX raises `InputError` if the tool makes one step per several periods.
+
+        The derivatives of other loops follow from their stability boundary, which this loop lacks.
+        """
+        tool = self.scene.tool
+        if tool is None or tool.every == 1:
+            return value
+
+        @jax.custom_jvp
+        def keep(value: Array) -> Array:
+            return value
+
+        @keep.defjvp
+        def refuse(primals: Any, tangents: Any) -> Any:
+            raise InputError(f"tool.every: got {tool.every}, but derivatives need one step per period; set every=1")
+
+        return keep(value)
+
     def labels(self, alpha: Array, beta: Array) -> Array:
         return ask(self.scene, "labels", alpha, beta)[0] > 0.5
 
     def radius(self, alpha: Array, beta: Array) -> Array:
-        return ask(self.scene, "radius", alpha, beta)[0]
+        return self._forbid_derivatives(ask(self.scene, "radius", alpha, beta)[0])
 
     def critical_walls(self, w: Array) -> tuple[Array, Array]:
         alpha, beta = ask(self.scene, "critical_walls", w)
@@ -134,7 +153,8 @@ class TracedLoop(LinearLoop):
 
     def trace_stiffest(self, negative_damping: bool | None) -> RidgePoint:
         """Return the stiffest stable wall; ``negative_damping`` as for `zwidth.Scene.max_stiffness`."""
-        alpha, beta, omega, kind, status = ask(self.scene, "stiffest", options=(negative_damping,))
+        values = ask(self.scene, "stiffest", options=(negative_damping,))
+        alpha, beta, omega, kind, status = map(self._forbid_derivatives, values)
         return RidgePoint(alpha, beta, omega, kind.astype(jnp.int32), status.astype(jnp.int32))
 
     def margins(self, alpha: Array, beta: Array, wanted: Container[str] = Margins._fields) -> Margins:

@@ -159,6 +159,7 @@ class SceneAnalysis(SceneParts):
         period (zero-order hold), and the discretization is exact. The states include those of the velocity estimate and
         the delayed forces. The result has A, B, C, D and the period dt.
         """
+        refuse_slow_tool(self, "the state-space model of the closed loop")
         compliance = self.timing.period**2 / float(self.mass)
         tool = self.tool and self.tool.respond(float(self.mass), self.timing.period)
         build = partial(realize_closed_loop, tool=tool)
@@ -355,6 +356,12 @@ def allows_negative(scene: SceneParts, negative_damping: bool | None) -> bool:
         estimate = scene.velocity.estimate(scene.timing.period)
         return bool(estimate.is_difference and estimate.gain > 0)
     return bool(negative_damping)
+
+
+def refuse_slow_tool(scene: SceneParts, result: str) -> None:
+    """Raise `InputError` if the tool of a scene makes one step per several periods; ``result`` names what needs one."""
+    if scene.tool is not None and scene.tool.every != 1:
+        raise InputError(f"tool.every: got {scene.tool.every}, but {result} needs one step per period; set every=1")
 
 
 def _realize(scene: SceneParts, build: Callable[..., StateSpace], unit: float, alpha: Any, beta: Any) -> StateSpace:

@@ -106,7 +106,10 @@ def format_parts(scene: Scene) -> list[str]:
         if name == "coupling":
             words.append(f"sensor at the {parts[name].sensor}")
         if name == "tool":
+            words = [word for word in words if not word.startswith("every ")]
             words.append(f"{parts[name].integrator} Euler")
+            if parts[name].every > 1:
+                words.append(f"one step per {parts[name].every} periods")
         words = [type(parts[name]).__name__, *words] if name in with_kind else words
         lines.append(format_line(name.replace("modes.", "mode "), ", ".join(words)))
     return lines
@@ -169,6 +172,12 @@ def list_tool_notes(scene: Scene) -> list[str]:
     """Return a note on the stability of a virtual coupling with other tools than the scene's; empty without a tool."""
     if scene.tool is None:
         return []
+    if scene.tool.every > 1:
+        rate = with_unit(1.0 / (scene.tool.every * scene.timing.period), "Hz")
+        return [
+            f"K and B are those of a virtual coupling; its tool makes one step per {scene.tool.every} periods, at "
+            f"{rate}; margins and islands are not computed"
+        ]
     if scene.tool.integrator == "semi-implicit":
         return [
             "K and B are those of a virtual coupling; its tool, in semi-implicit Euler, is not passive, so a coupling "

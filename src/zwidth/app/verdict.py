@@ -111,7 +111,7 @@ def format_check(
     lines += [format_line("CAUTION", text) for text in list_omission_cautions(scene, omitted)]
     # With K = 0, print the stable dampings of a pure damper. Exclude measured responses, which have no poles and
     # therefore the frequency NaN.
-    damper = wall.stiffness == 0 and not isnan(verdict.frequency)
+    damper = wall.stiffness == 0 and not isnan(verdict.frequency) and scene.loop.has_boundary
     dampings = tuple(map(tuple, scene.damper_range().tolist())) if damper else verdict.stable_damping
     if word == "MARGINAL":
         lines.append(format_line("", MARGINAL_DAMPER if damper else MARGINAL_PLANT))
@@ -121,9 +121,8 @@ def format_check(
     elif word == "UNSTABLE" and limits is not None:
         changes = [each.spell() for each in stabilize(scene)] or ["no stabilizing change of one parameter was found"]
         lines += [format_line("remedy", changes[0]), *(format_line("", f"or {change}") for change in changes[1:])]
-        lines.append(
-            format_line("", "these are limits of stability, without margins: for a wall to set, use recommend")
-        )
+        advice = ": for a wall to set, use recommend" if scene.loop.has_boundary else ""
+        lines.append(format_line("", f"these are limits of stability, without margins{advice}"))
     lines += format_margins(verdict)
     lines += format_decay(verdict)
     if word != "UNSTABLE" or verbose:
@@ -184,7 +183,7 @@ def _list_maximum(scene: Scene, verdict: Assessment, verbose: bool) -> list[str]
 
 def format_margins(verdict: Assessment) -> list[str]:
     """Return a list with the printed line of the margins of a stable wall; empty for other walls."""
-    if not verdict.stable:
+    if not verdict.stable or isnan(verdict.gain_margin):
         return []
     gain, phase, late, least = (
         round_margin(f"{name}_margin", verdict, True) for name in ("gain", "phase", "delay", "modulus")

@@ -98,9 +98,10 @@ def check(scene: Any, hardware: dict[str, Any], verbose: bool, as_json: bool) ->
             *printing.list_limit_cautions(scene),
             *printing.list_omission_cautions(scene, find_omitted()),
         ]
-        result["islands"] = [island._asdict() for island in scene.islands()]
+        result["islands"] = _list_islands(scene)
         unstable = verdict.stable is False and not verdict.marginal
-        if scene.wall.stiffness == 0 and not isinstance(scene.device, MeasuredDevice):
+        has_damper_range = scene.loop.has_boundary and not isinstance(scene.device, MeasuredDevice)
+        if scene.wall.stiffness == 0 and has_damper_range:
             result["damper_range"] = scene.damper_range().tolist()
         result["remedies"] = [each._asdict() for each in stabilize(scene)] if unstable else []
     else:
@@ -156,19 +157,21 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
             ]
     result["kind"] = kind
     if given is not None:
-        slopes, notes = printing.list_slopes(scene), printing.list_notes(scene) + _list_obstacles(scene)
+        slopes = printing.list_slopes(scene) if scene.loop.has_boundary else []
+        notes = printing.list_notes(scene) + _list_obstacles(scene)
         stiffest = scene.replace(wall=VirtualWall(float(wall.stiffness), float(wall.virtual_damping)))
         cautions = [*printing.compare_with_limit(stiffest), *printing.list_omission_cautions(scene, find_omitted())]
         wall_values = wall.stiffness, wall.virtual_damping, wall.frequency
         named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, wall_values), strict=True))
         result |= named | {
             "sensitivities": {slope.name: slope.as_dict() for slope in slopes},
-            "islands": [island._asdict() for island in scene.islands()],
+            "islands": _list_islands(scene),
             "notes": notes,
             "cautions": cautions,
         }
         B, f = with_unit(wall_values[1], scene.unit_system["N s/m"]), with_unit(named["frequency"], "Hz")
         K = format_stiffness(named["stiffness_max"], scene.unit_system)
+        advice = "zwidth recommend, with the same options, for the wall to set"
         top = f"{K} at B = {B}, {f} ({kind.replace('_', ' ')} optimum)"
         lines = [
             printing.format_line("K_max", top),
@@ -176,12 +179,17 @@ def ridge(delta: float | None, d: float | None, scene: Any, as_json: bool) -> No
             printing.format_line("device", spell_device(scene, find_omitted())),
             *printing.format_parts(scene),
             *(printing.format_line("CAUTION", text) for text in cautions),
-            printing.format_line("next", "zwidth recommend, with the same options, for the wall to set"),
+            *([printing.format_line("next", advice)] if scene.loop.has_boundary else []),
             "",
             *(slope.line() for slope in slopes),
             *printing.format_notes(notes),
         ]
     printing.print_result(result, lines, as_json, printing.LABEL)
+
+
+def _list_islands(scene: Any) -> list[dict[str, Any]] | None:
+    """Return the islands of a scene for a record; None if they are not available, with a slow simulated tool."""
+    return [island._asdict() for island in scene.islands()] if scene.loop.has_boundary else None
 
 
 def _list_obstacles(scene: Any) -> list[str]:
@@ -389,10 +397,11 @@ def recommend(
     The options --mass (or --device) and --rate (or --period) are required; the defaults of damping and delay are 0.
     Parameters that are not given as options are taken from SCENE.yaml (or from the folder of a run). If you use
     --stiffness-fraction, --gain-margin, --phase-margin or --passive, your requirement replaces all default
-    requirements; --grasps does not replace them. With --resolution, --friction or --max-force, the command also
-    simulates the wall to find limit cycles and saturation; --max-force also limits the force in the code of --code. A
-    hand (--operator-...) is a part of the device, and the command also checks the wall without this hand. The exit code
-    is 1 if no wall exists.
+    requirements; --grasps does not replace them. So --passive alone recommends the stiffest passive wall, the limit
+    that publications state; add --phase-margin 30 --gain-margin 2 to keep the default margins. With --resolution,
+    --friction or --max-force, the command also simulates the wall to find limit cycles and saturation; --max-force also
+    limits the force in the code of --code. A hand (--operator-...) is a part of the device, and the command also checks
+    the wall without this hand. The exit code is 1 if no wall exists.
     """
     from zwidth.app.verdict import format_recommendation
 

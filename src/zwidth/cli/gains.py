@@ -44,7 +44,7 @@ _REQUIRED = {"cascade": ("pos_gain", "vel_gain"), "pid": ("kp",)}
 _DEVICE = {"scene", "device", "mass", "rate", "period"}  # options that imply a device, of which a scene is built
 
 
-class _Controller(NamedTuple):
+class _GivenController(NamedTuple):
     """A controller: its gains by kind ("pid" or "cascade"), wall and feedback, and its scene if a device is given."""
 
     gains: dict[ControllerKind, dict[str, float]]  # a wall may have gains of both kinds
@@ -88,7 +88,7 @@ def _find_kind(given: dict[str, float]) -> ControllerKind | None:
     return kinds[0] if kinds else None
 
 
-def _read_controller(values: dict[str, Any], system: UnitSystem) -> _Controller:
+def _read_controller(values: dict[str, Any], system: UnitSystem) -> _GivenController:
     """Return the controller that the options describe; ``values`` are those of the options of a scene."""
     options = click.get_current_context().params
     given = {name: options[name] for name in _HELP if options[name] is not None}
@@ -110,7 +110,7 @@ def _read_controller(values: dict[str, Any], system: UnitSystem) -> _Controller:
         wall, feedback = VirtualWall(values.get("stiffness", 0.0), values.get("virtual_damping", 0.0)), None
         if scene is not None:
             wall, feedback = scene.wall, scene.feedback
-        return _Controller(
+        return _GivenController(
             _list_gains(wall, feedback, units, output_unit), units, wall, feedback, scene, {}, system, output
         )
     position = None if scene is None else scene.position
@@ -134,7 +134,7 @@ def _read_controller(values: dict[str, Any], system: UnitSystem) -> _Controller:
                     return bare.replace(wall=changed.wall, feedback=changed.feedback)
 
                 limits[name] = find_gain_limits(change, given[name])
-    return _Controller({kind: given}, units, parts.wall, parts.feedback, scene, limits, system, output)
+    return _GivenController({kind: given}, units, parts.wall, parts.feedback, scene, limits, system, output)
 
 
 def _list_gains(
@@ -152,7 +152,7 @@ def _list_gains(
     return gains
 
 
-def _format_controller(controller: _Controller) -> list[str]:
+def _format_controller(controller: _GivenController) -> list[str]:
     """Return printed lines with the gains of a controller and their stable intervals."""
     lines = []
     for kind, gains in controller.gains.items():
@@ -174,7 +174,7 @@ _MOTOR = "--mass '1000 g cm^2' --rate '8 kHz' --delay '1.5 periods'"
 @scene_options(wall=True, make=_read_controller)
 @verbose_option
 @json_option
-def gains(scene: _Controller, verbose: bool, as_json: bool, **_: Any) -> None:
+def gains(scene: _GivenController, verbose: bool, as_json: bool, **_: Any) -> None:
     """Convert the gains of a motor controller to K and B, or K and B to gains; with a device, assess the controller.
 
     Gains are numbers in the units of the controller: a cascade (ODrive, VESC, SimpleFOC) has --pos-gain, --vel-gain and

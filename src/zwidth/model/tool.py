@@ -67,6 +67,15 @@ class Tool(Part):
         at the angular frequency w is ``M (cos(w T) - 1)/T < 0``. Therefore `Scene.is_safe_for_every_world` is not valid
         for this tool. A tool that is integrated by implicit Euler is passive.
 
+        With ``every`` = N > 1, the loop has the period N T (docs/theory/passivity.md, U9). The methods of a scene that
+        return stability, spectral radius, poles, stable intervals or the maximum stiffness compute the eigenvalues of
+        its monodromy matrix; methods that need the stability boundary raise `InputError`. `Scene.poles` returns these
+        eigenvalues, i.e. poles per N periods, while spectral radius and decay rate refer to one period. The frequency
+        of the dominant pole is between 0 and ``1/(2 N T)``, because an eigenvalue does not determine multiples of
+        ``1/(N T)``. `Scene.max_stiffness` searches couplings with B >= 0 on a grid with at least 96 values of B and 32
+        values of K per decade, and refines the highest values. It does not find regions that are narrower than the
+        grid. It takes about 0.5 s.
+
     References:
         Colgate, Stanley, Brown 1995, Proc. IROS, vol. 3 (virtual coupling); Adams, Hannaford 1999, IEEE Trans. Robotics
         and Automation 15 (coupling with a tool).
@@ -76,6 +85,9 @@ class Tool(Part):
         >>> device, timing = zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3, delay=1e-3)
         >>> print(f"{zwidth.Scene(device, timing, tool=zwidth.Tool(mass=0.3)).max_stiffness().stiffness:.0f} N/m")
         22201 N/m
+        >>> slow = zwidth.Scene(device, timing, tool=zwidth.Tool(mass=0.3, every=16))  # 62.5 Hz
+        >>> print(f"K < {slow.stable_stiffness(0)[0, 1]:.0f} N/m at B = 0")
+        K < 1282 N/m at B = 0
     """
 
     _owner = "tool"
@@ -88,13 +100,14 @@ class Tool(Part):
     damping: Any = 0.0
     stiffness: Any = 0.0
     integrator: Integrator = "semi-implicit"
+    every: int = 1
 
     def respond(self, mass: Any, period: Any) -> ToolResponse:
         """Return the response G_t = y/f of the tool, divided by T^2/m.
 
         Args:
             mass: m in kg, the unit of mass of the scene.
-            period: sampling period T in s.
+            period: sampling period T in s; ``every`` must be 1.
         """
         rate = period / self.mass
         p, q = self.damping * rate, self.stiffness * (rate * period)
@@ -109,7 +122,7 @@ class Tool(Part):
             mass: m in kg, the unit of mass of the scene.
             period: sampling period T in s.
         """
-        every = getattr(self, "every", 1)
+        every = self.every
         rate = every * period / self.mass
         p, q, gain = self.damping * rate, self.stiffness * (rate * every * period), every**2 * mass / self.mass
         if self.integrator == "implicit":

@@ -210,7 +210,7 @@ def _list_minima(values: Array) -> Array:
     return np.argpartition(rank, MAX_MINIMA - 1, axis=-1)[..., :MAX_MINIMA]
 
 
-def select_gain_margin(stable: np.ndarray, w: np.ndarray, gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def select_gain_margin(stable: np.ndarray | bool, w: np.ndarray, gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the gain margin, i.e. the gain factor closest to 1 on a logarithmic scale, and the angle of its crossover.
 
     Args:
@@ -226,7 +226,7 @@ def select_gain_margin(stable: np.ndarray, w: np.ndarray, gains: np.ndarray) -> 
     return np.where(np.isnan(w), np.where(stable, np.inf, 0.0), 1.0 / gain), w
 
 
-def select_phase_margin(stable: np.ndarray, w: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def select_phase_margin(stable: np.ndarray | bool, w: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the phase margin in degrees, which is negative for an unstable loop, and the angle of its gain crossover.
 
     Args:

@@ -231,19 +231,35 @@ _PARAMETERS = (
     *(each for k in range(MOST_MODES) for each in _describe_mode(f"modes.{k}", f"mode {k}", str(k))),
     Parameter(
         "position.coefficient", "coefficient a of the exponential filter", "a", Range(0.0, 1.0, low_open=True),
-        note="instead of the cut-off frequency",
+        slider=(0.01, 1.0), note="instead of the cut-off frequency", short_name="coefficient",
     ),
-    Parameter("position.cutoff", "cut-off frequency of the position filter", "f_p", POSITIVE, "Hz"),
-    Parameter("position.time_constant", "time constant of the position filter", r"\tau_p", POSITIVE, "s"),
-    Parameter("position.order", "order of the position filter", "n_p", Range(1, 8), whole=True),
+    Parameter(
+        "position.cutoff", "cut-off frequency of the position filter", "f_p", POSITIVE, "Hz", (1.0, 5e3),
+        short_name="cut-off frequency",
+    ),
+    Parameter(
+        "position.time_constant", "time constant of the position filter", r"\tau_p", POSITIVE, "s", (2e-5, 0.2),
+        short_name="time constant",
+    ),
+    Parameter(
+        "position.order", "order of the position filter", "n_p", Range(1, 8), slider=(1.0, 8.0), whole=True,
+        short_name="filter order",
+    ),
     Parameter("position.coded_period", "sampling period in the formula of the position filter", "T_p", POSITIVE, "s"),
-    Parameter("position.bandwidth", "bandwidth of the phase-locked loop", r"\omega_p", POSITIVE, "1/s"),
-    Parameter("feedback.gain", "integral gain", "k_i", ANY, "N/(m s)"),
+    Parameter(
+        "position.bandwidth", "bandwidth of the phase-locked loop", r"\omega_p", POSITIVE, "1/s", (10.0, 1e4),
+        short_name="bandwidth",
+    ),
+    Parameter("feedback.gain", "integral gain", "k_i", ANY, "N/(m s)", (0.0, 1e5)),
     Parameter("feedback.position", "weight of the position estimate in the input of the feedback", "w_p", ANY),
     Parameter("feedback.velocity", "weight of the velocity estimate in the input of the feedback", "w_v", ANY),
     Parameter("tool.mass", "mass of the simulated tool", "M", POSITIVE, "kg", (1e-3, 2.0), "", "mass of the tool"),
     Parameter("tool.damping", "damping of the simulated tool", "c_t", NOT_NEGATIVE, "N s/m", (0.0, 9.0), "default 0"),
     Parameter("tool.stiffness", "stiffness of the simulated tool", "k_t", NOT_NEGATIVE, "N/m", (0.0, 1e3), "default 0"),
+    Parameter(
+        "tool.every", "sampling periods per step of the simulated tool", "N", Range(1, 1000),
+        note="> 1 for a physics engine that is slower than the control program; default 1", whole=True,
+    ),
     Parameter("stiffness", "stiffness K of the virtual wall", "K", ANY, "N/m", (0.0, 50e3), short_name="stiffness"),
     Parameter(
         "alpha", "normalized stiffness of the virtual wall, K T^2/m", r"\alpha", ANY, slider=(0.0, 1.0),

@@ -194,3 +194,18 @@ def test_weakly_damped_and_long_delayed_displays():
             limit = display.max_environment_stiffness(virtual_damping=virtual_damping)
             single = zwidth.AdmittanceDisplay(100, virtual_damping, LAG, display.timing, "velocity", "trapezoidal")
             assert limit.stiffness == pytest.approx(single.scene().stable_stiffness(0.0)[-1, 1], rel=1e-9)
+
+
+def test_robots_with_very_fast_and_very_slow_modes():
+    """Robots with modes that decay within a period, and with four modes that take a hundred periods."""
+    T = 0.01
+    for poles in ([-37.8 + 44.8j, -37.8 - 44.8j, -4.9, -0.8], [-0.01, -0.011, -0.012 + 0.01j, -0.012 - 0.01j]):
+        denominator = np.poly(np.array(poles) / T).real
+        robot, timing = zwidth.LinearDevice((denominator[-1:], denominator)), zwidth.Timing(T, "0.2 periods")
+        display = zwidth.AdmittanceDisplay(0.003, 2e-4, robot, timing)
+        limits = display.max_environment_stiffness([0, 5e-4], virtual_damping=[[2e-4], [1e-2]])
+        for i, j in np.ndindex(2, 2):
+            single = zwidth.AdmittanceDisplay(0.003, [2e-4, 1e-2][i], robot, timing)
+            intervals = single.scene(0, [0, 5e-4][j]).stable_stiffness(0.0)
+            assert intervals[0, 0] <= 0
+            assert limits.stiffness[i, j] == pytest.approx(intervals[0, 1], rel=1e-9)

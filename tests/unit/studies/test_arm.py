@@ -75,7 +75,7 @@ def test_every_pose_and_direction_agrees_with_its_scene(tmp_path, capsys):
     ("joints", "others"), [(JOINTS, ""), (JOINTS[:-1] + ", slide: [0, 1 cm]}", " and other joints")]
 )
 def test_figure_names_its_quantity_and_the_worst_pose_and_direction(tmp_path, joints, others):
-    (study,) = load_config(write_config(tmp_path, joints)).studies
+    study: Any = load_config(write_config(tmp_path, joints)).studies[0]
     outcome = study.compute(None, True)
     plt = pytest.importorskip("matplotlib.pyplot")
     (ax,) = outcome.figures[""]()

@@ -1,9 +1,9 @@
 """Controls of the explorer page: sliders and choices of a scene, and texts that reproduce the scene.
 
 The explorer (`zwidth explore`) is a browser page with sliders for the parameters of a scene, and choices for its parts
-(velocity estimate, actuator, coupling, hand). `Controls` converts the values that the page shows, in its units, to a
-`zwidth.Scene` and back. A normalized scene has m = 1 and T = 1, so that K is alpha, B is beta, b is delta and the
-delay is d. `to_link`, `to_yaml` and `to_python` write the scene as an address, a configuration and a script.
+(estimates, further feedback, actuator, coupling, hand). `Controls` converts the values that the page shows, in its
+units, to a `zwidth.Scene` and back. A normalized scene has m = 1 and T = 1, so that K is alpha, B is beta, b is delta
+and the delay is d. `to_link`, `to_yaml` and `to_python` write the scene as an address, a configuration and a script.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.scenes import NormalizedScene
 from zwidth.core.errors import InputError
 from zwidth.model.device import Device
+from zwidth.model.feedback import IntegralFeedback
 from zwidth.model.linear_device import LinearDevice
-from zwidth.model.parameter_paths import PARTS, find_parts, spell_part, spell_scene
+from zwidth.model.parameter_paths import PARTS, WITH_KIND, find_parts, spell_part, spell_scene
+from zwidth.model.position import ExponentialFilter, Pll, has_velocity
 from zwidth.model.timing import Timing
 from zwidth.model.velocity import BackwardDifference, Butterworth, LowPass, WindowedDifference
 from zwidth.model.wall import VirtualWall
@@ -80,12 +82,13 @@ def _make_slider(parameter: Parameter, system: UnitSystem) -> Slider:
 
 
 # Units of the page that differ from SI units, each with the number of these units per SI unit.
-_SHOWN = {"kg": ("g", 1e3), "s": ("ms", 1e3)}
+_SHOWN = {"kg": ("g", 1e3), "s": ("ms", 1e3), "1/s": ("rad/s", 1.0)}
 # Unit of a rotary device on the page and the number of these units per SI unit, for each SI unit of linear devices.
 _ROTARY_UNITS = {"kg": ("g cm^2", 1e7), "N s/m": ("mN m s/rad", 1e3), "N/m": ("N m/rad", 1.0)}
+_ROTARY_UNITS |= {"N/(m s)": ("N m/(rad s)", 1.0)}
 # Typical ratio of a rotary to a linear parameter in SI units, for a mass at a radius of about 3 cm; by the SI unit of
 # linear devices.
-_SMALLER = {"kg": 1e-3, "N s/m": 1e-3, "N/m": 1e-3}
+_SMALLER = {"kg": 1e-3, "N s/m": 1e-3, "N/m": 1e-3, "N/(m s)": 1e-3}
 _BARE = ("device", "timing", "wall")  # parts whose parameters have no prefix in a path
 _DEVICE = ("mass", "damping", "period", "delay", "delta", "d")
 _WALL = ("stiffness", "virtual_damping", "alpha", "beta")
@@ -96,6 +99,7 @@ SLIDERS = {name: _make_slider(PARAMETERS[name], LINEAR) for name in _WITH_SLIDER
 ROTARY_SLIDERS = {name: _make_slider(PARAMETERS[name], ROTARY) for name in _WITH_SLIDER}
 # Parameters of a scene with m = 1 and T = 1, by the normalized parameter whose value they have.
 _NORMALIZED = {"delta": "damping", "d": "delay", "alpha": "stiffness", "beta": "virtual_damping"}
+_AS_GIVEN = "coefficients, as given"  # text of the choices that only a configuration file can set
 CHOICES = {
     "mode": {"physical": "physical", "normalized": "normalized"},
     "motion": {"linear": "linear", "rotary": "rotary"},
@@ -104,8 +108,18 @@ CHOICES = {
         "WindowedDifference": "window of n",
         "LowPass": "low-pass",
         "Butterworth": "Butterworth",
-        "VelocityFilter": "coefficients, as given",
+        "VelocityFilter": _AS_GIVEN,
     },
+    "position": {
+        "none": "none",
+        "ExponentialFilter": "exponential filter",
+        "LowPass": "low-pass",
+        "Butterworth": "Butterworth",
+        "Pll": "phase-locked loop (PLL)",
+        "PositionFilter": _AS_GIVEN,
+        "Observer": _AS_GIVEN,
+    },
+    "feedback": {"none": "none", "IntegralFeedback": "integral gain", "Feedback": _AS_GIVEN},
     **{name: {form: form for form in ("none", *part.usual)} for name, part in PARTS.items()},
 }
 CHOICES["coupling"] |= {"motor": "tip, sensor at the motor", "tip": "tip, sensor at the tip"}
@@ -153,6 +167,7 @@ class Controls:
             numbers = {name: value for name, value in numbers.items() if name not in idle}
         choices = {"mode": "physical", "motion": "rotary" if self.rotary else "linear"}
         choices |= {"velocity": type(scene.velocity).__name__}
+        choices |= {name: _name_class(getattr(scene, name)) for name in WITH_KIND}
         if isinstance(scene.device, LinearDevice):
             # Omit the choices of hand, coupling and actuator, because a linear system already contains these parts.
             return numbers | choices
@@ -215,12 +230,20 @@ class Controls:
             return replace(
                 self, scene=scene.replace(**{name: None if kind == "none" else self._make_usual(name, kind)})
             )
-        cutoff = min(100.0, 0.1 / scene.timing.period)
-        usual = BackwardDifference(), WindowedDifference(5), LowPass(cutoff=cutoff), Butterworth(cutoff)
-        estimates = {type(each).__name__: each for each in usual}
-        if kind not in estimates:
-            raise InputError(f"{name}: coefficients can only be set in a configuration file; choose another estimate")
-        return replace(self, scene=scene.replace(velocity=estimates[kind]))
+        cutoff, gain = min(100.0, 0.1 / scene.timing.period), 1e3 * (_SMALLER["N/(m s)"] if self.rotary else 1.0)
+        usual = {
+            "velocity": (BackwardDifference(), WindowedDifference(5), LowPass(cutoff=cutoff), Butterworth(cutoff)),
+            "position": (None, ExponentialFilter(0.5), LowPass(cutoff=cutoff), Butterworth(cutoff), Pll(2.0 * cutoff)),
+            "feedback": (None, IntegralFeedback(gain)),
+        }
+        parts = {_name_class(part): part for part in usual[name]}
+        if kind not in parts:
+            raise InputError(f"{name}: coefficients can only be set in a configuration file; choose another kind")
+        changes = {name: parts[kind]}
+        if has_velocity(changes.get("position")):
+            # Reset the velocity estimate, because the phase-locked loop estimates the velocity, too.
+            changes["velocity"] = BackwardDifference()
+        return replace(self, scene=scene.replace(**changes))
 
     def _make_usual(self, name: str, kind: str) -> Any:
         """Return a part with the values of one of its presets, converted to typical values of this kind of device."""
@@ -250,6 +273,11 @@ def _check_range(name: str, slider: Slider, value: float) -> None:
         ends = allowed._replace(low=allowed.low * by, high=allowed.high * by)
         unit = f" {slider.unit}" if slider.unit else ""
         raise InputError(f"{slider.label}: got {value:g}{unit}; it must be {ends}{unit}")
+
+
+def _name_class(part: Any) -> str:
+    """Return the name of the class of an estimate or feedback; "none" for None."""
+    return "none" if part is None else type(part).__name__
 
 
 def _round(value: float, digits: int) -> float:

@@ -39,6 +39,30 @@ CENTRAL_DIFFERENCE = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2,
 DIFFERENCE_STEP = 1e-3
 
 
+class StateTerms:
+    """Response of the states of a device, in sampling periods, to a unit command from rest, in Taylor arithmetic."""
+
+    def __init__(self, A: Taylor, B: Taylor, one: Taylor, fraction: Taylor, sampled: bool) -> None:
+        """Compute Psi, Gamma(1) and Gamma(1 - f).
+
+        Args:
+            A, B: matrices of the device; if ``sampled``, those of one period, otherwise those of continuous time.
+            one: the number 1 with the variables of A and B.
+            fraction: fractional part f of the delay.
+            sampled: whether the device is in discrete time, for one period and one delay.
+        """
+        if sampled:
+            self.psi, self.full, self.late = A + stack(-np.eye(len(A.v)), one), B, B
+        else:
+            self.psi, self.full = flow(A, B, one)
+            self.late = flow(A, B, one - fraction)[1]
+
+    def respond(self, zeta: Taylor) -> tuple[Taylor, Taylor]:
+        """Return ``zeta - Psi`` and ``x = (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1))``, with ``zeta = z - 1``."""
+        matrix = zeta.map(lambda part: np.multiply.outer(np.eye(len(self.full.v)), part)) - self.psi
+        return matrix, solve(matrix, self.full + self.late * zeta.map(lambda part: np.asarray(part)[None]))
+
+
 class LoopTerms:
     """Taylor expansions of q = -1/G and of F in the numbers of a scene and in further variables.
 
@@ -66,12 +90,7 @@ class LoopTerms:
         self.estimates = build_estimates(self.varied)
         A, B = (stack(part, self.one) for part in chain.realize()[:2])
         self.lag = n + 1
-        if chain.sampled:
-            self.psi, self.full = A + stack(-np.eye(len(A.v)), self.one), B
-            self.late = B
-        else:
-            self.psi, self.full = flow(A, B, self.one)
-            self.late = flow(A, B, self.one - (delay - n))[1]
+        self.states = StateTerms(A, B, self.one, delay - n, chain.sampled)
 
     def controller(self, lam: Taylor) -> Jet:
         """Return q = -1/G and its derivative in lambda = log z; with a simulated tool, G includes its response."""
@@ -85,11 +104,8 @@ class LoopTerms:
     def _control_device(self, lam: Taylor) -> Jet:
         """Return q = -1/G of the device without a tool, and its derivative in lambda."""
         z, zeta = lam.exp(), lam.expm1()
-        size = len(self.full.v)
-        matrix = zeta.map(lambda part: np.multiply.outer(np.eye(size), part)) - self.psi
-        late = self.late * z.map(lambda part: np.asarray(part)[None])
-        x = solve(matrix, self.full + late - self.late)
-        change = solve(matrix, late - x * z.map(lambda part: np.asarray(part)[None]))
+        matrix, x = self.states.respond(zeta)
+        change = solve(matrix, (self.states.late - x) * z.map(lambda part: np.asarray(part)[None]))
         q = -(lam * self.lag).exp() / x[0]
         q_slope = q * (self.one * self.lag - change[0] / x[0])
         if self.estimates is None:

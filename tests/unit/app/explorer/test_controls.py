@@ -53,6 +53,24 @@ def test_every_choice_is_a_scene_with_adjustable_parameters(velocity, operator, 
         assert others == {other: value for other, value in shown.items() if other != name}
 
 
+@pytest.mark.parametrize("motion", ["linear", "rotary"])
+@pytest.mark.parametrize("position", ["none", "ExponentialFilter", "LowPass", "Butterworth", "Pll"])
+def test_position_estimates_and_feedback_have_sliders(motion, position):
+    controls = Controls().change({"motion": motion, "velocity": "LowPass"})
+    controls = controls.change({"position": position, "feedback": "IntegralFeedback"})
+    shown = controls.shown()
+    assert (shown["position"], shown["feedback"]) == (position, "IntegralFeedback")
+    assert controls.change(shown) == controls
+    for name in (name for name in shown if name.startswith(("position.", "feedback."))):
+        slider = controls.sliders[name]
+        assert slider.low <= shown[name] <= slider.high
+        moved = controls.change({name: 0.5 * shown[name] if not slider.whole else 2})
+        assert moved.scene.parameters()[name] == pytest.approx(moved.shown()[name] / slider.per_si)
+    assert controls.change({"position": "none", "feedback": "none"}).scene.position is None
+    # A phase-locked loop estimates the velocity, too, and replaces the velocity estimate.
+    assert shown["velocity"] == ("BackwardDifference" if position == "Pll" else "LowPass")
+
+
 def test_units_are_converted_and_restored():
     normalized = Controls().change({"mode": "normalized"})
     shown = normalized.shown()
@@ -78,6 +96,8 @@ def test_units_are_converted_and_restored():
         ({"velocity": "x" * 1000}, "choose one of"),
         ({"velocity": ["LowPass"]}, "choose one of"),
         ({"velocity": "VelocityFilter"}, "in a configuration file"),
+        ({"position": "Observer"}, "in a configuration file"),
+        ({"position": "Pll", "position.bandwidth": 900}, "position.bandwidth: got 900 rad/s; the PLL is unstable"),
         ({"velocity": "LowPass", "velocity.cutoff": 600}, "velocity.cutoff: got 600 Hz"),
         ({"delay": 1e6}, "delay: the loop has"),
         ({"velocity": "WindowedDifference", "velocity.samples": 900}, "delay: the loop has"),

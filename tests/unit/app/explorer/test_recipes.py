@@ -29,6 +29,8 @@ VIEWS = {
     "filter": Controls(
         Controls().scene.replace(velocity=zwidth.VelocityFilter([500, 0, -500], [1, 0, 0])),
     ),
+    "position filter": Controls().change({"position": "ExponentialFilter", "feedback": "IntegralFeedback"}),
+    "phase-locked loop": Controls().change({"motion": "rotary", "position": "Pll", "feedback": "IntegralFeedback"}),
     "actuator lag": Controls().change({"actuator": "second order"}),
     "resonance": Controls(
         zwidth.Scene(

@@ -4,7 +4,9 @@
 const start = JSON.parse(document.getElementById("start").textContent);
 const by = id => document.getElementById(id);
 const STEPS = 1000;
-const LABELS = { mode: "units", velocity: "velocity estimate", coupling: "compliance" };
+const LABELS = {
+  mode: "units", velocity: "velocity estimate", position: "position estimate", feedback: "further feedback", coupling: "compliance",
+};
 const fields = {};
 const CAPTIONS = ["poles_words", "nyquist_words", "bode_words", "step_words", "contact_words"];
 let inputs = null, serial = 0, answered = 0, waiting = {}, sent = {}, rests = false, scheduled = false;
