@@ -174,17 +174,16 @@ def list_tool_notes(scene: Scene) -> list[str]:
     if scene.tool is None:
         return []
     if scene.tool.every > 1:
-        rate = with_unit(1.0 / (scene.tool.every * scene.timing.period), "Hz")
-        every = scene.tool.every
-        text = f"its tool makes one step per {every} periods, at {rate}; margins and islands are not computed"
+        rate, every = with_unit(1.0 / (scene.tool.every * scene.timing.period), "Hz"), scene.tool.every
+        text = f"; its tool makes one step per {every} periods, at {rate}; margins and islands are not computed"
     elif scene.tool.integrator == "semi-implicit":
         text = (
-            "its tool is integrated by semi-implicit Euler and therefore not passive, so a coupling that is safe for "
+            "; its tool is integrated by semi-implicit Euler and therefore not passive, so a coupling that is safe for "
             "every passive world may be unstable with it; lightest_tool returns the smallest mass"
         )
     else:
-        text = "is_safe_for_every_world includes every tool that is integrated by implicit Euler"
-    return [f"K and B are those of a virtual coupling; {text}", *_list_narrow_regions(scene)]
+        text = ""
+    return [f"K and B are those of a virtual coupling{text}", *_list_narrow_regions(scene)]
 
 
 def _list_narrow_regions(scene: Scene) -> list[str]:
